@@ -1,0 +1,1 @@
+"""Self-contained 4D Gaussian trainers in the style of the codebases that users have."""

@@ -1,0 +1,92 @@
+"""A synchronized multi-camera recording: cameras, frames, and pictures that are read when asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+
+from d2_plugin.errors import D2Error, unknown_name
+
+MonoKind = Literal["relative", "metric"]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A calibrated pinhole camera: OpenCV axes, x_cam = R X + t, pixel i has its centre at i + 0.5."""
+
+    name: str
+    width: int
+    height: int
+    K: np.ndarray  # [3, 3] float64, pixels
+    T_camera_world: np.ndarray  # [4, 4] float64
+    near_far: tuple[float, float] | None = None  # depth range the data set declares, world units
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Camera centre in the world, [3]."""
+        return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
+
+
+class Source(Protocol):
+    """Where pictures come from; each read opens one file (or decodes one video frame) and keeps nothing."""
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        """RGB uint8 [H, W, 3]."""
+
+    def depth(self, camera: str, frame: int) -> np.ndarray | None:
+        """True planar z float32 [H, W], 0 where unknown, or None where there is no truth."""
+
+    def mono(self, camera: str, frame: int) -> np.ndarray | None:
+        """A monocular prediction float32 [h, w] lying on disk, or None."""
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Cameras, frames and a source of pictures.
+
+    `frames` are the frame numbers present for every camera, ascending; `fps` converts them to seconds.
+    `mono_kind` says what `source.mono` returns: "relative" is affine-invariant inverse depth (larger is nearer),
+    "metric" is depth; None when there are no maps. `mono_emulated` is True when those maps were made from true
+    depth rather than predicted by a network: whoever shows a figure that rests on them must say so.
+    """
+
+    name: str
+    cameras: dict[str, Camera]
+    frames: tuple[int, ...]
+    fps: float
+    source: Source
+    path: Path | None = None
+    mono_kind: MonoKind | None = None
+    mono_emulated: bool = False
+    notes: tuple[str, ...] = field(default=())
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        """RGB uint8 [H, W, 3]; refuses a picture whose size is not the camera's."""
+        image = self.source.image(self._known(camera), frame)
+        expected = (self.cameras[camera].height, self.cameras[camera].width)
+        if image.shape[:2] != expected:
+            raise D2Error(
+                f"frame {frame} of camera {camera} is {image.shape[1]}x{image.shape[0]} pixels but its calibration says "
+                f"{expected[1]}x{expected[0]}: resize the picture or correct the camera"
+            )
+        return image
+
+    def depth(self, camera: str, frame: int) -> np.ndarray | None:
+        """True planar z float32 [H, W] (0 = unknown), or None."""
+        return self.source.depth(self._known(camera), frame)
+
+    def mono(self, camera: str, frame: int) -> np.ndarray | None:
+        """Monocular map of `mono_kind` from disk, float32 at the size it is stored in, or None."""
+        return self.source.mono(self._known(camera), frame)
+
+    def seconds(self, frame: int) -> float:
+        """Time of a frame since the first one, in seconds."""
+        return (frame - self.frames[0]) / self.fps
+
+    def _known(self, camera: str) -> str:
+        if camera not in self.cameras:
+            raise unknown_name("camera", camera, self.cameras)
+        return camera

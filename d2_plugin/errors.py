@@ -1,0 +1,30 @@
+"""The one exception that a user is meant to read."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class D2Error(ValueError):
+    """A mistake in input or configuration, told in one sentence: what, expected and got, what to do.
+
+    The `d2` command prints it without a traceback and exits with code 2.
+    """
+
+
+class MissingExtra(D2Error, ImportError):
+    """A feature was asked for whose optional packages are not installed."""
+
+
+def missing_extra(package: str, extra: str, purpose: str) -> MissingExtra:
+    """The error for an import of `package` that failed: names the purpose and the command that mends it."""
+    return MissingExtra(f"{purpose} needs {package}, which is not installed: run `pip install 'd2-4dgs[{extra}]'`")
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> D2Error:
+    """The error for a name that is not among `known`, with the nearest one suggested."""
+    have = sorted(known)
+    near = difflib.get_close_matches(name, have, n=1)
+    hint = f"; did you mean '{near[0]}'?" if near else ""
+    return D2Error(f"unknown {kind} '{name}': have {', '.join(have) or 'none'}{hint}")

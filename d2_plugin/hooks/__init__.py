@@ -1,0 +1,1 @@
+"""The four hooks: prior, densify, prune, depth loss."""

@@ -1,0 +1,1 @@
+"""Depth priors: monocular and geometric depth, aligned, verified, fused and stored."""

@@ -1,0 +1,160 @@
+"""The contract: plain data and one Protocol, shared by hooks, rasterizer, priors and adapters.
+
+Conventions, everywhere: OpenCV axes (x right, y down, z forward); ``T_camera_world`` maps world points to camera
+points; pixel i has its centre at i + 0.5; depth is planar z > 0; images are [H, W, 3] in 0..1; times are in the
+backbone's own unit; covariances are stored as xx, xy, xz, yy, yz, zz.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple, Protocol, runtime_checkable
+
+from torch import Tensor
+
+
+class Label(IntEnum):
+    """What is known about one pixel of a depth prior (paper, section "Dual-source Depth Consistency Prior")."""
+
+    EMPTY = 0  # no depth
+    MONO = 1  # aligned monocular depth only: may propose a Gaussian, never judge one
+    VERIFIED = 2  # geometric depth confirmed by aligned monocular depth (Omega^v)
+    CONFLICT = 3  # the two sources disagree: discarded
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera at one instant.
+
+    `T_camera_world` [4, 4] maps world to camera, `K` [3, 3] is in pixels; both are float tensors on the device of
+    the backbone. `camera` and `frame` are the key of the depth prior; `time` is in the backbone's own unit.
+    """
+
+    camera: str
+    frame: int
+    time: float
+    T_camera_world: Tensor
+    K: Tensor
+    width: int
+    height: int
+
+
+class Splats(NamedTuple):
+    """3D Gaussians at one instant, differentiable with respect to the backbone's parameters.
+
+    `opacities` already include the temporal factor. `rows` says which of the backbone's N Gaussians each one is.
+    """
+
+    means: Tensor  # [M, 3] world
+    covariances: Tensor  # [M, 6] xx xy xz yy yz zz
+    opacities: Tensor  # [M] in 0..1
+    rows: Tensor  # [M] int64, indices into 0..N-1
+
+
+class Points(NamedTuple):
+    """Gaussians to insert: what a depth prior knows about a surface point."""
+
+    positions: Tensor  # [K, 3] world
+    colors: Tensor  # [K, 3] in 0..1
+    times: Tensor  # [K] in the backbone's unit
+    scales: Tensor  # [K] isotropic standard deviation in world units
+    opacities: Tensor  # [K] in 0..1
+
+
+class Edit(NamedTuple):
+    """What a hook wants changed: rows to remove (bool [N]) and points to insert. None means nothing."""
+
+    remove: Tensor | None = None
+    insert: Points | None = None
+
+
+class DepthPrior(NamedTuple):
+    """D* of one view: `depth` [H, W] float32 (0 where there is none) and `labels` [H, W] uint8 (see `Label`)."""
+
+    depth: Tensor
+    labels: Tensor
+
+    @property
+    def verified(self) -> Tensor:
+        """Omega^v: pixels that may prune and supervise, bool [H, W]."""
+        return self.labels == Label.VERIFIED
+
+    @property
+    def support(self) -> Tensor:
+        """Omega^p: pixels that have a depth at all (verified or mono-only), bool [H, W]."""
+        return (self.labels == Label.VERIFIED) | (self.labels == Label.MONO)
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """Constants of splatting; the defaults are those of the Inria rasterizer, which most backbones were tuned with."""
+
+    near: float = 0.2
+    """Gaussians with a view depth z <= near are not drawn; world units."""
+    blur: float = 0.3
+    """Added to both diagonal entries of the projected covariance; pixels squared."""
+    alpha_max: float = 0.99
+    """Upper clamp of alpha; no gradient flows through a clamped alpha."""
+    alpha_min: float = 1 / 255
+    """Contributions with a smaller alpha are skipped."""
+    transmittance_min: float = 1e-4
+    """A pixel is finished before the Gaussian that would bring its transmittance to this value or below."""
+    fov_clamp: float = 1.3
+    """x/z and y/z are clamped to this multiple of tan(fov/2) in the projection's Jacobian."""
+
+
+class Render(NamedTuple):
+    """What a rasterizer returns for one view; every output has gradients."""
+
+    color: Tensor  # [H, W, C] sum of w_i c_i (plus the background's share)
+    depth_sum: Tensor  # [H, W] sum of w_i z_i, not normalised
+    alpha: Tensor  # [H, W] A(p) = sum of w_i
+
+
+class Survey(NamedTuple):
+    """Compositing weights of one view, gathered per Gaussian (M rows of the surveyed `Splats`) and per pixel.
+
+    Per Gaussian, with w its weight at a pixel (paper: w_{k,q}), z its view depth, D* the prior:
+    """
+
+    weight: Tensor  # [M] sum of w over verified pixels
+    error: Tensor  # [M] sum of w |z - D*| / (D* + eps) over verified pixels
+    max_weight: Tensor  # [M] maximum of w over all pixels; 0 where it contributes nowhere
+    hits: Tensor  # [M] int32, number of verified pixels it contributes to
+    depth_sum: Tensor  # [H, W]
+    alpha: Tensor  # [H, W]
+
+
+ResizeListener = Callable[[Tensor], None]
+"""Called with `index` [N_new] after a structural change: row r was row index[r] before, -1 for a new row."""
+
+
+@runtime_checkable
+class Backbone(Protocol):
+    """What the hooks need from a 4D Gaussian model; structural, so nothing has to be inherited.
+
+    Optional members: ``rendered_depth(view, output) -> (depth_sum, alpha)`` when the trainer's own render already has
+    both with gradients, and ``active(step) -> bool`` when the hooks must wait (stages, warm-up).
+    """
+
+    settings: RasterSettings
+
+    def __len__(self) -> int:
+        """N, the number of Gaussians."""
+
+    def view(self, camera: object) -> View:
+        """The trainer's own camera object as a `View`."""
+
+    def slice_at(self, view: View) -> Splats:
+        """The 3D Gaussians at `view.time`, differentiable."""
+
+    def insert(self, points: Points) -> int:
+        """Add Gaussians together with their optimizer rows; returns how many were really added."""
+
+    def remove(self, mask: Tensor) -> None:
+        """Delete the rows where `mask` [N] is True together with their optimizer rows."""
+
+    def on_resize(self, listener: ResizeListener) -> None:
+        """Register a listener for every structural change, the backbone's own ones included."""

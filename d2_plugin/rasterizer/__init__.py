@@ -1,0 +1,1 @@
+"""Differentiable splatting with depth and alpha, and the survey of compositing weights."""

@@ -1,0 +1,1 @@
+"""Metrics, evaluation, ablations and reports."""
