@@ -1,0 +1,202 @@
+"""C++ sources of this package, compiled at first use and kept in a cache.
+
+Nothing is compiled at import or at installation, and no torch header is involved: a source is a plain C ABI reached
+through ctypes, so a torch upgrade never invalidates a build. An entry of the cache is named by a hash of everything
+that shapes the machine code: sources, headers, flags, and all that the compiler predefines for this CPU (its version
+and the instruction sets among it), so that a home folder shared by different machines stays safe.
+
+Environment:
+    CXX            the compiler to use (with arguments if needed); otherwise c++, g++ or clang++
+    D2_CXXFLAGS    flags added last, e.g. ``-march=x86-64-v3`` to leave AVX-512 out
+    D2_CACHE       the cache folder; otherwise ``$XDG_CACHE_HOME/d2-4dgs`` or ``~/.cache/d2-4dgs``
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import hashlib
+import logging
+import os
+import shlex
+import shutil
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from .errors import D2Error
+
+logger = logging.getLogger(__name__)
+
+BASE_FLAGS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-pthread", "-fno-math-errno", "-fno-trapping-math")
+"""Flags of every build. No -ffast-math: the kernels test for NaN and infinity."""
+
+NATIVE_FLAGS = (("-march=native",), ("-mcpu=native",), ())
+"""How compilers are asked for this CPU's instructions, best first; the last one always works."""
+
+_loaded: dict[Path, ctypes.CDLL] = {}
+_guard = threading.Lock()
+
+
+class NoCompiler(D2Error):
+    """There is no C++17 compiler; whoever has a slower way should take it."""
+
+
+class CompileError(D2Error):
+    """The compiler refused a source of this package; the message carries the compiler's own words."""
+
+
+def cache_folder() -> Path:
+    """Where compiled libraries are kept (not created here)."""
+    if chosen := os.environ.get("D2_CACHE"):
+        return Path(chosen).expanduser()
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "d2-4dgs"
+
+
+def find_compiler() -> list[str]:
+    """The command of the C++ compiler: ``CXX`` alone where it is set, else the first of c++, g++, clang++.
+
+    Raises:
+        NoCompiler: none of them is on the path.
+    """
+    chosen = os.environ.get("CXX", "").strip()
+    if chosen:
+        command = shlex.split(chosen)
+        if shutil.which(command[0]) is None:
+            raise NoCompiler(f"CXX names '{command[0]}', which is not on the path: correct CXX or unset it")
+        return command
+    for name in ("c++", "g++", "clang++"):
+        if shutil.which(name):
+            return [name]
+    raise NoCompiler("no C++ compiler found (looked for CXX, c++, g++, clang++): install g++ or clang++")
+
+
+def load_library(
+    name: str, sources: Sequence[Path], headers: Sequence[Path] = (), flags: Sequence[str] = ()
+) -> ctypes.CDLL:
+    """The shared library compiled from `sources`, from the cache where it is there already.
+
+    Args:
+        name: what the library is called in the cache and in messages, e.g. ``"rasterizer"``.
+        sources: C++ files, compiled together.
+        headers: files the sources include; a change in them compiles anew, their folders are searched for includes.
+        flags: added to `BASE_FLAGS`.
+
+    Raises:
+        NoCompiler: there is no C++17 compiler.
+        CompileError: the compiler refused the sources.
+        D2Error: the cache folder cannot be written.
+    """
+    compiler = find_compiler()
+    command = [*compiler, *_flags(compiler, (*sources, *headers), flags)]
+    key = _key(_predefined(tuple(command)), sources, headers, flags)
+    library = cache_folder() / f"{name}-{key}.so"
+    with _guard:
+        if library not in _loaded:
+            _loaded[library] = _open(library) or _build(library, command, sources)
+        return _loaded[library]
+
+
+def _flags(compiler: Sequence[str], files: Sequence[Path], extra: Sequence[str]) -> list[str]:
+    includes = dict.fromkeys(f"-I{file.parent}" for file in files)
+    user = shlex.split(os.environ.get("D2_CXXFLAGS", ""))
+    return [*BASE_FLAGS, *_native_flags(tuple(compiler)), *extra, *includes, *user]
+
+
+@functools.cache
+def _native_flags(compiler: tuple[str, ...]) -> tuple[str, ...]:
+    for flags in NATIVE_FLAGS:
+        if _run([*compiler, *flags, "-std=c++17", "-fsyntax-only", "-x", "c++", "-"]).returncode == 0:
+            return flags
+    raise NoCompiler(f"'{shlex.join(compiler)}' does not compile C++17: install a newer g++ or clang++, or set CXX")
+
+
+@functools.cache
+def _predefined(command: tuple[str, ...]) -> str:
+    """Every macro that the compiler predefines: its version, the target and the instruction sets it will use."""
+    shown = _run([part for part in command if part != "-shared"] + ["-E", "-dM", "-x", "c++", "-"])
+    if shown.returncode:
+        raise CompileError(f"the compiler refuses its flags ({shlex.join(command)}): {shown.stderr.strip()}")
+    return shown.stdout
+
+
+def _key(predefined: str, sources: Sequence[Path], headers: Sequence[Path], flags: Sequence[str]) -> str:
+    digest = hashlib.sha256("\0".join([*BASE_FLAGS, *flags, os.environ.get("D2_CXXFLAGS", ""), predefined]).encode())
+    for path in (*sources, *headers):
+        digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:20]
+
+
+def _open(library: Path) -> ctypes.CDLL | None:
+    """The cached library, or None where it is absent or damaged.
+
+    The checksum comes first because the dynamic loader answers a truncated file with a bus error, not an exception.
+    """
+    try:
+        if library.with_suffix(".sha256").read_text() != _checksum(library):
+            return None
+        return ctypes.CDLL(str(library))
+    except (OSError, UnicodeDecodeError):
+        return None
+
+
+def _build(library: Path, command: Sequence[str], sources: Sequence[Path]) -> ctypes.CDLL:
+    try:
+        library.parent.mkdir(parents=True, exist_ok=True)
+        with _locked(library.with_suffix(".lock")):
+            # Another process may have built it while this one waited for the lock.
+            return _open(library) or _compile(library, command, sources)
+    except OSError as error:
+        raise D2Error(f"cannot use the cache {library.parent} ({error}): set D2_CACHE to a writable folder") from error
+
+
+def _compile(library: Path, command: Sequence[str], sources: Sequence[Path]) -> ctypes.CDLL:
+    start = time.perf_counter()
+    with tempfile.TemporaryDirectory(prefix=library.stem, dir=library.parent) as folder:
+        built = Path(folder) / library.name
+        result = _run([*command, *map(str, sources), "-o", str(built)])
+        if result.returncode:
+            raise CompileError(
+                f"compiling {', '.join(source.name for source in sources)} failed; please report the command "
+                f"`{shlex.join(command)}` and what it said:\n{result.stderr.strip()}"
+            )
+        checksum = _checksum(built)
+        built.replace(library)
+    written = library.with_suffix(f".{os.getpid()}")
+    written.write_text(checksum)
+    written.replace(library.with_suffix(".sha256"))
+    logger.info("compiled %s in %.1f s", library.name, time.perf_counter() - start)
+    return ctypes.CDLL(str(library))
+
+
+def _checksum(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    # LC_ALL=C: messages in English, whatever the user's language, since they end up in reports.
+    environment = {**os.environ, "LC_ALL": "C"}
+    try:
+        return subprocess.run(command, input="", capture_output=True, text=True, env=environment, check=False)
+    except OSError as error:
+        raise NoCompiler(f"the compiler '{command[0]}' cannot be run ({error}): install g++ or clang++") from error
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold an exclusive lock on `path` between processes; the system releases it if the process dies."""
+    with path.open("w") as file:
+        try:
+            import fcntl
+        except ImportError:  # Windows
+            import msvcrt
+
+            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)  # type: ignore[attr-defined]
+        else:
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
