@@ -1,0 +1,157 @@
+"""Two-view geometry of calibrated pinhole cameras, in array indices.
+
+A capture's intrinsics place the centre of pixel i at i + 0.5. Resampling kernels (OpenCV, our own) address arrays,
+where that pixel is simply i. Everything in this file is in array indices; `index_intrinsics` is the one place where
+the half pixel is taken off. For a reference pixel p = (u, v, 1) at inverse depth q the source pixel is
+
+    p' ~ A p + k q,     A = K_s R K_r^-1,  k = K_s t,     (R, t) maps reference to source camera,
+
+so a plane sweep or an inverse-depth plane costs one homography each (`reference/priors.md` section 2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from d2_plugin.captures.capture import Camera
+from d2_plugin.errors import D2Error
+
+
+class Projection(NamedTuple):
+    """Where reference pixels land in a source: array indices `x`, `y` and view depth `z` (all NaN-free; test z > 0)."""
+
+    x: np.ndarray
+    y: np.ndarray
+    z: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPair:
+    """Homography parts from a reference to a source camera; `direction` is the source centre seen by the reference."""
+
+    A: np.ndarray  # [3, 3] float64, K_s R K_r^-1
+    k: np.ndarray  # [3] float64, K_s t
+    direction: np.ndarray  # [3] float64, source centre in reference camera coordinates, world units
+
+    def project(self, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> Projection:
+        """Reference pixels (u, v) at planar depth `depth` -> source indices and depth; behind the source z <= 0."""
+        dtype = depth.dtype
+        A, k = self.A.astype(dtype), self.k.astype(dtype)
+        z = depth * (A[2, 0] * u + A[2, 1] * v + A[2, 2]) + k[2]
+        safe = np.where(z > 0, z, np.inf).astype(dtype)
+        x = (depth * (A[0, 0] * u + A[0, 1] * v + A[0, 2]) + k[0]) / safe
+        y = (depth * (A[1, 0] * u + A[1, 1] * v + A[1, 2]) + k[1]) / safe
+        return Projection(x, y, z)
+
+
+def index_intrinsics(camera: Camera) -> np.ndarray:
+    """K [3, 3] for array indices: the pixel whose centre the capture puts at (0.5, 0.5) is at (0, 0) here."""
+    K = np.array(camera.K, dtype=np.float64)
+    K[:2, 2] -= 0.5
+    return K
+
+
+def relative_pose(reference: Camera, source: Camera) -> np.ndarray:
+    """T_source_reference [4, 4]: points in the reference camera's frame to the source camera's."""
+    return source.T_camera_world @ np.linalg.inv(reference.T_camera_world)
+
+
+def view_pair(reference: Camera, source: Camera) -> ViewPair:
+    """The homography parts A and k from `reference` to `source`."""
+    T = relative_pose(reference, source)
+    K_s, K_r = index_intrinsics(source), index_intrinsics(reference)
+    R, t = T[:3, :3], T[:3, 3]
+    return ViewPair(K_s @ R @ np.linalg.inv(K_r), K_s @ t, -R.T @ t)
+
+
+def pixel_grid(camera: Camera, dtype: type = np.float32) -> tuple[np.ndarray, np.ndarray]:
+    """Index coordinates u [1, W] and v [H, 1], to be broadcast."""
+    return np.arange(camera.width, dtype=dtype)[None, :], np.arange(camera.height, dtype=dtype)[:, None]
+
+
+def viewing_rays(camera: Camera, dtype: type = np.float32) -> np.ndarray:
+    """Directions [H, W, 3] with z = 1: the 3D point of a pixel is its depth times its ray, in camera coordinates."""
+    u, v = pixel_grid(camera, np.float64)
+    K_inverse = np.linalg.inv(index_intrinsics(camera))
+    pixels = np.stack(np.broadcast_arrays(u, v, np.ones(1)), axis=-1)
+    return (pixels @ K_inverse.T).astype(dtype)
+
+
+def back_project(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """World points [H, W, 3] float64 of a planar depth map [H, W]."""
+    points = viewing_rays(camera, np.float64) * depth[..., None].astype(np.float64)
+    R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
+    return (points - t) @ R
+
+
+def triangulation_angle(camera: Camera, pair: ViewPair, depth: np.ndarray) -> np.ndarray:
+    """Angle [H, W] in radians between the rays of both cameras at each pixel's 3D point; 0 for one centre."""
+    points = viewing_rays(camera) * depth[..., None]
+    other = points - pair.direction.astype(np.float32)
+    cross = np.linalg.norm(np.cross(points, other), axis=-1)
+    # atan2 of (|a x b|, a.b) keeps its digits at small angles, where arccos of float32 has none below .03 degrees.
+    return np.arctan2(cross, np.einsum("hwc,hwc->hw", points, other))
+
+
+def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The same camera with an image of another size; with centres at i + 0.5 the intrinsics only scale."""
+    K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
+    return replace(camera, width=width, height=height, K=K)
+
+
+def inverse_depth_planes(
+    reference: Camera, sources: Sequence[Camera], depth_range: tuple[float, float], step: float
+) -> np.ndarray:
+    """Inverse depths [D] float64, ascending, spaced so that no projection moves further than `step` source pixels.
+
+    The spacing follows the fastest projection that lies inside any source image, so a range that is ten times too
+    wide adds planes only where pixels are really seen twice; where there is no overlap at all it stays coarse.
+    """
+    bounds = 1 / depth_range[1], 1 / depth_range[0]
+    fine = np.linspace(*bounds, 2049)
+    u, v = np.meshgrid(np.linspace(0, reference.width - 1, 9), np.linspace(0, reference.height - 1, 9))
+    speed = np.zeros(len(fine) - 1)
+    for source in sources:
+        at = view_pair(reference, source).project(u.ravel()[None, :], v.ravel()[None, :], 1 / fine[:, None])
+        inside = (at.z > 0) & (at.x > -1) & (at.y > -1) & (at.x < source.width) & (at.y < source.height)
+        moved = np.hypot(np.diff(at.x, axis=0), np.diff(at.y, axis=0))
+        speed = np.maximum(speed, np.where(inside[1:] | inside[:-1], np.minimum(moved, source.width), 0).max(axis=1))
+    travel = np.concatenate([[0.0], np.cumsum(np.maximum(speed, 1e-6))])
+    count = max(3, int(np.ceil(travel[-1] / step)) + 1)
+    return np.interp(np.linspace(0, travel[-1], count), travel, fine)
+
+
+def check_depth_range(depth_range: tuple[float, float]) -> tuple[float, float]:
+    """The range as floats.
+
+    Raises:
+        D2Error: unless 0 < near < far and both are finite.
+    """
+    near, far = (float(bound) for bound in depth_range)
+    if not (np.isfinite(near) and np.isfinite(far) and 0 < near < far):
+        raise D2Error(
+            f"depth range must be 0 < near < far in world units, got near {near:g} and far {far:g}: swap or correct it"
+        )
+    return near, far
+
+
+def check_views(images: Sequence[np.ndarray], cameras: Sequence[Camera]) -> None:
+    """Refuse a list of pictures that does not belong to the list of cameras.
+
+    Raises:
+        D2Error: on unequal lengths, fewer than two views, or a picture of another size than its camera.
+    """
+    if len(images) != len(cameras):
+        raise D2Error(f"stereo got {len(images)} pictures for {len(cameras)} cameras: pass one picture per camera")
+    if len(images) < 2:
+        raise D2Error(f"stereo needs at least 2 cameras, got {len(images)}: use monocular depth alone for one camera")
+    for image, camera in zip(images, cameras):
+        if image.shape[:2] != (camera.height, camera.width):
+            raise D2Error(
+                f"picture of camera {camera.name} is {image.shape[1]}x{image.shape[0]} pixels but its calibration says "
+                f"{camera.width}x{camera.height}: resize the picture or correct the camera"
+            )
