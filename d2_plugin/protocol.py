@@ -71,10 +71,15 @@ class Edit(NamedTuple):
 
 
 class DepthPrior(NamedTuple):
-    """D* of one view: `depth` [H, W] float32 (0 where there is none) and `labels` [H, W] uint8 (see `Label`)."""
+    """D* of one view: `depth` [H, W] float32 (0 where there is none) and `labels` [H, W] uint8 (see `Label`).
+
+    `colors` [H, W, 3] uint8 are the pixels of the picture the prior was made for: inserted Gaussians start with them,
+    and a trainer's camera need not keep its picture in memory.
+    """
 
     depth: Tensor
     labels: Tensor
+    colors: Tensor | None = None
 
     @property
     def verified(self) -> Tensor:
@@ -135,8 +140,9 @@ ResizeListener = Callable[[Tensor], None]
 class Backbone(Protocol):
     """What the hooks need from a 4D Gaussian model; structural, so nothing has to be inherited.
 
-    Optional members: ``rendered_depth(view, output) -> (depth_sum, alpha)`` when the trainer's own render already has
-    both with gradients, and ``active(step) -> bool`` when the hooks must wait (stages, warm-up).
+    Optional members: ``rendered_depth(view) -> (depth_sum, alpha) | None`` when the trainer has just rendered this view
+    and its own output has both with gradients (saves a second render), and ``active(step) -> bool`` when the hooks must
+    wait (stages, warm-up).
     """
 
     settings: RasterSettings

@@ -1,0 +1,105 @@
+"""The backbone's own adaptive density control, as 3D Gaussian Splatting does it, on 4D Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from .rotation4d import normalized_quaternions, rotation_matrices_3d, rotation_matrices_4d
+
+if TYPE_CHECKING:
+    from .yang4d import Yang4D
+
+
+@dataclass(frozen=True)
+class DensifySettings:
+    """When the backbone clones, splits, prunes and resets; fractions are of the run's iterations."""
+
+    enabled: bool = True
+    start: float = 0.05
+    """Fraction of the run before the first edit."""
+    stop: float = 0.6
+    """Fraction of the run after the last edit."""
+    every: int = 100
+    """Steps between edits."""
+    gradient: float = 2e-4
+    """Mean screen-space gradient (in units of half the image) above which a Gaussian is cloned or split."""
+    dense_fraction: float = 0.01
+    """Gaussians larger than this fraction of the extent are split, smaller ones cloned."""
+    opacity: float = 0.005
+    """Gaussians below this opacity are pruned."""
+    scale_fraction: float = 0.5
+    """Gaussians larger than this fraction of the extent are pruned."""
+    reset_every: int = 0
+    """Steps between opacity resets to 0.01; 0 never resets (official: 3000 of 30000 steps)."""
+    budget: int = 100_000
+    """No growth beyond this number of Gaussians."""
+
+
+@torch.no_grad()
+def densify(model: Yang4D, settings: DensifySettings, step: int, iterations: int, generator: torch.Generator) -> None:
+    """Clone, split, prune and reset as scheduled; all structure changes go through model.append and model.select."""
+    if not settings.enabled or not settings.start * iterations <= step <= settings.stop * iterations:
+        return
+    if step % settings.every == 0:
+        grow(model, settings, generator)
+        prune(model, settings)
+        for value in model.gaussians.statistics.values():
+            value.zero_()
+    if settings.reset_every and step % settings.reset_every == 0:
+        logits = model.gaussians["opacity_logits"]
+        model.gaussians.overwrite("opacity_logits", logits.clamp(max=torch.logit(torch.tensor(0.01)).item()))
+
+
+def grow(model: Yang4D, settings: DensifySettings, generator: torch.Generator) -> None:
+    """Clone small Gaussians with a large mean screen-space gradient, split large ones in two."""
+    statistics = model.gaussians.statistics
+    mean_gradient = statistics["screen_gradient"] / statistics["seen"].clamp(min=1)
+    wanted = torch.nonzero(mean_gradient > settings.gradient).squeeze(-1)
+    room = max(settings.budget - len(model), 0)
+    if len(wanted) > room:
+        wanted = wanted[mean_gradient[wanted].topk(room).indices.sort().values]
+    large = model.gaussians["log_scales"][wanted].exp().amax(-1) > settings.dense_fraction * model.extent
+    cloned, split = wanted[~large], wanted[large]
+    raw = {name: value.detach() for name, value in model.gaussians.parameters.items()}
+    rows = {name: torch.cat([value[cloned], value[split], value[split]]) for name, value in raw.items()}
+    children = slice(len(cloned), None)
+    _scatter_children(rows, children, generator)
+    if len(rows["positions"]):
+        model.append(rows)
+        keep = torch.ones(len(model), dtype=torch.bool, device=split.device)
+        keep[split] = False
+        model.select(torch.nonzero(keep).squeeze(-1))
+
+
+def prune(model: Yang4D, settings: DensifySettings) -> None:
+    """Remove Gaussians that are nearly transparent or as large as the scene."""
+    raw = model.gaussians
+    opaque = torch.sigmoid(raw["opacity_logits"]) >= settings.opacity
+    bounded = raw["log_scales"].exp().amax(-1) <= settings.scale_fraction * model.extent
+    keep = opaque & bounded
+    if not keep.all():
+        model.select(torch.nonzero(keep).squeeze(-1))
+
+
+def _scatter_children(rows: dict[str, Tensor], children: slice, generator: torch.Generator) -> None:
+    """Move split children to samples of their parent Gaussian (in 4D where there is time) and shrink them by 1.6."""
+    temporal = "times" in rows
+    left = normalized_quaternions(rows["left"][children])
+    scales = rows["log_scales"][children].exp()
+    if temporal:
+        right = normalized_quaternions(rows["right"][children])
+        scales = torch.cat([scales, rows["log_time_scales"][children].exp()[:, None]], -1)
+        rotation = rotation_matrices_4d(left, right)
+    else:
+        rotation = rotation_matrices_3d(left)
+    noise = torch.randn(scales.shape, generator=generator, dtype=scales.dtype).to(scales.device)
+    offset = (rotation @ (scales * noise)[..., None]).squeeze(-1)
+    rows["positions"][children] += offset[:, :3]
+    rows["log_scales"][children] -= torch.log(torch.tensor(1.6))
+    if temporal:
+        rows["times"][children] += offset[:, 3]
+        rows["log_time_scales"][children] -= torch.log(torch.tensor(1.6))

@@ -1,0 +1,41 @@
+"""The photometric loss that all backbones share: 0.8 L1 + 0.2 D-SSIM."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+@lru_cache(maxsize=8)
+def _window(device: torch.device, dtype: torch.dtype) -> Tensor:
+    """Gaussian window of 11 taps, sigma 1.5 pixels, summing to one."""
+    x = torch.arange(11, dtype=torch.float64) - 5
+    weights = torch.exp(-(x**2) / (2 * 1.5**2))
+    return (weights / weights.sum()).to(device=device, dtype=dtype)
+
+
+def _blur(maps: Tensor) -> Tensor:
+    """Separable Gaussian blur of [K, H, W] with zero padding."""
+    window = _window(maps.device, maps.dtype)
+    rows = F.conv2d(maps[:, None], window[None, None, None], padding=(0, 5))
+    return F.conv2d(rows, window[None, None, :, None], padding=(5, 0))[:, 0]
+
+
+def ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Structural similarity of images [H, W, 3] in 0..1 as 3D Gaussian Splatting defines it (11x11 Gaussian window)."""
+    a, b = a.permute(2, 0, 1), b.permute(2, 0, 1)
+    k = len(a)
+    mean_a, mean_b, aa, bb, ab = _blur(torch.cat([a, b, a * a, b * b, a * b])).split(k)
+    variance_a, variance_b, covariance = aa - mean_a**2, bb - mean_b**2, ab - mean_a * mean_b
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
+    return (similarity / ((mean_a**2 + mean_b**2 + c1) * (variance_a + variance_b + c2))).mean()
+
+
+def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+    """(1 - w) mean |image - target| + w (1 - SSIM) for images [H, W, 3] in 0..1."""
+    loss = (1 - ssim_weight) * torch.abs(image - target).mean()
+    return loss + ssim_weight * (1 - ssim(image, target)) if ssim_weight else loss

@@ -1,0 +1,112 @@
+"""The training loop that both bundled backbones share, and the example that users copy: three lines attach D2.
+
+The loop knows nothing of D2 beyond those lines: `d2` is whatever `attach(model)` returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from d2_plugin.rasterizer import Render, View
+
+from .photometric import photometric_loss
+
+
+class Model(Protocol):
+    """What the loop needs of a backbone."""
+
+    def render(self, view: View, background: Tensor | None = None) -> Render: ...
+    def accumulate(self, view: View) -> None: ...
+    def optimize(self, step: int, iterations: int) -> None: ...
+    def densify(self, step: int, iterations: int, generator: torch.Generator) -> None: ...
+    def state_dict(self) -> dict[str, object]: ...
+    def load_state_dict(self, state: Mapping[str, object]) -> None: ...
+
+
+class Frames(Protocol):
+    """The training pictures: views, and the picture [H, W, 3] in 0..1 of each."""
+
+    views: Sequence[View]
+
+    def image(self, index: int) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """How long and on what loss to train."""
+
+    iterations: int = 3000
+    ssim_weight: float = 0.2
+    """Share of D-SSIM in the photometric loss."""
+    seed: int = 0
+    """Of the order of views and of split samples; the global random state is never used."""
+
+
+class Trainer:
+    """One run: model, frames, settings, and the state of the sampler."""
+
+    def __init__(
+        self,
+        model: Model,
+        frames: Frames,
+        settings: TrainSettings,
+        attach: Callable[[Model], object] | None = None,
+    ) -> None:
+        self.model, self.frames, self.settings = model, frames, settings
+        self.step = 0
+        self._generator = torch.Generator().manual_seed(settings.seed)
+        self._queue: list[int] = []
+        self.d2 = attach(model) if attach else None  # D2, line 1: after the optimizer exists
+
+    def run(
+        self, until: int | None = None, on_step: Callable[[int, float], None] | None = None
+    ) -> None:
+        """Train up to and including step `until` (default: all); `on_step(step, loss)` reports each one."""
+        model, iterations, d2 = self.model, self.settings.iterations, self.d2
+        while self.step < (iterations if until is None else until):
+            self.step += 1
+            index = self._next_view()
+            view = self.frames.views[index]
+            render = model.render(view)
+            loss = photometric_loss(render.color, self.frames.image(index), self.settings.ssim_weight)
+            logged = loss.item()
+            if d2 is not None:
+                loss = loss + d2.loss(self.step, [view])  # D2, line 2: before backward, never +=
+            loss.backward()
+            model.accumulate(view)
+            model.optimize(self.step, iterations)
+            model.densify(self.step, iterations, self._generator)
+            if d2 is not None:
+                d2.step(self.step)  # D2, line 3: after the optimizer's step and zero_grad
+            if on_step:
+                on_step(self.step, logged)
+
+    def state_dict(self) -> dict[str, object]:
+        """Model, sampler and D2: a run resumed from here is bitwise the uninterrupted one."""
+        return {
+            "step": self.step,
+            "model": self.model.state_dict(),
+            "generator": self._generator.get_state(),
+            "queue": list(self._queue),
+            "d2": self.d2.state_dict() if self.d2 is not None else None,
+        }
+
+    def load_state_dict(self, state: Mapping[str, object]) -> None:
+        """Continue from `state_dict()`."""
+        self.step = state["step"]
+        self.model.load_state_dict(state["model"])
+        self._generator.set_state(state["generator"])
+        self._queue = list(state["queue"])
+        if self.d2 is not None:
+            self.d2.load_state_dict(state["d2"])
+
+    def _next_view(self) -> int:
+        """Every view once, in a new random order each time round."""
+        if not self._queue:
+            self._queue = torch.randperm(len(self.frames.views), generator=self._generator).tolist()
+        return self._queue.pop()
