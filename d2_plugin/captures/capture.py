@@ -65,18 +65,12 @@ class Capture:
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3]; refuses a picture whose size is not the camera's."""
-        image = self.source.image(self._known(camera), frame)
-        expected = (self.cameras[camera].height, self.cameras[camera].width)
-        if image.shape[:2] != expected:
-            raise D2Error(
-                f"frame {frame} of camera {camera} is {image.shape[1]}x{image.shape[0]} pixels but its calibration says "
-                f"{expected[1]}x{expected[0]}: resize the picture or correct the camera"
-            )
-        return image
+        return self._sized(self.source.image(self._known(camera), frame), camera, frame, "frame")
 
     def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        """True planar z float32 [H, W] (0 = unknown), or None."""
-        return self.source.depth(self._known(camera), frame)
+        """True planar z float32 [H, W] (0 = unknown), or None; refuses a map whose size is not the camera's."""
+        depth = self.source.depth(self._known(camera), frame)
+        return None if depth is None else self._sized(depth, camera, frame, "true depth of frame")
 
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
         """Monocular map of `mono_kind` from disk, float32 at the size it is stored in, or None."""
@@ -85,6 +79,15 @@ class Capture:
     def seconds(self, frame: int) -> float:
         """Time of a frame since the first one, in seconds."""
         return (frame - self.frames[0]) / self.fps
+
+    def _sized(self, array: np.ndarray, camera: str, frame: int, what: str) -> np.ndarray:
+        expected = (self.cameras[camera].height, self.cameras[camera].width)
+        if array.shape[:2] != expected:
+            raise D2Error(
+                f"{what} {frame} of camera {camera} is {array.shape[1]}x{array.shape[0]} pixels but its calibration "
+                f"says {expected[1]}x{expected[0]}: resize the picture or correct the camera"
+            )
+        return array
 
     def _known(self, camera: str) -> str:
         if camera not in self.cameras:

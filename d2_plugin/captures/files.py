@@ -1,0 +1,49 @@
+"""Which frame lies in which file: pictures and maps found by the number in their name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from d2_plugin.captures.pictures import PICTURE_SUFFIXES
+from d2_plugin.errors import D2Error
+
+FrameFiles = dict[int, Path]
+
+_LAST_NUMBER = re.compile(r"(\d+)\D*$")
+
+
+def numbered_files(folder: Path, suffixes: Iterable[str] = PICTURE_SUFFIXES) -> FrameFiles:
+    """Frame number -> file for everything in `folder` with one of `suffixes`; the last number in a name counts.
+
+    Raises `D2Error` for a file without a number and for two files of one frame (1.png beside 00001.jpg).
+    """
+    wanted = tuple(suffixes)
+    return collect(path for path in sorted(folder.iterdir()) if path.suffix.lower() in wanted)
+
+
+def collect(paths: Iterable[Path]) -> FrameFiles:
+    """Frame number -> path; see `numbered_files`."""
+    found: FrameFiles = {}
+    for path in paths:
+        number = _LAST_NUMBER.search(path.stem)
+        if number is None:
+            raise D2Error(f"{path} has no frame number in its name: name it like 00012{path.suffix}")
+        frame = int(number.group(1))
+        if frame in found:
+            raise D2Error(f"{found[frame].name} and {path.name} in {path.parent} are both frame {frame}: remove one")
+        found[frame] = path
+    return found
+
+
+def common_frames(files: Mapping[str, Iterable[int]], where: Path) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """(frames that every camera has, ascending; a note when some camera has more)."""
+    sets = [set(frames) for frames in files.values()]
+    shared, every = set.intersection(*sets), set.union(*sets)
+    if not every:
+        raise D2Error(f"no frames in {where}: expected pictures named like 00000.png or 00000.jpg")
+    if not shared:
+        raise D2Error(f"no frame in {where} is there for all of {', '.join(files)}: give every camera the same frames")
+    notes = (f"{len(every - shared)} frames left out because not every camera has them",) if every - shared else ()
+    return tuple(sorted(shared)), notes

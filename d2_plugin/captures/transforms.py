@@ -1,0 +1,82 @@
+"""The same capture with fewer cameras, fewer frames or fewer pixels; still read only when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.captures.pictures import shrink_depth, shrink_picture
+from d2_plugin.errors import D2Error, unknown_name
+
+
+def select_cameras(capture: Capture, cameras: Iterable[str]) -> Capture:
+    """The capture with the named cameras only, in the order given."""
+    names = list(cameras)
+    if not names:
+        raise D2Error(f"no camera chosen from {capture.name}: name at least one of {', '.join(capture.cameras)}")
+    for name in names:
+        if name not in capture.cameras:
+            raise unknown_name("camera", name, capture.cameras)
+    if len(set(names)) < len(names):
+        raise D2Error(f"camera names {', '.join(names)} contain a duplicate: name each camera once")
+    return replace(capture, cameras={name: capture.cameras[name] for name in names})
+
+
+def select_frames(capture: Capture, frames: Iterable[int]) -> Capture:
+    """The capture with the given frame numbers only, ascending."""
+    chosen = tuple(sorted(set(frames)))
+    missing = [frame for frame in chosen if frame not in set(capture.frames)]
+    if missing or not chosen:
+        what = f"frame {missing[0]} is not in {capture.name}" if missing else f"no frame chosen from {capture.name}"
+        raise D2Error(f"{what}: choose among frames {capture.frames[0]} to {capture.frames[-1]}")
+    return replace(capture, frames=chosen)
+
+
+def downscale(capture: Capture, factor: int) -> Capture:
+    """The capture with every `factor` x `factor` block of pixels made one, and K made to fit.
+
+    Rows and columns that fill no block are cut off at the bottom and on the right, so K / factor is exact with pixel
+    centres at i + 0.5. Monocular maps keep the size they are stored in.
+    """
+    if isinstance(factor, bool) or not isinstance(factor, int | np.integer) or factor < 1:
+        raise D2Error(f"downscale {factor!r} is no whole number of at least 1: give 1, 2, 4 or the like")
+    if factor == 1:
+        return capture
+    cameras = {name: _smaller_camera(camera, factor) for name, camera in capture.cameras.items()}
+    return replace(capture, cameras=cameras, source=DownscaledSource(capture, factor))
+
+
+@dataclass(frozen=True)
+class DownscaledSource:
+    """The pictures and depths of a capture, made smaller by a whole factor after their size was checked."""
+
+    capture: Capture
+    factor: int
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        """RGB uint8 [H // factor, W // factor, 3]: the mean of each block."""
+        return shrink_picture(self.capture.image(camera, frame), self.factor)
+
+    def depth(self, camera: str, frame: int) -> np.ndarray | None:
+        """True planar z float32 [H // factor, W // factor], 0 where unknown, or None; see `shrink_depth`."""
+        depth = self.capture.depth(camera, frame)
+        return None if depth is None else shrink_depth(depth, self.factor)
+
+    def mono(self, camera: str, frame: int) -> np.ndarray | None:
+        """The monocular map at the size it is stored in, or None."""
+        return self.capture.mono(camera, frame)
+
+
+def _smaller_camera(camera: Camera, factor: int) -> Camera:
+    width, height = camera.width // factor, camera.height // factor
+    if min(width, height) < 1:
+        raise D2Error(
+            f"downscale {factor} leaves no pixel of camera {camera.name} ({camera.width}x{camera.height}): "
+            "choose a smaller factor"
+        )
+    K = camera.K.copy()
+    K[:2] /= factor
+    return replace(camera, width=width, height=height, K=K)

@@ -1,0 +1,91 @@
+"""Frames out of videos, decoded when asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d2_plugin.captures.pictures import opencv
+from d2_plugin.errors import D2Error
+
+SKIP_LIMIT = 32
+"""A frame this little ahead is reached by decoding on; any other by a seek, which decodes from a key frame."""
+
+
+class VideoHeader(NamedTuple):
+    """What a video says about itself."""
+
+    frames: int
+    fps: float  # 0 where the file does not say
+    size: tuple[int, int]  # width, height in pixels
+
+
+@dataclass
+class _Decoder:
+    video: Any  # cv2.VideoCapture
+    next_frame: int = 0
+
+
+@dataclass
+class VideoSource:
+    """Frames decoded from one video per camera; each camera's decoder stays open and remembers where it stands.
+
+    Reading frames in ascending order decodes every frame once. Not for several threads at the same time; a copy in
+    another process opens its own decoders.
+    """
+
+    videos: dict[str, Path]
+    _decoders: dict[str, _Decoder] = field(default_factory=dict, repr=False)
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        """RGB uint8 [H, W, 3]; raises `D2Error` for a frame that cannot be decoded."""
+        cv2 = opencv("reading videos")
+        if camera not in self._decoders:
+            self._decoders[camera] = _Decoder(_open_video(self.videos[camera]))
+        decoder = self._decoders[camera]
+        self._advance(decoder, frame)
+        decoded, picture = decoder.video.read()
+        if not decoded:
+            del self._decoders[camera]
+            raise D2Error(f"frame {frame} of {self.videos[camera]} cannot be decoded: repair the video or leave it out")
+        decoder.next_frame = frame + 1
+        return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+    def depth(self, camera: str, frame: int) -> None:
+        """None: a video carries no true depth."""
+
+    def mono(self, camera: str, frame: int) -> None:
+        """None: a video carries no monocular maps."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"videos": self.videos, "_decoders": {}}
+
+    @staticmethod
+    def _advance(decoder: _Decoder, frame: int) -> None:
+        if not 0 <= frame - decoder.next_frame <= SKIP_LIMIT:
+            decoder.video.set(opencv("reading videos").CAP_PROP_POS_FRAMES, frame)
+            decoder.next_frame = frame
+        for _ in range(frame - decoder.next_frame):
+            decoder.video.grab()
+
+
+def video_header(path: Path) -> VideoHeader:
+    """Number of frames, frame rate and size, without decoding a frame."""
+    cv2 = opencv("reading videos")
+    video = _open_video(path)
+    try:
+        size = (int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+        fps = max(float(video.get(cv2.CAP_PROP_FPS)), 0.0)
+        return VideoHeader(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), fps, size)
+    finally:
+        video.release()
+
+
+def _open_video(path: Path) -> Any:
+    video = opencv("reading videos").VideoCapture(str(path))
+    if not video.isOpened():
+        raise D2Error(f"video {path} cannot be opened: replace the file or leave its camera out")
+    return video
