@@ -1,1 +1,112 @@
-"""Differentiable splatting with depth and alpha, and the survey of compositing weights."""
+"""Differentiable splatting with depth and alpha, and the survey of compositing weights.
+
+    from d2_plugin.rasterizer import RasterSettings, Splats, View, rasterize
+
+    render = rasterize(splats, colors, view)                       # color, depth_sum, alpha: all with gradients
+    statistics = survey(splats, view, prior)                       # per Gaussian: what the depth prior says about it
+
+float32 on the CPU runs in kernels that are compiled at first use (see `d2_plugin.compiler`), float64 in `reference`.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from d2_plugin.errors import D2Error
+from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
+
+from . import reference
+
+__all__ = ["DepthPrior", "RasterSettings", "Render", "Splats", "Survey", "View", "rasterize", "survey"]
+
+
+def rasterize(
+    splats: Splats,
+    colors: Tensor,
+    view: View,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008  a frozen value
+    *,
+    background: Tensor | None = None,
+    screen_offsets: Tensor | None = None,
+) -> Render:
+    """Composite Gaussians front to back into color, accumulated depth and alpha.
+
+    Args:
+        splats: M Gaussians in the world, float32 or float64; M may be 0. `splats.rows` is not used.
+        colors: [M, C], any C >= 1, e.g. RGB in 0..1 or features.
+        view: camera; no gradient flows to it, `K` must have no skew.
+        settings: constants, in units named there.
+        background: [C] seen through what the Gaussians leave transparent; None is black.
+        screen_offsets: [M, 2] pixels added to the projected centres. Pass zeros that require gradients to receive
+            dL/d(screen mean) as their gradient, which densification accumulates ("viewspace points").
+
+    Returns:
+        `Render` with gradients to means, covariances, opacities, colors, background and screen_offsets. The gradient
+        of a covariance's off-diagonal entry is that of the stored number, which stands for both places in the matrix.
+
+    A Gaussian with a NaN or an infinity in any attribute is left out, with zero gradient; the others are not affected.
+
+    Raises:
+        D2Error: shapes, dtypes or devices do not fit together.
+    """
+    _check(splats, view, settings, colors=colors, background=background, screen_offsets=screen_offsets)
+    return reference.rasterize(splats, colors, view, settings, background, screen_offsets)
+
+
+@torch.no_grad()
+def survey(
+    splats: Splats,
+    view: View,
+    prior: DepthPrior,
+    settings: RasterSettings = RasterSettings(),  # noqa: B008  a frozen value
+    *,
+    eps: float = 1e-8,
+) -> Survey:
+    """Gather the compositing weights w_{k,q} of one view per Gaussian k, without gradients.
+
+    Verified pixels (Omega^v) are those that the prior labels so and whose depth is finite and positive.
+
+    Args:
+        splats: M Gaussians in the world.
+        view: camera.
+        prior: D* and its labels, of the view's size.
+        settings: constants; the same as in `rasterize` give the same weights.
+        eps: epsilon of |z - D*| / (D* + eps), in units of depth.
+
+    Raises:
+        D2Error: shapes, dtypes or devices do not fit together.
+    """
+    _check(splats, view, settings)
+    size = (view.height, view.width)
+    if prior.depth.shape != size or prior.labels.shape != size:
+        raise D2Error(
+            f"the prior of camera '{view.camera}' has depth {tuple(prior.depth.shape)} and labels "
+            f"{tuple(prior.labels.shape)} but the view is {size}: resample it to the view's height and width"
+        )
+    return reference.survey(splats, view, prior, settings, eps)
+
+
+def _check(splats: Splats, view: View, settings: RasterSettings, **extra: Tensor | None) -> None:
+    """Refuse what the kernels, which trust their pointers, could not survive."""
+    count = splats.means.shape[0]
+    expected = {"means": (splats.means, (count, 3)), "covariances": (splats.covariances, (count, 6))}
+    expected["opacities"] = (splats.opacities, (count,))
+    if (colors := extra.get("colors")) is not None:
+        channels = colors.shape[-1] if colors.ndim == 2 else 0
+        expected["colors"] = (colors, (count, max(channels, 1)))
+        if (background := extra["background"]) is not None:
+            expected["background"] = (background, (channels,))
+        if (screen_offsets := extra["screen_offsets"]) is not None:
+            expected["screen_offsets"] = (screen_offsets, (count, 2))
+    for name, (tensor, shape) in expected.items():
+        if tensor.shape != shape:
+            raise D2Error(f"{name} has shape {tuple(tensor.shape)}, expected {shape} for {count} Gaussians")
+        if tensor.dtype != splats.means.dtype or tensor.dtype not in (torch.float32, torch.float64):
+            raise D2Error(f"{name} is {tensor.dtype}, expected one dtype for all, float32 or float64: convert it")
+        if tensor.device != splats.means.device:
+            raise D2Error(f"{name} is on {tensor.device} but means is on {splats.means.device}: move it there")
+    if view.width < 1 or view.height < 1:
+        raise D2Error(f"view is {view.width}x{view.height} pixels, expected at least 1x1")
+    if not (settings.near > 0 and settings.alpha_min > 0 and 0 < settings.alpha_max < 1):
+        raise D2Error(f"{settings} needs near > 0, alpha_min > 0 and 0 < alpha_max < 1: a division by zero otherwise")
