@@ -1,1 +1,11 @@
-"""The four hooks: prior, densify, prune, depth loss."""
+"""The four hooks: prior, densify, prune, depth loss. Each is pure functions (the paper's equations) and a thin class."""
+
+from __future__ import annotations
+
+from .densify import Densify
+from .depth_loss import DepthLoss
+from .hook import Context, Hook, Surveyed, Window
+from .prior import PriorLoader
+from .prune import Prune
+
+__all__ = ["Context", "Densify", "DepthLoss", "Hook", "PriorLoader", "Prune", "Surveyed", "Window"]

@@ -1,0 +1,128 @@
+"""Depth-guided densification (paper, section "Densification and Pruning")."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from d2_plugin.config import DensifyConfig
+from d2_plugin.protocol import Edit, Label, Points, Splats, View
+
+from .hook import Context, Hook, Surveyed, Window
+from .rendered_depth import relative_discrepancy, rendered_depth
+
+
+def under_reconstructed(depth: Tensor, valid: Tensor, prior: Tensor, support: Tensor, tau_u: float | Tensor) -> Tensor:
+    """U: pixels of the prior's support where nothing valid is rendered, or at another depth; bool [H, W].
+
+    `depth`, `valid` are D_hat and M^r; `tau_u` may be a map [H, W], since a mono-only depth is less exact than a
+    verified one.
+    """
+    return support & (~valid | (relative_discrepancy(depth, prior) > tau_u))
+
+
+def back_project(view: View, pixels: Tensor, depth: Tensor) -> Tensor:
+    """World points [K, 3] = Pi^-1(p, D) of pixels [K, 2] (column, row; integers) at planar depths [K]."""
+    centres = torch.cat([pixels.to(depth) + 0.5, torch.ones_like(depth)[:, None]], -1)
+    camera = torch.linalg.solve(view.K.to(depth), centres.T).T * depth[:, None]
+    rotation, translation = view.T_camera_world[:3, :3].to(depth), view.T_camera_world[:3, 3].to(depth)
+    return (camera - translation) @ rotation  # R^T (x - t), row by row
+
+
+def sample_pixels(mask: Tensor, budget: int, generator: torch.Generator) -> Tensor:
+    """At most `budget` pixels [K, 2] (column, row) of `mask` [H, W], uniformly and without repetition."""
+    rows, columns = torch.nonzero(mask, as_tuple=True)
+    pixels = torch.stack([columns, rows], -1)
+    if len(pixels) > budget:
+        chosen = torch.randperm(len(pixels), generator=generator)[:budget].sort().values
+        pixels = pixels[chosen.to(pixels.device)]
+    return pixels
+
+
+def frustum_cells(view: View, points: Tensor, stride: float, depth_step: float) -> Tensor:
+    """Which cell of the view's frustum each world point lies in: int64 [K]; -1 outside the picture.
+
+    Cells are `stride` pixels wide and `depth_step` (relative) deep, so they grow with distance as the prior's own
+    uncertainty does. Two points in one cell describe the same piece of surface.
+    """
+    camera = points @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
+    z = camera[:, 2]
+    front = z > 0
+    safe = torch.where(front, z, torch.ones_like(z))
+    image = (camera / safe[:, None]) @ view.K.T
+    inside = front & (image[:, 0] >= 0) & (image[:, 0] < view.width) & (image[:, 1] >= 0) & (image[:, 1] < view.height)
+    image = torch.where(inside[:, None], image, torch.zeros_like(image))
+    column, row = (image[:, 0] / stride).long(), (image[:, 1] / stride).long()
+    layer = torch.floor(safe.double().log() / math.log1p(depth_step)).long() + (1 << 20)
+    key = (layer * (1 << 20) + row) * (1 << 20) + column
+    return torch.where(inside, key, torch.full_like(key, -1))
+
+
+def first_of_each(keys: Tensor) -> Tensor:
+    """Mask [K]: True for the first element of each distinct key (in order)."""
+    order = torch.argsort(keys, stable=True)
+    ordered = keys[order]
+    first = torch.ones_like(ordered, dtype=torch.bool)
+    first[1:] = ordered[1:] != ordered[:-1]
+    return torch.zeros_like(first).scatter(0, order, first)
+
+
+class Densify(Hook):
+    """Inserts Gaussians where the prior has a surface that the render lacks or puts at another depth."""
+
+    def __init__(self, config: DensifyConfig) -> None:
+        self.config = config
+        self.window = Window(config.start, config.stop, config.every)
+
+    def edit(self, context: Context) -> Edit | None:
+        """Points from the under-reconstructed pixels of the evaluated views, within the budget."""
+        room = self.config.max_gaussians - len(context.backbone)
+        inserted: list[Points] = []
+        for surveyed in context.evaluation:
+            budget = min(self.config.budget_per_view, room - sum(len(p.positions) for p in inserted))
+            if budget > 0:
+                points = self._propose(surveyed, inserted, budget, context.generator)
+                inserted += [points] if len(points.positions) else []
+        if not inserted:
+            return None
+        return Edit(insert=Points(*(torch.cat(values) for values in zip(*inserted, strict=True))))
+
+    def _propose(
+        self, surveyed: Surveyed, earlier: list[Points], budget: int, generator: torch.Generator
+    ) -> Points:
+        """New points of one view that no existing Gaussian and no point of an earlier view already stands for."""
+        config, view, prior = self.config, surveyed.view, surveyed.prior
+        depth, valid = rendered_depth(surveyed.survey.depth_sum, surveyed.survey.alpha, config.tau_v)
+        tau_u = torch.where(prior.labels == Label.VERIFIED, config.tau_u, config.tau_u_mono)
+        region = under_reconstructed(depth, valid, prior.depth, prior.support, tau_u)
+        pixels = sample_pixels(region, budget, generator)
+        column, row = pixels.unbind(-1)
+        target = prior.depth[row, column]
+        positions = back_project(view, pixels, target)
+        spacing = self._spacing(int(region.sum()), len(pixels))
+        free = self._free(view, surveyed.splats, positions, earlier, spacing)
+        colors = prior.colors[row, column].to(target) / 255 if prior.colors is not None else torch.full_like(positions, 0.5)
+        focal = torch.sqrt(view.K[0, 0] * view.K[1, 1])
+        scales = config.scale * spacing * target / focal
+        return Points(
+            positions[free],
+            colors[free],
+            torch.full_like(target, view.time)[free],
+            scales[free],
+            torch.full_like(target, config.opacity)[free],
+        )
+
+    def _spacing(self, region: int, sampled: int) -> float:
+        """Mean distance in pixels between samples of the region, at least one pixel."""
+        return max(math.sqrt(region / max(sampled, 1)), 1.0)
+
+    def _free(self, view: View, splats: Splats, positions: Tensor, earlier: list[Points], spacing: float) -> Tensor:
+        """Mask of candidates whose frustum cell is empty, one per cell."""
+        config = self.config
+        opaque = splats.means[splats.opacities > config.occupied_opacity]
+        taken = torch.cat([opaque, *(p.positions for p in earlier)])
+        cells = frustum_cells(view, positions, config.cell * spacing, config.tau_u)
+        occupied = frustum_cells(view, taken, config.cell * spacing, config.tau_u)
+        return (cells >= 0) & ~torch.isin(cells, occupied) & first_of_each(cells)

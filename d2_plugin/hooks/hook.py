@@ -1,0 +1,88 @@
+"""What a hook is: two verbs, `loss` and `edit`, that return data; D2Hooks applies it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from d2_plugin.protocol import Backbone, DepthPrior, Edit, Splats, Survey, View
+from d2_plugin.rasterizer import survey
+
+
+@dataclass(frozen=True)
+class Window:
+    """The steps at which a hook is due: start <= step < stop, every so many steps."""
+
+    start: int = 0
+    stop: int | None = None
+    every: int = 1
+
+    def due(self, step: int) -> bool:
+        """Whether the hook runs at `step` (1-based, as trainers count)."""
+        return self.start <= step and (self.stop is None or step < self.stop) and step % self.every == 0
+
+
+class Surveyed(NamedTuple):
+    """One view of an evaluation: its sliced Gaussians, its prior, and the compositing weights."""
+
+    view: View
+    splats: Splats
+    prior: DepthPrior
+    survey: Survey
+
+
+@dataclass(frozen=True)
+class Context:
+    """Everything a hook may look at in one step; `evaluation` is computed once and shared by all hooks."""
+
+    step: int
+    backbone: Backbone
+    views: Sequence[View]
+    """The views of the present training step."""
+    prior: Callable[[View], DepthPrior | None]
+    generator: torch.Generator
+    sample: Callable[[], Sequence[View]] = field(default=tuple)
+    """The views to evaluate when structure is edited: a stratified sample of all training views."""
+
+    @cached_property
+    def evaluation(self) -> list[Surveyed]:
+        """The sampled views that have a prior, surveyed without gradients."""
+        return [s for view in self.sample() if (s := self._survey(view)) is not None]
+
+    @torch.no_grad()
+    def _survey(self, view: View) -> Surveyed | None:
+        prior = self.prior(view)
+        if prior is None:
+            return None
+        splats = self.backbone.slice_at(view)
+        return Surveyed(view, splats, prior, survey(splats, view, prior, self.backbone.settings))
+
+
+class Hook:
+    """Base of all hooks: does nothing. Per-Gaussian state is declared by implementing `follow`."""
+
+    window = Window()
+
+    def loss(self, context: Context) -> Tensor | None:
+        """A term to add to the training loss of this step, or None."""
+
+    def edit(self, context: Context) -> Edit | None:
+        """Rows to remove and points to insert, or None."""
+
+    def follow(self, index: Tensor) -> None:
+        """The Gaussians changed: row r was row index[r] before, -1 for a new one."""
+
+    def reset(self) -> None:
+        """The Gaussians changed without a report: forget per-Gaussian state."""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """What an exact continuation needs."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Continue from `state_dict()`."""

@@ -1,0 +1,93 @@
+"""Consistency-aware pruning (paper, section "Densification and Pruning")."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from d2_plugin.config import PruneConfig
+from d2_plugin.protocol import Edit
+
+from .hook import Context, Hook, Surveyed, Window
+from .rendered_depth import EPSILON
+
+
+def depth_inconsistency(error: Tensor, weight: Tensor, tau_u: float) -> Tensor:
+    """E_k = min(E~_k / tau_u, 1) in 0..1, [N].
+
+    `error` [N] is the sum of w |z - D*| / (D* + eps) over verified pixels and `weight` [N] the sum of w; where a
+    Gaussian touches no verified pixel (weight 0) E_k is 0, as there is no evidence against it.
+    """
+    touched = weight > 0
+    mean = torch.where(touched, error, torch.zeros_like(error)) / torch.where(touched, weight + EPSILON, 1.0)
+    return (mean / tau_u).clamp(max=1.0)
+
+
+def opacity_contribution(weight_maxima: Tensor, observations: Tensor) -> Tensor:
+    """O_k in 0..1, [N]: mean over visible observations of the largest compositing weight.
+
+    `weight_maxima` [N] sums max_p w over the views where the Gaussian is visible, `observations` [N] counts them;
+    O_k is 0 where it is visible nowhere.
+    """
+    return weight_maxima / observations.clamp(min=1)
+
+
+def pruning_score(inconsistency: Tensor, contribution: Tensor, lambda_e: float, lambda_o: float) -> Tensor:
+    """S_k = lambda_e E_k + lambda_o (1 - O_k), [N]."""
+    return lambda_e * inconsistency + lambda_o * (1 - contribution)
+
+
+def gather(evaluation: Sequence[Surveyed], count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Sum the surveys of several views per Gaussian: error, weight, weight maxima, observations, each [count]."""
+    device = evaluation[0].survey.weight.device
+    error, weight, maxima, observations = torch.zeros(4, count, device=device)
+    for _, splats, _, survey in evaluation:
+        error.index_add_(0, splats.rows, survey.error)
+        weight.index_add_(0, splats.rows, survey.weight)
+        maxima.index_add_(0, splats.rows, survey.max_weight)
+        observations.index_add_(0, splats.rows, (survey.max_weight > 0).to(maxima))
+    return error, weight, maxima, observations
+
+
+class Prune(Hook):
+    """Removes Gaussians whose score stays above tau_p in consecutive evaluations that touched verified pixels."""
+
+    def __init__(self, config: PruneConfig) -> None:
+        self.config = config
+        self.window = Window(config.start, config.stop, config.every)
+        self.streak: Tensor | None = None  # [N] evaluations in a row with S_k > tau_p
+
+    def edit(self, context: Context) -> Edit | None:
+        """Update the streaks with one evaluation; propose the rows whose streak is long enough."""
+        if not context.evaluation:
+            return None
+        config, count = self.config, len(context.backbone)
+        error, weight, maxima, observations = gather(context.evaluation, count)
+        inconsistency = depth_inconsistency(error, weight, config.tau_u)
+        contribution = opacity_contribution(maxima, observations)
+        high = pruning_score(inconsistency, contribution, config.lambda_e, config.lambda_o) > config.tau_p
+        if self.streak is None:
+            self.streak = torch.zeros(count, dtype=torch.int64, device=weight.device)
+        updated = torch.where(high, self.streak + 1, torch.zeros_like(self.streak))
+        self.streak = torch.where(weight > 0, updated, self.streak)
+        remove = self.streak >= config.patience
+        return Edit(remove=remove) if remove.any() else None
+
+    def follow(self, index: Tensor) -> None:
+        """Streaks move with their Gaussians; new ones start at 0."""
+        if self.streak is not None:
+            self.streak = torch.where(index >= 0, self.streak[index.clamp(min=0)], 0)
+
+    def reset(self) -> None:
+        """Forget all streaks."""
+        self.streak = None
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The streaks, if there are any yet."""
+        return {} if self.streak is None else {"streak": self.streak.clone()}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Continue from `state_dict()`."""
+        self.streak = state["streak"].clone() if "streak" in state else None

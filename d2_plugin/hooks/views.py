@@ -1,0 +1,58 @@
+"""Which training views an evaluation looks at: a stratified sample that visits all of them in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import torch
+
+from d2_plugin.protocol import View
+
+
+class ViewSampler:
+    """Remembers every view that was trained on and hands them out camera by camera, each camera's frames in turn.
+
+    The trainer never has to list its views: those seen so far are known, which is all of them after one epoch.
+    """
+
+    def __init__(self) -> None:
+        self._views: dict[tuple[str, int], View] = {}
+        self._queues: dict[str, list[int]] = {}
+        self._next_camera = 0
+
+    def add(self, views: Iterable[View]) -> None:
+        """Remember views; one that is known already changes nothing."""
+        for view in views:
+            self._views.setdefault((view.camera, view.frame), view)
+
+    def sample(self, count: int, generator: torch.Generator) -> Sequence[View]:
+        """At most `count` different views; over several calls every known view comes once before any comes again."""
+        cameras = sorted({camera for camera, _ in self._views})
+        chosen: dict[tuple[str, int], View] = {}
+        for _ in range(count if cameras else 0):
+            camera = cameras[self._next_camera % len(cameras)]
+            self._next_camera += 1
+            key = (camera, self._next_frame(camera, generator))
+            chosen.setdefault(key, self._views[key])
+        return list(chosen.values())
+
+    def _next_frame(self, camera: str, generator: torch.Generator) -> int:
+        queue = self._queues.setdefault(camera, [])
+        if not queue:
+            frames = sorted(frame for name, frame in self._views if name == camera)
+            queue += [frames[i] for i in torch.randperm(len(frames), generator=generator).tolist()]
+        return queue.pop()
+
+    def state_dict(self) -> dict[str, object]:
+        """The known views and the position in their order; tensors and plain values only."""
+        return {
+            "views": [vars(view).copy() for view in self._views.values()],
+            "queues": {camera: list(queue) for camera, queue in self._queues.items()},
+            "next_camera": self._next_camera,
+        }
+
+    def load_state_dict(self, state: Mapping[str, object]) -> None:
+        """Continue from `state_dict()`."""
+        self._views = {(v["camera"], v["frame"]): View(**v) for v in state["views"]}
+        self._queues = {camera: list(queue) for camera, queue in state["queues"].items()}
+        self._next_camera = state["next_camera"]

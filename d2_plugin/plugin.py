@@ -1,0 +1,193 @@
+"""D2Hooks: the only thing a trainer sees. Three lines attach it:
+
+    d2 = D2Hooks.from_config("d2.toml", backbone=adapter)      # after the optimizer exists
+    loss = loss + d2.loss(step, views)                         # before backward, never +=
+    d2.step(step)                                              # after optimizer.step() and zero_grad(), before saving
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from d2_plugin.config import HOOKS, D2Config
+from d2_plugin.errors import D2Error
+from d2_plugin.hooks import Context, Densify, DepthLoss, Hook, PriorLoader, Prune
+from d2_plugin.hooks.views import ViewSampler
+from d2_plugin.protocol import Backbone, Edit, Points
+
+_CLASSES: dict[str, Callable[[Any], Hook]] = {"densify": Densify, "prune": Prune, "depth_loss": DepthLoss}
+
+
+class Trace(NamedTuple):
+    """One thing a hook did: `action` is "loss", "insert" or "remove"; `count` is the number of Gaussians."""
+
+    step: int
+    hook: str
+    action: str
+    count: int
+
+
+class Report(NamedTuple):
+    """What one call of `D2Hooks.step` changed."""
+
+    inserted: int = 0
+    removed: int = 0
+    gaussians: int = 0
+
+
+class D2Hooks:
+    """Runs the configured hooks on a backbone.
+
+    With no hook configured, a run is bitwise the bare trainer's: the loss is the number 0.0, nothing is edited and
+    the global random state is never touched.
+    """
+
+    def __init__(self, config: D2Config, backbone: Backbone, store: object | None = None) -> None:
+        """`store` is anything with `prior(camera, frame) -> DepthPrior | None`; by default the folder config.prior."""
+        self.config, self.backbone = config, backbone
+        self.hooks: dict[str, Hook] = {name: _CLASSES[name](getattr(config, name)) for name in config.hooks}
+        self.trace: deque[Trace] = deque(maxlen=1000)
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self._sampler = ViewSampler()
+        self._prior: PriorLoader | None = None
+        self._store = store
+        self._count = len(backbone)
+        self._warned = False
+        if self.hooks:
+            self._store = store if store is not None else _open_store(config.prior)
+            backbone.on_resize(self._follow)
+
+    @classmethod
+    def from_config(
+        cls, config: str | Path | Mapping[str, Any] | D2Config, backbone: Backbone, store: object | None = None
+    ) -> D2Hooks:
+        """From a TOML file, a mapping or a D2Config."""
+        if isinstance(config, (str, Path)):
+            config = D2Config.from_toml(config)
+        elif not isinstance(config, D2Config):
+            config = D2Config.from_dict(config)
+        return cls(config, backbone, store)
+
+    def loss(self, step: int, views: object) -> Tensor | float:
+        """The hooks' share of this step's loss: a scalar on the backbone's device, or 0.0 when there is none.
+
+        `views` is the trainer's own camera object, or a list of them for a batch.
+        """
+        if not self.hooks:
+            return 0.0
+        self._check_count()
+        batch = views if isinstance(views, (list, tuple)) else [views]
+        converted = [self.backbone.view(camera) for camera in batch]
+        self._sampler.add(converted)
+        context = self._context(step, converted)
+        total: Tensor | float = 0.0
+        for name, hook in self._due(step):
+            term = hook.loss(context)
+            if term is not None:
+                self.trace.append(Trace(step, name, "loss", 0))
+                total = total + term
+        return total
+
+    @torch.no_grad()
+    def step(self, step: int) -> Report:
+        """Insert and remove what the hooks ask for, in one edit; call after the optimizer's step and zero_grad."""
+        if not self.hooks:
+            return Report(gaussians=len(self.backbone))
+        self._check_count()
+        context = self._context(step, ())
+        edits = [(name, edit) for name, hook in self._due(step) if (edit := hook.edit(context)) is not None]
+        removed = self._remove(step, edits)
+        inserted = self._insert(step, edits)
+        return Report(inserted, removed, len(self.backbone))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything an exact continuation needs; save it beside the trainer's checkpoint."""
+        return {
+            "hooks": {name: hook.state_dict() for name, hook in self.hooks.items()},
+            "views": self._sampler.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state_dict()`; refuses the state of other hooks than these. Call after the backbone is restored."""
+        saved = set(state["hooks"])
+        if saved != set(self.hooks):
+            raise D2Error(
+                f"the checkpoint was made with hooks {sorted(saved) or 'none'} but this run has "
+                f"{sorted(self.hooks) or 'none'}: resume with the same hooks"
+            )
+        for name, hook in self.hooks.items():
+            hook.load_state_dict(state["hooks"][name])
+        self._sampler.load_state_dict(state["views"])
+        self.generator.set_state(state["generator"])
+        self._count = len(self.backbone)
+
+    def _due(self, step: int) -> list[tuple[str, Hook]]:
+        active = getattr(self.backbone, "active", None)
+        if active is not None and not active(step):
+            return []
+        return [(name, hook) for name, hook in self.hooks.items() if hook.window.due(step)]
+
+    def _context(self, step: int, views: Sequence) -> Context:
+        def sample() -> Sequence:
+            return self._sampler.sample(self.config.views_per_evaluation, self.generator)
+
+        return Context(step, self.backbone, views, self._load_prior, self.generator, sample)
+
+    def _load_prior(self, view):  # noqa: ANN001, ANN202 - the signature of PriorLoader.__call__
+        if self._prior is None:
+            self._prior = PriorLoader(self._store, view.K.device)
+        return self._prior(view)
+
+    def _remove(self, step: int, edits: Sequence[tuple[str, Edit]]) -> int:
+        masks = [(name, edit.remove) for name, edit in edits if edit.remove is not None]
+        if not masks:
+            return 0
+        self.trace.extend(Trace(step, name, "remove", int(mask.sum())) for name, mask in masks)
+        union = torch.stack([mask for _, mask in masks]).any(0)
+        self.backbone.remove(union)
+        return int(union.sum())
+
+    def _insert(self, step: int, edits: Sequence[tuple[str, Edit]]) -> int:
+        proposals = [(name, edit.insert) for name, edit in edits if edit.insert is not None]
+        if not proposals:
+            return 0
+        points = Points(*(torch.cat(values) for values in zip(*(p for _, p in proposals), strict=True)))
+        inserted = self.backbone.insert(points)
+        self.trace.append(Trace(step, proposals[0][0], "insert", inserted))
+        return inserted
+
+    def _follow(self, index: Tensor) -> None:
+        for hook in self.hooks.values():
+            hook.follow(index)
+        self._count = len(index)
+
+    def _check_count(self) -> None:
+        """The safety net of the contract: a change of N that nobody reported resets per-Gaussian state."""
+        if len(self.backbone) == self._count:
+            return
+        for hook in self.hooks.values():
+            hook.reset()
+        if not self._warned:
+            warnings.warn(
+                f"the backbone went from {self._count} to {len(self.backbone)} Gaussians without telling its listeners: "
+                "pruning starts counting anew; report changes through on_resize",
+                stacklevel=3,
+            )
+            self._warned = True
+        self._count = len(self.backbone)
+
+
+def _open_store(path: str | None) -> object:
+    from d2_plugin.priors.store import PriorStore
+
+    if path is None:
+        raise D2Error(f"the hooks {', '.join(HOOKS)} need a depth prior: set `prior` to the folder that `d2 priors` wrote")
+    return PriorStore.open(Path(path))

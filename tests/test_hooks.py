@@ -1,0 +1,202 @@
+"""The paper's equations as pure functions, at the points where an implementation goes wrong."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from d2_plugin.hooks.densify import (
+    back_project,
+    first_of_each,
+    frustum_cells,
+    sample_pixels,
+    under_reconstructed,
+)
+from d2_plugin.hooks.depth_loss import charbonnier, depth_loss
+from d2_plugin.hooks.prune import depth_inconsistency, opacity_contribution, pruning_score
+from d2_plugin.hooks.rendered_depth import relative_discrepancy, rendered_depth
+from d2_plugin.protocol import View
+
+
+def tensor(*values: float) -> torch.Tensor:
+    return torch.tensor(values)
+
+
+def a_view(width: int = 64, height: int = 48) -> View:
+    angle = 0.3
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.tensor(
+        [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]], dtype=torch.float64
+    )
+    pose[:3, 3] = torch.tensor([0.2, -0.1, 0.5], dtype=torch.float64)
+    intrinsics = torch.tensor([[60.0, 0, 30.5], [0, 55.0, 25.0], [0, 0, 1]], dtype=torch.float64)
+    return View("a", 0, 0.0, pose, intrinsics, width, height)
+
+
+class TestRenderedDepth:
+    def test_depth_is_normalised_by_alpha(self) -> None:
+        depth, valid = rendered_depth(tensor(2.0), tensor(0.5), tau_v=0.4)  # one Gaussian, alpha .5, at z = 4
+        torch.testing.assert_close(depth, tensor(4.0))
+        assert valid.all()
+
+    def test_nothing_rendered_gives_zero_depth_zero_mask_and_zero_gradient(self) -> None:
+        depth_sum, alpha = torch.zeros(3, requires_grad=True), torch.zeros(3, requires_grad=True)
+        depth, valid = rendered_depth(depth_sum, alpha, tau_v=0.5)
+        depth.sum().backward()
+        assert not valid.any()
+        assert (depth == 0).all()
+        assert (depth_sum.grad == 0).all()
+        assert (alpha.grad == 0).all()
+
+    def test_mask_flips_within_one_ulp_of_tau_v(self) -> None:
+        half = torch.tensor(0.5)
+        alphas = torch.stack([torch.nextafter(half, tensor(0.0)[0]), half, torch.nextafter(half, tensor(1.0)[0])])
+        depth, valid = rendered_depth(alphas * 3, alphas, tau_v=0.5)
+        assert valid.tolist() == [False, False, True]
+        assert torch.isfinite(depth).all()
+
+    @pytest.mark.parametrize("alpha", [1e-8, 1e-6, 1e-4])
+    def test_vanishing_alpha_is_masked_rather_than_amplified(self, alpha: float) -> None:
+        depth_sum = torch.full((1,), 4 * alpha, requires_grad=True)
+        depth, _ = rendered_depth(depth_sum, tensor(alpha), tau_v=0.5)
+        depth.sum().backward()
+        assert depth_sum.grad.item() == 0
+
+    def test_discrepancy_is_relative_to_the_prior(self) -> None:
+        torch.testing.assert_close(relative_discrepancy(tensor(1.1, 1.1e6), tensor(1.0, 1e6)), tensor(0.1, 0.1))
+
+
+class TestCharbonnier:
+    def test_equals_the_formula(self) -> None:
+        r = torch.linspace(-3, 3, 31, dtype=torch.float64)
+        torch.testing.assert_close(charbonnier(r, 0.1), torch.sqrt(r**2 + 0.01) - 0.1)
+
+    def test_equals_kornia_rescaled(self) -> None:
+        kornia = pytest.importorskip("kornia", reason="kornia is in the `image` extra")
+        r = torch.linspace(-3, 3, 31, dtype=torch.float64)
+        expected = 0.1 * kornia.losses.charbonnier_loss(r / 0.1, torch.zeros_like(r))
+        torch.testing.assert_close(charbonnier(r, 0.1), expected)
+
+    @pytest.mark.parametrize("value", [0.0, 1e-30, 1e20])
+    def test_is_finite_with_finite_gradient_at_extremes_in_float32(self, value: float) -> None:
+        r = torch.tensor([value], requires_grad=True)
+        loss = charbonnier(r, 0.01)
+        loss.sum().backward()
+        assert torch.isfinite(loss).all()
+        assert torch.isfinite(r.grad).all()
+        assert loss.item() == pytest.approx(value if value > 1 else 0.0, rel=1e-6, abs=1e-12)
+        if value == 0:
+            assert r.grad.item() == 0
+
+
+class TestDepthLoss:
+    def test_counts_only_pixels_that_are_verified_and_validly_rendered(self) -> None:
+        depth, prior = tensor(2.0, 2.0, 2.0), tensor(1.0, 4.0, 8.0)
+        valid, verified = torch.tensor([True, True, False]), torch.tensor([True, False, True])
+        expected = charbonnier(tensor(1.0), 0.01).squeeze()
+        torch.testing.assert_close(depth_loss(depth, valid, prior, verified, 0.01), expected)
+
+    def test_no_common_pixel_gives_zero_loss_and_zero_gradient(self) -> None:
+        depth = torch.ones(4, requires_grad=True)
+        loss = depth_loss(depth, torch.zeros(4, dtype=torch.bool), torch.ones(4), torch.ones(4, dtype=torch.bool), 0.01)
+        loss.backward()
+        assert loss.item() == 0
+        assert (depth.grad == 0).all()
+
+    @pytest.mark.parametrize("bad", [float("nan"), float("inf"), 0.0, -1.0])
+    def test_bad_prior_pixels_outside_the_mask_never_leak(self, bad: float) -> None:
+        depth = torch.tensor([1.0, 2.0], requires_grad=True)
+        verified = torch.tensor([True, False])
+        loss = depth_loss(depth, torch.ones(2, dtype=torch.bool), tensor(1.1, bad), verified, 0.01)
+        loss.backward()
+        assert torch.isfinite(loss)
+        assert torch.isfinite(depth.grad).all()
+
+    @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
+    def test_does_not_depend_on_the_scale_of_the_scene(self, scale: float) -> None:
+        mask = torch.ones(2, dtype=torch.bool)
+        reference = depth_loss(tensor(1.1, 3.0), mask, tensor(1.0, 4.0), mask, 0.01)
+        scaled = depth_loss(tensor(1.1, 3.0) * scale, mask, tensor(1.0, 4.0) * scale, mask, 0.01)
+        torch.testing.assert_close(scaled, reference, rtol=2e-5, atol=0)
+
+    def test_depths_a_billion_apart_in_one_picture_weigh_alike(self) -> None:
+        mask = torch.ones(2, dtype=torch.bool)
+        loss = depth_loss(tensor(1.1e-3, 1.1e6), mask, tensor(1e-3, 1e6), mask, 0.01)
+        torch.testing.assert_close(loss, charbonnier(tensor(0.1), 0.01).squeeze(), rtol=1e-4, atol=0)
+
+
+class TestPruning:
+    def test_inconsistency_is_the_weighted_mean_error_over_tau_u_and_saturates(self) -> None:
+        e = depth_inconsistency(error=tensor(0.01, 5.0, 0.0), weight=tensor(0.2, 10.0, 0.0), tau_u=0.1)
+        torch.testing.assert_close(e, tensor(0.5, 1.0, 0.0))
+
+    def test_no_verified_pixel_is_no_evidence(self) -> None:
+        assert depth_inconsistency(tensor(float("nan")), tensor(0.0), 0.1).item() == 0
+
+    def test_contribution_is_zero_where_a_gaussian_is_visible_nowhere(self) -> None:
+        torch.testing.assert_close(opacity_contribution(tensor(0.0, 1.5), tensor(0.0, 3.0)), tensor(0.0, 0.5))
+
+    @settings(deadline=None)
+    @given(st.floats(0, 1), st.floats(0, 1), st.floats(0, 1))
+    def test_score_stays_in_the_unit_interval(self, e: float, o: float, lambda_e: float) -> None:
+        score = pruning_score(tensor(e), tensor(o), lambda_e, 1 - lambda_e).item()
+        assert -1e-6 <= score <= 1 + 1e-6
+
+
+class TestDensification:
+    def test_region_holds_both_conditions_and_nothing_outside_the_support(self) -> None:
+        depth, valid = tensor(0.0, 1.0, 1.3, 1.3), torch.tensor([False, True, True, True])
+        support = torch.tensor([True, True, True, False])
+        region = under_reconstructed(depth, valid, torch.ones(4), support, tau_u=0.2)
+        assert region.tolist() == [True, False, True, False]
+
+    def test_back_projection_of_a_projected_point_is_the_point(self) -> None:
+        view = a_view()
+        pixels = torch.tensor([[0, 0], [63, 47], [10, 20]])
+        depth = torch.tensor([0.5, 2.0, 1e4], dtype=torch.float64)
+        points = back_project(view, pixels, depth)
+        camera = points @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
+        image = camera @ view.K.T
+        torch.testing.assert_close(camera[:, 2], depth)
+        torch.testing.assert_close(image[:, :2] / image[:, 2:] - 0.5, pixels.double())
+
+    def test_back_projection_agrees_with_kornia_shifted_by_half_a_pixel(self) -> None:
+        depth_module = pytest.importorskip("kornia.geometry.depth", reason="kornia is in the `image` extra")
+        view = a_view()
+        depth = torch.rand(view.height, view.width, dtype=torch.float64) + 1
+        rows, columns = torch.meshgrid(torch.arange(view.height), torch.arange(view.width), indexing="ij")
+        pixels = torch.stack([columns.flatten(), rows.flatten()], -1)
+        centred = view.K.clone()
+        centred[:2, 2] -= 0.5  # kornia's pixel centres are integers
+        in_camera = depth_module.depth_to_3d_v2(depth[None], centred[None]).reshape(-1, 3)
+        world = (in_camera - view.T_camera_world[:3, 3]) @ view.T_camera_world[:3, :3]
+        torch.testing.assert_close(back_project(view, pixels, depth.flatten()), world)
+
+    def test_sampling_respects_budget_and_mask(self) -> None:
+        mask = torch.rand(20, 30, generator=torch.Generator().manual_seed(0)) > 0.5
+        pixels = sample_pixels(mask, 50, torch.Generator().manual_seed(1))
+        assert len(pixels) == 50
+        assert len(torch.unique(pixels, dim=0)) == 50
+        assert mask[pixels[:, 1], pixels[:, 0]].all()
+        assert len(sample_pixels(mask, 10_000, torch.Generator())) == int(mask.sum())
+
+    def test_points_of_one_cell_share_a_key_and_distant_ones_do_not(self) -> None:
+        view = a_view()
+        pixels = torch.tensor([[10, 10], [10, 10], [30, 10], [10, 10]])
+        points = back_project(view, pixels, torch.tensor([2.0, 2.001, 2.0, 3.0], dtype=torch.float64))
+        cells = frustum_cells(view, points, stride=4, depth_step=0.1)
+        assert cells[0] == cells[1]
+        assert len(set(cells.tolist())) == 3
+
+    def test_points_behind_or_outside_have_no_cell(self) -> None:
+        view = a_view()
+        points = back_project(view, torch.tensor([[10, 10], [500, 10]]), torch.tensor([-2.0, 2.0], dtype=torch.float64))
+        assert frustum_cells(view, points, 1, 0.1).tolist() == [-1, -1]
+
+    def test_first_of_each_keeps_one_per_key_in_order(self) -> None:
+        assert first_of_each(torch.tensor([5, 3, 5, 5, 3, 7])).tolist() == [True, True, False, False, False, True]
+        assert first_of_each(torch.zeros(0, dtype=torch.int64)).tolist() == []
