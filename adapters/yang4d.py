@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.backbones.yang4d import Yang4D, initial_rows
-from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
+from d2_plugin.protocol import Points, RasterSettings, Render, ResizeListener, Splats, View
 
 
 class Yang4DAdapter:
@@ -36,11 +36,7 @@ class Yang4DAdapter:
 
     def insert(self, points: Points) -> int:
         """Isotropic Gaussians at the points, living around the time of their frame; returns their number."""
-        model = self.model
-        rows = initial_rows(
-            points.positions, points.colors, points.times, points.scales, points.opacities, model.settings, model.duration
-        )
-        model.append(rows)
+        self.model.append(initial_rows(*points, self.model.settings, self.model.duration))
         return len(points.positions)
 
     def remove(self, mask: Tensor) -> None:
@@ -71,8 +67,8 @@ class Yang4DAdapter:
             select(index)
             self._tell(index)
 
-        def watched_render(view: View, *args, **kwargs):  # noqa: ANN002, ANN003, ANN202
-            output = render(view, *args, **kwargs)
+        def watched_render(view: View, background: Tensor | None = None) -> Render:
+            output = render(view, background)
             self._rendered = (view, output.depth_sum, output.alpha) if output.alpha.requires_grad else None
             return output
 

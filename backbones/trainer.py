@@ -63,9 +63,7 @@ class Trainer:
         self._queue: list[int] = []
         self.d2 = attach(model) if attach else None  # D2, line 1: after the optimizer exists
 
-    def run(
-        self, until: int | None = None, on_step: Callable[[int, float], None] | None = None
-    ) -> None:
+    def run(self, until: int | None = None, on_step: Callable[[int, float], None] | None = None) -> None:
         """Train up to and including step `until` (default: all); `on_step(step, loss)` reports each one."""
         model, iterations, d2 = self.model, self.settings.iterations, self.d2
         while self.step < (iterations if until is None else until):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -57,8 +57,8 @@ class Yang4DSettings:
     color_rate: float = 1e-2
     """Of the constant term; higher harmonics learn at a twentieth of it."""
     initial_opacity: float = 0.1
-    raster: RasterSettings = RasterSettings()
-    densify: DensifySettings = DensifySettings()
+    raster: RasterSettings = field(default_factory=RasterSettings)
+    densify: DensifySettings = field(default_factory=DensifySettings)
 
 
 class Yang4D:
@@ -114,7 +114,9 @@ class Yang4D:
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] of the sliced Gaussians as seen in `view`."""
         g, s = self.gaussians, self.settings
-        coefficients = torch.cat([g["base_colors"], g["harmonics"]], 1) if "harmonics" in g.parameters else g["base_colors"]
+        coefficients = g["base_colors"]
+        if "harmonics" in g.parameters:
+            coefficients = torch.cat([coefficients, g["harmonics"]], 1)
         if len(splats.rows) < len(g):
             coefficients = coefficients[splats.rows]
         centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
@@ -133,7 +135,7 @@ class Yang4D:
 
     @torch.no_grad()
     def accumulate(self, view: View) -> None:
-        """After backward: add the screen-space gradient of the last render (in units of half the image) per Gaussian."""
+        """After backward: add the last render's screen-space gradient, in units of half the image, per Gaussian."""
         gradient = self.screen_offsets.grad
         half = gradient.new_tensor([view.width / 2, view.height / 2])
         length = (gradient * half).norm(dim=-1)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -179,9 +179,7 @@ def _section(name: str, value: Any) -> Any:
     for key, setting in value.items():
         if key not in known:
             raise unknown_name(f"setting of {name}", key, known)
-        default = known[key].default
-        allowed = (int, float) if default is MISSING or default is None or not isinstance(default, bool) else (bool,)
-        if setting is not None and (not isinstance(setting, allowed) or isinstance(setting, bool) != (allowed == (bool,))):
+        if setting is not None and (isinstance(setting, bool) or not isinstance(setting, (int, float))):
             raise D2Error(f"{name}.{key} must be a number, got {setting!r}")
     return HOOKS[name](**value)
 

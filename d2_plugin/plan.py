@@ -45,7 +45,7 @@ class ScenePlan:
 
 
 def plan_scene(capture: Capture, cameras: Sequence[str], mono_source: str | None) -> ScenePlan:
-    """Decide for `capture` trained with `cameras`; `mono_source` names where monocular depth comes from, if anywhere."""
+    """Decide for `capture` trained with `cameras`; `mono_source` says where monocular depth comes from, if anywhere."""
     stereo = _stereo(capture, cameras)
     mono = Decision("monocular", mono_source is not None, mono_source or "no maps on disk and no ONNX model given")
     both = stereo.use and mono.use
@@ -59,9 +59,9 @@ def _temporal(capture: Capture, cameras: Sequence[str]) -> Decision:
     if len(capture.frames) == 1:
         return Decision("temporal", False, "one instant")
     share = max(changed_share(capture, camera) for camera in cameras)
-    verdict = "motion" if share > MOVING_SHARE else "no motion"
+    moves = share > MOVING_SHARE
     return Decision(
-        "temporal", share > MOVING_SHARE, f"{verdict}: at most {share:.2%} of a camera's pixels change over the recording"
+        "temporal", moves, f"{'' if moves else 'no '}motion: up to {share:.2%} of a camera's pixels change over time"
     )
 
 

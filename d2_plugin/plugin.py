@@ -1,8 +1,8 @@
 """D2Hooks: the only thing a trainer sees. Three lines attach it:
 
-    d2 = D2Hooks.from_config("d2.toml", backbone=adapter)      # after the optimizer exists
-    loss = loss + d2.loss(step, views)                         # before backward, never +=
-    d2.step(step)                                              # after optimizer.step() and zero_grad(), before saving
+d2 = D2Hooks.from_config("d2.toml", backbone=adapter)      # after the optimizer exists
+loss = loss + d2.loss(step, views)                         # before backward, never +=
+d2.step(step)                                              # after optimizer.step() and zero_grad(), before saving
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from d2_plugin.config import HOOKS, D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Densify, DepthLoss, Hook, PriorLoader, Prune
 from d2_plugin.hooks.views import ViewSampler
-from d2_plugin.protocol import Backbone, Edit, Points
+from d2_plugin.protocol import Backbone, DepthPrior, Edit, Points, View
 
 _CLASSES: dict[str, Callable[[Any], Hook]] = {"densify": Densify, "prune": Prune, "depth_loss": DepthLoss}
 
@@ -116,7 +116,7 @@ class D2Hooks:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict()`; refuses the state of other hooks than these. Call after the backbone is restored."""
+        """Continue from `state_dict()`, once the backbone is restored; refuses the state of other hooks than these."""
         saved = set(state["hooks"])
         if saved != set(self.hooks):
             raise D2Error(
@@ -141,7 +141,7 @@ class D2Hooks:
 
         return Context(step, self.backbone, views, self._load_prior, self.generator, sample)
 
-    def _load_prior(self, view):  # noqa: ANN001, ANN202 - the signature of PriorLoader.__call__
+    def _load_prior(self, view: View) -> DepthPrior | None:
         if self._prior is None:
             self._prior = PriorLoader(self._store, view.K.device)
         return self._prior(view)
@@ -177,8 +177,8 @@ class D2Hooks:
             hook.reset()
         if not self._warned:
             warnings.warn(
-                f"the backbone went from {self._count} to {len(self.backbone)} Gaussians without telling its listeners: "
-                "pruning starts counting anew; report changes through on_resize",
+                f"the backbone went from {self._count} to {len(self.backbone)} Gaussians without telling its "
+                "listeners: pruning starts counting anew; report changes through on_resize",
                 stacklevel=3,
             )
             self._warned = True
@@ -186,8 +186,8 @@ class D2Hooks:
 
 
 def _open_store(path: str | None) -> object:
+    if path is None:
+        raise D2Error(f"{', '.join(HOOKS)} need a depth prior: set `prior` to the folder that `d2 priors` wrote")
     from d2_plugin.priors.store import PriorStore
 
-    if path is None:
-        raise D2Error(f"the hooks {', '.join(HOOKS)} need a depth prior: set `prior` to the folder that `d2 priors` wrote")
     return PriorStore.open(Path(path))

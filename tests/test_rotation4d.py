@@ -96,7 +96,7 @@ def test_conditional_covariance_stays_positive_in_float32(seed: int, time_scale:
     left, right = random_quaternions(seed, 64, torch.float32), random_quaternions(seed + 1, 64, torch.float32)
     factors = rotation_matrices_4d(left, right) * torch.tensor([1e-2, 1e-2, 1e-3, time_scale])
     spatial, velocity = condition_on_time(factors)
-    eigenvalues = torch.linalg.eigvalsh((spatial.double() @ spatial.double().mT))
+    eigenvalues = torch.linalg.eigvalsh(spatial.double() @ spatial.double().mT)
     assert (eigenvalues > 0).all()
     assert torch.isfinite(velocity).all()
 

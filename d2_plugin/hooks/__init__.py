@@ -1,4 +1,4 @@
-"""The four hooks: prior, densify, prune, depth loss. Each is pure functions (the paper's equations) and a thin class."""
+"""The four hooks: prior, densify, prune, depth loss; each is pure functions (the equations) and a thin class."""
 
 from __future__ import annotations
 

@@ -89,9 +89,7 @@ class Densify(Hook):
             return None
         return Edit(insert=Points(*(torch.cat(values) for values in zip(*inserted, strict=True))))
 
-    def _propose(
-        self, surveyed: Surveyed, earlier: list[Points], budget: int, generator: torch.Generator
-    ) -> Points:
+    def _propose(self, surveyed: Surveyed, earlier: list[Points], budget: int, generator: torch.Generator) -> Points:
         """New points of one view that no existing Gaussian and no point of an earlier view already stands for."""
         config, view, prior = self.config, surveyed.view, surveyed.prior
         depth, valid = rendered_depth(surveyed.survey.depth_sum, surveyed.survey.alpha, config.tau_v)
@@ -103,7 +101,9 @@ class Densify(Hook):
         positions = back_project(view, pixels, target)
         spacing = self._spacing(int(region.sum()), len(pixels))
         free = self._free(view, surveyed.splats, positions, earlier, spacing)
-        colors = prior.colors[row, column].to(target) / 255 if prior.colors is not None else torch.full_like(positions, 0.5)
+        colors = (
+            prior.colors[row, column].to(target) / 255 if prior.colors is not None else torch.full_like(positions, 0.5)
+        )
         focal = torch.sqrt(view.K[0, 0] * view.K[1, 1])
         scales = config.scale * spacing * target / focal
         return Points(

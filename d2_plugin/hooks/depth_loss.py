@@ -41,7 +41,9 @@ class DepthLoss(Hook):
     def loss(self, context: Context) -> Tensor | None:
         """lambda_d times the mean of L_depth over the step's views that have verified pixels."""
         pairs = [(view, context.prior(view)) for view in context.views]
-        terms = [self._term(context, view, prior) for view, prior in pairs if prior is not None and prior.verified.any()]
+        terms = [
+            self._term(context, view, prior) for view, prior in pairs if prior is not None and prior.verified.any()
+        ]
         return self.config.weight * torch.stack(terms).mean() if terms else None
 
     def _term(self, context: Context, view: View, prior: DepthPrior) -> Tensor:

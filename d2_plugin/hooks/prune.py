@@ -78,7 +78,10 @@ class Prune(Hook):
     def follow(self, index: Tensor) -> None:
         """Streaks move with their Gaussians; new ones start at 0."""
         if self.streak is not None:
-            self.streak = torch.where(index >= 0, self.streak[index.clamp(min=0)], 0)
+            kept = index >= 0
+            moved = self.streak.new_zeros(len(index))
+            moved[kept] = self.streak[index[kept]]
+            self.streak = moved
 
     def reset(self) -> None:
         """Forget all streaks."""

@@ -1,0 +1,105 @@
+"""A scene small enough for tests: a textured plane seen by three cameras at two instants, with its exact prior."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from d2_plugin.adapters.yang4d import Yang4DAdapter
+from d2_plugin.backbones.densify import DensifySettings
+from d2_plugin.backbones.trainer import Trainer, TrainSettings
+from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
+from d2_plugin.config import D2Config, DensifyConfig, DepthLossConfig, PruneConfig
+from d2_plugin.plugin import D2Hooks
+from d2_plugin.protocol import DepthPrior, Label, View
+
+WIDTH, HEIGHT, DISTANCE = 32, 24, 3.0
+
+
+def make_views() -> list[View]:
+    """Three cameras side by side, looking along z at a plane z = 3; two frames."""
+    intrinsics = torch.tensor([[30.0, 0, WIDTH / 2], [0, 30.0, HEIGHT / 2], [0, 0, 1]])
+    views = []
+    for frame in range(2):
+        for i, x in enumerate((-0.4, 0.0, 0.4)):
+            pose = torch.eye(4)
+            pose[0, 3] = -x
+            views.append(View(f"cam{i}", frame, frame / 2, pose, intrinsics, WIDTH, HEIGHT))
+    return views
+
+
+class TinyFrames:
+    """Pictures of the plane."""
+
+    def __init__(self) -> None:
+        self.views = make_views()
+
+    def image(self, index: int) -> Tensor:
+        """A smooth texture fixed to the plane, [H, W, 3]."""
+        view = self.views[index]
+        rows, columns = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+        x = (columns - view.K[0, 2]) / view.K[0, 0] * DISTANCE - view.T_camera_world[0, 3]
+        y = (rows - view.K[1, 2]) / view.K[1, 1] * DISTANCE
+        return torch.stack([torch.sin(3 * x), torch.cos(4 * y), torch.sin(2 * x + y)], -1) * 0.4 + 0.5
+
+
+class TinyStore:
+    """The exact depth as a prior: left half verified, right half mono-only, one column in conflict."""
+
+    def prior(self, camera: str, frame: int) -> DepthPrior:
+        """D* of any view."""
+        labels = torch.full((HEIGHT, WIDTH), int(Label.MONO), dtype=torch.uint8)
+        labels[:, : WIDTH // 2] = Label.VERIFIED
+        labels[:, WIDTH // 2] = Label.CONFLICT
+        depth = torch.where(labels == Label.CONFLICT, 0.0, DISTANCE)
+        return DepthPrior(depth, labels, torch.full((HEIGHT, WIDTH, 3), 128, dtype=torch.uint8))
+
+
+def make_model(count: int = 60, temporal: bool = True, seed: int = 0) -> Yang4D:
+    """Gaussians scattered between the cameras and beyond the plane."""
+    generator = torch.Generator().manual_seed(seed)
+    positions = torch.rand(count, 3, generator=generator) * torch.tensor([3.0, 2.0, 3.0]) + torch.tensor(
+        [-1.5, -1, 1.5]
+    )
+    settings = Yang4DSettings(
+        temporal=temporal,
+        initial_opacity=0.5,
+        densify=DensifySettings(start=0.1, stop=0.9, every=7, gradient=5e-3, budget=150),
+    )
+    colors, times = torch.rand(count, 3, generator=generator), torch.rand(count, generator=generator) / 2
+    return Yang4D.from_points(positions, colors, times, settings, extent=2.0, duration=0.5)
+
+
+ALL_HOOKS = D2Config(
+    densify=DensifyConfig(start=5, stop=25, every=5, budget_per_view=20),
+    prune=PruneConfig(start=5, stop=30, every=4, patience=2, tau_p=0.6),
+    depth_loss=DepthLossConfig(),
+    views_per_evaluation=3,
+)
+
+
+def make_trainer(config: D2Config | None = None, iterations: int = 30, **model: object) -> Trainer:
+    """A trainer of the tiny scene, with D2 attached where a configuration is given."""
+
+    def attach(model: Yang4D) -> D2Hooks:
+        return D2Hooks.from_config(config, backbone=Yang4DAdapter(model), store=TinyStore())
+
+    settings = TrainSettings(iterations=iterations, seed=3)
+    return Trainer(make_model(**model), TinyFrames(), settings, attach if config is not None else None)
+
+
+def parameters(trainer: Trainer) -> dict[str, Tensor]:
+    """The model's parameters, detached."""
+    return {name: value.detach().clone() for name, value in trainer.model.gaussians.parameters.items()}
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    """Bitwise equality of named tensors."""
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def is_finite(trainer: Trainer) -> bool:
+    """No parameter is NaN or infinite."""
+    return all(math.isfinite(value.abs().max()) for value in parameters(trainer).values())
