@@ -1,9 +1,10 @@
 """The final filter of geometric depth, the same for every maker: it decides which depths may act as anchors.
 
-A depth survives when it matched well, where there is texture to match, when enough other views confirm it by a
-forward-backward reprojection and by their own depth, when the rays of a confirming view meet at an angle, and when
-it is not a speckle. Measured on synthetic rooms, filtering matters more than matching: unfiltered maps are wrong by
-more than 5 % at a fifth of the pixels, filtered ones at half a per cent (`reference/priors.md` section 3).
+A depth survives when it matched well, where there is texture to match, when it lies on one surface with its
+neighbours, when enough other views confirm it by a forward-backward reprojection and by their own depth, when the rays
+of a confirming view meet at an angle, and when it is not a speckle. Measured on synthetic rooms, filtering matters more
+than matching: unfiltered maps are wrong by more than 5 % at a fifth of the pixels, filtered ones at half a per cent
+(`reference/priors.md` section 3).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
+from d2_plugin.priors.coherence import surface_coherence
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import Projection, pixel_grid, triangulation_angle, view_pair
 from d2_plugin.priors.settings import StereoSettings
@@ -58,10 +60,12 @@ def filter_depths(
     Returns:
         One `GeometricDepth` per camera. Nothing survives where no source can confirm it.
     """
-    matched = [np.where(np.isfinite(d) & (d > 0) & (c < settings.cost_max), d, 0) for d, c in zip(depths, costs)]
-    candidates = [
-        np.where(texture_mask(gray, settings), depth, 0).astype(np.float32) for gray, depth in zip(grays, matched)
-    ]
+    known = [np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32) for depth in depths]
+    matched = [np.where(cost < settings.cost_max, depth, 0) for depth, cost in zip(known, costs)]
+    textured = [np.where(texture_mask(gray, settings), depth, 0) for gray, depth in zip(grays, matched)]
+    # The unfiltered map is asked: a neighbour that matched badly may still tell where the surface runs.
+    coherent = [coherence_mask(gray, depth, settings) for gray, depth in zip(grays, known)]
+    candidates = [np.where(mask, depth, 0) for mask, depth in zip(coherent, textured)]
     results = []
     for index, (gray, cost) in enumerate(zip(grays, costs)):
         count = count_confirmations(index, cameras, candidates, settings)
@@ -71,7 +75,8 @@ def filter_depths(
         survivors = {
             "pixels": gray.size,
             "matched": np.count_nonzero(matched[index]),
-            "textured": np.count_nonzero(candidates[index]),
+            "textured": np.count_nonzero(textured[index]),
+            "coherent": np.count_nonzero(candidates[index]),
             "confirmed": np.count_nonzero(confirmed),
             "kept": np.count_nonzero(final),
         }
@@ -87,6 +92,14 @@ def texture_mask(gray: np.ndarray, settings: StereoSettings) -> np.ndarray:
     mean = cv2.blur(values, size, borderType=cv2.BORDER_REPLICATE)
     square = cv2.blur(values * values, size, borderType=cv2.BORDER_REPLICATE)
     return np.sqrt(np.maximum(square - mean * mean, 0)) > settings.texture_min
+
+
+def coherence_mask(gray: np.ndarray, depth: np.ndarray, settings: StereoSettings) -> np.ndarray:
+    """Pixels [H, W] bool that lie on one surface with enough of their neighbours (see `surface_coherence`)."""
+    share = surface_coherence(
+        gray, depth, settings.coherence_radius, settings.relative_depth_max, settings.coherence_contrast
+    )
+    return share >= settings.coherence_min
 
 
 def count_confirmations(
