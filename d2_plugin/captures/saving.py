@@ -1,0 +1,67 @@
+"""Any capture written out in the folder layout, from which it reads back the same."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.captures.pictures import write_png
+from d2_plugin.errors import D2Error
+
+
+def save_capture(capture: Capture, path: Path | str) -> Path:
+    """Write pictures, cameras, true depth and monocular maps of `capture` under `path`; returns it.
+
+    Pictures are lossless PNG; maps are float32. Raises `D2Error` where `path` already holds something.
+    """
+    folder = Path(path)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise D2Error(f"{folder} already exists and is not empty: choose another folder, nothing was written")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cameras.json").write_text(json.dumps(_description(capture), indent=1) + "\n")
+    for camera in capture.cameras:
+        for frame in capture.frames:
+            _save_frame(capture, folder, camera, frame)
+    if capture.mono_kind is not None:
+        declared = {"kind": capture.mono_kind, "emulated": capture.mono_emulated}
+        (folder / "mono" / "mono.json").write_text(json.dumps(declared) + "\n")
+    return folder
+
+
+def _save_frame(capture: Capture, folder: Path, camera: str, frame: int) -> None:
+    def place(kind: str, suffix: str) -> Path:
+        target = folder / kind / camera / f"{frame:05d}{suffix}"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return target
+
+    write_png(place("images", ".png"), capture.image(camera, frame))
+    depth, mono = capture.depth(camera, frame), capture.mono(camera, frame)
+    if depth is not None:
+        np.savez_compressed(place("depth", ".npz"), depth=depth.astype(np.float32))
+    if mono is not None:
+        np.save(place("mono", ".npy"), mono.astype(np.float32))
+
+
+def _description(capture: Capture) -> dict[str, Any]:
+    bounds = {name: list(camera.near_far) for name, camera in capture.cameras.items() if camera.near_far is not None}
+    return {
+        "convention": "OpenCV axes, x_cam = R X + t, pixel centres at +0.5",
+        "source": capture.name,
+        "notes": list(capture.notes),
+        "fps": capture.fps,
+        "bounds": bounds,
+        "cameras": [_camera_entry(camera) for camera in capture.cameras.values()],
+    }
+
+
+def _camera_entry(camera: Camera) -> dict[str, Any]:
+    if camera.K[0, 1] != 0:
+        raise D2Error(f"camera {camera.name} has skew {camera.K[0, 1]:g}, which the folder layout cannot hold")
+    fx, fy, cx, cy = (float(camera.K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    rotation, translation = camera.T_camera_world[:3, :3].tolist(), camera.T_camera_world[:3, 3].tolist()
+    size = {"width": camera.width, "height": camera.height}
+    return {"name": camera.name, **size, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "R": rotation, "t": translation}
