@@ -1,0 +1,289 @@
+"""The positive-scale Charbonnier fit, solved to a certified duality gap.
+
+    minimise over a >= a_min, b:   F(a, b) = sum_i rho(w_i (a x_i + b - y_i)),   rho(r) = sqrt(r^2 + eps^2) - eps
+
+(paper, section "Dual-source Depth Consistency Prior Construction"). F is convex and smooth, so the optimum is unique
+unless x is constant. The paper's a > 0 is an open set; the closed problem a >= a_min is solved, and an optimum on the
+boundary says that no positive scale is best.
+
+The certificate holds for any iterate. rho(r) = max over |u| <= 1 of u r - eps (1 - sqrt(1 - u^2)), hence for every u
+with |u_i| <= 1, sum w_i u_i = 0 and s = sum w_i x_i u_i >= 0
+
+    F* >= a_min s - sum u_i w_i y_i - eps sum (1 - sqrt(1 - u_i^2)),
+
+and u = rho'(r), projected onto the equalities, makes this bound tight at the optimum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+BLENDS = (0.0, 0.01, 0.1, 0.5, 1.0)
+"""Shares of IRLS curvature tried in turn; at 1 the model majorises F, so a step of it always descends."""
+
+ARMIJO = 1e-4
+MIN_EPSILON = 1e-100  # in normalised units: its square must not vanish
+OBJECTIVE_FLOOR = 1e-6  # of eps per point: below it an objective is zero to all purposes
+SINGULAR = 1e-14  # determinant of the 2x2 system, relative to the product of its diagonal
+
+
+@dataclass(frozen=True)
+class AffineFit:
+    """y ~ scale x + shift with its certificate.
+
+    `objective` is F and `gap` an upper bound of F - F*, relative to max(F, 1e-6 n eps): below a millionth of the
+    smoothing per point an objective is zero to all purposes. `boundary` is True where scale = a_min, `flat` where x is
+    constant (then only the shift was fitted). `scale_error` is the sandwich standard error of the scale.
+    """
+
+    scale: float
+    shift: float
+    objective: float
+    gap: float
+    iterations: int
+    count: int
+    boundary: bool
+    flat: bool
+    scale_error: float
+
+
+def fit_affine(
+    x: np.ndarray,
+    y: np.ndarray,
+    weights: np.ndarray | None = None,
+    *,
+    epsilon: float,
+    scale_min: float = 0.0,
+    tolerance: float = 1e-10,
+    max_iterations: int = 100,
+) -> AffineFit:
+    """Fit scale >= `scale_min` and shift; non-finite points and those without positive weight are ignored.
+
+    Args:
+        x: [n] what is aligned (a monocular prediction).
+        y: [n] what it is aligned to.
+        weights: [n] multiplies each residual; 1 where None.
+        epsilon: smoothing of rho, in units of weights * y; must be positive.
+        scale_min: lower bound of the scale.
+        tolerance: relative duality gap to stop at.
+        max_iterations: Newton steps at most; the certificate tells what was reached.
+
+    Returns:
+        The fit; with no usable point everything is NaN and `count` is 0.
+    """
+    x, y, weights = _usable(x, y, weights)
+    if x.size == 0:
+        return AffineFit(np.nan, np.nan, np.nan, np.nan, 0, 0, boundary=False, flat=True, scale_error=np.nan)
+    unit = _Units.of(x, y, weights, epsilon)
+    problem = _Problem(
+        p=unit.weights * (x - unit.x_centre) / unit.x_spread,
+        q=unit.weights,
+        t=unit.weights * (y - unit.y_centre) / unit.y_spread,
+        epsilon=max(epsilon / unit.weight / unit.y_spread, MIN_EPSILON),
+        scale_min=scale_min * unit.x_spread / unit.y_spread,
+    )
+    flat = x.size < 2 or not unit.x_spread > 64 * np.finfo(float).eps * np.abs(x).max()
+    if flat:
+        problem = _Problem(np.zeros_like(problem.p), problem.q, problem.t, problem.epsilon, 0.0)
+        state = _State(0.0, problem.best_shift(0.0, problem.median_shift()), 0.0, 0)
+        boundary = False
+    else:
+        state = problem.solve(tolerance, max_iterations)
+        boundary = state.a <= problem.scale_min
+    scale = state.a * unit.y_spread / unit.x_spread
+    return AffineFit(
+        scale=scale,
+        shift=state.b * unit.y_spread + unit.y_centre - scale * unit.x_centre,
+        objective=problem.objective(state.a, state.b) * unit.y_spread * unit.weight,
+        gap=state.gap,
+        iterations=state.iterations,
+        count=x.size,
+        boundary=boundary,
+        flat=flat,
+        scale_error=problem.scale_error(state.a, state.b) * unit.y_spread / unit.x_spread,
+    )
+
+
+def charbonnier(residual: np.ndarray, epsilon: float) -> np.ndarray:
+    """rho(r) = sqrt(r^2 + eps^2) - eps, in a form that neither cancels at small residuals nor overflows."""
+    return residual * (residual / (np.hypot(residual, epsilon) + epsilon))
+
+
+def _usable(
+    x: np.ndarray, y: np.ndarray, weights: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    x, y = np.asarray(x, np.float64).ravel(), np.asarray(y, np.float64).ravel()
+    weights = np.ones_like(x) if weights is None else np.asarray(weights, np.float64).ravel()
+    keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(weights) & (weights > 0)
+    return (x, y, weights) if keep.all() else (x[keep], y[keep], weights[keep])
+
+
+@dataclass(frozen=True, eq=False)
+class _Units:
+    """Centre and spread of the data: in these units an offset of 1e8 or a scale of 1e-3..1e6 changes nothing."""
+
+    x_centre: float
+    x_spread: float
+    y_centre: float
+    y_spread: float
+    weight: float
+    weights: np.ndarray
+
+    @classmethod
+    def of(cls, x: np.ndarray, y: np.ndarray, weights: np.ndarray, epsilon: float) -> _Units:
+        weight = float(np.median(weights))
+        x_centre, y_centre = float(np.median(x)), float(np.median(y))
+        x_spread, y_spread = float(np.abs(x - x_centre).mean()), float(np.abs(y - y_centre).mean())
+        tiny = np.finfo(float).tiny
+        y_spread = max(y_spread, epsilon / weight, tiny)
+        return cls(x_centre, max(x_spread, tiny), y_centre, y_spread, weight, weights / weight)
+
+
+@dataclass(frozen=True)
+class _State:
+    a: float
+    b: float
+    gap: float
+    iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """min over a >= scale_min, b of sum rho(a p + b q - t): the same problem in normalised units."""
+
+    p: np.ndarray
+    q: np.ndarray
+    t: np.ndarray
+    epsilon: float
+    scale_min: float
+
+    def residual(self, a: float, b: float) -> np.ndarray:
+        return a * self.p + b * self.q - self.t
+
+    def root(self, r: np.ndarray) -> np.ndarray:
+        """sqrt(r^2 + eps^2); in normalised units |r| <= n, so that the squares need no care."""
+        return np.sqrt(r * r + self.epsilon * self.epsilon)
+
+    def objective(self, a: float, b: float) -> float:
+        r = self.residual(a, b)
+        return float(r @ (r / (self.root(r) + self.epsilon)))
+
+    def median_shift(self) -> float:
+        return float(np.median(self.t / self.q))
+
+    def normal(self, curvature: np.ndarray) -> tuple[float, float, float]:
+        """The 2x2 matrix sum c (p, q)(p, q)^T as its entries aa, ab, bb."""
+        cp = curvature * self.p
+        return float(cp @ self.p), float(cp @ self.q), float((curvature * self.q) @ self.q)
+
+    def solve(self, tolerance: float, max_iterations: int) -> _State:
+        """Newton with IRLS blending from a few IRLS steps; the gap uses the best bound over all iterates."""
+        a, b = self._start()
+        bound, gap = -np.inf, np.inf
+        floor = OBJECTIVE_FLOOR * self.t.size * self.epsilon
+        for iteration in range(max_iterations + 1):
+            r = self.residual(a, b)
+            inverse_root = 1 / self.root(r)
+            u = r * inverse_root
+            value = float(r @ (u / (1 + self.epsilon * inverse_root)))
+            bound = max(bound, self.lower_bound(u, a))
+            gap = max(value - bound, 0.0) / max(value, floor)
+            step = None if gap <= tolerance else self._descend(a, b, u, inverse_root, value)
+            if step is None or iteration == max_iterations:
+                break
+            a, b = step
+        return _State(a, b, gap, iteration)
+
+    def _start(self) -> tuple[float, float]:
+        """Least squares, then two reweighted steps."""
+        a, b = self.scale_min, self.median_shift()
+        weight = np.ones_like(self.t)
+        for _ in range(3):
+            wp, wq = weight * self.p, weight * self.q
+            step = _solve_2x2(*self.normal(weight), float(wp @ self.t), float(wq @ self.t))
+            if step is None:
+                break
+            a = max(self.scale_min, step[0])
+            b = float(wq @ (self.t - a * self.p)) / float(wq @ self.q)
+            weight = 1 / self.root(self.residual(a, b))
+        return a, b
+
+    def _descend(
+        self, a: float, b: float, u: np.ndarray, inverse_root: np.ndarray, value: float
+    ) -> tuple[float, float] | None:
+        """One step that lowers F, on the boundary the exact best shift, or None where neither moves."""
+        gradient_a, gradient_b = float(self.p @ u), float(self.q @ u)
+        irls = self.normal(inverse_root)
+        newton = self.normal(inverse_root * (self.epsilon * inverse_root) ** 2)
+        for blend in BLENDS:
+            h_aa, h_ab, h_bb = ((1 - blend) * n + blend * i for n, i in zip(newton, irls))
+            step = _solve_2x2(h_aa, h_ab, h_bb, -gradient_a, -gradient_b)
+            if step is None:
+                continue
+            a_new, b_new = a + step[0], b + step[1]
+            if a_new <= self.scale_min:
+                a_new = self.scale_min
+                b_new = b - (gradient_b + h_ab * (a_new - a)) / h_bb
+            predicted = gradient_a * (a_new - a) + gradient_b * (b_new - b)
+            if self.objective(a_new, b_new) < value + ARMIJO * min(predicted, 0.0):
+                return a_new, b_new
+        b_new = self.best_shift(a, b) if a <= self.scale_min else b
+        return None if b_new == b else (a, b_new)
+
+    def best_shift(self, a: float, b: float) -> float:
+        """argmin over b at fixed a: Newton on a monotone derivative inside a shrinking bracket, to the last digit."""
+        zeros = (self.t - a * self.p) / self.q
+        low, high = float(zeros.min()), float(zeros.max())
+        b = min(max(b, low), high)
+        for _ in range(200):
+            r = self.residual(a, b)
+            inverse_root = 1 / self.root(r)
+            slope = float(self.q @ (r * inverse_root))
+            curvature = float((self.q * self.q) @ (inverse_root * (self.epsilon * inverse_root) ** 2))
+            low, high = (low, b) if slope > 0 else (b, high)
+            proposal = b - slope / curvature if curvature > 0 else np.nan
+            b_new = proposal if low <= proposal <= high else 0.5 * (low + high)
+            if abs(b_new - b) <= 1e-15 * max(1.0, abs(b)):
+                return b_new
+            b = b_new
+        return b
+
+    def lower_bound(self, u: np.ndarray, a: float) -> float:
+        """The dual value of u = rho'(r) after making it feasible; valid for every feasible a and b."""
+        slope_a, slope_b = float(self.p @ u), float(self.q @ u)
+        keep = max(0.0, slope_a) if a <= self.scale_min else 0.0
+        best = -np.inf
+        # Moving only those u that have room to +-1 wastes least; where none has, all of them move and are scaled.
+        for room in (1 - u * u, np.ones_like(u)):
+            step = _solve_2x2(*self.normal(room), slope_a - keep, slope_b)
+            if step is None:
+                if keep != slope_a or slope_b != 0:
+                    continue
+                step = (0.0, 0.0)
+            feasible = u - room * (step[0] * self.p + step[1] * self.q)
+            shrink = max(1.0, float(np.abs(feasible).max()))
+            feasible = feasible / shrink
+            square = np.minimum(feasible * feasible, 1.0)
+            conjugate = self.epsilon * float((square / (1 + np.sqrt(1 - square))).sum())
+            best = max(best, self.scale_min * keep / shrink - float(feasible @ self.t) - conjugate)
+        return best
+
+    def scale_error(self, a: float, b: float) -> float:
+        """Sandwich standard error of the scale of an M-estimator: H^-1 (sum psi^2 z z^T) H^-1 with z = (p, q)."""
+        r = self.residual(a, b)
+        inverse_root = 1 / self.root(r)
+        row = _solve_2x2(*self.normal(inverse_root * (self.epsilon * inverse_root) ** 2), 1.0, 0.0)
+        if row is None:
+            return float("inf")
+        m_aa, m_ab, m_bb = self.normal((r * inverse_root) ** 2)
+        return float(np.sqrt(max(row[0] ** 2 * m_aa + 2 * row[0] * row[1] * m_ab + row[1] ** 2 * m_bb, 0.0)))
+
+
+def _solve_2x2(h_aa: float, h_ab: float, h_bb: float, g_a: float, g_b: float) -> tuple[float, float] | None:
+    """Solution of the symmetric system, or None where it is singular to working precision."""
+    determinant = h_aa * h_bb - h_ab * h_ab
+    if not determinant > SINGULAR * h_aa * h_bb:
+        return None
+    return (h_bb * g_a - h_ab * g_b) / determinant, (h_aa * g_b - h_ab * g_a) / determinant

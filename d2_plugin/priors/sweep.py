@@ -1,0 +1,144 @@
+"""Guided plane sweep on the CPU with OpenCV's kernels: geometric depth where there is no compiler.
+
+For each inverse depth one homography warps every source onto the reference, a small window correlates, the best half of
+the sources is averaged (the others are taken for occluded), and a guided filter aggregates the cost along the edges of
+the picture. The minimum over planes is refined by a parabola. Planes stand at most half a source pixel apart, which is
+what makes the result insensitive to the range; only the running minimum and its two neighbours are kept in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from types import ModuleType
+
+import numpy as np
+
+from d2_plugin.captures.capture import Camera
+from d2_plugin.errors import missing_extra
+from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.geometry import ViewPair, check_depth_range, inverse_depth_planes, view_pair
+from d2_plugin.priors.settings import StereoSettings
+
+WORST_COST = 2.0
+MIN_VARIANCE = 1e-5  # of grey values in 0..1 over one window: below it NCC correlates sensor noise
+
+
+def sweep(
+    grays: Sequence[np.ndarray], cameras: Sequence[Camera], depth_range: tuple[float, float], settings: StereoSettings
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Depth and matching cost of every view from all the others.
+
+    Args:
+        grays: uint8 [H, W] per camera.
+        cameras: at least two.
+        depth_range: near and far in world units.
+        settings: the `sweep_*` fields are used.
+
+    Returns:
+        Per camera: planar depth float32 [H, W] (0 where no source covers the pixel) and 1 - NCC float32 [H, W].
+    """
+    cv2 = opencv("the plane sweep")
+    if not hasattr(cv2, "ximgproc"):
+        raise missing_extra("OpenCV with its contrib modules", "stereo", "the plane sweep")
+    depth_range = check_depth_range(depth_range)
+    return [_sweep_one(cv2, index, grays, cameras, depth_range, settings) for index in range(len(cameras))]
+
+
+def _sweep_one(
+    cv2: ModuleType,
+    index: int,
+    grays: Sequence[np.ndarray],
+    cameras: Sequence[Camera],
+    depth_range: tuple[float, float],
+    settings: StereoSettings,
+) -> tuple[np.ndarray, np.ndarray]:
+    others = [other for other in range(len(cameras)) if other != index]
+    seen_by = [cameras[other] for other in others]
+    planes = inverse_depth_planes(cameras[index], seen_by, depth_range, settings.sweep_step)
+    correlate = _correlator(cv2, grays[index], settings.sweep_window)
+    sources = [(view_pair(cameras[index], cameras[other]), grays[other].astype(np.float32) / 255) for other in others]
+    guide = cv2.ximgproc.createGuidedFilter(
+        np.ascontiguousarray(grays[index]), settings.sweep_guide_radius, (settings.sweep_guide_epsilon * 255) ** 2
+    )
+    minimum = RunningMinimum(grays[index].shape)
+    for plane in planes:
+        costs = [correlate(_warp(cv2, gray, pair, plane, grays[index].shape)) for pair, gray in sources]
+        minimum.add(guide.filter(best_half(costs)))
+    position, cost = minimum.result()
+    inverse = np.interp(position, np.arange(len(planes)), planes)
+    covered = cost < WORST_COST
+    return np.where(covered, 1 / inverse, 0).astype(np.float32), np.where(covered, cost, WORST_COST)
+
+
+def _warp(cv2: ModuleType, gray: np.ndarray, pair: ViewPair, plane: float, shape: tuple[int, int]) -> np.ndarray:
+    """The source seen from the reference through the plane at inverse depth `plane`; -1 outside of the source."""
+    homography = pair.A.copy()
+    homography[:, 2] += pair.k * plane
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return cv2.warpPerspective(
+        gray, homography, shape[::-1], flags=flags, borderMode=cv2.BORDER_CONSTANT, borderValue=-1
+    )
+
+
+def _correlator(cv2: ModuleType, gray: np.ndarray, window: int) -> Callable[[np.ndarray], np.ndarray]:
+    """A function from a warped source to 1 - NCC with the reference, whose own moments are computed once."""
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return cv2.blur(values, (window, window), borderType=cv2.BORDER_REPLICATE)
+
+    reference = gray.astype(np.float32) / 255
+    mean_r = mean(reference)
+    variance_r = mean(reference * reference) - mean_r * mean_r
+
+    def cost(warped: np.ndarray) -> np.ndarray:
+        outside = warped < 0
+        warped[outside] = 0
+        mean_w = mean(warped)
+        variance_w = mean(warped * warped) - mean_w * mean_w
+        covariance = mean(warped * reference) - mean_w * mean_r
+        product = np.maximum(variance_w, 0) * np.maximum(variance_r, 0)
+        result = 1 - covariance / np.sqrt(np.maximum(product, MIN_VARIANCE**2))
+        result[outside | (variance_w < MIN_VARIANCE) | (variance_r < MIN_VARIANCE)] = WORST_COST
+        return result
+
+    return cost
+
+
+def best_half(costs: list[np.ndarray]) -> np.ndarray:
+    """Mean of the better half (rounded up) of the sources' costs, per pixel: the rest may be occluded."""
+    if len(costs) == 1:
+        return costs[0]
+    keep = (len(costs) + 1) // 2
+    return np.partition(np.stack(costs), keep - 1, axis=0)[:keep].mean(axis=0)
+
+
+class RunningMinimum:
+    """Minimum over a stream of cost slices, with both neighbours of the best slice for a parabola; O(1) memory."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._count = 0
+        self._previous = np.full(shape, np.inf, np.float32)
+        self._best = np.full(shape, np.inf, np.float32)
+        self._before = np.full(shape, np.inf, np.float32)
+        self._after = np.full(shape, np.inf, np.float32)
+        self._index = np.zeros(shape, np.int32)
+
+    def add(self, cost: np.ndarray) -> None:
+        """The next slice, float32 [H, W]."""
+        was_best = self._index == self._count - 1
+        np.copyto(self._after, cost, where=was_best)
+        better = cost < self._best
+        np.copyto(self._best, cost, where=better)
+        np.copyto(self._before, self._previous, where=better)
+        self._after[better] = np.inf
+        self._index[better] = self._count
+        self._previous = cost
+        self._count += 1
+
+    def result(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position of the minimum in slices (fractional; float64) and its cost; a minimum at either end stays there."""
+        inner = np.isfinite(self._before) & np.isfinite(self._after)
+        before, after = np.where(inner, self._before, self._best), np.where(inner, self._after, self._best)
+        curvature = before - 2 * self._best + after
+        offset = np.where(curvature > 1e-6, 0.5 * (before - after) / np.maximum(curvature, 1e-6), 0)
+        return self._index + np.clip(offset, -0.5, 0.5).astype(np.float64), self._best
