@@ -27,6 +27,9 @@ from .rotation4d import (
     temporal_marginal,
     time_row,
 )
+from .trainer import Trainer, TrainSettings
+
+__all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "initial_rows"]
 
 MARGINAL_CUT = 0.05
 """A Gaussian whose temporal marginal F(t) is not above this is not drawn (forward.cu:334)."""
@@ -235,3 +238,23 @@ def nearest_neighbour_scales(positions: Tensor, neighbours: int = 3) -> Tensor:
     k = min(neighbours, count - 1) + 1
     chunks = [torch.cdist(chunk, positions).topk(k, largest=False).values for chunk in positions.split(1024)]
     return torch.cat(chunks)[:, 1:].square().mean(-1).sqrt().clamp(min=1e-7)
+
+
+def create(
+    positions: Tensor,
+    colors: Tensor,
+    times: Tensor,
+    *,
+    extent: float,
+    duration: float,
+    temporal: bool,
+    settings: Mapping[str, object] | None = None,
+) -> Yang4D:
+    """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults.
+
+    `settings` holds fields of `Yang4DSettings`, and under "densify" and "raster" tables of theirs.
+    """
+    chosen = dict(settings or {})
+    chosen["densify"] = DensifySettings(**chosen.get("densify", {}))
+    chosen["raster"] = RasterSettings(**chosen.get("raster", {}))
+    return Yang4D.from_points(positions, colors, times, Yang4DSettings(temporal=temporal, **chosen), extent, duration)

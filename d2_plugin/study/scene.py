@@ -127,3 +127,22 @@ def _random_points(
     colors = capture.image(camera, frame)[rows, columns] / 255
     times = rng.uniform(0, max(capture.seconds(capture.frames[-1]), 1e-9), count)
     return (in_camera - translation) @ rotation, colors, times
+
+
+def triangulated_points(capture: Capture, cameras: tuple[str, ...], instants: int = 5) -> dict[str, np.ndarray]:
+    """Points triangulated with the known poses at up to `instants` frames spread over the recording.
+
+    Returns positions [P, 3], colors [P, 3] in 0..1 and frames [P]; empty for a single camera.
+    """
+    from d2_plugin.priors.colmap import triangulate
+
+    empty = {"positions": np.zeros((0, 3)), "colors": np.zeros((0, 3)), "frames": np.zeros(0, dtype=np.int64)}
+    if len(cameras) < 2:
+        return empty
+    chosen = np.unique(np.linspace(0, len(capture.frames) - 1, instants).round().astype(int))
+    parts = []
+    for frame in (capture.frames[i] for i in chosen):
+        images = [capture.image(camera, frame) for camera in cameras]
+        points = triangulate(images, [capture.cameras[camera] for camera in cameras])
+        parts.append((points.positions, points.colors, np.full(len(points.positions), frame, dtype=np.int64)))
+    return {name: np.concatenate(values) for name, values in zip(empty, zip(*parts, strict=True), strict=True)}

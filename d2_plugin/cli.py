@@ -1,0 +1,234 @@
+"""The `d2` command: demo, plan, priors, train, eval, bench, doctor."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from d2_plugin import __version__
+from d2_plugin.errors import D2Error, unknown_name
+
+HOOKS_HELP = "all, none, or names of prior, densify, prune, depth_loss joined by commas"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; a mistake in the input is one sentence on stderr and exit code 2."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options) or 0
+    except D2Error as error:
+        sys.stderr.write(f"d2: {error}\n")
+        return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="d2", description="Dual-source depth priors for 4D Gaussian Splatting from two to four cameras."
+    )
+    parser.add_argument("--version", action="version", version=f"d2-4dgs {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for add in (_add_demo, _add_plan, _add_priors, _add_train, _add_eval, _add_bench, _add_doctor):
+        add(commands)
+    return parser
+
+
+def _command(commands: Any, name: str, run: Any, help: str) -> argparse.ArgumentParser:
+    parser = commands.add_parser(
+        name, help=help, description=help, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    parser.set_defaults(run=run)
+    return parser
+
+
+def _add_capture_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("capture", help="folder of the recording: images/CAMERA/FRAME.png with cameras.json, or N3DV")
+    parser.add_argument("--train-cameras", required=True, type=_names, help="names joined by commas, e.g. 00,02,05,07")
+    parser.add_argument("--frames", type=_frames, default=None, help="first:last or first:last:step; default all")
+    parser.add_argument("--downscale", type=int, default=1, help="train on pictures this many times smaller (integer)")
+    parser.add_argument("--mono-onnx", default=None, help="monocular depth network as an ONNX file")
+    parser.add_argument(
+        "--mono-kind",
+        choices=("relative", "metric"),
+        default=None,
+        help="what the network predicts: inverse depth or depth",
+    )
+    parser.add_argument("--config", type=Path, default=None, help="TOML with tables over the defaults")
+
+
+def _add_train(commands: Any) -> None:
+    parser = _command(commands, "train", _train, "Train on some cameras, score on the others; continues a stopped run.")
+    _add_capture_options(parser)
+    parser.add_argument("--test-cameras", type=_names, default=None, help="names joined by commas; default all others")
+    parser.add_argument("--backbone", default="yang4d", help="which 4D Gaussian model")
+    parser.add_argument("--iterations", type=int, default=3000, help="optimizer steps, one view each")
+    parser.add_argument("--hooks", default="all", help=HOOKS_HELP)
+    parser.add_argument("--output", type=Path, required=True, help="folder of the run; an unfinished run is continued")
+    parser.add_argument("--priors", type=Path, default=None, help="folder of the depth prior; default OUTPUT/priors")
+    parser.add_argument("--seed", type=int, default=0, help="of every random choice")
+    parser.add_argument("--export-ply", action="store_true", help="also write one 3DGS PLY per frame")
+
+
+def _add_eval(commands: Any) -> None:
+    parser = _command(commands, "eval", _eval, "Score the held-out cameras of a trained run again.")
+    parser.add_argument("run_folder", type=Path, help="the --output of d2 train")
+    parser.add_argument("--no-pictures", action="store_true", help="scores only")
+
+
+def _add_priors(commands: Any) -> None:
+    parser = _command(commands, "priors", _priors, "Build the depth prior of a recording; finished frames are kept.")
+    _add_capture_options(parser)
+    parser.add_argument("--output", type=Path, required=True, help="folder of the prior store")
+
+
+def _add_plan(commands: Any) -> None:
+    parser = _command(commands, "plan", _plan, "What the method needs for a recording, and what is left out, and why.")
+    _add_capture_options(parser)
+
+
+def _add_demo(commands: Any) -> None:
+    parser = _command(commands, "demo", _demo, "Synthetic recording, backbone alone against backbone with D2.")
+    parser.add_argument("--output", type=Path, default=Path("d2-demo"), help="folder for capture, runs and the picture")
+    parser.add_argument("--iterations", type=int, default=1000, help="optimizer steps of each of the two runs")
+
+
+def _add_bench(commands: Any) -> None:
+    parser = _command(commands, "bench", _bench, "Error against run time of one part; `d2 bench PART --help` for more.")
+    parser.add_argument("part", choices=sorted(BENCHMARKS), help="what to measure")
+    parser.add_argument("rest", nargs=argparse.REMAINDER, help="options of that benchmark")
+
+
+def _add_doctor(commands: Any) -> None:
+    _command(commands, "doctor", _doctor, "What is installed, what is missing for which feature, compiler and caches.")
+
+
+BENCHMARKS = {"raster": "d2_plugin.study.bench_raster", "stereo": "d2_plugin.study.bench_stereo"}
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _frames(text: str) -> tuple[int, ...]:
+    try:
+        first, last, *step = (int(part) for part in text.split(":"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not first:last or first:last:step") from None
+    return tuple(range(first, last + 1, *step))
+
+
+def _hooks(text: str) -> tuple[str, ...]:
+    from d2_plugin.study.settings import HOOK_NAMES
+
+    if text in ("all", "none"):
+        return HOOK_NAMES if text == "all" else ()
+    names = _names(text)
+    for name in names:
+        if name not in HOOK_NAMES:
+            raise unknown_name("hook", name, [*HOOK_NAMES, "all", "none"])
+    return names
+
+
+def _settings(options: argparse.Namespace, **more: Any) -> Any:
+    from d2_plugin.study.settings import RunSettings
+
+    return RunSettings(
+        capture=options.capture,
+        train_cameras=options.train_cameras,
+        frames=options.frames,
+        downscale=options.downscale,
+        mono_onnx=options.mono_onnx,
+        mono_kind=options.mono_kind,
+        overrides=_overrides(options.config),
+        **more,
+    )
+
+
+def _overrides(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    try:
+        return tomllib.loads(path.read_text())
+    except FileNotFoundError:
+        raise D2Error(f"no configuration at {path}: write one, or leave out --config") from None
+    except tomllib.TOMLDecodeError as error:
+        raise D2Error(f"{path} is not valid TOML: {error}") from None
+
+
+def _train(options: argparse.Namespace) -> None:
+    from d2_plugin.study.report import metrics_table
+    from d2_plugin.study.run import Run
+
+    settings = _settings(
+        options,
+        test_cameras=options.test_cameras,
+        backbone=options.backbone,
+        iterations=options.iterations,
+        hooks=_hooks(options.hooks),
+        seed=options.seed,
+        priors=str(options.priors) if options.priors else None,
+    )
+    run = Run(settings, options.output)
+    _print_plan(run.scene.plan)
+    run.train()
+    metrics = run.evaluate()
+    if options.export_ply:
+        print(f"{len(run.export_ply())} PLY files in {options.output / 'ply'}")
+    print(metrics_table({options.output.name: metrics}))
+    print(f"metrics in {options.output / 'metrics.json'}, pictures in {options.output / 'pictures'}")
+
+
+def _eval(options: argparse.Namespace) -> None:
+    from d2_plugin.study.report import metrics_table
+    from d2_plugin.study.run import Run
+
+    metrics = Run.load(options.run_folder).evaluate(pictures=not options.no_pictures)
+    print(metrics_table({options.run_folder.name: metrics}))
+
+
+def _priors(options: argparse.Namespace) -> None:
+    from d2_plugin.study.run import build_priors_for
+    from d2_plugin.study.scene import triangulated_points
+    from d2_plugin.study.settings import Scene, check
+
+    settings = check(_settings(options))
+    scene = Scene.open(settings)
+    _print_plan(scene.plan)
+    points = triangulated_points(scene.capture, scene.train_cameras)["positions"]
+    print(build_priors_for(settings, scene, points, options.output))
+
+
+def _plan(options: argparse.Namespace) -> None:
+    from d2_plugin.study.settings import Scene, check
+
+    _print_plan(Scene.open(check(_settings(options))).plan)
+
+
+def _print_plan(plan: Any) -> None:
+    for decision in plan.decisions:
+        print(f"{'use' if decision.use else 'leave out':>9}  {decision.name:12} {decision.reason}")
+
+
+def _demo(options: argparse.Namespace) -> None:
+    from d2_plugin.study.demo import run_demo
+
+    print(run_demo(options.output, options.iterations))
+
+
+def _bench(options: argparse.Namespace) -> int | None:
+    import importlib
+
+    return importlib.import_module(BENCHMARKS[options.part]).main(options.rest)
+
+
+def _doctor(options: argparse.Namespace) -> None:
+    from d2_plugin.study.doctor import report
+
+    print(report())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

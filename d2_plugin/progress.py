@@ -1,0 +1,59 @@
+"""Progress of long work: a bar where `rich` is installed and a person watches, a line now and then otherwise."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+
+class Bar(Protocol):
+    """One piece of work of known length."""
+
+    def update(self, done: int, note: str = "") -> None: ...
+
+
+class _Lines:
+    """A line on stderr at most every ten seconds, with the share done and the time that remains."""
+
+    def __init__(self, title: str, total: int) -> None:
+        self.title, self.total = title, max(total, 1)
+        self.start = self.last = time.monotonic()
+
+    def update(self, done: int, note: str = "") -> None:
+        """`done` units of work are finished; `note` is shown behind."""
+        now = time.monotonic()
+        if now - self.last < 10 and done < self.total:
+            return
+        self.last = now
+        left = (now - self.start) / max(done, 1) * (self.total - done)
+        sys.stderr.write(f"{self.title}: {done}/{self.total}, {left:.0f} s left {note}\n")
+
+
+class _Rich:
+    def __init__(self, progress: object, task: object) -> None:
+        self._progress, self._task = progress, task
+
+    def update(self, done: int, note: str = "") -> None:
+        """`done` units of work are finished; `note` is shown behind."""
+        self._progress.update(self._task, completed=done, note=note)
+
+
+@contextmanager
+def progress_bar(title: str, total: int) -> Iterator[Bar]:
+    """A bar for `total` units of work, written to stderr so that results on stdout stay clean."""
+    try:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    except ImportError:
+        yield _Lines(title, total)
+        return
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _Lines(title, total)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, TextColumn("{task.fields[note]}"), console=console) as progress:
+        yield _Rich(progress, progress.add_task(title, total=total, note=""))

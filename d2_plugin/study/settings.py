@@ -1,0 +1,111 @@
+"""What a run is: its settings, checked, and what follows from them before anything is computed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from d2_plugin import registry
+from d2_plugin.captures import Capture, open_capture
+from d2_plugin.config import D2Config, for_iterations
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.plan import ScenePlan, plan_scene
+
+HOOK_NAMES = ("prior", "densify", "prune", "depth_loss")
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What is trained, on what, for how long. Two runs with equal settings are the same run."""
+
+    capture: str
+    train_cameras: tuple[str, ...]
+    backbone: str = "yang4d"
+    iterations: int = 3000
+    hooks: tuple[str, ...] = HOOK_NAMES
+    seed: int = 0
+    downscale: int = 1
+    frames: tuple[int, ...] | None = None
+    test_cameras: tuple[str, ...] | None = None
+    mono_onnx: str | None = None
+    mono_kind: str | None = None
+    priors: str | None = None
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    """Tables over the defaults: `backbone`, `densify`, `prune`, `depth_loss`, `priors`, `plan`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A capture with its split into training and test cameras, and the plan for it."""
+
+    capture: Capture
+    train_cameras: tuple[str, ...]
+    test_cameras: tuple[str, ...]
+    plan: ScenePlan
+
+    @classmethod
+    def open(cls, settings: RunSettings) -> Scene:
+        """Open the capture that `settings` name, split its cameras, and measure what it needs."""
+        capture = open_capture(settings.capture, frames=settings.frames, downscale=settings.downscale)
+        train, test = _split(capture, settings)
+        plan = plan_scene(capture, train, _mono_source(capture, settings))
+        return cls(capture, train, test, plan.override(**settings.overrides.get("plan", {})))
+
+
+def check(settings: RunSettings) -> RunSettings:
+    """The same settings, or a D2Error for what cannot be."""
+    if not settings.train_cameras:
+        raise D2Error("no training camera: name at least one with --train-cameras")
+    if settings.iterations < 1:
+        raise D2Error(f"--iterations is {settings.iterations}: give at least 1")
+    for name in settings.hooks:
+        if name not in HOOK_NAMES:
+            raise unknown_name("hook", name, [*HOOK_NAMES, "all", "none"])
+    if settings.mono_onnx and settings.mono_kind not in ("relative", "metric"):
+        raise D2Error("--mono-onnx needs --mono-kind relative (inverse depth) or metric (depth): a file does not tell")
+    if settings.backbone not in registry.names(registry.BACKBONES):
+        raise unknown_name("backbone", settings.backbone, registry.names(registry.BACKBONES))
+    return settings
+
+
+def _split(capture: Capture, settings: RunSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Training cameras as named, test cameras as named or all others."""
+    test = settings.test_cameras
+    if test is None:
+        test = tuple(name for name in capture.cameras if name not in settings.train_cameras)
+    for name in (*settings.train_cameras, *test):
+        if name not in capture.cameras:
+            raise unknown_name("camera", name, capture.cameras)
+    both = sorted(set(settings.train_cameras) & set(test))
+    if both:
+        raise D2Error(f"camera {both[0]} is named for training and for test: leave it out of one")
+    return settings.train_cameras, test
+
+
+def _mono_source(capture: Capture, settings: RunSettings) -> str | None:
+    if settings.mono_onnx:
+        return f"ONNX model {Path(settings.mono_onnx).name}"
+    if capture.mono_kind is None:
+        return None
+    return f"{capture.mono_kind} maps on disk" + (" (emulated)" if capture.mono_emulated else "")
+
+
+def prior_settings(settings: RunSettings, plan: ScenePlan) -> Any:
+    """Settings of the prior builder: defaults, the monocular source of the run, the plan's decisions, overrides."""
+    from d2_plugin.priors.build import PriorSettings
+
+    table = settings.overrides.get("priors", {})
+    return PriorSettings(mono_onnx=settings.mono_onnx, mono_kind=settings.mono_kind, **table)
+
+
+def hook_config(settings: RunSettings, priors: Path) -> D2Config:
+    """The hooks of a run with schedules that fit its length, and the user's tables over the defaults."""
+    hooks = tuple(name for name in settings.hooks if name != "prior")
+    config = for_iterations(hooks, settings.iterations, prior=str(priors), seed=settings.seed)
+    tables = {name: settings.overrides.get(name, {}) for name in hooks}
+    return D2Config.from_dict(
+        {name: value for name, value in vars(config).items() if name not in hooks}
+        | {name: vars(getattr(config, name)) | tables[name] for name in hooks}
+    )
