@@ -1,0 +1,95 @@
+"""Cross-source verification and fusion of the two depths into D* (paper, "Dual-source Depth Consistency Prior")."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.protocol import Label
+
+VARIANTS = ("dual", "mono", "mvs", "dual_unaligned", "dual_unverified")
+"""What D* is made of; the paper's full prior and the rows "Prior" of its ablation table.
+
+`dual`: aligned, verified, fused: the method.
+`mono`: aligned monocular depth alone. Geometric depth serves the alignment and is then left out; every pixel counts as
+verified, since the paper runs "identical densification, pruning, and RGB-D optimization" on each row.
+`mvs`: geometric depth alone, every pixel of it counts as verified; no monocular map is used at all.
+`dual_unaligned`: as `dual`, but with a = 1, b = 0. A relative map has no scale, so nearly all of it contradicts D^g.
+`dual_unverified`: aligned, but every geometric depth counts as verified, whatever the monocular map says.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class FusedPrior:
+    """D* [H, W] float32 (0 = empty) and `Label` [H, W] uint8, as numpy arrays."""
+
+    depth: np.ndarray
+    labels: np.ndarray
+
+    def shares(self) -> dict[str, float]:
+        """Share of the pixels that carry each label."""
+        counts = np.bincount(self.labels.ravel(), minlength=len(Label))
+        return {label.name.lower(): float(counts[label] / self.labels.size) for label in Label}
+
+
+def cross_source_discrepancy(mono: np.ndarray, geometric: np.ndarray, epsilon: float = 1e-9) -> np.ndarray:
+    """e = |D-bar^m - D^g| / (D^g + eps), float32 [H, W]; infinite where there is no geometric depth.
+
+    Args:
+        mono: aligned monocular depth D-bar^m [H, W], 0 where it has none (which then disagrees with any D^g).
+        geometric: D^g [H, W], 0 where there is none.
+        epsilon: the paper's eps, world units.
+    """
+    known = geometric > 0
+    relative = np.abs(mono - geometric) / (np.where(known, geometric, 1) + epsilon)
+    return np.where(known, relative, np.inf).astype(np.float32)
+
+
+def verified_region(discrepancy: np.ndarray, tau_c: float) -> np.ndarray:
+    """Omega^v: pixels of Omega^g whose discrepancy is below tau_c, bool [H, W]."""
+    return discrepancy < tau_c
+
+
+def fuse(mono: np.ndarray, geometric: np.ndarray, *, tau_c: float, variant: str = "dual") -> FusedPrior:
+    """D* and its labels from aligned monocular depth and filtered geometric depth.
+
+    Verified pixels take D^g, pixels without D^g the aligned monocular depth, and pixels where the two disagree nothing.
+
+    Args:
+        mono: D-bar^m float [H, W], 0 where it has none.
+        geometric: D^g float [H, W], 0 where it has none.
+        tau_c: largest relative discrepancy of a verified pixel.
+        variant: one of `VARIANTS`; `dual_unaligned` fuses like `dual` and expects the unaligned map as `mono`.
+
+    Raises:
+        D2Error: maps of two sizes, or an unknown variant.
+    """
+    if variant not in VARIANTS:
+        raise unknown_name("prior variant", variant, VARIANTS)
+    if mono.shape != geometric.shape:
+        raise D2Error(f"monocular depth is {mono.shape}, geometric depth {geometric.shape}: bring both to one size")
+    if variant == "mono":
+        return _labelled(mono, np.zeros_like(geometric), mono > 0)
+    if variant == "mvs":
+        return _labelled(np.zeros_like(mono), geometric, geometric > 0)
+    if variant == "dual_unverified":
+        return _labelled(mono, geometric, geometric > 0)
+    return _labelled(mono, geometric, verified_region(cross_source_discrepancy(mono, geometric), tau_c))
+
+
+def empty_prior(shape: tuple[int, int]) -> FusedPrior:
+    """D* of a frame that was refused: no depth anywhere."""
+    return FusedPrior(np.zeros(shape, np.float32), np.zeros(shape, np.uint8))
+
+
+def _labelled(mono: np.ndarray, geometric: np.ndarray, verified: np.ndarray) -> FusedPrior:
+    known = geometric > 0
+    labels = np.full(mono.shape, Label.EMPTY, np.uint8)
+    labels[~known & (mono > 0)] = Label.MONO
+    labels[known] = Label.CONFLICT
+    labels[verified] = Label.VERIFIED
+    supported = (labels == Label.VERIFIED) | (labels == Label.MONO)
+    depth = np.where(supported, np.where(known, geometric, mono), 0)
+    return FusedPrior(depth.astype(np.float32), labels)
