@@ -11,6 +11,8 @@ class StereoSettings:
 
     maker: str = "auto"
     """`patchmatch` (compiled), `sweep` (OpenCV), or `auto`: patchmatch where there is a compiler."""
+    scale: float = 1.0
+    """Pictures are shrunk by this factor before matching; half costs a quarter. Depth comes back at full size."""
     sweep_step: float = 0.5
     """Disparity between neighbouring planes of the sweep, source pixels; above half a pixel the minimum is missed."""
     sweep_window: int = 3

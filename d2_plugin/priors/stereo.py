@@ -1,0 +1,195 @@
+"""Geometric depth of one timestamp: choose a maker, match at the chosen resolution, filter, bring back to full size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from d2_plugin.captures.capture import Camera
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.priors.filter import GeometricDepth, filter_depths
+from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera
+from d2_plugin.priors.settings import StereoSettings
+
+RawDepth = tuple[np.ndarray, np.ndarray]
+"""Planar depth float32 [H, W] (0 = none) and matching cost 1 - NCC float32 [H, W] in 0..2."""
+
+Maker = Callable[[Sequence[np.ndarray], Sequence[Camera], tuple[float, float], StereoSettings], list[RawDepth]]
+"""(grey uint8 [H, W] per camera, cameras, (near, far), settings) -> raw depth and cost per camera."""
+
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601, as every codec of the captures uses
+
+
+class DepthBounds(NamedTuple):
+    """Near and far of a rig in world units, and where they come from."""
+
+    near: float
+    far: float
+    origin: str
+
+
+def _patchmatch(
+    grays: Sequence[np.ndarray], cameras: Sequence[Camera], depth_range: tuple[float, float], settings: StereoSettings
+) -> list[RawDepth]:
+    from d2_plugin.priors.patchmatch import patchmatch
+
+    return patchmatch(grays, cameras, depth_range, settings)
+
+
+def _sweep(
+    grays: Sequence[np.ndarray], cameras: Sequence[Camera], depth_range: tuple[float, float], settings: StereoSettings
+) -> list[RawDepth]:
+    from d2_plugin.priors.sweep import sweep
+
+    return sweep(grays, cameras, depth_range, settings)
+
+
+MAKERS: dict[str, Maker] = {"patchmatch": _patchmatch, "sweep": _sweep}
+
+
+def geometric_depth(
+    images: Sequence[np.ndarray],
+    cameras: Sequence[Camera],
+    depth_range: tuple[float, float],
+    settings: StereoSettings,
+    maker: str | None = None,
+) -> list[GeometricDepth]:
+    """D^g of every view from the synchronized views of one timestamp, and of no other.
+
+    Args:
+        images: RGB uint8 [H, W, 3] per camera.
+        cameras: at least two, in the same order.
+        depth_range: near and far in world units; ten times too wide does no harm.
+        settings: matching and filtering.
+        maker: name in `MAKERS` or `auto`; settings.maker where None.
+
+    Returns:
+        Per camera the filtered depth; empty everywhere where nothing can be known (no texture, one centre).
+
+    Raises:
+        D2Error: fewer than two views, pictures of another size than their camera, an inverted range, an unknown maker.
+    """
+    check_views(images, cameras)
+    depth_range = check_depth_range(depth_range)
+    name = choose_maker(maker or settings.maker, cameras)
+    small = [_shrunk(gray(image), camera, settings.scale) for image, camera in zip(images, cameras)]
+    grays, small_cameras = [pair[0] for pair in small], [pair[1] for pair in small]
+    raw = MAKERS[name](grays, small_cameras, depth_range, settings)
+    filtered = filter_depths(grays, small_cameras, [depth for depth, _ in raw], [cost for _, cost in raw], settings)
+    return [enlarged(result, camera.width, camera.height) for result, camera in zip(filtered, cameras)]
+
+
+def choose_maker(name: str, cameras: Sequence[Camera]) -> str:
+    """The name of the maker that `auto` stands for on this machine, or `name` itself if it is known."""
+    if name != "auto":
+        if name not in MAKERS:
+            raise unknown_name("stereo maker", name, [*MAKERS, "auto"])
+        return name
+    from d2_plugin.compiler import NoCompiler, find_compiler
+
+    try:
+        find_compiler()
+    except NoCompiler:
+        return "sweep"
+    return "patchmatch"
+
+
+def gray(image: np.ndarray) -> np.ndarray:
+    """Luma uint8 [H, W] of an RGB uint8 picture [H, W, 3]."""
+    return np.rint(image.astype(np.float32) @ LUMA).astype(np.uint8)
+
+
+def depth_bounds(cameras: Sequence[Camera], points: np.ndarray | None = None) -> DepthBounds:
+    """Depth range of a rig: from triangulated points, else from what the data set declares, else from the baselines.
+
+    Args:
+        cameras: the cameras that are matched.
+        points: world points [N, 3] triangulated with the known poses, or None.
+
+    Raises:
+        D2Error: nothing tells a range, because all cameras stand at one point.
+    """
+    depths = [] if points is None else [_visible_depths(camera, np.asarray(points, np.float64)) for camera in cameras]
+    depths = [values for values in depths if values.size >= 10]
+    if depths:
+        # COLMAP's own margins around the 1st and 99th percentile of the sparse depths (model.cc, ComputeDepthRanges).
+        near = min(float(np.percentile(values, 1)) for values in depths) * 0.75
+        far = max(float(np.percentile(values, 99)) for values in depths) * 1.25
+        return DepthBounds(near, far, f"{sum(values.size for values in depths)} triangulated observations")
+    declared = [camera.near_far for camera in cameras if camera.near_far is not None]
+    if declared:
+        near, far = min(bounds[0] for bounds in declared), max(bounds[1] for bounds in declared)
+        return DepthBounds(*check_depth_range((near * 0.8, far * 1.2)), "near and far of the data set")
+    return _bounds_from_baselines(cameras)
+
+
+def _bounds_from_baselines(cameras: Sequence[Camera]) -> DepthBounds:
+    """From a disparity of three quarters of the picture for the nearest pair to half a pixel for the farthest."""
+    centres = np.stack([camera.centre for camera in cameras])
+    distances = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    apart = distances[distances > 0]
+    if apart.size == 0:
+        names = ", ".join(camera.name for camera in cameras)
+        raise D2Error(f"cameras {names} stand at one point, so nothing can be triangulated: use cameras that are apart")
+    focal = max(float(camera.K[0, 0]) for camera in cameras)
+    near = min(float(camera.K[0, 0]) / camera.width for camera in cameras) * apart.min() / 0.75
+    return DepthBounds(float(near), float(focal * apart.max() / 0.5), "baselines alone, so it is very wide")
+
+
+def _visible_depths(camera: Camera, points: np.ndarray) -> np.ndarray:
+    local = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    pixels = local @ camera.K.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2]
+    inside = (local[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    return local[inside, 2]
+
+
+def _shrunk(gray: np.ndarray, camera: Camera, scale: float) -> tuple[np.ndarray, Camera]:
+    if scale == 1:
+        return gray, camera
+    from d2_plugin.priors.extras import opencv
+
+    cv2 = opencv("matching at another resolution")
+    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    small = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
+    return small, scaled_camera(camera, width, height)
+
+
+def enlarged(result: GeometricDepth, width: int, height: int, tolerance: float = 0.01) -> GeometricDepth:
+    """The maps at another size: inverse depth, which is linear over a plane, is interpolated between four neighbours.
+
+    Where they differ by more than twice `tolerance`, or one is missing, nothing is known: an interpolated value would
+    hang between two surfaces.
+    """
+    if result.depth.shape == (height, width):
+        return result
+    rows, row_share = _neighbours(result.depth.shape[0], height)
+    columns, column_share = _neighbours(result.depth.shape[1], width)
+    corners = [result.depth[r][:, c] for r in rows for c in columns]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = [1 / corner for corner in corners]
+        top = inverse[0] * (1 - column_share) + inverse[1] * column_share
+        bottom = inverse[2] * (1 - column_share) + inverse[3] * column_share
+        depth = 1 / (top * (1 - row_share)[:, None] + bottom * row_share[:, None])
+    nearest, farthest = np.minimum.reduce(corners), np.maximum.reduce(corners)
+    smooth = (nearest > 0) & (farthest - nearest <= 2 * tolerance * nearest)
+    row, column = np.where(row_share < 0.5, rows[0], rows[1]), np.where(column_share < 0.5, columns[0], columns[1])
+    return replace(
+        result,
+        depth=np.where(smooth, depth, 0).astype(np.float32),
+        cost=result.cost[row][:, column],
+        confirmations=result.confirmations[row][:, column],
+    )
+
+
+def _neighbours(small: int, large: int) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """Indices of the pixels before and after each enlarged pixel's centre, and the share of the one after."""
+    position = (np.arange(large) + 0.5) * (small / large) - 0.5
+    before = np.clip(np.floor(position), 0, small - 1).astype(np.int64)
+    after = np.clip(before + 1, 0, small - 1)
+    share = np.clip(position - before, 0, 1).astype(np.float32)
+    return (before, after), share
