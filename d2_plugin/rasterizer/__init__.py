@@ -16,7 +16,7 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
 
-from . import reference
+from . import native, ops, reference
 
 __all__ = ["DepthPrior", "RasterSettings", "Render", "Splats", "Survey", "View", "rasterize", "survey"]
 
@@ -51,7 +51,8 @@ def rasterize(
         D2Error: shapes, dtypes or devices do not fit together.
     """
     _check(splats, view, settings, colors=colors, background=background, screen_offsets=screen_offsets)
-    return reference.rasterize(splats, colors, view, settings, background, screen_offsets)
+    path = ops if _has_kernels(splats.means) else reference
+    return path.rasterize(splats, colors, view, settings, background, screen_offsets)
 
 
 @torch.no_grad()
@@ -84,7 +85,12 @@ def survey(
             f"the prior of camera '{view.camera}' has depth {tuple(prior.depth.shape)} and labels "
             f"{tuple(prior.labels.shape)} but the view is {size}: resample it to the view's height and width"
         )
-    return reference.survey(splats, view, prior, settings, eps)
+    path = ops if _has_kernels(splats.means) else reference
+    return path.survey(splats, view, prior, settings, eps)
+
+
+def _has_kernels(means: Tensor) -> bool:
+    return means.dtype == torch.float32 and means.device.type == "cpu" and native.available()
 
 
 def _check(splats: Splats, view: View, settings: RasterSettings, **extra: Tensor | None) -> None:

@@ -1,0 +1,180 @@
+// From Gaussians in the world to lists of Gaussians per tile, front to back.
+//
+// Three steps: project Gaussians and count pairs per tile, chunk by chunk; turn counts into places; put every pair in
+// its place and sort each tile by depth (when it is drawn). Pairs enter a tile in the order of Gaussian indices and the
+// sort is stable, so that equal depths keep that order and no result depends on the number of chunks or threads.
+#pragma once
+
+#include <algorithm>
+#include <vector>
+
+#include "frame.h"
+#include "parallel.h"
+
+namespace d2 {
+
+template <class Visit>
+D2_INLINE void for_each_tile(const Record& r, int tiles_x, Visit visit) {
+  if (r.last_x < r.first_x) return;
+  for (int y = r.first_y / TILE_BLOCKS; y <= r.last_y / TILE_BLOCKS; y++)
+    for (int x = r.first_x / TILE_BLOCKS; x <= r.last_x / TILE_BLOCKS; x++) visit(y * tiles_x + x);
+}
+
+// First and last block along one axis whose pixel centres lie within `reach` of `center`; empty: last < first.
+D2_INLINE void block_range(Floats center, Floats reach, int size, float block, float* first, float* last) {
+  const Floats margin = fma(reach, Floats(1e-5f), Floats(1e-4f));  // rounding of the bound must not cut a fragment
+  const Floats low = max(-floor(-(center - reach - margin - Floats(0.5f))), Floats(0.f));
+  const Floats high = min(floor(center + reach + margin - Floats(0.5f)), Floats(float(size - 1)));
+  const Mask some = high >= low;
+  select(some, floor(low * Floats(1 / block)), Floats(1.f)).store(first);
+  select(some, floor(high * Floats(1 / block)), Floats(0.f)).store(last);
+}
+
+D2_INLINE Gaussian<Floats> load_gaussians(const Frame& f, int64_t i, int rows) {
+  Gaussian<Floats> g;
+  for (int k = 0; k < 3; k++) g.mean[k] = load_column(f.means + 3 * i, 3, k, rows);
+  for (int k = 0; k < 6; k++) g.covariance[k] = load_column(f.covariances + 6 * i, 6, k, rows);
+  g.opacity = load_column(f.opacities + i, 1, 0, rows);
+  return g;
+}
+
+// Screen offsets and whether everything besides the geometry is finite.
+D2_INLINE Mask load_extras(const Frame& f, int64_t i, int rows, Floats& offset_x, Floats& offset_y) {
+  offset_x = offset_y = Floats(0.f);
+  if (f.screen_offsets) {
+    offset_x = load_column(f.screen_offsets + 2 * i, 2, 0, rows);
+    offset_y = load_column(f.screen_offsets + 2 * i, 2, 1, rows);
+  }
+  Floats zero = 0.f;
+  if (f.colors)
+    for (int c = 0; c < f.channels; c++) {
+      const Floats color = load_column(f.colors + i * f.channels, f.channels, c, rows);
+      zero = zero + color * Floats(0.f);
+    }
+  return zero >= Floats(0.f);
+}
+
+D2_INLINE void project_group(const Frame& f, int64_t i, int rows, int32_t* counts) {
+  Floats offset_x, offset_y;
+  const Mask finite = load_extras(f, i, rows, offset_x, offset_y);
+  const Projected<Floats> p = project(load_gaussians(f, i, rows), offset_x, offset_y, f.camera, f.constants);
+  alignas(64) float fields[7][LANES], first_x[LANES], last_x[LANES], first_y[LANES], last_y[LANES];
+  const Footprint<Floats>& s = p.footprint;
+  const Floats* parts[7] = {&s.x, &s.y, &s.ux, &s.uy, &s.vy, &s.log2_opacity, &s.depth};
+  for (int k = 0; k < 7; k++) parts[k]->store(fields[k]);
+  block_range(s.x, p.reach.x, f.width, BLOCK_WIDTH, first_x, last_x);
+  block_range(s.y, p.reach.y, f.height, BLOCK_HEIGHT, first_y, last_y);
+  const unsigned visible = lanes(p.visible & finite);
+  const int tiles_x = f.tiles_x();
+  for (int lane = 0; lane < rows; lane++) {
+    Record& r = f.records[i + lane];
+    const bool drawn = (visible >> lane & 1) && last_x[lane] >= first_x[lane] && last_y[lane] >= first_y[lane];
+    if (!drawn) {
+      r.first_x = 1, r.last_x = 0;
+      continue;
+    }
+    r.footprint = {fields[0][lane], fields[1][lane], fields[2][lane], fields[3][lane],
+                   fields[4][lane], fields[5][lane], fields[6][lane]};
+    r.first_x = uint16_t(first_x[lane]), r.last_x = uint16_t(last_x[lane]);
+    r.first_y = uint16_t(first_y[lane]), r.last_y = uint16_t(last_y[lane]);
+    if (f.colors)
+      for (int c = 0; c < f.channels && c < 3; c++) r.color[c] = f.colors[(i + lane) * f.channels + c];
+    for_each_tile(r, tiles_x, [&](int tile) { counts[tile]++; });
+  }
+}
+
+// Fills records and counts; returns the number of pairs.
+inline int64_t project_all(const Frame& f) {
+  const int tiles = f.tile_count();
+  parallel_for(f.threads, f.chunks, [&](int64_t chunk) {
+    int32_t* counts = f.counts + chunk * (tiles + 1);
+    std::fill(counts, counts + tiles + 1, 0);
+    const int64_t end = f.chunk_begin(chunk + 1);
+    for (int64_t i = f.chunk_begin(chunk); i < end; i += LANES)
+      project_group(f, i, int(std::min<int64_t>(LANES, end - i)), counts);
+  });
+  int64_t pairs = 0;
+  for (int tile = 0; tile < tiles; tile++)
+    for (int chunk = 0; chunk < f.chunks; chunk++) {
+      int32_t* row = f.counts + int64_t(chunk) * (tiles + 1);
+      const int32_t here = row[tile];
+      row[tile] = int32_t(pairs);
+      row[tiles] += here;
+      pairs += here;
+    }
+  return pairs;
+}
+
+// A positive float's bits order like the float; the index below makes the order of equal depths that of the indices.
+D2_INLINE uint64_t sort_key(float depth, int64_t index) {
+  uint32_t bits;
+  std::memcpy(&bits, &depth, sizeof bits);
+  return uint64_t(bits) << 32 | uint64_t(index);
+}
+
+// Puts every pair into its tile, in the order of Gaussian indices.
+inline void distribute(const Frame& f, int64_t pairs) {
+  const int tiles = f.tile_count(), tiles_x = f.tiles_x();
+  for (int tile = 0; tile < tiles; tile++) {
+    const int32_t begin = f.counts[tile], end = tile + 1 < tiles ? f.counts[tile + 1] : int32_t(pairs);
+    f.tiles[tile] = {begin, end - begin};
+  }
+  std::vector<int32_t> first_slot(f.chunks + 1);
+  for (int chunk = 0; chunk < f.chunks; chunk++)
+    first_slot[chunk + 1] = first_slot[chunk] + f.counts[int64_t(chunk) * (tiles + 1) + tiles];
+  f.slots[f.count] = int32_t(pairs);
+  parallel_for(f.threads, f.chunks, [&](int64_t chunk) {
+    int32_t* place = f.counts + chunk * (tiles + 1);
+    int32_t slot = first_slot[chunk];
+    const int64_t end = f.chunk_begin(chunk + 1);
+    for (int64_t i = f.chunk_begin(chunk); i < end; i++) {
+      const Record& r = f.records[i];
+      f.slots[i] = slot;
+      const uint64_t key = sort_key(r.footprint.depth, i);
+      for_each_tile(r, tiles_x, [&](int tile) {
+        f.blocks[place[tile]++] = key;
+        slot++;
+      });
+    }
+  });
+}
+
+// Sorts keys by depth, stable: by radix on the digits in which depths differ, or by insertion where they are few.
+inline void sort_by_depth(const uint64_t* keys, int count, std::vector<uint64_t>& out, std::vector<uint64_t>& spare) {
+  out.assign(keys, keys + count);
+  if (count <= 48) {
+    for (int i = 1; i < count; i++) {
+      const uint64_t key = out[i];
+      int k = i;
+      for (; k > 0 && out[k - 1] > key; k--) out[k] = out[k - 1];
+      out[k] = key;
+    }
+    return;
+  }
+  uint32_t low = ~0u, high = 0;
+  for (int i = 0; i < count; i++) {
+    const uint32_t depth = uint32_t(keys[i] >> 32);
+    low = std::min(low, depth), high = std::max(high, depth);
+  }
+  spare.resize(count);
+  const int bits = high > low ? 32 - __builtin_clz(high - low) : 0;
+  const int passes = (bits + 9) / 10, digit = passes ? (bits + passes - 1) / passes : 0;
+  int32_t places[1 << 10];
+  for (int pass = 0; pass < passes; pass++) {
+    const int shift = pass * digit;
+    const uint32_t mask = (1u << digit) - 1;
+    std::fill(places, places + (1 << digit), 0);
+    const auto bucket = [&](uint64_t key) { return (uint32_t(key >> 32) - low) >> shift & mask; };
+    for (uint64_t key : out) places[bucket(key)]++;
+    int32_t total = 0;
+    for (int b = 0; b < 1 << digit; b++) {
+      const int32_t here = places[b];
+      places[b] = total;
+      total += here;
+    }
+    for (uint64_t key : out) spare[places[bucket(key)]++] = key;
+    out.swap(spare);
+  }
+}
+
+}  // namespace d2

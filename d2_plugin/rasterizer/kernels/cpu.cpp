@@ -1,0 +1,423 @@
+// Splatting on the CPU: tiles on threads, blocks of pixels in vectors, Gaussians front to back.
+//
+// The loop over Gaussians is the outer one: a block's pixels stay in the L1 cache while a Gaussian visits the blocks
+// that it reaches, and its constants stay in registers. The backward pass runs front to back as well, peeling what a
+// Gaussian hides off the pixel's total, so that the forward pass has no lists per pixel to save. Sums over pixels go to
+// one slot per (Gaussian, tile) and are added up in the order of tiles: the same bits for any number of threads.
+#include "binning.h"
+
+namespace d2 {
+
+// Buffers of a thread, kept from call to call.
+struct Scratch {
+  std::vector<uint64_t> keys, spare;
+  std::vector<float> memory;
+  float* vectors(size_t count) {
+    memory.resize(count * LANES + 16);
+    const uintptr_t address = reinterpret_cast<uintptr_t>(memory.data());
+    return reinterpret_cast<float*>((address + 63) & ~uintptr_t(63));
+  }
+};
+static thread_local Scratch scratch;
+
+struct Corner {
+  int x, y;  // pixels
+};
+D2_INLINE Corner corner_of(const Frame& f, int tile) {
+  return {tile % f.tiles_x() * TILE_WIDTH, tile / f.tiles_x() * TILE_HEIGHT};
+}
+
+// Calls visit(pixel, place) for the pixels of a tile inside the image: place = lane of a block + LANES * block.
+template <class Visit>
+D2_INLINE void for_each_pixel(const Frame& f, int tile, Visit visit) {
+  const Corner corner = corner_of(f, tile);
+  const int width = std::min(TILE_WIDTH, f.width - corner.x), height = std::min(TILE_HEIGHT, f.height - corner.y);
+  for (int y = 0; y < height; y++)
+    for (int x = 0; x < width; x++) {
+      const int block = y / BLOCK_HEIGHT * TILE_BLOCKS + x / BLOCK_WIDTH;
+      const int lane = y % BLOCK_HEIGHT * BLOCK_WIDTH + x % BLOCK_WIDTH;
+      visit(int64_t(corner.y + y) * f.width + corner.x + x, block, lane);
+    }
+}
+
+// Blocks of the tile at `corner` that a Gaussian may reach, one bit each.
+D2_INLINE uint64_t reached(const Record& r, Corner corner) {
+  const int left = corner.x / BLOCK_WIDTH, top = corner.y / BLOCK_HEIGHT;
+  const int x0 = std::max(r.first_x - left, 0), x1 = std::min(r.last_x - left, TILE_BLOCKS - 1);
+  const int y0 = std::max(r.first_y - top, 0), y1 = std::min(r.last_y - top, TILE_BLOCKS - 1);
+  const uint64_t columns = (uint64_t(2) << x1) - (uint64_t(1) << x0);
+  const uint64_t rows = (~uint64_t(0) >> (8 * (7 - y1))) & (~uint64_t(0) << (8 * y0));
+  return columns * 0x0101010101010101u & rows;
+}
+
+// Distances of a block's pixel centres from a Gaussian's centre, and the fragment there.
+struct Lattice {
+  Floats x, y;  // pixel centres of the tile's first block
+  explicit Lattice(Corner corner) {
+    alignas(64) float along_x[LANES], along_y[LANES];
+    for (int lane = 0; lane < LANES; lane++) {
+      along_x[lane] = corner.x + lane % BLOCK_WIDTH + 0.5f;
+      along_y[lane] = corner.y + lane / BLOCK_WIDTH + 0.5f;
+    }
+    x = Floats::load(along_x), y = Floats::load(along_y);
+  }
+  D2_INLINE Fragment<Floats> at(const Footprint<float>& f, int block) const {
+    const float right = float(block % TILE_BLOCKS * BLOCK_WIDTH), down = float(block / TILE_BLOCKS * BLOCK_HEIGHT);
+    return fragment(f, x - Floats(f.x - right), y - Floats(f.y - down));
+  }
+};
+
+// out[i] = sum of parts[i]
+#if defined(D2_AVX512)
+D2_INLINE __m512 pair_sums(__m512 a, __m512 b) { return _mm512_unpacklo_ps(a, b) + _mm512_unpackhi_ps(a, b); }
+D2_INLINE __m512 quad_sums(__m512 a, __m512 b) {
+  const __m512d x = _mm512_castps_pd(a), y = _mm512_castps_pd(b);
+  return _mm512_castpd_ps(_mm512_unpacklo_pd(x, y)) + _mm512_castpd_ps(_mm512_unpackhi_pd(x, y));
+}
+D2_INLINE __m512 lane_sums(__m512 a, __m512 b) {
+  return _mm512_shuffle_f32x4(a, b, 0x88) + _mm512_shuffle_f32x4(a, b, 0xdd);
+}
+template <int N>
+D2_INLINE void store_sums(const Floats* parts, float* out) {
+  for (int first = 0; first < N; first += 16) {
+    __m512 quads[4];
+    for (int q = 0; q < 4; q++) {
+      const auto part = [&](int i) { return first + 4 * q + i < N ? parts[first + 4 * q + i].v : _mm512_setzero_ps(); };
+      quads[q] = quad_sums(pair_sums(part(0), part(1)), pair_sums(part(2), part(3)));
+    }
+    Floats(lane_sums(lane_sums(quads[0], quads[1]), lane_sums(quads[2], quads[3]))).store(out + first);
+  }
+}
+#else
+template <int N>
+D2_INLINE void store_sums(const Floats* parts, float* out) {
+  for (int i = 0; i < N; i++) out[i] = sum(parts[i]);
+}
+#endif
+
+// Slot of the pair (Gaussian `id`, tile).
+D2_INLINE int64_t slot_of(const Frame& f, const Record& r, int32_t id, Corner corner) {
+  const int x0 = r.first_x / TILE_BLOCKS, y0 = r.first_y / TILE_BLOCKS, across = r.last_x / TILE_BLOCKS - x0 + 1;
+  return f.slots[id] + int64_t(corner.y / TILE_HEIGHT - y0) * across + (corner.x / TILE_WIDTH - x0);
+}
+
+// ---------------------------------------------------------------------------------------------------- forward
+
+// State of a block in the forward pass: transmittance, depth sum, colors.
+template <int FIXED>
+static void render_tile(const Frame& f, int tile) {
+  const int channels = FIXED ? FIXED : f.channels, fields = 2 + channels;
+  float* state = scratch.vectors(size_t(BLOCKS) * fields);
+  std::fill(state, state + BLOCKS * fields * LANES, 0.f);
+  uint64_t alive = 0;
+  for_each_pixel(f, tile, [&](int64_t, int block, int lane) {
+    state[block * fields * LANES + lane] = 1.f;
+    alive |= uint64_t(1) << block;
+  });
+
+  const Corner corner = corner_of(f, tile);
+  const Lattice lattice(corner);
+  const float log2_alpha_min = f.log2_alpha_min();
+  const int32_t begin = f.tiles[tile].begin, pairs = f.tiles[tile].live;
+  sort_by_depth(f.blocks + begin, pairs, scratch.keys, scratch.spare);
+  const uint64_t* keys = scratch.keys.data();
+  int32_t live = begin;
+  for (int q = 0; q < pairs && alive; q++) {
+    if (q + 8 < pairs) __builtin_prefetch(f.records + uint32_t(keys[q + 8]));
+    const uint32_t id = uint32_t(keys[q]);
+    const Record& r = f.records[id];
+    const float* color = FIXED ? r.color : f.colors + int64_t(id) * channels;
+    uint64_t contributes = 0;
+    for (uint64_t left = reached(r, corner) & alive; left; left &= left - 1) {
+      const int block = __builtin_ctzll(left);
+      const Fragment<Floats> here = lattice.at(r.footprint, block);
+      if (!any(here.log2_alpha >= Floats(log2_alpha_min))) continue;
+      float* field = state + block * fields * LANES;
+      const Step<Floats> step = composite(here.log2_alpha, Floats::load(field), log2_alpha_min, f.constants);
+      step.transmittance.store(field);
+      const auto add = [&](int k, float value) {
+        fma(step.weight, Floats(value), Floats::load(field + k * LANES)).store(field + k * LANES);
+      };
+      add(1, r.footprint.depth);
+      for (int c = 0; c < channels; c++) add(2 + c, color[c]);
+      if (any(step.kept)) contributes |= uint64_t(1) << block;
+      if (any(andnot(step.seen, step.kept)) && !any(step.transmittance > Floats(0.f))) alive &= ~(uint64_t(1) << block);
+    }
+    if (contributes) f.ids[live] = int32_t(id), f.blocks[live++] = contributes;
+  }
+  f.tiles[tile].live = live - begin;
+
+  for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
+    const float* field = state + block * fields * LANES + lane;
+    const float transmittance = field[0] < 0 ? -field[0] : field[0];
+    f.alpha[pixel] = 1.f - transmittance;
+    f.depth_sum[pixel] = field[LANES];
+    for (int c = 0; c < channels; c++)
+      f.color[pixel * channels + c] = field[(2 + c) * LANES] + (f.background ? transmittance * f.background[c] : 0.f);
+  });
+}
+
+// ---------------------------------------------------------------------------------------------------- backward
+
+// State of a block in the backward pass: transmittance, what is left of sum of w dL/dw, and dL/d of alpha (with the
+// background's share), depth sum and colors at its pixels.
+static void load_gradients(const Frame& f, int tile, int channels, float* state) {
+  const int fields = 4 + channels;
+  std::fill(state, state + BLOCKS * fields * LANES, 0.f);
+  float* background = f.background_parts ? f.background_parts + int64_t(tile) * channels : nullptr;
+  if (background) std::fill(background, background + channels, 0.f);
+  for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
+    float* field = state + block * fields * LANES + lane;
+    const float alpha = f.alpha[pixel];
+    float on_alpha = f.grad_alpha ? f.grad_alpha[pixel] : 0.f, total = on_alpha * alpha;
+    const float on_depth = f.grad_depth_sum ? f.grad_depth_sum[pixel] : 0.f;
+    total += on_depth * f.depth_sum[pixel];
+    for (int c = 0; c < channels; c++) {
+      const float on_color = f.grad_color ? f.grad_color[pixel * channels + c] : 0.f;
+      const float behind = f.background ? f.background[c] : 0.f;
+      // The image holds (1 - A) background, which is part of the dependence on alpha and not of the sum over Gaussians.
+      total += on_color * (f.color[pixel * channels + c] - behind);
+      on_alpha -= on_color * behind;
+      field[(4 + c) * LANES] = on_color;
+      if (background) background[c] += (1.f - alpha) * on_color;
+    }
+    field[0] = 1.f, field[LANES] = total, field[2 * LANES] = on_alpha, field[3 * LANES] = on_depth;
+  });
+}
+
+template <int FIXED>
+static void backward_tile(const Frame& f, int tile) {
+  const int channels = FIXED ? FIXED : f.channels, fields = 4 + channels;
+  float* state = scratch.vectors(size_t(BLOCKS) * fields + 7 + channels);
+  Floats* loose_sums = reinterpret_cast<Floats*>(state + BLOCKS * fields * LANES);
+  load_gradients(f, tile, channels, state);
+  const Corner corner = corner_of(f, tile);
+  const Lattice lattice(corner);
+  const float log2_alpha_min = f.log2_alpha_min(), log2_alpha_max = f.log2_alpha_max();
+  const int64_t stride = moment_stride(channels);
+  const int32_t begin = f.tiles[tile].begin, end = begin + f.tiles[tile].live;
+  for (int32_t q = begin; q < end; q++) {
+    if (q + 8 < end) {
+      __builtin_prefetch(f.records + f.ids[q + 8]);
+      __builtin_prefetch(f.slots + f.ids[q + 8]);
+    }
+    const int32_t id = f.ids[q];
+    const Record& r = f.records[id];
+    const float* color = FIXED ? r.color : f.colors + int64_t(id) * channels;
+    Floats fixed_sums[7 + (FIXED ? FIXED : 1)];
+    Floats* sums = FIXED ? fixed_sums : loose_sums;
+    for (int k = 0; k < 7 + channels; k++) sums[k] = Floats(0.f);
+    for (uint64_t left = f.blocks[q]; left; left &= left - 1) {
+      const int block = __builtin_ctzll(left);
+      const Fragment<Floats> here = lattice.at(r.footprint, block);
+      float* field = state + block * fields * LANES;
+      const Floats transmittance = Floats::load(field);
+      const Step<Floats> step = composite(here.log2_alpha, transmittance, log2_alpha_min, f.constants);
+      const Floats on_depth = Floats::load(field + 3 * LANES);
+      Floats value = fma(on_depth, Floats(r.footprint.depth), Floats::load(field + 2 * LANES));
+      for (int c = 0; c < channels; c++) {
+        const Floats on_color = Floats::load(field + (4 + c) * LANES);
+        value = fma(on_color, Floats(color[c]), value);
+        sums[7 + c] = fma(step.weight, on_color, sums[7 + c]);
+      }
+      const Floats behind = fnma(step.weight, value, Floats::load(field + LANES));
+      const Floats g = log_alpha_gradient(step, here.log2_alpha, transmittance, value, behind, log2_alpha_max);
+      const Floats gu = g * here.u, gv = g * here.v;
+      sums[0] = sums[0] + g;
+      sums[1] = sums[1] + gu;
+      sums[2] = sums[2] + gv;
+      sums[3] = fma(gu, here.u, sums[3]);
+      sums[4] = fma(gu, here.v, sums[4]);
+      sums[5] = fma(gv, here.v, sums[5]);
+      sums[6] = fma(step.weight, on_depth, sums[6]);
+      step.transmittance.store(field);
+      behind.store(field + LANES);
+    }
+    const int64_t slot = slot_of(f, r, id, corner);
+    f.touched[slot] = 1;
+    float* moments = f.moments + slot * stride;
+    if (FIXED)
+      store_sums<7 + FIXED>(fixed_sums, moments);
+    else
+      for (int k = 0; k < 7 + channels; k++) moments[k] = sum(sums[k]);
+  }
+}
+
+// Adds up the slots of a Gaussian, in the order of tiles.
+D2_INLINE bool gather_moments(const Frame& f, int64_t i, int64_t stride, float* total) {
+  bool any_slot = false;
+  for (int64_t slot = f.slots[i]; slot < f.slots[i + 1]; slot++) {
+    if (!f.touched[slot]) continue;
+    const float* part = f.moments + slot * stride;
+    for (int64_t k = 0; k < stride; k++) total[k] += part[k];
+    any_slot = true;
+  }
+  return any_slot;
+}
+
+static void backward_group(const Frame& f, int64_t i, int rows, float* totals) {
+  const int64_t stride = moment_stride(f.channels);
+  std::fill(totals, totals + LANES * stride, 0.f);
+  alignas(64) float drawn[LANES] = {};
+  for (int lane = 0; lane < rows; lane++) drawn[lane] = gather_moments(f, i + lane, stride, totals + lane * stride);
+  const auto column = [&](int k) { return load_column(totals, stride, k, rows); };
+
+  // Only what `project_backward` reads: the rest of a footprint comes from the Gaussian itself.
+  Floats offset_x, offset_y;
+  load_extras(f, i, rows, offset_x, offset_y);
+  const Gaussian<Floats> g = load_gaussians(f, i, rows);
+  const Projected<Floats> p = project(g, offset_x, offset_y, f.camera, f.constants);
+  const Moments<Floats> m = {column(0), column(1), column(2), column(3), column(4), column(5), column(6)};
+  Gaussian<Floats> out;
+  Floats center_x, center_y;
+  project_backward(g, p.footprint, m, f.camera, f.constants, out, center_x, center_y);
+
+  // A Gaussian that was not drawn may hold anything, NaN included.
+  const Mask mask = Floats::load(drawn) > Floats(0.f);
+  for (int k = 0; k < 3; k++) store_column(where(mask, out.mean[k]), f.grad_means + 3 * i, 3, k, rows);
+  for (int k = 0; k < 6; k++) store_column(where(mask, out.covariance[k]), f.grad_covariances + 6 * i, 6, k, rows);
+  store_column(where(mask, out.opacity), f.grad_opacities + i, 1, 0, rows);
+  for (int c = 0; c < f.channels; c++)
+    store_column(column(7 + c), f.grad_colors + i * f.channels, f.channels, c, rows);
+  if (f.grad_screen_offsets) {
+    store_column(where(mask, center_x), f.grad_screen_offsets + 2 * i, 2, 0, rows);
+    store_column(where(mask, center_y), f.grad_screen_offsets + 2 * i, 2, 1, rows);
+  }
+}
+
+// ---------------------------------------------------------------------------------------------------- survey
+
+// State of a block in the survey: transmittance, depth sum, and at verified pixels 1 / (D* + eps), D* / (D* + eps), 1.
+static void survey_tile(const Frame& f, int tile) {
+  constexpr int fields = 5;
+  float* state = scratch.vectors(size_t(BLOCKS) * fields);
+  std::fill(state, state + BLOCKS * fields * LANES, 0.f);
+  uint64_t alive = 0;
+  for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
+    float* field = state + block * fields * LANES + lane;
+    field[0] = 1.f;
+    alive |= uint64_t(1) << block;
+    const float depth = f.prior_depth[pixel];
+    if (!f.verified[pixel] || !(depth > 0.f) || depth - depth != 0.f) return;
+    const float scale = 1.f / (depth + f.eps);
+    field[2 * LANES] = scale, field[3 * LANES] = depth * scale, field[4 * LANES] = 1.f;
+  });
+
+  const Corner corner = corner_of(f, tile);
+  const Lattice lattice(corner);
+  const float log2_alpha_min = f.log2_alpha_min();
+  const int32_t begin = f.tiles[tile].begin, pairs = f.tiles[tile].live;
+  sort_by_depth(f.blocks + begin, pairs, scratch.keys, scratch.spare);
+  const uint64_t* keys = scratch.keys.data();
+  for (int q = 0; q < pairs && alive; q++) {
+    if (q + 8 < pairs) __builtin_prefetch(f.records + uint32_t(keys[q + 8]));
+    const uint32_t id = uint32_t(keys[q]);
+    const Record& r = f.records[id];
+    const Floats depth = r.footprint.depth;
+    Floats sums[3] = {0.f, 0.f, 0.f};  // weight and error over verified pixels, largest weight
+    int hits = 0;
+    bool contributes = false;
+    for (uint64_t left = reached(r, corner) & alive; left; left &= left - 1) {
+      const int block = __builtin_ctzll(left);
+      const Fragment<Floats> here = lattice.at(r.footprint, block);
+      if (!any(here.log2_alpha >= Floats(log2_alpha_min))) continue;
+      float* field = state + block * fields * LANES;
+      const Step<Floats> step = composite(here.log2_alpha, Floats::load(field), log2_alpha_min, f.constants);
+      step.transmittance.store(field);
+      fma(step.weight, depth, Floats::load(field + LANES)).store(field + LANES);
+      const Floats scale = Floats::load(field + 2 * LANES), true_depth = Floats::load(field + 3 * LANES);
+      const Floats verified = Floats::load(field + 4 * LANES);
+      const Floats error = abs(fma(depth, scale, -true_depth));
+      sums[0] = fma(step.weight, verified, sums[0]);
+      sums[1] = fma(step.weight, error, sums[1]);
+      sums[2] = max(step.weight, sums[2]);
+      hits += count(step.kept & (verified > Floats(0.f)));
+      contributes |= any(step.kept);
+      if (any(andnot(step.seen, step.kept)) && !any(step.transmittance > Floats(0.f))) alive &= ~(uint64_t(1) << block);
+    }
+    if (!contributes) continue;
+    const int64_t slot = slot_of(f, r, int32_t(id), corner);
+    f.touched[slot] = 1;
+    f.statistics[slot] = {sum(sums[0]), sum(sums[1]), largest(sums[2]), float(hits)};
+  }
+
+  for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
+    const float* field = state + block * fields * LANES + lane;
+    f.alpha[pixel] = 1.f - (field[0] < 0 ? -field[0] : field[0]);
+    f.depth_sum[pixel] = field[LANES];
+  });
+}
+
+static void gather_statistics(const Frame& f, int64_t i) {
+  float weight = 0, error = 0, max_weight = 0;
+  int32_t hits = 0;
+  for (int64_t slot = f.slots[i]; slot < f.slots[i + 1]; slot++) {
+    if (!f.touched[slot]) continue;
+    const Statistics& s = f.statistics[slot];
+    weight += s.weight, error += s.error, hits += int32_t(s.hits);
+    max_weight = std::max(max_weight, s.max_weight);
+  }
+  f.weight[i] = weight, f.error[i] = error, f.max_weight[i] = max_weight, f.hits[i] = hits;
+}
+
+}  // namespace d2
+
+// ---------------------------------------------------------------------------------------------------- C ABI
+
+using d2::Frame;
+
+// The order of `tile_count`, `moment_stride` and the steps is fixed by native.py.
+extern "C" {
+
+int32_t d2_tile_count(const Frame* f) { return f->tile_count(); }
+int64_t d2_moment_stride(int32_t channels) { return d2::moment_stride(channels); }
+int64_t d2_frame_size() { return sizeof(Frame); }
+
+// Step 1: projects and counts; returns the number of pairs to allocate for.
+int64_t d2_project(const Frame* f) { return d2::project_all(*f); }
+
+// Step 2, for an image.
+void d2_render(const Frame* f, int64_t pairs) {
+  d2::distribute(*f, pairs);
+  d2::parallel_for(f->threads, f->tile_count(), [&](int64_t tile) {
+    if (f->channels == 3)
+      d2::render_tile<3>(*f, int(tile));
+    else
+      d2::render_tile<0>(*f, int(tile));
+  });
+}
+
+// Step 2, for a survey.
+void d2_survey(const Frame* f, int64_t pairs) {
+  d2::distribute(*f, pairs);
+  std::memset(f->touched, 0, pairs);
+  d2::parallel_for(f->threads, f->tile_count(), [&](int64_t tile) { d2::survey_tile(*f, int(tile)); });
+  d2::parallel_for(f->threads, f->chunks, [&](int64_t chunk) {
+    for (int64_t i = f->chunk_begin(chunk); i < f->chunk_begin(chunk + 1); i++) d2::gather_statistics(*f, i);
+  });
+}
+
+// After d2_render with the same state: gradients of everything.
+void d2_backward(const Frame* f, int64_t pairs) {
+  std::memset(f->touched, 0, pairs);
+  const int tiles = f->tile_count();
+  d2::parallel_for(f->threads, tiles, [&](int64_t tile) {
+    if (f->channels == 3)
+      d2::backward_tile<3>(*f, int(tile));
+    else
+      d2::backward_tile<0>(*f, int(tile));
+  });
+  if (f->grad_background)
+    for (int c = 0; c < f->channels; c++) {
+      double total = 0;
+      for (int tile = 0; tile < tiles; tile++) total += f->background_parts[int64_t(tile) * f->channels + c];
+      f->grad_background[c] = float(total);
+    }
+  d2::parallel_for(f->threads, f->chunks, [&](int64_t chunk) {
+    float* totals = d2::scratch.vectors(size_t(d2::moment_stride(f->channels)));
+    const int64_t end = f->chunk_begin(chunk + 1);
+    for (int64_t i = f->chunk_begin(chunk); i < end; i += d2::LANES)
+      d2::backward_group(*f, i, int(std::min<int64_t>(d2::LANES, end - i)), totals);
+  });
+}
+}

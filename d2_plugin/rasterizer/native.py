@@ -1,0 +1,237 @@
+"""The kernels on the CPU: `kernels/cpu.cpp` through its C ABI.
+
+Compiled at first use (`d2_plugin.compiler`). Tensors are float32, contiguous and on the CPU; `ops` sees to that.
+Runs on `torch.get_num_threads()` threads; results are the same bits for any number of them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import warnings
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from d2_plugin.compiler import NoCompiler, load_library
+from d2_plugin.errors import D2Error
+from d2_plugin.protocol import Survey
+
+KERNELS = Path(__file__).parent / "kernels"
+SOURCES = (KERNELS / "cpu.cpp",)
+HEADERS = tuple(KERNELS / name for name in ("splat.h", "simd.h", "parallel.h", "frame.h", "binning.h"))
+FLAGS = ("-ffp-contract=off",)
+"""The same formula must give the same bits wherever it is inlined; see kernels/simd.h."""
+
+RECORD = 16
+"""Floats of a projected Gaussian, one cache line."""
+
+_float, _int, _long, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_int64, ctypes.c_void_p
+
+
+class Frame(ctypes.Structure):
+    """d2::Frame of kernels/frame.h: everything that one call works on; absent pointers stay null."""
+
+    _fields_ = (
+        ("rotation", _float * 9),
+        ("translation", _float * 3),
+        *((name, _float) for name in ("focal_x", "focal_y", "center_x", "center_y", "image_width", "image_height")),
+        ("constants", _float * 6),
+        *((name, _int) for name in ("width", "height", "channels", "threads", "chunks")),
+        ("eps", _float),
+        ("count", _long),
+        *(
+            (name, _pointer)
+            for name in (
+                *("means", "covariances", "opacities", "colors", "screen_offsets", "background"),
+                *("prior_depth", "verified"),
+                *("records", "slots", "counts", "tiles", "ids", "blocks"),
+                *("color", "depth_sum", "alpha", "grad_color", "grad_depth_sum", "grad_alpha"),
+                *("touched", "moments", "background_parts"),
+                *("grad_means", "grad_covariances", "grad_opacities", "grad_colors"),
+                *("grad_screen_offsets", "grad_background"),
+                *("statistics", "weight", "error", "max_weight", "hits"),
+            )
+        ),
+    )
+
+    def point(self, **tensors: Tensor | None) -> Frame:
+        """Set pointers by name and keep their tensors alive as long as the frame."""
+        for name, tensor in tensors.items():
+            if tensor is not None:
+                setattr(self, name, tensor.data_ptr())
+        self.kept = (*getattr(self, "kept", ()), tensors)
+        return self
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """The compiled kernels.
+
+    Raises:
+        NoCompiler, CompileError: see `d2_plugin.compiler.load_library`.
+    """
+    kernels = load_library("rasterizer", SOURCES, HEADERS, FLAGS)
+    frame = ctypes.POINTER(Frame)
+    signatures = {
+        "d2_frame_size": ((), _long),
+        "d2_tile_count": ((frame,), _int),
+        "d2_moment_stride": ((_int,), _long),
+        "d2_project": ((frame,), _long),
+        "d2_render": ((frame, _long), None),
+        "d2_survey": ((frame, _long), None),
+        "d2_backward": ((frame, _long), None),
+    }
+    for name, (arguments, result) in signatures.items():
+        getattr(kernels, name).argtypes, getattr(kernels, name).restype = arguments, result
+    assert kernels.d2_frame_size() == ctypes.sizeof(Frame), "Frame differs between native.py and kernels/frame.h"
+    return kernels
+
+
+@functools.cache
+def available() -> bool:
+    """Whether the kernels can be had; warns once where they cannot for want of a compiler."""
+    try:
+        library()
+    except NoCompiler as error:
+        warnings.warn(
+            f"{error}. Until then splatting runs in plain torch: the same images and gradients, but orders of "
+            "magnitude slower and with much more memory.",
+            stacklevel=3,
+        )
+        return False
+    return True
+
+
+def rasterize(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    background: Tensor | None,
+    screen_offsets: Tensor | None,
+    T_camera_world: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    constants: list[float],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """color [H, W, C], depth_sum [H, W], alpha [H, W] and the state that `backward` needs (records, lists)."""
+    frame = _frame(T_camera_world, K, width, height, constants, len(means), colors.shape[1])
+    frame.point(means=means, covariances=covariances, opacities=opacities, colors=colors)
+    frame.point(background=background, screen_offsets=screen_offsets)
+    records, lists, pairs = _project(frame, means)
+    color = means.new_empty(height, width, colors.shape[1])
+    depth_sum, alpha = means.new_empty(height, width), means.new_empty(height, width)
+    frame.point(color=color, depth_sum=depth_sum, alpha=alpha)
+    library().d2_render(frame, pairs)
+    return color, depth_sum, alpha, records, lists
+
+
+def backward(
+    grad_color: Tensor | None,
+    grad_depth_sum: Tensor | None,
+    grad_alpha: Tensor | None,
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    background: Tensor | None,
+    screen_offsets: Tensor | None,
+    T_camera_world: Tensor,
+    K: Tensor,
+    constants: list[float],
+    color: Tensor,
+    depth_sum: Tensor,
+    alpha: Tensor,
+    records: Tensor,
+    lists: Tensor,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Gradients of means, covariances, opacities, colors, background [C] and screen_offsets [M, 2]."""
+    height, width, channels = color.shape
+    frame = _frame(T_camera_world, K, width, height, constants, len(means), channels)
+    frame.point(means=means, covariances=covariances, opacities=opacities, colors=colors)
+    frame.point(background=background, screen_offsets=screen_offsets, records=records)
+    frame.point(color=color, depth_sum=depth_sum, alpha=alpha)
+    frame.point(grad_color=grad_color, grad_depth_sum=grad_depth_sum, grad_alpha=grad_alpha)
+    tiles = library().d2_tile_count(frame)
+    pairs = (len(lists) - len(means) - 1 - 2 * tiles) // 3
+    _point_lists(frame, lists, pairs)
+    moments = means.new_empty(pairs, library().d2_moment_stride(channels))
+    touched = torch.empty(pairs, dtype=torch.uint8)
+    gradients = [torch.empty_like(part) for part in (means, covariances, opacities, colors)]
+    gradients += [means.new_empty(channels), means.new_empty(len(means), 2)]
+    parts = means.new_empty(tiles, channels)
+    frame.point(touched=touched, moments=moments, background_parts=parts)
+    frame.point(grad_means=gradients[0], grad_covariances=gradients[1], grad_opacities=gradients[2])
+    frame.point(grad_colors=gradients[3], grad_background=gradients[4], grad_screen_offsets=gradients[5])
+    library().d2_backward(frame, pairs)
+    return tuple(gradients)
+
+
+def survey(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    prior_depth: Tensor,
+    verified: Tensor,
+    T_camera_world: Tensor,
+    K: Tensor,
+    constants: list[float],
+    eps: float,
+) -> Survey:
+    """See `d2_plugin.rasterizer.survey`; `verified` [H, W] bool, `prior_depth` [H, W] float32."""
+    height, width = prior_depth.shape
+    frame = _frame(T_camera_world, K, width, height, constants, len(means), 0)
+    frame.eps = eps
+    frame.point(means=means, covariances=covariances, opacities=opacities)
+    frame.point(prior_depth=prior_depth, verified=verified)
+    _, _, pairs = _project(frame, means)
+    touched, statistics = torch.empty(pairs, dtype=torch.uint8), means.new_empty(pairs, 4)
+    weight, error, max_weight = (torch.empty_like(opacities) for _ in range(3))
+    hits = torch.empty(len(means), dtype=torch.int32)
+    depth_sum, alpha = torch.empty_like(prior_depth), torch.empty_like(prior_depth)
+    frame.point(touched=touched, statistics=statistics, depth_sum=depth_sum, alpha=alpha)
+    frame.point(weight=weight, error=error, max_weight=max_weight, hits=hits)
+    library().d2_survey(frame, pairs)
+    return Survey(weight, error, max_weight, hits, depth_sum, alpha)
+
+
+def _frame(
+    T_camera_world: Tensor, K: Tensor, width: int, height: int, constants: list[float], count: int, channels: int
+) -> Frame:
+    frame = Frame(width=width, height=height, channels=channels, count=count, threads=torch.get_num_threads())
+    frame.chunks = min(4 * frame.threads, max(1, count // 256))
+    rows = T_camera_world.tolist()
+    frame.rotation[:] = [*rows[0][:3], *rows[1][:3], *rows[2][:3]]
+    frame.translation[:] = [row[3] for row in rows[:3]]
+    (frame.focal_x, skew, frame.center_x), (_, frame.focal_y, frame.center_y), _ = K.tolist()
+    if skew != 0:
+        raise D2Error(f"K has skew {skew}, expected 0: undistort the pictures to a pinhole camera without skew")
+    frame.image_width, frame.image_height = width, height
+    frame.constants[:] = constants
+    return frame
+
+
+def _project(frame: Frame, means: Tensor) -> tuple[Tensor, Tensor, int]:
+    """Records [M, 16], an empty buffer for the lists of pairs, and their number."""
+    tiles = library().d2_tile_count(frame)
+    records = means.new_empty(len(means), RECORD)
+    counts = torch.empty(frame.chunks * (tiles + 1), dtype=torch.int32)
+    pairs = library().d2_project(frame.point(records=records, counts=counts))
+    if pairs > 2**31 - 1:
+        raise D2Error(f"{pairs} pairs of Gaussian and tile, at most 2^31 - 1 are possible: use a smaller image")
+    lists = torch.empty(3 * pairs + len(means) + 1 + 2 * tiles, dtype=torch.int32)
+    _point_lists(frame, lists, pairs)
+    return records, lists, pairs
+
+
+def _point_lists(frame: Frame, lists: Tensor, pairs: int) -> None:
+    """One buffer: blocks (64 bit) [pairs], ids [pairs], slots [M + 1], tiles [tiles, 2]."""
+    frame.kept = (*frame.kept, lists)
+    start = lists.data_ptr()
+    frame.blocks = start
+    frame.ids = start + 8 * pairs
+    frame.slots = start + 12 * pairs
+    frame.tiles = start + 12 * pairs + 4 * (frame.count + 1)
