@@ -88,16 +88,16 @@ def prune(model: Yang4D, settings: DensifySettings) -> None:
 def _scatter_children(rows: dict[str, Tensor], children: slice, generator: torch.Generator) -> None:
     """Move split children to samples of their parent Gaussian (in 4D where there is time) and shrink them by 1.6."""
     temporal = "times" in rows
-    left = normalized_quaternions(rows["left"][children])
+    left = normalized_quaternions(rows["left"][children].T)
     scales = rows["log_scales"][children].exp()
     if temporal:
-        right = normalized_quaternions(rows["right"][children])
+        right = normalized_quaternions(rows["right"][children].T)
         scales = torch.cat([scales, rows["log_time_scales"][children].exp()[:, None]], -1)
         rotation = rotation_matrices_4d(left, right)
     else:
         rotation = rotation_matrices_3d(left)
     noise = torch.randn(scales.shape, generator=generator, dtype=scales.dtype).to(scales.device)
-    offset = (rotation @ (scales * noise)[..., None]).squeeze(-1)
+    offset = (rotation * (scales * noise).T).sum(1).T
     rows["positions"][children] += offset[:, :3]
     rows["log_scales"][children] -= torch.log(torch.tensor(1.6))
     if temporal:

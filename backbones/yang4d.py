@@ -94,25 +94,25 @@ class Yang4D:
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time` (paper: the selected temporal parameterization), differentiable."""
         g = self.gaussians
-        scales = g["log_scales"].clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
-        left = normalized_quaternions(g["left"])
         opacities = torch.sigmoid(g["opacity_logits"])
+        scales = _components(g["log_scales"]).clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
+        left = normalized_quaternions(_components(g["left"]))
         if not self.settings.temporal:
-            covariances = covariances_from_factors(rotation_matrices_3d(left) * scales[:, None])
+            covariances = covariances_from_factors(rotation_matrices_3d(left) * scales)
             return Splats(g["positions"], covariances, opacities, torch.arange(len(g), device=g.device))
         time_scales = g["log_time_scales"].clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
-        scales = torch.cat([scales, time_scales[:, None]], -1)
-        right = normalized_quaternions(g["right"])
-        variance = (time_row(left, right) * scales).square().sum(-1)
+        scales = torch.cat([scales, time_scales[None]])
+        right = normalized_quaternions(_components(g["right"]))
         offset = view.time - g["times"]
-        marginal = temporal_marginal(offset, variance)
+        marginal = temporal_marginal(offset, (time_row(left, right) * scales).square().sum(0))
         rows = torch.nonzero(marginal.detach() > MARGINAL_CUT).squeeze(-1)
-        tensors = (g["positions"], left, right, scales, offset, opacities * marginal)
+        positions, opacities = _components(g["positions"]), opacities * marginal
         if len(rows) < len(g):  # Gaussians outside their temporal support are never projected
-            tensors = tuple(t[rows] for t in tensors)
-        positions, left, right, scales, offset, opacities = tensors
-        factors, velocity = condition_on_time(rotation_matrices_4d(left, right) * scales[:, None])
-        return Splats(positions + velocity * offset[:, None], covariances_from_factors(factors), opacities, rows)
+            tensors = (positions, left, right, scales, offset, opacities)
+            positions, left, right, scales, offset, opacities = (t[..., rows] for t in tensors)
+        factors, velocity = condition_on_time(rotation_matrices_4d(left, right) * scales)
+        means = (positions + velocity * offset).T.contiguous()
+        return Splats(means, covariances_from_factors(factors), opacities, rows)
 
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] of the sliced Gaussians as seen in `view`."""
@@ -188,6 +188,11 @@ class Yang4D:
             "harmonics": s.color_rate / 20,
         }
         return {name: rates[name] for name in rows}
+
+
+def _components(rows: Tensor) -> Tensor:
+    """[K, N] contiguous from [N, K]: what the functions of rotation4d work on."""
+    return rows.T.contiguous()
 
 
 _STATISTICS = ("screen_gradient", "seen")
