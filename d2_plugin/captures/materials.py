@@ -79,7 +79,7 @@ def books(rng: np.random.Generator, shelves: int = 3, count: int = 17) -> np.nda
     shelf = np.floor(v * shelves).astype(int)
     edges = np.sort(rng.uniform(0, 1, (shelves, count)), axis=1)
     book = (u[..., None] > edges[shelf]).sum(axis=-1) % count
-    color = rng.uniform(0.12, 0.85, (shelves, count, 3))[shelf, book]
+    color = rng.uniform(0.12, 0.7, (shelves, count, 3))[shelf, book]
     height = (v * shelves) % 1
     band = np.abs(height - rng.uniform(0.3, 0.75, (shelves, count))[shelf, book]) < 0.05
     color = np.where(band[..., None], 0.5 * color + 0.45, color) + 0.04 * clouds(rng, finest=8)[..., None]
@@ -87,11 +87,14 @@ def books(rng: np.random.Generator, shelves: int = 3, count: int = 17) -> np.nda
     return np.clip(color * (1 - wood) + np.array([0.36, 0.25, 0.16]) * wood, 0, 1)
 
 
-def confetti(rng: np.random.Generator, ground: tuple[float, float, float], spots: int = 60) -> np.ndarray:
-    """Coloured disks of many sizes on a plain ground: posters, toys, patterned cloth."""
+def confetti(
+    rng: np.random.Generator, ground: tuple[float, float, float], spots: int = 60, muted: float = 0.0
+) -> np.ndarray:
+    """Coloured disks of many sizes on a plain ground, `muted` (0..1) towards it: posters, toys, patterned cloth."""
     texture = _tinted(ground, 0.05 * clouds(rng, finest=10))
     radii = np.sort(rng.uniform(0.02, 0.11, spots))[::-1] * SIZE
-    for radius, centre, color in zip(radii, rng.uniform(0, SIZE, (spots, 2)), rng.uniform(0.05, 0.95, (spots, 3))):
+    colors = muted * np.array(ground) + (1 - muted) * rng.uniform(0.05, 0.95, (spots, 3))
+    for radius, centre, color in zip(radii, rng.uniform(0, SIZE, (spots, 2)), colors):
         reach = math.ceil(radius) + 1
         rows, columns = (np.arange(int(middle) - reach, int(middle) + reach + 1) for middle in centre)
         distance = np.hypot(rows[:, None] + 0.5 - centre[0], columns + 0.5 - centre[1])

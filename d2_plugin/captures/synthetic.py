@@ -118,7 +118,7 @@ def furnished_room(seed: int, moving: bool) -> Scene:
         _box((-1.45, 1.1, 0.35), (0.35, 0.35, 0.35), 24, materials.crate(rng), 0.7),
         _box((-1.35, 1.12, 0.88), (0.2, 0.15, 0.18), -15, materials.confetti(rng, (0.2, 0.42, 0.38)), 0.6),
         _box((-0.2, 1.98, 1.55), (0.55, 0.015, 0.4), 0, materials.confetti(rng, (0.93, 0.9, 0.8)), 1.1),
-        _box((0.1, 0.1, 0.008), (1.2, 0.8, 0.008), 0, materials.confetti(rng, (0.5, 0.16, 0.18), 120), 1.2),
+        _box((0.1, 0.1, 0.008), (1.2, 0.8, 0.008), 0, materials.confetti(rng, (0.5, 0.16, 0.18), 120, muted=0.45), 1.2),
         Solid(_rolling(moving), materials.beach_ball(rng), np.full(3, 0.27), radius=0.27),
         Solid(_turning(moving), materials.confetti(rng, (0.92, 0.72, 0.16), 40), np.array([0.2, 0.2, 0.2]), repeat=0.4),
     )
