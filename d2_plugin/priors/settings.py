@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from d2_plugin.captures.capture import MonoKind
+from d2_plugin.errors import unknown_name
 
 
 @dataclass(frozen=True)
@@ -77,3 +82,51 @@ class AlignSettings:
     """Fit only inliers of a least-median-of-squares line: every convex fit breaks at 40 % leverage outliers."""
     seed: int = 0
     """Seed of the subsampling and of the leverage guard."""
+
+
+@dataclass(frozen=True)
+class PriorSettings:
+    """Everything that decides what D* of a capture is."""
+
+    variant: str = "dual"
+    """What D* is made of: `dual`, or one of the paper's ablation rows (see `d2_plugin.priors.fuse.VARIANTS`)."""
+    tau_c: float = 0.1
+    """A geometric depth is verified when aligned monocular depth differs by less than this share of it."""
+    z_far_factor: float = 3.0
+    """Aligned monocular depth beyond this multiple of the 99.5 percentile of the anchors is left empty."""
+    depth_range: tuple[float, float] | None = None
+    """Near and far of the stereo search, world units; by default from sparse points, the data set, or the baselines."""
+    mono_onnx: str | None = None
+    """Path of a monocular ONNX network; the capture's own maps on disk where None."""
+    mono_kind: MonoKind | None = None
+    """What the network predicts: `relative` (inverse depth) or `metric`; required with `mono_onnx`."""
+    mono_preprocessing: str = "auto"
+    """Of the network's input: `depth_anything_v2`, `unit`, or `auto`."""
+    mono_threads: int = 1
+    """Threads of one inference."""
+    stereo: StereoSettings = field(default_factory=StereoSettings)
+    """Geometric depth."""
+    align: AlignSettings = field(default_factory=AlignSettings)
+    """Alignment and its acceptance."""
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> PriorSettings:
+        """From a table as TOML gives it, with the tables `stereo` and `align` inside; what is absent keeps its default.
+
+        Raises:
+            D2Error: an unknown name, with the nearest one suggested.
+        """
+        tables = {"stereo": StereoSettings, "align": AlignSettings}
+        known = {name: kind(**_known(kind, name, values[name])) for name, kind in tables.items() if name in values}
+        plain = _known(cls, "priors", {name: value for name, value in values.items() if name not in tables})
+        if isinstance(plain.get("depth_range"), list):
+            plain["depth_range"] = tuple(plain["depth_range"])
+        return cls(**plain, **known)
+
+
+def _known(kind: type, table: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    names = [entry.name for entry in fields(kind)]
+    for name in values:
+        if name not in names:
+            raise unknown_name(f"setting in [{table}]", name, names)
+    return dict(values)

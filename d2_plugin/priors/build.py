@@ -1,0 +1,244 @@
+"""Building the priors of a capture: per frame stereo, per picture a monocular map, alignment, verification, fusion."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.captures.capture import Capture
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.priors.align import Alignment, align, aligned_depth, not_aligned
+from d2_plugin.priors.fuse import VARIANTS, FusedPrior, empty_prior, fuse
+from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.priors.sources import (
+    Frame,
+    GeometricSource,
+    MonoSource,
+    StoredDepth,
+    describe_camera,
+    hash_of,
+    mono_source,
+)
+from d2_plugin.priors.stereo import DepthBounds, depth_bounds
+from d2_plugin.priors.store import PriorStore
+
+__all__ = ["PriorSettings", "PriorSummary", "build_priors"]
+
+FUSION_VERSION = 1  # raise it when alignment or fusion change what they return
+
+NO_GEOMETRY = "no geometric depth survived the filter"
+NO_MAP = "there is no monocular map of this frame"
+SCALE_UNKNOWN = "one camera and a relative monocular map: its scale cannot be known"
+
+Progress = Callable[[int, int, str], None]
+"""(pictures done, pictures in all, what was just done)."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class PriorSummary:
+    """What a build did: mean shares of the labels per camera, refused views and why, notes on what was left out."""
+
+    built: int = 0
+    kept: int = 0
+    shares: dict[str, dict[str, float]] = field(default_factory=dict)
+    refused: list[tuple[str, int, str]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    _counts: Counter[str] = field(default_factory=Counter)
+
+    def add(self, camera: str, frame: int, record: dict[str, Any], built: bool) -> None:
+        """Take one view's record into account."""
+        self.built, self.kept = self.built + built, self.kept + (not built)
+        count = self._counts[camera]
+        mean = self.shares.setdefault(camera, dict.fromkeys(record["shares"], 0.0))
+        for label, share in record["shares"].items():
+            mean[label] += (share - mean[label]) / (count + 1)
+        self._counts[camera] += 1
+        if record["refused"]:
+            self.refused.append((camera, frame, record["refused"]))
+
+    def __str__(self) -> str:
+        lines = [f"{self.built} priors built, {self.kept} kept", f"{'camera':12}verified  mono only  conflict   empty"]
+        for camera, share in self.shares.items():
+            values = (share[name] for name in ("verified", "mono", "conflict", "empty"))
+            lines.append(f"{camera:12}" + "  ".join(f"{value:8.1%}" for value in values))
+        reasons = Counter(reason for _, _, reason in self.refused)
+        for reason, count in reasons.most_common():
+            examples = [f"{camera}/{frame}" for camera, frame, why in self.refused if why == reason][:3]
+            lines.append(f"refused {count}x ({', '.join(examples)}{', ...' if count > 3 else ''}): {reason}")
+        return "\n".join([*lines, *self.notes])
+
+
+def build_priors(
+    capture: Capture,
+    cameras: Sequence[str],
+    output: Path | str,
+    settings: PriorSettings,
+    *,
+    sparse_points: np.ndarray | None = None,
+    progress: Progress | None = None,
+) -> PriorSummary:
+    """Build what is missing of the priors of `cameras` in the store at `output`.
+
+    Geometric depth of a frame comes from these cameras at that timestamp and from no other. A view that must be refused
+    gets an empty prior and a reason; nothing is lost. A build that was killed goes on where it stopped.
+
+    Args:
+        capture: the recording.
+        cameras: the training cameras; held-out ones must not be among them.
+        output: folder of the store.
+        settings: everything that decides what D* is.
+        sparse_points: world points [N, 3] triangulated with the known poses, for the depth range.
+        progress: called after every picture.
+
+    Raises:
+        D2Error: unknown cameras, no depth source at all, or a folder that holds something else.
+    """
+    builder = _Builder(capture, list(cameras), Path(output), settings, sparse_points)
+    summary = PriorSummary(notes=builder.notes)
+    total, done = len(capture.frames) * len(builder.names), 0
+    for frame in capture.frames:
+        for camera, record, built in builder.build(frame):
+            summary.add(camera, frame, record, built)
+            done += 1
+            if progress is not None:
+                progress(done, total, f"camera {camera}, frame {frame}: {record['shares']['verified']:.0%} verified")
+    return summary
+
+
+class _Builder:
+    """The sources, settings and store of one build."""
+
+    def __init__(
+        self, capture: Capture, names: list[str], output: Path, settings: PriorSettings, points: np.ndarray | None
+    ) -> None:
+        self.capture, self.names, self.notes = capture, names, []
+        _check(capture, names, settings)
+        self.cameras = [capture.cameras[name] for name in names]
+        self.mono = None if settings.variant == "mvs" else mono_source(capture, settings, output / "cache" / "mono")
+        self.bounds: DepthBounds | None = None
+        self.geometric: GeometricSource | None = None
+        if len(names) > 1:
+            self.bounds = _rounded(depth_bounds(self.cameras, points), settings.depth_range)
+            folder = output / "cache" / "stereo"
+            self.geometric = GeometricSource(self.cameras, self.bounds, settings.stereo, folder)
+        self.settings, self.variant = settings, self._variant(settings.variant)
+        self.store = PriorStore.create(output, names, capture.frames, {"capture": capture.name})
+
+    def _variant(self, wanted: str) -> str:
+        """The variant that the sources at hand allow; what is left out is noted."""
+        if self.geometric is not None and self.mono is not None:
+            return wanted
+        if self.geometric is not None:
+            if wanted != "mvs":
+                self.notes.append("no monocular depth: geometric depth counts as verified without a second source")
+            return "mvs"
+        if self.mono is None:
+            raise D2Error(
+                f"{self.capture.name} with one camera has no depth source: give a metric monocular network, or a "
+                "second camera"
+            )
+        self.notes.append("one camera: no geometric depth, so nothing is verified and nothing can prune or supervise")
+        return wanted
+
+    def build(self, number: int) -> Iterator[tuple[str, dict[str, Any], bool]]:
+        """(camera, record, whether it was built now) for every camera of one frame."""
+        frame = Frame.read(self.capture, self.names, number)
+        keys = {name: self._key(name, frame) for name in self.names}
+        missing = [name for name in self.names if not self.store.is_current(name, number, keys[name])]
+        geometric = self.geometric.depths(frame) if self.geometric is not None and missing else {}
+        for name in self.names:
+            if name in missing:
+                prior, record = self._prior(name, frame, geometric.get(name))
+                self.store.write(name, number, prior, {**record, "key": keys[name]})
+            yield name, self.store.record(name, number), name in missing
+
+    def _key(self, name: str, frame: Frame) -> str:
+        return hash_of(
+            FUSION_VERSION,
+            self.variant,
+            self.settings.tau_c,
+            self.settings.z_far_factor,
+            asdict(self.settings.align),
+            None if self.geometric is None else self.geometric.key(frame),
+            None if self.mono is None else self.mono.key(name, frame),
+        )
+
+    def _prior(self, name: str, frame: Frame, stereo: StoredDepth | None) -> tuple[FusedPrior, dict[str, Any]]:
+        shape = frame.images[name].shape[:2]
+        geometric = np.zeros(shape, np.float32) if stereo is None else stereo.depth
+        alignment, mono, refused = self._aligned(name, frame, geometric)
+        fused = fuse(mono, geometric, tau_c=self.settings.tau_c, variant=self.variant)
+        prior = empty_prior(shape) if refused else fused
+        record = {
+            "refused": refused,
+            "shares": prior.shares(),
+            "variant": self.variant,
+            "alignment": None if alignment is None else alignment.as_json(),
+            "monocular": None if self.mono is None else self.mono.about,
+            "stereo": None if stereo is None else {k: v for k, v in stereo.record.items() if k != "checksum"},
+            "bounds": None if self.bounds is None else list(self.bounds),
+            "settings": asdict(self.settings),
+            "camera": describe_camera(self.capture.cameras[name]),
+            "image": frame.hashes[name],
+        }
+        return prior, record
+
+    def _aligned(
+        self, name: str, frame: Frame, geometric: np.ndarray
+    ) -> tuple[Alignment | None, np.ndarray, str]:
+        """The alignment, aligned monocular depth [H, W], and why the view is refused (empty where it is not)."""
+        nothing = np.zeros_like(geometric)
+        if self.mono is None:
+            return None, nothing, "" if geometric.any() else NO_GEOMETRY
+        prediction = self.mono.map(name, frame)
+        if prediction is None:
+            return None, nothing, NO_MAP
+        if self.geometric is None and self.mono.kind == "relative":
+            return None, nothing, SCALE_UNKNOWN
+        alignment = self._fit(prediction, geometric, self.mono)
+        if not alignment.accepted:
+            return alignment, nothing, alignment.status.value
+        anchors = geometric[geometric > 0]
+        z_far = self.settings.z_far_factor * float(np.percentile(anchors, 99.5)) if anchors.size else np.inf
+        return alignment, aligned_depth(prediction, alignment, z_far), ""
+
+    def _fit(self, prediction: np.ndarray, geometric: np.ndarray, mono: MonoSource) -> Alignment:
+        """The alignment; a metric map is taken as it is where there is no geometric depth to fit it to."""
+        if self.geometric is None or self.variant == "dual_unaligned":
+            return not_aligned(mono.kind)
+        return align(prediction, geometric, kind=mono.kind, settings=self.settings.align)
+
+
+
+
+def _rounded(bounds: DepthBounds, chosen: tuple[float, float] | None) -> DepthBounds:
+    """Bounds to two digits, outwards: triangulation draws random samples, and its last digits must not void a cache."""
+    if chosen is not None:
+        return DepthBounds(*chosen, "setting depth_range")
+
+    def outwards(value: float, towards: Callable[[float], int]) -> float:
+        unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+        return towards(value / unit) * unit
+
+    return DepthBounds(outwards(bounds.near, math.floor), outwards(bounds.far, math.ceil), bounds.origin)
+
+
+def _check(capture: Capture, names: list[str], settings: PriorSettings) -> None:
+    if not names:
+        raise D2Error("no camera was chosen for the priors: name at least one")
+    for name in names:
+        if name not in capture.cameras:
+            raise unknown_name("camera", name, capture.cameras)
+    if len(set(names)) < len(names):
+        raise D2Error(f"a camera is named twice in {', '.join(names)}: name each once")
+    if settings.variant not in VARIANTS:
+        raise unknown_name("prior variant", settings.variant, VARIANTS)

@@ -1,0 +1,198 @@
+"""The two depths that D* is made of, each with a cache on disk: monocular maps and geometric depth of one frame."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from d2_plugin.captures.capture import Camera, Capture, MonoKind
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.files import EntryFolder
+from d2_plugin.priors.monocular import MonocularModel, upsample
+from d2_plugin.priors.settings import PriorSettings, StereoSettings
+from d2_plugin.priors.stereo import DepthBounds, choose_maker, geometric_depth
+from d2_plugin.priors.store import DepthRange
+
+STEREO_VERSION = 1  # raise it when makers or filter change what they return, so that caches are not trusted
+MONO_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The synchronized pictures of one timestamp and their hashes, by camera."""
+
+    number: int
+    images: dict[str, np.ndarray]
+    hashes: dict[str, str]
+
+    @classmethod
+    def read(cls, capture: Capture, cameras: Sequence[str], number: int) -> Frame:
+        """Read the pictures of `cameras` at one frame."""
+        images = {camera: capture.image(camera, number) for camera in cameras}
+        return cls(number, images, {camera: digest(image) for camera, image in images.items()})
+
+
+class MonoSource(Protocol):
+    """Where monocular maps come from."""
+
+    kind: MonoKind
+    about: str
+
+    def key(self, camera: str, frame: Frame) -> str:
+        """Hash of everything the map depends on."""
+
+    def map(self, camera: str, frame: Frame) -> np.ndarray | None:
+        """The map float32 [H, W] at the picture's size, or None where there is none."""
+
+
+class MapsOnDisk:
+    """Monocular maps that lie beside the pictures of a capture."""
+
+    def __init__(self, capture: Capture) -> None:
+        self.capture, self.kind = capture, capture.mono_kind
+        self.about = f"{self.kind} maps on disk" + (" (emulated)" if capture.mono_emulated else "")
+
+    def key(self, camera: str, frame: Frame) -> str:
+        """Hash of the map itself."""
+        stored = self.capture.mono(camera, frame.number)
+        return "none" if stored is None else digest(stored)
+
+    def map(self, camera: str, frame: Frame) -> np.ndarray | None:
+        """The stored map, enlarged to the picture."""
+        stored = self.capture.mono(camera, frame.number)
+        return None if stored is None else upsample(stored, *frame.images[camera].shape[:2])
+
+
+class MapsFromNetwork:
+    """Predictions of an ONNX network, cached at the network's output size."""
+
+    def __init__(self, model: MonocularModel, cache: Path) -> None:
+        self.model, self.kind, self.entries = model, model.kind, EntryFolder(cache)
+        self.about = f"{model.kind} maps of {model.path.name} on {model.provider}, preprocessing {model.preprocessing}"
+        self._fingerprint = model.fingerprint()
+
+    def key(self, camera: str, frame: Frame) -> str:
+        """Hash of network and picture."""
+        return hash_of(MONO_VERSION, self._fingerprint, frame.hashes[camera])
+
+    def map(self, camera: str, frame: Frame) -> np.ndarray:
+        """The prediction, computed once."""
+        key = self.key(camera, frame)
+        entry = self.entries.find_current(camera, frame.number, key)
+        if entry is None:
+            prediction = self.model.predict(frame.images[camera])
+            self.entries.write(camera, frame.number, prediction, {"key": key, "about": self.about})
+        else:
+            prediction = entry.array()
+        return upsample(prediction, *frame.images[camera].shape[:2])
+
+
+def mono_source(capture: Capture, settings: PriorSettings, cache: Path) -> MonoSource | None:
+    """The monocular source that settings and capture name, or None where there is none.
+
+    Raises:
+        D2Error: a network without a declared kind, or a declared kind that contradicts the capture's.
+    """
+    if settings.mono_onnx:
+        if settings.mono_kind is None:
+            raise D2Error(
+                f"what {settings.mono_onnx} predicts is not declared: say mono_kind = relative (inverse depth, as most "
+                "Depth Anything V2 models) or metric"
+            )
+        model = MonocularModel(
+            settings.mono_onnx, settings.mono_kind, settings.mono_preprocessing, settings.mono_threads
+        )
+        return MapsFromNetwork(model, cache)
+    if capture.mono_kind is None:
+        return None
+    if settings.mono_kind not in (None, capture.mono_kind):
+        raise D2Error(
+            f"mono_kind = {settings.mono_kind} but the maps of {capture.name} are declared {capture.mono_kind}: "
+            "leave mono_kind out, or correct cameras.json"
+        )
+    return MapsOnDisk(capture)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredDepth:
+    """D^g of one view as the cache gives it back: `depth` float32 [H, W] (0 = none) and what is recorded about it."""
+
+    depth: np.ndarray
+    record: dict[str, Any]
+
+
+class GeometricSource:
+    """Filtered geometric depth of all cameras, one timestamp at a time, cached as 16-bit logarithmic depth."""
+
+    def __init__(
+        self, cameras: Sequence[Camera], bounds: DepthBounds, settings: StereoSettings, cache: Path
+    ) -> None:
+        self.cameras, self.bounds, self.settings = list(cameras), bounds, settings
+        self.maker = choose_maker(settings.maker, self.cameras)
+        self.entries = EntryFolder(cache)
+
+    def key(self, frame: Frame) -> str:
+        """Hash of pictures, cameras, range and settings: of all views, since each depends on all."""
+        return hash_of(
+            STEREO_VERSION,
+            self.maker,
+            asdict(self.settings),
+            list(self.bounds[:2]),
+            [describe_camera(camera) for camera in self.cameras],
+            [frame.hashes[camera.name] for camera in self.cameras],
+        )
+
+    def depths(self, frame: Frame) -> dict[str, StoredDepth]:
+        """D^g by camera name; what the cache holds already is not computed again."""
+        key = self.key(frame)
+        stored = {camera.name: self._stored(camera.name, frame.number, key) for camera in self.cameras}
+        if any(depth is None for depth in stored.values()):
+            self._compute(frame, key)
+            stored = {camera.name: self._stored(camera.name, frame.number, key) for camera in self.cameras}
+        return stored
+
+    def _stored(self, camera: str, frame: int, key: str) -> StoredDepth | None:
+        entry = self.entries.find_current(camera, frame, key)
+        if entry is None:
+            return None
+        return StoredDepth(DepthRange(*entry.record["depth_range"]).decode(entry.array()), entry.record)
+
+    def _compute(self, frame: Frame, key: str) -> None:
+        images = [frame.images[camera.name] for camera in self.cameras]
+        results = geometric_depth(images, self.cameras, self.bounds[:2], self.settings, self.maker)
+        for camera, result in zip(self.cameras, results):
+            depth_range = DepthRange.of(result.depth)
+            record = {
+                "key": key,
+                "maker": self.maker,
+                "depth_range": [depth_range.near, depth_range.far],
+                "survivors": {name: int(count) for name, count in result.survivors.items()},
+            }
+            self.entries.write(camera.name, frame.number, depth_range.encode(result.depth), record)
+
+
+def describe_camera(camera: Camera) -> dict[str, Any]:
+    """Name, size, K and pose as plain values, for records and hashes."""
+    return {
+        "name": camera.name,
+        "size": [camera.width, camera.height],
+        "K": np.asarray(camera.K, float).tolist(),
+        "T_camera_world": np.asarray(camera.T_camera_world, float).tolist(),
+    }
+
+
+def digest(array: np.ndarray) -> str:
+    """Hash of an array's type, shape and bytes."""
+    head = f"{array.dtype.str}{array.shape}".encode()
+    return hashlib.blake2b(head + np.ascontiguousarray(array).tobytes(), digest_size=16).hexdigest()
+
+
+def hash_of(*parts: Any) -> str:
+    """Hash of plain values, in an order that does not depend on dictionaries."""
+    return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=16).hexdigest()
