@@ -158,7 +158,7 @@ class _Builder:
         for name in self.names:
             if name in missing:
                 prior, record = self._prior(name, frame, geometric.get(name))
-                self.store.write(name, number, prior, {**record, "key": keys[name]})
+                self.store.write(name, number, prior, frame.images[name], {**record, "key": keys[name]})
             yield name, self.store.record(name, number), name in missing
 
     def _key(self, name: str, frame: Frame) -> str:

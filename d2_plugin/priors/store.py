@@ -1,12 +1,12 @@
 """Depth priors on disk: one memory-mapped array and one record per camera and frame.
 
     STORE/store.json                     format, and what the store was built for
-    STORE/priors/CAMERA/FRAME.npy        structured [H, W]: depth uint16 (logarithmic, 0 = empty), label uint8
+    STORE/priors/CAMERA/FRAME.npy        structured [H, W]: depth uint16 (logarithmic, 0 = empty), label uint8, RGB uint8
     STORE/priors/CAMERA/FRAME.json       record: a, b, gap, status, shares, settings, hashes, depth range, checksum
     STORE/cache/...                      stereo and monocular maps, so that other fusion settings cost seconds
 
-Logarithmic depth in 16 bits is exact to 1e-5 in a room and to 1.6e-4 from 1e-3 to 1e6, at 3 bytes per pixel with its
-label. Every file is written under a temporary name and renamed, the array before its record: a record therefore
+Logarithmic depth in 16 bits is exact to 1e-5 in a room and to 1.6e-4 from 1e-3 to 1e6. The picture lies beside it, at 6
+bytes per pixel in all: inserted Gaussians take its colours, and training need not open the capture for them. Every file is written under a temporary name and renamed, the array before its record: a record therefore
 vouches for its array, a build that is killed loses the frame in work, and readers never see half a file.
 """
 
@@ -25,8 +25,8 @@ from d2_plugin.priors.files import Entry, EntryFolder, read_json, write_json
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import DepthPrior, Label
 
-FORMAT = 1
-PRIOR_DTYPE = np.dtype([("depth", "<u2"), ("label", "u1")])
+FORMAT = 2
+PRIOR_DTYPE = np.dtype([("depth", "<u2"), ("label", "u1"), ("color", "u1", (3,))])
 CODES = 65534  # depth codes 1..65535; 0 is empty
 
 @dataclass(frozen=True)
@@ -132,7 +132,8 @@ class PriorStore:
             return None
         codes = entry.array(PRIOR_DTYPE)
         depth = DepthRange(*entry.record["depth_range"]).decode(codes["depth"])
-        return DepthPrior(torch.from_numpy(depth), torch.from_numpy(np.ascontiguousarray(codes["label"])))
+        labels, colors = np.ascontiguousarray(codes["label"]), np.ascontiguousarray(codes["color"])
+        return DepthPrior(torch.from_numpy(depth), torch.from_numpy(labels), torch.from_numpy(colors))
 
     def record(self, camera: str, frame: int) -> dict[str, Any] | None:
         """What is known about one prior: alignment, shares, settings, hashes; None where the store has none."""
@@ -143,16 +144,23 @@ class PriorStore:
         """Whether an intact prior built from exactly these inputs is there; a damaged one is named in the log."""
         return self.entries.find_current(camera, frame, key) is not None
 
-    def write(self, camera: str, frame: int, prior: FusedPrior, record: dict[str, Any]) -> None:
-        """Store one prior with its record.
+    def write(
+        self, camera: str, frame: int, prior: FusedPrior, image: np.ndarray, record: dict[str, Any]
+    ) -> None:
+        """Store one prior with the picture it was made for (RGB uint8 [H, W, 3]) and its record.
 
         Raises:
-            D2Error: depth that is not finite or negative, or labels that contradict it.
+            D2Error: a picture of another size, depth that is not finite or negative, or labels that contradict it.
         """
         _check(prior, f"the prior of camera {camera}, frame {frame}")
+        if image.shape != (*prior.depth.shape, 3):
+            raise D2Error(
+                f"the picture of camera {camera}, frame {frame} is {image.shape} but its prior {prior.depth.shape}: "
+                "build the prior at the picture's size"
+            )
         depth_range = DepthRange.of(prior.depth)
         codes = np.empty(prior.depth.shape, PRIOR_DTYPE)
-        codes["depth"], codes["label"] = depth_range.encode(prior.depth), prior.labels
+        codes["depth"], codes["label"], codes["color"] = depth_range.encode(prior.depth), prior.labels, image
         self.entries.write(camera, frame, codes, {**record, "depth_range": [depth_range.near, depth_range.far]})
 
     def _entry(self, camera: str, frame: int) -> Entry | None:
