@@ -1,0 +1,131 @@
+"""LPIPS, version 0.1, computed from weight files that lie on this machine; nothing is ever downloaded.
+
+Two files are needed per network: the feature extractor as torchvision publishes it (`alexnet-*.pth`, `vgg16-*.pth`) and
+the linear layers as the `lpips` package ships them (`alex.pth`, `vgg.pth`). They are looked for in a folder that the
+caller names, in torch's own download cache, and inside an installed `lpips` package.
+
+Convention: that of lpipsPyTorch, which 3DGS codebases report. Pictures go in as 0..1 and are shifted and scaled by
+constants made for -1..1; the `lpips` package maps to -1..1 first and gives other numbers.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from d2_plugin.errors import D2Error, unknown_name
+
+log = logging.getLogger(__name__)
+
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+
+SMALLEST = 64
+"""Least width and height in pixels: below it the deepest features have no pixel left."""
+
+_VGG16 = (64, 64, "pool", 128, 128, "pool", *(256,) * 3, "pool", *(512,) * 3, "pool", *(512,) * 3)
+_TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}  # layers (ReLUs) whose output is compared
+_FILES = {"alex": ("alexnet*.pth", "alex.pth"), "vgg": ("vgg16-*.pth", "vgg.pth")}
+
+
+class Lpips:
+    """Learned perceptual distance of two pictures; `net` is `alex` or `vgg`."""
+
+    def __init__(self, net: str, features: Path, linear: Path) -> None:
+        if net not in _TAPS:
+            raise unknown_name("LPIPS network", net, _TAPS)
+        self.net = net
+        with torch.device("meta"):  # no random initial weights, which would advance the global random state
+            self.layers = _alexnet() if net == "alex" else _vgg16()
+        trained = _load(features)
+        prefix = "features."
+        try:
+            convolutions = {k[len(prefix) :]: v for k, v in trained.items() if k.startswith(prefix)}
+            self.layers.load_state_dict(convolutions, assign=True)
+            weights = _load(linear)
+            self.weights = [weights[f"lin{i}.model.1.weight"].flatten() for i in range(len(_TAPS[net]))]
+        except (RuntimeError, KeyError) as failure:
+            raise D2Error(f"{features} and {linear} do not fit LPIPS {net} ({failure}): check the files") from None
+        self.layers.eval().requires_grad_(False)
+
+    @property
+    def variant(self) -> str:
+        """The definition behind the number, for metrics.json."""
+        return f"version 0.1, {self.net}, pictures in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)"
+
+    @torch.no_grad()
+    def __call__(self, image: Tensor, truth: Tensor) -> float:
+        """Distance of two pictures [H, W, 3] in 0..1; 0 for equal ones, larger is worse."""
+        if image.shape != truth.shape or min(image.shape[:2]) < SMALLEST:
+            raise D2Error(
+                f"LPIPS needs two pictures of one size, at least {SMALLEST}x{SMALLEST} pixels, and got "
+                f"{tuple(image.shape)} and {tuple(truth.shape)}: compare larger pictures"
+            )
+        pairs = zip(self._features(image), self._features(truth), self.weights)
+        return sum(((a - b).square() * w[:, None, None]).sum(0).mean().item() for a, b, w in pairs)
+
+    def _features(self, image: Tensor) -> Iterator[Tensor]:
+        """Features [C, h, w] of unit length per pixel, layer by layer."""
+        values = image.float().cpu().permute(2, 0, 1)
+        shift, scale = torch.tensor(SHIFT), torch.tensor(SCALE)
+        values = ((values - shift[:, None, None]) / scale[:, None, None])[None]
+        for number, layer in enumerate(self.layers):
+            values = layer(values)
+            if number in _TAPS[self.net]:
+                yield values[0] / (values[0].square().sum(0).sqrt() + 1e-10)
+
+
+def find_lpips(net: str = "alex", folder: Path | None = None) -> Lpips | None:
+    """LPIPS from weight files in `folder` or the usual places, or None (said once in the log) where there are none."""
+    if net not in _FILES:
+        raise unknown_name("LPIPS network", net, _FILES)
+    places = [folder] if folder is not None else list(_usual_places())
+    found = [next((file for place in places for file in sorted(place.glob(name))), None) for name in _FILES[net]]
+    if None in found:
+        log.info("LPIPS is not available: no %s and %s in %s", *_FILES[net], ", ".join(map(str, places)))
+        return None
+    return Lpips(net, *found)
+
+
+def _usual_places() -> Iterator[Path]:
+    yield Path(torch.hub.get_dir()) / "checkpoints"
+    package = importlib.util.find_spec("lpips")
+    if package is not None and package.origin:
+        yield Path(package.origin).parent / "weights" / "v0.1"
+
+
+def _load(path: Path) -> dict[str, Tensor]:
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError) as failure:
+        raise D2Error(f"cannot read LPIPS weights {path} ({type(failure).__name__}): replace the file") from None
+
+
+def _alexnet() -> nn.Sequential:
+    """The convolutions of AlexNet, numbered as torchvision does."""
+    return nn.Sequential(
+        nn.Conv2d(3, 64, 11, stride=4, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2),
+        nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2),
+        nn.Conv2d(192, 384, 3, padding=1), nn.ReLU(),
+        nn.Conv2d(384, 256, 3, padding=1), nn.ReLU(),
+        nn.Conv2d(256, 256, 3, padding=1), nn.ReLU(),
+    )  # fmt: skip
+
+
+def _vgg16() -> nn.Sequential:
+    """The convolutions of VGG16 up to relu5_3, numbered as torchvision does."""
+    layers: list[nn.Module] = []
+    width = 3
+    for step in _VGG16:
+        if step == "pool":
+            layers.append(nn.MaxPool2d(2, 2))
+        else:
+            layers += [nn.Conv2d(width, step, 3, padding=1), nn.ReLU()]
+            width = step
+    return nn.Sequential(*layers)

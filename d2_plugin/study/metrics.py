@@ -1,0 +1,155 @@
+"""Image and depth metrics, each in the exact variant that published tables use.
+
+Images are tensors [H, W, 3] in 0..1 and every function returns one number per image; tables are means over images.
+`VARIANTS` says in words which definition stands behind each key of metrics.json.
+
+The published SSIM_1 and SSIM_2 columns of dense-view papers are scikit-image's `structural_similarity` with a uniform
+7x7 window and a data range of 1 or 2. For the same window SSIM_2 >= SSIM_1 in practice; tables where it is lower mix
+two definitions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from d2_plugin.errors import D2Error
+
+UNIFORM_WINDOW = 7
+GAUSSIAN_WINDOW = 11
+GAUSSIAN_SIGMA = 1.5
+K1, K2 = 0.01, 0.03
+"""SSIM's stabilising constants, times the data range."""
+
+STRIP_ROWS = 32
+"""Rows of the picture whose similarity is computed at a time."""
+
+VARIANTS = {
+    "psnr": "20 log10(1 / sqrt(MSE)) per image in dB, then the mean over images",
+    "ssim1": "uniform 7x7 window, sample covariance, 3 px border dropped, data range 1 (scikit-image)",
+    "ssim2": "uniform 7x7 window, sample covariance, 3 px border dropped, data range 2 (scikit-image)",
+    "ssim_3dgs": "Gaussian 11x11 window with sigma 1.5, zero padding, biased covariance (3DGS)",
+    "lpips": "version 0.1 on AlexNet, pictures in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)",
+    "depth_absrel": "mean |z - z*| / z* over true depth; a missing rendered depth counts as 1",
+    "depth_delta1": "share of true depth with max(z / z*, z* / z) < 1.25; a missing rendered depth counts as a miss",
+}
+
+
+def psnr(image: Tensor, truth: Tensor) -> float:
+    """Peak signal to noise ratio in dB, 20 log10(1 / sqrt(MSE)); infinite for equal pictures."""
+    image, truth = _pair(image, truth)
+    error = (image - truth).square().mean().item()
+    return -10 * math.log10(error) if error > 0 else math.inf
+
+
+def ssim_range1(image: Tensor, truth: Tensor) -> float:
+    """SSIM_1: scikit-image's structural similarity for a data range of 1."""
+    return ssim_uniform(image, truth, data_range=1.0)
+
+
+def ssim_range2(image: Tensor, truth: Tensor) -> float:
+    """SSIM_2: the same with a data range of 2, scikit-image's old default for floats."""
+    return ssim_uniform(image, truth, data_range=2.0)
+
+
+def ssim_uniform(image: Tensor, truth: Tensor, data_range: float) -> float:
+    """Structural similarity with a uniform 7x7 window and sample covariance, mean over windows inside the picture."""
+    image, truth = _pair(image, truth, UNIFORM_WINDOW)
+    count = UNIFORM_WINDOW**2
+    taps = [1 / UNIFORM_WINDOW] * UNIFORM_WINDOW
+    return _ssim(image, truth, taps, data_range, unbias=count / (count - 1))
+
+
+def ssim_3dgs(image: Tensor, truth: Tensor) -> float:
+    """Structural similarity as 3DGS codebases compute it: Gaussian 11x11 window over a zero-padded picture."""
+    image, truth = _pair(image, truth, GAUSSIAN_WINDOW)
+    reach = GAUSSIAN_WINDOW // 2
+    weights = [math.exp(-0.5 * (offset / GAUSSIAN_SIGMA) ** 2) for offset in range(-reach, reach + 1)]
+    taps = [weight / sum(weights) for weight in weights]
+    padded = [functional.pad(picture, (reach,) * 4) for picture in (image, truth)]
+    return _ssim(*padded, taps, data_range=1.0, unbias=1.0)
+
+
+def depth_absrel(depth: Tensor, truth: Tensor) -> float | None:
+    """Mean relative depth error |z - z*| / z* over pixels with true depth z* > 0; None where there is none.
+
+    `depth` [H, W] is 0 (or not finite) where nothing was rendered. Such a pixel counts as a relative error of 1:
+    leaving it out would flatter a model with holes.
+    """
+    rendered, true = _known_depths(depth, truth)
+    if true.numel() == 0:
+        return None
+    error = torch.where(rendered > 0, (rendered - true).abs() / true, torch.ones_like(true))
+    return error.mean().item()
+
+
+def depth_delta1(depth: Tensor, truth: Tensor, threshold: float = 1.25) -> float | None:
+    """Share of pixels with true depth where max(z / z*, z* / z) < `threshold`; None where there is no truth.
+
+    A missing rendered depth counts as a miss.
+    """
+    rendered, true = _known_depths(depth, truth)
+    if true.numel() == 0:
+        return None
+    ratio = torch.maximum(rendered / true, true / rendered.clamp(min=torch.finfo(true.dtype).tiny))
+    return ((ratio < threshold) & (rendered > 0)).double().mean().item()
+
+
+def _known_depths(depth: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """Rendered (0 = missing) and true depth, float64, at the pixels that have a true one."""
+    if depth.shape != truth.shape:
+        raise D2Error(f"rendered depth {tuple(depth.shape)} and truth {tuple(truth.shape)} differ: compare equal sizes")
+    known = torch.isfinite(truth) & (truth > 0)
+    rendered = depth[known].double()
+    return torch.where(torch.isfinite(rendered), rendered, 0.0), truth[known].double()
+
+
+def _ssim(image: Tensor, truth: Tensor, taps: Sequence[float], data_range: float, unbias: float) -> float:
+    """Mean SSIM over windows inside the pictures [3, H, W]; `unbias` turns window variances into sample variances.
+
+    Goes over the picture in strips, which stay in the processor's cache and keep memory small for large pictures.
+    """
+    margin = len(taps) - 1
+    rows = image.shape[1] - margin
+    strips = [slice(start, min(start + STRIP_ROWS, rows) + margin) for start in range(0, rows, STRIP_ROWS)]
+    total = sum(_similarity(image[:, s], truth[:, s], taps, data_range, unbias).sum().item() for s in strips)
+    return total / (image.shape[0] * rows * (image.shape[2] - margin))
+
+
+def _similarity(image: Tensor, truth: Tensor, taps: Sequence[float], data_range: float, unbias: float) -> Tensor:
+    """The SSIM of every window inside the pictures, [3, H - w + 1, W - w + 1] for w taps."""
+    c1, c2 = (K1 * data_range) ** 2, (K2 * data_range) ** 2
+    products = torch.stack([image, truth, image * image, truth * truth, image * truth])
+    mean_x, mean_y, square_x, square_y, cross = _filtered(_filtered(products, taps, -1), taps, -2)
+    variance_x, variance_y = unbias * (square_x - mean_x.square()), unbias * (square_y - mean_y.square())
+    covariance = unbias * (cross - mean_x * mean_y)
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x.square() + mean_y.square() + c1)
+    structure = (2 * covariance + c2) / (variance_x + variance_y + c2)
+    return luminance * structure
+
+
+def _filtered(values: Tensor, taps: Sequence[float], axis: int) -> Tensor:
+    """Correlation with `taps` along one axis, where the window fits."""
+    length = values.shape[axis] - len(taps) + 1
+    total = taps[0] * values.narrow(axis, 0, length)
+    for start, tap in enumerate(taps[1:], start=1):
+        total.add_(values.narrow(axis, start, length), alpha=tap)
+    return total
+
+
+def _pair(image: Tensor, truth: Tensor, window: int = 1) -> tuple[Tensor, Tensor]:
+    """Both pictures as [3, H, W] float64 (in float32 the variances of flat regions would be rounding noise)."""
+    if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
+        raise D2Error(
+            f"pictures of shape {tuple(image.shape)} and {tuple(truth.shape)} cannot be compared: give two [H, W, 3]"
+        )
+    if min(image.shape[:2]) < window:
+        raise D2Error(
+            f"a picture of {image.shape[1]}x{image.shape[0]} pixels is smaller than the {window}x{window} window "
+            "of this metric: compare larger pictures"
+        )
+    return image.double().permute(2, 0, 1), truth.double().permute(2, 0, 1)
