@@ -69,7 +69,7 @@ def text(line: str, size: int = 1) -> np.ndarray:
 
 def side_by_side(panels: Sequence[Panel]) -> np.ndarray:
     """All panels in one row, each with its caption and colour scale above; a caption too long for its panel is cut."""
-    size = 2 if max(panel.picture.shape[1] for panel in panels) >= 480 else 1
+    size = int(np.clip(max(panel.picture.shape[1] for panel in panels) // 300, 1, 4))  # of the letters, in pixels
     header = 20 * size
     height = header + max(panel.picture.shape[0] for panel in panels)
     row: list[np.ndarray] = []

@@ -124,26 +124,23 @@ def _panels(
         Panel(f"truth  {row['camera']}  frame {row['frame']}", _bytes(truth)),
         Panel(f"rendered  {row['psnr']:.2f} dB", _bytes(color)),
     ]
-    shown = {f"rendered depth{_error_text(row)}": None if depth is None else depth.numpy(), "true depth": true_depth}
+    shown = {"depth": None if depth is None else depth.numpy(), "true depth": true_depth}
     shown = {title: array for title, array in shown.items() if array is not None}
     if shown:
         low, high = _depth_range(list(shown.values())[-1])  # the true one's where there is one
-        panels += [_depth_panel(title, array, low, high) for title, array in shown.items()]
+        panels += [_depth_panel(title, array, low, high, row["depth_absrel"]) for title, array in shown.items()]
     error = np.abs(color - truth).mean(axis=-1)
     fire = color_scale("inferno")
     panels.append(Panel(f"error  0 .. {ERROR_SHOWN:g}", colorize(error, 0, ERROR_SHOWN, fire), fire))
     return panels
 
 
-def _error_text(row: dict[str, Any]) -> str:
-    return "" if row["depth_absrel"] is None else f" (AbsRel {row['depth_absrel']:.3f})"
-
-
-def _depth_panel(title: str, depth: np.ndarray, low: float, high: float) -> Panel:
+def _depth_panel(title: str, depth: np.ndarray, low: float, high: float, error: float | None) -> Panel:
     scale = color_scale("viridis")
     known = np.isfinite(depth) & (depth > 0)
     picture = colorize(np.where(known, depth, 0), low, high, scale)
-    return Panel(f"{title}  {low:.3g} .. {high:.3g}", np.where(known[..., None], picture, np.uint8(0)), scale)
+    score = f"  AbsRel {error:.3f}" if error is not None and title == "depth" else ""
+    return Panel(f"{title}  {low:.3g} .. {high:.3g}{score}", np.where(known[..., None], picture, np.uint8(0)), scale)
 
 
 def _depth_range(depth: np.ndarray) -> tuple[float, float]:

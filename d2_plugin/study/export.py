@@ -1,0 +1,117 @@
+"""The Gaussians of one instant as a 3DGS PLY file, which viewers such as SuperSplat, Brush and SIBR open.
+
+Files named `frame_00000.ply`, `frame_00001.ply`, ... that are dropped together play as an animation in SuperSplat; a zip
+of them does in Brush.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from d2_plugin.errors import D2Error
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * f_dc."""
+
+ALPHA_MIN = 1 / 255
+"""Gaussians that never reach this opacity are not drawn by any rasterizer and are left out."""
+
+ALPHA_MAX = 1 - 1e-6
+"""Largest opacity that has a finite logit in float32."""
+
+FLATTEST = 1e-12
+"""Smallest eigenvalue of a covariance relative to its largest: below it float64 holds only rounding."""
+
+ATTRIBUTES = (
+    *("x", "y", "z", "nx", "ny", "nz"),
+    *("f_dc_0", "f_dc_1", "f_dc_2"),
+    "opacity",
+    *("scale_0", "scale_1", "scale_2"),
+    *("rot_0", "rot_1", "rot_2", "rot_3"),
+)
+"""Order of the Inria code base; all float32, little endian."""
+
+
+def write_ply(path: Path, means: Tensor, covariances: Tensor, colors: Tensor, opacities: Tensor) -> int:
+    """Write Gaussians without view-dependent colour; returns how many were written.
+
+    Args:
+        path: the file, which is replaced if it exists.
+        means: [M, 3] world.
+        covariances: [M, 6] xx xy xz yy yz zz, world.
+        colors: [M, 3] in 0..1, as seen at this instant.
+        opacities: [M] in 0..1 with the temporal factor F(t) included: it belongs inside the logit, not on top of it.
+
+    Gaussians below an opacity of 1/255 and those that are not finite are left out.
+    """
+    count = len(means)
+    shapes = {
+        "covariances": (covariances, (count, 6)),
+        "colors": (colors, (count, 3)),
+        "opacities": (opacities, (count,)),
+    }
+    for name, (values, expected) in shapes.items():
+        if tuple(values.shape) != expected:
+            raise D2Error(f"{name} of a PLY have shape {tuple(values.shape)}, expected {expected}: one row per mean")
+    means, covariances, colors, opacities = (
+        values.detach().double().cpu() for values in (means, covariances, colors, opacities)
+    )
+    finite = torch.isfinite(torch.cat([means, covariances, colors, opacities[:, None]], dim=1)).all(dim=1)
+    kept = finite & (opacities >= ALPHA_MIN)
+    scales, quaternions = scales_and_rotations(covariances[kept])
+    columns = [
+        means[kept],
+        torch.zeros_like(means[kept]),  # normals, which readers expect and ignore
+        (colors[kept] - 0.5) / SH_C0,
+        torch.logit(opacities[kept].clamp(max=ALPHA_MAX))[:, None],
+        scales.log(),
+        quaternions,
+    ]
+    rows = torch.cat(columns, dim=1).float().numpy().astype("<f4")
+    path.write_bytes(_header(len(rows)) + np.ascontiguousarray(rows).tobytes())
+    return len(rows)
+
+
+def scales_and_rotations(covariances: Tensor) -> tuple[Tensor, Tensor]:
+    """Standard deviations [M, 3] and unit quaternions [M, 4] (w first) of covariances [M, 6].
+
+    covariance = R diag(scales^2) R^T with R the rotation of the quaternion.
+    """
+    xx, xy, xz, yy, yz, zz = covariances.unbind(-1)
+    matrices = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1).reshape(-1, 3, 3)
+    variances, axes = torch.linalg.eigh(matrices)
+    floor = (FLATTEST * variances[:, 2:]).clamp(min=torch.finfo(variances.dtype).tiny)
+    mirrored = torch.linalg.det(axes) < 0
+    axes = torch.cat([torch.where(mirrored[:, None, None], -axes[..., :1], axes[..., :1]), axes[..., 1:]], dim=-1)
+    return torch.maximum(variances, floor).sqrt(), _quaternions(axes)
+
+
+def _quaternions(rotations: Tensor) -> Tensor:
+    """Unit quaternions [M, 4], w first, of rotation matrices [M, 3, 3].
+
+    The four products of a component with the whole quaternion are linear in the matrix; the one with the largest
+    component loses no digits.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotations.unbind(-2))
+    products = torch.stack(
+        [
+            torch.stack([1 + a + e + i, h - f, c - g, d - b], dim=-1),
+            torch.stack([h - f, 1 + a - e - i, b + d, c + g], dim=-1),
+            torch.stack([c - g, b + d, 1 - a + e - i, f + h], dim=-1),
+            torch.stack([d - b, c + g, f + h, 1 - a - e + i], dim=-1),
+        ],
+        dim=-2,
+    )
+    largest = products.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+    chosen = products[torch.arange(len(products)), largest]
+    return chosen / chosen.norm(dim=-1, keepdim=True)
+
+
+def _header(count: int) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", "comment SplatRenderMode: default", f"element vertex {count}"]
+    lines += [f"property float {name}" for name in ATTRIBUTES]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
