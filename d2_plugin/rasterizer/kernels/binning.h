@@ -90,8 +90,9 @@ inline int64_t project_all(const Frame& f) {
     int32_t* counts = f.counts + chunk * (tiles + 1);
     std::fill(counts, counts + tiles + 1, 0);
     const int64_t end = f.chunk_begin(chunk + 1);
-    for (int64_t i = f.chunk_begin(chunk); i < end; i += LANES)
-      project_group(f, i, int(std::min<int64_t>(LANES, end - i)), counts);
+    int64_t i = f.chunk_begin(chunk);
+    for (; i + LANES <= end; i += LANES) project_group(f, i, LANES, counts);
+    if (i < end) project_group(f, i, int(end - i), counts);
   });
   int64_t pairs = 0;
   for (int tile = 0; tile < tiles; tile++)

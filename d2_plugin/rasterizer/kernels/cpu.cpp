@@ -40,31 +40,67 @@ D2_INLINE void for_each_pixel(const Frame& f, int tile, Visit visit) {
     }
 }
 
-// Blocks of the tile at `corner` that a Gaussian may reach, one bit each.
-D2_INLINE uint64_t reached(const Record& r, Corner corner) {
-  const int left = corner.x / BLOCK_WIDTH, top = corner.y / BLOCK_HEIGHT;
-  const int x0 = std::max(r.first_x - left, 0), x1 = std::min(r.last_x - left, TILE_BLOCKS - 1);
-  const int y0 = std::max(r.first_y - top, 0), y1 = std::min(r.last_y - top, TILE_BLOCKS - 1);
-  const uint64_t columns = (uint64_t(2) << x1) - (uint64_t(1) << x0);
-  const uint64_t rows = (~uint64_t(0) >> (8 * (7 - y1))) & (~uint64_t(0) << (8 * y0));
-  return columns * 0x0101010101010101u & rows;
+// Where the blocks of a tile are, in pixels from its corner: first pixel centre of each.
+struct Blocks {
+  float right[BLOCKS], down[BLOCKS];
+};
+static constexpr Blocks block_places() {
+  Blocks b{};
+  for (int i = 0; i < BLOCKS; i++) {
+    b.right[i] = i % TILE_BLOCKS * BLOCK_WIDTH + 0.5f;
+    b.down[i] = i / TILE_BLOCKS * BLOCK_HEIGHT + 0.5f;
+  }
+  return b;
 }
+alignas(64) static constexpr Blocks PLACES = block_places();
 
-// Distances of a block's pixel centres from a Gaussian's centre, and the fragment there.
-struct Lattice {
-  Floats x, y;  // pixel centres of the tile's first block
-  explicit Lattice(Corner corner) {
-    alignas(64) float along_x[LANES], along_y[LANES];
-    for (int lane = 0; lane < LANES; lane++) {
-      along_x[lane] = corner.x + lane % BLOCK_WIDTH + 0.5f;
-      along_y[lane] = corner.y + lane / BLOCK_WIDTH + 0.5f;
+// A Gaussian over the pixels of one tile.
+struct Spread {
+  const Footprint<float>& footprint;
+  float x, y;     // centre, from the tile's corner
+  Floats u0, v0;  // u and v at the pixels of a block that starts at the corner, less the half pixel in PLACES
+
+  D2_INLINE Spread(const Footprint<float>& f, Corner corner, Floats lane_x, Floats lane_y)
+      : footprint(f), x(f.x - corner.x), y(f.y - corner.y) {
+    const Floats dx = lane_x - Floats(x), dy = lane_y - Floats(y);
+    u0 = along_u(f, dx, dy), v0 = along_v(f, dy);
+  }
+
+  D2_INLINE Fragment<Floats> at(int block) const {
+    const Footprint<float>& f = footprint;
+    const float right = PLACES.right[block], down = PLACES.down[block];
+    return fragment(f.log2_opacity, u0 + Floats(along_u(f, right, down)), v0 + Floats(along_v(f, down)));
+  }
+
+  // The blocks where it may reach alpha_min, one bit each: bounds u and v over each block separately.
+  D2_INLINE uint64_t blocks(const Record& r, Corner corner, float log2_alpha_min) const {
+    const Footprint<float>& f = footprint;
+    const int top = corner.y / BLOCK_HEIGHT;
+    const int first = std::max(r.first_y - top, 0), last = std::min(r.last_y - top, TILE_BLOCKS - 1);
+    constexpr float half_x = 0.5f * (BLOCK_WIDTH - 1), half_y = 0.5f * (BLOCK_HEIGHT - 1);
+    const Floats spread_u = f.ux * half_x + __builtin_fabsf(f.uy) * half_y, spread_v = f.vy * half_y;
+    const Floats budget = (f.log2_opacity - log2_alpha_min) * 1.0001f + 1e-4f;  // generous to rounding
+    uint64_t found = 0;
+    for (int i = first * TILE_BLOCKS / LANES; i <= (last * TILE_BLOCKS + TILE_BLOCKS - 1) / LANES; i++) {
+      const Floats dx = Floats::load(PLACES.right + i * LANES) + Floats(half_x - x);
+      const Floats dy = Floats::load(PLACES.down + i * LANES) + Floats(half_y - y);
+      const Floats u = max(abs(along_u(f, dx, dy)) - spread_u, Floats(0.f));
+      const Floats v = max(abs(along_v(f, dy)) - spread_v, Floats(0.f));
+      found |= uint64_t(lanes(fma(u, u, v * v) <= budget)) << (i * LANES);
     }
+    return found;
+  }
+};
+
+// Pixels of a block, from its first.
+struct Lattice {
+  Floats x, y;
+  Lattice() {
+    alignas(64) float along_x[LANES], along_y[LANES];
+    for (int lane = 0; lane < LANES; lane++) along_x[lane] = lane % BLOCK_WIDTH, along_y[lane] = lane / BLOCK_WIDTH;
     x = Floats::load(along_x), y = Floats::load(along_y);
   }
-  D2_INLINE Fragment<Floats> at(const Footprint<float>& f, int block) const {
-    const float right = float(block % TILE_BLOCKS * BLOCK_WIDTH), down = float(block / TILE_BLOCKS * BLOCK_HEIGHT);
-    return fragment(f, x - Floats(f.x - right), y - Floats(f.y - down));
-  }
+  D2_INLINE Spread spread(const Record& r, Corner corner) const { return {r.footprint, corner, x, y}; }
 };
 
 // out[i] = sum of parts[i]
@@ -86,6 +122,24 @@ D2_INLINE void store_sums(const Floats* parts, float* out) {
       quads[q] = quad_sums(pair_sums(part(0), part(1)), pair_sums(part(2), part(3)));
     }
     Floats(lane_sums(lane_sums(quads[0], quads[1]), lane_sums(quads[2], quads[3]))).store(out + first);
+  }
+}
+#elif defined(D2_AVX2)
+D2_INLINE __m256 pair_sums(__m256 a, __m256 b) { return _mm256_unpacklo_ps(a, b) + _mm256_unpackhi_ps(a, b); }
+D2_INLINE __m256 quad_sums(__m256 a, __m256 b) {
+  const __m256d x = _mm256_castps_pd(a), y = _mm256_castps_pd(b);
+  return _mm256_castpd_ps(_mm256_unpacklo_pd(x, y)) + _mm256_castpd_ps(_mm256_unpackhi_pd(x, y));
+}
+template <int N>
+D2_INLINE void store_sums(const Floats* parts, float* out) {
+  for (int first = 0; first < N; first += 8) {
+    __m256 quads[2];
+    for (int q = 0; q < 2; q++) {
+      const auto part = [&](int i) { return first + 4 * q + i < N ? parts[first + 4 * q + i].v : _mm256_setzero_ps(); };
+      quads[q] = quad_sums(pair_sums(part(0), part(1)), pair_sums(part(2), part(3)));
+    }
+    const __m256 low = _mm256_permute2f128_ps(quads[0], quads[1], 0x20);
+    Floats(low + _mm256_permute2f128_ps(quads[0], quads[1], 0x31)).store(out + first);
   }
 }
 #else
@@ -116,7 +170,7 @@ static void render_tile(const Frame& f, int tile) {
   });
 
   const Corner corner = corner_of(f, tile);
-  const Lattice lattice(corner);
+  const Lattice lattice;
   const float log2_alpha_min = f.log2_alpha_min();
   const int32_t begin = f.tiles[tile].begin, pairs = f.tiles[tile].live;
   sort_by_depth(f.blocks + begin, pairs, scratch.keys, scratch.spare);
@@ -127,11 +181,11 @@ static void render_tile(const Frame& f, int tile) {
     const uint32_t id = uint32_t(keys[q]);
     const Record& r = f.records[id];
     const float* color = FIXED ? r.color : f.colors + int64_t(id) * channels;
+    const Spread spread = lattice.spread(r, corner);
     uint64_t contributes = 0;
-    for (uint64_t left = reached(r, corner) & alive; left; left &= left - 1) {
+    for (uint64_t left = spread.blocks(r, corner, log2_alpha_min) & alive; left; left &= left - 1) {
       const int block = __builtin_ctzll(left);
-      const Fragment<Floats> here = lattice.at(r.footprint, block);
-      if (!any(here.log2_alpha >= Floats(log2_alpha_min))) continue;
+      const Fragment<Floats> here = spread.at(block);
       float* field = state + block * fields * LANES;
       const Step<Floats> step = composite(here.log2_alpha, Floats::load(field), log2_alpha_min, f.constants);
       step.transmittance.store(field);
@@ -140,8 +194,8 @@ static void render_tile(const Frame& f, int tile) {
       };
       add(1, r.footprint.depth);
       for (int c = 0; c < channels; c++) add(2 + c, color[c]);
-      if (any(step.kept)) contributes |= uint64_t(1) << block;
-      if (any(andnot(step.seen, step.kept)) && !any(step.transmittance > Floats(0.f))) alive &= ~(uint64_t(1) << block);
+      contributes |= uint64_t(any(step.seen & step.open)) << block;
+      if (!any(step.open)) alive &= ~(uint64_t(1) << block);
     }
     if (contributes) f.ids[live] = int32_t(id), f.blocks[live++] = contributes;
   }
@@ -192,7 +246,7 @@ static void backward_tile(const Frame& f, int tile) {
   Floats* loose_sums = reinterpret_cast<Floats*>(state + BLOCKS * fields * LANES);
   load_gradients(f, tile, channels, state);
   const Corner corner = corner_of(f, tile);
-  const Lattice lattice(corner);
+  const Lattice lattice;
   const float log2_alpha_min = f.log2_alpha_min(), log2_alpha_max = f.log2_alpha_max();
   const int64_t stride = moment_stride(channels);
   const int32_t begin = f.tiles[tile].begin, end = begin + f.tiles[tile].live;
@@ -207,9 +261,10 @@ static void backward_tile(const Frame& f, int tile) {
     Floats fixed_sums[7 + (FIXED ? FIXED : 1)];
     Floats* sums = FIXED ? fixed_sums : loose_sums;
     for (int k = 0; k < 7 + channels; k++) sums[k] = Floats(0.f);
+    const Spread spread = lattice.spread(r, corner);
     for (uint64_t left = f.blocks[q]; left; left &= left - 1) {
       const int block = __builtin_ctzll(left);
-      const Fragment<Floats> here = lattice.at(r.footprint, block);
+      const Fragment<Floats> here = spread.at(block);
       float* field = state + block * fields * LANES;
       const Floats transmittance = Floats::load(field);
       const Step<Floats> step = composite(here.log2_alpha, transmittance, log2_alpha_min, f.constants);
@@ -255,7 +310,7 @@ D2_INLINE bool gather_moments(const Frame& f, int64_t i, int64_t stride, float* 
   return any_slot;
 }
 
-static void backward_group(const Frame& f, int64_t i, int rows, float* totals) {
+D2_INLINE void backward_group(const Frame& f, int64_t i, int rows, float* totals) {
   const int64_t stride = moment_stride(f.channels);
   std::fill(totals, totals + LANES * stride, 0.f);
   alignas(64) float drawn[LANES] = {};
@@ -304,7 +359,7 @@ static void survey_tile(const Frame& f, int tile) {
   });
 
   const Corner corner = corner_of(f, tile);
-  const Lattice lattice(corner);
+  const Lattice lattice;
   const float log2_alpha_min = f.log2_alpha_min();
   const int32_t begin = f.tiles[tile].begin, pairs = f.tiles[tile].live;
   sort_by_depth(f.blocks + begin, pairs, scratch.keys, scratch.spare);
@@ -316,11 +371,10 @@ static void survey_tile(const Frame& f, int tile) {
     const Floats depth = r.footprint.depth;
     Floats sums[3] = {0.f, 0.f, 0.f};  // weight and error over verified pixels, largest weight
     int hits = 0;
-    bool contributes = false;
-    for (uint64_t left = reached(r, corner) & alive; left; left &= left - 1) {
+    const Spread spread = lattice.spread(r, corner);
+    for (uint64_t left = spread.blocks(r, corner, log2_alpha_min) & alive; left; left &= left - 1) {
       const int block = __builtin_ctzll(left);
-      const Fragment<Floats> here = lattice.at(r.footprint, block);
-      if (!any(here.log2_alpha >= Floats(log2_alpha_min))) continue;
+      const Fragment<Floats> here = spread.at(block);
       float* field = state + block * fields * LANES;
       const Step<Floats> step = composite(here.log2_alpha, Floats::load(field), log2_alpha_min, f.constants);
       step.transmittance.store(field);
@@ -331,11 +385,10 @@ static void survey_tile(const Frame& f, int tile) {
       sums[0] = fma(step.weight, verified, sums[0]);
       sums[1] = fma(step.weight, error, sums[1]);
       sums[2] = max(step.weight, sums[2]);
-      hits += count(step.kept & (verified > Floats(0.f)));
-      contributes |= any(step.kept);
-      if (any(andnot(step.seen, step.kept)) && !any(step.transmittance > Floats(0.f))) alive &= ~(uint64_t(1) << block);
+      hits += count(step.seen & step.open & (verified > Floats(0.f)));
+      if (!any(step.open)) alive &= ~(uint64_t(1) << block);
     }
-    if (!contributes) continue;
+    if (!any(sums[2] > Floats(0.f))) continue;
     const int64_t slot = slot_of(f, r, int32_t(id), corner);
     f.touched[slot] = 1;
     f.statistics[slot] = {sum(sums[0]), sum(sums[1]), largest(sums[2]), float(hits)};
@@ -416,8 +469,9 @@ void d2_backward(const Frame* f, int64_t pairs) {
   d2::parallel_for(f->threads, f->chunks, [&](int64_t chunk) {
     float* totals = d2::scratch.vectors(size_t(d2::moment_stride(f->channels)));
     const int64_t end = f->chunk_begin(chunk + 1);
-    for (int64_t i = f->chunk_begin(chunk); i < end; i += d2::LANES)
-      d2::backward_group(*f, i, int(std::min<int64_t>(d2::LANES, end - i)), totals);
+    int64_t i = f->chunk_begin(chunk);
+    for (; i + d2::LANES <= end; i += d2::LANES) d2::backward_group(*f, i, d2::LANES, totals);
+    if (i < end) d2::backward_group(*f, i, int(end - i), totals);
   });
 }
 }

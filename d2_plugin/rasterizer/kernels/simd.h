@@ -82,9 +82,12 @@ D2_INLINE Floats min(Floats a, Floats b) { return _mm512_min_ps(a.v, b.v); }
 D2_INLINE Floats max(Floats a, Floats b) { return _mm512_max_ps(a.v, b.v); }
 D2_INLINE Floats sqrt(Floats a) { return _mm512_sqrt_ps(a.v); }
 D2_INLINE Floats abs(Floats a) { return _mm512_abs_ps(a.v); }
+D2_INLINE Floats negative(Floats a) { return _mm512_or_ps(a.v, _mm512_set1_ps(-0.f)); }  // -|a|
 D2_INLINE Floats floor(Floats a) { return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
-D2_INLINE Floats round(Floats a) { return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
-D2_INLINE Floats scale_by_power_of_2(Floats a, Floats power) { return _mm512_scalef_ps(a.v, power.v); }
+D2_INLINE Floats add_to_exponent(Floats a, Floats low_bits) {
+  const __m512i exponent = _mm512_slli_epi32(_mm512_castps_si512(low_bits.v), 23);
+  return _mm512_castsi512_ps(_mm512_add_epi32(_mm512_castps_si512(a.v), exponent));
+}
 D2_INLINE Floats reciprocal(Floats a) {
   const Floats estimate = _mm512_rcp14_ps(a.v);
   return estimate * fnma(a, estimate, Floats(2.f));
@@ -114,14 +117,14 @@ D2_INLINE Floats min(Floats a, Floats b) { return _mm256_min_ps(a.v, b.v); }
 D2_INLINE Floats max(Floats a, Floats b) { return _mm256_max_ps(a.v, b.v); }
 D2_INLINE Floats sqrt(Floats a) { return _mm256_sqrt_ps(a.v); }
 D2_INLINE Floats abs(Floats a) { return _mm256_andnot_ps(_mm256_set1_ps(-0.f), a.v); }
+D2_INLINE Floats negative(Floats a) { return _mm256_or_ps(a.v, _mm256_set1_ps(-0.f)); }
 D2_INLINE Floats floor(Floats a) { return _mm256_floor_ps(a.v); }
-D2_INLINE Floats round(Floats a) { return _mm256_round_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC); }
 D2_INLINE Floats reciprocal(Floats a) {
   const Floats estimate = _mm256_rcp_ps(a.v);
   return estimate * fnma(a, estimate, Floats(2.f));
 }
-D2_INLINE Floats scale_by_power_of_2(Floats a, Floats power) {
-  const __m256i exponent = _mm256_slli_epi32(_mm256_cvtps_epi32(power.v), 23);
+D2_INLINE Floats add_to_exponent(Floats a, Floats low_bits) {
+  const __m256i exponent = _mm256_slli_epi32(_mm256_castps_si256(low_bits.v), 23);
   return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(a.v), exponent));
 }
 D2_INLINE float sum(Floats a) {
@@ -161,6 +164,7 @@ D2_INLINE Floats sqrt(Floats a) {
   return Native{__builtin_sqrtf(a.v[0]), __builtin_sqrtf(a.v[1]), __builtin_sqrtf(a.v[2]), __builtin_sqrtf(a.v[3])};
 }
 D2_INLINE Floats abs(Floats a) { return Native(Integers(a.v) & 0x7fffffff); }
+D2_INLINE Floats negative(Floats a) { return Native(Integers(a.v) | int32_t(0x80000000)); }
 // Beyond 2^22 a float is an integer as far as any pixel is concerned; converting more than 2^31 would be undefined.
 D2_INLINE Floats round(Floats a) {
   const Floats bounded = max(min(a, Floats(4194304.f)), Floats(-4194304.f));
@@ -172,8 +176,8 @@ D2_INLINE Floats floor(Floats a) {
   return near - where(near > a, Floats(1.f));
 }
 D2_INLINE Floats reciprocal(Floats a) { return Floats(1.f) / a; }
-D2_INLINE Floats scale_by_power_of_2(Floats a, Floats power) {
-  return Native(Integers(a.v) + (__builtin_convertvector(power.v, Integers) << 23));
+D2_INLINE Floats add_to_exponent(Floats a, Floats low_bits) {
+  return Native(Integers(a.v) + (Integers(low_bits.v) << 23));
 }
 D2_INLINE float sum(Floats a) { return (a.v[0] + a.v[2]) + (a.v[1] + a.v[3]); }
 D2_INLINE float larger(float a, float b) { return a > b ? a : b; }
@@ -181,15 +185,17 @@ D2_INLINE float largest(Floats a) { return larger(larger(a.v[0], a.v[2]), larger
 
 #endif
 
-// 2^x for x in about -126..127 by a minimax polynomial on [-1/2, 1/2]; relative error 7.5e-8 before rounding.
+// 2^x for x in -126..127 by a minimax polynomial on [-1/2, 1/2], relative error 7.5e-8 before rounding; beyond, the
+// result means nothing. Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits, to be shifted into the
+// exponent.
 D2_INLINE Floats exp2(Floats x) {
-  const Floats whole = round(x), part = x - whole;
+  const Floats magic = 12582912.f, shifted = x + magic, part = x - (shifted - magic);
   Floats p = fma(part, Floats(1.327647152e-3f), Floats(9.675541331e-3f));
   p = fma(p, part, Floats(5.550713275e-2f));
   p = fma(p, part, Floats(2.402211972e-1f));
   p = fma(p, part, Floats(6.931469671e-1f));
   p = fma(p, part, Floats(1.000000072f));
-  return scale_by_power_of_2(p, whole);
+  return add_to_exponent(p, shifted);
 }
 
 // log2 of positive normal x: exponent plus the series of 2 atanh((m - 1) / (m + 1)) / ln 2 for m in sqrt(1/2)..sqrt(2).

@@ -30,6 +30,7 @@ D2_FN float min(float a, float b) { return a < b ? a : b; }
 D2_FN float max(float a, float b) { return a > b ? a : b; }
 D2_FN float select(bool mask, float yes, float no) { return mask ? yes : no; }
 D2_FN float where(bool mask, float yes) { return mask ? yes : 0.f; }
+D2_FN float negative(float a) { return a < 0 ? a : -a; }  // -|a|
 D2_FN float reciprocal(float a) { return 1.f / a; }
 
 // ln 2 and the factor that turns exp(-(x^2) / 2) into 2^-((k x)^2).
@@ -240,28 +241,37 @@ struct Fragment {
 };
 
 template <class S>
-D2_FN Fragment<S> fragment(const Footprint<float>& f, S dx, S dy) {
-  const S u = fma(S(f.ux), dx, S(f.uy) * dy), v = S(f.vy) * dy;
-  return {u, v, fnma(u, u, fnma(v, v, S(f.log2_opacity)))};
+D2_FN Fragment<S> fragment(float log2_opacity, S u, S v) {
+  return {u, v, fnma(u, u, fnma(v, v, S(log2_opacity)))};
+}
+
+// u and v at (dx, dy) pixels from the centre.
+template <class S>
+D2_FN S along_u(const Footprint<float>& f, S dx, S dy) {
+  return fma(S(f.ux), dx, S(f.uy) * dy);
+}
+template <class S>
+D2_FN S along_v(const Footprint<float>& f, S dy) {
+  return S(f.vy) * dy;
 }
 
 // One step of front-to-back compositing. A finished pixel carries its transmittance negated.
 template <class S>
 struct Step {
-  decltype(S() > S()) seen, kept;  // reaches alpha_min at an unfinished pixel; and does not finish it
-  S alpha, weight;                 // weight is 0 where not kept
+  decltype(S() > S()) seen, open;  // reaches alpha_min; and the pixel is not finished, by this Gaussian or before
+  S alpha, weight;                 // alpha is 0 where not seen, weight where not seen or not open
   S transmittance;                 // behind the Gaussian
 };
 
 template <class S>
 D2_FN Step<S> composite(S log2_alpha, S transmittance, float log2_alpha_min, const Constants& c) {
   Step<S> s;
-  s.seen = (log2_alpha >= S(log2_alpha_min)) & (transmittance > S(0.f));
-  s.alpha = min(exp2(max(log2_alpha, S(-64.f))), S(c.alpha_max));
+  s.seen = log2_alpha >= S(log2_alpha_min);
+  s.alpha = where(s.seen, min(exp2(log2_alpha), S(c.alpha_max)));
   const S after = fnma(s.alpha, transmittance, transmittance);
-  s.kept = s.seen & (after > S(c.transmittance_min));
-  s.weight = where(s.kept, s.alpha * transmittance);
-  s.transmittance = select(s.kept, after, select(s.seen, -transmittance, transmittance));
+  s.open = after > S(c.transmittance_min);
+  s.weight = where(s.open, s.alpha * transmittance);
+  s.transmittance = select(s.open, after, negative(transmittance));
   return s;
 }
 
@@ -270,7 +280,7 @@ D2_FN Step<S> composite(S log2_alpha, S transmittance, float log2_alpha_min, con
 template <class S>
 D2_FN S log_alpha_gradient(const Step<S>& s, S log2_alpha, S transmittance, S value, S behind, float log2_alpha_max) {
   const S gradient = fnma(behind, reciprocal(S(1.f) - s.alpha), value * transmittance);
-  return where(s.kept & (log2_alpha <= S(log2_alpha_max)), s.alpha * gradient);
+  return where(s.open & (log2_alpha <= S(log2_alpha_max)), s.alpha * gradient);
 }
 
 }  // namespace d2
