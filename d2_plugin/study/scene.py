@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +12,8 @@ import torch
 from torch import Tensor
 
 from d2_plugin.captures import Camera, Capture
+from d2_plugin.errors import MissingExtra
+from d2_plugin.priors.colmap import SparsePoints, triangulate_frames
 from d2_plugin.protocol import View
 
 MIN_POINTS = 5000
@@ -129,20 +132,16 @@ def _random_points(
     return (in_camera - translation) @ rotation, colors, times
 
 
-def triangulated_points(capture: Capture, cameras: tuple[str, ...], instants: int = 5) -> dict[str, np.ndarray]:
+def triangulated_points(capture: Capture, cameras: Sequence[str], instants: int = 5) -> dict[str, np.ndarray]:
     """Points triangulated with the known poses at up to `instants` frames spread over the recording.
 
-    Returns positions [P, 3], colors [P, 3] in 0..1 and frames [P]; empty for a single camera.
+    Returns positions [P, 3], colors [P, 3] in 0..1 and frames [P]; none for a single camera, or where pycolmap is not
+    installed, which is said in a warning.
     """
-    from d2_plugin.priors.colmap import triangulate
-
-    empty = {"positions": np.zeros((0, 3)), "colors": np.zeros((0, 3)), "frames": np.zeros(0, dtype=np.int64)}
-    if len(cameras) < 2:
-        return empty
     chosen = np.unique(np.linspace(0, len(capture.frames) - 1, instants).round().astype(int))
-    parts = []
-    for frame in (capture.frames[i] for i in chosen):
-        images = [capture.image(camera, frame) for camera in cameras]
-        points = triangulate(images, [capture.cameras[camera] for camera in cameras])
-        parts.append((points.positions, points.colors, np.full(len(points.positions), frame, dtype=np.int64)))
-    return {name: np.concatenate(values) for name, values in zip(empty, zip(*parts, strict=True), strict=True)}
+    try:
+        points = triangulate_frames(capture, cameras, [capture.frames[i] for i in chosen])
+    except MissingExtra as error:
+        warnings.warn(f"{error}; Gaussians start from random points instead", stacklevel=2)
+        points = SparsePoints.empty()
+    return {"positions": points.positions, "colors": points.colors, "frames": points.frames}

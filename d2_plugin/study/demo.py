@@ -1,0 +1,48 @@
+"""`d2 demo`: a synthetic recording, the backbone alone against the backbone with D2, a table and a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.captures import open_capture
+from d2_plugin.captures.pictures import read_picture, write_png
+from d2_plugin.captures.saving import save_capture
+from d2_plugin.captures.synthetic import split, synthetic_capture
+from d2_plugin.study.report import metrics_table
+from d2_plugin.study.run import Run
+from d2_plugin.study.settings import HOOK_NAMES, RunSettings
+
+NAMES = {"backbone": (), "backbone + D2": HOOK_NAMES}
+
+
+def run_demo(folder: Path, iterations: int) -> str:
+    """Write capture, two runs and comparison.png under `folder`; returns the table to print.
+
+    Both runs start from the same points and take the same number of iterations; a demo that was cut off goes on.
+    """
+    path = folder / "capture"
+    if not path.is_dir():
+        save_capture(synthetic_capture(), path)
+    train, held_out = split(open_capture(path))
+    runs = {}
+    for name, hooks in NAMES.items():
+        settings = RunSettings(str(path), tuple(train), iterations=iterations, hooks=hooks)
+        run = Run(settings, folder / name.replace(" + ", "_").lower())
+        run.train()
+        runs[name] = (run, run.evaluate())
+    picture = folder / "comparison.png"
+    _compare({name: run.folder for name, (run, _) in runs.items()}, held_out[len(held_out) // 2], picture)
+    table = metrics_table({name: metrics for name, (_, metrics) in runs.items()})
+    return f"{table}\nThe recording is rendered and its monocular depth is emulated.\nPicture: {picture}"
+
+
+def _compare(folders: dict[str, Path], camera: str, picture: Path) -> None:
+    """The same held-out view of every run, one row of panels per run."""
+    rows: list[Any] = []
+    for folder in folders.values():
+        found = sorted((folder / "pictures").glob(f"{camera}_*.png"))
+        rows.append(read_picture(found[len(found) // 2]))
+    write_png(picture, np.concatenate(rows))
