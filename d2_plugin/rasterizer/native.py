@@ -46,12 +46,11 @@ class Frame(ctypes.Structure):
             for name in (
                 *("means", "covariances", "opacities", "colors", "screen_offsets", "background"),
                 *("prior_depth", "verified"),
-                *("records", "slots", "counts", "tiles", "ids", "blocks"),
+                *("records", "slots", "tiles", "ids", "blocks"),
                 *("color", "depth_sum", "alpha", "grad_color", "grad_depth_sum", "grad_alpha"),
-                *("touched", "moments", "background_parts"),
                 *("grad_means", "grad_covariances", "grad_opacities", "grad_colors"),
                 *("grad_screen_offsets", "grad_background"),
-                *("statistics", "weight", "error", "max_weight", "hits"),
+                *("weight", "error", "max_weight", "hits"),
             )
         ),
     )
@@ -77,7 +76,6 @@ def library() -> ctypes.CDLL:
     signatures = {
         "d2_frame_size": ((), _long),
         "d2_tile_count": ((frame,), _int),
-        "d2_moment_stride": ((_int,), _long),
         "d2_project": ((frame,), _long),
         "d2_render": ((frame, _long), None),
         "d2_survey": ((frame, _long), None),
@@ -158,12 +156,8 @@ def backward(
     tiles = library().d2_tile_count(frame)
     pairs = (len(lists) - len(means) - 1 - 2 * tiles) // 3
     _point_lists(frame, lists, pairs)
-    moments = means.new_empty(pairs, library().d2_moment_stride(channels))
-    touched = torch.empty(pairs, dtype=torch.uint8)
     gradients = [torch.empty_like(part) for part in (means, covariances, opacities, colors)]
     gradients += [means.new_empty(channels), means.new_empty(len(means), 2)]
-    parts = means.new_empty(tiles, channels)
-    frame.point(touched=touched, moments=moments, background_parts=parts)
     frame.point(grad_means=gradients[0], grad_covariances=gradients[1], grad_opacities=gradients[2])
     frame.point(grad_colors=gradients[3], grad_background=gradients[4], grad_screen_offsets=gradients[5])
     library().d2_backward(frame, pairs)
@@ -188,11 +182,10 @@ def survey(
     frame.point(means=means, covariances=covariances, opacities=opacities)
     frame.point(prior_depth=prior_depth, verified=verified)
     _, _, pairs = _project(frame, means)
-    touched, statistics = torch.empty(pairs, dtype=torch.uint8), means.new_empty(pairs, 4)
     weight, error, max_weight = (torch.empty_like(opacities) for _ in range(3))
     hits = torch.empty(len(means), dtype=torch.int32)
     depth_sum, alpha = torch.empty_like(prior_depth), torch.empty_like(prior_depth)
-    frame.point(touched=touched, statistics=statistics, depth_sum=depth_sum, alpha=alpha)
+    frame.point(depth_sum=depth_sum, alpha=alpha)
     frame.point(weight=weight, error=error, max_weight=max_weight, hits=hits)
     library().d2_survey(frame, pairs)
     return Survey(weight, error, max_weight, hits, depth_sum, alpha)
@@ -218,8 +211,7 @@ def _project(frame: Frame, means: Tensor) -> tuple[Tensor, Tensor, int]:
     """Records [M, 16], an empty buffer for the lists of pairs, and their number."""
     tiles = library().d2_tile_count(frame)
     records = means.new_empty(len(means), RECORD)
-    counts = torch.empty(frame.chunks * (tiles + 1), dtype=torch.int32)
-    pairs = library().d2_project(frame.point(records=records, counts=counts))
+    pairs = library().d2_project(frame.point(records=records))
     if pairs > 2**31 - 1:
         raise D2Error(f"{pairs} pairs of Gaussian and tile, at most 2^31 - 1 are possible: use a smaller image")
     lists = torch.empty(3 * pairs + len(means) + 1 + 2 * tiles, dtype=torch.int32)

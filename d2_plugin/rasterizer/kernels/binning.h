@@ -6,7 +6,6 @@
 #pragma once
 
 #include <algorithm>
-#include <vector>
 
 #include "frame.h"
 #include "parallel.h"
@@ -14,10 +13,10 @@
 namespace d2 {
 
 template <class Visit>
-D2_INLINE void for_each_tile(const Record& r, int tiles_x, Visit visit) {
-  if (r.last_x < r.first_x) return;
-  for (int y = r.first_y / TILE_BLOCKS; y <= r.last_y / TILE_BLOCKS; y++)
-    for (int x = r.first_x / TILE_BLOCKS; x <= r.last_x / TILE_BLOCKS; x++) visit(y * tiles_x + x);
+D2_INLINE void for_each_tile(const Box& b, int tiles_x, Visit visit) {
+  if (b.last_x < b.first_x) return;
+  for (int y = b.first_y / TILE_BLOCKS; y <= b.last_y / TILE_BLOCKS; y++)
+    for (int x = b.first_x / TILE_BLOCKS; x <= b.last_x / TILE_BLOCKS; x++) visit(y * tiles_x + x);
 }
 
 // First and last block along one axis whose pixel centres lie within `reach` of `center`; empty: last < first.
@@ -54,7 +53,7 @@ D2_INLINE Mask load_extras(const Frame& f, int64_t i, int rows, Floats& offset_x
   return zero >= Floats(0.f);
 }
 
-D2_INLINE void project_group(const Frame& f, int64_t i, int rows, int32_t* counts) {
+D2_INLINE void project_group(const Frame& f, int64_t i, int rows, Box* boxes, int32_t* counts) {
   Floats offset_x, offset_y;
   const Mask finite = load_extras(f, i, rows, offset_x, offset_y);
   const Projected<Floats> p = project(load_gaussians(f, i, rows), offset_x, offset_y, f.camera, f.constants);
@@ -67,40 +66,43 @@ D2_INLINE void project_group(const Frame& f, int64_t i, int rows, int32_t* count
   const unsigned visible = lanes(p.visible & finite);
   const int tiles_x = f.tiles_x();
   for (int lane = 0; lane < rows; lane++) {
-    Record& r = f.records[i + lane];
-    const bool drawn = (visible >> lane & 1) && last_x[lane] >= first_x[lane] && last_y[lane] >= first_y[lane];
-    if (!drawn) {
-      r.first_x = 1, r.last_x = 0;
+    Box& box = boxes[i + lane];
+    if (!(visible >> lane & 1) || last_x[lane] < first_x[lane] || last_y[lane] < first_y[lane]) {
+      box = {1, 1, 0, 0, 0.f};
       continue;
     }
+    box = {uint16_t(first_x[lane]), uint16_t(first_y[lane]), uint16_t(last_x[lane]), uint16_t(last_y[lane]),
+           fields[6][lane]};
+    Record& r = f.records[i + lane];
     r.footprint = {fields[0][lane], fields[1][lane], fields[2][lane], fields[3][lane],
                    fields[4][lane], fields[5][lane], fields[6][lane]};
-    r.first_x = uint16_t(first_x[lane]), r.last_x = uint16_t(last_x[lane]);
-    r.first_y = uint16_t(first_y[lane]), r.last_y = uint16_t(last_y[lane]);
+    r.first_x = box.first_x, r.first_y = box.first_y, r.last_x = box.last_x, r.last_y = box.last_y;
     if (f.colors)
       for (int c = 0; c < f.channels && c < 3; c++) r.color[c] = f.colors[(i + lane) * f.channels + c];
-    for_each_tile(r, tiles_x, [&](int tile) { counts[tile]++; });
+    for_each_tile(box, tiles_x, [&](int tile) { counts[tile]++; });
   }
 }
 
-// Fills records and counts; returns the number of pairs.
+// Fills records, boxes and counts; returns the number of pairs.
 inline int64_t project_all(const Frame& f) {
   const int tiles = f.tile_count();
+  Box* boxes = scratch().boxes.reserve(f.count);
+  int32_t* all_counts = scratch().counts.reserve(size_t(f.chunks) * (tiles + 1));
   parallel_for(f.threads, f.chunks, [&](int64_t chunk) {
-    int32_t* counts = f.counts + chunk * (tiles + 1);
+    int32_t* counts = all_counts + chunk * (tiles + 1);
     std::fill(counts, counts + tiles + 1, 0);
     const int64_t end = f.chunk_begin(chunk + 1);
     int64_t i = f.chunk_begin(chunk);
-    for (; i + LANES <= end; i += LANES) project_group(f, i, LANES, counts);
-    if (i < end) project_group(f, i, int(end - i), counts);
+    for (; i + LANES <= end; i += LANES) project_group(f, i, LANES, boxes, counts);
+    if (i < end) project_group(f, i, int(end - i), boxes, counts);
   });
   int64_t pairs = 0;
   for (int tile = 0; tile < tiles; tile++)
     for (int chunk = 0; chunk < f.chunks; chunk++) {
-      int32_t* row = f.counts + int64_t(chunk) * (tiles + 1);
-      const int32_t here = row[tile];
-      row[tile] = int32_t(pairs);
-      row[tiles] += here;
+      int32_t* counts = all_counts + int64_t(chunk) * (tiles + 1);
+      const int32_t here = counts[tile];
+      counts[tile] = int32_t(pairs);
+      counts[tiles] += here;
       pairs += here;
     }
   return pairs;
@@ -116,23 +118,27 @@ D2_INLINE uint64_t sort_key(float depth, int64_t index) {
 // Puts every pair into its tile, in the order of Gaussian indices.
 inline void distribute(const Frame& f, int64_t pairs) {
   const int tiles = f.tile_count(), tiles_x = f.tiles_x();
+  const Box* boxes = scratch().boxes.data();
+  int32_t* all_counts = scratch().counts.data();
   for (int tile = 0; tile < tiles; tile++) {
-    const int32_t begin = f.counts[tile], end = tile + 1 < tiles ? f.counts[tile + 1] : int32_t(pairs);
+    const int32_t begin = all_counts[tile], end = tile + 1 < tiles ? all_counts[tile + 1] : int32_t(pairs);
     f.tiles[tile] = {begin, end - begin};
   }
-  std::vector<int32_t> first_slot(f.chunks + 1);
-  for (int chunk = 0; chunk < f.chunks; chunk++)
-    first_slot[chunk + 1] = first_slot[chunk] + f.counts[int64_t(chunk) * (tiles + 1) + tiles];
+  int32_t first_slot = 0;
+  for (int chunk = 0; chunk < f.chunks; chunk++) {
+    int32_t& here = all_counts[int64_t(chunk) * (tiles + 1) + tiles];
+    first_slot += here;
+    here = first_slot - here;
+  }
   f.slots[f.count] = int32_t(pairs);
   parallel_for(f.threads, f.chunks, [&](int64_t chunk) {
-    int32_t* place = f.counts + chunk * (tiles + 1);
-    int32_t slot = first_slot[chunk];
+    int32_t* place = all_counts + chunk * (tiles + 1);
+    int32_t slot = place[tiles];
     const int64_t end = f.chunk_begin(chunk + 1);
     for (int64_t i = f.chunk_begin(chunk); i < end; i++) {
-      const Record& r = f.records[i];
       f.slots[i] = slot;
-      const uint64_t key = sort_key(r.footprint.depth, i);
-      for_each_tile(r, tiles_x, [&](int tile) {
+      const uint64_t key = sort_key(boxes[i].depth, i);
+      for_each_tile(boxes[i], tiles_x, [&](int tile) {
         f.blocks[place[tile]++] = key;
         slot++;
       });
@@ -141,8 +147,14 @@ inline void distribute(const Frame& f, int64_t pairs) {
 }
 
 // Sorts keys by depth, stable: by radix on the digits in which depths differ, or by insertion where they are few.
-inline void sort_by_depth(const uint64_t* keys, int count, std::vector<uint64_t>& out, std::vector<uint64_t>& spare) {
-  out.assign(keys, keys + count);
+inline const uint64_t* sort_by_depth(const uint64_t* keys, int count) {
+  uint64_t *out = scratch().keys.reserve(count), *spare = scratch().spare.reserve(count);
+  uint32_t low = ~0u, high = 0;
+  for (int i = 0; i < count; i++) {
+    const uint32_t depth = uint32_t(keys[i] >> 32);
+    low = std::min(low, depth), high = std::max(high, depth);
+    out[i] = keys[i];
+  }
   if (count <= 48) {
     for (int i = 1; i < count; i++) {
       const uint64_t key = out[i];
@@ -150,14 +162,8 @@ inline void sort_by_depth(const uint64_t* keys, int count, std::vector<uint64_t>
       for (; k > 0 && out[k - 1] > key; k--) out[k] = out[k - 1];
       out[k] = key;
     }
-    return;
+    return out;
   }
-  uint32_t low = ~0u, high = 0;
-  for (int i = 0; i < count; i++) {
-    const uint32_t depth = uint32_t(keys[i] >> 32);
-    low = std::min(low, depth), high = std::max(high, depth);
-  }
-  spare.resize(count);
   const int bits = high > low ? 32 - __builtin_clz(high - low) : 0;
   const int passes = (bits + 9) / 10, digit = passes ? (bits + passes - 1) / passes : 0;
   int32_t places[1 << 10];
@@ -166,16 +172,17 @@ inline void sort_by_depth(const uint64_t* keys, int count, std::vector<uint64_t>
     const uint32_t mask = (1u << digit) - 1;
     std::fill(places, places + (1 << digit), 0);
     const auto bucket = [&](uint64_t key) { return (uint32_t(key >> 32) - low) >> shift & mask; };
-    for (uint64_t key : out) places[bucket(key)]++;
+    for (int i = 0; i < count; i++) places[bucket(out[i])]++;
     int32_t total = 0;
     for (int b = 0; b < 1 << digit; b++) {
       const int32_t here = places[b];
       places[b] = total;
       total += here;
     }
-    for (uint64_t key : out) spare[places[bucket(key)]++] = key;
-    out.swap(spare);
+    for (int i = 0; i < count; i++) spare[places[bucket(out[i])]++] = out[i];
+    std::swap(out, spare);
   }
+  return out;
 }
 
 }  // namespace d2

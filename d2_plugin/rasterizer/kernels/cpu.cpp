@@ -8,18 +8,6 @@
 
 namespace d2 {
 
-// Buffers of a thread, kept from call to call.
-struct Scratch {
-  std::vector<uint64_t> keys, spare;
-  std::vector<float> memory;
-  float* vectors(size_t count) {
-    memory.resize(count * LANES + 16);
-    const uintptr_t address = reinterpret_cast<uintptr_t>(memory.data());
-    return reinterpret_cast<float*>((address + 63) & ~uintptr_t(63));
-  }
-};
-static thread_local Scratch scratch;
-
 struct Corner {
   int x, y;  // pixels
 };
@@ -161,7 +149,7 @@ D2_INLINE int64_t slot_of(const Frame& f, const Record& r, int32_t id, Corner co
 template <int FIXED>
 static void render_tile(const Frame& f, int tile) {
   const int channels = FIXED ? FIXED : f.channels, fields = 2 + channels;
-  float* state = scratch.vectors(size_t(BLOCKS) * fields);
+  float* state = scratch().state.reserve(size_t(BLOCKS) * fields * LANES);
   std::fill(state, state + BLOCKS * fields * LANES, 0.f);
   uint64_t alive = 0;
   for_each_pixel(f, tile, [&](int64_t, int block, int lane) {
@@ -173,8 +161,7 @@ static void render_tile(const Frame& f, int tile) {
   const Lattice lattice;
   const float log2_alpha_min = f.log2_alpha_min();
   const int32_t begin = f.tiles[tile].begin, pairs = f.tiles[tile].live;
-  sort_by_depth(f.blocks + begin, pairs, scratch.keys, scratch.spare);
-  const uint64_t* keys = scratch.keys.data();
+  const uint64_t* keys = sort_by_depth(f.blocks + begin, pairs);
   int32_t live = begin;
   for (int q = 0; q < pairs && alive; q++) {
     if (q + 8 < pairs) __builtin_prefetch(f.records + uint32_t(keys[q + 8]));
@@ -215,10 +202,9 @@ static void render_tile(const Frame& f, int tile) {
 
 // State of a block in the backward pass: transmittance, what is left of sum of w dL/dw, and dL/d of alpha (with the
 // background's share), depth sum and colors at its pixels.
-static void load_gradients(const Frame& f, int tile, int channels, float* state) {
+static void load_gradients(const Frame& f, int tile, int channels, float* state, float* background) {
   const int fields = 4 + channels;
   std::fill(state, state + BLOCKS * fields * LANES, 0.f);
-  float* background = f.background_parts ? f.background_parts + int64_t(tile) * channels : nullptr;
   if (background) std::fill(background, background + channels, 0.f);
   for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
     float* field = state + block * fields * LANES + lane;
@@ -239,12 +225,18 @@ static void load_gradients(const Frame& f, int tile, int channels, float* state)
   });
 }
 
+// Where the tiles of one call put their sums: `Scratch` of the thread that calls.
+struct Sums {
+  uint8_t* touched;
+  float *moments, *background;
+};
+
 template <int FIXED>
-static void backward_tile(const Frame& f, int tile) {
+static void backward_tile(const Frame& f, int tile, const Sums& to) {
   const int channels = FIXED ? FIXED : f.channels, fields = 4 + channels;
-  float* state = scratch.vectors(size_t(BLOCKS) * fields + 7 + channels);
+  float* state = scratch().state.reserve(size_t(BLOCKS * fields + 7 + channels) * LANES);
   Floats* loose_sums = reinterpret_cast<Floats*>(state + BLOCKS * fields * LANES);
-  load_gradients(f, tile, channels, state);
+  load_gradients(f, tile, channels, state, to.background ? to.background + int64_t(tile) * channels : nullptr);
   const Corner corner = corner_of(f, tile);
   const Lattice lattice;
   const float log2_alpha_min = f.log2_alpha_min(), log2_alpha_max = f.log2_alpha_max();
@@ -289,8 +281,8 @@ static void backward_tile(const Frame& f, int tile) {
       behind.store(field + LANES);
     }
     const int64_t slot = slot_of(f, r, id, corner);
-    f.touched[slot] = 1;
-    float* moments = f.moments + slot * stride;
+    to.touched[slot] = 1;
+    float* moments = to.moments + slot * stride;
     if (FIXED)
       store_sums<7 + FIXED>(fixed_sums, moments);
     else
@@ -299,22 +291,22 @@ static void backward_tile(const Frame& f, int tile) {
 }
 
 // Adds up the slots of a Gaussian, in the order of tiles.
-D2_INLINE bool gather_moments(const Frame& f, int64_t i, int64_t stride, float* total) {
+D2_INLINE bool gather_moments(const Frame& f, const Sums& from, int64_t i, int64_t stride, float* total) {
   bool any_slot = false;
   for (int64_t slot = f.slots[i]; slot < f.slots[i + 1]; slot++) {
-    if (!f.touched[slot]) continue;
-    const float* part = f.moments + slot * stride;
+    if (!from.touched[slot]) continue;
+    const float* part = from.moments + slot * stride;
     for (int64_t k = 0; k < stride; k++) total[k] += part[k];
     any_slot = true;
   }
   return any_slot;
 }
 
-D2_INLINE void backward_group(const Frame& f, int64_t i, int rows, float* totals) {
+D2_INLINE void backward_group(const Frame& f, const Sums& from, int64_t i, int rows, float* totals) {
   const int64_t stride = moment_stride(f.channels);
   std::fill(totals, totals + LANES * stride, 0.f);
   alignas(64) float drawn[LANES] = {};
-  for (int lane = 0; lane < rows; lane++) drawn[lane] = gather_moments(f, i + lane, stride, totals + lane * stride);
+  for (int lane = 0; lane < rows; lane++) drawn[lane] = gather_moments(f, from, i + lane, stride, totals + lane * stride);
   const auto column = [&](int k) { return load_column(totals, stride, k, rows); };
 
   // Only what `project_backward` reads: the rest of a footprint comes from the Gaussian itself.
@@ -343,9 +335,9 @@ D2_INLINE void backward_group(const Frame& f, int64_t i, int rows, float* totals
 // ---------------------------------------------------------------------------------------------------- survey
 
 // State of a block in the survey: transmittance, depth sum, and at verified pixels 1 / (D* + eps), D* / (D* + eps), 1.
-static void survey_tile(const Frame& f, int tile) {
+static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* statistics) {
   constexpr int fields = 5;
-  float* state = scratch.vectors(size_t(BLOCKS) * fields);
+  float* state = scratch().state.reserve(size_t(BLOCKS) * fields * LANES);
   std::fill(state, state + BLOCKS * fields * LANES, 0.f);
   uint64_t alive = 0;
   for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
@@ -362,8 +354,7 @@ static void survey_tile(const Frame& f, int tile) {
   const Lattice lattice;
   const float log2_alpha_min = f.log2_alpha_min();
   const int32_t begin = f.tiles[tile].begin, pairs = f.tiles[tile].live;
-  sort_by_depth(f.blocks + begin, pairs, scratch.keys, scratch.spare);
-  const uint64_t* keys = scratch.keys.data();
+  const uint64_t* keys = sort_by_depth(f.blocks + begin, pairs);
   for (int q = 0; q < pairs && alive; q++) {
     if (q + 8 < pairs) __builtin_prefetch(f.records + uint32_t(keys[q + 8]));
     const uint32_t id = uint32_t(keys[q]);
@@ -390,8 +381,8 @@ static void survey_tile(const Frame& f, int tile) {
     }
     if (!any(sums[2] > Floats(0.f))) continue;
     const int64_t slot = slot_of(f, r, int32_t(id), corner);
-    f.touched[slot] = 1;
-    f.statistics[slot] = {sum(sums[0]), sum(sums[1]), largest(sums[2]), float(hits)};
+    touched[slot] = 1;
+    statistics[slot] = {sum(sums[0]), sum(sums[1]), float(hits), largest(sums[2])};
   }
 
   for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
@@ -401,77 +392,80 @@ static void survey_tile(const Frame& f, int tile) {
   });
 }
 
-static void gather_statistics(const Frame& f, int64_t i) {
+static void gather_statistics(const Frame& f, const uint8_t* touched, const Statistics* statistics, int64_t i) {
   float weight = 0, error = 0, max_weight = 0;
   int32_t hits = 0;
   for (int64_t slot = f.slots[i]; slot < f.slots[i + 1]; slot++) {
-    if (!f.touched[slot]) continue;
-    const Statistics& s = f.statistics[slot];
+    if (!touched[slot]) continue;
+    const Statistics& s = statistics[slot];
     weight += s.weight, error += s.error, hits += int32_t(s.hits);
     max_weight = std::max(max_weight, s.max_weight);
   }
   f.weight[i] = weight, f.error[i] = error, f.max_weight[i] = max_weight, f.hits[i] = hits;
 }
 
+// ---------------------------------------------------------------------------------------------------- the calls
+
+static void render(const Frame& f, int64_t pairs) {
+  distribute(f, pairs);
+  parallel_for(f.threads, f.tile_count(), [&](int64_t tile) {
+    if (f.channels == 3)
+      render_tile<3>(f, int(tile));
+    else
+      render_tile<0>(f, int(tile));
+  });
+}
+
+static void survey(const Frame& f, int64_t pairs) {
+  distribute(f, pairs);
+  uint8_t* touched = scratch().touched.reserve(pairs);
+  Statistics* statistics = scratch().statistics.reserve(pairs);
+  std::fill(touched, touched + pairs, 0);
+  parallel_for(f.threads, f.tile_count(), [&](int64_t tile) { survey_tile(f, int(tile), touched, statistics); });
+  parallel_for(f.threads, f.chunks, [&](int64_t chunk) {
+    for (int64_t i = f.chunk_begin(chunk); i < f.chunk_begin(chunk + 1); i++)
+      gather_statistics(f, touched, statistics, i);
+  });
+}
+
+static void backward(const Frame& f, int64_t pairs) {
+  const int tiles = f.tile_count();
+  const int64_t stride = moment_stride(f.channels);
+  Sums sums = {scratch().touched.reserve(pairs), scratch().moments.reserve(pairs * stride), nullptr};
+  if (f.grad_background) sums.background = scratch().background.reserve(size_t(tiles) * f.channels);
+  std::fill(sums.touched, sums.touched + pairs, 0);
+  parallel_for(f.threads, tiles, [&](int64_t tile) {
+    if (f.channels == 3)
+      backward_tile<3>(f, int(tile), sums);
+    else
+      backward_tile<0>(f, int(tile), sums);
+  });
+  if (f.grad_background)
+    for (int c = 0; c < f.channels; c++) {
+      double total = 0;
+      for (int tile = 0; tile < tiles; tile++) total += sums.background[int64_t(tile) * f.channels + c];
+      f.grad_background[c] = float(total);
+    }
+  parallel_for(f.threads, f.chunks, [&](int64_t chunk) {
+    float* totals = scratch().state.reserve(size_t(LANES) * stride);
+    const int64_t end = f.chunk_begin(chunk + 1);
+    int64_t i = f.chunk_begin(chunk);
+    for (; i + LANES <= end; i += LANES) backward_group(f, sums, i, LANES, totals);
+    if (i < end) backward_group(f, sums, i, int(end - i), totals);
+  });
+}
+
 }  // namespace d2
 
 // ---------------------------------------------------------------------------------------------------- C ABI
 
-using d2::Frame;
-
-// The order of `tile_count`, `moment_stride` and the steps is fixed by native.py.
+// native.py calls `d2_project`, allocates `ids` and `blocks` for as many pairs, and calls one of the next two on the
+// same thread; `d2_backward` takes what d2_render left behind.
 extern "C" {
-
-int32_t d2_tile_count(const Frame* f) { return f->tile_count(); }
-int64_t d2_moment_stride(int32_t channels) { return d2::moment_stride(channels); }
-int64_t d2_frame_size() { return sizeof(Frame); }
-
-// Step 1: projects and counts; returns the number of pairs to allocate for.
-int64_t d2_project(const Frame* f) { return d2::project_all(*f); }
-
-// Step 2, for an image.
-void d2_render(const Frame* f, int64_t pairs) {
-  d2::distribute(*f, pairs);
-  d2::parallel_for(f->threads, f->tile_count(), [&](int64_t tile) {
-    if (f->channels == 3)
-      d2::render_tile<3>(*f, int(tile));
-    else
-      d2::render_tile<0>(*f, int(tile));
-  });
-}
-
-// Step 2, for a survey.
-void d2_survey(const Frame* f, int64_t pairs) {
-  d2::distribute(*f, pairs);
-  std::memset(f->touched, 0, pairs);
-  d2::parallel_for(f->threads, f->tile_count(), [&](int64_t tile) { d2::survey_tile(*f, int(tile)); });
-  d2::parallel_for(f->threads, f->chunks, [&](int64_t chunk) {
-    for (int64_t i = f->chunk_begin(chunk); i < f->chunk_begin(chunk + 1); i++) d2::gather_statistics(*f, i);
-  });
-}
-
-// After d2_render with the same state: gradients of everything.
-void d2_backward(const Frame* f, int64_t pairs) {
-  std::memset(f->touched, 0, pairs);
-  const int tiles = f->tile_count();
-  d2::parallel_for(f->threads, tiles, [&](int64_t tile) {
-    if (f->channels == 3)
-      d2::backward_tile<3>(*f, int(tile));
-    else
-      d2::backward_tile<0>(*f, int(tile));
-  });
-  if (f->grad_background)
-    for (int c = 0; c < f->channels; c++) {
-      double total = 0;
-      for (int tile = 0; tile < tiles; tile++) total += f->background_parts[int64_t(tile) * f->channels + c];
-      f->grad_background[c] = float(total);
-    }
-  d2::parallel_for(f->threads, f->chunks, [&](int64_t chunk) {
-    float* totals = d2::scratch.vectors(size_t(d2::moment_stride(f->channels)));
-    const int64_t end = f->chunk_begin(chunk + 1);
-    int64_t i = f->chunk_begin(chunk);
-    for (; i + d2::LANES <= end; i += d2::LANES) d2::backward_group(*f, i, d2::LANES, totals);
-    if (i < end) d2::backward_group(*f, i, int(end - i), totals);
-  });
-}
+int64_t d2_frame_size() { return sizeof(d2::Frame); }
+int32_t d2_tile_count(const d2::Frame* f) { return f->tile_count(); }
+int64_t d2_project(const d2::Frame* f) { return d2::project_all(*f); }
+void d2_render(const d2::Frame* f, int64_t pairs) { d2::render(*f, pairs); }
+void d2_survey(const d2::Frame* f, int64_t pairs) { d2::survey(*f, pairs); }
+void d2_backward(const d2::Frame* f, int64_t pairs) { d2::backward(*f, pairs); }
 }

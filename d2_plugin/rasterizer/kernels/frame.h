@@ -1,7 +1,12 @@
-// What one call works on: the arrays of a view, laid out as native.py fills them in, and the tiles of its image.
+// What one call works on: the arrays of a view, laid out as native.py fills them in, the tiles of its image, and the
+// buffers that a thread keeps from call to call.
 #pragma once
 
+#include <sys/mman.h>
+
 #include <cstdint>
+#include <cstdlib>
+#include <new>
 
 #include "simd.h"
 #include "splat.h"
@@ -15,7 +20,7 @@ constexpr int TILE_WIDTH = TILE_BLOCKS * BLOCK_WIDTH, TILE_HEIGHT = TILE_BLOCKS 
 // A projected Gaussian in one cache line.
 struct alignas(64) Record {
   Footprint<float> footprint;
-  uint16_t first_x, first_y, last_x, last_y;  // blocks that it may reach, inclusive; none where last < first
+  uint16_t first_x, first_y, last_x, last_y;  // as in Box
   float color[7];                             // of up to 3 channels; others are read from Frame::colors
 };
 static_assert(sizeof(Record) == 64, "one cache line");
@@ -27,7 +32,13 @@ struct Tile {
 
 // Per (Gaussian, tile), what the survey adds up.
 struct Statistics {
-  float weight, error, max_weight, hits;
+  float weight, error, hits, max_weight;
+};
+
+// What binning needs of a projected Gaussian: the blocks that it may reach, inclusive (none where last < first).
+struct Box {
+  uint16_t first_x, first_y, last_x, last_y;
+  float depth;
 };
 
 struct Frame {
@@ -45,9 +56,8 @@ struct Frame {
 
   // State of the forward pass. A pair is a Gaussian in a tile: pairs of Gaussian i have the slots slots[i]..slots[i+1]-1
   // in row-major order of tiles; pairs of a tile stand together in `ids` and `blocks`.
-  Record* records;   // [M]
+  Record* records;   // [M]; undefined where a Gaussian has no pairs
   int32_t* slots;    // [M + 1]
-  int32_t* counts;   // [chunks, tiles + 1] pairs per tile, then where they go; the last column sums a chunk
   Tile* tiles;       // [tiles]
   int32_t* ids;      // [pairs]
   uint64_t* blocks;  // [pairs] bit b: contributes to block b; before that, depth and id to sort by
@@ -56,14 +66,10 @@ struct Frame {
   float *color, *depth_sum, *alpha;
   const float *grad_color, *grad_depth_sum, *grad_alpha;
 
-  // Backward: per slot, whether it was written, and its sums (Moments, then dL/d color), `stride` floats apart.
-  uint8_t* touched;
-  float* moments;
-  float* background_parts;  // [tiles, channels]
+  // Gradients; the last two may be null.
   float *grad_means, *grad_covariances, *grad_opacities, *grad_colors, *grad_screen_offsets, *grad_background;
 
-  // Survey; `touched` as above.
-  Statistics* statistics;
+  // Survey.
   float *weight, *error, *max_weight;
   int32_t* hits;
 
@@ -77,6 +83,50 @@ struct Frame {
   float log2_alpha_min() const { return d2::log2(constants.alpha_min); }
   float log2_alpha_max() const { return d2::log2(constants.alpha_max); }
 };
+
+// Memory that only grows, so that a training loop does not pay for fresh pages in every step.
+template <class T>
+class Buffer {
+ public:
+  ~Buffer() { std::free(data_); }
+  T* reserve(size_t count) {
+    if (count > capacity_) {
+      std::free(data_);
+      capacity_ = count + count / 4;
+      const size_t page = size_t(2) << 20, bytes = capacity_ * sizeof(T);
+      const size_t alignment = bytes < page ? 64 : page;
+      data_ = static_cast<T*>(std::aligned_alloc(alignment, (bytes + alignment - 1) / alignment * alignment));
+      if (!data_) throw std::bad_alloc();
+#if defined(MADV_HUGEPAGE)
+      if (bytes >= page) madvise(data_, bytes, MADV_HUGEPAGE);
+#endif
+    }
+    return data_;
+  }
+  T* data() const { return data_; }
+
+ private:
+  T* data_ = nullptr;
+  size_t capacity_ = 0;
+};
+
+// Buffers of a thread. The first group belongs to the thread that calls, and lives at least through one call (`boxes`
+// and `counts` from d2_project to the step that follows it); the second to every thread that works on tiles.
+struct Scratch {
+  Buffer<Box> boxes;                // [M]
+  Buffer<int32_t> counts;           // [chunks, tiles + 1] pairs per tile, then where they go; last: pairs of the chunk
+  Buffer<uint8_t> touched;          // [pairs] whether the slot was written
+  Buffer<float> moments;            // [pairs, stride] per slot: Moments, then dL/d color
+  Buffer<float> background;         // [tiles, channels] parts of dL/d background
+  Buffer<Statistics> statistics;    // [pairs] per slot
+
+  Buffer<uint64_t> keys, spare;     // [pairs of the tile]
+  Buffer<float> state;              // fields of the tile's blocks
+};
+inline Scratch& scratch() {
+  static thread_local Scratch buffers;
+  return buffers;
+}
 
 // Floats between the moments of two slots: whole cache lines.
 inline int64_t moment_stride(int channels) { return (7 + channels + 15) / 16 * 16; }
