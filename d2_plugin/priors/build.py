@@ -15,6 +15,7 @@ import numpy as np
 from d2_plugin.captures.capture import Capture
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.align import Alignment, align, aligned_depth, not_aligned
+from d2_plugin.priors.correct import corrected_depth
 from d2_plugin.priors.fuse import VARIANTS, FusedPrior, empty_prior, fuse
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.sources import (
@@ -209,7 +210,10 @@ class _Builder:
             return alignment, nothing, alignment.status.value
         anchors = geometric[geometric > 0]
         z_far = self.settings.z_far_factor * float(np.percentile(anchors, 99.5)) if anchors.size else np.inf
-        return alignment, aligned_depth(prediction, alignment, z_far), ""
+        aligned = aligned_depth(prediction, alignment, z_far)
+        if self.variant != "dual_unaligned":
+            aligned = corrected_depth(aligned, geometric, self.settings.align)
+        return alignment, aligned, ""
 
     def _fit(self, prediction: np.ndarray, geometric: np.ndarray, mono: MonoSource) -> Alignment:
         """The alignment; a metric map is taken as it is where there is no geometric depth to fit it to."""

@@ -1,13 +1,14 @@
 """Depth priors on disk: one memory-mapped array and one record per camera and frame.
 
     STORE/store.json                     format, and what the store was built for
-    STORE/priors/CAMERA/FRAME.npy        structured [H, W]: depth uint16 (logarithmic, 0 = empty), label uint8, RGB uint8
+    STORE/priors/CAMERA/FRAME.npy        structured [H, W]: depth uint16 (logarithmic, 0 = empty), label, RGB uint8
     STORE/priors/CAMERA/FRAME.json       record: a, b, gap, status, shares, settings, hashes, depth range, checksum
     STORE/cache/...                      stereo and monocular maps, so that other fusion settings cost seconds
 
 Logarithmic depth in 16 bits is exact to 1e-5 in a room and to 1.6e-4 from 1e-3 to 1e6. The picture lies beside it, at 6
-bytes per pixel in all: inserted Gaussians take its colours, and training need not open the capture for them. Every file is written under a temporary name and renamed, the array before its record: a record therefore
-vouches for its array, a build that is killed loses the frame in work, and readers never see half a file.
+bytes per pixel in all: inserted Gaussians take its colours, and training need not open the capture for them. Every file
+is written under a temporary name and renamed, the array before its record: a record therefore vouches for its array, a
+build that is killed loses the frame in work, and readers never see half a file.
 """
 
 from __future__ import annotations
