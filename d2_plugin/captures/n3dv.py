@@ -60,9 +60,12 @@ def camera_from_row(row: np.ndarray, name: str, size: tuple[int, int] | None, wh
     `size` None means the size in the row; another one must have the same aspect and scales the focal length.
     """
     pose = np.asarray(row[:15], np.float64).reshape(3, 5)
-    if not np.isfinite(row).all():
-        raise D2Error(f"the row of camera {name} in {where} has a number that is not finite: correct the calibration")
     height, width, focal = pose[:, 4]
+    if not np.isfinite(row).all() or min(height, width) < 1:
+        raise D2Error(
+            f"the row of camera {name} in {where} has a number that is not finite or a size below one pixel: "
+            "correct the calibration"
+        )
     size = size or (round(width), round(height))
     scale = size[0] / width
     if abs(size[1] / height - scale) > 0.01 * scale:

@@ -22,13 +22,14 @@ def save_capture(capture: Capture, path: Path | str) -> Path:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise D2Error(f"{folder} already exists and is not empty: choose another folder, nothing was written")
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "cameras.json").write_text(json.dumps(_description(capture), indent=1) + "\n")
+    description = json.dumps(_description(capture), indent=1)
     for camera in capture.cameras:
         for frame in capture.frames:
             _save_frame(capture, folder, camera, frame)
     if capture.mono_kind is not None:
         declared = {"kind": capture.mono_kind, "emulated": capture.mono_emulated}
         (folder / "mono" / "mono.json").write_text(json.dumps(declared) + "\n")
+    (folder / "cameras.json").write_text(description + "\n")  # last: without it a half-written folder is no capture
     return folder
 
 

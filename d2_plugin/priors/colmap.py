@@ -26,6 +26,9 @@ from d2_plugin.errors import D2Error, missing_extra
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue in the grey picture that features are found in (ITU-R BT.601)."""
 
+DESCRIPTOR_LENGTH = 128
+"""Numbers in a SIFT descriptor."""
+
 
 @dataclass(frozen=True)
 class TriangulationSettings:
@@ -182,7 +185,7 @@ def _extract(pycolmap: ModuleType, image: np.ndarray, settings: TriangulationSet
     gray = np.rint(image @ LUMA).astype(np.uint8)
     keypoints, descriptors = extractor.extract_from_uint8_array(gray)
     pixels = np.array([(point.x, point.y) for point in keypoints], np.float64).reshape(-1, 2)
-    vectors = np.asarray(descriptors.data, np.float32).reshape(len(pixels), -1)
+    vectors = np.asarray(descriptors.data, np.float32).reshape(len(pixels), DESCRIPTOR_LENGTH)
     return _Features(pixels, vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
 
 

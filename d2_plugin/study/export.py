@@ -1,7 +1,7 @@
 """The Gaussians of one instant as a 3DGS PLY file, which viewers such as SuperSplat, Brush and SIBR open.
 
-Files named `frame_00000.ply`, `frame_00001.ply`, ... that are dropped together play as an animation in SuperSplat; a zip
-of them does in Brush.
+Files named `frame_00000.ply`, `frame_00001.ply`, ... that are dropped together play as an animation in SuperSplat; a
+zip of them does in Brush.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ALPHA_MAX = 1 - 1e-6
 """Largest opacity that has a finite logit in float32."""
 
 FLATTEST = 1e-12
-"""Smallest eigenvalue of a covariance relative to its largest: below it float64 holds only rounding."""
+"""Smallest eigenvalue written, relative to the largest: a flat covariance in float32 may have a negative one."""
 
 ATTRIBUTES = (
     *("x", "y", "z", "nx", "ny", "nz"),

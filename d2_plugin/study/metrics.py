@@ -1,6 +1,7 @@
 """Image and depth metrics, each in the exact variant that published tables use.
 
 Images are tensors [H, W, 3] in 0..1 and every function returns one number per image; tables are means over images.
+All arithmetic is float64 on the CPU.
 `VARIANTS` says in words which definition stands behind each key of metrics.json.
 
 The published SSIM_1 and SSIM_2 columns of dense-view papers are scikit-image's `structural_similarity` with a uniform
@@ -13,9 +14,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from d2_plugin.errors import D2Error
 
@@ -42,7 +43,7 @@ VARIANTS = {
 def psnr(image: Tensor, truth: Tensor) -> float:
     """Peak signal to noise ratio in dB, 20 log10(1 / sqrt(MSE)); infinite for equal pictures."""
     image, truth = _pair(image, truth)
-    error = (image - truth).square().mean().item()
+    error = float(np.square(image - truth).mean())
     return -10 * math.log10(error) if error > 0 else math.inf
 
 
@@ -70,7 +71,7 @@ def ssim_3dgs(image: Tensor, truth: Tensor) -> float:
     reach = GAUSSIAN_WINDOW // 2
     weights = [math.exp(-0.5 * (offset / GAUSSIAN_SIGMA) ** 2) for offset in range(-reach, reach + 1)]
     taps = [weight / sum(weights) for weight in weights]
-    padded = [functional.pad(picture, (reach,) * 4) for picture in (image, truth)]
+    padded = [np.pad(picture, ((0, 0), (reach, reach), (reach, reach))) for picture in (image, truth)]
     return _ssim(*padded, taps, data_range=1.0, unbias=1.0)
 
 
@@ -108,7 +109,7 @@ def _known_depths(depth: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(torch.isfinite(rendered), rendered, 0.0), truth[known].double()
 
 
-def _ssim(image: Tensor, truth: Tensor, taps: Sequence[float], data_range: float, unbias: float) -> float:
+def _ssim(image: np.ndarray, truth: np.ndarray, taps: Sequence[float], data_range: float, unbias: float) -> float:
     """Mean SSIM over windows inside the pictures [3, H, W]; `unbias` turns window variances into sample variances.
 
     Goes over the picture in strips, which stay in the processor's cache and keep memory small for large pictures.
@@ -116,32 +117,32 @@ def _ssim(image: Tensor, truth: Tensor, taps: Sequence[float], data_range: float
     margin = len(taps) - 1
     rows = image.shape[1] - margin
     strips = [slice(start, min(start + STRIP_ROWS, rows) + margin) for start in range(0, rows, STRIP_ROWS)]
-    total = sum(_similarity(image[:, s], truth[:, s], taps, data_range, unbias).sum().item() for s in strips)
-    return total / (image.shape[0] * rows * (image.shape[2] - margin))
+    total = sum(_similarity(image[:, s], truth[:, s], taps, data_range, unbias).sum() for s in strips)
+    return float(total) / (image.shape[0] * rows * (image.shape[2] - margin))
 
 
-def _similarity(image: Tensor, truth: Tensor, taps: Sequence[float], data_range: float, unbias: float) -> Tensor:
+def _similarity(
+    image: np.ndarray, truth: np.ndarray, taps: Sequence[float], data_range: float, unbias: float
+) -> np.ndarray:
     """The SSIM of every window inside the pictures, [3, H - w + 1, W - w + 1] for w taps."""
     c1, c2 = (K1 * data_range) ** 2, (K2 * data_range) ** 2
-    products = torch.stack([image, truth, image * image, truth * truth, image * truth])
+    products = np.stack([image, truth, image * image, truth * truth, image * truth])
     mean_x, mean_y, square_x, square_y, cross = _filtered(_filtered(products, taps, -1), taps, -2)
-    variance_x, variance_y = unbias * (square_x - mean_x.square()), unbias * (square_y - mean_y.square())
+    variance_x, variance_y = unbias * (square_x - mean_x**2), unbias * (square_y - mean_y**2)
     covariance = unbias * (cross - mean_x * mean_y)
-    luminance = (2 * mean_x * mean_y + c1) / (mean_x.square() + mean_y.square() + c1)
+    luminance = (2 * mean_x * mean_y + c1) / (mean_x**2 + mean_y**2 + c1)
     structure = (2 * covariance + c2) / (variance_x + variance_y + c2)
     return luminance * structure
 
 
-def _filtered(values: Tensor, taps: Sequence[float], axis: int) -> Tensor:
+def _filtered(values: np.ndarray, taps: Sequence[float], axis: int) -> np.ndarray:
     """Correlation with `taps` along one axis, where the window fits."""
-    length = values.shape[axis] - len(taps) + 1
-    total = taps[0] * values.narrow(axis, 0, length)
-    for start, tap in enumerate(taps[1:], start=1):
-        total.add_(values.narrow(axis, start, length), alpha=tap)
-    return total
+    moved = np.swapaxes(values, axis, 0)
+    length = len(moved) - len(taps) + 1
+    return np.swapaxes(sum(tap * moved[start : start + length] for start, tap in enumerate(taps)), axis, 0)
 
 
-def _pair(image: Tensor, truth: Tensor, window: int = 1) -> tuple[Tensor, Tensor]:
+def _pair(image: Tensor, truth: Tensor, window: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Both pictures as [3, H, W] float64 (in float32 the variances of flat regions would be rounding noise)."""
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
         raise D2Error(
@@ -152,4 +153,5 @@ def _pair(image: Tensor, truth: Tensor, window: int = 1) -> tuple[Tensor, Tensor
             f"a picture of {image.shape[1]}x{image.shape[0]} pixels is smaller than the {window}x{window} window "
             "of this metric: compare larger pictures"
         )
-    return image.double().permute(2, 0, 1), truth.double().permute(2, 0, 1)
+    first, second = (picture.detach().cpu().double().permute(2, 0, 1).numpy() for picture in (image, truth))
+    return np.ascontiguousarray(first), np.ascontiguousarray(second)
