@@ -15,8 +15,8 @@ from d2_plugin.captures.calibration import pinhole, rigid
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.synthetic import synthetic_capture
 from d2_plugin.errors import D2Error, MissingExtra
-from d2_plugin.priors import colmap
-from d2_plugin.priors.colmap import SparsePoints, sampson_distance, triangulate, triangulate_frames
+from d2_plugin.priors.colmap import SparsePoints, triangulate, triangulate_frames
+from d2_plugin.priors.matching import fundamental_matrix, sampson_distance
 
 pytest.importorskip("pycolmap")
 
@@ -88,9 +88,11 @@ def test_points_survive_a_file(capture: Capture, tmp_path: Path) -> None:
     again = SparsePoints.load(tmp_path / "points.cache")
     for name in ("positions", "colors", "errors", "track_lengths", "frames"):
         np.testing.assert_array_equal(getattr(again, name), getattr(points, name))
-    (tmp_path / "points.cache").write_bytes(b"cut off")
-    with pytest.raises(D2Error, match=r"cannot read sparse points from .*points\.cache"):
-        SparsePoints.load(tmp_path / "points.cache")
+    whole = (tmp_path / "points.cache").read_bytes()
+    for damaged in (b"cut off", whole[:-200], whole[:300] + bytes(200) + whole[500:]):
+        (tmp_path / "points.cache").write_bytes(damaged)
+        with pytest.raises(D2Error, match=r"cannot read sparse points from .*points\.cache"):
+            SparsePoints.load(tmp_path / "points.cache")
 
 
 def test_hopeless_input_gives_no_points_and_no_abort(capture: Capture) -> None:
@@ -122,7 +124,7 @@ def test_sampson_distance_is_the_pixel_distance_for_a_pure_sideways_move() -> No
     """Rectified cameras: epipolar lines are rows, and the first-order distance of a row offset d is d / sqrt(2)."""
     first = Camera("a", 100, 80, pinhole(90, 90, 50, 40), np.eye(4))
     second = Camera("b", 100, 80, pinhole(90, 90, 50, 40), rigid(np.eye(3), np.array([-0.3, 0, 0])))
-    fundamental = colmap._fundamental(first, second)
+    fundamental = fundamental_matrix(first, second)
     pixels = np.random.default_rng(0).uniform(0, 80, (20, 2))
     moved = pixels - [7.0, 0.0]
     np.testing.assert_allclose(sampson_distance(fundamental, pixels, moved), 0, atol=1e-9)
@@ -136,7 +138,7 @@ def test_epipolar_geometry_holds_for_projected_points(capture: Capture) -> None:
     for camera in (first, second):
         projected = (points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]) @ camera.K.T
         pixels.append(projected[:, :2] / projected[:, 2:])
-    assert sampson_distance(colmap._fundamental(first, second), *pixels).max() < 1e-9
+    assert sampson_distance(fundamental_matrix(first, second), *pixels).max() < 1e-9
 
 
 def test_a_missing_pycolmap_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,8 @@ from __future__ import annotations
 import json
 import logging
 import re
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -207,9 +209,10 @@ def _frame_rate(description: dict[str, Any], path: Path, frames: int) -> tuple[f
 def _load_array(path: Path, key: str | None) -> np.ndarray:
     """A 2D array from .npy, or from .npz under `key`."""
     try:
-        loaded = np.load(path)
-        array = loaded if key is None else loaded[key]
-    except (OSError, ValueError, KeyError, EOFError) as failure:
+        with open(path, "rb") as file:  # np.load leaves a damaged file open
+            loaded = np.load(file)
+            array = loaded if key is None else loaded[key]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as failure:
         raise D2Error(f"cannot read {path} ({failure}): replace the file or remove it") from None
     if array.ndim != 2:
         raise D2Error(f"{path} has shape {array.shape}, expected [height, width]: write one number per pixel")

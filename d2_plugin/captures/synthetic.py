@@ -14,6 +14,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -107,6 +108,7 @@ def arc_cameras(cameras: int, held_out: int, width: int, height: int, arc_degree
     return placed
 
 
+@lru_cache(maxsize=4)
 def furnished_room(seed: int, moving: bool) -> Scene:
     """Brick wall, plaster walls, plank floor, furniture, a rolling ball and a toy that turns while it travels."""
     rng = np.random.default_rng(seed)

@@ -10,18 +10,20 @@ from __future__ import annotations
 import itertools
 import os
 import tempfile
-import zlib  # noqa: F401 - before pycolmap, whose own copy of zlib would otherwise be bound and crash later calls
+import zipfile
+import zlib  # before pycolmap, whose own copy of zlib would otherwise be bound and crash later calls
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.priors.matching import Features, epipolar_matches, fundamental_matrix, same_spot
 
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue in the grey picture that features are found in (ITU-R BT.601)."""
@@ -89,17 +91,12 @@ class SparsePoints:
     def load(cls, path: Path) -> SparsePoints:
         """Read what `save` wrote."""
         try:
-            with np.load(path) as arrays:
+            with open(path, "rb") as file, np.load(file) as arrays:  # np.load leaves a damaged file open
                 return cls(*(arrays[field.name] for field in fields(cls)))
-        except (OSError, ValueError, KeyError, EOFError) as failure:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as failure:
             raise D2Error(
                 f"cannot read sparse points from {path} ({failure}): delete the file and build again"
             ) from None
-
-
-class _Features(NamedTuple):
-    pixels: np.ndarray  # [F, 2] float64, pixel centres at i + 0.5
-    descriptors: np.ndarray  # [F, 128] float32, unit length
 
 
 def triangulate(
@@ -129,12 +126,7 @@ def triangulate(
     pycolmap = _pycolmap()
     with _quiet(pycolmap), tempfile.TemporaryDirectory(prefix="d2_sparse_") as folder:
         features = [_extract(pycolmap, image, settings) for image in images]
-        pairs = {
-            (i, j): _matches(features[i], features[j], _fundamental(cameras[i], cameras[j]), settings)
-            for i, j in itertools.combinations(range(len(cameras)), 2)
-            if not _one_spot(cameras[i], cameras[j])
-        }
-        pairs = {key: matches for key, matches in pairs.items() if len(matches)}
+        pairs = _matched_pairs(features, cameras, settings)
         if not pairs:
             return SparsePoints.empty()
         model = _triangulated(pycolmap, Path(folder), cameras, features, pairs, settings)
@@ -175,7 +167,7 @@ def _quiet(pycolmap: ModuleType) -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def _extract(pycolmap: ModuleType, image: np.ndarray, settings: TriangulationSettings) -> _Features:
+def _extract(pycolmap: ModuleType, image: np.ndarray, settings: TriangulationSettings) -> Features:
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = os.cpu_count() or 1
@@ -186,71 +178,33 @@ def _extract(pycolmap: ModuleType, image: np.ndarray, settings: TriangulationSet
     keypoints, descriptors = extractor.extract_from_uint8_array(gray)
     pixels = np.array([(point.x, point.y) for point in keypoints], np.float64).reshape(-1, 2)
     vectors = np.asarray(descriptors.data, np.float32).reshape(len(pixels), DESCRIPTOR_LENGTH)
-    return _Features(pixels, vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
+    return Features(pixels, vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
 
 
-def _matches(
-    first: _Features, second: _Features, fundamental: np.ndarray, settings: TriangulationSettings
-) -> np.ndarray:
-    """Pairs of feature indices [M, 2] that are each other's nearest, pass the ratio test and fit the known geometry."""
-    if min(len(first.pixels), len(second.pixels)) < 2:
-        return np.zeros((0, 2), np.int64)
-    forward, backward = (
-        _nearest(a.descriptors, b.descriptors, settings) for a, b in ((first, second), (second, first))
-    )
-    here = np.flatnonzero(forward >= 0)
-    here = here[backward[forward[here]] == here]
-    matches = np.stack([here, forward[here]], axis=1)
-    error = sampson_distance(fundamental, first.pixels[matches[:, 0]], second.pixels[matches[:, 1]])
-    return matches[error <= settings.epipolar_error]
-
-
-def _nearest(
-    queries: np.ndarray, candidates: np.ndarray, settings: TriangulationSettings, block: int = 1024
-) -> np.ndarray:
-    """Index of the candidate nearest to each query [Q], -1 where it is too far or a second one is as near."""
-    nearest = np.full(len(queries), -1)
-    for start in range(0, len(queries), block):
-        similarity = queries[start : start + block] @ candidates.T
-        best = similarity.argmax(axis=1)
-        top_two = np.arccos(np.clip(np.partition(similarity, -2, axis=1)[:, -2:], -1, 1))
-        clear = (top_two[:, 1] <= settings.max_angle) & (top_two[:, 1] <= settings.max_ratio * top_two[:, 0])
-        nearest[start : start + block] = np.where(clear, best, -1)
-    return nearest
-
-
-def sampson_distance(fundamental: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """First-order distance [M] in pixels of matched points [M, 2] from the epipolar geometry F [3, 3]."""
-    x, y = (np.concatenate([points, np.ones((len(points), 1))], axis=1) for points in (first, second))
-    line_second, line_first = x @ fundamental.T, y @ fundamental
-    gradient = np.hypot(np.hypot(*line_second[:, :2].T), np.hypot(*line_first[:, :2].T))
-    return np.abs((y * line_second).sum(axis=1)) / np.maximum(gradient, np.finfo(float).tiny)
-
-
-def _relative_pose(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """(R, t) from the first camera's coordinates to the second's."""
-    pose = second.T_camera_world @ np.linalg.inv(first.T_camera_world)
-    return pose[:3, :3], pose[:3, 3]
-
-
-def _one_spot(first: Camera, second: Camera) -> bool:
-    """Whether two cameras stand on the same spot, up to rounding: they see no parallax."""
-    baseline = np.linalg.norm(first.centre - second.centre)
-    return bool(baseline <= 1e-9 * max(1.0, np.abs(first.centre).max()))
-
-
-def _fundamental(first: Camera, second: Camera) -> np.ndarray:
-    """F [3, 3] with y^T F x = 0 for pixels x of `first` and y of `second` of one world point."""
-    rotation, (x, y, z) = _relative_pose(first, second)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.linalg.inv(second.K).T @ cross @ rotation @ np.linalg.inv(first.K)
+def _matched_pairs(
+    features: Sequence[Features], cameras: Sequence[Camera], settings: TriangulationSettings
+) -> dict[tuple[int, int], np.ndarray]:
+    """Matches [M, 2] of every pair of pictures that has any."""
+    pairs = {}
+    for i, j in itertools.combinations(range(len(cameras)), 2):
+        if not same_spot(cameras[i], cameras[j]):
+            fundamental = fundamental_matrix(cameras[i], cameras[j])
+            pairs[i, j] = epipolar_matches(
+                features[i],
+                features[j],
+                fundamental,
+                settings.max_ratio,
+                settings.max_angle,
+                settings.epipolar_error,
+            )
+    return {pair: matches for pair, matches in pairs.items() if len(matches)}
 
 
 def _triangulated(
     pycolmap: ModuleType,
     folder: Path,
     cameras: Sequence[Camera],
-    features: Sequence[_Features],
+    features: Sequence[Features],
     pairs: dict[tuple[int, int], np.ndarray],
     settings: TriangulationSettings,
 ) -> Any:
@@ -287,7 +241,7 @@ def _write_database(
     pycolmap: ModuleType,
     path: Path,
     model: Any,
-    features: Sequence[_Features],
+    features: Sequence[Features],
     pairs: dict[tuple[int, int], np.ndarray],
 ) -> None:
     database = pycolmap.Database.open(path)
