@@ -106,20 +106,21 @@ def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
 def inverse_depth_planes(
     reference: Camera, sources: Sequence[Camera], depth_range: tuple[float, float], step: float
 ) -> np.ndarray:
-    """Inverse depths [D] float64, ascending, spaced so that no projection moves further than `step` source pixels.
+    """Inverse depths [D] float64, ascending, between which a projection moves by `step` source pixels on average.
 
-    The spacing follows the fastest projection that lies inside any source image, so a range that is ten times too
-    wide adds planes only where pixels are really seen twice; where there is no overlap at all it stays coarse.
+    The average is over the pixels that lie inside a source image, and over the sources. Spacing by the fastest of them
+    takes four times as many planes at wide angles for the same result. A range that is ten times too wide adds planes
+    only where pixels are really seen twice; where there is no overlap at all the spacing stays coarse.
     """
-    bounds = 1 / depth_range[1], 1 / depth_range[0]
-    fine = np.linspace(*bounds, 2049)
+    fine = np.linspace(1 / depth_range[1], 1 / depth_range[0], 2049)
     u, v = np.meshgrid(np.linspace(0, reference.width - 1, 9), np.linspace(0, reference.height - 1, 9))
     speed = np.zeros(len(fine) - 1)
     for source in sources:
         at = view_pair(reference, source).project(u.ravel()[None, :], v.ravel()[None, :], 1 / fine[:, None])
         inside = (at.z > 0) & (at.x > -1) & (at.y > -1) & (at.x < source.width) & (at.y < source.height)
-        moved = np.hypot(np.diff(at.x, axis=0), np.diff(at.y, axis=0))
-        speed = np.maximum(speed, np.where(inside[1:] | inside[:-1], np.minimum(moved, source.width), 0).max(axis=1))
+        inside = inside[1:] | inside[:-1]
+        moved = np.minimum(np.hypot(np.diff(at.x, axis=0), np.diff(at.y, axis=0)), source.width)
+        speed += (moved * inside).sum(axis=1) / np.maximum(inside.sum(axis=1), 1) / len(sources)
     travel = np.concatenate([[0.0], np.cumsum(np.maximum(speed, 1e-6))])
     count = max(3, int(np.ceil(travel[-1] / step)) + 1)
     return np.interp(np.linspace(0, travel[-1], count), travel, fine)

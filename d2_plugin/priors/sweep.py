@@ -1,9 +1,12 @@
 """Guided plane sweep on the CPU with OpenCV's kernels: geometric depth where there is no compiler.
 
-For each inverse depth one homography warps every source onto the reference, a small window correlates, the best half of
-the sources is averaged (the others are taken for occluded), and a guided filter aggregates the cost along the edges of
-the picture. The minimum over planes is refined by a parabola. Planes stand at most half a source pixel apart, which is
-what makes the result insensitive to the range; only the running minimum and its two neighbours are kept in memory.
+For each inverse depth one homography warps every source onto the reference, a small window correlates, the source that
+matches best is taken (the others may be occluded, or too oblique), and a guided filter aggregates the cost along the
+edges of the picture. The minimum over planes is refined by a parabola. Planes stand a source pixel apart, which makes
+the result insensitive to the range; only the running minimum and its two neighbours are kept in memory.
+
+Measured on studio (16 to 33 degrees between neighbours): completeness .136 with the best source, .092 with the mean of
+the best two. Fronto-parallel planes see little of such a rig: a compiled PatchMatch finds .39 there.
 """
 
 from __future__ import annotations
@@ -63,7 +66,7 @@ def _sweep_one(
     minimum = RunningMinimum(grays[index].shape)
     for plane in planes:
         costs = [correlate(_warp(cv2, gray, pair, plane, grays[index].shape)) for pair, gray in sources]
-        minimum.add(guide.filter(best_half(costs)))
+        minimum.add(guide.filter(np.minimum.reduce(costs)))
     position, cost = minimum.result()
     inverse = np.interp(position, np.arange(len(planes)), planes)
     covered = cost < WORST_COST
@@ -102,14 +105,6 @@ def _correlator(cv2: ModuleType, gray: np.ndarray, window: int) -> Callable[[np.
         return result
 
     return cost
-
-
-def best_half(costs: list[np.ndarray]) -> np.ndarray:
-    """Mean of the better half (rounded up) of the sources' costs, per pixel: the rest may be occluded."""
-    if len(costs) == 1:
-        return costs[0]
-    keep = (len(costs) + 1) // 2
-    return np.partition(np.stack(costs), keep - 1, axis=0)[:keep].mean(axis=0)
 
 
 class RunningMinimum:
