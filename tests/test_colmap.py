@@ -180,5 +180,10 @@ def test_points_of_sear_steak_agree_with_the_checked_ones(shared_data) -> None:
     points = points_of(scene, list(scene.cameras))
     assert len(points) > 1000
     checked = np.load(path / "sift_points.npz")["xyz"].astype(float)
-    nearest = np.array([np.linalg.norm(checked - position, axis=1).min() for position in points.positions])
-    assert np.median(nearest) < 0.05  # of a scene 15 units deep
+
+    def coinciding(positions: np.ndarray) -> float:
+        """Share of points with a checked one within 0.02 units: the same feature, in a scene 15 units deep."""
+        return np.mean([np.linalg.norm(checked - position, axis=1).min() < 0.02 for position in positions])
+
+    assert coinciding(points.positions) > 0.3  # the checked ones come from another SIFT: not every feature is shared
+    assert coinciding(points.positions + [0.1, 0, 0.1]) < 0.05
