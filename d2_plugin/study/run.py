@@ -73,20 +73,23 @@ class Run:
     def evaluate(self, pictures: bool = True) -> dict[str, Any]:
         """Score every held-out camera at every frame; writes metrics.json and pictures/ and returns the metrics."""
         from d2_plugin.study.evaluation import evaluate
+        from d2_plugin.study.lpips import find_lpips
 
-        trainer = self._trained()
-        scene = self.scene
-        folder = self.folder / "pictures" if pictures else None
-        with self._timed("eval"):
+        trainer, scene = self._trained(), self.scene
+        cameras = scene.test_cameras or scene.train_cameras
+        total = len(cameras) * len(scene.capture.frames)
+        with progress_bar("evaluate", total) as bar, self._timed("eval"):
             scores = evaluate(
                 self._renderer(trainer.model),
                 scene.capture,
-                scene.test_cameras or scene.train_cameras,
+                cameras,
                 scene.capture.frames,
-                folder,
+                self.folder / "pictures" if pictures else None,
+                lpips=find_lpips(),
+                progress=lambda done, _: bar.update(done),
             )
         if not scene.test_cameras:
-            scores = {"test": None, "train": scores["test"], "per_view": scores["per_view"]}
+            scores = {"test": None, "train": scores.pop("test")} | scores
         metrics = scores | {
             "gaussians": len(trainer.model),
             "iterations": trainer.step,
