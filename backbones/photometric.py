@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from .native_ssim import can_compare, native_photometric_loss
+
 
 @lru_cache(maxsize=8)
 def _window(device: torch.device, dtype: torch.dtype) -> Tensor:
@@ -37,6 +39,16 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 
 
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """(1 - w) mean |image - target| + w (1 - SSIM) for images [H, W, 3] in 0..1."""
+    """(1 - w) mean |image - target| + w (1 - SSIM) for images [H, W, 3] in 0..1.
+
+    float32 on the CPU with a fixed target runs in a kernel, where there is a compiler.
+    """
+    if ssim_weight and can_compare(image, target):
+        return native_photometric_loss(image, target, _window(image.device, image.dtype), ssim_weight)
+    return reference_photometric_loss(image, target, ssim_weight)
+
+
+def reference_photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+    """The same in torch: any dtype and device, and the oracle of the kernel."""
     loss = (1 - ssim_weight) * torch.abs(image - target).mean()
     return loss + ssim_weight * (1 - ssim(image, target)) if ssim_weight else loss

@@ -11,13 +11,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_SMALL_NORM = 1e-12  # quaternions shorter than this have no direction and are read as the identity
+SMALL_NORM = 1e-30
+"""Quaternions shorter than this have no direction and are read as the identity; float32 can invert longer ones."""
 
 
 def normalized_quaternions(quaternions: Tensor) -> Tensor:
     """Unit quaternions [4, N], w first; zero, vanishing and non-finite ones become the identity with zero gradient."""
     largest = quaternions.detach().abs().amax(0)
-    ok = (largest > _SMALL_NORM) & torch.isfinite(largest)
+    ok = (largest > SMALL_NORM) & torch.isfinite(largest)
     if not ok.all():
         identity = torch.zeros_like(quaternions)
         identity[0] = 1

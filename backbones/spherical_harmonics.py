@@ -52,6 +52,8 @@ def colors(coefficients: Tensor, directions: Tensor, phase: Tensor | None, degre
     `directions` [M, 3] point from the camera centre to the Gaussian (any length); `phase` [M] is
     (t - mu_t) / duration, None when time_degree is 0.
     """
+    if degree == 0 and not time_degree:
+        return torch.relu(C0 * coefficients[:, 0] + 0.5)
     if degree == 0:
         values = coefficients.new_full((len(coefficients), 1), C0)
     else:

@@ -13,11 +13,13 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from d2_plugin.errors import D2Error
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 
 from . import spherical_harmonics as sh
 from .densify import DensifySettings, densify
 from .gaussians import Gaussians
+from .native_slice import STATIC, TEMPORAL, can_slice, native_slice
 from .rotation4d import (
     condition_on_time,
     covariances_from_factors,
@@ -92,27 +94,17 @@ class Yang4D:
         return len(self.gaussians)
 
     def slice_at(self, view: View) -> Splats:
-        """The 3D Gaussians at `view.time` (paper: the selected temporal parameterization), differentiable."""
-        g = self.gaussians
-        opacities = torch.sigmoid(g["opacity_logits"])
-        scales = _components(g["log_scales"]).clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
-        left = normalized_quaternions(_components(g["left"]))
-        if not self.settings.temporal:
-            covariances = covariances_from_factors(rotation_matrices_3d(left) * scales)
-            return Splats(g["positions"], covariances, opacities, torch.arange(len(g), device=g.device))
-        time_scales = g["log_time_scales"].clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
-        scales = torch.cat([scales, time_scales[None]])
-        right = normalized_quaternions(_components(g["right"]))
-        offset = view.time - g["times"]
-        marginal = temporal_marginal(offset, (time_row(left, right) * scales).square().sum(0))
-        rows = torch.nonzero(marginal.detach() > MARGINAL_CUT).squeeze(-1)
-        positions, opacities = _components(g["positions"]), opacities * marginal
-        if len(rows) < len(g):  # Gaussians outside their temporal support are never projected
-            tensors = (positions, left, right, scales, offset, opacities)
-            positions, left, right, scales, offset, opacities = (t[..., rows] for t in tensors)
-        factors, velocity = condition_on_time(rotation_matrices_4d(left, right) * scales)
-        means = (positions + velocity * offset).T.contiguous()
-        return Splats(means, covariances_from_factors(factors), opacities, rows)
+        """The 3D Gaussians at `view.time` (paper: the selected temporal parameterization), differentiable.
+
+        Raises:
+            D2Error: the time is not a number; one outside the scene is fine, and shows less or nothing.
+        """
+        if self.settings.temporal and math.isnan(view.time):
+            raise D2Error(f"the time of camera '{view.camera}', frame {view.frame} is NaN: give every view a time")
+        names = TEMPORAL if self.settings.temporal else STATIC
+        raw = {name: self.gaussians[name] for name in names}
+        slice_in = native_slice if can_slice(raw) else reference_slice
+        return Splats(*slice_in(raw, view.time, MARGINAL_CUT, LOG_SCALE_LIMIT))
 
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] of the sliced Gaussians as seen in `view`."""
@@ -188,6 +180,39 @@ class Yang4D:
             "harmonics": s.color_rate / 20,
         }
         return {name: rates[name] for name in rows}
+
+
+def reference_slice(
+    raw: Mapping[str, Tensor], time: float, marginal_cut: float = MARGINAL_CUT, log_scale_limit: float = LOG_SCALE_LIMIT
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The slice in torch: any dtype and device, and the oracle of `native_slice`, which documents the arguments."""
+    if "times" not in raw:
+        factors = rotation_matrices_3d(_unit(raw["left"])) * _scales(raw["log_scales"], log_scale_limit)
+        rows = torch.arange(len(raw["positions"]), device=factors.device)
+        return raw["positions"], covariances_from_factors(factors), torch.sigmoid(raw["opacity_logits"]), rows
+    log_scales = torch.cat([raw["log_scales"], raw["log_time_scales"][:, None]], 1)
+    parts = (raw["positions"], log_scales, raw["left"], raw["right"], raw["opacity_logits"], raw["times"])
+    # A Gaussian outside its temporal support is never projected; without a gradient, none of it is 0 * inf.
+    with torch.no_grad():
+        last = time_row(_unit(raw["left"]), _unit(raw["right"])) * _scales(log_scales, log_scale_limit)
+        rows = torch.nonzero(temporal_marginal(time - raw["times"], last.square().sum(0)) > marginal_cut).squeeze(-1)
+    if len(rows) < len(log_scales):
+        parts = tuple(part.index_select(0, rows) for part in parts)
+    positions, log_scales, left, right, logits, times = parts
+    factors = rotation_matrices_4d(_unit(left), _unit(right)) * _scales(log_scales, log_scale_limit)
+    spatial, velocity = condition_on_time(factors)
+    offset = time - times
+    means = positions + (velocity * offset).T
+    opacities = torch.sigmoid(logits) * temporal_marginal(offset, factors[3].square().sum(0))
+    return means, covariances_from_factors(spatial), opacities, rows
+
+
+def _unit(quaternions: Tensor) -> Tensor:
+    return normalized_quaternions(_components(quaternions))
+
+
+def _scales(log_scales: Tensor, limit: float) -> Tensor:
+    return _components(log_scales).clamp(-limit, limit).exp()
 
 
 def _components(rows: Tensor) -> Tensor:

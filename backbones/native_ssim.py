@@ -1,0 +1,87 @@
+"""The photometric loss with its gradient, in `kernels/ssim.cpp`: one walk over the rows instead of ten convolutions.
+
+Compiled at first use; runs on `torch.get_num_threads()` threads, and results are the same bits for any number of them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from d2_plugin.compiler import NoCompiler, load_library
+
+from .native_slice import FLAGS, KERNELS, SHARED_HEADERS
+
+
+class _Call(ctypes.Structure):
+    """d2::Photometric of kernels/ssim.cpp; a null gradient is not computed."""
+
+    _fields_ = (
+        *((name, ctypes.c_int32) for name in ("height", "width", "channels", "threads")),
+        ("ssim_weight", ctypes.c_float),
+        ("window", ctypes.c_float * 11),
+        *((name, ctypes.c_void_p) for name in ("image", "target", "gradient", "differences", "similarities")),
+    )
+
+
+@functools.cache
+def library() -> ctypes.CDLL | None:
+    """The compiled kernel; None without a compiler, of which the rasterizer has warned already.
+
+    Raises:
+        CompileError: see `d2_plugin.compiler.load_library`.
+    """
+    try:
+        kernel = load_library("ssim", (KERNELS / "ssim.cpp",), SHARED_HEADERS, FLAGS)
+    except NoCompiler:
+        return None
+    kernel.d2_photometric.argtypes, kernel.d2_photometric.restype = (ctypes.POINTER(_Call),), ctypes.c_double
+    kernel.d2_photometric_size.restype = ctypes.c_int64
+    size = kernel.d2_photometric_size()
+    assert size == ctypes.sizeof(_Call), "the call differs between native_ssim.py and ssim.cpp"
+    return kernel
+
+
+def can_compare(image: Tensor, target: Tensor) -> bool:
+    """Whether these pictures are the kernel's: float32 on the CPU, a fixed target, and there is a compiler."""
+    fit = all(part.dtype == torch.float32 and part.device.type == "cpu" for part in (image, target))
+    same = image.ndim == 3 and image.shape == target.shape and image.numel() > 0
+    return fit and same and not target.requires_grad and library() is not None
+
+
+def native_photometric_loss(image: Tensor, target: Tensor, window: Tensor, ssim_weight: float) -> Tensor:
+    """`photometric.photometric_loss` of float32 pictures [H, W, C] on the CPU, differentiable once by `image`.
+
+    `window` [11] holds the weights of the blur, symmetric.
+    """
+    if not torch.is_grad_enabled():
+        image = image.detach()
+    return _Photometric.apply(image, target, window.tolist(), ssim_weight)
+
+
+class _Photometric(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, window: list[float], ssim_weight: float) -> Tensor:
+        height, width, channels = image.shape
+        image, target = image.contiguous(), target.contiguous()
+        gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
+        sums = torch.empty(2, height, dtype=torch.float64)
+        call = _Call(height, width, channels, torch.get_num_threads(), ssim_weight, (ctypes.c_float * 11)(*window))
+        call.image, call.target = image.data_ptr(), target.data_ptr()
+        call.gradient = None if gradient is None else gradient.data_ptr()
+        call.differences, call.similarities = sums[0].data_ptr(), sums[1].data_ptr()
+        loss = library().d2_photometric(call)
+        ctx.save_for_backward(gradient)
+        return image.new_tensor(loss)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        (gradient,) = ctx.saved_tensors
+        # Multiplying costs as much as the blurs do, and the loss is usually the last thing computed.
+        return gradient if upstream.item() == 1 else gradient * upstream, None, None, None
