@@ -84,7 +84,7 @@ def align(mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: 
         D2Error: maps of two sizes, or an unknown kind or residual.
     """
     _check(mono, geometric, kind, settings)
-    anchors = np.isfinite(mono) & np.isfinite(geometric) & (geometric > 0)
+    anchors = predicted(mono) & np.isfinite(geometric) & (geometric > 0)
     x_all, depth_all = mono[anchors].astype(np.float64), geometric[anchors].astype(np.float64)
     count = int(x_all.size)
     if count == 0:
@@ -135,6 +135,14 @@ def aligned_depth(mono: np.ndarray, alignment: Alignment, z_far: float) -> np.nd
     return _depth(mono.astype(np.float64), alignment.scale, alignment.shift, alignment.kind, z_far).astype(np.float32)
 
 
+def predicted(mono: np.ndarray) -> np.ndarray:
+    """Pixels at which the network said something, bool: finite, and not the zero of a saturated ReLU.
+
+    Depth Anything V2 ends in a ReLU. Its exact zeros say "farther than I can tell", which is no value to fit a line to.
+    """
+    return np.isfinite(mono) & (mono != 0)
+
+
 def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
     """Spearman's rank correlation of two vectors; 0 where one is constant. Ties share their mean rank."""
     ranks = [np.searchsorted(np.sort(v), v, "left") + np.searchsorted(np.sort(v), v, "right") for v in (x, y)]
@@ -144,11 +152,11 @@ def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def _depth(mono: np.ndarray, scale: float, shift: float, kind: MonoKind, z_far: float) -> np.ndarray:
-    value = scale * mono + shift
+    value = scale * np.where(predicted(mono), mono, np.nan) + shift
     if kind == "relative":
         near_enough = value > max(1 / z_far, np.finfo(np.float32).tiny)
         return np.where(near_enough, 1 / np.where(near_enough, value, 1), 0)
-    return np.where((value > 0) & (value <= z_far) & np.isfinite(value), value, 0)
+    return np.where((value > 0) & (value <= z_far), value, 0)
 
 
 def _fit(x: np.ndarray, target: np.ndarray, settings: AlignSettings) -> tuple[AffineFit, float]:

@@ -20,7 +20,7 @@ class StereoSettings:
     """Pictures are shrunk by this factor before matching; half costs a quarter. Depth comes back at full size."""
     sweep_step: float = 1.0
     """Mean disparity between neighbouring planes of the sweep, source pixels. Measured on four Middlebury pairs: half a
-    pixel changes F at 1 % by .00 and doubles the time; the parabola finds the minimum between planes."""
+    pixel doubles the time and changes F at 1 % by .015 at most, either way: the parabola finds what lies between."""
     sweep_window: int = 3
     """Side of the box over which the sweep correlates, pixels; the guided filter then aggregates the cost."""
     sweep_guide_radius: int = 4
@@ -60,7 +60,8 @@ class AlignSettings:
     """Alignment of one monocular map to one geometric map, and when to refuse it (`reference/priors.md` section 5)."""
 
     residual: str = "relative"
-    """`absolute` is the paper's a D^m + b - D^g; `relative` divides by D^g, which halves the bias at 60 % outliers."""
+    """`absolute` is the paper's a D^m + b - D^g; `relative` divides it by D^g, as verification does. Measured: median
+    error of aligned maps .041 with either on studio; with 60 % uniform outliers neither is better in all scenes."""
     epsilon: float = 0.02
     """Smoothing of the Charbonnier penalty: of the relative residual, or (absolute) times the median of the target."""
     max_anchors: int = 20_000
