@@ -56,8 +56,9 @@ struct Spread {
 
   D2_INLINE Fragment<Floats> at(int block) const {
     const Footprint<float>& f = footprint;
-    const float right = PLACES.right[block], down = PLACES.down[block];
-    return fragment(f.log2_opacity, u0 + Floats(along_u(f, right, down)), v0 + Floats(along_v(f, down)));
+    const Floats right = PLACES.right[block], down = PLACES.down[block];
+    const Floats u = fma(Floats(f.ux), right, fma(Floats(f.uy), down, u0)), v = fma(Floats(f.vy), down, v0);
+    return fragment(f.log2_opacity, u, v);
   }
 
   // The blocks where it may reach alpha_min, one bit each: bounds u and v over each block separately.
@@ -90,6 +91,30 @@ struct Lattice {
   }
   D2_INLINE Spread spread(const Record& r, Corner corner) const { return {r.footprint, corner, x, y}; }
 };
+
+// Calls visit(id, record, blocks) for the Gaussians of a tile front to back, with the blocks that they may reach among
+// those still `alive`; ends when none is. Which blocks is found out for a batch ahead, since the loop over them ends
+// unpredictably: the sooner the processor knows when, the less it does in vain.
+template <class Visit>
+D2_INLINE void for_each_reaching(const Frame& f, const uint64_t* keys, int pairs, Corner corner, uint64_t& alive,
+                                 Visit visit) {
+  constexpr int BATCH = 32;
+  const Lattice lattice;
+  const float log2_alpha_min = f.log2_alpha_min();
+  uint64_t blocks[BATCH];
+  for (int first = 0; first < pairs && alive; first += BATCH) {
+    const int count = std::min(BATCH, pairs - first);
+    for (int i = 0; i < count; i++) {
+      if (first + i + 8 < pairs) __builtin_prefetch(f.records + uint32_t(keys[first + i + 8]));
+      const Record& r = f.records[uint32_t(keys[first + i])];
+      blocks[i] = lattice.spread(r, corner).blocks(r, corner, log2_alpha_min);
+    }
+    for (int i = 0; i < count; i++) {
+      const uint32_t id = uint32_t(keys[first + i]);
+      if (const uint64_t reached = blocks[i] & alive) visit(id, f.records[id], reached);
+    }
+  }
+}
 
 // out[i] = sum of parts[i]
 #if defined(D2_AVX512)
@@ -163,14 +188,11 @@ static void render_tile(const Frame& f, int tile) {
   const int32_t begin = f.tiles[tile].begin, pairs = f.tiles[tile].live;
   const uint64_t* keys = sort_by_depth(f.blocks + begin, pairs);
   int32_t live = begin;
-  for (int q = 0; q < pairs && alive; q++) {
-    if (q + 8 < pairs) __builtin_prefetch(f.records + uint32_t(keys[q + 8]));
-    const uint32_t id = uint32_t(keys[q]);
-    const Record& r = f.records[id];
+  for_each_reaching(f, keys, pairs, corner, alive, [&](uint32_t id, const Record& r, uint64_t reached) {
     const float* color = FIXED ? r.color : f.colors + int64_t(id) * channels;
     const Spread spread = lattice.spread(r, corner);
     uint64_t contributes = 0;
-    for (uint64_t left = spread.blocks(r, corner, log2_alpha_min) & alive; left; left &= left - 1) {
+    for (uint64_t left = reached; left; left &= left - 1) {
       const int block = __builtin_ctzll(left);
       const Fragment<Floats> here = spread.at(block);
       float* field = state + block * fields * LANES;
@@ -185,7 +207,7 @@ static void render_tile(const Frame& f, int tile) {
       if (!any(step.open)) alive &= ~(uint64_t(1) << block);
     }
     if (contributes) f.ids[live] = int32_t(id), f.blocks[live++] = contributes;
-  }
+  });
   f.tiles[tile].live = live - begin;
 
   for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
@@ -355,15 +377,12 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
   const float log2_alpha_min = f.log2_alpha_min();
   const int32_t begin = f.tiles[tile].begin, pairs = f.tiles[tile].live;
   const uint64_t* keys = sort_by_depth(f.blocks + begin, pairs);
-  for (int q = 0; q < pairs && alive; q++) {
-    if (q + 8 < pairs) __builtin_prefetch(f.records + uint32_t(keys[q + 8]));
-    const uint32_t id = uint32_t(keys[q]);
-    const Record& r = f.records[id];
+  for_each_reaching(f, keys, pairs, corner, alive, [&](uint32_t id, const Record& r, uint64_t reached) {
+    const Spread spread = lattice.spread(r, corner);
     const Floats depth = r.footprint.depth;
     Floats sums[3] = {0.f, 0.f, 0.f};  // weight and error over verified pixels, largest weight
     int hits = 0;
-    const Spread spread = lattice.spread(r, corner);
-    for (uint64_t left = spread.blocks(r, corner, log2_alpha_min) & alive; left; left &= left - 1) {
+    for (uint64_t left = reached; left; left &= left - 1) {
       const int block = __builtin_ctzll(left);
       const Fragment<Floats> here = spread.at(block);
       float* field = state + block * fields * LANES;
@@ -379,11 +398,11 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
       hits += count(step.seen & step.open & (verified > Floats(0.f)));
       if (!any(step.open)) alive &= ~(uint64_t(1) << block);
     }
-    if (!any(sums[2] > Floats(0.f))) continue;
+    if (!any(sums[2] > Floats(0.f))) return;
     const int64_t slot = slot_of(f, r, int32_t(id), corner);
     touched[slot] = 1;
     statistics[slot] = {sum(sums[0]), sum(sums[1]), float(hits), largest(sums[2])};
-  }
+  });
 
   for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
     const float* field = state + block * fields * LANES + lane;

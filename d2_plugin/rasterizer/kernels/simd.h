@@ -109,7 +109,9 @@ D2_INLINE Mask operator>(Floats a, Floats b) { return {_mm256_cmp_ps(a.v, b.v, _
 D2_INLINE Mask operator>=(Floats a, Floats b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GE_OQ)}; }
 D2_INLINE Mask operator<(Floats a, Floats b) { return b > a; }
 D2_INLINE Mask operator<=(Floats a, Floats b) { return b >= a; }
-D2_INLINE Floats select(Mask m, Floats yes, Floats no) { return _mm256_blendv_ps(no.v, yes.v, m.v); }
+D2_INLINE Floats select(Mask m, Floats yes, Floats no) {
+  return _mm256_or_ps(_mm256_and_ps(m.v, yes.v), _mm256_andnot_ps(m.v, no.v));
+}
 D2_INLINE Floats where(Mask m, Floats yes) { return _mm256_and_ps(m.v, yes.v); }
 D2_INLINE Floats fma(Floats a, Floats b, Floats c) { return _mm256_fmadd_ps(a.v, b.v, c.v); }
 D2_INLINE Floats fnma(Floats a, Floats b, Floats c) { return _mm256_fnmadd_ps(a.v, b.v, c.v); }
