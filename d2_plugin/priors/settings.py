@@ -36,9 +36,9 @@ class StereoSettings:
     wrong matches better, so only windows without any texture are refused; OpenMVS, without it, asks for .02."""
     coherence_min: float = 0.55
     """A depth survives when this share of its neighbours lies on its tangent plane; 0 switches the test off."""
-    coherence_radius: int = 6
+    coherence_radius: int = 9
     """Half the side of the window whose pixels are asked for coherence, pixels."""
-    coherence_contrast: float = 0.08
+    coherence_contrast: float = 0.05
     """Neighbours whose grey value differs by more than this (0..1) have little say in coherence."""
     reprojection_max: float = 1.0
     """Forward-backward reprojection error of a confirming source must be below this, pixels (COLMAP)."""
