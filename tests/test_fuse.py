@@ -1,0 +1,78 @@
+"""Verification and fusion: the paper's equations for e, Omega^v and D*, and the rows of its ablation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.fuse import VARIANTS, cross_source_discrepancy, empty_prior, fuse, verified_region
+from d2_plugin.protocol import Label
+
+# Pixels: both agree, both disagree, only geometric, only monocular, neither.
+MONO = np.array([[2.1, 3.0, 0.0, 5.0, 0.0]], np.float32)
+GEOMETRIC = np.array([[2.0, 2.0, 4.0, 0.0, 0.0]], np.float32)
+
+
+def test_the_discrepancy_is_relative_to_geometric_depth() -> None:
+    e = cross_source_discrepancy(MONO, GEOMETRIC)
+    np.testing.assert_allclose(e, [[0.05, 0.5, 1.0, np.inf, np.inf]], rtol=1e-5)
+    np.testing.assert_allclose(cross_source_discrepancy(MONO * 1e3, GEOMETRIC * 1e3), e, rtol=1e-5)
+
+
+def test_verified_is_strictly_below_tau_c() -> None:
+    np.testing.assert_array_equal(verified_region(np.array([0.0, 0.099, 0.1, np.inf]), 0.1), [True, True, False, False])
+
+
+def test_fusion_takes_geometric_depth_where_verified_and_monocular_where_it_is_alone() -> None:
+    prior = fuse(MONO, GEOMETRIC, tau_c=0.1)
+    np.testing.assert_allclose(prior.depth, [[2, 0, 0, 5, 0]])
+    np.testing.assert_array_equal(
+        prior.labels, [[Label.VERIFIED, Label.CONFLICT, Label.CONFLICT, Label.MONO, Label.EMPTY]]
+    )
+    assert prior.shares() == {"empty": 0.2, "mono": 0.2, "verified": 0.2, "conflict": 0.4}
+
+
+@pytest.mark.parametrize(
+    ("variant", "depth", "labels"),
+    [
+        ("mono", [[2.1, 3, 0, 5, 0]], [[2, 2, 0, 2, 0]]),
+        ("mvs", [[2, 2, 4, 0, 0]], [[2, 2, 2, 0, 0]]),
+        ("dual_unverified", [[2, 2, 4, 5, 0]], [[2, 2, 2, 1, 0]]),
+        ("dual_unaligned", [[2, 0, 0, 5, 0]], [[2, 3, 3, 1, 0]]),
+    ],
+)
+def test_each_row_of_the_ablation_is_a_variant(variant: str, depth: list, labels: list) -> None:
+    prior = fuse(MONO, GEOMETRIC, tau_c=0.1, variant=variant)
+    np.testing.assert_allclose(prior.depth, depth)
+    np.testing.assert_array_equal(prior.labels, labels)
+
+
+depths = arrays(np.float32, (4, 5), elements=st.one_of(st.just(0.0), st.floats(0.125, 1000, width=32)))
+
+
+@given(depths, depths, st.floats(0.01, 0.5), st.sampled_from(VARIANTS))
+def test_exactly_supported_pixels_have_a_depth_and_it_is_one_of_the_two(
+    mono: np.ndarray, geometric: np.ndarray, tau_c: float, variant: str
+) -> None:
+    prior = fuse(mono, geometric, tau_c=tau_c, variant=variant)
+    supported = np.isin(prior.labels, (Label.VERIFIED, Label.MONO))
+    np.testing.assert_array_equal(supported, prior.depth > 0)
+    assert np.all((prior.depth == 0) | (prior.depth == mono) | (prior.depth == geometric))
+    assert sum(prior.shares().values()) == pytest.approx(1)
+
+
+def test_a_refused_frame_is_empty_everywhere() -> None:
+    prior = empty_prior((3, 4))
+    assert not prior.depth.any()
+    assert not prior.labels.any()
+
+
+def test_unknown_variants_and_unequal_sizes_are_refused() -> None:
+    with pytest.raises(D2Error, match="did you mean 'dual_unverified'"):
+        fuse(MONO, GEOMETRIC, tau_c=0.1, variant="dual_unverifed")
+    with pytest.raises(D2Error, match="bring both to one size"):
+        fuse(MONO[:, :2], GEOMETRIC, tau_c=0.1)

@@ -1,0 +1,175 @@
+"""The prior store: what comes out is what went in, and damage is named."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.fuse import FusedPrior
+from d2_plugin.priors.store import DepthRange, PriorStore
+from d2_plugin.protocol import Label
+
+SHAPE = (12, 17)
+IMAGE = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3)).astype(np.uint8)
+
+
+def some_prior(seed: int = 0) -> FusedPrior:
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(0, 4, SHAPE).astype(np.uint8)
+    supported = (labels == Label.MONO) | (labels == Label.VERIFIED)
+    return FusedPrior(np.where(supported, rng.uniform(1, 9, SHAPE), 0).astype(np.float32), labels)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> PriorStore:
+    made = PriorStore.create(tmp_path / "priors", ["a", "b"], [0, 3], {"capture": "test"})
+    for camera in ("a", "b"):
+        made.write(camera, 0, some_prior(), IMAGE, {"key": "k", "shares": some_prior().shares()})
+    return made
+
+
+def array_file(store: PriorStore, camera: str = "a", frame: int = 0) -> Path:
+    return store.entries.location(camera, frame)
+
+
+def test_depth_labels_and_colours_come_back(store: PriorStore) -> None:
+    prior = PriorStore.open(store.path).prior("a", 0)
+    expected = some_prior()
+    np.testing.assert_allclose(prior.depth.numpy(), expected.depth, rtol=2e-5)
+    np.testing.assert_array_equal(prior.depth.numpy() == 0, expected.depth == 0)
+    np.testing.assert_array_equal(prior.labels.numpy(), expected.labels)
+    np.testing.assert_array_equal(prior.colors.numpy(), IMAGE)
+    assert int(prior.verified.sum()) == int((expected.labels == Label.VERIFIED).sum())
+
+
+def test_a_view_that_was_not_built_is_none(store: PriorStore) -> None:
+    assert store.prior("a", 3) is None
+    assert store.record("b", 3) is None
+    with pytest.raises(D2Error, match="unknown camera of the prior store 'c'"):
+        store.prior("c", 0)
+
+
+@given(st.floats(1e-3, 1e3), st.floats(1, 1e9), st.integers(0, 10**6))
+def test_sixteen_bits_of_logarithm_are_as_exact_as_promised(near: float, ratio: float, seed: int) -> None:
+    depth = near * ratio ** np.random.default_rng(seed).random((8, 8))
+    depth[0, 0] = 0
+    depth_range = DepthRange.of(depth)
+    decoded = depth_range.decode(depth_range.encode(depth))
+    assert decoded[0, 0] == 0
+    known = depth > 0
+    bound = 0.51 * math.log(depth_range.far / depth_range.near) / 65534 + 3e-7
+    assert np.abs(decoded[known] / depth[known] - 1).max() <= bound
+
+
+def test_a_map_of_one_depth_and_a_map_of_none_survive() -> None:
+    for depth in (np.full((3, 3), 2.5), np.zeros((3, 3))):
+        depth_range = DepthRange.of(depth)
+        np.testing.assert_allclose(depth_range.decode(depth_range.encode(depth)), depth, rtol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
+def test_depth_that_is_no_depth_is_refused(store: PriorStore, bad: float) -> None:
+    prior = some_prior(1)
+    prior.depth[2, 3] = bad
+    before = array_file(store).read_bytes()
+    with pytest.raises(D2Error, match="camera a, frame 0 has 1 depths that are NaN, infinite or negative"):
+        store.write("a", 0, prior, IMAGE, {})
+    assert array_file(store).read_bytes() == before
+
+
+def test_labels_that_contradict_depth_are_refused(store: PriorStore) -> None:
+    prior = some_prior()
+    prior.labels[prior.depth > 0] = Label.CONFLICT
+    with pytest.raises(D2Error, match="contradict its depth"):
+        store.write("a", 0, prior, IMAGE, {})
+    prior.labels[0, 0] = 9
+    with pytest.raises(D2Error, match="label 9"):
+        store.write("a", 0, prior, IMAGE, {})
+    with pytest.raises(D2Error, match="build the prior at the picture's size"):
+        store.write("a", 0, some_prior(), IMAGE[:5], {})
+
+
+def test_a_truncated_array_is_named_on_open(store: PriorStore) -> None:
+    file = array_file(store)
+    file.write_bytes(file.read_bytes()[:-40])
+    with pytest.raises(D2Error, match=r"camera a, frame 0 is damaged .* run `d2 priors` again"):
+        PriorStore.open(store.path)
+
+
+def test_a_missing_array_is_named_on_open(store: PriorStore) -> None:
+    array_file(store, "b").unlink()
+    with pytest.raises(D2Error, match="camera b, frame 0 is damaged"):
+        PriorStore.open(store.path)
+
+
+def test_a_flipped_bit_is_found_when_the_map_is_read(store: PriorStore) -> None:
+    data = bytearray(array_file(store).read_bytes())
+    data[-7] ^= 1
+    array_file(store).write_bytes(data)
+    opened = PriorStore.open(store.path)  # headers are intact
+    with pytest.raises(D2Error, match="checksum"):
+        opened.prior("a", 0)
+    assert not opened.is_current("a", 0, "k")
+
+
+def test_a_damaged_record_is_named(store: PriorStore) -> None:
+    array_file(store).with_suffix(".json").write_text('{"key": "k", "sha')
+    with pytest.raises(D2Error, match=r"00000.json is damaged"):
+        PriorStore.open(store.path)
+    assert not store.is_current("a", 0, "k")
+
+
+def test_an_array_whose_record_was_not_written_yet_does_not_exist(store: PriorStore) -> None:
+    array_file(store).with_suffix(".json").unlink()
+    assert PriorStore.open(store.path).prior("a", 0) is None
+    assert not store.is_current("a", 0, "k")
+
+
+def test_an_array_replaced_without_its_record_is_not_trusted(store: PriorStore) -> None:
+    record = array_file(store).with_suffix(".json").read_text()
+    store.write("a", 0, some_prior(5), IMAGE, {"key": "k2"})
+    array_file(store).with_suffix(".json").write_text(record)  # as a kill between the two writes leaves it
+    assert not store.is_current("a", 0, "k")
+
+
+def test_another_key_is_another_prior(store: PriorStore) -> None:
+    assert store.is_current("a", 0, "k")
+    assert not store.is_current("a", 0, "other")
+
+
+def test_nothing_but_finished_files_is_left(store: PriorStore) -> None:
+    names = {path.name for path in store.path.rglob("*") if path.is_file()}
+    assert names == {"store.json", "00000.npy", "00000.json"}
+
+
+def test_the_store_is_memory_mapped(store: PriorStore) -> None:
+    assert isinstance(store.entries.find("a", 0).array(), np.memmap)
+
+
+def test_stores_of_other_captures_formats_and_other_folders_are_refused(store: PriorStore, tmp_path: Path) -> None:
+    with pytest.raises(D2Error, match="holds the priors of test, not of other"):
+        PriorStore.create(store.path, ["a"], [0], {"capture": "other"})
+    with pytest.raises(D2Error, match="no depth priors at"):
+        PriorStore.open(tmp_path / "nowhere")
+    described = json.loads((store.path / "store.json").read_text())
+    (store.path / "store.json").write_text(json.dumps({**described, "format": 99}))
+    with pytest.raises(D2Error, match="format 99"):
+        PriorStore.open(store.path)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("do not lose me")
+    with pytest.raises(D2Error, match="holds no prior store"):
+        PriorStore.create(tmp_path / "mine", ["a"], [0], {"capture": "test"})
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_frames_built_before_stay_part_of_the_store(store: PriorStore) -> None:
+    again = PriorStore.create(store.path, ["a", "b"], [5], {"capture": "test"})
+    assert again.frames == (0, 3, 5)
+    assert PriorStore.open(store.path).prior("a", 0) is not None

@@ -1,0 +1,63 @@
+"""Tiny ONNX networks written as raw protobuf, so that tests need neither the onnx package nor a file from elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+FLOAT, FLOAT16, UINT8 = 1, 10, 2  # TensorProto.DataType
+INT, INTS = 2, 7  # AttributeProto.AttributeType
+
+
+def mean_network(
+    path: Path, height: int | str, width: int | str, channels: int = 3, dtype: int = FLOAT, outputs: int = 1
+) -> Path:
+    """A network whose output [N, outputs, H, W] is the mean of its input channels; a size given as text is dynamic."""
+    steps = [_node("ReduceMean", ["picture"], ["mean"], axes=[1], keepdims=1)]
+    if outputs == 1:
+        steps.append(_node("Identity", ["mean"], ["disparity"]))
+    else:
+        steps.append(_node("Concat", ["mean"] * outputs, ["disparity"], axis=1))
+    graph = b"".join(_message(1, step) for step in steps) + _text(2, "mean")
+    graph += _message(11, _value("picture", dtype, [1, channels, height, width]))
+    graph += _message(12, _value("disparity", dtype, [1, outputs, height, width]))
+    opset = _text(1, "") + _varint(2, 13)
+    path.write_bytes(_varint(1, 8) + _message(7, graph) + _message(8, opset))
+    return path
+
+
+def _node(operation: str, inputs: Sequence[str], outputs: Sequence[str], **attributes: int | list[int]) -> bytes:
+    parts = [_text(1, name) for name in inputs] + [_text(2, name) for name in outputs] + [_text(4, operation)]
+    for name, value in attributes.items():
+        if isinstance(value, list):
+            body = _text(1, name) + b"".join(_varint(8, item) for item in value) + _varint(20, INTS)
+        else:
+            body = _text(1, name) + _varint(3, value) + _varint(20, INT)
+        parts.append(_message(5, body))
+    return b"".join(parts)
+
+
+def _value(name: str, dtype: int, shape: Sequence[int | str]) -> bytes:
+    dims = (_varint(1, size) if isinstance(size, int) else _text(2, size) for size in shape)
+    tensor = _varint(1, dtype) + _message(2, b"".join(_message(1, dim) for dim in dims))
+    return _text(1, name) + _message(2, _message(1, tensor))
+
+
+def _varint(field: int, value: int) -> bytes:
+    return _base128(field << 3) + _base128(value)
+
+
+def _text(field: int, value: str) -> bytes:
+    return _message(field, value.encode())
+
+
+def _message(field: int, body: bytes) -> bytes:
+    return _base128(field << 3 | 2) + _base128(len(body)) + body
+
+
+def _base128(value: int) -> bytes:
+    out = bytearray()
+    while value > 127:
+        out.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*out, value])
