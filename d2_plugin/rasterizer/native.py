@@ -18,6 +18,8 @@ from d2_plugin.compiler import NoCompiler, load_library
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Survey
 
+from .reference import refuse_skew
+
 KERNELS = Path(__file__).parent / "kernels"
 SOURCES = (KERNELS / "cpu.cpp",)
 HEADERS = tuple(KERNELS / name for name in ("splat.h", "simd.h", "parallel.h", "frame.h", "binning.h"))
@@ -200,8 +202,7 @@ def _frame(
     frame.rotation[:] = [*rows[0][:3], *rows[1][:3], *rows[2][:3]]
     frame.translation[:] = [row[3] for row in rows[:3]]
     (frame.focal_x, skew, frame.center_x), (_, frame.focal_y, frame.center_y), _ = K.tolist()
-    if skew != 0:
-        raise D2Error(f"K has skew {skew}, expected 0: undistort the pictures to a pinhole camera without skew")
+    refuse_skew(skew)
     frame.image_width, frame.image_height = width, height
     frame.constants[:] = constants
     return frame

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
 
 TILE = 32
@@ -129,6 +130,7 @@ def project(
     """
     rotation, translation = view.T_camera_world[:3, :3].to(splats.means), view.T_camera_world[:3, 3].to(splats.means)
     K = view.K.to(splats.means)
+    refuse_skew(float(view.K[0, 1]))
     focal, principal = torch.stack([K[0, 0], K[1, 1]]), K[:2, 2]
     size = torch.tensor([view.width, view.height]).to(K)
     points = splats.means @ rotation.T + translation
@@ -151,6 +153,12 @@ def project(
     if screen_offsets is not None:
         centers = centers + screen_offsets
     return Projection(centers, variance_x, variance_y, slope, given_y, depths, splats.opacities)
+
+
+def refuse_skew(skew: float) -> None:
+    """Raise D2Error where K[0, 1] is not 0: the projection's Jacobian knows no skew, nor does any backbone's."""
+    if skew != 0:
+        raise D2Error(f"K has skew {skew}, expected 0: undistort the pictures to a pinhole camera without skew")
 
 
 def _take(splats: Splats, index: Tensor) -> Splats:

@@ -69,14 +69,15 @@ D2_INLINE void project_group(const Frame& f, int64_t i, int rows, Box* boxes, in
     Box& box = boxes[i + lane];
     if (!(visible >> lane & 1) || last_x[lane] < first_x[lane] || last_y[lane] < first_y[lane]) {
       box = {1, 1, 0, 0, 0.f};
+      f.records[i + lane] = {};
       continue;
     }
     box = {uint16_t(first_x[lane]), uint16_t(first_y[lane]), uint16_t(last_x[lane]), uint16_t(last_y[lane]),
            fields[6][lane]};
     Record& r = f.records[i + lane];
-    r.footprint = {fields[0][lane], fields[1][lane], fields[2][lane], fields[3][lane],
-                   fields[4][lane], fields[5][lane], fields[6][lane]};
-    r.first_x = box.first_x, r.first_y = box.first_y, r.last_x = box.last_x, r.last_y = box.last_y;
+    r = {{fields[0][lane], fields[1][lane], fields[2][lane], fields[3][lane],
+          fields[4][lane], fields[5][lane], fields[6][lane]},
+         box.first_x, box.first_y, box.last_x, box.last_y, {}};
     if (f.colors)
       for (int c = 0; c < f.channels && c < 3; c++) r.color[c] = f.colors[(i + lane) * f.channels + c];
     for_each_tile(box, tiles_x, [&](int tile) { counts[tile]++; });

@@ -209,6 +209,7 @@ static void render_tile(const Frame& f, int tile) {
     if (contributes) f.ids[live] = int32_t(id), f.blocks[live++] = contributes;
   });
   f.tiles[tile].live = live - begin;
+  std::fill(f.ids + live, f.ids + begin + pairs, -1);
 
   for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
     const float* field = state + block * fields * LANES + lane;

@@ -56,10 +56,10 @@ struct Frame {
 
   // State of the forward pass. A pair is a Gaussian in a tile: pairs of Gaussian i have the slots slots[i]..slots[i+1]-1
   // in row-major order of tiles; pairs of a tile stand together in `ids` and `blocks`.
-  Record* records;   // [M]; undefined where a Gaussian has no pairs
+  Record* records;   // [M]; 0 where a Gaussian has no pairs
   int32_t* slots;    // [M + 1]
   Tile* tiles;       // [tiles]
-  int32_t* ids;      // [pairs]
+  int32_t* ids;      // [pairs]; -1 behind the live ones of a tile
   uint64_t* blocks;  // [pairs] bit b: contributes to block b; before that, depth and id to sort by
 
   // Outputs of the forward pass and what comes back to them; null where nothing comes back.

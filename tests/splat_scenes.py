@@ -1,0 +1,127 @@
+"""For the rasterizer's tests: random Gaussians, a camera, and the definition of splatting in numpy."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
+
+
+class Scene(NamedTuple):
+    means: Tensor
+    covariances: Tensor
+    opacities: Tensor
+    colors: Tensor
+    view: View
+
+    @property
+    def splats(self) -> Splats:
+        return Splats(*self[:3], torch.arange(len(self.means)))
+
+    def to(self, dtype: torch.dtype) -> Scene:
+        return Scene(*(part.to(dtype) for part in self[:4]), self.view)
+
+    def requires_grad(self) -> Scene:
+        return Scene(*(part.detach().clone().requires_grad_() for part in self[:4]), self.view)
+
+    def render(self, settings: RasterSettings = RasterSettings(), **options: Tensor | None) -> Render:  # noqa: B008
+        return rasterize(self.splats, self.colors, self.view, settings, **options)
+
+
+def make_view(width: int, height: int, focal: float | None = None, principal: tuple | None = None) -> View:
+    """A camera at the origin that looks along z."""
+    focal = 0.85 * width if focal is None else focal
+    x, y = principal or (width / 2, height / 2)
+    return View("cam", 0, 0.0, torch.eye(4), torch.tensor([[focal, 0, x], [0, focal, y], [0, 0, 1.0]]), width, height)
+
+
+def covariance(scales: Tensor, generator: torch.Generator) -> Tensor:
+    """Covariances [M, 6] with standard deviations `scales` [M, 3] in random directions."""
+    axes = torch.linalg.qr(torch.randn(len(scales), 3, 3, dtype=scales.dtype, generator=generator))[0]
+    full = (axes * scales[:, None] ** 2) @ axes.mT
+    return full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+
+
+def random_scene(seed: int, count: int, width: int, height: int, channels: int = 3, radius: float = 3.0) -> Scene:
+    """Gaussians of about `radius` pixels in and around the view, float64 numbers that float32 holds exactly."""
+    g = torch.Generator().manual_seed(seed)
+    view = make_view(width, height)
+    focal = float(view.K[0, 0])
+    depth = 1 + 4 * torch.rand(count, generator=g, dtype=torch.float64)
+    across = (torch.rand(count, 2, generator=g, dtype=torch.float64) - 0.5) * 1.2
+    means = torch.cat([across * torch.tensor([width, height]) / focal * depth[:, None], depth[:, None]], 1)
+    spread = torch.exp(0.5 * torch.randn(count, 3, generator=g, dtype=torch.float64)) * radius / focal / 2
+    parts = (
+        means,
+        covariance(spread * depth[:, None], g),
+        torch.rand(count, generator=g, dtype=torch.float64) * 0.98 + 0.01,
+        torch.rand(count, channels, generator=g, dtype=torch.float64),
+    )
+    return Scene(*(part.float().double() for part in parts), view)
+
+
+def single(
+    depth: float = 4.0, opacity: float = 0.5, variance: float = 0.01, size: int = 15, dtype: torch.dtype = torch.float64
+) -> Scene:
+    """One round Gaussian in front of the middle pixel of a square image."""
+    numbers = ([[0.0, 0, depth]], [[variance, 0, 0, variance, 0, variance]], [opacity], [[1.0, 0.5, 0.25]])
+    return Scene(*(torch.tensor(part, dtype=dtype) for part in numbers), make_view(size, size))
+
+
+class Fragments(NamedTuple):
+    """Everything that Gaussian i (in front-to-back order, `order`) does at every pixel, by the definition."""
+
+    weights: np.ndarray  # [M, H, W] in the order of the scene
+    unclamped: np.ndarray  # [M, H, W] o G; 0 where the pixel was finished before
+    after: np.ndarray  # [M, H, W] transmittance that it would leave behind it; 1 where it is skipped or comes too late
+    depths: np.ndarray  # [M]
+
+
+def brute_force(scene: Scene, settings: RasterSettings = RasterSettings()) -> Fragments:  # noqa: B008
+    """The image formation model with explicit matrices, in numpy float64, one pixel at a time."""
+    means, packed, opacities = (part.detach().double().numpy() for part in scene[:3])
+    view = scene.view
+    pose, K = view.T_camera_world.double().numpy(), view.K.double().numpy()
+    points = means @ pose[:3, :3].T + pose[:3, 3]
+    shape = (len(means), view.height, view.width)
+    weights, unclamped, after = np.zeros(shape), np.zeros(shape), np.ones(shape)
+    rows, columns = np.mgrid[: view.height, : view.width] + 0.5
+    transmittance, finished = np.ones(shape[1:]), np.zeros(shape[1:], bool)
+    for i in np.argsort(points[:, 2], kind="stable"):
+        x, y, z = points[i]
+        if z <= settings.near:
+            continue
+        inverse = np.linalg.inv(_screen_covariance(packed[i], pose[:3, :3], x, y, z, K, view, settings))
+        dx, dy = columns - (K[0, 0] * x / z + K[0, 2]), rows - (K[1, 1] * y / z + K[1, 2])
+        power = inverse[0, 0] * dx**2 + 2 * inverse[0, 1] * dx * dy + inverse[1, 1] * dy**2
+        unclamped[i] = np.where(finished, 0, opacities[i] * np.exp(-power / 2))
+        alpha = np.where(unclamped[i] < settings.alpha_min, 0, np.minimum(unclamped[i], settings.alpha_max))
+        after[i] = np.where(alpha > 0, transmittance * (1 - alpha), 1)
+        finished |= after[i] <= settings.transmittance_min
+        weights[i] = np.where(finished, 0, alpha * transmittance)
+        transmittance = np.where(finished | (alpha == 0), transmittance, after[i])
+    return Fragments(weights, unclamped, after, points[:, 2])
+
+
+def _screen_covariance(
+    packed: np.ndarray, R: np.ndarray, x: float, y: float, z: float, K: np.ndarray, view: View, settings: RasterSettings
+) -> np.ndarray:
+    xx, xy, xz, yy, yz, zz = packed
+    world = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    limits = []
+    for slope, size, focal, middle in ((x / z, view.width, K[0, 0], K[0, 2]), (y / z, view.height, K[1, 1], K[1, 2])):
+        centre, half = (size / 2 - middle) / focal, settings.fov_clamp * size / 2 / focal
+        limits.append(np.clip(slope, centre - half, centre + half))
+    jacobian = np.array([[K[0, 0], 0, -K[0, 0] * limits[0]], [0, K[1, 1], -K[1, 1] * limits[1]]]) / z
+    return jacobian @ R @ world @ R.T @ jacobian.T + settings.blur * np.eye(2)
+
+
+def near_threshold(fragments: Fragments, settings: RasterSettings = RasterSettings()) -> np.ndarray:  # noqa: B008
+    """Pixels [H, W] where rounding may decide differently: somebody's alpha or transmittance is at its threshold."""
+    at_alpha = np.abs(fragments.unclamped / settings.alpha_min - 1) < 1e-4
+    at_end = np.abs(fragments.after / settings.transmittance_min - 1) < 1e-3
+    return (at_alpha | at_end).any(0)

@@ -1,0 +1,197 @@
+"""The torch rasterizer against the definition of splatting, pixel by pixel, and its gradients against differences."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from splat_scenes import Scene, brute_force, make_view, random_scene, single
+from torch.autograd import gradcheck
+
+from d2_plugin.errors import D2Error
+from d2_plugin.rasterizer import DepthPrior, RasterSettings, Splats, View, rasterize, survey
+
+SETTINGS = RasterSettings()
+
+
+def rotated(scene: Scene) -> Scene:
+    """The same scene in another world frame, so that the camera is not at the origin."""
+    angle = torch.tensor(0.7, dtype=torch.float64)
+    cos, sin = angle.cos(), angle.sin()
+    R = torch.eye(3, dtype=torch.float64)
+    R[0, 0], R[0, 2], R[2, 0], R[2, 2] = cos, sin, -sin, cos
+    t = torch.tensor([0.3, -2.0, 5.0], dtype=torch.float64)
+    xx, xy, xz, yy, yz, zz = scene.covariances.unbind(1)
+    full = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], 1).reshape(-1, 3, 3)
+    full = R.T @ full @ R
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3], pose[:3, 3] = R, t
+    view = View("cam", 0, 0.0, pose, scene.view.K, scene.view.width, scene.view.height)
+    packed = full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return Scene((scene.means - t) @ R, packed, scene.opacities, scene.colors, view)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_image_is_the_compositing_sum_of_the_definition(seed):
+    scene = random_scene(seed, 150, 37, 41)
+    found, render = brute_force(scene), scene.render()
+    color = np.einsum("mhw,mc->hwc", found.weights, scene.colors.numpy())
+    np.testing.assert_allclose(render.color.numpy(), color, atol=1e-12)
+    depth_sum = np.einsum("mhw,m->hw", found.weights, found.depths)
+    np.testing.assert_allclose(render.depth_sum.numpy(), depth_sum, atol=1e-11)
+    np.testing.assert_allclose(render.alpha.numpy(), found.weights.sum(0), atol=1e-12)
+
+
+def test_a_moved_world_gives_the_same_image():
+    scene = random_scene(5, 80, 24, 20)
+    for part, other in zip(scene.render(), rotated(scene).render()):
+        torch.testing.assert_close(part, other, atol=1e-10, rtol=0)
+
+
+def test_settings_change_the_image_as_the_definition_says():
+    settings = RasterSettings(1.5, 1.0, 0.8, 0.02, 0.05, 0.7)
+    scene = random_scene(1, 150, 30, 20)
+    found = brute_force(scene, settings)
+    np.testing.assert_allclose(scene.render(settings).alpha.numpy(), found.weights.sum(0), atol=1e-12)
+
+
+def test_one_gaussian_has_its_opacity_at_its_centre_and_falls_off_with_its_screen_covariance():
+    scene = single(depth=2.0, opacity=0.8, variance=0.04)
+    focal = float(scene.view.K[0, 0])
+    variance = 0.04 * (focal / 2) ** 2 + SETTINGS.blur
+    alpha = scene.render().alpha
+    assert alpha[7, 7].item() == pytest.approx(0.8, abs=1e-12)
+    assert alpha[7, 9].item() == pytest.approx(0.8 * math.exp(-0.5 * 4 / variance), abs=1e-12)
+
+
+def test_depth_is_accumulated_not_normalised():
+    render = single(depth=4.0, opacity=0.5).render()
+    assert render.depth_sum[7, 7].item() == pytest.approx(2.0)
+    assert (render.depth_sum / render.alpha)[7, 7].item() == pytest.approx(4.0)
+
+
+def test_the_nearer_gaussian_hides_the_farther_one_whatever_their_order():
+    near, far = single(depth=2.0, opacity=0.6), single(depth=3.0, opacity=0.9)
+    for first, second in ((near, far), (far, near)):
+        both = Scene(*(torch.cat(pair) for pair in zip(first[:4], second[:4])), near.view)
+        assert both.render().depth_sum[7, 7].item() == pytest.approx(0.6 * 2 + 0.4 * 0.9 * 3)
+
+
+def test_background_shines_through_what_is_left_transparent():
+    background = torch.tensor([0.2, 0.4, 0.8], dtype=torch.float64)
+    scene = single(opacity=0.5)
+    color = scene.render(background=background).color
+    torch.testing.assert_close(color[7, 7], 0.5 * scene.colors[0] + 0.5 * background)
+    torch.testing.assert_close(color[0, 0], background)
+
+
+def test_screen_offsets_move_the_image_by_pixels():
+    scene = single(size=21)
+    shift = torch.tensor([[2.0, -3.0]], dtype=torch.float64)
+    still, moved = scene.render().alpha, scene.render(screen_offsets=shift).alpha
+    torch.testing.assert_close(moved[5:10, 9:15], still[8:13, 7:13])
+
+
+def test_gradient_of_screen_offsets_is_that_of_the_screen_mean():
+    scene = random_scene(0, 20, 12, 10).requires_grad()
+    offsets = torch.zeros(20, 2, dtype=torch.float64, requires_grad=True)
+    render = scene.render(screen_offsets=offsets)
+    weight = torch.rand(10, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    grad = torch.autograd.grad((render.alpha * weight).sum(), offsets)[0]
+    step = 1e-6
+    for i in (3, 11):
+        change = torch.zeros_like(offsets)
+        change[i, 1] = step
+        ahead, behind = (scene.render(screen_offsets=sign * change).alpha for sign in (1, -1))
+        assert grad[i, 1].item() == pytest.approx(((ahead - behind) * weight).sum().item() / (2 * step), abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_gradients_are_those_of_the_image(seed):
+    scene = random_scene(seed, 4, 7, 5, channels=2, radius=2.0).requires_grad()
+    background = torch.rand(2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)).requires_grad_()
+    offsets = torch.zeros(4, 2, dtype=torch.float64, requires_grad=True)
+
+    def render(means, covariances, opacities, colors, background, offsets):
+        splats = Splats(means, covariances, opacities, torch.arange(4))
+        return tuple(rasterize(splats, colors, scene.view, background=background, screen_offsets=offsets))
+
+    # Every entry of the Jacobian for some seeds, a random projection of it (a tenth of the time) for the others.
+    assert gradcheck(render, (*scene[:4], background, offsets), fast_mode=seed >= 5), f"seed {seed}"
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (33, 31), (64, 1)])
+def test_any_image_size_works(size):
+    scene = random_scene(2, 60, *size)
+    np.testing.assert_allclose(scene.render().alpha.numpy(), brute_force(scene).weights.sum(0), atol=1e-12)
+
+
+def test_survey_sums_the_weights_of_the_definition():
+    scene = random_scene(3, 120, 36, 34)
+    random = np.random.default_rng(0)
+    labels = torch.from_numpy(random.integers(0, 4, (34, 36)).astype(np.uint8))
+    depth = torch.from_numpy(random.uniform(0.5, 6, (34, 36)))
+    depth[0, :3] = torch.tensor([0.0, torch.nan, -1.0])  # labelled or not, these are no depths
+    statistics = survey(scene.splats, scene.view, DepthPrior(depth, labels), eps=1e-3)
+
+    found = brute_force(scene)
+    verified = (labels.numpy() == 2) & (np.nan_to_num(depth.numpy()) > 0)
+    w = found.weights * verified
+    safe = np.where(verified, depth.numpy(), 1)
+    error = np.abs(found.depths[:, None, None] - safe) / (safe + 1e-3)
+    np.testing.assert_allclose(statistics.weight.numpy(), w.sum((1, 2)), atol=1e-12)
+    np.testing.assert_allclose(statistics.error.numpy(), (w * error).sum((1, 2)), atol=1e-11)
+    np.testing.assert_allclose(statistics.max_weight.numpy(), found.weights.max((1, 2)), atol=1e-12)
+    np.testing.assert_array_equal(statistics.hits.numpy(), (w > 0).sum((1, 2)))
+    np.testing.assert_allclose(statistics.alpha.numpy(), found.weights.sum(0), atol=1e-12)
+    np.testing.assert_allclose(statistics.depth_sum.numpy(), scene.render().depth_sum.numpy(), atol=1e-12)
+
+
+def test_survey_without_verified_pixels_still_knows_the_largest_weight():
+    scene = single(opacity=0.5)
+    prior = DepthPrior(torch.ones(15, 15), torch.ones(15, 15, dtype=torch.uint8))
+    statistics = survey(scene.splats, scene.view, prior)
+    assert statistics.weight.item() == statistics.error.item() == statistics.hits.item() == 0
+    assert statistics.max_weight.item() == pytest.approx(0.5)
+
+
+def bad(scene: Scene, **changes: object) -> tuple:
+    values = {**scene._asdict(), "settings": SETTINGS, "background": None, "screen_offsets": None, **changes}
+    splats = Splats(values["means"], values["covariances"], values["opacities"], torch.arange(1))
+    return splats, values["colors"], values["view"], values["settings"], values["background"], values["screen_offsets"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"covariances": torch.zeros(1, 3, 3, dtype=torch.float64)}, r"covariances has shape \(1, 3, 3\)"),
+        ({"opacities": torch.zeros(1, 1, dtype=torch.float64)}, "opacities has shape"),
+        ({"colors": torch.zeros(2, 3, dtype=torch.float64)}, "colors has shape"),
+        ({"colors": torch.zeros(1, 0, dtype=torch.float64)}, "colors has shape"),
+        ({"colors": torch.zeros(1, 3)}, "colors is torch.float32"),
+        ({"background": torch.zeros(4, dtype=torch.float64)}, "background has shape"),
+        ({"screen_offsets": torch.zeros(1, 3, dtype=torch.float64)}, "screen_offsets has shape"),
+        ({"view": make_view(0, 5)}, "view is 0x5 pixels"),
+        ({"settings": RasterSettings(alpha_min=0.0)}, "alpha_min > 0"),
+    ],
+)
+def test_what_does_not_fit_together_is_named(changes, message):
+    splats, colors, view, settings, background, offsets = bad(single(), **changes)
+    with pytest.raises(D2Error, match=message):
+        rasterize(splats, colors, view, settings, background=background, screen_offsets=offsets)
+
+
+def test_a_prior_of_another_size_is_refused():
+    prior = DepthPrior(torch.ones(15, 14), torch.ones(15, 14, dtype=torch.uint8))
+    with pytest.raises(D2Error, match="resample it to the view's height and width"):
+        survey(single().splats, single().view, prior)
+
+
+def test_skew_is_refused_on_every_path():
+    view = make_view(15, 15)
+    view.K[0, 1] = 2.0
+    for dtype in (torch.float32, torch.float64):
+        with pytest.raises(D2Error, match="skew"):
+            single(dtype=dtype)._replace(view=view).render()
