@@ -50,15 +50,18 @@ class Yang4DSettings:
     """Degree of the view-dependent colour, 0..3."""
     sh_time_degree: int = 0
     """Number of cosines in time that modulate the colour (0: constant in time)."""
-    position_rate: float = 1.6e-3
-    """Learning rate of positions times the extent of the scene, at the first step."""
-    position_rate_final: float = 1.6e-5
+    position_rate: float = 3e-4
+    """Learning rate of positions times the extent of the scene, at the first step (studio, backbone alone, held-out
+    PSNR after 1210 steps: 25.3 dB; 24.9 at 1e-4)."""
+    position_rate_final: float = 3e-6
     """The same at the last step; exponential in between."""
     time_rate: float = 1.6e-3
     """Learning rate of mean times, relative to the duration."""
     scale_rate: float = 1e-2
+    """Of log-scales (as above: 24.6 dB at 5e-3, 24.9 at 2e-2)."""
     rotation_rate: float = 2e-3
     opacity_rate: float = 5e-2
+    """Of opacity logits (as above: 24.5 dB at 2e-2)."""
     color_rate: float = 1e-2
     """Of the constant term; higher harmonics learn at a twentieth of it."""
     initial_opacity: float = 0.1

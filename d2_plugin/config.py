@@ -1,7 +1,8 @@
 """One dataclass per hook; a hook is switched on by its presence. TOML in and out.
 
 The paper's supplement, which fixes thresholds, weights and schedules, is not public: the defaults here are this
-project's own choices, set by measurement on the captures named in each docstring.
+project's own choices, set by measurement. "Studio" in a docstring means the rendered studio capture (320x180, four
+training views 00 02 05 07, frames 0 to 8, emulated monocular depth, one seed), the number held-out PSNR.
 """
 
 from __future__ import annotations
@@ -31,14 +32,15 @@ class DensifyConfig:
     """Relative depth error above which a verified pixel counts as under-reconstructed."""
     tau_u_mono: float = 0.2
     """The same for a mono-only pixel, whose depth is itself off by some per cent."""
-    budget_per_view: int = 1500
-    """Samples drawn per evaluated view."""
+    budget_per_view: int = 500
+    """Samples drawn per evaluated view (studio, 1210 steps: 28.2 dB at 1500, 29.3 at 500)."""
     max_gaussians: int = 200_000
     """No insertion beyond this number of Gaussians."""
-    scale: float = 0.5
-    """Standard deviation of a new Gaussian in units of the distance between samples."""
+    scale: float = 1.0
+    """Standard deviation of a new Gaussian in units of the distance between samples (studio: 29.3 dB at 0.5, 30.7 at
+    1.0, 30.2 at 1.5)."""
     opacity: float = 0.3
-    """Opacity of a new Gaussian."""
+    """Opacity of a new Gaussian (studio: 29.3 dB at 0.3, 29.5 at 0.1)."""
     cell: float = 1.0
     """Side of the frustum cells that keep duplicates out, in units of the distance between samples."""
     occupied_opacity: float = 0.1
@@ -84,7 +86,7 @@ class DepthLossConfig:
     every: int = 1
     """Steps between additions."""
     weight: float = 0.2
-    """lambda_d."""
+    """lambda_d (studio: 29.3 dB and depth AbsRel .086 at 0.2, 29.1 dB and .073 at 1.0; 0.4 dB less without)."""
     epsilon: float = 0.01
     """epsilon_rho of the Charbonnier penalty, on relative depth residuals."""
     tau_v: float = 0.5

@@ -16,8 +16,9 @@ from d2_plugin.errors import MissingExtra
 from d2_plugin.priors.colmap import SparsePoints, triangulate_frames
 from d2_plugin.protocol import View
 
-MIN_POINTS = 5000
-"""Fewer triangulated points than this are filled up with random ones."""
+MIN_POINTS = 1000
+"""Fewer triangulated points than this are filled up with random ones (studio, backbone alone, 600 steps: 24.5 dB with
+1214 triangulated points, 22.2 with 3786 random ones added)."""
 
 
 def make_view(capture: Capture, camera: str, frame: int, device: torch.device | str = "cpu") -> View:
