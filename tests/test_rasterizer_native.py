@@ -50,12 +50,12 @@ def prior_of(scene: Scene) -> DepthPrior:
 
 
 SCENES = {
-    "small Gaussians": lambda: random_scene(0, 600, 61, 47),
-    "large Gaussians, early finish": lambda: random_scene(1, 400, 70, 40, radius=40.0),
+    "small Gaussians": lambda: random_scene(0, 250, 61, 37),
+    "large Gaussians, early finish": lambda: random_scene(1, 150, 70, 40, radius=40.0),
     "one channel": lambda: random_scene(2, 200, 40, 40, channels=1),
     "two channels": lambda: random_scene(2, 200, 40, 40, channels=2),
     "five channels": lambda: random_scene(3, 200, 33, 66, channels=5),
-    "forty channels": lambda: random_scene(3, 60, 33, 20, channels=40),
+    "forty channels": lambda: random_scene(3, 40, 33, 20, channels=40),
     "one pixel": lambda: random_scene(4, 30, 1, 1),
     "7x5": lambda: random_scene(5, 50, 7, 5),
     "one Gaussian": lambda: single(),
@@ -155,8 +155,8 @@ def test_other_instruction_sets_agree_with_the_reference(flags):
         pytest.skip("flags of x86")
     if "v3" in flags and "avx2" not in Path("/proc/cpuinfo").read_text():
         pytest.skip("no AVX2 here")
-    tests = ("test_float32_kernels_agree_with_the_float64_reference", "test_survey_agrees_with_the_float64_reference")
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *(f"{__file__}::{t}" for t in tests)]
+    chosen = "agree and float64 and (one or five or 7x5)"
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", chosen]
     environment = {**os.environ, "D2_CXXFLAGS": flags}
     result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert result.returncode == 0, result.stdout
