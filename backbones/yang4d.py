@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import torch
 from torch import Tensor
 
-from d2_plugin.errors import D2Error
+from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 
 from . import spherical_harmonics as sh
@@ -285,9 +285,15 @@ def create(
 ) -> Yang4D:
     """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults.
 
-    `settings` holds fields of `Yang4DSettings`, and under "densify" and "raster" tables of theirs.
+    `settings` holds fields of `Yang4DSettings`, and under "densify" and "raster" tables of theirs; other names are
+    refused with a D2Error.
     """
     chosen = dict(settings or {})
-    chosen["densify"] = DensifySettings(**chosen.get("densify", {}))
-    chosen["raster"] = RasterSettings(**chosen.get("raster", {}))
+    for name, kind in (("densify", DensifySettings), ("raster", RasterSettings), ("backbone", Yang4DSettings)):
+        table = chosen if name == "backbone" else chosen.setdefault(name, {})
+        known = {entry.name for entry in fields(kind)} - {"temporal"}
+        for key in table:
+            if key not in known:
+                raise unknown_name(f"setting of {name}", key, known)
+    chosen["densify"], chosen["raster"] = DensifySettings(**chosen["densify"]), RasterSettings(**chosen["raster"])
     return Yang4D.from_points(positions, colors, times, Yang4DSettings(temporal=temporal, **chosen), extent, duration)

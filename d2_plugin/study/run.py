@@ -211,7 +211,7 @@ def build_priors_for(settings: RunSettings, scene: Scene, points: np.ndarray, fo
             scene.capture,
             scene.train_cameras,
             folder,
-            prior_settings(settings, scene.plan),
+            prior_settings(settings),
             sparse_points=points,
             progress=lambda done, total, note="": bar.update(done, note),
         )

@@ -12,8 +12,11 @@ from d2_plugin.captures import Capture, open_capture
 from d2_plugin.config import D2Config, for_iterations
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.plan import ScenePlan, plan_scene
+from d2_plugin.priors.settings import PriorSettings
 
 HOOK_NAMES = ("prior", "densify", "prune", "depth_loss")
+TABLES = ("backbone", "densify", "prune", "depth_loss", "priors", "plan")
+"""What a configuration file may hold."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class RunSettings:
     mono_kind: str | None = None
     priors: str | None = None
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    """Tables over the defaults: `backbone`, `densify`, `prune`, `depth_loss`, `priors`, `plan`."""
+    """Tables over the defaults, see `TABLES`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +68,11 @@ def check(settings: RunSettings) -> RunSettings:
             raise unknown_name("hook", name, [*HOOK_NAMES, "all", "none"])
     if settings.mono_onnx and settings.mono_kind not in ("relative", "metric"):
         raise D2Error("--mono-onnx needs --mono-kind relative (inverse depth) or metric (depth): a file does not tell")
+    for name in settings.overrides:
+        if name not in TABLES:
+            raise unknown_name("table", name, TABLES)
+    prior_settings(settings)
+    hook_config(settings, Path())
     if settings.backbone not in registry.names(registry.BACKBONES):
         raise unknown_name("backbone", settings.backbone, registry.names(registry.BACKBONES))
     return settings
@@ -92,12 +100,10 @@ def _mono_source(capture: Capture, settings: RunSettings) -> str | None:
     return f"{capture.mono_kind} maps on disk" + (" (emulated)" if capture.mono_emulated else "")
 
 
-def prior_settings(settings: RunSettings, plan: ScenePlan) -> Any:
-    """Settings of the prior builder: defaults, the monocular source of the run, the plan's decisions, overrides."""
-    from d2_plugin.priors.build import PriorSettings
-
-    table = settings.overrides.get("priors", {})
-    return PriorSettings(mono_onnx=settings.mono_onnx, mono_kind=settings.mono_kind, **table)
+def prior_settings(settings: RunSettings) -> PriorSettings:
+    """Settings of the prior builder: defaults, the monocular source of the run, the user's table over them."""
+    source = {"mono_onnx": settings.mono_onnx, "mono_kind": settings.mono_kind}
+    return PriorSettings.from_dict(source | settings.overrides.get("priors", {}))
 
 
 def hook_config(settings: RunSettings, priors: Path) -> D2Config:
