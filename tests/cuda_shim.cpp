@@ -23,7 +23,7 @@ extern "C" const char* d2_shim_launch(const char* name, int blocks, int rows, in
   try {
     for (const auto& [known, kernel] : kernels)
       if (std::string(known) == name) {
-        shim::launch(kernel, {unsigned(blocks), unsigned(rows), 1}, {d2::THREADS, 1, 1}, descending != 0, *frame);
+        shim::launch(kernel, {unsigned(blocks), unsigned(rows), 1}, d2::THREADS, descending != 0, *frame);
         return nullptr;
       }
     error = std::string("no kernel ") + name;

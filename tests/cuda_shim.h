@@ -1,5 +1,5 @@
 // CUDA on the CPU, for tests: enough of the language that a .cu file compiles as C++ and runs, block after block, with a
-// fibre (a stack of its own, switched by hand) for every thread of a block.
+// fibre (a stack of its own, switched by hand) for every thread of a block. Blocks are one-dimensional.
 //
 // A fibre runs until it must wait for the others of its warp (shuffles, votes) or of its block (barriers). What hardware
 // leaves open is a choice here: `descending` runs warps and blocks in the opposite order, so that code whose result
@@ -99,7 +99,7 @@ class Context {
 struct Meeting {
   int members = 0, arrived = 0;
   unsigned generation = 0;
-  int sum = 0, sums[2] = {0, 0};
+  uint64_t sum = 0, sums[2] = {0, 0};
   uint64_t deposits[2][WARP];
 
   void release() {
@@ -121,7 +121,8 @@ struct Block {
   Meeting all;
   Context scheduler;
   int current = 0;
-  dim3 index, threads, grid;
+  dim3 index, grid;
+  int threads = 0;
   const std::function<void()>* body = nullptr;
 
   Meeting& warp() { return warps[current / WARP]; }
@@ -131,7 +132,7 @@ static Block block;  // of this library: one is compiled per number of channels
 inline void leave() { Context::change(block.fibers[block.current].context, block.scheduler); }
 
 // Waits for the others of the meeting; returns which of the two places holds this round's values.
-inline unsigned meet(Meeting& meeting, int value) {
+inline unsigned meet(Meeting& meeting, uint64_t value) {
   const unsigned round = meeting.generation;
   meeting.sum += value;
   if (++meeting.arrived == meeting.members) meeting.release();
@@ -161,12 +162,12 @@ inline bool run_warp(int warp) {
          block.warps[warp].arrived + block.all.arrived != arrived;
 }
 
-inline void run_block(const std::function<void()>& body, dim3 index, dim3 threads, dim3 grid, bool descending) {
-  const int count = int(threads.x * threads.y * threads.z), warps = (count + WARP - 1) / WARP;
+inline void run_block(const std::function<void()>& body, dim3 index, int count, dim3 grid, bool descending) {
+  const int warps = (count + WARP - 1) / WARP;
   block.fibers.resize(count);
   block.warps.assign(warps, Meeting());
   block.all = Meeting();
-  block.index = index, block.threads = threads, block.grid = grid, block.body = &body;
+  block.index = index, block.threads = count, block.grid = grid, block.body = &body;
   for (int i = 0; i < count; i++) {
     block.fibers[i].done = false;
     block.fibers[i].context.start(block.fibers[i].stack.get(), run_fiber);
@@ -181,7 +182,7 @@ inline void run_block(const std::function<void()>& body, dim3 index, dim3 thread
 }
 
 template <class Kernel, class... Arguments>
-void launch(Kernel kernel, dim3 grid, dim3 threads, bool descending, const Arguments&... arguments) {
+void launch(Kernel kernel, dim3 grid, int threads, bool descending, const Arguments&... arguments) {
   const std::function<void()> body = [&] { kernel(arguments...); };
   const unsigned count = grid.x * grid.y * grid.z;
   for (unsigned i = 0; i < count; i++) {
@@ -212,20 +213,19 @@ T from_bits(uint64_t bits) {
   return value;
 }
 
-inline dim3 thread_index() {
-  const unsigned i = unsigned(block.current), x = block.threads.x, y = block.threads.y;
-  return {i % x, i / x % y, i / (x * y)};
-}
+inline dim3 thread_index() { return {unsigned(block.current), 0, 0}; }
 
 }  // namespace shim
 
 #define threadIdx (shim::thread_index())
 #define blockIdx (shim::block.index)
-#define blockDim (shim::block.threads)
+#define blockDim (dim3{unsigned(shim::block.threads)})
 #define gridDim (shim::block.grid)
 
 // A barrier's sums are kept in the same two places as a warp's values.
-inline int __syncthreads_count(int predicate) { return shim::block.all.sums[shim::meet(shim::block.all, predicate != 0)]; }
+inline int __syncthreads_count(int predicate) {
+  return int(shim::block.all.sums[shim::meet(shim::block.all, predicate != 0)]);
+}
 inline int __syncthreads_or(int predicate) { return __syncthreads_count(predicate) > 0; }
 inline void __syncthreads() { __syncthreads_count(0); }
 
@@ -233,11 +233,10 @@ template <class T>
 T __shfl_xor_sync(unsigned, T value, int mask) {
   return shim::from_bits<T>(shim::exchange(value)[shim::lane() ^ mask]);
 }
+// Votes are a sum of different powers of two.
 inline unsigned __ballot_sync(unsigned mask, int predicate) {
-  const uint64_t* values = shim::exchange(predicate != 0);
-  unsigned votes = 0;
-  for (int i = 0; i < shim::WARP; i++) votes |= unsigned(values[i] & 1) << i;
-  return votes & mask;
+  shim::Meeting& warp = shim::block.warp();
+  return unsigned(warp.sums[shim::meet(warp, uint64_t(predicate != 0) << shim::lane())]) & mask;
 }
 inline int __any_sync(unsigned mask, int predicate) { return __ballot_sync(mask, predicate) != 0; }
 inline int __popc(unsigned value) { return __builtin_popcount(value); }

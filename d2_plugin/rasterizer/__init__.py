@@ -5,7 +5,8 @@
     render = rasterize(splats, colors, view)                       # color, depth_sum, alpha: all with gradients
     statistics = survey(splats, view, prior)                       # per Gaussian: what the depth prior says about it
 
-float32 on the CPU runs in kernels that are compiled at first use (see `d2_plugin.compiler`), float64 in `reference`.
+float32 runs in kernels that are compiled at first use, on the CPU (`native`, `d2_plugin.compiler`) or on the GPU
+(`cuda`, by NVRTC), wherever the Gaussians are; float64 in `reference`.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
 
-from . import native, ops, reference
+from . import cuda, native, ops, reference
 
 __all__ = ["DepthPrior", "RasterSettings", "Render", "Splats", "Survey", "View", "rasterize", "survey"]
 
@@ -90,7 +91,12 @@ def survey(
 
 
 def _has_kernels(means: Tensor) -> bool:
-    return means.dtype == torch.float32 and means.device.type == "cpu" and native.available()
+    """The device decides: CUDA kernels on a GPU, those of the CPU there, the reference for everything else."""
+    if means.dtype != torch.float32:
+        return False
+    if means.device.type == "cuda":
+        return cuda.available(means.device)
+    return means.device.type == "cpu" and native.available()
 
 
 def _check(splats: Splats, view: View, settings: RasterSettings, **extra: Tensor | None) -> None:

@@ -268,7 +268,8 @@ def _count_pairs(ends: Tensor, K: Tensor) -> int:
     last = ends[-1] if len(ends) else ends.new_zeros(())
     pairs, skewed = torch.stack([last, (K[0, 1] != 0).to(last)]).tolist()
     if skewed:
-        raise D2Error(f"K has skew {K[0, 1].item()}, expected 0: undistort the pictures to a pinhole camera without skew")
+        skew = K[0, 1].item()
+        raise D2Error(f"K has skew {skew}, expected 0: undistort the pictures to a pinhole camera without skew")
     if pairs > MOST_PAIRS:
         raise D2Error(f"{pairs} pairs of Gaussian and tile, at most 2^31 - 1 are possible: use a smaller image")
     return pairs

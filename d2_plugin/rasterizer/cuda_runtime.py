@@ -101,8 +101,8 @@ class Nvrtc:
         self._check(self._library.nvrtcCreateProgram(ctypes.byref(program), *arguments))
         try:
             options = [option.encode() for option in (f"--gpu-architecture={architecture}", *flags)]
-            result = self._library.nvrtcCompileProgram(program, len(options), (ctypes.c_char_p * len(options))(*options))
-            if result:
+            array = ctypes.c_char_p * len(options)
+            if self._library.nvrtcCompileProgram(program, len(options), array(*options)):
                 raise CompileError(
                     f"NVRTC {self.version[0]}.{self.version[1]} failed on {SOURCE.name} for {architecture}; please "
                     f"report what it said:\n{self._read(program, 'ProgramLog').decode(errors='replace').strip(chr(0))}"

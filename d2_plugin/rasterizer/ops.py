@@ -14,7 +14,7 @@ from torch import Tensor
 
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
 
-from . import native
+from . import cuda, native
 
 _CAMERA = "Tensor T_camera_world, Tensor K"
 _SPLATS = "Tensor means, Tensor covariances, Tensor opacities"
@@ -47,10 +47,10 @@ def rasterize(
 def survey(splats: Splats, view: View, prior: DepthPrior, settings: RasterSettings, eps: float) -> Survey:
     """See `d2_plugin.rasterizer.survey`; float32."""
     means, covariances, opacities, _ = splats
-    depth = prior.depth.to(means).contiguous()
+    depth, verified = prior.depth.to(means).contiguous(), prior.verified.to(means.device).contiguous()
     camera = (view.T_camera_world, view.K)
     parts = (means.contiguous(), covariances.contiguous(), opacities.contiguous())
-    return Survey(*_survey(*parts, depth, prior.verified.contiguous(), *camera, _constants(settings), eps))
+    return Survey(*_survey(*parts, depth, verified, *camera, _constants(settings), eps))
 
 
 def _constants(settings: RasterSettings) -> list[float]:
@@ -85,6 +85,9 @@ _survey = torch.library.custom_op(
     schema=f"({_SPLATS}, Tensor prior_depth, Tensor verified, {_CAMERA}, float[] constants, float eps) -> "
     "(Tensor weight, Tensor error, Tensor max_weight, Tensor hits, Tensor depth_sum, Tensor alpha)",
 )
+
+for _operator, _kernel in ((_rasterize, cuda.rasterize), (_rasterize_backward, cuda.backward), (_survey, cuda.survey)):
+    _operator.register_kernel("cuda")(_kernel)
 
 
 @_rasterize.register_fake
