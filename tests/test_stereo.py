@@ -152,7 +152,7 @@ def test_auto_is_patchmatch_where_there_is_a_compiler(pair: Capture, monkeypatch
 def test_any_function_can_be_a_maker(pair: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     truths = [pair.depth(name, 0) for name in pair.cameras]
 
-    def oracle(grays: list, cameras: list[Camera], depth_range: tuple[float, float], settings: StereoSettings) -> list:
+    def oracle(grays: list, cameras: list[Camera], bounds: tuple, settings: StereoSettings, wanted: None) -> list:
         return [(truth, np.zeros_like(truth)) for truth in truths]
 
     monkeypatch.setitem(stereo.MAKERS, "oracle", oracle)

@@ -24,6 +24,7 @@ from d2_plugin.priors.sources import (
     MonoSource,
     StoredDepth,
     describe_camera,
+    frame_blocks,
     hash_of,
     mono_source,
 )
@@ -86,6 +87,7 @@ def build_priors(
     *,
     sparse_points: np.ndarray | None = None,
     progress: Progress | None = None,
+    shard: tuple[int, int] | None = None,
 ) -> PriorSummary:
     """Build what is missing of the priors of `cameras` in the store at `output`.
 
@@ -99,14 +101,17 @@ def build_priors(
         settings: everything that decides what D* is.
         sparse_points: world points [N, 3] triangulated with the known poses, for the depth range.
         progress: called after every picture.
+        shard: (index, count) with 0 <= index < count builds one part of the frames; all parts, built anywhere and in
+            any order into one folder, make the store that a single build makes.
 
     Raises:
         D2Error: unknown cameras, no depth source at all, or a folder that holds something else.
     """
+    frames = _shard(capture.frames, settings, shard)
     builder = _Builder(capture, list(cameras), Path(output), settings, sparse_points)
     summary = PriorSummary(notes=builder.notes)
-    total, done = len(capture.frames) * len(builder.names), 0
-    for frame in capture.frames:
+    total, done = len(frames) * len(builder.names), 0
+    for frame in frames:
         for camera, record, built in builder.build(frame):
             summary.add(camera, frame, record, built)
             done += 1
@@ -130,7 +135,9 @@ class _Builder:
         if len(names) > 1:
             self.bounds = _rounded(depth_bounds(self.cameras, points), settings.depth_range)
             folder = output / "cache" / "stereo"
-            self.geometric = GeometricSource(self.cameras, self.bounds, settings.stereo, folder)
+            self.geometric = GeometricSource(
+                self.cameras, self.bounds, settings.stereo, folder, capture.frames, self.read
+            )
         self.settings, self.variant = settings, self._variant(settings.variant)
         self.store = PriorStore.create(output, names, capture.frames, {"capture": capture.name})
 
@@ -150,9 +157,13 @@ class _Builder:
         self.notes.append("one camera: no geometric depth, so nothing is verified and nothing can prune or supervise")
         return wanted
 
+    def read(self, number: int) -> Frame:
+        """The pictures of one frame."""
+        return Frame.read(self.capture, self.names, number)
+
     def build(self, number: int) -> Iterator[tuple[str, dict[str, Any], bool]]:
         """(camera, record, whether it was built now) for every camera of one frame."""
-        frame = Frame.read(self.capture, self.names, number)
+        frame = self.read(number)
         keys = {name: self._key(name, frame) for name in self.names}
         missing = [name for name in self.names if not self.store.is_current(name, number, keys[name])]
         geometric = self.geometric.depths(frame) if self.geometric is not None and missing else {}
@@ -234,6 +245,14 @@ def _rounded(bounds: DepthBounds, chosen: tuple[float, float] | None) -> DepthBo
         return towards(value / unit) * unit
 
     return DepthBounds(outwards(bounds.near, math.floor), outwards(bounds.far, math.ceil), bounds.origin)
+
+
+def _shard(frames: Sequence[int], settings: PriorSettings, shard: tuple[int, int] | None) -> list[int]:
+    """The frames of one part: whole blocks, since frames within a block are built in order."""
+    index, count = (0, 1) if shard is None else shard
+    if not 0 <= index < count:
+        raise D2Error(f"shard {index} of {count} does not exist: give an index from 0 to {count - 1}")
+    return [number for block in frame_blocks(frames, settings.stereo)[index::count] for number in block]
 
 
 def _check(capture: Capture, names: list[str], settings: PriorSettings) -> None:

@@ -92,14 +92,18 @@ class EntryFolder:
         return None if problem else entry
 
     def write(self, camera: str, frame: int, array: np.ndarray, record: dict[str, Any]) -> None:
-        """Array first, record second: a record vouches for the array beside it."""
-        path = self.location(camera, frame)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = _temporary(path)
-        with temporary.open("wb") as file:
-            np.save(file, array)
-        temporary.replace(path)
-        write_json(path.with_suffix(".json"), {**record, "shape": list(array.shape), "checksum": checksum(array)})
+        """Write the array and its record (see `write_entry`)."""
+        write_entry(self.location(camera, frame), array, record)
+
+
+def write_entry(path: Path, array: np.ndarray, record: dict[str, Any]) -> None:
+    """Array first, record second, each under a temporary name: a record vouches for the array beside it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = _temporary(path)
+    with temporary.open("wb") as file:
+        np.save(file, array)
+    temporary.replace(path)
+    write_json(path.with_suffix(".json"), {**record, "shape": list(array.shape), "checksum": checksum(array)})
 
 
 def checksum(array: np.ndarray) -> int:

@@ -103,6 +103,13 @@ def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
     return replace(camera, width=width, height=height, K=K)
 
 
+def cropped_camera(camera: Camera, rows: slice, columns: slice) -> Camera:
+    """The camera whose picture is that part of this one's."""
+    K = np.array(camera.K, dtype=np.float64)
+    K[:2, 2] -= columns.start, rows.start
+    return replace(camera, width=columns.stop - columns.start, height=rows.stop - rows.start, K=K)
+
+
 def inverse_depth_planes(
     reference: Camera, sources: Sequence[Camera], depth_range: tuple[float, float], step: float
 ) -> np.ndarray:

@@ -51,6 +51,14 @@ class StereoSettings:
     """A source confirms only where both rays meet at more than this, degrees; identical cameras never do."""
     speckle_size: int = 20
     """Connected pieces of the depth map with fewer pixels are dropped."""
+    reuse_static: bool = True
+    """Carry matches over where the picture did not change; off matches every frame in full."""
+    reuse_change: float = 6 / 255
+    """Change of the grey value (0..1, mean of 3x3 pixels) above which a pixel is matched anew."""
+    reuse_radius: int = 6
+    """Pixels this near to a change are matched anew too: the matching window reaches that far."""
+    reuse_block: int = 30
+    """After this many frames everything is matched anew; blocks are independent, and shards are made of them."""
     seed: int = 0
     """Seed of the makers that draw random hypotheses."""
 

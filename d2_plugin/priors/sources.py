@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,8 +15,10 @@ import numpy as np
 from d2_plugin.captures.capture import Camera, Capture, MonoKind
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.files import EntryFolder
+from d2_plugin.priors.filter import GeometricDepth
 from d2_plugin.priors.monocular import MonocularModel, upsample
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
+from d2_plugin.priors.static import MatchMemory
 from d2_plugin.priors.stereo import DepthBounds, choose_maker, geometric_depth
 from d2_plugin.priors.store import DepthRange
 
@@ -128,32 +131,60 @@ class StoredDepth:
 
 
 class GeometricSource:
-    """Filtered geometric depth of all cameras, one timestamp at a time, cached as 16-bit logarithmic depth."""
+    """Filtered geometric depth of all cameras, one timestamp at a time, cached as 16-bit logarithmic depth.
+
+    Frames come in blocks within which matches of static pixels are carried over, so a frame depends on the pictures
+    before it in its block and on no other.
+
+    Args:
+        cameras: the cameras that are matched.
+        bounds: depth range that is searched.
+        settings: matching, filtering, carrying over.
+        cache: folder of the cache; the matches of unfinished blocks lie in `matches` beside it.
+        frames: all frame numbers of the build, ascending.
+        read: reads the pictures of one frame.
+    """
 
     def __init__(
-        self, cameras: Sequence[Camera], bounds: DepthBounds, settings: StereoSettings, cache: Path
+        self,
+        cameras: Sequence[Camera],
+        bounds: DepthBounds,
+        settings: StereoSettings,
+        cache: Path,
+        frames: Sequence[int],
+        read: Callable[[int], Frame],
     ) -> None:
-        self.cameras, self.bounds, self.settings = list(cameras), bounds, settings
+        self.cameras, self.bounds, self.settings, self.read = list(cameras), bounds, settings, read
         self.maker = choose_maker(settings.maker, self.cameras)
-        self.entries = EntryFolder(cache)
+        self.entries, self.matches = EntryFolder(cache), cache.with_name("matches")
+        self.blocks = frame_blocks(frames, settings)
+        self._before = {after: before for block in self.blocks for before, after in pairwise(block)}
+        self._keys: dict[int, str] = {}
+        self._memory, self._remembered = MatchMemory(), ""
 
     def key(self, frame: Frame) -> str:
         """Hash of pictures, cameras, range and settings: of all views, since each depends on all."""
-        return hash_of(
-            STEREO_VERSION,
-            self.maker,
-            asdict(self.settings),
-            list(self.bounds[:2]),
-            [describe_camera(camera) for camera in self.cameras],
-            [frame.hashes[camera.name] for camera in self.cameras],
-        )
+        if frame.number not in self._keys:
+            before = self._before.get(frame.number)
+            if before is not None and before not in self._keys:
+                self.key(self.read(before))
+            self._keys[frame.number] = hash_of(
+                STEREO_VERSION,
+                self.maker,
+                asdict(self.settings),
+                list(self.bounds[:2]),
+                [describe_camera(camera) for camera in self.cameras],
+                [frame.hashes[camera.name] for camera in self.cameras],
+                "" if before is None else self._keys[before],
+            )
+        return self._keys[frame.number]
 
     def depths(self, frame: Frame) -> dict[str, StoredDepth]:
         """D^g by camera name; what the cache holds already is not computed again."""
         key = self.key(frame)
         stored = {camera.name: self._stored(camera.name, frame.number, key) for camera in self.cameras}
         if any(depth is None for depth in stored.values()):
-            self._compute(frame, key)
+            self._store(frame, key, self._match(frame))
             stored = {camera.name: self._stored(camera.name, frame.number, key) for camera in self.cameras}
         return stored
 
@@ -163,18 +194,47 @@ class GeometricSource:
             return None
         return StoredDepth(DepthRange(*entry.record["depth_range"]).decode(entry.array()), entry.record)
 
-    def _compute(self, frame: Frame, key: str) -> None:
+    def _match(self, frame: Frame) -> list[GeometricDepth]:
+        """Match one frame after making sure that the memory is that of the frame before it."""
+        before = self._before.get(frame.number)
+        folder = self.matches / f"{self._first(frame.number):05d}"
+        if before is None:
+            self._memory = MatchMemory()
+        elif self._remembered != self._keys[before]:
+            saved = MatchMemory.load(folder, self._keys[before], len(self.cameras))
+            if saved is None:
+                self._match(self.read(before))
+            else:
+                self._memory = saved
         images = [frame.images[camera.name] for camera in self.cameras]
-        results = geometric_depth(images, self.cameras, self.bounds[:2], self.settings, self.maker)
+        memory = self._memory if self.settings.reuse_static else None
+        results = geometric_depth(images, self.cameras, self.bounds[:2], self.settings, self.maker, memory)
+        self._remembered = self.key(frame)
+        if frame.number in self._before.values():
+            self._memory.save(folder, self._remembered)
+        return results
+
+    def _first(self, number: int) -> int:
+        return next(block[0] for block in self.blocks if number in block)
+
+    def _store(self, frame: Frame, key: str, results: Sequence[GeometricDepth]) -> None:
+        matched = round(self._memory.matched_share, 6) if self.settings.reuse_static else 1.0
         for camera, result in zip(self.cameras, results):
             depth_range = DepthRange.of(result.depth)
             record = {
                 "key": key,
                 "maker": self.maker,
+                "matched_share": matched,
                 "depth_range": [depth_range.near, depth_range.far],
                 "survivors": {name: int(count) for name, count in result.survivors.items()},
             }
             self.entries.write(camera.name, frame.number, depth_range.encode(result.depth), record)
+
+
+def frame_blocks(frames: Sequence[int], settings: StereoSettings) -> list[tuple[int, ...]]:
+    """Frames in the groups that must be built in order; single frames where nothing is carried over."""
+    size = max(settings.reuse_block, 1) if settings.reuse_static else 1
+    return [tuple(frames[start : start + size]) for start in range(0, len(frames), size)]
 
 
 def describe_camera(camera: Camera) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,12 +13,16 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.filter import GeometricDepth, filter_depths
 from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera
 from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.static import MatchMemory
 
 RawDepth = tuple[np.ndarray, np.ndarray]
 """Planar depth float32 [H, W] (0 = none) and matching cost 1 - NCC float32 [H, W] in 0..2."""
 
-Maker = Callable[[Sequence[np.ndarray], Sequence[Camera], tuple[float, float], StereoSettings], list[RawDepth]]
-"""(grey uint8 [H, W] per camera, cameras, (near, far), settings) -> raw depth and cost per camera."""
+Maker = Callable[..., list[RawDepth]]
+"""(grey uint8 [H, W] per camera, cameras, (near, far), settings, wanted) -> raw depth and cost per camera.
+
+`wanted` is None or bool [H, W] per camera: a maker may leave out all other pixels, and should where that saves time.
+"""
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601, as every codec of the captures uses
 
@@ -31,20 +35,16 @@ class DepthBounds(NamedTuple):
     origin: str
 
 
-def _patchmatch(
-    grays: Sequence[np.ndarray], cameras: Sequence[Camera], depth_range: tuple[float, float], settings: StereoSettings
-) -> list[RawDepth]:
+def _patchmatch(*arguments: Any) -> list[RawDepth]:
     from d2_plugin.priors.patchmatch import patchmatch
 
-    return patchmatch(grays, cameras, depth_range, settings)
+    return patchmatch(*arguments[:4])
 
 
-def _sweep(
-    grays: Sequence[np.ndarray], cameras: Sequence[Camera], depth_range: tuple[float, float], settings: StereoSettings
-) -> list[RawDepth]:
+def _sweep(*arguments: Any) -> list[RawDepth]:
     from d2_plugin.priors.sweep import sweep
 
-    return sweep(grays, cameras, depth_range, settings)
+    return sweep(*arguments)
 
 
 MAKERS: dict[str, Maker] = {"patchmatch": _patchmatch, "sweep": _sweep}
@@ -56,6 +56,7 @@ def geometric_depth(
     depth_range: tuple[float, float],
     settings: StereoSettings,
     maker: str | None = None,
+    memory: MatchMemory | None = None,
 ) -> list[GeometricDepth]:
     """D^g of every view from the synchronized views of one timestamp, and of no other.
 
@@ -65,6 +66,8 @@ def geometric_depth(
         depth_range: near and far in world units; ten times too wide does no harm.
         settings: matching and filtering.
         maker: name in `MAKERS` or `auto`; settings.maker where None.
+        memory: matches of the frames before, which are carried over where the pictures did not change, and which this
+            frame's are added to.
 
     Returns:
         Per camera the filtered depth; empty everywhere where nothing can be known (no texture, one centre).
@@ -77,7 +80,10 @@ def geometric_depth(
     name = choose_maker(maker or settings.maker, cameras)
     small = [_shrunk(gray(image), camera, settings.scale) for image, camera in zip(images, cameras)]
     grays, small_cameras = [pair[0] for pair in small], [pair[1] for pair in small]
-    raw = MAKERS[name](grays, small_cameras, depth_range, settings)
+    wanted = None if memory is None else memory.wanted(grays, settings)
+    raw = MAKERS[name](grays, small_cameras, depth_range, settings, wanted)
+    if memory is not None:
+        raw = memory.merge(grays, raw, wanted)
     filtered = filter_depths(grays, small_cameras, [depth for depth, _ in raw], [cost for _, cost in raw], settings)
     return [enlarged(result, camera.width, camera.height) for result, camera in zip(filtered, cameras)]
 

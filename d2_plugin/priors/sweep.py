@@ -19,15 +19,20 @@ import numpy as np
 from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import missing_extra
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.geometry import ViewPair, check_depth_range, inverse_depth_planes, view_pair
+from d2_plugin.priors.geometry import ViewPair, check_depth_range, cropped_camera, inverse_depth_planes, view_pair
 from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.static import Box, covering_boxes
 
 WORST_COST = 2.0
 MIN_VARIANCE = 1e-5  # of grey values in 0..1 over one window: below it NCC correlates sensor noise
 
 
 def sweep(
-    grays: Sequence[np.ndarray], cameras: Sequence[Camera], depth_range: tuple[float, float], settings: StereoSettings
+    grays: Sequence[np.ndarray],
+    cameras: Sequence[Camera],
+    depth_range: tuple[float, float],
+    settings: StereoSettings,
+    wanted: Sequence[np.ndarray] | None = None,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Depth and matching cost of every view from all the others.
 
@@ -36,6 +41,8 @@ def sweep(
         cameras: at least two.
         depth_range: near and far in world units.
         settings: the `sweep_*` fields are used.
+        wanted: bool [H, W] per camera, pixels whose depth is asked for; all of them where None. Boxes around them are
+            matched, and what lies outside of the boxes has no depth.
 
     Returns:
         Per camera: planar depth float32 [H, W] (0 where no source covers the pixel) and 1 - NCC float32 [H, W].
@@ -44,28 +51,42 @@ def sweep(
     if not hasattr(cv2, "ximgproc"):
         raise missing_extra("OpenCV with its contrib modules", "stereo", "the plane sweep")
     depth_range = check_depth_range(depth_range)
-    return [_sweep_one(cv2, index, grays, cameras, depth_range, settings) for index in range(len(cameras))]
+    results = []
+    for index, gray in enumerate(grays):
+        depth, cost = np.zeros(gray.shape, np.float32), np.full(gray.shape, WORST_COST, np.float32)
+        whole = [(slice(0, gray.shape[0]), slice(0, gray.shape[1]))]
+        for box in whole if wanted is None else covering_boxes(wanted[index], _reach(settings)):
+            depth[box], cost[box] = _sweep_box(cv2, index, box, grays, cameras, depth_range, settings)
+        results.append((depth, cost))
+    return results
 
 
-def _sweep_one(
+def _reach(settings: StereoSettings) -> int:
+    """How far away a pixel's aggregated cost asks, pixels: a guided filter is two boxes, one after the other."""
+    return settings.sweep_window // 2 + 2 * settings.sweep_guide_radius
+
+
+def _sweep_box(
     cv2: ModuleType,
     index: int,
+    box: Box,
     grays: Sequence[np.ndarray],
     cameras: Sequence[Camera],
     depth_range: tuple[float, float],
     settings: StereoSettings,
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and cost of one part of view `index`, whose sources are the other views in full."""
     others = [other for other in range(len(cameras)) if other != index]
-    seen_by = [cameras[other] for other in others]
-    planes = inverse_depth_planes(cameras[index], seen_by, depth_range, settings.sweep_step)
-    correlate = _correlator(cv2, grays[index], settings.sweep_window)
-    sources = [(view_pair(cameras[index], cameras[other]), grays[other].astype(np.float32) / 255) for other in others]
+    gray, camera = np.ascontiguousarray(grays[index][box]), cropped_camera(cameras[index], *box)
+    planes = inverse_depth_planes(cameras[index], [cameras[j] for j in others], depth_range, settings.sweep_step)
+    correlate = _correlator(cv2, gray, settings.sweep_window)
+    sources = [(view_pair(camera, cameras[other]), grays[other].astype(np.float32) / 255) for other in others]
     guide = cv2.ximgproc.createGuidedFilter(
-        np.ascontiguousarray(grays[index]), settings.sweep_guide_radius, (settings.sweep_guide_epsilon * 255) ** 2
+        gray, settings.sweep_guide_radius, (settings.sweep_guide_epsilon * 255) ** 2
     )
-    minimum = RunningMinimum(grays[index].shape)
+    minimum = RunningMinimum(gray.shape)
     for plane in planes:
-        costs = [correlate(_warp(cv2, gray, pair, plane, grays[index].shape)) for pair, gray in sources]
+        costs = [correlate(_warp(cv2, source, pair, plane, gray.shape)) for pair, source in sources]
         minimum.add(guide.filter(np.minimum.reduce(costs)))
     position, cost = minimum.result()
     inverse = np.interp(position, np.arange(len(planes)), planes)

@@ -1,0 +1,116 @@
+"""Static pixels once: matches are carried from frame to frame where the picture did not change.
+
+Matching takes nearly all of the time, and in a room with fixed cameras most pixels look the same from one frame to the
+next. Where a pixel's neighbourhood has not changed since its depth was matched, raw depth and cost are carried over;
+the others are matched anew. The filter then runs on the whole maps of the frame, so a carried depth counts only while
+some other view, as it is now, still confirms it.
+
+Measured on studio (20 frames, 4 training views, PatchMatch): 18 % of the pixels are matched anew. Depths that survive,
+their median error and the share off by more than 5 %: 28.7 %, .00087, .0088 when every frame is matched in full, and
+28.3 %, .00090, .0085 when static pixels are carried over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.files import Entry, read_json, write_entry
+from d2_plugin.priors.settings import StereoSettings
+
+SMOOTHING = 3  # side of the box over which a change is averaged, pixels: noise cancels, moving things do not
+MEMORY_DTYPE = np.dtype([("gray", "u1"), ("depth", "<f4"), ("cost", "<f4")])
+
+Box = tuple[slice, slice]
+"""Rows and columns of a part of a picture."""
+
+
+@dataclass(eq=False)
+class MatchMemory:
+    """Per view what was matched last, pixel by pixel, and the grey value it was matched with."""
+
+    views: list[np.ndarray] = field(default_factory=list)  # MEMORY_DTYPE [H, W] per view
+    matched_share: float = 0.0
+
+    def wanted(self, grays: Sequence[np.ndarray], settings: StereoSettings) -> list[np.ndarray] | None:
+        """Pixels that must be matched anew, bool [H, W] per view; None where nothing is remembered yet."""
+        if not self.views:
+            return None
+        return [changed(gray, view["gray"], settings) for gray, view in zip(grays, self.views)]
+
+    def merge(
+        self,
+        grays: Sequence[np.ndarray],
+        raw: Sequence[tuple[np.ndarray, np.ndarray]],
+        wanted: Sequence[np.ndarray] | None,
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Take in what was matched at the wanted pixels; returns whole maps of depth and cost."""
+        if wanted is None:
+            wanted = [np.ones(gray.shape, bool) for gray in grays]
+            self.views = [np.zeros(gray.shape, MEMORY_DTYPE) for gray in grays]
+        for view, gray, (depth, cost), mask in zip(self.views, grays, raw, wanted):
+            view["gray"][mask], view["depth"][mask], view["cost"][mask] = gray[mask], depth[mask], cost[mask]
+        self.matched_share = float(np.mean([mask.mean() for mask in wanted]))
+        return [(view["depth"].copy(), view["cost"].copy()) for view in self.views]
+
+    def save(self, folder: Path, key: str) -> None:
+        """Keep the memory on disk, so that a build that is killed goes on with the same matches."""
+        for index, view in enumerate(self.views):
+            write_entry(folder / f"{index}.npy", view, {"key": key, "matched_share": self.matched_share})
+
+    @classmethod
+    def load(cls, folder: Path, key: str, count: int) -> MatchMemory | None:
+        """The memory of `count` views that was saved under `key`, or None where there is no intact one."""
+        views = []
+        for index in range(count):
+            path = folder / f"{index}.npy"
+            try:
+                entry = Entry(path, read_json(path.with_suffix(".json")))
+                if entry.record.get("key") != key:
+                    return None
+                views.append(np.array(entry.array(MEMORY_DTYPE)))
+            except (FileNotFoundError, D2Error):
+                return None
+        return cls(views)
+
+
+def changed(gray: np.ndarray, before: np.ndarray, settings: StereoSettings) -> np.ndarray:
+    """Pixels in whose neighbourhood the picture changed, bool [H, W]."""
+    cv2 = opencv("carrying static pixels over")
+    difference = cv2.blur(gray.astype(np.float32) - before, (SMOOTHING, SMOOTHING))
+    moved = (np.abs(difference) > 255 * settings.reuse_change).astype(np.uint8)
+    side = 2 * settings.reuse_radius + 1
+    return cv2.dilate(moved, np.ones((side, side), np.uint8)) > 0
+
+
+def covering_boxes(mask: np.ndarray, margin: int) -> list[Box]:
+    """Boxes that cover all pixels of `mask` with `margin` around them, merged where that saves work.
+
+    For makers that work on rectangles: two boxes become one when their union is no larger than both together.
+    """
+    cv2 = opencv("carrying static pixels over")
+    height, width = mask.shape
+    kernel = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
+    _, _, stats, _ = cv2.connectedComponentsWithStats(cv2.dilate(mask.astype(np.uint8), kernel))
+    boxes = [(x, y, x + w, y + h) for x, y, w, h, _ in stats[1:].tolist()]
+    merged: list[tuple[int, int, int, int]] = []
+    while boxes:
+        box = boxes.pop()
+        for other in (*merged, *boxes):
+            union = (min(box[0], other[0]), min(box[1], other[1]), max(box[2], other[2]), max(box[3], other[3]))
+            if _area(union) <= _area(box) + _area(other):
+                (merged if other in merged else boxes).remove(other)
+                boxes.append(union)
+                break
+        else:
+            merged.append(box)
+    return [(slice(top, min(bottom, height)), slice(left, min(right, width))) for left, top, right, bottom in merged]
+
+
+def _area(box: tuple[int, int, int, int]) -> int:
+    return (box[2] - box[0]) * (box[3] - box[1])
