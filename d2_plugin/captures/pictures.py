@@ -56,7 +56,7 @@ def write_png(path: Path, picture: np.ndarray) -> None:
     rows[:, 1:4] = flat[:, :3]
     rows[:, 4:] = flat[:, 3:] - flat[:, :-3]
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes(), 6)), (b"IEND", b""))
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes(), 3)), (b"IEND", b""))
     path.write_bytes(_PNG_SIGNATURE + b"".join(_png_chunk(kind, body) for kind, body in chunks))
 
 
