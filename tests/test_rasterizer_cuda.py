@@ -11,6 +11,7 @@ import functools
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import pytest
@@ -38,17 +39,19 @@ class ShimLauncher:
 
     def launch(self, kernel: str, blocks: int, frame: cuda.Frame, rows: int = 1) -> None:
         self.launched.append(kernel)
-        error = shim_library(frame.channels or 3)(kernel.encode(), blocks, rows, self.descending, ctypes.byref(frame))
+        run = shim_library(frame.channels or 3).d2_shim_launch
+        error = run(kernel.encode(), blocks, rows, self.descending, ctypes.byref(frame))
         assert error is None, error.decode()
 
 
 @functools.cache
-def shim_library(channels: int):
+def shim_library(channels: int) -> ctypes.CDLL:
     flags = (f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda.Frame)}", "-ffp-contract=off")
     headers = (HERE / "cuda_shim.h", cuda.SOURCE, *cuda.HEADERS)
-    launch = load_library("cuda-shim", (HERE / "cuda_shim.cpp",), headers, flags).d2_shim_launch
-    launch.restype = ctypes.c_char_p
-    return launch
+    library = load_library("cuda-shim", (HERE / "cuda_shim.cpp",), headers, flags)
+    library.d2_shim_launch.restype = ctypes.c_char_p
+    library.d2_shim_stream.restype = ctypes.c_void_p
+    return library
 
 
 @pytest.fixture(autouse=True)
@@ -281,6 +284,26 @@ def test_gradients_outside_of_the_fov_clamp(backend: torch.device) -> None:
     assert_same_gradients(gradients_of_kernels(scene, backend, upstream), expected)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_extreme_gaussians_leave_everything_finite(backend: torch.device, seed: int) -> None:
+    """Sizes, distances and elongations over thirty decades, opacities at both ends."""
+    generator = torch.Generator().manual_seed(seed)
+    draw = functools.partial(torch.rand, generator=generator)
+    scene = make_scene(2000, 37, 21, seed=seed)
+    sizes = 10 ** (-12 + 30 * draw(2000, 3))
+    turns = torch.linalg.qr(torch.randn(2000, 3, 3, generator=generator)).Q * sizes[:, None]
+    full = turns @ turns.mT
+    covariances = torch.stack([full[:, a, b] for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))], 1)
+    means = scene.splats.means * 10 ** (-3 + 9 * draw(2000, 1))
+    opacities = torch.where(draw(2000) < 0.5, scene.splats.opacities, (draw(2000) < 0.5).float())
+    scene = scene._replace(splats=Splats(means, covariances, opacities, scene.splats.rows))
+    _, outputs = render_kernels(scene, backend)
+    upstream = tuple(torch.ones_like(part) for part in outputs[:3])
+    survey_of_it = survey_kernels(scene, make_prior(scene), backend)
+    for value in (*outputs[:3], *gradients_of_kernels(scene, backend, upstream), *survey_of_it):
+        assert torch.isfinite(value).all()
+
+
 @pytest.mark.parametrize("given", range(3), ids=Render._fields)
 def test_outputs_without_an_upstream_gradient_count_as_zero(backend: torch.device, given: int) -> None:
     scene = make_scene(100, 32, 32)
@@ -485,6 +508,42 @@ def test_without_a_driver_splatting_falls_back_with_one_warning(monkeypatch: pyt
 
 def no_library(*_: object, **__: object) -> None:
     raise OSError("no such library")
+
+
+@pytest.fixture
+def driver(compiler: runtime.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ctypes.CDLL:
+    """The shim's CUDA driver in place of the real one, with stream 77 current."""
+    try:
+        shim = shim_library(3)
+    except NoCompiler as error:
+        pytest.skip(str(error))
+    monkeypatch.setenv("D2_CACHE", str(tmp_path))
+    monkeypatch.setattr(runtime, "_load_driver", lambda: shim)
+    monkeypatch.setattr(torch.cuda, "init", lambda: None)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0))
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: SimpleNamespace(cuda_stream=77))
+    return shim
+
+
+def test_the_launcher_talks_to_the_driver(driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Context, module, functions, frame and stream arrive; the kernels themselves run in the shim."""
+    launcher = runtime.CudaLauncher(torch.device("cuda", 0))
+    monkeypatch.setattr(cuda, "launcher", lambda device: launcher)
+    scene = make_scene(100, 32, 32)
+    render, upstream, expected = reference_with_gradients(scene)
+    cpu = torch.device("cpu")
+    assert_same_image(scene, render_kernels(scene, cpu)[1], render)
+    assert_same_gradients(gradients_of_kernels(scene, cpu, upstream), expected)
+    assert survey_kernels(scene, make_prior(scene), cpu).hits.any()
+    assert driver.d2_shim_stream() == 77
+    assert driver.d2_shim_contexts() == 0
+
+
+def test_a_driver_that_refuses_the_kernels_is_named(driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime, "build", lambda *_: runtime.Binary(b"no cubin", "sm_90"))
+    with pytest.raises(runtime.NoCuda, match=r"refuses kernels for sm_90 .*NO_BINARY.*: update the NVIDIA driver"):
+        runtime.CudaLauncher(torch.device("cuda", 0))
+    assert driver.d2_shim_contexts() == 0
 
 
 # ---------------------------------------------------------------------------------------------------- the device
