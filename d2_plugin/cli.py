@@ -1,4 +1,4 @@
-"""The `d2` command: demo, plan, priors, train, eval, bench, doctor."""
+"""The `d2` command: demo, plan, priors, train, eval, compare, bench, doctor."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"d2-4dgs {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_add_demo, _add_plan, _add_priors, _add_train, _add_eval, _add_bench, _add_doctor):
+    for add in (_add_demo, _add_plan, _add_priors, _add_train, _add_eval, _add_compare, _add_bench, _add_doctor):
         add(commands)
     return parser
 
@@ -76,6 +76,11 @@ def _add_eval(commands: Any) -> None:
     parser = _command(commands, "eval", _eval, "Score the held-out cameras of a trained run again.")
     parser.add_argument("run_folder", type=Path, help="the --output of d2 train")
     parser.add_argument("--no-pictures", action="store_true", help="scores only")
+
+
+def _add_compare(commands: Any) -> None:
+    parser = _command(commands, "compare", _compare, "One Markdown table of the scores of several runs.")
+    parser.add_argument("run_folders", type=Path, nargs="+", help="the --output folders of d2 train")
 
 
 def _add_priors(commands: Any) -> None:
@@ -187,6 +192,12 @@ def _eval(options: argparse.Namespace) -> None:
 
     metrics = Run.load(options.run_folder).evaluate(pictures=not options.no_pictures)
     print(metrics_table({options.run_folder.name: metrics}))
+
+
+def _compare(options: argparse.Namespace) -> None:
+    from d2_plugin.study.report import metrics_table, read_metrics
+
+    print(metrics_table({folder.name: read_metrics(folder) for folder in options.run_folders}))
 
 
 def _priors(options: argparse.Namespace) -> None:

@@ -110,6 +110,23 @@ def test_evaluating_again_gives_the_same_scores(finished: Path) -> None:
     assert after["per_view"] == before["per_view"]
 
 
+def test_compare_tabulates_what_was_measured(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", str(finished)]) == 0
+    header, _, row = capsys.readouterr().out.splitlines()
+    cells = dict(zip(header.split("|")[1:-1], row.split("|")[1:-1], strict=True))
+    cells = {key.strip(): value.strip() for key, value in cells.items()}
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert cells["run"] == "full"
+    assert cells["PSNR"] == f"{metrics['test']['psnr']:.2f}"
+    assert cells["LPIPS"] == "-"
+
+
+def test_doctor_names_compiler_device_and_extras(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert {line.split()[0] for line in lines} >= {"device", "compiler", "cache", "backbones", "onnxruntime", "cv2"}
+
+
 def test_plan_names_each_decision_with_its_measurement(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", str(capture), "--train-cameras", CAMERAS]) == 0
     lines = capsys.readouterr().out.splitlines()
