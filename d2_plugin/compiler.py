@@ -38,6 +38,9 @@ BASE_FLAGS = ("-std=c++17", "-O3", "-fPIC", "-shared", "-pthread", "-fno-math-er
 NATIVE_FLAGS = (("-march=native",), ("-mcpu=native",), ())
 """How compilers are asked for this CPU's instructions, best first; the last one always works."""
 
+MESSAGE_LIMIT = 4000
+"""Characters of a compiler's words in an error: the first mistake is there, what follows from it need not be."""
+
 _loaded: dict[Path, ctypes.CDLL] = {}
 _guard = threading.Lock()
 
@@ -163,7 +166,7 @@ def _compile(library: Path, command: Sequence[str], sources: Sequence[Path]) -> 
         if result.returncode:
             raise CompileError(
                 f"compiling {', '.join(source.name for source in sources)} failed; please report the command "
-                f"`{shlex.join(command)}` and what it said:\n{result.stderr.strip()}"
+                f"`{shlex.join(command)}` and what it said:\n{result.stderr.strip()[:MESSAGE_LIMIT]}"
             )
         checksum = _checksum(built)
         built.replace(library)

@@ -66,6 +66,8 @@ def rasterize(
             row.append((weights @ values[front_to_back]).reshape(height, width, -1))
         rows.append(torch.cat(row, 1))
     image = torch.cat(rows, 0)
+    # A loss that divides by alpha sends NaN where nobody contributes, which 0 times a weight would not silence.
+    image = torch.where(image[..., -1:].detach() > 0, image, 0)
     color, depth_sum, alpha = image[..., :-2], image[..., -2], image[..., -1]
     if background is not None:
         color = color + (1 - alpha)[..., None] * background

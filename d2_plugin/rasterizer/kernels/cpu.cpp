@@ -232,6 +232,11 @@ static void load_gradients(const Frame& f, int tile, int channels, float* state,
   for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
     float* field = state + block * fields * LANES + lane;
     const float alpha = f.alpha[pixel];
+    if (alpha == 0.f) {
+      // Nobody contributes here. A loss that divides by alpha sends NaN, which 0 times a weight would not silence.
+      for (int c = 0; background && f.grad_color && c < channels; c++) background[c] += f.grad_color[pixel * channels + c];
+      return;
+    }
     float on_alpha = f.grad_alpha ? f.grad_alpha[pixel] : 0.f, total = on_alpha * alpha;
     const float on_depth = f.grad_depth_sum ? f.grad_depth_sum[pixel] : 0.f;
     total += on_depth * f.depth_sum[pixel];
