@@ -31,8 +31,6 @@ STATIC = {"positions": 3, "log_scales": 3, "left": 4, "opacity_logits": 1}
 """Columns of the raw parameters of a model without time, in the order of `_Slice.apply`."""
 TEMPORAL = {**STATIC, "times": 1, "log_time_scales": 1, "right": 4}
 
-_CHUNK = 1024  # Gaussians of one task, as in the kernel
-
 
 class _Call(ctypes.Structure):
     """d2::Slice of kernels/slice4d.cpp: what one call works on; absent pointers stay null."""
@@ -64,9 +62,9 @@ def library() -> ctypes.CDLL | None:
     except NoCompiler:
         return None
     call = ctypes.POINTER(_Call)
-    kernel.d2_slice_rows.argtypes, kernel.d2_slice_rows.restype = (call, ctypes.c_void_p), ctypes.c_int64
-    kernel.d2_slice_forward.argtypes = kernel.d2_slice_backward.argtypes = (call,)
-    kernel.d2_slice_forward.restype = kernel.d2_slice_backward.restype = None
+    for name, result in ("rows", ctypes.c_int64), ("forward", None), ("backward", None):
+        function = getattr(kernel, f"d2_slice_{name}")
+        function.argtypes, function.restype = (call,), result
     kernel.d2_slice_size.restype = ctypes.c_int64
     assert kernel.d2_slice_size() == ctypes.sizeof(_Call), "the call differs between native_slice.py and slice4d.cpp"
     return kernel
@@ -81,7 +79,7 @@ def can_slice(raw: Mapping[str, Tensor]) -> bool:
 def native_slice(
     raw: Mapping[str, Tensor], time: float, marginal_cut: float, log_scale_limit: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The 3D Gaussians of a 4D model at an instant, differentiable once; arguments as of `yang4d.reference_slice`.
+    """The 3D Gaussians of a 4D model at an instant, differentiable once.
 
     Args:
         raw: parameters by name, float32 on the CPU: positions [N, 3], log_scales [N, 3], left [N, 4],
@@ -101,7 +99,7 @@ def native_slice(
     for name, width in columns.items():  # the kernel trusts its pointers
         if raw[name].numel() != count * width:
             shape = tuple(raw[name].shape)
-            raise D2Error(f"{name} has shape {shape}, expected one row of {width} for each of {count} Gaussians")
+            raise D2Error(f"{name} has shape {shape}, expected {width} numbers for each of {count} Gaussians: fix it")
     return _Slice.apply(float(time), marginal_cut, log_scale_limit, *(raw[name] for name in columns))
 
 
@@ -151,7 +149,6 @@ def _rows(call: _Call) -> Tensor:
         call.drawn = call.count
         return torch.arange(call.count)
     rows = torch.empty(call.count, dtype=torch.int64)
-    spare = torch.empty(-(-call.count // _CHUNK), dtype=torch.int64)
     call.point(rows=rows)
-    call.drawn = library().d2_slice_rows(call, spare.data_ptr())
+    call.drawn = library().d2_slice_rows(call)
     return rows[: call.drawn]

@@ -214,7 +214,7 @@ def test_each_output_alone_has_its_gradient(temporal: bool) -> None:
 def test_rows_of_another_number_of_gaussians_are_refused() -> None:
     rows = random_rows(10, True)
     rows["right"] = rows["right"][:9]
-    with pytest.raises(D2Error, match=r"right has shape \(9, 4\), expected one row of 4 for each of 10 Gaussians"):
+    with pytest.raises(D2Error, match=r"right has shape \(9, 4\), expected 4 numbers for each of 10 Gaussians"):
         native_slice(rows, AT, *CONSTANTS)
 
 

@@ -8,6 +8,7 @@
 #include <cstdint>
 #include <cstring>
 #include <utility>
+#include <vector>
 
 #include "parallel.h"
 #include "simd.h"
@@ -49,8 +50,8 @@ struct Group {
   }
 };
 
-// K rows of LANES numbers in memory are LANES rows of K, and the other way round: number `lane` of column k of the one is
-// number lane * K + k of the other. Where to find what in the two vectors that a shuffle joins, `next` being the second:
+// LANES rows of K numbers fill K vectors, as the K columns do: lane i of column k is number i * K + k of the rows.
+// Where to find what in the two vectors that a shuffle joins, `next` being the second:
 template <int K, int k, int next>
 struct ToColumn {
   static constexpr int at(int lane) {
@@ -251,7 +252,9 @@ D2_INLINE Unit load_quaternions(const Slice& s, const Group& group, const float*
   return normalized(raw, s.small_norm);
 }
 
-D2_INLINE Floats dot4(const Floats* a, const Floats* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]; }
+D2_INLINE Floats dot4(const Floats* a, const Floats* b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
+}
 
 // F(t) = exp(-offset^2 / (2 variance)); 1 at offset 0.
 D2_INLINE Floats temporal_marginal(Floats offset, Floats variance) {
@@ -383,8 +386,8 @@ static void backward_static(const Slice& s, const Group& in, const Incoming& g) 
   store<4>(in, grad_left, s.grad_left);
 }
 
-// Gradients of factor, log-scales and time. Sigma_cond = B B^T with B = [A, 0] H, the factor's part across its last row,
-// and velocity = L_i . L_3 / variance.
+// Gradients of factor, log-scales and time. Sigma_cond = B B^T with B = [A, 0] H, the part of the factor's rows across
+// the last one; velocity = L_i . L_3 / variance.
 struct ConditionalGradient {
   Floats factor[4][4], log_scales[4], time;
 
@@ -506,14 +509,15 @@ extern "C" {
 
 int64_t d2_slice_size() { return sizeof(Slice); }
 
-// Step 1: the rows that are drawn, in order; returns M. `spare` [chunks] is scratch.
-int64_t d2_slice_rows(const Slice* s, int64_t* spare) {
+// Step 1: the rows that are drawn, in order; returns M.
+int64_t d2_slice_rows(const Slice* s) {
+  std::vector<int64_t> found_in(size_t(s->count / d2::CHUNK + 1));
   d2::for_each_chunk(*s, s->count, [&](int64_t first, int64_t end) {
-    spare[first / d2::CHUNK] = d2::find_drawn(*s, first, end, s->rows + first);
+    found_in[first / d2::CHUNK] = d2::find_drawn(*s, first, end, s->rows + first);
   });
   int64_t drawn = 0;
   for (int64_t first = 0; first < s->count; first += d2::CHUNK) {
-    const int64_t found = spare[first / d2::CHUNK];
+    const int64_t found = found_in[first / d2::CHUNK];
     std::memmove(s->rows + drawn, s->rows + first, sizeof(int64_t) * found);
     drawn += found;
   }

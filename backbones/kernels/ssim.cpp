@@ -18,8 +18,8 @@ namespace d2 {
 constexpr int RADIUS = 5, TAPS = 2 * RADIUS + 1;
 constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
 
-// Variances are differences of nearly equal numbers where a picture is flat. They do not change if both pictures, and the
-// zeros around them, are shifted; numbers in -1/2..1/2 leave a quarter of the rounding.
+// Variances are differences of nearly equal numbers where a picture is flat. They do not change if both pictures, and
+// the zeros around them, are shifted; numbers in -1/2..1/2 leave a quarter of the rounding.
 constexpr float SHIFT = 0.5f;
 
 // What one call works on, as native_ssim.py fills it in.
@@ -27,8 +27,8 @@ struct Photometric {
   int32_t height, width, channels, threads;
   float ssim_weight;
   float window[TAPS];
-  const float *image, *target;  // [H, W, C]
-  float* gradient;              // [H, W, C] or null
+  const float *image, *target;         // [H, W, C]
+  float* gradient;                     // [H, W, C] or null
   double *differences, *similarities;  // [H] sums over each row
 
   int64_t row_length() const { return int64_t(width) * channels; }
@@ -57,7 +57,7 @@ class Band {
       : p_(p), begin_(begin), end_(end), length_(p.row_length()), margin_(int64_t(RADIUS) * p.channels),
         whole_((length_ + LANES - 1) / LANES * LANES), padded_(whole_ + 2 * margin_) {
     static thread_local std::vector<float> memory;
-    memory.assign(size_t((5 + 3) * padded_ + (3 * TAPS + 1) * whole_ + LANES), 0.f);
+    memory.assign(size_t((5 + 3) * padded_ + (3 * TAPS + 1) * whole_), 0.f);
     blurred_ = memory.data();
     derivatives_ = blurred_ + 5 * padded_;
     ring_ = derivatives_ + 3 * padded_;
