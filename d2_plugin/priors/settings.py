@@ -18,6 +18,21 @@ class StereoSettings:
     """`patchmatch` (compiled), `sweep` (OpenCV), or `auto`: patchmatch where there is a compiler."""
     scale: float = 1.0
     """Pictures are shrunk by this factor before matching; half costs a quarter. Depth comes back at full size."""
+    patchmatch_rounds: tuple[int, ...] = (4, 2, 2, 1)
+    """Red-black sweeps at each resolution, coarsest first; each resolution is twice the one before, the last is full.
+    A second sweep at full resolution fits noise and costs half as much again."""
+    patchmatch_sources: int = 4
+    """At most this many other views are matched, those that overlap at a good angle."""
+    patchmatch_contrast: float = 0.08
+    """Standard deviation of the bilateral weight over grey values in a matching window, in 0..1."""
+    patchmatch_geometric_rounds: int = 0
+    """Extra passes that also ask the other views' depths (1 is a "dense" mode): more complete, and more often wrong."""
+    patchmatch_geometric_weight: float = 0.1
+    """Matching cost of one pixel of forward-backward error in those passes."""
+    patchmatch_consensus_passes: int = 2
+    """How often each plane is averaged with those of its neighbours that agree with it; 0 keeps the raw planes."""
+    patchmatch_consensus_tolerance: float = 0.02
+    """Neighbouring planes agree when they pass within this share of the inverse depth."""
     sweep_step: float = 1.0
     """Mean disparity between neighbouring planes of the sweep, source pixels. Measured on four Middlebury pairs: half a
     pixel doubles the time and changes F at 1 % by .015 at most, either way: the parabola finds what lies between."""
@@ -112,6 +127,9 @@ class PriorSettings:
     studio at .05, .1, .15: verified 33.2, 33.8, 34.1 % of the pixels, of which .1, .4, .7 % are off by over 5 %."""
     z_far_factor: float = 3.0
     """Aligned monocular depth beyond this multiple of the 99.5 percentile of the anchors is left empty."""
+    hanging_limit: float = 0.08
+    """Mono-only pixels are left empty where monocular depth spans more than this share within 1 % of the picture's
+    width: they hang between two surfaces. 0 keeps them, as the paper does."""
     depth_range: tuple[float, float] | None = None
     """Near and far of the stereo search, world units; by default from sparse points, the data set, or the baselines."""
     mono_onnx: str | None = None
