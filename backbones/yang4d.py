@@ -116,7 +116,7 @@ class Yang4D:
         if "harmonics" in g.parameters:
             coefficients = torch.cat([coefficients, g["harmonics"]], 1)
         if len(splats.rows) < len(g):
-            coefficients = coefficients[splats.rows]
+            coefficients = coefficients.index_select(0, splats.rows)
         centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
         phase = (view.time - g["times"][splats.rows]) / self.duration if s.sh_time_degree else None
         return sh.colors(coefficients, splats.means - centre, phase, s.sh_degree, s.sh_time_degree)
