@@ -148,7 +148,8 @@ class PriorSettings:
     @classmethod
     def paper(cls, **changes: Any) -> PriorSettings:
         """The paper's construction and nothing else: absolute residuals, one scale and shift, blurred edges kept."""
-        return cls(hanging_limit=0.0, align=AlignSettings(residual="absolute", epsilon=0.01, local_scales=()), **changes)
+        align = AlignSettings(residual="absolute", epsilon=0.01, local_scales=())
+        return cls(hanging_limit=0.0, align=align, **changes)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> PriorSettings:
