@@ -85,6 +85,7 @@ class _Task(ctypes.Structure):
         ("explore", ctypes.c_int32),
         ("threads", ctypes.c_int32),
         ("seed", ctypes.c_uint32),
+        ("wanted", ctypes.c_void_p),
     )
 
 
@@ -98,6 +99,7 @@ class _View:
     planes: np.ndarray  # float32 [H, W, 3]
     known: np.ndarray  # bool [H, W], whether anything matched here, at this or a coarser resolution
     cost: np.ndarray  # float32 [H, W]
+    wanted: np.ndarray | None  # bool [H, W], where a match is asked for; everywhere where None
 
 
 def patchmatch(
@@ -105,6 +107,7 @@ def patchmatch(
     cameras: Sequence[Camera],
     depth_range: tuple[float, float],
     settings: StereoSettings | None = None,
+    wanted: Sequence[np.ndarray] | None = None,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Depth and matching cost of every view from the others, before any filter.
 
@@ -115,6 +118,7 @@ def patchmatch(
         cameras: at least two, in the same order.
         depth_range: near and far in world units; ten times too wide does no harm.
         settings: the `patchmatch_*` fields, `min_angle` and `seed` are used; defaults where None.
+        wanted: bool [H, W] per camera, pixels whose depth is asked for; all where None. Others may have no depth.
 
     Returns:
         Per camera: planar depth float32 [H, W] (0 where nothing matches) and 1 - NCC float32 [H, W] in 0..2. A view
@@ -133,7 +137,8 @@ def patchmatch(
     views: list[_View] = []
     for level, (divisor, rounds) in enumerate(_levels(cameras, settings.patchmatch_rounds)):
         coarser = views or [None] * len(cameras)
-        views = [_at_resolution(*view, divisor) for view in zip(grays, cameras, coarser)]
+        masks = wanted or [None] * len(cameras)
+        views = [_at_resolution(*view, divisor) for view in zip(grays, cameras, coarser, masks)]
         for index in range(len(views)):
             # Once planes are handed down from a coarser level, random ones are hardly ever better.
             matcher.match(views, index, level, rounds, explore=divisor > 1 or level == 0)
@@ -216,6 +221,7 @@ class _Matcher:
             explore,
             torch.get_num_threads(),
             int(np.random.SeedSequence([self.settings.seed, stage, index]).generate_state(1)[0]),
+            None if view.wanted is None else view.wanted.ctypes.data,
         )
         self.library.d2_patchmatch(ctypes.byref(task), _pointer(view.planes), _pointer(view.cost))
         view.known |= view.cost < NO_MATCH
@@ -259,7 +265,9 @@ def _levels(cameras: Sequence[Camera], rounds: Sequence[int]) -> list[tuple[int,
     return [(divisor, count) for divisor, count in levels if divisor == 1 or side // divisor >= SMALLEST_SIDE]
 
 
-def _at_resolution(gray: np.ndarray, camera: Camera, coarser: _View | None, divisor: int) -> _View:
+def _at_resolution(
+    gray: np.ndarray, camera: Camera, coarser: _View | None, wanted: np.ndarray | None, divisor: int
+) -> _View:
     """The view with `divisor` times fewer pixels each way, and the planes of the coarser one if there is one."""
     if divisor > 1:
         camera = scaled_camera(camera, round(camera.width / divisor), round(camera.height / divisor))
@@ -272,7 +280,17 @@ def _at_resolution(gray: np.ndarray, camera: Camera, coarser: _View | None, divi
         planes, known = np.zeros((*gray.shape, 3), np.float32), np.zeros(gray.shape, bool)
     else:
         planes, known = refined_planes(coarser.planes, gray.shape), _nearest(coarser.known, gray.shape)
-    return _View(camera, gray, _quads(gray), planes, known, cost)
+    mask = None if wanted is None else _any_within(wanted, gray.shape)
+    return _View(camera, gray, _quads(gray), planes, known, cost, mask)
+
+
+def _any_within(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Coarse pixels of `shape` from which any pixel of a finer mask takes its plane, bool."""
+    rows, columns = _parents(shape, mask.shape)
+    y, x = np.nonzero(mask)
+    coarse = np.zeros(shape, bool)
+    coarse[rows[y], columns[x]] = True
+    return coarse
 
 
 def refined_planes(planes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -288,10 +306,14 @@ def refined_planes(planes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 def _nearest(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """`values` [h, w, ...] at [H, W], each fine pixel taking what the coarse pixel around its centre has."""
-    rows, columns = (
-        ((np.arange(fine) + 0.5) * (coarse / fine)).astype(np.int64) for coarse, fine in zip(values.shape[:2], shape)
-    )
+    rows, columns = _parents(values.shape[:2], shape)
     return values[rows][:, columns]
+
+
+def _parents(coarse: tuple[int, int], fine: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of the coarse pixel around the centre of each fine row and column."""
+    rows, columns = (((np.arange(to) + 0.5) * (of / to)).astype(np.int64) for of, to in zip(coarse, fine))
+    return rows, columns
 
 
 def _depth(view: _View) -> np.ndarray:

@@ -38,7 +38,7 @@ class DepthBounds(NamedTuple):
 def _patchmatch(*arguments: Any) -> list[RawDepth]:
     from d2_plugin.priors.patchmatch import patchmatch
 
-    return patchmatch(*arguments[:4])
+    return patchmatch(*arguments)
 
 
 def _sweep(*arguments: Any) -> list[RawDepth]:

@@ -36,6 +36,7 @@ struct Task {
   int32_t explore;                  // try random depths and normals besides small changes
   int32_t threads;
   uint32_t seed;
+  const uint8_t* wanted;  // [H, W]: where it is 0 nothing is matched; null wants all
 };
 
 }  // extern "C"
@@ -121,8 +122,14 @@ class Matcher {
     uint32_t views = 0;
   };
 
+  bool wanted(size_t i) const { return !task_.wanted || task_.wanted[i]; }
+
   void initialise(int x, int y) {
     const size_t i = size_t(y) * width_ + x;
+    if (!wanted(i)) {
+      costs_[i] = kNoMatch;
+      return;
+    }
     const Patch patch(window_, task_.reference, x, y);
     if (task_.draw_planes) {
       Random random(task_.seed, uint32_t(i), ~0u);
@@ -145,6 +152,7 @@ class Matcher {
 
   void update(int x, int y, int round) {
     const size_t i = size_t(y) * width_ + x;
+    if (!wanted(i)) return;
     const Patch patch(window_, task_.reference, x, y);
     if (patch.variance < kMinVariance) {
       costs_[i] = kNoMatch;
