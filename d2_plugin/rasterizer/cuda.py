@@ -1,8 +1,8 @@
 """The kernels on the GPU: `kernels/gpu.cu`, what they need in memory, and in which order they run.
 
 The same functions as in `native`, on float32 tensors of one device; `ops` registers them for CUDA. How a kernel gets to
-run is a `Launcher`'s business: `cuda_runtime` compiles with NVRTC and launches through the driver, and the tests have
-one that runs the very same kernels on the CPU.
+run is a `Launcher`'s business: `nvrtc` compiles and `cuda_runtime` launches through the driver; the tests have a
+launcher that runs the very same kernels on the CPU.
 
 Everything is enqueued on torch's current stream. `rasterize` and `survey` wait for the device once, to learn how many
 pairs of Gaussian and tile there are to allocate (so they cannot be captured in a CUDA graph); `backward` never waits.
@@ -93,7 +93,7 @@ def launcher(device: torch.device) -> Launcher:
     """The launcher of a CUDA device; `device` has an index.
 
     Raises:
-        d2_plugin.rasterizer.cuda_runtime.NoCuda: no driver, no NVRTC, or an architecture that it does not know.
+        d2_plugin.rasterizer.nvrtc.NoCuda: no driver, no NVRTC, or an architecture that it does not know.
     """
     from .cuda_runtime import CudaLauncher
 
@@ -103,7 +103,7 @@ def launcher(device: torch.device) -> Launcher:
 @functools.cache
 def available(device: torch.device) -> bool:
     """Whether the kernels can be had on a CUDA device; warns once where they cannot."""
-    from .cuda_runtime import NoCuda
+    from .nvrtc import NoCuda
 
     try:
         launcher(device)

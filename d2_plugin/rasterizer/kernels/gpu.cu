@@ -293,19 +293,18 @@ D2_DEVICE float warp_sums(const float (&values)[N]) {
   float part[P];
 #pragma unroll
   for (int k = 0; k < P; k++) part[k] = k < N ? values[k] : 0.f;
-  int distance = WARP / 2;
+  // Every index must be known at compile time, or `part` goes to memory instead of registers.
 #pragma unroll
-  for (int half = P / 2; half > 0; half /= 2) {
+  for (int step = 0; step < 5; step++) {
+    const int half = P >> (step + 1), distance = WARP >> (step + 1);
     const bool upper = lane_index() & distance;
+    if (half == 0) part[0] += __shfl_xor_sync(ALL_LANES, part[0], distance);
 #pragma unroll
     for (int k = 0; k < half; k++) {
-      const float give = upper ? part[k] : part[k + half], keep = upper ? part[k + half] : part[k];
-      part[k] = keep + __shfl_xor_sync(ALL_LANES, give, distance);
+      const float low = part[k], high = part[k + half];
+      part[k] = (upper ? high : low) + __shfl_xor_sync(ALL_LANES, upper ? low : high, distance);
     }
-    distance /= 2;
   }
-#pragma unroll
-  for (; distance > 0; distance /= 2) part[0] += __shfl_xor_sync(ALL_LANES, part[0], distance);
   return part[0];
 }
 

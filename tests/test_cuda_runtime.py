@@ -1,0 +1,152 @@
+"""NVRTC, its cache and the launcher: what happens to gpu.cu before it runs, without a GPU."""
+
+from __future__ import annotations
+
+import ctypes
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from cuda_cases import (
+    assert_same_gradients,
+    assert_same_image,
+    gradients_of_kernels,
+    make_prior,
+    make_scene,
+    reference_with_gradients,
+    render_kernels,
+    shim_library,
+    survey_kernels,
+)
+
+from d2_plugin import D2Error
+from d2_plugin.compiler import NoCompiler
+from d2_plugin.rasterizer import cuda, nvrtc
+from d2_plugin.rasterizer import cuda_runtime as runtime
+
+
+@pytest.fixture
+def compiler() -> Iterator[nvrtc.Nvrtc]:
+    try:
+        yield nvrtc.library()
+    except nvrtc.NoCuda as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.parametrize(("capability", "channels"), [(80, 3), (90, 3), (120, 3), (90, 1), (90, 40)])
+def test_nvrtc_compiles_the_kernels_without_a_toolkit(
+    compiler: nvrtc.Nvrtc, capability: int, channels: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("D2_CACHE", str(tmp_path))
+    code, architecture = nvrtc.build(capability, channels)
+    assert architecture == f"sm_{capability}"
+    assert code.startswith(b"\x7fELF")
+    for kernel in ("project", "list", "render", "backward", "gather", "project_backward", "survey", "gather_survey"):
+        assert f"d2_{kernel}".encode() in code
+
+
+def test_the_cache_serves_what_it_has_and_rebuilds_what_is_damaged(
+    compiler: nvrtc.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("D2_CACHE", str(tmp_path))
+    first = nvrtc.build(90, 3)
+    (entry,) = tmp_path.iterdir()
+    compiled = []
+    compile_kernels = nvrtc.Nvrtc.compile
+    monkeypatch.setattr(nvrtc.Nvrtc, "compile", lambda *a: compiled.append(1) or compile_kernels(*a))
+    assert nvrtc.build(90, 3) == first
+    assert not compiled
+    entry.write_bytes(entry.read_bytes()[:1000])
+    assert nvrtc.build(90, 3) == first
+    assert compiled
+    nvrtc.build(90, 2)
+    nvrtc.build(80, 3)
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_cache_that_cannot_be_written_only_costs_time(
+    compiler: nvrtc.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("D2_CACHE", str(tmp_path / "file" / "below"))
+    assert nvrtc.build(90, 3).code.startswith(b"\x7fELF")
+    assert "cannot use the cache" in caplog.text
+
+
+def test_a_gpu_newer_than_nvrtc_gets_ptx_and_an_older_one_a_sentence(compiler: nvrtc.Nvrtc) -> None:
+    known = compiler.architectures()
+    assert compiler.architecture_for(999) == f"compute_{known[-1]}"
+    assert b".target" in compiler.compile("compute_80", (*nvrtc.FLAGS, "-DD2_CHANNELS=3", frame_size()))
+    with pytest.raises(nvrtc.NoCuda, match=rf"the GPU is sm_35, but NVRTC \d+\.\d+ compiles for sm_{known[0]}"):
+        compiler.architecture_for(35)
+
+
+def test_nvrtcs_own_words_are_in_the_error(compiler: nvrtc.Nvrtc) -> None:
+    with pytest.raises(D2Error, match="Frame differs between"):
+        compiler.compile("sm_90", (*nvrtc.FLAGS, "-DD2_CHANNELS=3", "-DD2_FRAME_SIZE=1"))
+
+
+def frame_size() -> str:
+    return f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda.Frame)}"
+
+
+def test_without_nvrtc_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nvrtc, "_files", lambda: iter(()))
+    monkeypatch.setattr(runtime.ctypes, "CDLL", no_library)
+    with pytest.raises(nvrtc.NoCuda, match=r"NVRTC.*not found: run `pip install 'd2-4dgs\[cuda\]'`"):
+        nvrtc.Nvrtc()
+
+
+def test_without_a_driver_splatting_falls_back_with_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime.ctypes, "CDLL", no_library)
+    cuda.launcher.cache_clear()
+    cuda.available.cache_clear()
+    with pytest.warns(UserWarning, match=r"NVIDIA driver .* not found.* plain torch"):
+        assert not cuda.available(torch.device("cuda", 7))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not cuda.available(torch.device("cuda", 7))
+    cuda.available.cache_clear()
+
+
+def no_library(*_: object, **__: object) -> None:
+    raise OSError("no such library")
+
+
+@pytest.fixture
+def driver(compiler: nvrtc.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ctypes.CDLL:
+    """The shim's CUDA driver in place of the real one, with stream 77 current."""
+    try:
+        shim = shim_library(3)
+    except NoCompiler as error:
+        pytest.skip(str(error))
+    monkeypatch.setenv("D2_CACHE", str(tmp_path))
+    monkeypatch.setattr(runtime, "_load_driver", lambda: shim)
+    monkeypatch.setattr(torch.cuda, "init", lambda: None)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0))
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: SimpleNamespace(cuda_stream=77))
+    return shim
+
+
+def test_the_launcher_talks_to_the_driver(driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Context, module, functions, frame and stream arrive; the kernels themselves run in the shim."""
+    launcher = runtime.CudaLauncher(torch.device("cuda", 0))
+    monkeypatch.setattr(cuda, "launcher", lambda device: launcher)
+    scene = make_scene(100, 32, 32)
+    render, upstream, expected = reference_with_gradients(scene)
+    cpu = torch.device("cpu")
+    assert_same_image(scene, render_kernels(scene, cpu)[1], render)
+    assert_same_gradients(gradients_of_kernels(scene, cpu, upstream), expected)
+    assert survey_kernels(scene, make_prior(scene), cpu).hits.any()
+    assert driver.d2_shim_stream() == 77
+    assert driver.d2_shim_contexts() == 0
+
+
+def test_a_driver_that_refuses_the_kernels_is_named(driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime, "build", lambda *_: nvrtc.Binary(b"no cubin", "sm_90"))
+    with pytest.raises(nvrtc.NoCuda, match=r"refuses kernels for sm_90 .*NO_BINARY.*: update the NVIDIA driver"):
+        runtime.CudaLauncher(torch.device("cuda", 0))
+    assert driver.d2_shim_contexts() == 0
