@@ -285,27 +285,34 @@ D2_FN constexpr int power_of_two(int least) {
   return power;
 }
 
+// Halves the values and doubles the lanes that each stands for, until there are no lanes left to add. Templates, since
+// every index must be known at compile time: arrays go to memory instead of registers otherwise.
+template <int P, int DISTANCE>
+D2_DEVICE float fold(const float (&part)[P]) {
+  if constexpr (DISTANCE == 0) {
+    return part[0];
+  } else {
+    constexpr int HALF = P > 1 ? P / 2 : 1;
+    const bool upper = lane_index() & DISTANCE;
+    float sum[HALF];
+#pragma unroll
+    for (int k = 0; k < HALF; k++) {
+      const float low = part[k], high = part[P > 1 ? k + HALF : k];
+      sum[k] = (upper ? high : low) + __shfl_xor_sync(ALL_LANES, upper ? low : high, DISTANCE);
+    }
+    return fold<HALF, DISTANCE / 2>(sum);
+  }
+}
+
 // Sums of N <= 32 values over the lanes of a warp: lane l returns that of value l / (32 / P), P the power of two from N
-// on. Each step halves the values and doubles the lanes that they stand for: P - 1 + log2(32 / P) shuffles, not 5 N.
+// on, after P - 1 + log2(32 / P) shuffles instead of 5 N.
 template <int N>
 D2_DEVICE float warp_sums(const float (&values)[N]) {
   constexpr int P = power_of_two(N);
   float part[P];
 #pragma unroll
   for (int k = 0; k < P; k++) part[k] = k < N ? values[k] : 0.f;
-  // Every index must be known at compile time, or `part` goes to memory instead of registers.
-#pragma unroll
-  for (int step = 0; step < 5; step++) {
-    const int half = P >> (step + 1), distance = WARP >> (step + 1);
-    const bool upper = lane_index() & distance;
-    if (half == 0) part[0] += __shfl_xor_sync(ALL_LANES, part[0], distance);
-#pragma unroll
-    for (int k = 0; k < half; k++) {
-      const float low = part[k], high = part[k + half];
-      part[k] = (upper ? high : low) + __shfl_xor_sync(ALL_LANES, upper ? low : high, distance);
-    }
-  }
-  return part[0];
+  return fold<P, WARP / 2>(part);
 }
 
 // What the warps of a tile found out about the Gaussians of a batch.
