@@ -16,11 +16,12 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
 
-TILE = 32
+TILE = 16
 """Side of the squares of pixels that are composited at once; limits memory, changes nothing else."""
 
 VARIANCE_FLOOR = 1e-8
@@ -57,21 +58,29 @@ def rasterize(
     kept = visible(splats, colors, view, settings, screen_offsets)
     screen = project(_take(splats, kept), view, settings, None if screen_offsets is None else screen_offsets[kept])
     values = torch.cat([colors[kept], screen.depths[:, None], torch.ones_like(screen.depths)[:, None]], 1)
-    rows = []
-    for y in range(0, view.height, TILE):
-        row = []
-        for x in range(0, view.width, TILE):
-            weights, front_to_back = _tile_weights(screen, view, settings, x, y)
-            height, width = min(TILE, view.height - y), min(TILE, view.width - x)
-            row.append((weights @ values[front_to_back]).reshape(height, width, -1))
-        rows.append(torch.cat(row, 1))
-    image = torch.cat(rows, 0)
+    image = torch.cat([_tile_row(screen, values, view, settings, y) for y in range(0, view.height, TILE)], 0)
     # A loss that divides by alpha sends NaN where nobody contributes, which 0 times a weight would not silence.
     image = torch.where(image[..., -1:].detach() > 0, image, 0)
     color, depth_sum, alpha = image[..., :-2], image[..., -2], image[..., -1]
     if background is not None:
         color = color + (1 - alpha)[..., None] * background
     return Render(color, depth_sum, alpha)
+
+
+def _tile_row(screen: Projection, values: Tensor, view: View, settings: RasterSettings, y: int) -> Tensor:
+    """Composited `values` [K, V] of a row of tiles, [h, W, V]; the backward pass computes it again, which bounds memory
+    by one row of tiles instead of the image."""
+    if torch.is_grad_enabled():
+        return checkpoint(_composite_row, screen, values, view, settings, y, use_reentrant=False)
+    return _composite_row(screen, values, view, settings, y)
+
+
+def _composite_row(screen: Projection, values: Tensor, view: View, settings: RasterSettings, y: int) -> Tensor:
+    height, row = min(TILE, view.height - y), []
+    for x in range(0, view.width, TILE):
+        weights, front_to_back = _tile_weights(screen, view, settings, x, y)
+        row.append((weights @ values[front_to_back]).reshape(height, min(TILE, view.width - x), -1))
+    return torch.cat(row, 1)
 
 
 @torch.no_grad()
