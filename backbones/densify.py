@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from .gaussians import Gaussians
 from .rotation4d import normalized_quaternions, rotation_matrices_3d, rotation_matrices_4d
 
-if TYPE_CHECKING:
-    from .yang4d import Yang4D
+
+class Growable(Protocol):
+    """What density control needs of a model; `statistics` of its Gaussians hold `screen_gradient` and `seen`."""
+
+    gaussians: Gaussians
+    extent: float
+
+    def __len__(self) -> int: ...
+    def append(self, rows: Mapping[str, Tensor]) -> None: ...
+    def select(self, index: Tensor) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -43,7 +53,7 @@ class DensifySettings:
 
 
 @torch.no_grad()
-def densify(model: Yang4D, settings: DensifySettings, step: int, iterations: int, generator: torch.Generator) -> None:
+def densify(model: Growable, settings: DensifySettings, step: int, iterations: int, generator: torch.Generator) -> None:
     """Clone, split, prune and reset as scheduled; all structure changes go through model.append and model.select."""
     if not settings.enabled or not settings.start * iterations <= step <= settings.stop * iterations:
         return
@@ -57,7 +67,7 @@ def densify(model: Yang4D, settings: DensifySettings, step: int, iterations: int
         model.gaussians.overwrite("opacity_logits", logits.clamp(max=torch.logit(torch.tensor(0.01)).item()))
 
 
-def grow(model: Yang4D, settings: DensifySettings, generator: torch.Generator) -> None:
+def grow(model: Growable, settings: DensifySettings, generator: torch.Generator) -> None:
     """Clone small Gaussians with a large mean screen-space gradient, split large ones in two."""
     statistics = model.gaussians.statistics
     mean_gradient = statistics["screen_gradient"] / statistics["seen"].clamp(min=1)
@@ -78,7 +88,7 @@ def grow(model: Yang4D, settings: DensifySettings, generator: torch.Generator) -
         model.select(torch.nonzero(keep).squeeze(-1))
 
 
-def prune(model: Yang4D, settings: DensifySettings) -> None:
+def prune(model: Growable, settings: DensifySettings) -> None:
     """Remove Gaussians that are nearly transparent or as large as the scene."""
     raw = model.gaussians
     opaque = torch.sigmoid(raw["opacity_logits"]) >= settings.opacity
