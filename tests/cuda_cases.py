@@ -66,7 +66,7 @@ def make_scene(
     height: int = 48,
     channels: int = 3,
     seed: int = 0,
-    scale: float = 0.12,
+    scale: float = 0.06,
     opaque: bool = False,
     settings: RasterSettings = RasterSettings(),  # noqa: B008  a frozen value
 ) -> Scene:
@@ -74,7 +74,9 @@ def make_scene(
     generator = torch.Generator().manual_seed(seed)
     uniform = functools.partial(torch.rand, generator=generator)
     normal = functools.partial(torch.randn, generator=generator)
-    depths = 1.0 + 5 * uniform(count) if opaque else -0.5 + 6 * uniform(count)
+    depths = 1.0 + 5 * uniform(count)
+    if not opaque:
+        depths[::20] -= 6
     means = torch.stack([(uniform(count) - 0.5) * 1.5 * depths, (uniform(count) - 0.5) * 1.2 * depths, depths], 1)
     factors = normal(count, 3, 3) * (scale * torch.exp(0.5 * normal(count)))[:, None, None]
     full = factors @ factors.mT
