@@ -168,7 +168,7 @@ class _Problem:
 
     def objective(self, a: float, b: float) -> float:
         r = self.residual(a, b)
-        return float(r @ (r / (self.root(r) + self.epsilon)))
+        return _dot(r, r / (self.root(r) + self.epsilon))
 
     def median_shift(self) -> float:
         return float(np.median(self.t / self.q))
@@ -176,7 +176,7 @@ class _Problem:
     def normal(self, curvature: np.ndarray) -> tuple[float, float, float]:
         """The 2x2 matrix sum c (p, q)(p, q)^T as its entries aa, ab, bb."""
         cp = curvature * self.p
-        return float(cp @ self.p), float(cp @ self.q), float((curvature * self.q) @ self.q)
+        return _dot(cp, self.p), _dot(cp, self.q), _dot(curvature * self.q, self.q)
 
     def solve(self, tolerance: float, max_iterations: int) -> _State:
         """Newton with IRLS blending from a few IRLS steps; the gap uses the best bound over all iterates."""
@@ -187,7 +187,7 @@ class _Problem:
             r = self.residual(a, b)
             inverse_root = 1 / self.root(r)
             u = r * inverse_root
-            value = float(r @ (u / (1 + self.epsilon * inverse_root)))
+            value = _dot(r, u / (1 + self.epsilon * inverse_root))
             bound = max(bound, self.lower_bound(u, a))
             gap = max(value - bound, 0.0) / max(value, floor)
             step = None if gap <= tolerance else self._descend(a, b, u, inverse_root, value)
@@ -202,11 +202,11 @@ class _Problem:
         weight = np.ones_like(self.t)
         for _ in range(3):
             wp, wq = weight * self.p, weight * self.q
-            step = _solve_2x2(*self.normal(weight), float(wp @ self.t), float(wq @ self.t))
+            step = _solve_2x2(*self.normal(weight), _dot(wp, self.t), _dot(wq, self.t))
             if step is None:
                 break
             a = max(self.scale_min, step[0])
-            b = float(wq @ (self.t - a * self.p)) / float(wq @ self.q)
+            b = _dot(wq, self.t - a * self.p) / _dot(wq, self.q)
             weight = 1 / self.root(self.residual(a, b))
         return a, b
 
@@ -214,7 +214,7 @@ class _Problem:
         self, a: float, b: float, u: np.ndarray, inverse_root: np.ndarray, value: float
     ) -> tuple[float, float] | None:
         """One step that lowers F, on the boundary the exact best shift, or None where neither moves."""
-        gradient_a, gradient_b = float(self.p @ u), float(self.q @ u)
+        gradient_a, gradient_b = _dot(self.p, u), _dot(self.q, u)
         irls = self.normal(inverse_root)
         newton = self.normal(inverse_root * (self.epsilon * inverse_root) ** 2)
         for blend in BLENDS:
@@ -240,8 +240,8 @@ class _Problem:
         for _ in range(200):
             r = self.residual(a, b)
             inverse_root = 1 / self.root(r)
-            slope = float(self.q @ (r * inverse_root))
-            curvature = float((self.q * self.q) @ (inverse_root * (self.epsilon * inverse_root) ** 2))
+            slope = _dot(self.q, r * inverse_root)
+            curvature = _dot(self.q * self.q, inverse_root * (self.epsilon * inverse_root) ** 2)
             low, high = (low, b) if slope > 0 else (b, high)
             proposal = b - slope / curvature if curvature > 0 else np.nan
             b_new = proposal if low <= proposal <= high else 0.5 * (low + high)
@@ -252,7 +252,7 @@ class _Problem:
 
     def lower_bound(self, u: np.ndarray, a: float) -> float:
         """The dual value of u = rho'(r) after making it feasible; valid for every feasible a and b."""
-        slope_a, slope_b = float(self.p @ u), float(self.q @ u)
+        slope_a, slope_b = _dot(self.p, u), _dot(self.q, u)
         keep = max(0.0, slope_a) if a <= self.scale_min else 0.0
         best = -np.inf
         # Moving only those u that have room to +-1 wastes least; where none has, all of them move and are scaled.
@@ -267,7 +267,7 @@ class _Problem:
             feasible = feasible / shrink
             square = np.minimum(feasible * feasible, 1.0)
             conjugate = self.epsilon * float((square / (1 + np.sqrt(1 - square))).sum())
-            best = max(best, self.scale_min * keep / shrink - float(feasible @ self.t) - conjugate)
+            best = max(best, self.scale_min * keep / shrink - _dot(feasible, self.t) - conjugate)
         return best
 
     def scale_error(self, a: float, b: float) -> float:
@@ -279,6 +279,12 @@ class _Problem:
             return float("inf")
         m_aa, m_ab, m_bb = self.normal((r * inverse_root) ** 2)
         return float(np.sqrt(max(row[0] ** 2 * m_aa + 2 * row[0] * row[1] * m_ab + row[1] ** 2 * m_bb, 0.0)))
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
+    """Inner product on one core: BLAS splits vectors of this length over threads, which wait for each other and for
+    whatever else runs, and takes 20 times as long on a busy machine."""
+    return float(np.einsum("i,i->", a, b))
 
 
 def _solve_2x2(h_aa: float, h_ab: float, h_bb: float, g_a: float, g_b: float) -> tuple[float, float] | None:

