@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from d2_plugin.captures import open_capture
 from d2_plugin.captures.pictures import read_picture, write_png
 from d2_plugin.captures.saving import save_capture
 from d2_plugin.captures.synthetic import split, synthetic_capture
+from d2_plugin.study.drawing import BACKGROUND, text
 from d2_plugin.study.report import metrics_table
 from d2_plugin.study.run import Run
 from d2_plugin.study.settings import HOOK_NAMES, RunSettings
@@ -41,8 +41,12 @@ def run_demo(folder: Path, iterations: int) -> str:
 
 def _compare(folders: dict[str, Path], camera: str, picture: Path) -> None:
     """The same held-out view of every run, one row of panels per run."""
-    rows: list[Any] = []
-    for folder in folders.values():
+    rows: list[np.ndarray] = []
+    for name, folder in folders.items():
         found = sorted((folder / "pictures").glob(f"{camera}_*.png"))
-        rows.append(read_picture(found[len(found) // 2]))
+        panels = read_picture(found[len(found) // 2])
+        title = np.full((14, panels.shape[1], 3), BACKGROUND, np.uint8)
+        letters = text(name)
+        title[4 : 4 + len(letters), 2 : 2 + letters.shape[1]] = letters
+        rows += [title, panels]
     write_png(picture, np.concatenate(rows))

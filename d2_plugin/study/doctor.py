@@ -10,6 +10,7 @@ import platform
 import torch
 
 from d2_plugin import __version__, compiler, registry
+from d2_plugin.rasterizer import nvrtc
 
 OPTIONAL = {
     "onnxruntime": ("mono", "monocular depth from an ONNX network"),
@@ -36,8 +37,16 @@ def report() -> str:
 
 def _device() -> str:
     if torch.cuda.is_available():
-        return f"{torch.cuda.get_device_name()} is present; the bundled rasterizer runs on the CPU in this version"
+        return f"{torch.cuda.get_device_name()}; {_cuda_kernels()}"
     return "CPU only: no CUDA device found"
+
+
+def _cuda_kernels() -> str:
+    try:
+        nvrtc.library()
+    except nvrtc.NoCuda as error:
+        return f"no CUDA kernels: {error}"
+    return "CUDA kernels compile through NVRTC at first use"
 
 
 def _compiler() -> str:
