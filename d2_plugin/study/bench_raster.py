@@ -1,0 +1,280 @@
+"""`d2 bench raster`: time against error of the rasterizer, beside its peers, on scenes of known size."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import math
+import platform
+import shlex
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from d2_plugin import __version__
+from d2_plugin.errors import D2Error, MissingExtra, missing_extra
+
+from .raster_measure import Case, error_of, exact, implementations, passes_of, peak_memory, timed
+
+logger = logging.getLogger(__name__)
+
+SCENES = ("synth:10000", "synth:50000", "synth:200000")
+SIZES = ("320x180", "640x360", "1280x720")
+PASSES = ("forward", "forward+backward", "survey")
+
+
+def bench_raster(
+    output: Path,
+    *,
+    scenes: Sequence[str] = SCENES,
+    sizes: Sequence[str] = SIZES,
+    garden: Path | None = None,
+    device: str = "cpu",
+    seconds: float = 3.0,
+    error_limit: int = 60_000,
+    memory: bool = True,
+    command: str = "",
+) -> list[dict[str, Any]]:
+    """Measure and write `raster.jsonl`, `raster.md` and, where matplotlib is installed, `raster.svg` into `output`.
+
+    Args:
+        output: folder, created where absent; its three files are replaced.
+        scenes: `synth:N` and `garden`.
+        sizes: images as WIDTHxHEIGHT in pixels.
+        garden: gsplat's test_garden.npz; with it `garden` is measured too.
+        device: what torch calls it.
+        seconds: about how long each pass is repeated.
+        error_limit: most Gaussians for which the error is measured; the truth in float64 takes minutes beyond.
+        memory: whether peak memory is measured; on the CPU that takes a new process for every row.
+        command: how this was started, for the captions.
+
+    Returns:
+        One row per implementation, scene and size.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    names = [*scenes, *(["garden"] if garden and "garden" not in scenes else [])]
+    cases = [Case(name, *parse_size(size), garden) for name in names for size in sizes]
+    rows = []
+    with (output / "raster.jsonl").open("w") as file:
+        for case in cases:
+            for row in _measure(case, torch.device(device), seconds, error_limit, memory):
+                rows.append({**row, "command": command})
+                file.write(json.dumps(rows[-1]) + "\n")
+                file.flush()
+    (output / "raster.md").write_text(table(rows))
+    try:
+        plot(rows, output / "raster.svg")
+    except MissingExtra as error:
+        logger.warning("no plot: %s", error)
+    return rows
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """(width, height) from `WIDTHxHEIGHT`."""
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
+        raise D2Error(f"size '{text}' is not WIDTHxHEIGHT in pixels, e.g. 640x360")
+    return int(width), int(height)
+
+
+def _measure(
+    case: Case, device: torch.device, seconds: float, error_limit: int, memory: bool
+) -> list[dict[str, Any]]:
+    scene = case.load()
+    gaussians = len(scene.means)
+    truth = exact(scene) if gaussians <= error_limit else None
+    rows = []
+    for name, render in implementations(device, gaussians).items():
+        passes = passes_of(render, scene, device)
+        rows.append(
+            {
+                "implementation": name,
+                "scene": case.scene,
+                "width": case.width,
+                "height": case.height,
+                "gaussians": gaussians,
+                "passes": {kind: timed(work, device, seconds) for kind, work in passes.items()},
+                "error": error_of(render, scene, device, truth) if truth else None,
+                "peak_mb": peak_memory(case, name, device) if memory else None,
+                **_circumstances(device),
+            }
+        )
+        logger.info("%s, %s at %dx%d is measured", name, *case[:3])
+    return rows
+
+
+def _circumstances(device: torch.device) -> dict[str, Any]:
+    return {
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _cpu_name(),
+        "threads": torch.get_num_threads(),
+        "version": __version__,
+        "commit": _commit(),
+        "torch": torch.__version__,
+    }
+
+
+def _cpu_name() -> str:
+    info = Path("/proc/cpuinfo")
+    for line in info.read_text().splitlines() if info.exists() else ():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _commit() -> str | None:
+    """The commit of a checkout (with + where files differ from it), None for an installed package."""
+    try:
+        options = {"cwd": Path(__file__).parent, "capture_output": True, "text": True, "check": True}
+        commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], **options).stdout.strip()
+        changed = subprocess.run(["git", "status", "--porcelain", "--", "."], **options).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return commit + ("+" if changed else "")
+
+
+def exponent(points: Sequence[tuple[float, float]]) -> float | None:
+    """Slope p of time ~ size^p by least squares in logarithms, None with fewer than two sizes."""
+    if len({size for size, _ in points}) < 2:
+        return None
+    logs = [(math.log(size), math.log(value)) for size, value in points]
+    mean_x, mean_y = (sum(values) / len(logs) for values in zip(*logs))
+    spread = sum((x - mean_x) ** 2 for x, _ in logs)
+    return sum((x - mean_x) * (y - mean_y) for x, y in logs) / spread
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Markdown: times, memory and errors per case, then how time grows with Gaussians and with pixels."""
+    lines = [_caption(rows), ""]
+    header = ["implementation", "scene", "size", *(f"{kind} ms" for kind in PASSES), "CPU ms", "peak MB"]
+    header += ["color p99.9", "color max", "pixels > 1e-4", "worst gradient"]
+    lines += [_line(header), _line(["---"] * len(header))]
+    lines += [_line(_cells(row)) for row in rows]
+    lines += ["", *_scaling(rows), ""]
+    return "\n".join(lines)
+
+
+def _caption(rows: Sequence[dict[str, Any]]) -> str:
+    return (
+        "Median wall time and half the interquartile range in ms; CPU ms is the CPU time of one forward+backward over "
+        "all threads; peak MB is what one forward+backward takes beyond its inputs. Error against float64: absolute "
+        f"for color (0..1), relative L2 for gradients. {_provenance(rows[0])}"
+    )
+
+
+def _provenance(row: dict[str, Any]) -> str:
+    where = f"{row['device']}, {row['threads']} threads, torch {row['torch']}"
+    return f"{where}, commit {row['commit'] or row['version']}, `{row['command']}`."
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    def milliseconds(kind: str) -> str:
+        found = row["passes"].get(kind)
+        return f"{found['median_ms']:.2f} ± {found['iqr_ms'] / 2:.2f}" if found else "-"
+
+    cells = [row["implementation"], row["scene"], f"{row['width']}x{row['height']}", *map(milliseconds, PASSES)]
+    cells += [f"{row['passes']['forward+backward']['cpu_ms']:.2f}"]
+    cells += ["-" if row["peak_mb"] is None else f"{row['peak_mb']:.0f}"]
+    error = row["error"]
+    if not error:
+        return [*cells, *["-"] * 4]
+    worst = max(value["relative_l2"] for name, value in error.items() if name.startswith("grad"))
+    color = error["color"]
+    return [*cells, f"{color['p99.9']:.1e}", f"{color['max']:.1e}", f"{color['over_1e-4']:.1e}", f"{worst:.1e}"]
+
+
+def _scaling(rows: Sequence[dict[str, Any]]) -> list[str]:
+    lines = ["Forward+backward grows as:", ""]
+    for name, mine in _grouped(rows, lambda row: row["implementation"]):
+        synthetic = [row for row in mine if row["scene"] != "garden"]
+        for size, group in _grouped(synthetic, lambda row: f"{row['width']}x{row['height']}"):
+            if (power := exponent([(row["gaussians"], _milliseconds(row)) for row in group])) is not None:
+                lines.append(f"- {name} at {size}: N^{power:.2f}")
+        for scene, group in _grouped(mine, lambda row: row["scene"]):
+            if (power := exponent([(row["width"] * row["height"], _milliseconds(row)) for row in group])) is not None:
+                lines.append(f"- {name}, {scene}: pixels^{power:.2f}")
+    return lines
+
+
+def _grouped(
+    rows: Sequence[dict[str, Any]], key: Callable[[dict[str, Any]], str]
+) -> list[tuple[str, list[dict[str, Any]]]]:
+    return [(value, [row for row in rows if key(row) == value]) for value in dict.fromkeys(map(key, rows))]
+
+
+def _milliseconds(row: dict[str, Any]) -> float:
+    return row["passes"]["forward+backward"]["median_ms"]
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    """Error against time, and time against the number of Gaussians.
+
+    Raises:
+        MissingExtra: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise missing_extra("matplotlib", "report", "the plot") from None
+    figure = Figure(figsize=(11, 4.8), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for name, mine in _grouped(rows, lambda row: row["implementation"]):
+        known = [row for row in mine if row["error"]]
+        errors = [max(row["error"]["color"]["p99.9"], 1e-9) for row in known]
+        if known:
+            left.scatter([_milliseconds(row) for row in known], errors, label=name)
+        synthetic = [row for row in mine if row["scene"] != "garden"]
+        for size, group in _grouped(synthetic, lambda row: f"{row['width']}x{row['height']}"):
+            points = sorted((row["gaussians"], _milliseconds(row)) for row in group)
+            right.plot(*zip(*points), marker="o", label=f"{name}, {size}")
+    if not any(row["error"] for row in rows):
+        left.text(0.5, 0.5, "error not measured", ha="center", transform=left.transAxes)
+    labels = (("forward+backward, ms", "color error against float64, p99.9"), ("Gaussians", "forward+backward, ms"))
+    for axes, (x, y) in zip((left, right), labels):
+        axes.set(xlabel=x, ylabel=y)
+        if axes.get_legend_handles_labels()[0]:
+            axes.set(xscale="log", yscale="log")
+            axes.grid(True, which="both", alpha=0.3)
+            axes.legend(fontsize=7)
+    figure.supxlabel(_provenance(rows[0]), fontsize=6, wrap=True)
+    figure.savefig(path, metadata={"Date": None})
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of `d2 bench raster`."""
+    parser = argparse.ArgumentParser(prog="d2 bench raster", description=__doc__)
+    parser.add_argument("--output", type=Path, default=Path("bench-raster"), help="folder of the results")
+    parser.add_argument("--scenes", nargs="+", default=SCENES, metavar="SCENE", help="synth:N (N Gaussians), garden")
+    parser.add_argument("--sizes", nargs="+", default=SIZES, metavar="WxH", help="image sizes in pixels")
+    parser.add_argument("--garden", type=Path, help="gsplat's test_garden.npz; adds the scene 'garden'")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--seconds", type=float, default=3.0, help="about how long each pass is repeated, seconds")
+    parser.add_argument("--threads", type=int, help="CPU threads; default: torch's")
+    parser.add_argument(
+        "--error-limit", type=int, default=60_000, help="most Gaussians for which the error is measured (slow beyond)"
+    )
+    parser.add_argument("--no-memory", action="store_true", help="do not measure peak memory (a new process per row)")
+    options = parser.parse_args(argv)
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    command = shlex.join(["d2", "bench", "raster", *(argv if argv is not None else ())])
+    bench_raster(
+        options.output,
+        scenes=options.scenes,
+        sizes=options.sizes,
+        garden=options.garden,
+        device=options.device,
+        seconds=options.seconds,
+        error_limit=options.error_limit,
+        memory=not options.no_memory,
+        command=command,
+    )
+    logger.info("results are in %s", options.output)
+    return 0

@@ -1,0 +1,217 @@
+"""Time, memory and error of one rasterizer on one scene."""
+
+from __future__ import annotations
+
+import importlib.util
+import multiprocessing
+import re
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from d2_plugin.rasterizer import DepthPrior, RasterSettings, Render, Splats, rasterize, reference, survey
+
+from .raster_scenes import Scene, load_scene
+
+SETTINGS = RasterSettings()
+GRADIENTS = ("means", "covariances", "opacities", "colors")
+REFERENCE_LIMIT = 12_000
+"""Most Gaussians for which the torch path is timed as a peer; it takes seconds per call beyond."""
+
+
+class Case(NamedTuple):
+    """A scene at an image size."""
+
+    scene: str
+    width: int
+    height: int
+    garden: Path | None
+
+    def load(self) -> Scene:
+        """The Gaussians and the camera, float32 on the CPU."""
+        return load_scene(self.scene, self.width, self.height, self.garden)
+
+
+RenderScene = Callable[[Splats, Tensor, Scene], Render]
+
+
+def _d2(splats: Splats, colors: Tensor, scene: Scene) -> Render:
+    return rasterize(splats, colors, scene.view, SETTINGS)
+
+
+def _reference(splats: Splats, colors: Tensor, scene: Scene) -> Render:
+    return reference.rasterize(splats, colors, scene.view, SETTINGS)
+
+
+def _gsplat(splats: Splats, colors: Tensor, scene: Scene) -> Render:
+    """gsplat from covariances, with the same constants; its tiles cut at 3 sigma, so its error is not only rounding."""
+    import gsplat
+
+    view, device = scene.view, colors.device
+    xx, xy, xz, yy, yz, zz = splats.covariances.unbind(-1)
+    full = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
+    image, alpha, _ = gsplat.rasterization(
+        *(splats.means, None, None, splats.opacities, colors),
+        *(view.T_camera_world.to(device)[None], view.K.to(device)[None], view.width, view.height),
+        near_plane=SETTINGS.near,
+        eps2d=SETTINGS.blur,
+        render_mode="RGB+D",
+        covars=full,
+    )
+    return Render(image[0, ..., :-1], image[0, ..., -1], alpha[0, ..., 0])
+
+
+def implementations(device: torch.device, gaussians: int) -> dict[str, RenderScene]:
+    """What is compared on `device`: this package, the torch path where it is bearable, gsplat where it is installed."""
+    found: dict[str, RenderScene] = {"d2": _d2}
+    if gaussians <= REFERENCE_LIMIT:
+        found["torch reference"] = _reference
+    if device.type == "cuda" and importlib.util.find_spec("gsplat"):
+        found["gsplat"] = _gsplat
+    return found
+
+
+def leaves_of(scene: Scene, device: torch.device, dtype: torch.dtype) -> list[Tensor]:
+    """Means, covariances, opacities and colors that require gradients."""
+    parts = (*scene.splats()[:3], scene.colors)
+    return [part.to(device, dtype).requires_grad_() for part in parts]
+
+
+def upstream(scene: Scene, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Fixed random gradients of color, depth sum and alpha."""
+    g = torch.Generator().manual_seed(0)
+    size = (scene.view.height, scene.view.width)
+    return tuple(torch.randn(shape, generator=g).to(like) for shape in ((*size, 3), size, size))
+
+
+def prior_of(scene: Scene, device: torch.device) -> DepthPrior:
+    """A depth prior with three fifths of its pixels verified, at random."""
+    g = torch.Generator().manual_seed(0)
+    size = (scene.view.height, scene.view.width)
+    labels = torch.where(torch.rand(size, generator=g) < 0.6, 2, 1).to(torch.uint8)
+    return DepthPrior((2 + 8 * torch.rand(size, generator=g)).to(device), labels.to(device))
+
+
+def passes_of(render: RenderScene, scene: Scene, device: torch.device) -> dict[str, Callable[[], object]]:
+    """What is timed: forward, forward and backward (gradients of everything for all three outputs), survey."""
+    leaves = leaves_of(scene, device, torch.float32)
+    splats = Splats(*leaves[:3], torch.arange(len(scene.means), device=device))
+    fixed = Splats(*(part.detach() for part in splats))
+    weights, prior = upstream(scene, leaves[0]), prior_of(scene, device)
+
+    def forward() -> object:
+        with torch.no_grad():
+            return render(fixed, leaves[3], scene)
+
+    def forward_backward() -> object:
+        return torch.autograd.grad(tuple(render(splats, leaves[3], scene)), leaves, weights)
+
+    passes = {"forward": forward, "forward+backward": forward_backward}
+    if render is _d2:
+        passes["survey"] = lambda: survey(fixed, scene.view, prior, SETTINGS)
+    return passes
+
+
+def timed(work: Callable[[], object], device: torch.device, seconds: float) -> dict[str, Any]:
+    """Wall and CPU time of repeated calls for about `seconds`, at least three after one that is not counted; ms."""
+    _finish(work(), device)
+    wall, cpu, end = [], [], time.perf_counter() + seconds
+    while len(wall) < 3 or (time.perf_counter() < end and len(wall) < 200):
+        start, start_cpu = time.perf_counter(), time.process_time()
+        _finish(work(), device)
+        wall.append(1e3 * (time.perf_counter() - start))
+        cpu.append(1e3 * (time.process_time() - start_cpu))
+    low, middle, high = statistics.quantiles(wall, n=4)
+    return {
+        "median_ms": middle,
+        "iqr_ms": high - low,
+        "min_ms": min(wall),
+        "cpu_ms": statistics.median(cpu),
+        "repeats": len(wall),
+    }
+
+
+def _finish(_result: object, device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def exact(scene: Scene) -> tuple[Render, list[Tensor]]:
+    """Image and gradients of the reference in float64, for `error_of`."""
+    leaves = leaves_of(scene, torch.device("cpu"), torch.float64)
+    splats = Splats(*leaves[:3], torch.arange(len(scene.means)))
+    render = reference.rasterize(splats, leaves[3], scene.view, SETTINGS)
+    gradients = torch.autograd.grad(tuple(render), leaves, upstream(scene, leaves[0]))
+    return Render(*(part.detach() for part in render)), list(gradients)
+
+
+def error_of(
+    render: RenderScene, scene: Scene, device: torch.device, truth: tuple[Render, list[Tensor]]
+) -> dict[str, dict[str, float]]:
+    """Deviation from `exact`: of color, depth sum and alpha as it is; of gradients in units of their own RMS.
+
+    `over_1e-4` is the share of pixels that deviate more; in float32 those are pixels where an alpha or a transmittance
+    lies at its threshold. `relative_l2` is the norm of the deviation over that of the truth.
+    """
+    leaves = leaves_of(scene, device, torch.float32)
+    found = render(Splats(*leaves[:3], torch.arange(len(scene.means), device=device)), leaves[3], scene)
+    gradients = torch.autograd.grad(tuple(found), leaves, upstream(scene, leaves[0]))
+    errors = {}
+    for name, part, true in zip(Render._fields, found, truth[0]):
+        deviation = (part.detach().cpu().double() - true).abs()
+        errors[name] = {**_quantiles(deviation), "over_1e-4": (deviation > 1e-4).double().mean().item()}
+    for name, part, true in zip(GRADIENTS, gradients, truth[1]):
+        deviation = (part.cpu().double() - true).abs()
+        scale = true.square().mean().sqrt().clamp(min=1e-300)
+        errors[f"grad {name}"] = {
+            **_quantiles(deviation / scale),
+            "relative_l2": (deviation.norm() / true.norm().clamp(min=1e-300)).item(),
+        }
+    return errors
+
+
+def _quantiles(deviation: Tensor) -> dict[str, float]:
+    ordered = deviation.flatten().sort().values
+    at = lambda share: ordered[min(int(share * len(ordered)), len(ordered) - 1)].item()  # noqa: E731
+    return {"p50": at(0.5), "p99.9": at(0.999), "max": ordered[-1].item()}
+
+
+def peak_memory(case: Case, name: str, device: torch.device) -> float:
+    """Peak MB that forward and backward take beyond what was there before, inputs excluded.
+
+    On the CPU resident memory in a fresh process (Linux; NaN elsewhere), on CUDA what torch's allocator handed out.
+    """
+    if device.type == "cuda":
+        scene = case.load()
+        work = passes_of(implementations(device, 0)[name], scene, device)["forward+backward"]
+        torch.cuda.synchronize(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+        _finish(work(), device)
+        return (torch.cuda.max_memory_allocated(device) - before) / 1e6
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(_peak_resident, (case, name, torch.get_num_threads()))
+
+
+def _peak_resident(case: Case, name: str, threads: int) -> float:
+    status = Path("/proc/self/status")
+    if not status.exists():
+        return float("nan")
+    torch.set_num_threads(threads)
+    renderers: Mapping[str, RenderScene] = implementations(torch.device("cpu"), 0)
+    # A small scene first: compiling, loading and thread stacks are not the rasterizer's memory.
+    passes_of(renderers[name], load_scene("synth:100", 64, 48), torch.device("cpu"))["forward+backward"]()
+    work = passes_of(renderers[name], case.load(), torch.device("cpu"))["forward+backward"]
+    Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
+    before = _status_mb(status, "VmRSS")
+    work()
+    return _status_mb(status, "VmHWM") - before
+
+
+def _status_mb(status: Path, key: str) -> float:
+    return int(re.search(rf"{key}:\s+(\d+) kB", status.read_text()).group(1)) * 1024 / 1e6
