@@ -34,8 +34,8 @@ class Run:
 
     def __init__(self, settings: RunSettings, folder: Path) -> None:
         self.settings, self.folder = check(settings), folder
-        self.scene = Scene.open(settings)
-        _claim(folder, settings)
+        self.scene = Scene.open(self.settings)
+        _claim(folder, self.settings)
         self.seconds = {"priors": 0.0, "train": 0.0, "eval": 0.0}
 
     @classmethod

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +58,7 @@ class Scene:
 
 
 def check(settings: RunSettings) -> RunSettings:
-    """The same settings, or a D2Error for what cannot be."""
+    """The same settings with absolute paths, or a D2Error for what cannot be."""
     if not settings.train_cameras:
         raise D2Error("no training camera: name at least one with --train-cameras")
     if settings.iterations < 1:
@@ -75,7 +75,9 @@ def check(settings: RunSettings) -> RunSettings:
     hook_config(settings, Path())
     if settings.backbone not in registry.names(registry.BACKBONES):
         raise unknown_name("backbone", settings.backbone, registry.names(registry.BACKBONES))
-    return settings
+    paths = ("capture", "mono_onnx", "priors")
+    absolute = {name: str(Path(path).resolve()) for name in paths if (path := getattr(settings, name)) is not None}
+    return replace(settings, **absolute)  # a run is found again from any folder
 
 
 def _split(capture: Capture, settings: RunSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:
