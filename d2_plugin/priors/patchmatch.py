@@ -237,6 +237,7 @@ class _Matcher:
                 CONSENSUS_RADIUS,
                 ctypes.c_float(self.settings.patchmatch_consensus_tolerance),
                 torch.get_num_threads(),
+                None if view.wanted is None else _pointer(view.wanted),
                 _pointer(view.planes),
                 _pointer(averaged),
             )

@@ -68,10 +68,13 @@ class StereoSettings:
     """Connected pieces of the depth map with fewer pixels are dropped."""
     reuse_static: bool = True
     """Carry matches over where the picture did not change; off matches every frame in full."""
-    reuse_change: float = 6 / 255
+    reuse_change: float = 12 / 255
     """Change of the grey value (0..1, mean of 3x3 pixels) above which a pixel is matched anew."""
     reuse_radius: int = 6
     """Pixels this near to a change are matched anew too: the matching window reaches that far."""
+    reuse_margin: int = 4
+    """Pixels this near to those are matched with them, to hand over good planes, but not taken. Measured on studio:
+    median error of verified pixels .00090 with and .00098 without, .00086 where every frame is matched in full."""
     reuse_block: int = 30
     """After this many frames everything is matched anew; blocks are independent, and shards are made of them."""
     seed: int = 0

@@ -13,7 +13,7 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.filter import GeometricDepth, filter_depths
 from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.static import MatchMemory
+from d2_plugin.priors.static import MatchMemory, widened
 
 RawDepth = tuple[np.ndarray, np.ndarray]
 """Planar depth float32 [H, W] (0 = none) and matching cost 1 - NCC float32 [H, W] in 0..2."""
@@ -81,7 +81,8 @@ def geometric_depth(
     small = [_shrunk(gray(image), camera, settings.scale) for image, camera in zip(images, cameras)]
     grays, small_cameras = [pair[0] for pair in small], [pair[1] for pair in small]
     wanted = None if memory is None else memory.wanted(grays, settings)
-    raw = MAKERS[name](grays, small_cameras, depth_range, settings, wanted)
+    asked = None if wanted is None else [widened(mask, settings.reuse_margin) for mask in wanted]
+    raw = MAKERS[name](grays, small_cameras, depth_range, settings, asked)
     if memory is not None:
         raw = memory.merge(grays, raw, wanted)
     filtered = filter_depths(grays, small_cameras, [depth for depth, _ in raw], [cost for _, cost in raw], settings)

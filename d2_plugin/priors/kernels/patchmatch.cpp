@@ -342,15 +342,17 @@ void d2_patchmatch(const Task* task, float* planes, float* costs) {
   }
 }
 
-// Average each plane with those of its neighbours that agree; planes and averaged [H, W, 3] must not overlap.
+// Average each plane with those of its neighbours that agree; planes and averaged [H, W, 3] must not overlap. Where
+// `wanted` [H, W] is 0 the plane stays as it is; null wants all.
 void d2_consensus(const Picture* picture, float contrast, int32_t radius, float tolerance, int32_t threads,
-                  const float* planes, float* averaged) {
+                  const uint8_t* wanted, const float* planes, float* averaged) {
   const Window window(contrast);
   const Plane* from = reinterpret_cast<const Plane*>(planes);
   Plane* to = reinterpret_cast<Plane*>(averaged);
   parallel_rows(picture->height, threads, [&](int y) {
     for (int x = 0; x < picture->width; x++) {
-      to[size_t(y) * picture->width + x] = consensus(*picture, window, from, radius, tolerance, x, y);
+      const size_t i = size_t(y) * picture->width + x;
+      to[i] = wanted && !wanted[i] ? from[i] : consensus(*picture, window, from, radius, tolerance, x, y);
     }
   });
 }
