@@ -18,8 +18,8 @@ HOOKS_HELP = "all, none, or names of prior, densify, prune, depth_loss joined by
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; a mistake in the input is one sentence on stderr and exit code 2."""
-    # Read when torch is first imported, further down. OpenMP threads that spin at each barrier cost a training step on a
-    # busy machine 130 to 210 ms instead of 20 (two threads, 25,000 Gaussians, 240x135).
+    # Read when torch is first imported, further down. OpenMP threads that spin at each barrier cost a training step
+    # on a busy machine 130 to 210 ms instead of 20 (two threads, 25,000 Gaussians, 240x135).
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     options = _parser().parse_args(arguments)
     try:
