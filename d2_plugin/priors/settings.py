@@ -16,8 +16,10 @@ class StereoSettings:
 
     maker: str = "auto"
     """`patchmatch` (compiled), `sweep` (OpenCV), or `auto`: patchmatch where there is a compiler."""
-    scale: float = 1.0
-    """Pictures are shrunk by this factor before matching; half costs a quarter. Depth comes back at full size."""
+    max_pixels: int = 500_000
+    """Pictures with more pixels are matched at a half, a third, ... of their size; depth comes back at full size.
+    Measured on n3dv_sear_steak_t0 (1352x1014, 4 views): at half size 35 % verified in 14 CPU seconds, in full 28 % in
+    47, with the same median deviation from SIFT points; windows of 11 pixels see more of a wall at half size."""
     patchmatch_rounds: tuple[int, ...] = (4, 2, 2, 1)
     """Red-black sweeps at each resolution, coarsest first; each resolution is twice the one before, the last is full.
     A second sweep at full resolution fits noise and costs half as much again."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -78,7 +79,7 @@ def geometric_depth(
     check_views(images, cameras)
     depth_range = check_depth_range(depth_range)
     name = choose_maker(maker or settings.maker, cameras)
-    small = [_shrunk(gray(image), camera, settings.scale) for image, camera in zip(images, cameras)]
+    small = [_shrunk(gray(image), camera, settings.max_pixels) for image, camera in zip(images, cameras)]
     grays, small_cameras = [pair[0] for pair in small], [pair[1] for pair in small]
     wanted = None if memory is None else memory.wanted(grays, settings)
     asked = None if wanted is None else [widened(mask, settings.reuse_margin) for mask in wanted]
@@ -155,13 +156,15 @@ def _visible_depths(camera: Camera, points: np.ndarray) -> np.ndarray:
     return local[inside, 2]
 
 
-def _shrunk(gray: np.ndarray, camera: Camera, scale: float) -> tuple[np.ndarray, Camera]:
-    if scale == 1:
+def _shrunk(gray: np.ndarray, camera: Camera, max_pixels: int) -> tuple[np.ndarray, Camera]:
+    """Picture and camera at the largest of full, half, a third, ... of the size that has at most `max_pixels`."""
+    divisor = math.ceil(math.sqrt(gray.size / max(max_pixels, 1)))
+    if divisor <= 1:
         return gray, camera
     from d2_plugin.priors.extras import opencv
 
     cv2 = opencv("matching at another resolution")
-    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    width, height = max(1, round(camera.width / divisor)), max(1, round(camera.height / divisor))
     small = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
     return small, scaled_camera(camera, width, height)
 
