@@ -6,7 +6,10 @@ import copy
 import inspect
 import io
 import math
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -213,6 +216,23 @@ def test_configuration_survives_toml(tmp_path) -> None:
     path.write_text("[densify\n")
     with pytest.raises(D2Error, match="not valid TOML"):
         D2Config.from_toml(path)
+
+
+def test_training_with_a_finished_prior_needs_torch_and_numpy_alone() -> None:
+    script = """
+import sys
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {"cv2", "pycolmap", "onnxruntime", "kornia", "rich", "matplotlib", "scipy", "skimage"}:
+            raise ImportError(f"{name} is not a dependency of training")
+
+sys.meta_path.insert(0, Refuse())
+import d2_plugin.priors.store
+from tiny import ALL_HOOKS, make_trainer
+make_trainer(ALL_HOOKS, iterations=6).run()
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parent, timeout=300)
 
 
 def test_refinement_continues_after_structure_updates_stop() -> None:
