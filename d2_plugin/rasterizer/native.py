@@ -120,7 +120,7 @@ def rasterize(
     """color [H, W, C], depth_sum [H, W], alpha [H, W] and the state that `backward` needs (records, lists)."""
     frame = _frame(T_camera_world, K, width, height, constants, len(means), colors.shape[1])
     frame.point(means=means, covariances=covariances, opacities=opacities, colors=colors)
-    frame.point(background=background, screen_offsets=screen_offsets)
+    frame.point(background=_background(background, colors), screen_offsets=screen_offsets)
     records, lists, pairs = _project(frame, means)
     color = means.new_empty(height, width, colors.shape[1])
     depth_sum, alpha = means.new_empty(height, width), means.new_empty(height, width)
@@ -152,7 +152,7 @@ def backward(
     height, width, channels = color.shape
     frame = _frame(T_camera_world, K, width, height, constants, len(means), channels)
     frame.point(means=means, covariances=covariances, opacities=opacities, colors=colors)
-    frame.point(background=background, screen_offsets=screen_offsets, records=records)
+    frame.point(background=_background(background, colors), screen_offsets=screen_offsets, records=records)
     frame.point(color=color, depth_sum=depth_sum, alpha=alpha)
     frame.point(grad_color=grad_color, grad_depth_sum=grad_depth_sum, grad_alpha=grad_alpha)
     tiles = library().d2_tile_count(frame)
@@ -191,6 +191,10 @@ def survey(
     frame.point(weight=weight, error=error, max_weight=max_weight, hits=hits)
     library().d2_survey(frame, pairs)
     return Survey(weight, error, max_weight, hits, depth_sum, alpha)
+
+
+def _background(background: Tensor | None, colors: Tensor) -> Tensor:
+    return colors.new_zeros(colors.shape[1]) if background is None else background
 
 
 def _frame(

@@ -4,6 +4,8 @@
 // that it reaches, and its constants stay in registers. The backward pass runs front to back as well, peeling what a
 // Gaussian hides off the pixel's total, so that the forward pass has no lists per pixel to save. Sums over pixels go to
 // one slot per (Gaussian, tile) and are added up in the order of tiles: the same bits for any number of threads.
+#include <type_traits>
+
 #include "binning.h"
 
 namespace d2 {
@@ -15,16 +17,26 @@ D2_INLINE Corner corner_of(const Frame& f, int tile) {
   return {tile % f.tiles_x() * TILE_WIDTH, tile / f.tiles_x() * TILE_HEIGHT};
 }
 
-// Calls visit(pixel, place) for the pixels of a tile inside the image: place = lane of a block + LANES * block.
+// Pixels of an image row that lie in one block.
+struct Strip {
+  int64_t pixel;        // the first one
+  int block, lane;      // where it is in the tile
+  int count;            // at most BLOCK_WIDTH
+};
+
+// Calls visit(strip, count) for the strips of a tile inside the image; `count` is a constant but at the right edge.
 template <class Visit>
-D2_INLINE void for_each_pixel(const Frame& f, int tile, Visit visit) {
+D2_INLINE void for_each_strip(const Frame& f, int tile, Visit visit) {
   const Corner corner = corner_of(f, tile);
   const int width = std::min(TILE_WIDTH, f.width - corner.x), height = std::min(TILE_HEIGHT, f.height - corner.y);
   for (int y = 0; y < height; y++)
-    for (int x = 0; x < width; x++) {
-      const int block = y / BLOCK_HEIGHT * TILE_BLOCKS + x / BLOCK_WIDTH;
-      const int lane = y % BLOCK_HEIGHT * BLOCK_WIDTH + x % BLOCK_WIDTH;
-      visit(int64_t(corner.y + y) * f.width + corner.x + x, block, lane);
+    for (int x = 0; x < width; x += BLOCK_WIDTH) {
+      const int block = y / BLOCK_HEIGHT * TILE_BLOCKS + x / BLOCK_WIDTH, lane = y % BLOCK_HEIGHT * BLOCK_WIDTH;
+      const Strip strip = {int64_t(corner.y + y) * f.width + corner.x + x, block, lane, std::min(BLOCK_WIDTH, width - x)};
+      if (strip.count == BLOCK_WIDTH)
+        visit(strip, std::integral_constant<int, BLOCK_WIDTH>());
+      else
+        visit(strip, strip.count);
     }
 }
 
@@ -126,6 +138,12 @@ D2_INLINE __m512 quad_sums(__m512 a, __m512 b) {
 D2_INLINE __m512 lane_sums(__m512 a, __m512 b) {
   return _mm512_shuffle_f32x4(a, b, 0x88) + _mm512_shuffle_f32x4(a, b, 0xdd);
 }
+// out[0..3] = sum of parts[0..3]
+D2_INLINE void store_quad(const Floats* parts, float* out) {
+  const __m512 quad = quad_sums(pair_sums(parts[0].v, parts[1].v), pair_sums(parts[2].v, parts[3].v));
+  const __m256 half = _mm512_castps512_ps256(quad) + _mm512_extractf32x8_ps(quad, 1);
+  _mm_storeu_ps(out, _mm256_castps256_ps128(half) + _mm256_extractf128_ps(half, 1));
+}
 template <int N>
 D2_INLINE void store_sums(const Floats* parts, float* out) {
   for (int first = 0; first < N; first += 16) {
@@ -142,6 +160,10 @@ D2_INLINE __m256 pair_sums(__m256 a, __m256 b) { return _mm256_unpacklo_ps(a, b)
 D2_INLINE __m256 quad_sums(__m256 a, __m256 b) {
   const __m256d x = _mm256_castps_pd(a), y = _mm256_castps_pd(b);
   return _mm256_castpd_ps(_mm256_unpacklo_pd(x, y)) + _mm256_castpd_ps(_mm256_unpackhi_pd(x, y));
+}
+D2_INLINE void store_quad(const Floats* parts, float* out) {
+  const __m256 quad = quad_sums(pair_sums(parts[0].v, parts[1].v), pair_sums(parts[2].v, parts[3].v));
+  _mm_storeu_ps(out, _mm256_castps256_ps128(quad) + _mm256_extractf128_ps(quad, 1));
 }
 template <int N>
 D2_INLINE void store_sums(const Floats* parts, float* out) {
@@ -160,6 +182,7 @@ template <int N>
 D2_INLINE void store_sums(const Floats* parts, float* out) {
   for (int i = 0; i < N; i++) out[i] = sum(parts[i]);
 }
+D2_INLINE void store_quad(const Floats* parts, float* out) { store_sums<4>(parts, out); }
 #endif
 
 // Slot of the pair (Gaussian `id`, tile).
@@ -170,16 +193,38 @@ D2_INLINE int64_t slot_of(const Frame& f, const Record& r, int32_t id, Corner co
 
 // ---------------------------------------------------------------------------------------------------- forward
 
-// State of a block in the forward pass: transmittance, depth sum, colors.
+// The unfinished pixels of a tile. A pixel that finishes keeps its transmittance in `last` and goes on with 0, so that
+// nothing contributes any more; that happens once per pixel, hence aside from the arithmetic of every fragment.
+struct Unfinished {
+  unsigned lanes[BLOCKS] = {};  // one bit per pixel of a block
+  uint64_t blocks = 0;          // one bit per block that has any
+
+  D2_INLINE void add(const Strip& strip) {
+    lanes[strip.block] |= ((1u << strip.count) - 1) << strip.lane;
+    blocks |= uint64_t(1) << strip.block;
+  }
+  D2_INLINE Floats advance(const Step<Floats>& step, Floats transmittance, int block, float* last) {
+    const unsigned open = d2::lanes(step.open);
+    if (open != lanes[block]) {
+      max(Floats::load(last), select(step.open, Floats(0.f), transmittance)).store(last);
+      lanes[block] = open;
+      if (!open) blocks &= ~(uint64_t(1) << block);
+    }
+    return where(step.open, step.after);
+  }
+};
+
+// State of a block in the forward pass: transmittance, that of finished pixels, depth sum, colors.
 template <int FIXED>
 static void render_tile(const Frame& f, int tile) {
-  const int channels = FIXED ? FIXED : f.channels, fields = 2 + channels;
+  const int channels = FIXED ? FIXED : f.channels, fields = 3 + channels;
   float* state = scratch().state.reserve(size_t(BLOCKS) * fields * LANES);
   std::fill(state, state + BLOCKS * fields * LANES, 0.f);
-  uint64_t alive = 0;
-  for_each_pixel(f, tile, [&](int64_t, int block, int lane) {
-    state[block * fields * LANES + lane] = 1.f;
-    alive |= uint64_t(1) << block;
+  Unfinished unfinished;
+  for_each_strip(f, tile, [&](const Strip& strip, auto count) {
+    float* field = state + strip.block * fields * LANES + strip.lane;
+    for (int i = 0; i < count; i++) field[i] = 1.f;
+    unfinished.add(strip);
   });
 
   const Corner corner = corner_of(f, tile);
@@ -188,36 +233,37 @@ static void render_tile(const Frame& f, int tile) {
   const int32_t begin = f.tiles[tile].begin, pairs = f.tiles[tile].live;
   const uint64_t* keys = sort_by_depth(f.blocks + begin, pairs);
   int32_t live = begin;
-  for_each_reaching(f, keys, pairs, corner, alive, [&](uint32_t id, const Record& r, uint64_t reached) {
+  for_each_reaching(f, keys, pairs, corner, unfinished.blocks, [&](uint32_t id, const Record& r, uint64_t reached) {
     const float* color = FIXED ? r.color : f.colors + int64_t(id) * channels;
     const Spread spread = lattice.spread(r, corner);
-    uint64_t contributes = 0;
     for (uint64_t left = reached; left; left &= left - 1) {
       const int block = __builtin_ctzll(left);
       const Fragment<Floats> here = spread.at(block);
       float* field = state + block * fields * LANES;
-      const Step<Floats> step = composite(here.log2_alpha, Floats::load(field), log2_alpha_min, f.constants);
-      step.transmittance.store(field);
+      const Floats transmittance = Floats::load(field);
+      const Step<Floats> step = composite(here.log2_alpha, transmittance, log2_alpha_min, f.constants);
+      unfinished.advance(step, transmittance, block, field + LANES).store(field);
       const auto add = [&](int k, float value) {
         fma(step.weight, Floats(value), Floats::load(field + k * LANES)).store(field + k * LANES);
       };
-      add(1, r.footprint.depth);
-      for (int c = 0; c < channels; c++) add(2 + c, color[c]);
-      contributes |= uint64_t(any(step.seen & step.open)) << block;
-      if (!any(step.open)) alive &= ~(uint64_t(1) << block);
+      add(2, r.footprint.depth);
+      for (int c = 0; c < channels; c++) add(3 + c, color[c]);
     }
-    if (contributes) f.ids[live] = int32_t(id), f.blocks[live++] = contributes;
+    f.ids[live] = int32_t(id), f.blocks[live++] = reached;
   });
   f.tiles[tile].live = live - begin;
   std::fill(f.ids + live, f.ids + begin + pairs, -1);
 
-  for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
-    const float* field = state + block * fields * LANES + lane;
-    const float transmittance = field[0] < 0 ? -field[0] : field[0];
-    f.alpha[pixel] = 1.f - transmittance;
-    f.depth_sum[pixel] = field[LANES];
-    for (int c = 0; c < channels; c++)
-      f.color[pixel * channels + c] = field[(2 + c) * LANES] + (f.background ? transmittance * f.background[c] : 0.f);
+  for_each_strip(f, tile, [&](const Strip& strip, auto count) {
+    const float* field = state + strip.block * fields * LANES + strip.lane;
+    float transmittance[BLOCK_WIDTH];
+    for (int i = 0; i < count; i++) transmittance[i] = max(field[i], field[LANES + i]);
+    for (int i = 0; i < count; i++) f.alpha[strip.pixel + i] = 1.f - transmittance[i];
+    for (int i = 0; i < count; i++) f.depth_sum[strip.pixel + i] = field[2 * LANES + i];
+    float* color = f.color + strip.pixel * channels;
+    for (int i = 0; i < count; i++)
+      for (int c = 0; c < channels; c++)
+        color[i * channels + c] = fma(transmittance[i], f.background[c], field[(3 + c) * LANES + i]);
   });
 }
 
@@ -225,31 +271,40 @@ static void render_tile(const Frame& f, int tile) {
 
 // State of a block in the backward pass: transmittance, what is left of sum of w dL/dw, and dL/d of alpha (with the
 // background's share), depth sum and colors at its pixels.
-static void load_gradients(const Frame& f, int tile, int channels, float* state, float* background) {
-  const int fields = 4 + channels;
+template <int FIXED>
+static void load_gradients(const Frame& f, int tile, float* state, float* background) {
+  const int channels = FIXED ? FIXED : f.channels, fields = 4 + channels;
   std::fill(state, state + BLOCKS * fields * LANES, 0.f);
   if (background) std::fill(background, background + channels, 0.f);
-  for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
-    float* field = state + block * fields * LANES + lane;
-    const float alpha = f.alpha[pixel];
-    if (alpha == 0.f) {
-      // Nobody contributes here. A loss that divides by alpha sends NaN, which 0 times a weight would not silence.
-      for (int c = 0; background && f.grad_color && c < channels; c++) background[c] += f.grad_color[pixel * channels + c];
-      return;
+  for_each_strip(f, tile, [&](const Strip& strip, auto count) {
+    float* field = state + strip.block * fields * LANES + strip.lane;
+    const float* alpha = f.alpha + strip.pixel;
+    float on_alpha[BLOCK_WIDTH] = {}, on_depth[BLOCK_WIDTH] = {}, total[BLOCK_WIDTH];
+    // Where nobody contributes nothing comes back: a loss that divides by alpha sends NaN there, which 0 times a weight
+    // would not silence.
+    if (f.grad_alpha)
+      for (int i = 0; i < count; i++) on_alpha[i] = alpha[i] > 0.f ? f.grad_alpha[strip.pixel + i] : 0.f;
+    if (f.grad_depth_sum)
+      for (int i = 0; i < count; i++) on_depth[i] = alpha[i] > 0.f ? f.grad_depth_sum[strip.pixel + i] : 0.f;
+    for (int i = 0; i < count; i++) total[i] = fma(on_alpha[i], alpha[i], on_depth[i] * f.depth_sum[strip.pixel + i]);
+    if (f.grad_color)
+      for (int c = 0; c < channels; c++) {
+        const float behind = f.background[c];
+        for (int i = 0; i < count; i++) {
+          const int64_t place = (strip.pixel + i) * channels + c;
+          const float on_color = alpha[i] > 0.f ? f.grad_color[place] : 0.f;
+          // The image holds (1 - A) background: part of the dependence on alpha, not of the sum over Gaussians.
+          total[i] = fma(on_color, f.color[place] - behind, total[i]);
+          on_alpha[i] = fma(-on_color, behind, on_alpha[i]);
+          field[(4 + c) * LANES + i] = on_color;
+        }
+        if (background)
+          for (int i = 0; i < count; i++) background[c] += (1.f - alpha[i]) * f.grad_color[(strip.pixel + i) * channels + c];
+      }
+    for (int i = 0; i < count; i++) {
+      field[i] = 1.f, field[LANES + i] = total[i];
+      field[2 * LANES + i] = on_alpha[i], field[3 * LANES + i] = on_depth[i];
     }
-    float on_alpha = f.grad_alpha ? f.grad_alpha[pixel] : 0.f, total = on_alpha * alpha;
-    const float on_depth = f.grad_depth_sum ? f.grad_depth_sum[pixel] : 0.f;
-    total += on_depth * f.depth_sum[pixel];
-    for (int c = 0; c < channels; c++) {
-      const float on_color = f.grad_color ? f.grad_color[pixel * channels + c] : 0.f;
-      const float behind = f.background ? f.background[c] : 0.f;
-      // The image holds (1 - A) background, which is part of the dependence on alpha and not of the sum over Gaussians.
-      total += on_color * (f.color[pixel * channels + c] - behind);
-      on_alpha -= on_color * behind;
-      field[(4 + c) * LANES] = on_color;
-      if (background) background[c] += (1.f - alpha) * on_color;
-    }
-    field[0] = 1.f, field[LANES] = total, field[2 * LANES] = on_alpha, field[3 * LANES] = on_depth;
   });
 }
 
@@ -264,16 +319,20 @@ static void backward_tile(const Frame& f, int tile, const Sums& to) {
   const int channels = FIXED ? FIXED : f.channels, fields = 4 + channels;
   float* state = scratch().state.reserve(size_t(BLOCKS * fields + 7 + channels) * LANES);
   Floats* loose_sums = reinterpret_cast<Floats*>(state + BLOCKS * fields * LANES);
-  load_gradients(f, tile, channels, state, to.background ? to.background + int64_t(tile) * channels : nullptr);
+  load_gradients<FIXED>(f, tile, state, to.background ? to.background + int64_t(tile) * channels : nullptr);
   const Corner corner = corner_of(f, tile);
   const Lattice lattice;
   const float log2_alpha_min = f.log2_alpha_min(), log2_alpha_max = f.log2_alpha_max();
   const int64_t stride = moment_stride(channels);
   const int32_t begin = f.tiles[tile].begin, end = begin + f.tiles[tile].live;
   for (int32_t q = begin; q < end; q++) {
+    if (q + 16 < end) {
+      __builtin_prefetch(f.records + f.ids[q + 16]);
+      __builtin_prefetch(f.slots + f.ids[q + 16]);
+    }
     if (q + 8 < end) {
-      __builtin_prefetch(f.records + f.ids[q + 8]);
-      __builtin_prefetch(f.slots + f.ids[q + 8]);
+      const int32_t soon = f.ids[q + 8];
+      __builtin_prefetch(to.moments + slot_of(f, f.records[soon], soon, corner) * stride, 1);
     }
     const int32_t id = f.ids[q];
     const Record& r = f.records[id];
@@ -305,7 +364,7 @@ static void backward_tile(const Frame& f, int tile, const Sums& to) {
       sums[4] = fma(gu, here.v, sums[4]);
       sums[5] = fma(gv, here.v, sums[5]);
       sums[6] = fma(step.weight, on_depth, sums[6]);
-      step.transmittance.store(field);
+      where(step.open, step.after).store(field);
       behind.store(field + LANES);
     }
     const int64_t slot = slot_of(f, r, id, corner);
@@ -362,20 +421,22 @@ D2_INLINE void backward_group(const Frame& f, const Sums& from, int64_t i, int r
 
 // ---------------------------------------------------------------------------------------------------- survey
 
-// State of a block in the survey: transmittance, depth sum, and at verified pixels 1 / (D* + eps), D* / (D* + eps), 1.
+// State of a block in the survey: transmittance, that of finished pixels, depth sum, and at verified pixels
+// 1 / (D* + eps), D* / (D* + eps), 1.
 static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* statistics) {
-  constexpr int fields = 5;
+  constexpr int fields = 6;
   float* state = scratch().state.reserve(size_t(BLOCKS) * fields * LANES);
   std::fill(state, state + BLOCKS * fields * LANES, 0.f);
-  uint64_t alive = 0;
-  for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
-    float* field = state + block * fields * LANES + lane;
-    field[0] = 1.f;
-    alive |= uint64_t(1) << block;
-    const float depth = f.prior_depth[pixel];
-    if (!f.verified[pixel] || !(depth > 0.f) || depth - depth != 0.f) return;
-    const float scale = 1.f / (depth + f.eps);
-    field[2 * LANES] = scale, field[3 * LANES] = depth * scale, field[4 * LANES] = 1.f;
+  Unfinished unfinished;
+  for_each_strip(f, tile, [&](const Strip& strip, auto count) {
+    float* field = state + strip.block * fields * LANES + strip.lane;
+    unfinished.add(strip);
+    for (int i = 0; i < count; i++) {
+      const float depth = f.prior_depth[strip.pixel + i];
+      const float use = f.verified[strip.pixel + i] && depth > 0.f && depth <= 3.4e38f ? 1.f : 0.f;
+      const float known = use > 0.f ? depth : 1.f, scale = use / (known + f.eps);
+      field[i] = 1.f, field[3 * LANES + i] = scale, field[4 * LANES + i] = known * scale, field[5 * LANES + i] = use;
+    }
   });
 
   const Corner corner = corner_of(f, tile);
@@ -383,37 +444,38 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
   const float log2_alpha_min = f.log2_alpha_min();
   const int32_t begin = f.tiles[tile].begin, pairs = f.tiles[tile].live;
   const uint64_t* keys = sort_by_depth(f.blocks + begin, pairs);
-  for_each_reaching(f, keys, pairs, corner, alive, [&](uint32_t id, const Record& r, uint64_t reached) {
+  for_each_reaching(f, keys, pairs, corner, unfinished.blocks, [&](uint32_t id, const Record& r, uint64_t reached) {
     const Spread spread = lattice.spread(r, corner);
     const Floats depth = r.footprint.depth;
-    Floats sums[3] = {0.f, 0.f, 0.f};  // weight and error over verified pixels, largest weight
-    int hits = 0;
+    Floats sums[4] = {0.f, 0.f, 0.f, 0.f}, largest_weight = 0.f;  // weight, error and hits over verified pixels
     for (uint64_t left = reached; left; left &= left - 1) {
       const int block = __builtin_ctzll(left);
       const Fragment<Floats> here = spread.at(block);
       float* field = state + block * fields * LANES;
-      const Step<Floats> step = composite(here.log2_alpha, Floats::load(field), log2_alpha_min, f.constants);
-      step.transmittance.store(field);
-      fma(step.weight, depth, Floats::load(field + LANES)).store(field + LANES);
-      const Floats scale = Floats::load(field + 2 * LANES), true_depth = Floats::load(field + 3 * LANES);
-      const Floats verified = Floats::load(field + 4 * LANES);
+      const Floats transmittance = Floats::load(field);
+      const Step<Floats> step = composite(here.log2_alpha, transmittance, log2_alpha_min, f.constants);
+      unfinished.advance(step, transmittance, block, field + LANES).store(field);
+      fma(step.weight, depth, Floats::load(field + 2 * LANES)).store(field + 2 * LANES);
+      const Floats scale = Floats::load(field + 3 * LANES), true_depth = Floats::load(field + 4 * LANES);
+      const Floats verified = Floats::load(field + 5 * LANES);
       const Floats error = abs(fma(depth, scale, -true_depth));
       sums[0] = fma(step.weight, verified, sums[0]);
       sums[1] = fma(step.weight, error, sums[1]);
-      sums[2] = max(step.weight, sums[2]);
-      hits += count(step.seen & step.open & (verified > Floats(0.f)));
-      if (!any(step.open)) alive &= ~(uint64_t(1) << block);
+      sums[2] = sums[2] + where(step.weight > Floats(0.f), verified);
+      largest_weight = max(step.weight, largest_weight);
     }
-    if (!any(sums[2] > Floats(0.f))) return;
+    const float most = largest(largest_weight);
+    if (!(most > 0.f)) return;
     const int64_t slot = slot_of(f, r, int32_t(id), corner);
     touched[slot] = 1;
-    statistics[slot] = {sum(sums[0]), sum(sums[1]), float(hits), largest(sums[2])};
+    store_quad(sums, &statistics[slot].weight);
+    statistics[slot].max_weight = most;
   });
 
-  for_each_pixel(f, tile, [&](int64_t pixel, int block, int lane) {
-    const float* field = state + block * fields * LANES + lane;
-    f.alpha[pixel] = 1.f - (field[0] < 0 ? -field[0] : field[0]);
-    f.depth_sum[pixel] = field[LANES];
+  for_each_strip(f, tile, [&](const Strip& strip, auto count) {
+    const float* field = state + strip.block * fields * LANES + strip.lane;
+    for (int i = 0; i < count; i++) f.alpha[strip.pixel + i] = 1.f - max(field[i], field[LANES + i]);
+    for (int i = 0; i < count; i++) f.depth_sum[strip.pixel + i] = field[2 * LANES + i];
   });
 }
 

@@ -49,7 +49,7 @@ struct Frame {
   float eps;
   int64_t count;  // M
 
-  // Inputs; `colors`, `screen_offsets` and `background` may be null.
+  // Inputs; `screen_offsets` may be null, for a survey also `colors` and `background`.
   const float *means, *covariances, *opacities, *colors, *screen_offsets, *background;
   const float* prior_depth;  // 0 or less, or not finite: not verified
   const uint8_t* verified;

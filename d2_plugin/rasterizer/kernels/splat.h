@@ -255,12 +255,13 @@ D2_FN S along_v(const Footprint<float>& f, S dy) {
   return S(f.vy) * dy;
 }
 
-// One step of front-to-back compositing. A finished pixel carries its transmittance negated.
+// One step of front-to-back compositing. A finished pixel carries its transmittance negated (or 0: the CPU's choice).
 template <class S>
 struct Step {
   decltype(S() > S()) seen, open;  // reaches alpha_min; and the pixel is not finished, by this Gaussian or before
   S alpha, weight;                 // alpha is 0 where not seen, weight where not seen or not open
-  S transmittance;                 // behind the Gaussian
+  S after;                         // transmittance behind the Gaussian if it is open
+  S transmittance;                 // the same, or where it is not open that in front, negated
 };
 
 template <class S>
@@ -268,10 +269,10 @@ D2_FN Step<S> composite(S log2_alpha, S transmittance, float log2_alpha_min, con
   Step<S> s;
   s.seen = log2_alpha >= S(log2_alpha_min);
   s.alpha = where(s.seen, min(exp2(log2_alpha), S(c.alpha_max)));
-  const S after = fnma(s.alpha, transmittance, transmittance);
-  s.open = after > S(c.transmittance_min);
+  s.after = fnma(s.alpha, transmittance, transmittance);
+  s.open = s.after > S(c.transmittance_min);
   s.weight = where(s.open, s.alpha * transmittance);
-  s.transmittance = select(s.open, after, negative(transmittance));
+  s.transmittance = select(s.open, s.after, negative(transmittance));
   return s;
 }
 
