@@ -85,6 +85,17 @@ def test_cameras_with_one_centre_confirm_nothing(capture: Capture) -> None:
         assert not result.valid.any()
 
 
+def test_views_that_meet_at_too_wide_an_angle_do_not_confirm_each_other(capture: Capture) -> None:
+    grays, cameras, depths, costs = views(capture)
+    outer = [0, 2]  # 30 degrees apart
+    kept = {}
+    for limit in (60, 25):
+        settings = replace(SETTINGS, max_angle=limit)
+        parts = [[values[i] for i in outer] for values in (grays, cameras, depths, costs)]
+        kept[limit] = filter_depths(*parts, settings)[0].valid.mean()
+    assert kept[25] < 0.3 * kept[60]
+
+
 def test_more_confirmations_can_be_asked_for(capture: Capture) -> None:
     grays, cameras, depths, costs = views(capture)
     kept = []

@@ -109,7 +109,7 @@ def count_confirmations(
 
     A source confirms when its own depth, read at the pixel on which ours lands, takes us back to within
     `reprojection_max` pixels (COLMAP's geometric consistency), agrees to `relative_depth_max` in our view, and the two
-    rays meet at more than `min_angle`.
+    rays meet at an angle between `min_angle` and `max_angle`.
     """
     reference, depth = cameras[index], depths[index]
     u, v = pixel_grid(reference)
@@ -124,8 +124,9 @@ def count_confirmations(
         with np.errstate(invalid="ignore", over="ignore"):
             near_pixel = np.hypot(back.x - u, back.y - v) < settings.reprojection_max
             near_depth = np.abs(back.z - depth) < settings.relative_depth_max * depth
-        wide = triangulation_angle(reference, pair, depth) > np.deg2rad(settings.min_angle)
-        count += (depth > 0) & (seen > 0) & near_pixel & near_depth & wide
+        angle = np.rad2deg(triangulation_angle(reference, pair, depth))
+        trusted = (angle > settings.min_angle) & (angle < settings.max_angle)
+        count += (depth > 0) & (seen > 0) & near_pixel & near_depth & trusted
     return count
 
 
