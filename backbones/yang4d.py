@@ -31,7 +31,7 @@ from .rotation4d import (
 )
 from .trainer import Trainer, TrainSettings
 
-__all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "initial_rows"]
+__all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "initial_rows", "settings_from"]
 
 MARGINAL_CUT = 0.05
 """A Gaussian whose temporal marginal F(t) is not above this is not drawn (forward.cu:334)."""
@@ -273,6 +273,19 @@ def nearest_neighbour_scales(positions: Tensor, neighbours: int = 3) -> Tensor:
     return torch.cat(chunks)[:, 1:].square().mean(-1).sqrt().clamp(min=1e-7)
 
 
+def settings_from(table: Mapping[str, object], temporal: bool = True) -> Yang4DSettings:
+    """`Yang4DSettings` from a plain table with tables "densify" and "raster" inside; a D2Error for unknown names."""
+    chosen = dict(table)
+    for name, kind in (("densify", DensifySettings), ("raster", RasterSettings), ("backbone", Yang4DSettings)):
+        values = chosen if name == "backbone" else chosen.setdefault(name, {})
+        known = {entry.name for entry in fields(kind)} - {"temporal"}
+        for key in values:
+            if key not in known:
+                raise unknown_name(f"setting of {name}", key, known)
+    chosen["densify"], chosen["raster"] = DensifySettings(**chosen["densify"]), RasterSettings(**chosen["raster"])
+    return Yang4DSettings(temporal=temporal, **chosen)
+
+
 def create(
     positions: Tensor,
     colors: Tensor,
@@ -283,17 +296,5 @@ def create(
     temporal: bool,
     settings: Mapping[str, object] | None = None,
 ) -> Yang4D:
-    """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults.
-
-    `settings` holds fields of `Yang4DSettings`, and under "densify" and "raster" tables of theirs; other names are
-    refused with a D2Error.
-    """
-    chosen = dict(settings or {})
-    for name, kind in (("densify", DensifySettings), ("raster", RasterSettings), ("backbone", Yang4DSettings)):
-        table = chosen if name == "backbone" else chosen.setdefault(name, {})
-        known = {entry.name for entry in fields(kind)} - {"temporal"}
-        for key in table:
-            if key not in known:
-                raise unknown_name(f"setting of {name}", key, known)
-    chosen["densify"], chosen["raster"] = DensifySettings(**chosen["densify"]), RasterSettings(**chosen["raster"])
-    return Yang4D.from_points(positions, colors, times, Yang4DSettings(temporal=temporal, **chosen), extent, duration)
+    """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults."""
+    return Yang4D.from_points(positions, colors, times, settings_from(settings or {}, temporal), extent, duration)

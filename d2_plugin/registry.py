@@ -7,7 +7,7 @@ from importlib.metadata import EntryPoint, entry_points
 from d2_plugin.errors import unknown_name
 
 BACKBONES = "d2_plugin.backbones"
-"""Entry-point group of modules with `create(...)`, `Trainer` and `TrainSettings` (see d2_plugin.backbones.yang4d)."""
+"""Entry-point group of modules with create, settings_from, Trainer and TrainSettings (see backbones/yang4d.py)."""
 
 ADAPTERS = "d2_plugin.adapters"
 """Entry-point group of callables that take a model and return a `d2_plugin.protocol.Backbone`."""

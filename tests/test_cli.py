@@ -142,6 +142,15 @@ def test_one_instant_leaves_the_temporal_dimension_out(capture: Path, tmp_path: 
     assert [path.name for path in (tmp_path / "still" / "ply").iterdir()] == ["frame_00001.ply"]
 
 
+def test_the_temporal_dimension_can_be_left_out_by_the_user(capture: Path, tmp_path: Path) -> None:
+    config = tmp_path / "still.toml"
+    config.write_text("[plan]\ntemporal = false\n")
+    assert train(capture, tmp_path / "still", "--hooks", "none", "--config", str(config)) == 0
+    decision = json.loads((tmp_path / "still" / "metrics.json").read_text())["plan"]["temporal"]
+    assert decision["use"] is False
+    assert "overridden by the user (measured: motion" in decision["reason"]
+
+
 def test_one_training_camera_without_metric_depth_is_refused_or_trains_bare(
     capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -242,6 +251,13 @@ class TestMistakes:
         config.write_text("[prune]\ntau_pp = 0.5\n")
         message = refused(capsys, train(capture, tmp_path / "x", "--config", str(config)))
         assert "unknown setting of prune 'tau_pp'" in message
+        config.write_text("[plan]\nstereo = false\n")
+        message = refused(capsys, train(capture, tmp_path / "x", "--config", str(config)))
+        assert "unknown decision of plan 'stereo': have temporal" in message
+        config.write_text("[backbone]\nsh_degre = 1\n")
+        message = refused(capsys, train(capture, tmp_path / "y", "--hooks", "none", "--config", str(config)))
+        assert "did you mean 'sh_degree'?" in message
+        assert not (tmp_path / "y").exists()
 
     def test_evaluating_what_is_no_run(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "holds no run" in refused(capsys, main(["eval", str(tmp_path)]))

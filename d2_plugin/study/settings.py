@@ -17,6 +17,8 @@ from d2_plugin.priors.settings import PriorSettings
 HOOK_NAMES = ("prior", "densify", "prune", "depth_loss")
 TABLES = ("backbone", "densify", "prune", "depth_loss", "priors", "plan")
 """What a configuration file may hold."""
+OVERRIDABLE = ("temporal",)
+"""Decisions of the plan that `[plan]` may take; the others follow from the cameras and depth sources that are given."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +73,13 @@ def check(settings: RunSettings) -> RunSettings:
     for name in settings.overrides:
         if name not in TABLES:
             raise unknown_name("table", name, TABLES)
+    for name in settings.overrides.get("plan", {}):
+        if name not in OVERRIDABLE:
+            raise unknown_name("decision of plan", name, OVERRIDABLE)
     prior_settings(settings)
     hook_config(settings, Path())
-    if settings.backbone not in registry.names(registry.BACKBONES):
-        raise unknown_name("backbone", settings.backbone, registry.names(registry.BACKBONES))
+    backbone = registry.load(registry.BACKBONES, settings.backbone)
+    backbone.settings_from(settings.overrides.get("backbone", {}))
     paths = ("capture", "mono_onnx", "priors")
     absolute = {name: str(Path(path).resolve()) for name in paths if (path := getattr(settings, name)) is not None}
     return replace(settings, **absolute)  # a run is found again from any folder
