@@ -65,8 +65,10 @@ def find_compiler() -> list[str]:
     """The command of the C++ compiler: ``CXX`` alone where it is set, else the first of c++, g++, clang++.
 
     Raises:
-        NoCompiler: none of them is on the path.
+        NoCompiler: none of them is on the path, or this is Windows, where the kernels have not been ported.
     """
+    if os.name == "nt":
+        raise NoCompiler("compiled kernels run on Linux and macOS: on Windows use the Linux subsystem (WSL)")
     chosen = os.environ.get("CXX", "").strip()
     if chosen:
         command = shlex.split(chosen)
@@ -193,13 +195,8 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Hold an exclusive lock on `path` between processes; the system releases it if the process dies."""
-    with path.open("w") as file:
-        try:
-            import fcntl
-        except ImportError:  # Windows
-            import msvcrt
+    import fcntl
 
-            msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)  # type: ignore[attr-defined]
-        else:
-            fcntl.flock(file, fcntl.LOCK_EX)
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
         yield

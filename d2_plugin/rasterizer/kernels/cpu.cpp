@@ -432,12 +432,19 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
     float* field = state + strip.block * fields * LANES + strip.lane;
     unfinished.add(strip);
     for (int i = 0; i < count; i++) {
-      const float depth = f.prior_depth[strip.pixel + i];
-      const float use = f.verified[strip.pixel + i] && depth > 0.f && depth <= 3.4e38f ? 1.f : 0.f;
-      const float known = use > 0.f ? depth : 1.f, scale = use / (known + f.eps);
-      field[i] = 1.f, field[3 * LANES + i] = scale, field[4 * LANES + i] = known * scale, field[5 * LANES + i] = use;
+      field[i] = 1.f;
+      field[4 * LANES + i] = f.prior_depth[strip.pixel + i], field[5 * LANES + i] = f.verified[strip.pixel + i];
     }
   });
+  for (int block = 0; block < BLOCKS; block++) {
+    float* field = state + block * fields * LANES;
+    const Floats depth = Floats::load(field + 4 * LANES), verified = Floats::load(field + 5 * LANES);
+    const Mask usable = (verified > Floats(0.f)) & (depth > Floats(0.f)) & (depth < Floats(__builtin_inff()));
+    const Floats scale = where(usable, Floats(1.f) / (depth + Floats(f.eps)));
+    scale.store(field + 3 * LANES);
+    (where(usable, depth) * scale).store(field + 4 * LANES);
+    where(usable, Floats(1.f)).store(field + 5 * LANES);
+  }
 
   const Corner corner = corner_of(f, tile);
   const Lattice lattice;
