@@ -1,7 +1,8 @@
 """The kernels on the CPU: `kernels/cpu.cpp` through its C ABI.
 
 Compiled at first use (`d2_plugin.compiler`). Tensors are float32, contiguous and on the CPU; `ops` sees to that.
-Runs on `torch.get_num_threads()` threads; results are the same bits for any number of them.
+Runs on `torch.get_num_threads()` threads; results are the same bits for any number of them. A thread that calls keeps
+its scratch memory (about 64 bytes per Gaussian and tile for the backward pass) for the next call.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -29,7 +31,7 @@ FLAGS = ("-ffp-contract=off",)
 RECORD = 16
 """Floats of a projected Gaussian, one cache line."""
 
-_float, _int, _long, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_int64, ctypes.c_void_p
+_float, _int, _long, _bool, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_int64, ctypes.c_bool, ctypes.c_void_p
 
 
 class Frame(ctypes.Structure):
@@ -79,9 +81,9 @@ def library() -> ctypes.CDLL:
         "d2_frame_size": ((), _long),
         "d2_tile_count": ((frame,), _int),
         "d2_project": ((frame,), _long),
-        "d2_render": ((frame, _long), None),
-        "d2_survey": ((frame, _long), None),
-        "d2_backward": ((frame, _long), None),
+        "d2_render": ((frame, _long), _bool),
+        "d2_survey": ((frame, _long), _bool),
+        "d2_backward": ((frame, _long), _bool),
     }
     for name, (arguments, result) in signatures.items():
         getattr(kernels, name).argtypes, getattr(kernels, name).restype = arguments, result
@@ -125,7 +127,7 @@ def rasterize(
     color = means.new_empty(height, width, colors.shape[1])
     depth_sum, alpha = means.new_empty(height, width), means.new_empty(height, width)
     frame.point(color=color, depth_sum=depth_sum, alpha=alpha)
-    library().d2_render(frame, pairs)
+    _run(library().d2_render, frame, pairs)
     return color, depth_sum, alpha, records, lists
 
 
@@ -162,7 +164,7 @@ def backward(
     gradients += [means.new_empty(channels), means.new_empty(len(means), 2)]
     frame.point(grad_means=gradients[0], grad_covariances=gradients[1], grad_opacities=gradients[2])
     frame.point(grad_colors=gradients[3], grad_background=gradients[4], grad_screen_offsets=gradients[5])
-    library().d2_backward(frame, pairs)
+    _run(library().d2_backward, frame, pairs)
     return tuple(gradients)
 
 
@@ -189,7 +191,7 @@ def survey(
     depth_sum, alpha = torch.empty_like(prior_depth), torch.empty_like(prior_depth)
     frame.point(depth_sum=depth_sum, alpha=alpha)
     frame.point(weight=weight, error=error, max_weight=max_weight, hits=hits)
-    library().d2_survey(frame, pairs)
+    _run(library().d2_survey, frame, pairs)
     return Survey(weight, error, max_weight, hits, depth_sum, alpha)
 
 
@@ -217,11 +219,18 @@ def _project(frame: Frame, means: Tensor) -> tuple[Tensor, Tensor, int]:
     tiles = library().d2_tile_count(frame)
     records = means.new_empty(len(means), RECORD)
     pairs = library().d2_project(frame.point(records=records))
+    if pairs < 0:
+        raise MemoryError(f"no memory for the projection of {len(means)} Gaussians")
     if pairs > 2**31 - 1:
         raise D2Error(f"{pairs} pairs of Gaussian and tile, at most 2^31 - 1 are possible: use a smaller image")
     lists = torch.empty(3 * pairs + len(means) + 1 + 2 * tiles, dtype=torch.int32)
     _point_lists(frame, lists, pairs)
     return records, lists, pairs
+
+
+def _run(step: Callable[[Frame, int], bool], frame: Frame, pairs: int) -> None:
+    if not step(frame, pairs):
+        raise MemoryError(f"no memory for {pairs} pairs of Gaussian and tile")
 
 
 def _point_lists(frame: Frame, lists: Tensor, pairs: int) -> None:

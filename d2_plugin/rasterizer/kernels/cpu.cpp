@@ -19,9 +19,9 @@ D2_INLINE Corner corner_of(const Frame& f, int tile) {
 
 // Pixels of an image row that lie in one block.
 struct Strip {
-  int64_t pixel;        // the first one
-  int block, lane;      // where it is in the tile
-  int count;            // at most BLOCK_WIDTH
+  int64_t pixel;    // the first one
+  int block, lane;  // where it is in the tile
+  int count;        // at most BLOCK_WIDTH
 };
 
 // Calls visit(strip, count) for the strips of a tile inside the image; `count` is a constant but at the right edge.
@@ -127,63 +127,6 @@ D2_INLINE void for_each_reaching(const Frame& f, const uint64_t* keys, int pairs
     }
   }
 }
-
-// out[i] = sum of parts[i]
-#if defined(D2_AVX512)
-D2_INLINE __m512 pair_sums(__m512 a, __m512 b) { return _mm512_unpacklo_ps(a, b) + _mm512_unpackhi_ps(a, b); }
-D2_INLINE __m512 quad_sums(__m512 a, __m512 b) {
-  const __m512d x = _mm512_castps_pd(a), y = _mm512_castps_pd(b);
-  return _mm512_castpd_ps(_mm512_unpacklo_pd(x, y)) + _mm512_castpd_ps(_mm512_unpackhi_pd(x, y));
-}
-D2_INLINE __m512 lane_sums(__m512 a, __m512 b) {
-  return _mm512_shuffle_f32x4(a, b, 0x88) + _mm512_shuffle_f32x4(a, b, 0xdd);
-}
-// out[0..3] = sum of parts[0..3]
-D2_INLINE void store_quad(const Floats* parts, float* out) {
-  const __m512 quad = quad_sums(pair_sums(parts[0].v, parts[1].v), pair_sums(parts[2].v, parts[3].v));
-  const __m256 half = _mm512_castps512_ps256(quad) + _mm512_extractf32x8_ps(quad, 1);
-  _mm_storeu_ps(out, _mm256_castps256_ps128(half) + _mm256_extractf128_ps(half, 1));
-}
-template <int N>
-D2_INLINE void store_sums(const Floats* parts, float* out) {
-  for (int first = 0; first < N; first += 16) {
-    __m512 quads[4];
-    for (int q = 0; q < 4; q++) {
-      const auto part = [&](int i) { return first + 4 * q + i < N ? parts[first + 4 * q + i].v : _mm512_setzero_ps(); };
-      quads[q] = quad_sums(pair_sums(part(0), part(1)), pair_sums(part(2), part(3)));
-    }
-    Floats(lane_sums(lane_sums(quads[0], quads[1]), lane_sums(quads[2], quads[3]))).store(out + first);
-  }
-}
-#elif defined(D2_AVX2)
-D2_INLINE __m256 pair_sums(__m256 a, __m256 b) { return _mm256_unpacklo_ps(a, b) + _mm256_unpackhi_ps(a, b); }
-D2_INLINE __m256 quad_sums(__m256 a, __m256 b) {
-  const __m256d x = _mm256_castps_pd(a), y = _mm256_castps_pd(b);
-  return _mm256_castpd_ps(_mm256_unpacklo_pd(x, y)) + _mm256_castpd_ps(_mm256_unpackhi_pd(x, y));
-}
-D2_INLINE void store_quad(const Floats* parts, float* out) {
-  const __m256 quad = quad_sums(pair_sums(parts[0].v, parts[1].v), pair_sums(parts[2].v, parts[3].v));
-  _mm_storeu_ps(out, _mm256_castps256_ps128(quad) + _mm256_extractf128_ps(quad, 1));
-}
-template <int N>
-D2_INLINE void store_sums(const Floats* parts, float* out) {
-  for (int first = 0; first < N; first += 8) {
-    __m256 quads[2];
-    for (int q = 0; q < 2; q++) {
-      const auto part = [&](int i) { return first + 4 * q + i < N ? parts[first + 4 * q + i].v : _mm256_setzero_ps(); };
-      quads[q] = quad_sums(pair_sums(part(0), part(1)), pair_sums(part(2), part(3)));
-    }
-    const __m256 low = _mm256_permute2f128_ps(quads[0], quads[1], 0x20);
-    Floats(low + _mm256_permute2f128_ps(quads[0], quads[1], 0x31)).store(out + first);
-  }
-}
-#else
-template <int N>
-D2_INLINE void store_sums(const Floats* parts, float* out) {
-  for (int i = 0; i < N; i++) out[i] = sum(parts[i]);
-}
-D2_INLINE void store_quad(const Floats* parts, float* out) { store_sums<4>(parts, out); }
-#endif
 
 // Slot of the pair (Gaussian `id`, tile).
 D2_INLINE int64_t slot_of(const Frame& f, const Record& r, int32_t id, Corner corner) {
@@ -298,8 +241,8 @@ static void load_gradients(const Frame& f, int tile, float* state, float* backgr
           on_alpha[i] = fma(-on_color, behind, on_alpha[i]);
           field[(4 + c) * LANES + i] = on_color;
         }
-        if (background)
-          for (int i = 0; i < count; i++) background[c] += (1.f - alpha[i]) * f.grad_color[(strip.pixel + i) * channels + c];
+        for (int i = 0; background && i < count; i++)
+          background[c] += (1.f - alpha[i]) * f.grad_color[(strip.pixel + i) * channels + c];
       }
     for (int i = 0; i < count; i++) {
       field[i] = 1.f, field[LANES + i] = total[i];
@@ -553,13 +496,34 @@ static void backward(const Frame& f, int64_t pairs) {
 
 // ---------------------------------------------------------------------------------------------------- C ABI
 
+// Runs `work`; false where memory does not suffice.
+template <class Work>
+static bool within_memory(Work work) {
+  try {
+    work();
+    return true;
+  } catch (const std::bad_alloc&) {
+    return false;
+  }
+}
+
 // native.py calls `d2_project`, allocates `ids` and `blocks` for as many pairs, and calls one of the next two on the
-// same thread; `d2_backward` takes what d2_render left behind.
+// same thread; `d2_backward` takes what d2_render left behind. -1 and false mean that memory does not suffice.
 extern "C" {
 int64_t d2_frame_size() { return sizeof(d2::Frame); }
 int32_t d2_tile_count(const d2::Frame* f) { return f->tile_count(); }
-int64_t d2_project(const d2::Frame* f) { return d2::project_all(*f); }
-void d2_render(const d2::Frame* f, int64_t pairs) { d2::render(*f, pairs); }
-void d2_survey(const d2::Frame* f, int64_t pairs) { d2::survey(*f, pairs); }
-void d2_backward(const d2::Frame* f, int64_t pairs) { d2::backward(*f, pairs); }
+int64_t d2_project(const d2::Frame* f) {
+  int64_t pairs = -1;
+  within_memory([&] { pairs = d2::project_all(*f); });
+  return pairs;
+}
+bool d2_render(const d2::Frame* f, int64_t pairs) {
+  return within_memory([&] { d2::render(*f, pairs); });
+}
+bool d2_survey(const d2::Frame* f, int64_t pairs) {
+  return within_memory([&] { d2::survey(*f, pairs); });
+}
+bool d2_backward(const d2::Frame* f, int64_t pairs) {
+  return within_memory([&] { d2::backward(*f, pairs); });
+}
 }

@@ -25,7 +25,7 @@ struct alignas(64) Record {
 };
 static_assert(sizeof(Record) == 64, "one cache line");
 
-// Gaussians of a tile, front to back: `live` of them from `begin` on contribute to it.
+// Gaussians of a tile, front to back: `live` of them, from `begin` on, come before all of its pixels are finished.
 struct Tile {
   int32_t begin, live;
 };
@@ -60,7 +60,7 @@ struct Frame {
   int32_t* slots;    // [M + 1]
   Tile* tiles;       // [tiles]
   int32_t* ids;      // [pairs]; -1 behind the live ones of a tile
-  uint64_t* blocks;  // [pairs] bit b: contributes to block b; before that, depth and id to sort by
+  uint64_t* blocks;  // [pairs] bit b: may contribute to block b; before that, depth and id to sort by
 
   // Outputs of the forward pass and what comes back to them; null where nothing comes back.
   float *color, *depth_sum, *alpha;

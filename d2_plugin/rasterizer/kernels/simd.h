@@ -217,4 +217,61 @@ D2_INLINE Floats log2(Floats x) {
   return fma(p, s, e);
 }
 
+// Sums of several vectors at once, by transposing instead of folding each: store_sums puts the sum of parts[i] in out[i]
+// (and writes whole vectors, hence up to LANES - 1 floats too many), store_quad does four of them.
+#if defined(D2_AVX512)
+D2_INLINE __m512 pair_sums(__m512 a, __m512 b) { return _mm512_unpacklo_ps(a, b) + _mm512_unpackhi_ps(a, b); }
+D2_INLINE __m512 quad_sums(__m512 a, __m512 b) {
+  const __m512d x = _mm512_castps_pd(a), y = _mm512_castps_pd(b);
+  return _mm512_castpd_ps(_mm512_unpacklo_pd(x, y)) + _mm512_castpd_ps(_mm512_unpackhi_pd(x, y));
+}
+D2_INLINE __m512 lane_sums(__m512 a, __m512 b) {
+  return _mm512_shuffle_f32x4(a, b, 0x88) + _mm512_shuffle_f32x4(a, b, 0xdd);
+}
+D2_INLINE void store_quad(const Floats* parts, float* out) {
+  const __m512 quad = quad_sums(pair_sums(parts[0].v, parts[1].v), pair_sums(parts[2].v, parts[3].v));
+  const __m256 half = _mm512_castps512_ps256(quad) + _mm512_extractf32x8_ps(quad, 1);
+  _mm_storeu_ps(out, _mm256_castps256_ps128(half) + _mm256_extractf128_ps(half, 1));
+}
+template <int N>
+D2_INLINE void store_sums(const Floats* parts, float* out) {
+  for (int first = 0; first < N; first += 16) {
+    __m512 quads[4];
+    for (int q = 0; q < 4; q++) {
+      const auto part = [&](int i) { return first + 4 * q + i < N ? parts[first + 4 * q + i].v : _mm512_setzero_ps(); };
+      quads[q] = quad_sums(pair_sums(part(0), part(1)), pair_sums(part(2), part(3)));
+    }
+    Floats(lane_sums(lane_sums(quads[0], quads[1]), lane_sums(quads[2], quads[3]))).store(out + first);
+  }
+}
+#elif defined(D2_AVX2)
+D2_INLINE __m256 pair_sums(__m256 a, __m256 b) { return _mm256_unpacklo_ps(a, b) + _mm256_unpackhi_ps(a, b); }
+D2_INLINE __m256 quad_sums(__m256 a, __m256 b) {
+  const __m256d x = _mm256_castps_pd(a), y = _mm256_castps_pd(b);
+  return _mm256_castpd_ps(_mm256_unpacklo_pd(x, y)) + _mm256_castpd_ps(_mm256_unpackhi_pd(x, y));
+}
+D2_INLINE void store_quad(const Floats* parts, float* out) {
+  const __m256 quad = quad_sums(pair_sums(parts[0].v, parts[1].v), pair_sums(parts[2].v, parts[3].v));
+  _mm_storeu_ps(out, _mm256_castps256_ps128(quad) + _mm256_extractf128_ps(quad, 1));
+}
+template <int N>
+D2_INLINE void store_sums(const Floats* parts, float* out) {
+  for (int first = 0; first < N; first += 8) {
+    __m256 quads[2];
+    for (int q = 0; q < 2; q++) {
+      const auto part = [&](int i) { return first + 4 * q + i < N ? parts[first + 4 * q + i].v : _mm256_setzero_ps(); };
+      quads[q] = quad_sums(pair_sums(part(0), part(1)), pair_sums(part(2), part(3)));
+    }
+    const __m256 low = _mm256_permute2f128_ps(quads[0], quads[1], 0x20);
+    Floats(low + _mm256_permute2f128_ps(quads[0], quads[1], 0x31)).store(out + first);
+  }
+}
+#else
+template <int N>
+D2_INLINE void store_sums(const Floats* parts, float* out) {
+  for (int i = 0; i < N; i++) out[i] = sum(parts[i]);
+}
+D2_INLINE void store_quad(const Floats* parts, float* out) { store_sums<4>(parts, out); }
+#endif
+
 }  // namespace d2
