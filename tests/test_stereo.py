@@ -123,7 +123,17 @@ def test_the_depth_range_comes_from_points_then_the_data_set_then_the_baselines(
     truth = np.concatenate([pair.depth(name, 0).ravel() for name in pair.cameras])
     assert wide.near < truth.min()
     assert wide.far > truth.max()
-    assert "baselines" in wide.origin
+    assert "cameras alone" in wide.origin
+
+
+def test_cameras_that_look_at_each_other_across_a_room_have_a_range_that_holds_it() -> None:
+    """At wide angles disparity says nothing about the near end, but the frusta do."""
+    room = synthetic_capture(cameras=3, held_out=0, frames=1, width=160, height=90, arc_degrees=120)
+    cameras = [replace(camera, near_far=None) for camera in room.cameras.values()]
+    bounds = depth_bounds(cameras)
+    truth = np.concatenate([room.depth(name, 0).ravel() for name in room.cameras])
+    assert 0.05 * truth.min() < bounds.near < truth.min()
+    assert bounds.far > truth.max()
 
 
 def test_points_behind_or_beside_the_camera_do_not_count(pair: Capture) -> None:

@@ -178,7 +178,7 @@ def _judge(
         return AlignStatus.FLAT if fit.flat else AlignStatus.BOUNDARY
     if not fit.gap <= settings.max_gap:
         return AlignStatus.NOT_CERTIFIED
-    if t < settings.min_t:
+    if t < settings.min_t and correlation < settings.min_correlation:
         return AlignStatus.UNSTABLE
     if inliers < settings.min_inliers:
         return AlignStatus.FEW_INLIERS

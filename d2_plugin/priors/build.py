@@ -133,7 +133,7 @@ class _Builder:
         self.bounds: DepthBounds | None = None
         self.geometric: GeometricSource | None = None
         if len(names) > 1:
-            self.bounds = _rounded(depth_bounds(self.cameras, points), settings.depth_range)
+            self.bounds = _rounded(depth_bounds(self.cameras, points, settings.stereo.max_angle), settings.depth_range)
             folder = output / "cache" / "stereo"
             self.geometric = GeometricSource(
                 self.cameras, self.bounds, settings.stereo, folder, capture.frames, self.read

@@ -104,7 +104,11 @@ class AlignSettings:
     max_gap: float = 1e-8
     """Relative duality gap above which a fit is refused; every case measured stops below 1e-10."""
     min_t: float = 10.0
-    """Scale over its standard error; measured: clean 2e4, 60 % outliers 80, unrelated maps 0.7."""
+    """Scale over its standard error below which a fit needs `min_correlation`; measured: clean 2e4, 60 % outliers 80,
+    unrelated maps 0.7."""
+    min_correlation: float = 0.5
+    """Rank correlation that speaks for a scale whose standard error does not: on pose2sim_single one view has t = 4 and
+    t = 69 in two successive frames, at .87 and .86."""
     inlier_error: float = 0.1
     """Relative discrepancy e below which an anchor counts as an inlier of the fit."""
     min_inliers: float = 0.3

@@ -12,7 +12,7 @@ import numpy as np
 from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.filter import GeometricDepth, filter_depths
-from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera
+from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera, view_pair, viewing_rays
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.static import MatchMemory, widened
 
@@ -110,12 +110,16 @@ def gray(image: np.ndarray) -> np.ndarray:
     return np.rint(image.astype(np.float32) @ LUMA).astype(np.uint8)
 
 
-def depth_bounds(cameras: Sequence[Camera], points: np.ndarray | None = None) -> DepthBounds:
-    """Depth range of a rig: from triangulated points, else from what the data set declares, else from the baselines.
+def depth_bounds(
+    cameras: Sequence[Camera], points: np.ndarray | None = None, max_angle: float = StereoSettings.max_angle
+) -> DepthBounds:
+    """Depth range of a rig: from triangulated points, else from what the data set declares, else from the cameras.
 
     Args:
         cameras: the cameras that are matched.
         points: world points [N, 3] triangulated with the known poses, or None.
+        max_angle: what two cameras see at a wider angle than this cannot be matched, degrees; it bounds the near end
+            where nothing else does.
 
     Raises:
         D2Error: nothing tells a range, because all cameras stand at one point.
@@ -131,20 +135,37 @@ def depth_bounds(cameras: Sequence[Camera], points: np.ndarray | None = None) ->
     if declared:
         near, far = min(bounds[0] for bounds in declared), max(bounds[1] for bounds in declared)
         return DepthBounds(*check_depth_range((near * 0.8, far * 1.2)), "near and far of the data set")
-    return _bounds_from_baselines(cameras)
+    return _bounds_from_baselines(cameras, max_angle)
 
 
-def _bounds_from_baselines(cameras: Sequence[Camera]) -> DepthBounds:
-    """From a disparity of three quarters of the picture for the nearest pair to half a pixel for the farthest."""
+def _bounds_from_baselines(cameras: Sequence[Camera], max_angle: float) -> DepthBounds:
+    """From where two cameras begin to see something alike to half a pixel of disparity between the farthest pair."""
     centres = np.stack([camera.centre for camera in cameras])
     distances = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
-    apart = distances[distances > 0]
-    if apart.size == 0:
+    if not distances.any():
         names = ", ".join(camera.name for camera in cameras)
         raise D2Error(f"cameras {names} stand at one point, so nothing can be triangulated: use cameras that are apart")
-    focal = max(float(camera.K[0, 0]) for camera in cameras)
-    near = min(float(camera.K[0, 0]) / camera.width for camera in cameras) * apart.min() / 0.75
-    return DepthBounds(float(near), float(focal * apart.max() / 0.5), "baselines alone, so it is very wide")
+    far = max(float(camera.K[0, 0]) for camera in cameras) * float(distances.max()) / 0.5
+    pairs = [(a, b) for i, a in enumerate(cameras) for j, b in enumerate(cameras) if distances[i, j] > 0]
+    nearest = np.concatenate([_first_shared_depths(reference, source, far, max_angle) for reference, source in pairs])
+    if nearest.size == 0:
+        return DepthBounds(far / 1e4, far, "baselines alone, and no two cameras see the same")
+    return DepthBounds(float(np.percentile(nearest, 2)), far, "the cameras alone, so it is very wide")
+
+
+def _first_shared_depths(reference: Camera, source: Camera, far: float, max_angle: float) -> np.ndarray:
+    """Depths from which on both see the same at less than `max_angle`, over a grid of pixels; empty where never."""
+    depths = np.geomspace(far * 1e-6, far, 400)[:, None]
+    grid = scaled_camera(reference, 9, 9)
+    pair = view_pair(grid, source)
+    u, v = np.meshgrid(np.arange(9.0), np.arange(9.0))
+    at = pair.project(u.reshape(1, -1), v.reshape(1, -1), depths)
+    seen = (at.z > 0) & (at.x > -0.5) & (at.y > -0.5) & (at.x < source.width - 0.5) & (at.y < source.height - 0.5)
+    points = viewing_rays(grid, np.float64).reshape(1, -1, 3) * depths[..., None]
+    away = points - pair.direction
+    cosine = (points * away).sum(-1) / (np.linalg.norm(points, axis=-1) * np.linalg.norm(away, axis=-1))
+    alike = seen & (cosine > np.cos(np.deg2rad(max_angle)))
+    return depths[alike.argmax(axis=0), 0][alike.any(axis=0)]
 
 
 def _visible_depths(camera: Camera, points: np.ndarray) -> np.ndarray:
