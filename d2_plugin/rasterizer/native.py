@@ -91,16 +91,26 @@ def library() -> ctypes.CDLL:
     return kernels
 
 
-@functools.cache
 def available() -> bool:
     """Whether the kernels can be had; warns once where they cannot for want of a compiler."""
+    global _available
+    # A plain variable and no functools.cache: torch.compile looks through the one but into the other.
+    if _available is None:
+        _available = _try_library()
+    return _available
+
+
+_available: bool | None = None
+
+
+def _try_library() -> bool:
     try:
         library()
     except NoCompiler as error:
         warnings.warn(
             f"{error}. Until then splatting runs in plain torch: the same images and gradients, but orders of "
             "magnitude slower and with much more memory.",
-            stacklevel=3,
+            stacklevel=4,
         )
         return False
     return True
