@@ -347,3 +347,10 @@ def test_settings_come_from_tables_and_unknown_names_are_refused() -> None:
         PriorSettings.from_dict({"stereo": {"makers": "sweep"}})
     with pytest.raises(D2Error, match="did you mean 'tau_c'"):
         PriorSettings.from_dict({"tauc": 0.2})
+    with pytest.raises(D2Error, match=r"setting tau_c in \[priors\] must be float as 0.1, got 'small'"):
+        PriorSettings.from_dict({"tau_c": "small"})
+    with pytest.raises(D2Error, match="speckle_size .* must be int"):
+        PriorSettings.from_dict({"stereo": {"speckle_size": True}})
+    with pytest.raises(D2Error, match="stereo must be a table"):
+        PriorSettings.from_dict({"stereo": "sweep"})
+    assert PriorSettings.from_dict({"tau_c": 1}).tau_c == 1

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from d2_plugin.captures.capture import MonoKind
-from d2_plugin.errors import unknown_name
+from d2_plugin.errors import D2Error, unknown_name
 
 
 @dataclass(frozen=True)
@@ -168,17 +168,31 @@ class PriorSettings:
         """From a table as TOML gives it, with the tables `stereo` and `align` inside; what is absent keeps its default.
 
         Raises:
-            D2Error: an unknown name, with the nearest one suggested.
+            D2Error: an unknown name, with the nearest one suggested, or a value of another type than the default's.
         """
         tables = {"stereo": StereoSettings, "align": AlignSettings}
-        known = {name: kind(**_known(kind, name, values[name])) for name, kind in tables.items() if name in values}
-        plain = _known(cls, "priors", {name: value for name, value in values.items() if name not in tables})
-        return cls(**plain, **known)
+        inner = {name: kind(**_known(kind, name, values[name])) for name, kind in tables.items() if name in values}
+        return cls(**_known(cls, "priors", {name: values[name] for name in values if name not in tables}), **inner)
 
 
-def _known(kind: type, table: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    names = [entry.name for entry in fields(kind)]
-    for name in values:
-        if name not in names:
-            raise unknown_name(f"setting in [{table}]", name, names)
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+def _known(kind: type, table: str, values: Any) -> dict[str, Any]:
+    """The entries of a table as arguments of the dataclass `kind`; lists become tuples."""
+    if not isinstance(values, Mapping):
+        raise D2Error(f"{table} must be a table of settings, got {values!r}: write [priors.{table}] above them")
+    defaults = {entry.name: entry.default for entry in fields(kind)}
+    arguments = {}
+    for name, value in values.items():
+        if name not in defaults:
+            raise unknown_name(f"setting in [{table}]", name, defaults)
+        arguments[name] = tuple(value) if isinstance(value, list) else value
+        expected = type(defaults[name])
+        if expected in (bool, int, float, str, tuple) and not _fits(arguments[name], expected):
+            like = f"{expected.__name__} as {defaults[name]!r}"
+            raise D2Error(f"setting {name} in [{table}] must be {like}, got {value!r}: correct it or leave it out")
+    return arguments
+
+
+def _fits(value: Any, expected: type) -> bool:
+    if expected is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, expected) and (expected is bool or not isinstance(value, bool))
