@@ -91,6 +91,7 @@ def _add_priors(commands: Any) -> None:
     parser = _command(commands, "priors", _priors, "Build the depth prior of a recording; finished frames are kept.")
     _add_capture_options(parser)
     parser.add_argument("--output", type=Path, required=True, help="folder of the prior store")
+    parser.add_argument("--shard", type=_shard, default=None, help="build part I of N only, as I/N with I from 1 to N")
 
 
 def _add_plan(commands: Any) -> None:
@@ -127,6 +128,16 @@ def _frames(text: str) -> tuple[int, ...]:
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is not first:last or first:last:step") from None
     return tuple(range(first, last + 1, *step))
+
+
+def _shard(text: str) -> tuple[int, int]:
+    try:
+        part, count = (int(number) for number in text.split("/"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not I/N, as in 1/4") from None
+    if not 1 <= part <= count:
+        raise argparse.ArgumentTypeError(f"part {part} of {count} does not exist: parts are 1 to {count}")
+    return part - 1, count
 
 
 def _hooks(text: str) -> tuple[str, ...]:
@@ -205,6 +216,8 @@ def _compare(options: argparse.Namespace) -> None:
 
 
 def _priors(options: argparse.Namespace) -> None:
+    from d2_plugin.priors.sheet import contact_sheet
+    from d2_plugin.priors.store import PriorStore
     from d2_plugin.study.run import build_priors_for
     from d2_plugin.study.scene import triangulated_points
     from d2_plugin.study.settings import Scene, check
@@ -213,7 +226,11 @@ def _priors(options: argparse.Namespace) -> None:
     scene = Scene.open(settings)
     _print_plan(scene.plan)
     points = triangulated_points(scene.capture, scene.train_cameras)["positions"]
-    print(build_priors_for(settings, scene, points, options.output))
+    print(build_priors_for(settings, scene, points, options.output, options.shard))
+    if options.shard is None:
+        sheet = options.output / "contact_sheet.png"
+        contact_sheet(PriorStore.open(options.output), scene.capture, sheet)
+        print(f"look at {sheet}")
 
 
 def _plan(options: argparse.Namespace) -> None:

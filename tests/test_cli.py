@@ -110,6 +110,20 @@ def test_evaluating_again_gives_the_same_scores(finished: Path) -> None:
     assert after["per_view"] == before["per_view"]
 
 
+def test_priors_are_built_in_parts_and_shown_on_a_sheet(
+    capture: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    build = ["priors", str(capture), "--train-cameras", CAMERAS, "--output", str(tmp_path)]
+    assert main([*build, "--shard", "2/2"]) == 0
+    assert not (tmp_path / "contact_sheet.png").exists()
+    assert main(build) == 0
+    assert "verified" in capsys.readouterr().out
+    assert (tmp_path / "contact_sheet.png").is_file()
+    whole, joined = PriorStore.open(finished / "priors"), PriorStore.open(tmp_path)
+    for camera in CAMERAS.split(","):
+        assert np.array_equal(whole.prior(camera, 1).depth, joined.prior(camera, 1).depth)
+
+
 def test_compare_tabulates_what_was_measured(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", str(finished)]) == 0
     header, _, row = capsys.readouterr().out.splitlines()

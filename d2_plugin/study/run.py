@@ -202,8 +202,13 @@ class Run:
             self.seconds[name] += time.monotonic() - start
 
 
-def build_priors_for(settings: RunSettings, scene: Scene, points: np.ndarray, folder: Path) -> Any:
-    """Build what is missing of the depth prior in `folder`; `points` [P, 3] bound the depths that are searched."""
+def build_priors_for(
+    settings: RunSettings, scene: Scene, points: np.ndarray, folder: Path, shard: tuple[int, int] | None = None
+) -> Any:
+    """Build what is missing of the depth prior in `folder`; `points` [P, 3] bound the depths that are searched.
+
+    `shard` (index from 0, count) builds one part of it, which any scheduler may run beside the others.
+    """
     from d2_plugin.priors.build import build_priors
 
     with progress_bar("priors", len(scene.capture.frames) * len(scene.train_cameras)) as bar:
@@ -214,6 +219,7 @@ def build_priors_for(settings: RunSettings, scene: Scene, points: np.ndarray, fo
             prior_settings(settings),
             sparse_points=points,
             progress=lambda done, total, note="": bar.update(done, note),
+            shard=shard,
         )
 
 
