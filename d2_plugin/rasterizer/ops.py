@@ -9,10 +9,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
+from d2_plugin.protocol import DepthPrior, Label, RasterSettings, Render, Splats, Survey, View
 
 from . import cuda, native
 
@@ -47,10 +48,18 @@ def rasterize(
 def survey(splats: Splats, view: View, prior: DepthPrior, settings: RasterSettings, eps: float) -> Survey:
     """See `d2_plugin.rasterizer.survey`; float32."""
     means, covariances, opacities, _ = splats
-    depth, verified = prior.depth.to(means).contiguous(), prior.verified.to(means.device).contiguous()
+    depth, verified = prior.depth.to(means).contiguous(), _verified(prior.labels).to(means.device).contiguous()
     camera = (view.T_camera_world, view.K)
     parts = (means.contiguous(), covariances.contiguous(), opacities.contiguous())
     return Survey(*_survey(*parts, depth, verified, *camera, _constants(settings), eps))
+
+
+def _verified(labels: Tensor) -> Tensor:
+    """`DepthPrior.verified`; by numpy on the CPU, since torch would wake its own threads for a microsecond of work and
+    wait for them, which takes milliseconds where the cores are busy."""
+    if labels.device.type == "cpu":
+        return torch.from_numpy(np.equal(labels.numpy(), Label.VERIFIED))
+    return labels == Label.VERIFIED
 
 
 def _constants(settings: RasterSettings) -> list[float]:
