@@ -6,18 +6,16 @@ import argparse
 import json
 import logging
 import math
-import platform
 import shlex
-import subprocess
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from d2_plugin import __version__
 from d2_plugin.errors import D2Error, MissingExtra, missing_extra
 
+from .provenance import circumstances, provenance
 from .raster_measure import Case, error_of, exact, implementations, passes_of, peak_memory, timed
 
 logger = logging.getLogger(__name__)
@@ -100,40 +98,11 @@ def _measure(
                 "passes": {kind: timed(work, device, seconds) for kind, work in passes.items()},
                 "error": error_of(render, scene, device, truth) if truth else None,
                 "peak_mb": peak_memory(case, name, device) if memory else None,
-                **_circumstances(device),
+                **circumstances(device),
             }
         )
         logger.info("%s, %s at %dx%d is measured", name, *case[:3])
     return rows
-
-
-def _circumstances(device: torch.device) -> dict[str, Any]:
-    return {
-        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _cpu_name(),
-        "threads": torch.get_num_threads(),
-        "version": __version__,
-        "commit": _commit(),
-        "torch": torch.__version__,
-    }
-
-
-def _cpu_name() -> str:
-    info = Path("/proc/cpuinfo")
-    for line in info.read_text().splitlines() if info.exists() else ():
-        if line.startswith("model name"):
-            return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
-
-
-def _commit() -> str | None:
-    """The commit of a checkout (with + where files differ from it), None for an installed package."""
-    try:
-        options = {"cwd": Path(__file__).parent, "capture_output": True, "text": True, "check": True}
-        commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], **options).stdout.strip()
-        changed = subprocess.run(["git", "status", "--porcelain", "--", "."], **options).stdout
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return commit + ("+" if changed else "")
 
 
 def exponent(points: Sequence[tuple[float, float]]) -> float | None:
@@ -162,13 +131,8 @@ def _caption(rows: Sequence[dict[str, Any]]) -> str:
         "Median wall time and half the interquartile range in ms; CPU ms is the CPU time of one forward+backward over "
         "all threads; peak MB is what one forward+backward takes beyond its inputs. Error against float64: absolute "
         "for color (0..1), relative L2 for gradients; pixels apart are the share where a threshold was decided "
-        f"differently, gradients are without them. {_provenance(rows[0])}"
+        f"differently, gradients are without them. {provenance(rows[0])}"
     )
-
-
-def _provenance(row: dict[str, Any]) -> str:
-    where = f"{row['device']}, {row['threads']} threads, torch {row['torch']}"
-    return f"{where}, commit {row['commit'] or row['version']}, `{row['command']}`."
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
@@ -244,7 +208,7 @@ def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
             axes.set(xscale="log", yscale="log")
             axes.grid(True, which="both", alpha=0.3)
             axes.legend(fontsize=7)
-    figure.supxlabel(_provenance(rows[0]), fontsize=6, wrap=True)
+    figure.supxlabel(provenance(rows[0]), fontsize=6, wrap=True)
     figure.savefig(path, metadata={"Date": None})
 
 

@@ -1,0 +1,49 @@
+"""Where a figure comes from: the machine, the versions and the commit that every row of a measurement carries."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from pathlib import Path
+
+import torch
+
+from d2_plugin import __version__
+
+
+def circumstances(device: torch.device | str = "cpu") -> dict[str, str | int | None]:
+    """Device, threads, versions and commit, for a row of results."""
+    device = torch.device(device)
+    return {
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name(),
+        "threads": torch.get_num_threads(),
+        "version": __version__,
+        "commit": commit(),
+        "torch": torch.__version__,
+    }
+
+
+def provenance(row: dict) -> str:
+    """One sentence for a caption, from a row that has what `circumstances` gives and the `command`."""
+    where = f"{row['device']}, {row['threads']} threads, torch {row['torch']}"
+    return f"{where}, commit {row['commit'] or row['version']}, `{row['command']}`."
+
+
+def cpu_name() -> str:
+    """What the processor calls itself."""
+    info = Path("/proc/cpuinfo")
+    for line in info.read_text().splitlines() if info.exists() else ():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def commit() -> str | None:
+    """The commit of a checkout (with + where files differ from it), None for an installed package."""
+    try:
+        options = {"cwd": Path(__file__).parent, "capture_output": True, "text": True, "check": True}
+        found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], **options).stdout.strip()
+        changed = subprocess.run(["git", "status", "--porcelain", "--", ".."], **options).stdout
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return found + ("+" if changed else "")
