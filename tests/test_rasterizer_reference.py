@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -174,6 +175,7 @@ def bad(scene: Scene, **changes: object) -> tuple:
         ({"background": torch.zeros(4, dtype=torch.float64)}, "background has shape"),
         ({"screen_offsets": torch.zeros(1, 3, dtype=torch.float64)}, "screen_offsets has shape"),
         ({"view": make_view(0, 5)}, "view is 0x5 pixels"),
+        ({"view": dataclasses.replace(make_view(5, 5), K=torch.eye(4))}, r"K \(4, 4\), expected"),
         ({"settings": RasterSettings(alpha_min=0.0)}, "alpha_min > 0"),
     ],
 )

@@ -118,7 +118,10 @@ def _check(splats: Splats, view: View, settings: RasterSettings, **extra: Tensor
             raise D2Error(f"{name} is {tensor.dtype}, expected one dtype for all, float32 or float64: convert it")
         if tensor.device != splats.means.device:
             raise D2Error(f"{name} is on {tensor.device} but means is on {splats.means.device}: move it there")
-    if view.width < 1 or view.height < 1:
-        raise D2Error(f"view is {view.width}x{view.height} pixels, expected at least 1x1")
+    if not (1 <= view.width <= 65535 and 1 <= view.height <= 65535):
+        raise D2Error(f"view is {view.width}x{view.height} pixels, expected 1 to 65535 each way")
+    if view.T_camera_world.shape != (4, 4) or view.K.shape != (3, 3):
+        pose, K = tuple(view.T_camera_world.shape), tuple(view.K.shape)
+        raise D2Error(f"T_camera_world has shape {pose} and K {K}, expected (4, 4) and (3, 3)")
     if not (settings.near > 0 and settings.alpha_min > 0 and 0 < settings.alpha_max < 1):
         raise D2Error(f"{settings} needs near > 0, alpha_min > 0 and 0 < alpha_max < 1: a division by zero otherwise")
