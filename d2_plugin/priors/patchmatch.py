@@ -45,8 +45,8 @@ SMALLEST_SIDE = 12
 CONSENSUS_RADIUS = 3
 """Half the side of the window over which planes are averaged, pixels."""
 
-GEOMETRIC_SWEEPS = 2
-"""Red-black sweeps of one geometric round."""
+GEOMETRIC_SWEEPS = 1
+"""Red-black sweeps of one geometric round; a second one costs as much and changes mean F at 1 % by less than .001."""
 
 BEST_ANGLE = 10.0
 """Angle between viewing rays, degrees, that sources are preferred for: wider ones match worse, narrower ones tell
@@ -117,7 +117,7 @@ def patchmatch(
         grays: uint8 [H, W] per camera, synchronized.
         cameras: at least two, in the same order.
         depth_range: near and far in world units; ten times too wide does no harm.
-        settings: the `patchmatch_*` fields, `min_angle` and `seed` are used; defaults where None.
+        settings: the `patchmatch_*` fields, `min_angle`, `max_angle` and `seed` are used; defaults where None.
         wanted: bool [H, W] per camera, pixels whose depth is asked for; all where None. Others may have no depth.
 
     Returns:
@@ -134,10 +134,10 @@ def patchmatch(
     _check(grays, settings)
     sources = [choose_sources(index, cameras, (near, far), settings) for index in range(len(cameras))]
     matcher = _Matcher(sources, (near, far), settings)
+    masks = wanted or [None] * len(cameras)
     views: list[_View] = []
     for level, (divisor, rounds) in enumerate(_levels(cameras, settings.patchmatch_rounds)):
         coarser = views or [None] * len(cameras)
-        masks = wanted or [None] * len(cameras)
         views = [_at_resolution(*view, divisor) for view in zip(grays, cameras, coarser, masks)]
         for index in range(len(views)):
             # Once planes are handed down from a coarser level, random ones are hardly ever better.
@@ -156,8 +156,9 @@ def choose_sources(
 ) -> list[int]:
     """Which other cameras view `index` is matched with, best first, at most `settings.patchmatch_sources`.
 
-    Points of the view frustum are tried: a source counts for each point that it sees at an angle above `min_angle`, the
-    more the nearer (by ratio) that angle is to `BEST_ANGLE`. A camera at the same place counts for nothing.
+    Points of the view frustum are tried: a source counts for each point that it sees at an angle between `min_angle`
+    and `max_angle`, the more the nearer (by ratio) that angle is to `BEST_ANGLE`. Outside of them the filter confirms
+    nothing, so a camera at the same place or one that looks from the other side is never matched.
     """
     grid = scaled_camera(cameras[index], 12, 8)
     u, v = pixel_grid(grid)
@@ -172,7 +173,7 @@ def choose_sources(
             at = pair.project(u, v, depth)
             seen = (at.z > 0) & (at.x > -0.5) & (at.y > -0.5) & (at.x < source.width) & (at.y < source.height)
             angle = np.rad2deg(triangulation_angle(grid, pair, depth))
-            useful = seen & (angle > settings.min_angle)
+            useful = seen & (angle > settings.min_angle) & (angle < settings.max_angle)
             ratio = np.log(np.where(useful, angle, BEST_ANGLE) / BEST_ANGLE) / np.log(3)
             worth[other] += float((useful * np.exp(-0.5 * ratio**2)).sum())
     ranked = sorted((other for other in worth if worth[other] > 0), key=lambda other: -worth[other])
@@ -223,7 +224,8 @@ class _Matcher:
             int(np.random.SeedSequence([self.settings.seed, stage, index]).generate_state(1)[0]),
             None if view.wanted is None else view.wanted.ctypes.data,
         )
-        self.library.d2_patchmatch(ctypes.byref(task), _pointer(view.planes), _pointer(view.cost))
+        chosen = np.zeros(view.gray.shape, np.uint32)
+        self.library.d2_patchmatch(ctypes.byref(task), _pointer(view.planes), _pointer(view.cost), _pointer(chosen))
         view.known |= view.cost < NO_MATCH
 
     def average(self, view: _View) -> None:

@@ -51,7 +51,7 @@ class StereoSettings:
     texture_min: float = 0.005
     """A depth survives where the grey value's standard deviation in the window exceeds this, in 0..1. Coherence tells
     wrong matches better, so only windows without any texture are refused; OpenMVS, without it, asks for .02."""
-    coherence_min: float = 0.55
+    coherence_min: float = 0.57
     """A depth survives when this share of its neighbours lies on its tangent plane; 0 switches the test off."""
     coherence_radius: int = 9
     """Half the side of the window whose pixels are asked for coherence, pixels."""

@@ -97,9 +97,9 @@ void parallel_rows(int rows, int threads, const Work& work) {
 // Everything that is known about one reference view while its planes spread.
 class Matcher {
  public:
-  Matcher(const Task& task, Plane* planes, float* costs)
+  Matcher(const Task& task, Plane* planes, float* costs, uint32_t* views)
       : task_(task), window_(task.contrast), width_(task.reference.width), height_(task.reference.height),
-        planes_(planes), costs_(costs), views_(size_t(width_) * height_) {}
+        planes_(planes), costs_(costs), views_(views) {}
 
   void initialise_row(int y) {
     for (int x = 0; x < width_; x++) initialise(x, y);
@@ -300,7 +300,7 @@ class Matcher {
   const int width_, height_;
   Plane* planes_;
   float* costs_;
-  std::vector<uint32_t> views_;  // bit s: source s was selected
+  uint32_t* views_;  // bit s: source s was selected
 };
 
 // The mean of the neighbours' planes that pass within `tolerance` of the pixel's own inverse depth, weighted by
@@ -330,9 +330,9 @@ Plane consensus(const Picture& picture, const Window& window, const Plane* plane
 extern "C" {
 
 // Match one view. planes [H, W, 3] are read unless task.draw_planes, then written; costs [H, W] are written: 1 - NCC in
-// 0..2, plus the geometric term where there is one.
-void d2_patchmatch(const Task* task, float* planes, float* costs) {
-  Matcher matcher(*task, reinterpret_cast<Plane*>(planes), costs);
+// 0..2, plus the geometric term where there is one. views [H, W] is zeros, for the sources that each pixel selects.
+void d2_patchmatch(const Task* task, float* planes, float* costs, uint32_t* views) {
+  Matcher matcher(*task, reinterpret_cast<Plane*>(planes), costs, views);
   const int rows = task->reference.height;
   parallel_rows(rows, task->threads, [&](int y) { matcher.initialise_row(y); });
   for (int round = 0; round < task->rounds; round++) {
