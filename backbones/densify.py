@@ -1,4 +1,4 @@
-"""The backbone's own adaptive density control, as 3D Gaussian Splatting does it, on 4D Gaussians."""
+"""The backbones' own adaptive density control, as 3D Gaussian Splatting does it, on Gaussians with and without time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from .gaussians import Gaussians
-from .rotation4d import normalized_quaternions, rotation_matrices_3d, rotation_matrices_4d
 
 
 class Growable(Protocol):
@@ -20,6 +19,7 @@ class Growable(Protocol):
     extent: float
 
     def __len__(self) -> int: ...
+    def rotations(self, rows: Mapping[str, Tensor]) -> Tensor: ...
     def append(self, rows: Mapping[str, Tensor]) -> None: ...
     def select(self, index: Tensor) -> None: ...
 
@@ -80,7 +80,7 @@ def grow(model: Growable, settings: DensifySettings, generator: torch.Generator)
     raw = {name: value.detach() for name, value in model.gaussians.parameters.items()}
     rows = {name: torch.cat([value[cloned], value[split], value[split]]) for name, value in raw.items()}
     children = slice(len(cloned), None)
-    _scatter_children(rows, children, generator)
+    _scatter_children(model, rows, children, generator)
     if len(rows["positions"]):
         model.append(rows)
         keep = torch.ones(len(model), dtype=torch.bool, device=split.device)
@@ -98,19 +98,15 @@ def prune(model: Growable, settings: DensifySettings) -> None:
         model.select(torch.nonzero(keep).squeeze(-1))
 
 
-def _scatter_children(rows: dict[str, Tensor], children: slice, generator: torch.Generator) -> None:
+def _scatter_children(model: Growable, rows: dict[str, Tensor], children: slice, generator: torch.Generator) -> None:
     """Move split children to samples of their parent Gaussian (in 4D where there is time) and shrink them by 1.6."""
+    parents = {name: value[children] for name, value in rows.items()}
     temporal = "times" in rows
-    left = normalized_quaternions(rows["left"][children].T)
-    scales = rows["log_scales"][children].exp()
+    scales = parents["log_scales"].exp()
     if temporal:
-        right = normalized_quaternions(rows["right"][children].T)
-        scales = torch.cat([scales, rows["log_time_scales"][children].exp()[:, None]], -1)
-        rotation = rotation_matrices_4d(left, right)
-    else:
-        rotation = rotation_matrices_3d(left)
+        scales = torch.cat([scales, parents["log_time_scales"].exp()[:, None]], -1)
     noise = torch.randn(scales.shape, generator=generator, dtype=scales.dtype).to(scales.device)
-    offset = (rotation * (scales * noise).T).sum(1).T
+    offset = (model.rotations(parents) * (scales * noise).T).sum(1).T
     rows["positions"][children] += offset[:, :3]
     rows["log_scales"][children] -= torch.log(torch.tensor(1.6))
     if temporal:

@@ -1,6 +1,6 @@
 """The slice of a 4D model at an instant, forward and backward, in `kernels/slice4d.cpp`.
 
-The same mathematics as `reference_slice` of yang4d.py, some twenty times faster on a CPU: one pass over the parameters
+The same mathematics as `reference_slice` of slicing.py, some twenty times faster on a CPU: one pass over the parameters
 each way instead of a hundred torch operations. Compiled at first use; runs on `torch.get_num_threads()` threads, and
 results are the same bits for any number of them.
 """

@@ -13,7 +13,8 @@ from d2_plugin.backbones import spherical_harmonics as sh
 from d2_plugin.backbones.densify import DensifySettings, grow, prune
 from d2_plugin.backbones.gaussians import Gaussians
 from d2_plugin.backbones.photometric import photometric_loss, ssim
-from d2_plugin.backbones.yang4d import Yang4DSettings, create, nearest_neighbour_scales
+from d2_plugin.backbones.starting import nearest_neighbour_scales
+from d2_plugin.backbones.yang4d import Yang4DSettings, create
 from d2_plugin.study.metrics import ssim_3dgs
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from d2_plugin import D2Error
 from d2_plugin.backbones import native_slice as kernel
 from d2_plugin.backbones.native_slice import STATIC, TEMPORAL, native_slice
-from d2_plugin.backbones.yang4d import LOG_SCALE_LIMIT, MARGINAL_CUT, reference_slice
+from d2_plugin.backbones.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, reference_slice
 
 AT, CONSTANTS = 0.5, (MARGINAL_CUT, LOG_SCALE_LIMIT)
 OUTPUTS = ("means", "covariances", "opacities")

@@ -1,4 +1,4 @@
-// Gaussians of a 4D model at an instant, forward and backward: what `reference_slice` of yang4d.py does in torch.
+// Gaussians of a 4D model at an instant, forward and backward: what `reference_slice` of slicing.py does in torch.
 //
 // LANES Gaussians at a time, one per lane; rows of the parameters are turned into columns on the way in and back on the
 // way out. Nothing is saved between the passes: computing a Gaussian again is cheaper than reading it from memory.

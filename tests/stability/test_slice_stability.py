@@ -17,7 +17,7 @@ from d2_plugin import D2Error
 from d2_plugin.backbones import native_slice as kernel
 from d2_plugin.backbones.native_slice import native_slice
 from d2_plugin.backbones.rotation4d import condition_on_time, normalized_quaternions, rotation_matrices_4d
-from d2_plugin.backbones.yang4d import reference_slice
+from d2_plugin.backbones.slicing import reference_slice
 from d2_plugin.rasterizer import Splats, rasterize
 
 PATHS = {

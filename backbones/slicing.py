@@ -1,0 +1,74 @@
+"""Raw parameters of 4D or 3D Gaussians to the 3D Gaussians of one instant, by the kernel or in torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from d2_plugin.rasterizer import Splats
+
+from .native_slice import can_slice, native_slice
+from .rotation4d import (
+    condition_on_time,
+    covariances_from_factors,
+    normalized_quaternions,
+    rotation_matrices_3d,
+    rotation_matrices_4d,
+    temporal_marginal,
+    time_row,
+)
+
+MARGINAL_CUT = 0.05
+"""A Gaussian whose temporal marginal F(t) is not above this is not drawn (forward.cu:334)."""
+
+LOG_SCALE_LIMIT = 30.0
+"""exp of a log-scale beyond +-this would leave the range where float32 squares are finite: such scales saturate."""
+
+
+def slice_gaussians(raw: Mapping[str, Tensor], time: float = 0.0) -> Splats:
+    """The 3D Gaussians at `time` (same unit as `times`), differentiable; for the raw tensors see `native_slice`."""
+    slice_in = native_slice if can_slice(raw) else reference_slice
+    return Splats(*slice_in(raw, time, MARGINAL_CUT, LOG_SCALE_LIMIT))
+
+
+def reference_slice(
+    raw: Mapping[str, Tensor], time: float, marginal_cut: float = MARGINAL_CUT, log_scale_limit: float = LOG_SCALE_LIMIT
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The slice in torch: any dtype and device, and the oracle of `native_slice`, which documents the arguments."""
+    if "times" not in raw:
+        factors = rotation_matrices_3d(unit_quaternions(raw["left"])) * _scales(raw["log_scales"], log_scale_limit)
+        rows = torch.arange(len(raw["positions"]), device=factors.device)
+        return raw["positions"], covariances_from_factors(factors), torch.sigmoid(raw["opacity_logits"]), rows
+    log_scales = torch.cat([raw["log_scales"], raw["log_time_scales"][:, None]], 1)
+    parts = (raw["positions"], log_scales, raw["left"], raw["right"], raw["opacity_logits"], raw["times"])
+    # A Gaussian outside its temporal support is never projected; without a gradient, none of it is 0 * inf.
+    with torch.no_grad():
+        axes = unit_quaternions(raw["left"]), unit_quaternions(raw["right"])
+        last = time_row(*axes) * _scales(log_scales, log_scale_limit)
+        rows = torch.nonzero(temporal_marginal(time - raw["times"], last.square().sum(0)) > marginal_cut).squeeze(-1)
+    if len(rows) < len(log_scales):
+        parts = tuple(part.index_select(0, rows) for part in parts)
+    positions, log_scales, left, right, logits, times = parts
+    rotation = rotation_matrices_4d(unit_quaternions(left), unit_quaternions(right))
+    factors = rotation * _scales(log_scales, log_scale_limit)
+    spatial, velocity = condition_on_time(factors)
+    offset = time - times
+    means = positions + (velocity * offset).T
+    opacities = torch.sigmoid(logits) * temporal_marginal(offset, factors[3].square().sum(0))
+    return means, covariances_from_factors(spatial), opacities, rows
+
+
+def unit_quaternions(rows: Tensor) -> Tensor:
+    """Unit quaternions [4, N], components first, from raw rows [N, 4]."""
+    return normalized_quaternions(_components(rows))
+
+
+def _scales(log_scales: Tensor, limit: float) -> Tensor:
+    return _components(log_scales).clamp(-limit, limit).exp()
+
+
+def _components(rows: Tensor) -> Tensor:
+    """[K, N] contiguous from [N, K]: what the functions of rotation4d work on."""
+    return rows.T.contiguous()

@@ -1,0 +1,78 @@
+"""What a backbone starts from: coloured points as isotropic Gaussians, and its settings from a plain table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.rasterizer import RasterSettings
+
+from . import spherical_harmonics as sh
+from .densify import DensifySettings
+from .model import SplatSettings
+
+Settings = TypeVar("Settings", bound=SplatSettings)
+
+
+def isotropic_rows(
+    positions: Tensor, colors: Tensor, scales: Tensor, opacities: Tensor, sh_degree: int, sh_time_degree: int = 0
+) -> dict[str, Tensor]:
+    """The raw rows that every backbone has: positions [K, 3], colors [K, 3] in 0..1, scales [K], opacities [K]."""
+    coefficients = sh.coefficients_from_rgb(colors, sh_degree, sh_time_degree)
+    rows = {
+        "positions": positions,
+        "log_scales": scales.log()[:, None].repeat(1, 3),
+        "opacity_logits": torch.logit(opacities, eps=1e-6),
+        "base_colors": coefficients[:, :1],
+    }
+    if coefficients.shape[1] > 1:
+        rows["harmonics"] = coefficients[:, 1:]
+    return rows
+
+
+def identity_quaternions(count: int, like: Tensor) -> Tensor:
+    """[count, 4], w first, with the dtype and device of `like`."""
+    identity = like.new_zeros(count, 4)
+    identity[:, 0] = 1
+    return identity
+
+
+def nearest_neighbour_scales(positions: Tensor, neighbours: int = 3) -> Tensor:
+    """Root mean square distance [N] to the nearest points, at least 1e-7; a lone point gets 1e-2.
+
+    With fewer than `neighbours` other points, those that there are count.
+    """
+    count = len(positions)
+    if count < 2:
+        return positions.new_full((count,), 1e-2)
+    k = min(neighbours, count - 1) + 1
+    chunks = [torch.cdist(chunk, positions).topk(k, largest=False).values for chunk in positions.split(1024)]
+    return torch.cat(chunks)[:, 1:].square().mean(-1).sqrt().clamp(min=1e-7)
+
+
+def settings_of(kind: type[Settings], table: Mapping[str, object], temporal: bool) -> Settings:
+    """Settings of a backbone from a plain table with tables "densify" and "raster" inside.
+
+    Raises:
+        D2Error: a name is unknown, or a table is none.
+    """
+    chosen = dict(table)
+    for name, part in (("densify", DensifySettings), ("raster", RasterSettings)):
+        chosen[name] = part(**_known(name, part, chosen.get(name, {})))
+    return kind(temporal=temporal, **_known("backbone", kind, chosen, {"temporal"}))
+
+
+def _known(name: str, kind: type, values: object, taken: set[str] = frozenset()) -> Mapping[str, object]:
+    """`values`, if they are a table of settings that `kind` has."""
+    if not isinstance(values, Mapping):
+        raise D2Error(f"backbone.{name} must be a table of settings, got {values!r}: write [backbone.{name}] above it")
+    known = {entry.name for entry in fields(kind)} - taken
+    for key in values:
+        if key not in known:
+            raise unknown_name(f"setting of {name}", key, known)
+    return values
