@@ -67,15 +67,17 @@ def test_bench_writes_rows_table_and_plot(tmp_path):
     sizes = ["--sizes", "24x16", "--seconds", "0", "--no-memory", "--output", str(tmp_path)]
     assert main(["--scenes", "synth:30", "synth:60", *sizes]) == 0
     rows = [json.loads(line) for line in (tmp_path / "raster.jsonl").read_text().splitlines()]
-    assert [(row["implementation"], row["gaussians"]) for row in rows] == [
+    assert [(row["method"], row["gaussians"]) for row in rows] == [
         *(("d2", 30), ("torch reference", 30)),
         *(("d2", 60), ("torch reference", 60)),
     ]
     for row in rows:
+        assert row["kind"] == "raster"
+        assert row["error"] == row["errors"]["color"]["p99.9"]
         assert row["passes"]["forward"]["repeats"] >= 3
         assert 0 < row["passes"]["forward+backward"]["min_ms"] <= row["passes"]["forward+backward"]["median_ms"]
-        assert 0 < row["error"]["color"]["max"] < 1e-3
-        assert 0 < row["error"]["grad covariances"]["relative_l2"] < 1e-3
+        assert 0 < row["errors"]["color"]["max"] < 1e-3
+        assert 0 < row["errors"]["grad covariances"]["relative_l2"] < 1e-3
         assert row["command"].startswith("d2 bench raster --scenes")
         assert not math.isnan(row["passes"]["forward"]["cpu_ms"])
     table = (tmp_path / "raster.md").read_text()
@@ -88,6 +90,7 @@ def test_beyond_the_limit_the_error_is_left_out_not_guessed(tmp_path):
     small = {"scenes": ["synth:20"], "sizes": ["16x16"], "seconds": 0}
     (row, _) = bench_raster(tmp_path, **small, error_limit=10, memory=False)
     assert row["error"] is None
+    assert row["errors"] is None
     assert "| - | - | - | - | - |" in (tmp_path / "raster.md").read_text()
 
 

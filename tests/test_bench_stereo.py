@@ -91,6 +91,7 @@ def test_bench_writes_rows_table_and_plot(tmp_path, monkeypatch: pytest.MonkeyPa
         ("sweep", "synthetic2", 96),
         ("sgbm", "synthetic2", 96),
     ]
+    assert all(row["kind"] == "stereo" and row["error"] == 1 - row["f1"] for row in rows)
     assert all(row["cpu"] > 0 and row["command"].startswith("d2 bench stereo --rigs") for row in rows)
     assert "| synthetic2 | 2 | 96x54 | sweep | default |" in (tmp_path / "stereo.md").read_text()
     assert (tmp_path / "stereo.svg").stat().st_size > 1000

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import math
 import shlex
@@ -15,8 +14,9 @@ import torch
 
 from d2_plugin.errors import D2Error, MissingExtra, missing_extra
 
-from .provenance import circumstances, provenance
+from .provenance import provenance
 from .raster_measure import Case, error_of, exact, implementations, passes_of, peak_memory, timed
+from .rows import append_rows, make_row
 
 logger = logging.getLogger(__name__)
 
@@ -57,12 +57,11 @@ def bench_raster(
     names = [*scenes, *(["garden"] if garden and "garden" not in scenes else [])]
     cases = [Case(name, *parse_size(size), garden) for name in names for size in sizes]
     rows = []
-    with (output / "raster.jsonl").open("w") as file:
-        for case in cases:
-            for row in _measure(case, torch.device(device), seconds, error_limit, memory):
-                rows.append({**row, "command": command})
-                file.write(json.dumps(rows[-1]) + "\n")
-                file.flush()
+    (output / "raster.jsonl").unlink(missing_ok=True)
+    for case in cases:
+        measured = _measure(case, torch.device(device), seconds, error_limit, memory, command)
+        append_rows(output / "raster.jsonl", measured)
+        rows += measured
     (output / "raster.md").write_text(table(rows))
     try:
         plot(rows, output / "raster.svg")
@@ -80,7 +79,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def _measure(
-    case: Case, device: torch.device, seconds: float, error_limit: int, memory: bool
+    case: Case, device: torch.device, seconds: float, error_limit: int, memory: bool, command: str
 ) -> list[dict[str, Any]]:
     scene = case.load()
     gaussians = len(scene.means)
@@ -88,18 +87,23 @@ def _measure(
     rows = []
     for name, render in implementations(device, gaussians).items():
         passes = passes_of(render, scene, device)
+        times = {kind: timed(work, device, seconds) for kind, work in passes.items()}
+        errors = error_of(render, scene, device, truth) if truth else None
         rows.append(
-            {
-                "implementation": name,
-                "scene": case.scene,
-                "width": case.width,
-                "height": case.height,
-                "gaussians": gaussians,
-                "passes": {kind: timed(work, device, seconds) for kind, work in passes.items()},
-                "error": error_of(render, scene, device, truth) if truth else None,
-                "peak_mb": peak_memory(case, name, device) if memory else None,
-                **circumstances(device),
-            }
+            make_row(
+                *("raster", f"{case.scene} at {case.width}x{case.height}", name),
+                error=errors["color"]["p99.9"] if errors else None,
+                seconds=times["forward+backward"]["median_ms"] / 1e3,
+                command=command,
+                device=device,
+                scene=case.scene,
+                width=case.width,
+                height=case.height,
+                gaussians=gaussians,
+                passes=times,
+                errors=errors,
+                peak_mb=peak_memory(case, name, device) if memory else None,
+            )
         )
         logger.info("%s, %s at %dx%d is measured", name, *case[:3])
     return rows
@@ -140,10 +144,10 @@ def _cells(row: dict[str, Any]) -> list[str]:
         found = row["passes"].get(kind)
         return f"{found['median_ms']:.2f} ± {found['iqr_ms'] / 2:.2f}" if found else "-"
 
-    cells = [row["implementation"], row["scene"], f"{row['width']}x{row['height']}", *map(milliseconds, PASSES)]
+    cells = [row["method"], row["scene"], f"{row['width']}x{row['height']}", *map(milliseconds, PASSES)]
     cells += [f"{row['passes']['forward+backward']['cpu_ms']:.2f}"]
     cells += ["-" if row["peak_mb"] is None else f"{row['peak_mb']:.0f}"]
-    error = row["error"]
+    error = row["errors"]
     if not error:
         return [*cells, *["-"] * 4]
     worst = max(value["relative_l2"] for name, value in error.items() if name.startswith("grad"))
@@ -153,7 +157,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 def _scaling(rows: Sequence[dict[str, Any]]) -> list[str]:
     lines = ["Forward+backward grows as:", ""]
-    for name, mine in _grouped(rows, lambda row: row["implementation"]):
+    for name, mine in _grouped(rows, lambda row: row["method"]):
         synthetic = [row for row in mine if row["scene"] != "garden"]
         for size, group in _grouped(synthetic, lambda row: f"{row['width']}x{row['height']}"):
             if (power := exponent([(row["gaussians"], _milliseconds(row)) for row in group])) is not None:
@@ -190,16 +194,16 @@ def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
         raise missing_extra("matplotlib", "report", "the plot") from None
     figure = Figure(figsize=(11, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
-    for name, mine in _grouped(rows, lambda row: row["implementation"]):
-        known = [row for row in mine if row["error"]]
-        errors = [max(row["error"]["color"]["p99.9"], 1e-9) for row in known]
+    for name, mine in _grouped(rows, lambda row: row["method"]):
+        known = [row for row in mine if row["errors"]]
+        errors = [max(row["errors"]["color"]["p99.9"], 1e-9) for row in known]
         if known:
             left.scatter([_milliseconds(row) for row in known], errors, label=name)
         synthetic = [row for row in mine if row["scene"] != "garden"]
         for size, group in _grouped(synthetic, lambda row: f"{row['width']}x{row['height']}"):
             points = sorted((row["gaussians"], _milliseconds(row)) for row in group)
             right.plot(*zip(*points), marker="o", label=f"{name}, {size}")
-    if not any(row["error"] for row in rows):
+    if not any(row["errors"] for row in rows):
         left.text(0.5, 0.5, "error not measured", ha="center", transform=left.transAxes)
     labels = (("forward+backward, ms", "color error against float64, p99.9"), ("Gaussians", "forward+backward, ms"))
     for axes, (x, y) in zip((left, right), labels):

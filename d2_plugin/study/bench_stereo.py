@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import shlex
 from collections.abc import Sequence
@@ -14,7 +13,8 @@ import torch
 
 from d2_plugin.errors import MissingExtra, missing_extra, unknown_name
 
-from .provenance import circumstances, provenance
+from .provenance import provenance
+from .rows import append_rows, make_row
 from .stereo_measure import Method, measure, methods
 from .stereo_rigs import ARCS, MIDDLEBURY, load_rigs
 
@@ -56,20 +56,29 @@ def bench_stereo(
     loaded = [load_rigs(name, data, width) for name in rigs]
     output.mkdir(parents=True, exist_ok=True)
     rows = []
-    with (output / "stereo.jsonl").open("w") as file:
-        for group in loaded:
-            for method in chosen:
-                row = measure(method, group, widen, repeats)
-                rows.append({**row, "widen": widen, "repeats": repeats, **circumstances(), "command": command})
-                file.write(json.dumps(rows[-1]) + "\n")
-                file.flush()
-                logger.info("%s (%s) on %s is measured", method.name, method.setting, row["rig"])
+    (output / "stereo.jsonl").unlink(missing_ok=True)
+    for group in loaded:
+        for method in chosen:
+            row = measure(method, group, widen, repeats)
+            rows.append(_row(row, widen=widen, repeats=repeats, command=command))
+            append_rows(output / "stereo.jsonl", rows[-1:])
+            logger.info("%s (%s) on %s is measured", method.name, method.setting, row["rig"])
     (output / "stereo.md").write_text(table(rows))
     try:
         plot(rows, output / "stereo.svg")
     except MissingExtra as error:
         logger.warning("no plot: %s", error)
     return rows
+
+
+def _row(found: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """What `measure` found, as a row of the study: error 1 - F, seconds of CPU time per view."""
+    case = f"{found['rig']} at {found['width']}x{found['height']}"
+    error, seconds = (None, None) if found["failed"] else (1 - found["f1"], found["cpu"])
+    named = ("method", "setting", "failed")
+    details = {name: value for name, value in found.items() if name not in named}
+    arguments = {name: found[name] for name in named}
+    return make_row("stereo", case, **arguments, error=error, seconds=seconds, **details, **more)
 
 
 def _chosen(makers: Sequence[str], defaults_only: bool) -> list[Method]:

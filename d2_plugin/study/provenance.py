@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import platform
 import subprocess
 from pathlib import Path
@@ -38,8 +39,9 @@ def cpu_name() -> str:
     return platform.processor() or platform.machine()
 
 
+@functools.cache
 def commit() -> str | None:
-    """The commit of a checkout (with + where files differ from it), None for an installed package."""
+    """The commit of a checkout (with + where files differ from it) when first asked, None for an installed package."""
     try:
         options = {"cwd": Path(__file__).parent, "capture_output": True, "text": True, "check": True}
         found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], **options).stdout.strip()

@@ -1,0 +1,117 @@
+"""The rows of `runs.jsonl`: every measurement of the study in one form, one JSON object a line, only ever appended.
+
+Whatever was measured, a row says what (`kind`, `case`), how (`method`, `setting`), how well (`error`, lower is better;
+`seconds`), or why not (`failed`), and where from (device, threads, versions, commit, command). What else a kind knows
+stands beside these under names of its own; `d2 report` makes tables and plots of all of them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from d2_plugin.errors import D2Error, unknown_name
+
+from .provenance import circumstances
+
+Row = dict[str, Any]
+
+KINDS = {
+    "alignment": "relative objective gap F / F* - 1 of the fit",
+    "stereo": "1 - F at 1 % of geometric depth",
+    "raster": "99.9th percentile of the colour's deviation from float64, 0..1",
+    "training": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
+    "ablation": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
+    "stability": "as each case defines it",
+    "plan": "loss of what is left out, as each decision defines it",
+    "scaling": "none",
+}
+"""What `error` is for each kind of row."""
+
+REQUIRED = ("kind", "case", "method", "setting", "error", "seconds", "failed", "device", "commit", "command")
+
+
+def make_row(
+    kind: str,
+    case: str,
+    method: str,
+    setting: str = "default",
+    *,
+    error: float | None,
+    seconds: float | None,
+    failed: str | None = None,
+    command: str = "",
+    device: torch.device | str = "cpu",
+    **details: Any,
+) -> Row:
+    """One measurement with its circumstances.
+
+    Args:
+        kind: one of `KINDS`.
+        case: scene, rig, capture or sweep that was measured.
+        method, setting: what was measured, and what was varied about it.
+        error: lower is better; None where it was not measured. Not finite is a failure and is recorded as one.
+        seconds: of the work as the kind defines it; None where it was not measured.
+        failed: why there is no result, in the method's own words.
+        command: how this was started.
+        device: what torch calls it.
+        details: whatever else the kind knows, as JSON can hold it.
+    """
+    if kind not in KINDS:
+        raise unknown_name("kind of row", kind, KINDS)
+    if error is not None and not math.isfinite(error):
+        error, failed = None, failed or f"the error is {error}"
+    row = {"kind": kind, "case": case, "method": method, "setting": setting}
+    row |= {"error": error, "seconds": seconds, "failed": failed}
+    return row | details | circumstances(device) | {"command": command}
+
+
+def append_rows(path: Path, rows: Iterable[Row]) -> None:
+    """Add rows to the end of a file, which is created where absent."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        file.writelines(json.dumps(_plain(row), allow_nan=False) + "\n" for row in rows)
+
+
+def read_rows(paths: Sequence[Path]) -> list[Row]:
+    """The rows of all files, in order.
+
+    Raises:
+        D2Error: an absent file, a line that is not JSON, or a row that lacks what every row has.
+    """
+    return [_checked(line, f"{path}, line {number}") for path in paths for number, line in _lines(path)]
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    try:
+        text = path.read_text()
+    except OSError as error:
+        raise D2Error(f"{path} cannot be read ({error.strerror}): give a file that a `d2` command wrote") from None
+    return [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+
+
+def _checked(line: str, where: str) -> Row:
+    try:
+        row = json.loads(line)
+    except json.JSONDecodeError:
+        raise D2Error(f"{where} is not JSON: restore the file, or remove that line") from None
+    missing = [name for name in REQUIRED if name not in row] if isinstance(row, dict) else list(REQUIRED)
+    if missing:
+        raise D2Error(f"{where} has no {', '.join(missing)}: measure it again, its form is not that of this version")
+    if row["kind"] not in KINDS:
+        raise unknown_name(f"kind of row ({where})", row["kind"], KINDS)
+    return row
+
+
+def _plain(value: Any) -> Any:
+    """The same without numbers that JSON does not have: they become null."""
+    if isinstance(value, dict):
+        return {name: _plain(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
