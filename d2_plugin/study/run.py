@@ -19,6 +19,7 @@ from d2_plugin import registry
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
+from d2_plugin.study.provenance import circumstances
 from d2_plugin.study.scene import Extent, TrainingFrames, initial_points, make_view, scene_extent, triangulated_points
 from d2_plugin.study.settings import HOOK_NAMES, RunSettings, Scene, check, hook_config, prior_settings
 
@@ -102,6 +103,7 @@ class Run:
             "capture": scene.capture.name,
             "mono_emulated": scene.capture.mono_emulated,
             "notes": list(scene.capture.notes),
+            "made": circumstances(),
         }
         _write_json(self.folder / "metrics.json", metrics)
         return metrics

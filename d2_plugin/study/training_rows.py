@@ -1,0 +1,78 @@
+"""Run folders of `d2 train` as rows of the study: held-out score, time with that of the prior, Gaussians."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from .provenance import circumstances
+from .report import read_metrics
+from .rows import Row, make_row
+
+SCORES = ("psnr", "ssim1", "ssim2", "lpips", "depth_absrel")
+HOOKS = ("prior", "densify", "prune", "depth_loss")
+
+
+def training_rows(folders: Sequence[Path]) -> list[Row]:
+    """One row per run folder; the error is the root mean square error of held-out colour that the PSNR stands for.
+
+    Device, versions and commit are those that the run recorded; a run that recorded none says so in `commit`.
+
+    Raises:
+        D2Error: a folder without metrics.json.
+    """
+    return [_row(folder) for folder in folders]
+
+
+def _row(folder: Path) -> Row:
+    metrics = read_metrics(folder)
+    settings = json.loads((folder / "run.json").read_text()) if (folder / "run.json").is_file() else {}
+    scores = metrics.get("test") or {}
+    seconds = metrics["seconds"]
+    made = metrics.get("made")
+    found = make_row(
+        "training",
+        case_of(metrics),
+        method_of(metrics),
+        f"{metrics['iterations']} steps" + (f", seed {settings['seed']}" if "seed" in settings else ""),
+        error=10 ** (-scores["psnr"] / 20) if scores.get("psnr") is not None else None,
+        seconds=seconds["priors"] + seconds["train"],
+        failed=None if scores.get("psnr") is not None else "no camera was held out",
+        command=f"d2 train ... --output {folder.name}",
+        run=folder.name,
+        priors_seconds=seconds["priors"],
+        train_seconds=seconds["train"],
+        gaussians=metrics["gaussians"],
+        iterations=metrics["iterations"],
+        seed=settings.get("seed"),
+        mono_emulated=metrics.get("mono_emulated", False),
+        peak_mb=metrics.get("peak_mb"),
+        **{name: scores.get(name) for name in SCORES},
+    )
+    unknown = dict.fromkeys(circumstances(), "not recorded by the run")
+    return found | (made or unknown)
+
+
+def case_of(metrics: dict[str, Any]) -> str:
+    """The capture and how many cameras trained."""
+    return f"{metrics['capture']}, {len(metrics['train_cameras'])} views"
+
+
+def method_of(metrics: dict[str, Any]) -> str:
+    """The backbone with its hooks: `yang4d`, `yang4d + D2`, or the hooks by name."""
+    hooks = [name for name in metrics["hooks"] if name != "prior"]
+    if not hooks:
+        return metrics["backbone"]
+    return f"{metrics['backbone']} + " + ("D2" if set(HOOKS[1:]) <= set(hooks) else ", ".join(hooks))
+
+
+def picture_of(folder: Path) -> tuple[str, str] | None:
+    """(name, PNG as a data URI) of the held-out picture in the middle of a run's, or None where it kept none."""
+    found = sorted((folder / "pictures").glob("*.png"))
+    if not found:
+        return None
+    path = found[len(found) // 2]
+    return path.stem, "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
