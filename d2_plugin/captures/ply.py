@@ -1,0 +1,51 @@
+"""Point clouds as the PLY files that Gaussian Splatting trainers start from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from d2_plugin.errors import D2Error
+
+
+class PointCloud(NamedTuple):
+    """Where Gaussians start."""
+
+    positions: np.ndarray  # [P, 3] world
+    colors: np.ndarray  # [P, 3] in 0..1
+    times: np.ndarray | None = None  # [P] in the unit of the trainer's cameras
+
+
+_NORMALS = ("nx", "ny", "nz")
+
+
+def write_point_cloud(path: Path, cloud: PointCloud) -> None:
+    """Write `cloud` as binary PLY: x y z nx ny nz (float), red green blue (uchar) and, where it has times, time.
+
+    These are the properties that the Inria family's `fetchPly` asks for; normals are zero, as in its own `storePly`.
+    fudan-zvg/4d-gaussian-splatting reads `time`, the others ignore it.
+    """
+    count = len(cloud.positions)
+    for name, values, shape in (("colors", cloud.colors, (count, 3)), ("times", cloud.times, (count,))):
+        if values is not None and np.shape(values) != shape:
+            raise D2Error(f"{name} of a point cloud have shape {np.shape(values)}, expected {shape}: one per position")
+    layout = [(axis, "<f4") for axis in ("x", "y", "z", *_NORMALS)] + [(c, "u1") for c in ("red", "green", "blue")]
+    layout += [("time", "<f4")] if cloud.times is not None else []
+    rows = np.zeros(count, layout)
+    for axis, values in zip("xyz", np.asarray(cloud.positions).T):
+        rows[axis] = values
+    for channel, values in zip(("red", "green", "blue"), color_bytes(cloud.colors).T):
+        rows[channel] = values
+    if cloud.times is not None:
+        rows["time"] = cloud.times
+    kinds = {"<f4": "float", "u1": "uchar"}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {kinds[kind]} {name}" for name, kind in layout]
+    path.write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode() + rows.tobytes())
+
+
+def color_bytes(colors: np.ndarray) -> np.ndarray:
+    """uint8 of colours in 0..1."""
+    return np.clip(np.rint(np.asarray(colors) * 255), 0, 255).astype(np.uint8)
