@@ -2,19 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
+from d2_plugin.captures.blender import FILES as TRANSFORMS_FILES
+from d2_plugin.captures.blender import open_transforms
 from d2_plugin.captures.capture import Camera, Capture, MonoKind, Source
+from d2_plugin.captures.colmap import open_colmap
+from d2_plugin.captures.colmap_model import find_model
+from d2_plugin.captures.enerf import open_enerf
 from d2_plugin.captures.folder import open_folder
 from d2_plugin.captures.n3dv import open_n3dv
+from d2_plugin.captures.technicolor import PARAMETERS as TECHNICOLOR_FILE
+from d2_plugin.captures.technicolor import open_technicolor
 from d2_plugin.captures.transforms import downscale as _downscale
 from d2_plugin.captures.transforms import select_cameras, select_frames
 from d2_plugin.errors import D2Error, unknown_name
 
-__all__ = ["Camera", "Capture", "MonoKind", "Source", "open_capture", "select_cameras", "select_frames"]
+__all__ = ["LAYOUTS", "Camera", "Capture", "MonoKind", "Source", "open_capture", "select_cameras", "select_frames"]
 
-LAYOUTS = ("folder", "n3dv")
+Reader = Callable[[Path, tuple[str, ...] | None, bool], Capture]
+"""(folder, cameras to read or None, whether to leave out cameras without counterpart) -> capture."""
+
+LAYOUTS: dict[str, Reader] = {
+    "folder": open_folder,
+    "n3dv": lambda path, cameras, _: open_n3dv(path, cameras),
+    "technicolor": open_technicolor,
+    "enerf": open_enerf,
+    "transforms": open_transforms,
+    "colmap": open_colmap,
+}
+"""Readers by the name of what they read; a folder that fits several is read as the first of them."""
 
 
 def open_capture(
@@ -29,8 +48,10 @@ def open_capture(
     """Open the recording in `path`; pictures are read when asked for.
 
     Args:
-        path: a folder in one of the layouts `folder` (cameras.json, images/) or `n3dv` (poses_bounds.npy and videos or
-            extracted frames); one that holds both is read as `folder`.
+        path: a folder in one of the layouts `folder` (cameras.json, images/), `n3dv` (poses_bounds.npy and videos or
+            extracted frames), `technicolor` (cameras_parameters.txt), `enerf` (intri.yml, extri.yml), `transforms`
+            (transforms.json or transforms_train.json) and `colmap` (sparse/0, images/); see docs/captures.md. The
+            first that fits is taken.
         cameras: names to read, in this order; all of them otherwise. Only those read are checked.
         frames: frame numbers to read; all that every camera has otherwise.
         downscale: every block of this many by this many pixels becomes one.
@@ -41,16 +62,13 @@ def open_capture(
         D2Error: one sentence for anything that is missing or contradicts itself.
     """
     folder = Path(path)
+    if layout is not None and layout not in LAYOUTS:
+        raise unknown_name("layout", layout, LAYOUTS)
     layout = layout or _recognised(folder)
     names = None if cameras is None else tuple(cameras)
     if names is not None and len(set(names)) < max(len(names), 1):
         raise D2Error(f"camera names '{', '.join(names)}' are empty or repeated: name each camera once")
-    if layout == "folder":
-        capture = open_folder(folder, names, intersect)
-    elif layout == "n3dv":
-        capture = open_n3dv(folder, names)
-    else:
-        raise unknown_name("layout", layout, LAYOUTS)
+    capture = replace(LAYOUTS[layout](folder, names, intersect), layout=layout)
     if frames is not None:
         capture = select_frames(capture, frames)
     return _downscale(capture, downscale)
@@ -60,15 +78,22 @@ def _recognised(folder: Path) -> str:
     if not folder.is_dir():
         raise D2Error(f"no such capture: {folder} is not a folder; give the folder that holds the recording")
     calibrated, pictures = (folder / "cameras.json").is_file(), (folder / "images").is_dir()
-    if calibrated and pictures:
-        return "folder"
-    if (folder / "poses_bounds.npy").is_file():
-        return "n3dv"
+    signs = {
+        "folder": calibrated and pictures,
+        "n3dv": (folder / "poses_bounds.npy").is_file(),
+        "technicolor": (folder / TECHNICOLOR_FILE).is_file(),
+        "enerf": (folder / "intri.yml").is_file(),
+        "transforms": any((folder / name).is_file() for name in TRANSFORMS_FILES),
+        "colmap": find_model(folder) is not None,
+    }
+    for layout, found in signs.items():
+        if found:
+            return layout
     if calibrated:
         raise D2Error(f"{folder} has cameras.json but no folder images: put pictures at images/<camera>/<frame>.png")
     if pictures:
         raise D2Error(f"{folder} has images but no cameras.json: write the calibration of every camera there")
     raise D2Error(
-        f"{folder} is no capture: expected cameras.json and images/<camera>/<frame>.png, or poses_bounds.npy and "
-        "camXX.mp4"
+        f"{folder} is no capture: expected cameras.json and images/<camera>/<frame>.png, or the files of another "
+        f"layout ({', '.join(list(LAYOUTS)[1:])}; see docs/captures.md)"
     )

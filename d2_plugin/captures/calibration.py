@@ -10,6 +10,9 @@ from d2_plugin.errors import D2Error
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R R^T - I that still counts as rounding in a text file."""
 
+ASPECT_TOLERANCE = 0.01
+"""Relative difference of horizontal and vertical scale that still counts as rounding of a size to whole pixels."""
+
 
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     """K [3, 3] float64 in pixels."""
@@ -22,6 +25,17 @@ def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     transform[:3, :3] = rotation
     transform[:3, 3] = translation
     return transform
+
+
+def resized(K: np.ndarray, calibrated: tuple[int, int], pictures: tuple[int, int], name: str, where: str) -> np.ndarray:
+    """K for pictures that are smaller or larger copies of the size (width, height) that was calibrated."""
+    scale = np.array(pictures) / calibrated
+    if abs(scale[1] - scale[0]) > ASPECT_TOLERANCE * scale[0]:
+        raise D2Error(
+            f"pictures of camera {name} are {pictures[0]}x{pictures[1]} but {where} says {calibrated[0]}x"
+            f"{calibrated[1]}, another aspect: use pictures that are scaled, not cropped"
+        )
+    return np.diag([*scale, 1.0]) @ K
 
 
 def checked_camera(

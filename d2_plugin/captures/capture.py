@@ -50,7 +50,8 @@ class Capture:
     `frames` are the frame numbers present for every camera, ascending; `fps` converts them to seconds.
     `mono_kind` says what `source.mono` returns: "relative" is affine-invariant inverse depth (larger is nearer),
     "metric" is depth; None when there are no maps. `mono_emulated` is True when those maps were made from true
-    depth rather than predicted by a network: whoever shows a figure that rests on them must say so.
+    depth rather than predicted by a network: whoever shows a figure that rests on them must say so. `layout` names the
+    reader in `d2_plugin.captures.LAYOUTS` that opened it, which camera presets go by.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Capture:
     mono_kind: MonoKind | None = None
     mono_emulated: bool = False
     notes: tuple[str, ...] = field(default=())
+    layout: str = "folder"
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3]; refuses a picture whose size is not the camera's."""

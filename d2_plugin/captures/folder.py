@@ -9,56 +9,20 @@ monocular prediction: affine-invariant inverse depth, unless mono/mono.json says
 
 from __future__ import annotations
 
-import json
-import logging
-import re
-import zipfile
-import zlib
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
+from d2_plugin.captures.assembly import assembled, read_json
 from d2_plugin.captures.calibration import checked_camera, pinhole, rigid
-from d2_plugin.captures.capture import Camera, Capture, MonoKind
-from d2_plugin.captures.files import FrameFiles, common_frames, numbered_files
-from d2_plugin.captures.pictures import picture_size, read_picture
+from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.captures.files import common_frames, numbered_files
+from d2_plugin.captures.pictures import picture_size
 from d2_plugin.errors import D2Error, unknown_name
-
-log = logging.getLogger(__name__)
 
 DEFAULT_FPS = 30.0
 """Frame rate taken, and noted, where cameras.json names none."""
-
-
-@dataclass(frozen=True)
-class FolderSource:
-    """Pictures and maps as files; every read opens one file."""
-
-    images: dict[str, FrameFiles]
-    depths: dict[str, FrameFiles]
-    monos: dict[str, FrameFiles]
-
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        """RGB uint8 [H, W, 3]."""
-        path = self.images[camera].get(frame)
-        if path is None:
-            raise D2Error(f"camera {camera} has no frame {frame}: choose one of the capture's frames")
-        return read_picture(path)
-
-    def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        """True planar z float32 [H, W], 0 where unknown, or None."""
-        path = self.depths.get(camera, {}).get(frame)
-        if path is None:
-            return None
-        depth = _load_array(path, "depth").astype(np.float32)
-        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-
-    def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        """Monocular map float32 [h, w] exactly as stored (its holes and NaN are the reader's to judge), or None."""
-        path = self.monos.get(camera, {}).get(frame)
-        return None if path is None else _load_array(path, None).astype(np.float32)
 
 
 def open_folder(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Capture:
@@ -67,7 +31,7 @@ def open_folder(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
     `cameras` restricts everything, checks included, to the named ones; `intersect` leaves out, with a note, cameras
     that have pictures without calibration or calibration without pictures, which are otherwise refused by name.
     """
-    description = _read_json(path / "cameras.json")
+    description = read_json(path / "cameras.json")
     calibrated = _calibrations(description, path / "cameras.json")
     pictured = {folder.name: folder for folder in sorted((path / "images").iterdir()) if folder.is_dir()}
     names, notes = _agreed(list(calibrated), list(pictured), cameras, intersect, path)
@@ -75,33 +39,10 @@ def open_folder(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
     frames, frame_notes = common_frames(images, path / "images")
     for name in names:
         _check_size(calibrated[name], images[name][frames[0]])
-    kind, emulated, mono_notes = _mono_description(path)
-    source = FolderSource(images, _maps(path / "depth", names, ".npz"), _maps(path / "mono", names, ".npy"))
     fps, fps_notes = _frame_rate(description, path, len(frames))
-    all_notes = (*notes, *frame_notes, *mono_notes, *fps_notes)
-    for note in all_notes:
-        log.info("%s: %s", path.name, note)
-    return Capture(
-        name=path.resolve().name,
-        cameras={name: calibrated[name] for name in names},
-        frames=frames,
-        fps=fps,
-        source=source,
-        path=path,
-        mono_kind=kind if any(source.monos.values()) else None,
-        mono_emulated=emulated and any(source.monos.values()),
-        notes=all_notes,
+    return assembled(
+        path, {name: calibrated[name] for name in names}, images, frames, fps, (*notes, *frame_notes, *fps_notes)
     )
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as failure:
-        raise D2Error(f"{path} is not JSON ({failure}): correct the file") from None
-    if not isinstance(content, dict):
-        raise D2Error(f"{path} holds a {type(content).__name__}, expected an object: see the folder layout")
-    return content
 
 
 def _calibrations(description: dict[str, Any], path: Path) -> dict[str, Camera]:
@@ -169,34 +110,6 @@ def _check_size(camera: Camera, first: Path) -> None:
         )
 
 
-def _maps(folder: Path, names: list[str], suffix: str) -> dict[str, FrameFiles]:
-    return {name: numbered_files(folder / name, (suffix,)) for name in names if (folder / name).is_dir()}
-
-
-def _mono_description(path: Path) -> tuple[MonoKind, bool, tuple[str, ...]]:
-    """(kind, emulated, notes) of the maps in mono/."""
-    declared = path / "mono" / "mono.json"
-    if not declared.exists():
-        return "relative", *_emulated_by_source(path)
-    content = _read_json(declared)
-    kind, emulated = content.get("kind", "relative"), content.get("emulated", False)
-    if kind not in get_args(MonoKind) or not isinstance(emulated, bool):
-        raise D2Error(
-            f"{declared} says kind {kind!r} and emulated {emulated!r}: "
-            "expected 'relative' or 'metric', and true or false"
-        )
-    return kind, emulated, ("monocular maps are emulated, not predicted",) if emulated else ()
-
-
-def _emulated_by_source(path: Path) -> tuple[bool, tuple[str, ...]]:
-    """Captures without mono.json that own up to emulated maps in their SOURCE.txt must not pass for predictions."""
-    source = path / "SOURCE.txt"
-    text = source.read_text(errors="replace") if source.exists() else ""
-    if re.search(r"\bmono\b[^\n]*\bEMULATED\b", text, re.IGNORECASE) is None:
-        return False, ()
-    return True, ("monocular maps are emulated, not predicted (SOURCE.txt says so)",)
-
-
 def _frame_rate(description: dict[str, Any], path: Path, frames: int) -> tuple[float, tuple[str, ...]]:
     if "fps" not in description:
         return DEFAULT_FPS, (f"cameras.json names no fps: {DEFAULT_FPS:g} taken",) if frames > 1 else ()
@@ -204,16 +117,3 @@ def _frame_rate(description: dict[str, Any], path: Path, frames: int) -> tuple[f
     if not isinstance(fps, int | float) or not 0 < fps < float("inf"):
         raise D2Error(f"{path / 'cameras.json'} says fps {fps!r}, expected frames per second above 0: correct it")
     return float(fps), ()
-
-
-def _load_array(path: Path, key: str | None) -> np.ndarray:
-    """A 2D array from .npy, or from .npz under `key`."""
-    try:
-        with open(path, "rb") as file:  # np.load leaves a damaged file open
-            loaded = np.load(file)
-            array = loaded if key is None else loaded[key]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as failure:
-        raise D2Error(f"cannot read {path} ({failure}): replace the file or remove it") from None
-    if array.ndim != 2:
-        raise D2Error(f"{path} has shape {array.shape}, expected [height, width]: write one number per pixel")
-    return array

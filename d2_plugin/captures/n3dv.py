@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from d2_plugin.captures.assembly import assembled
 from d2_plugin.captures.calibration import checked_camera, pinhole, rigid
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import FrameFiles, collect, common_frames, numbered_files
-from d2_plugin.captures.folder import FolderSource
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES, picture_size
 from d2_plugin.captures.video import VideoSource, video_header
 from d2_plugin.errors import D2Error, unknown_name
@@ -112,10 +112,7 @@ def _from_pictures(
     frames, notes = common_frames(files, path)
     where = str(path / "poses_bounds.npy")
     cameras = {name: camera_from_row(rows[name], name, picture_size(files[name][frames[0]]), where) for name in names}
-    source = FolderSource(files, {}, {})
-    return Capture(
-        path.resolve().name, cameras, frames, N3DV_FPS, source, path, notes=(*notes, *_known_flaws(path, names))
-    )
+    return assembled(path, cameras, files, frames, N3DV_FPS, (*notes, *_known_flaws(path, names)))
 
 
 def _known_flaws(path: Path, names: list[str]) -> tuple[str, ...]:

@@ -1,0 +1,234 @@
+"""Blender's and Instant-NGP's transforms.json: a list of pictures, each with its pose, time and intrinsics.
+
+`transform_matrix` maps camera to world with OpenGL axes (x right, y up, z backward). `time` is in any unit: seconds in
+converted multi-view recordings, 0 to 1 in D-NeRF's scenes. Pictures of one pose are the frames of one camera; a file
+without times from many poses is one instant. Intrinsics may stand at the top or beside each picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.captures.assembly import assembled, read_json
+from d2_plugin.captures.calibration import checked_camera, pinhole, resized
+from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.captures.files import common_frames
+from d2_plugin.captures.lens import Lens, opencv_lens
+from d2_plugin.captures.naming import Shot, arrange, by_camera
+from d2_plugin.captures.pictures import PICTURE_SUFFIXES, picture_size
+from d2_plugin.errors import D2Error, unknown_name
+
+FILES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
+"""All that are there are read; their pictures are joined."""
+
+STATIC_FPS = 30.0
+"""Frame rate of files without times, where it means nothing."""
+
+SAME_POSE = 1e-5
+"""Largest difference of the matrices of one camera; these files are converted, not estimated per picture."""
+
+TIME_DIGITS = 9
+"""Decimals of a time that count: splits are written by programs that divide in another order."""
+
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class _Entry:
+    """One picture as a file lists it."""
+
+    name: str  # path without the leading ./, with a suffix
+    file: Path
+    matrix: np.ndarray  # [4, 4] camera to world, OpenGL axes
+    time: float | None
+    intrinsics: Mapping[str, Any]
+    listed_in: Path
+
+
+def open_transforms(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Capture:
+    """Read transforms.json, or transforms_train.json with its companions; only headers of pictures are opened.
+
+    Missing pictures are refused by name, or left out with a note where `intersect`.
+
+    Raises:
+        D2Error: among others for a camera that moves over time: the cameras of a `Capture` stand still.
+    """
+    entries, notes = _present(_entries(path), intersect)
+    shots, fps = _shots(entries, path)
+    files = by_camera(shots, {name: entry.file for name, entry in entries.items()})
+    for name in cameras or ():
+        if name not in files:
+            raise unknown_name("camera", name, files)
+    images = {name: files[name] for name in (cameras or files)}
+    frames, frame_notes = common_frames(images, path)
+    first = {shot.camera: entries[name] for name, shot in shots.items() if shot.frame == frames[0]}
+    calibrated = {name: _camera(name, first[name]) for name in images}
+    return assembled(
+        path,
+        {name: camera for name, (camera, _) in calibrated.items()},
+        images,
+        frames,
+        fps,
+        (*notes, *_split_notes(entries, shots), *frame_notes),
+        {name: lens for name, (_, lens) in calibrated.items()},
+    )
+
+
+def _entries(path: Path) -> dict[str, _Entry]:
+    found: dict[str, _Entry] = {}
+    for listed_in in (path / name for name in FILES if (path / name).is_file()):
+        content = read_json(listed_in)
+        frames = content.get("frames")
+        if not isinstance(frames, list) or not frames:
+            raise D2Error(f"{listed_in} has no list 'frames': write one entry per picture")
+        common = {key: value for key, value in content.items() if key != "frames"}
+        for frame in frames:
+            entry = _entry(frame, common, listed_in)
+            found.setdefault(entry.name, entry)  # a picture that several files list counts once
+    if not found:
+        raise D2Error(f"{path} has no transforms.json and no transforms_train.json: give the folder that holds them")
+    return found
+
+
+def _entry(frame: Any, common: Mapping[str, Any], listed_in: Path) -> _Entry:
+    try:
+        name = str(frame["file_path"])
+        matrix = np.array(frame["transform_matrix"], np.float64)
+        matrix = np.vstack([matrix, [0, 0, 0, 1]]) if matrix.shape == (3, 4) else matrix.reshape(4, 4)
+        time = round(float(frame["time"]), TIME_DIGITS) if "time" in frame else None
+    except KeyError as missing:
+        raise D2Error(f"a picture in {listed_in} has no {missing}: add it") from None
+    except (TypeError, ValueError) as failure:
+        raise D2Error(f"a picture in {listed_in} cannot be understood ({failure}): see docs/captures.md") from None
+    if not np.isfinite(matrix).all() or (time is not None and not math.isfinite(time)):
+        raise D2Error(f"{name} in {listed_in} has a number that is not finite: correct the file")
+    file = _picture_file(listed_in.parent / name)
+    return _Entry(name.removeprefix("./"), file, matrix, time, {**common, **frame}, listed_in)
+
+
+def _picture_file(path: Path) -> Path:
+    """The file itself, or the one with a suffix where the list leaves it out."""
+    if path.suffix.lower() in PICTURE_SUFFIXES:
+        return path
+    candidates = [path.with_name(path.name + suffix) for suffix in PICTURE_SUFFIXES]
+    return next((file for file in candidates if file.is_file()), candidates[0])
+
+
+def _present(entries: dict[str, _Entry], intersect: bool) -> tuple[dict[str, _Entry], tuple[str, ...]]:
+    present = {name: entry for name, entry in entries.items() if entry.file.is_file()}
+    missing = [entry for name, entry in entries.items() if name not in present]
+    if missing and (not present or not intersect):
+        raise D2Error(
+            f"{missing[0].file} is listed in {missing[0].listed_in} but is not there ({len(missing)} of {len(entries)} "
+            "pictures are missing): add the pictures or remove them from the list"
+        )
+    return present, (f"{len(missing)} listed pictures are missing and left out",) if missing else ()
+
+
+def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], float]:
+    """Camera and frame of every picture, and frames per unit of time."""
+    shots = arrange(entries, lambda group: _still([entries[name] for name in group]))
+    times = {name: entry.time for name, entry in entries.items()}
+    instants = set(times.values())
+    if len(instants) == 1:
+        return shots, STATIC_FPS
+    if None in instants:
+        raise D2Error(f"some pictures listed in {path} have a time and others have none: give all of them one")
+    if all(shot.frame == 0 for shot in shots.values()):
+        raise D2Error(
+            f"{len(entries)} pictures listed in {path} were taken at {len(instants)} times by cameras that move or "
+            "have no number in their names: expected cameras that stand still, and names like CAMERA_FRAME.png"
+        )
+    return _timed(shots, times)
+
+
+def _timed(shots: dict[str, Shot], times: dict[str, float]) -> tuple[dict[str, Shot], float]:
+    """Frames and their rate; frames are counted by time where the numbers in names do not run with it."""
+    numbers, instants = zip(*sorted({(shots[name].frame, time) for name, time in times.items()}), strict=True)
+    distinct = sorted(set(instants))
+    if list(instants) == distinct and len(set(numbers)) == len(numbers):
+        return shots, (numbers[-1] - numbers[0]) / (distinct[-1] - distinct[0])
+    rank = {time: number for number, time in enumerate(distinct)}
+    counted = {name: Shot(shot.camera, rank[times[name]]) for name, shot in shots.items()}
+    return counted, (len(distinct) - 1) / (distinct[-1] - distinct[0])
+
+
+def _still(group: list[_Entry]) -> bool:
+    first = group[0].matrix
+    return all(np.abs(entry.matrix - first).max() <= SAME_POSE * max(np.abs(first).max(), 1) for entry in group)
+
+
+def _camera(name: str, entry: _Entry) -> tuple[Camera, Lens]:
+    """The pinhole camera of the undistorted pictures, and the lens that the recorded ones need undone."""
+    size, where = picture_size(entry.file), str(entry.listed_in)
+    try:
+        given = {key: float(entry.intrinsics[key]) for key in _NUMBERS if key in entry.intrinsics}
+    except (TypeError, ValueError) as failure:
+        raise D2Error(
+            f"camera {name} in {where} has intrinsics that are no numbers ({failure}): correct them"
+        ) from None
+    calibrated = (round(given.get("w", size[0])), round(given.get("h", size[1])))
+    focal = _focal_lengths(given, calibrated, name, where)
+    centre = given.get("cx", calibrated[0] / 2), given.get("cy", calibrated[1] / 2)
+    K = resized(pinhole(*focal, *centre), calibrated, size, name, where)
+    lens = _lens(K, given, str(entry.intrinsics.get("camera_model", "")), f"camera {name} in {where}")
+    T_world_camera = entry.matrix @ OPENGL_TO_OPENCV
+    rotation = T_world_camera[:3, :3].T  # checked to be orthonormal next
+    T_camera_world = np.eye(4)
+    T_camera_world[:3, :3], T_camera_world[:3, 3] = rotation, -rotation @ T_world_camera[:3, 3]
+    return checked_camera(name, size, lens.pinhole, T_camera_world, None, where), lens
+
+
+_NUMBERS = (
+    "w",
+    "h",
+    "fl_x",
+    "fl_y",
+    "cx",
+    "cy",
+    "camera_angle_x",
+    "camera_angle_y",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "p1",
+    "p2",
+)
+
+
+def _focal_lengths(given: dict[str, float], size: tuple[int, int], name: str, where: str) -> tuple[float, float]:
+    """Focal lengths in pixels: given as such, or by the angle of view in radians; one of the two serves for both."""
+    focal: dict[str, float] = {}
+    for axis, length in zip("xy", size):
+        if f"fl_{axis}" in given:
+            focal[axis] = given[f"fl_{axis}"]
+        elif f"camera_angle_{axis}" in given:
+            focal[axis] = length / (2 * math.tan(given[f"camera_angle_{axis}"] / 2))
+    if not focal:
+        raise D2Error(f"camera {name} in {where} has neither fl_x nor camera_angle_x: add its focal length in pixels")
+    return focal.get("x", focal.get("y", 0.0)), focal.get("y", focal.get("x", 0.0))
+
+
+def _lens(K: np.ndarray, given: dict[str, float], model: str, where: str) -> Lens:
+    k1, k2, k3, k4, p1, p2 = (given.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if "FISHEYE" in model.upper():
+        return Lens(K, (k1, k2, k3, k4), fisheye=True)
+    coefficients = [k1, k2, p1, p2, k3] + ([k4] if k4 else [])
+    return opencv_lens(K, np.array(coefficients), where)
+
+
+def _split_notes(entries: dict[str, _Entry], shots: dict[str, Shot]) -> tuple[str, ...]:
+    """Which cameras the files name for what; the split of a run stays a setting."""
+    listed: dict[str, set[str]] = {}
+    for name, entry in entries.items():
+        listed.setdefault(entry.listed_in.name, set()).add(shots[name].camera)
+    if len(listed) == 1:
+        return ()
+    return tuple(f"{file} lists {', '.join(sorted(cameras))}" for file, cameras in listed.items())

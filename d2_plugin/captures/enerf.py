@@ -1,0 +1,171 @@
+"""ENeRF-Outdoor and other captures of EasyMocap and EasyVolcap: intri.yml and extri.yml beside images/<camera>/.
+
+Both are OpenCV's YAML. intri.yml: K_<camera> and D_<camera> or dist_<camera>; extri.yml: R_<camera> (rotation vector)
+or Rot_<camera> (matrix) and T_<camera>, mapping world to camera. Principal points are taken as they are written.
+Pictures are undistorted on load with K kept.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.captures.assembly import assembled
+from d2_plugin.captures.calibration import checked_camera, resized, rigid
+from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.captures.files import FrameFiles, common_frames, numbered_files
+from d2_plugin.captures.lens import Lens, opencv_lens
+from d2_plugin.captures.pictures import opencv, picture_size
+from d2_plugin.errors import D2Error, unknown_name
+
+INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
+
+ENERF_FPS = 60.0
+"""Frame rate at which EasyVolcap plays the data set; the files name none."""
+
+NOT_USED = ("masks", "mask", "bgmtv2", "bkgd", "vhull", "background.ply")
+"""What recordings of this layout may hold besides, and this reader leaves alone: the whole picture is the truth."""
+
+
+class OpencvYaml:
+    """The entries of one file of OpenCV's FileStorage."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        cv2 = opencv("reading OpenCV's YAML files")
+        try:
+            storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+            self._storage, opened = storage, storage.isOpened()  # the nodes live as long as their storage
+        except cv2.error:
+            opened = False
+        if not opened:
+            raise D2Error(f"{path} is missing or not a YAML file of OpenCV's: restore the file")
+
+    def names(self) -> list[str]:
+        """The list `names`, empty where there is none."""
+        node = self._storage.getNode("names")
+        return [_text(node.at(i)) for i in range(node.size())] if node.isSeq() else []
+
+    def matrix(self, *keys: str) -> np.ndarray | None:
+        """The matrix under the first of `keys` that is there, float64, or None."""
+        for key in keys:
+            node = self._storage.getNode(key)
+            if not node.empty():
+                matrix = node.mat() if node.isMap() else None
+                if matrix is None:
+                    raise D2Error(f"{key} in {self.path} is no matrix: write it as !!opencv-matrix")
+                return np.asarray(matrix, np.float64)
+        return None
+
+    def number(self, key: str) -> float | None:
+        """The number under `key`, or None."""
+        node = self._storage.getNode(key)
+        return float(node.real()) if node.isReal() or node.isInt() else None
+
+
+def open_enerf(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = True) -> Capture:
+    """Read the layout of EasyMocap and EasyVolcap; of the pictures only headers are opened.
+
+    The published files name cameras of which only some have a pose or pictures: the others are always left out, with
+    a note. A camera that is asked for by name must have all three.
+    """
+    intrinsics, extrinsics = OpencvYaml(path / INTRINSICS), OpencvYaml(path / EXTRINSICS)
+    folders = {folder.name: folder for folder in sorted((path / "images").glob("*")) if folder.is_dir()}
+    names, notes = _agreed(intrinsics, extrinsics, list(folders), cameras, path)
+    images = {name: numbered_files(folders[name]) for name in names}
+    frames, frame_notes = common_frames(images, path / "images")
+    calibrated = {name: _camera(name, intrinsics, extrinsics, images[name], frames[0]) for name in names}
+    unused = [name for name in NOT_USED if (path / name).exists()]
+    return assembled(
+        path,
+        {name: camera for name, (camera, _) in calibrated.items()},
+        images,
+        frames,
+        ENERF_FPS,
+        (*notes, *frame_notes, *((f"not used: {', '.join(unused)}",) if unused else ())),
+        {name: lens for name, (_, lens) in calibrated.items()},
+    )
+
+
+def _agreed(
+    intrinsics: OpencvYaml, extrinsics: OpencvYaml, folders: list[str], asked: tuple[str, ...] | None, path: Path
+) -> tuple[list[str], tuple[str, ...]]:
+    """(cameras with intrinsics, pose and pictures, notes)."""
+    listed = list(dict.fromkeys([*extrinsics.names(), *intrinsics.names(), *folders]))
+    lacks = {
+        name: [
+            *([INTRINSICS] if intrinsics.matrix(f"K_{name}") is None else []),
+            *([EXTRINSICS] if extrinsics.matrix(f"T_{name}") is None else []),
+            *(["images"] if name not in folders else []),
+        ]
+        for name in listed
+    }
+    complete = sorted(name for name in listed if not lacks[name])
+    for name in asked or ():
+        if name not in lacks:
+            raise unknown_name("camera", name, complete)
+        if lacks[name]:
+            raise D2Error(
+                f"camera {name} of {path} is missing in {' and '.join(lacks[name])}: choose among {', '.join(complete)}"
+            )
+    if not complete:
+        raise D2Error(
+            f"no camera of {path} has intrinsics in {INTRINSICS}, a pose in {EXTRINSICS} and a folder in images: "
+            "name the folders as the files name the cameras"
+        )
+    missing = [f"{name} (no {', '.join(lacks[name])})" for name in listed if lacks[name]]
+    notes = (f"left out, calibration or pictures missing: {', '.join(missing)}",) if missing and asked is None else ()
+    return list(asked) if asked is not None else complete, notes
+
+
+def _camera(
+    name: str, intrinsics: OpencvYaml, extrinsics: OpencvYaml, files: FrameFiles, frame: int
+) -> tuple[Camera, Lens]:
+    """The pinhole camera of the undistorted pictures, and the lens that the recorded ones need undone."""
+    size, where = picture_size(files[frame]), str(intrinsics.path)
+    K = _shaped(intrinsics.matrix(f"K_{name}"), (3, 3), f"K_{name}", where)
+    width, height = intrinsics.number(f"W_{name}"), intrinsics.number(f"H_{name}")
+    if width and height:
+        K = resized(K, (round(width), round(height)), size, name, where)
+    distortion = intrinsics.matrix(f"D_{name}", f"dist_{name}")
+    lens = opencv_lens(K, np.zeros(5) if distortion is None else distortion, f"camera {name} in {where}")
+    near, far = extrinsics.number(f"n_{name}"), extrinsics.number(f"f_{name}")
+    near_far = (near, far) if near is not None and far is not None else None
+    pose = _pose(name, extrinsics)
+    return checked_camera(name, size, lens.pinhole, pose, near_far, f"{where} and {EXTRINSICS}"), lens
+
+
+def _pose(name: str, extrinsics: OpencvYaml) -> np.ndarray:
+    """T_camera_world [4, 4]; the rotation vector is preferred, as the layout's own readers do."""
+    where = str(extrinsics.path)
+    translation = _shaped(extrinsics.matrix(f"T_{name}"), (3,), f"T_{name}", where)
+    vector = extrinsics.matrix(f"R_{name}")
+    if vector is not None:
+        return rigid(rotation_of_vector(_shaped(vector, (3,), f"R_{name}", where)), translation)
+    rotation = extrinsics.matrix(f"Rot_{name}")
+    if rotation is None:
+        raise D2Error(f"{where} has neither R_{name} nor Rot_{name}: add the rotation of camera {name}")
+    return rigid(_shaped(rotation, (3, 3), f"Rot_{name}", where), translation)
+
+
+def rotation_of_vector(vector: np.ndarray) -> np.ndarray:
+    """Rotation [3, 3] about `vector` [3] by its length in radians (Rodrigues)."""
+    angle = np.linalg.norm(vector)
+    x, y, z = vector
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    # sin(a) / a and (1 - cos(a)) / a^2, finite at a = 0; np.sinc(x) is sin(pi x) / (pi x).
+    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * (cross @ cross)
+
+
+def _shaped(matrix: np.ndarray | None, shape: tuple[int, ...], key: str, where: str) -> np.ndarray:
+    if matrix is None or matrix.size != np.prod(shape):
+        found = "nothing" if matrix is None else f"shape {matrix.shape}"
+        raise D2Error(f"{key} in {where} has {found}, expected {shape}: correct the calibration")
+    return matrix.reshape(shape)
+
+
+def _text(node: Any) -> str:
+    """A name, also where it is written without quotes and read as a number."""
+    return node.string() if node.isString() else str(int(node.real()))

@@ -1,0 +1,155 @@
+"""Lens distortion, undone when a picture is read: from here on every camera is a pinhole.
+
+Both models are OpenCV's and map an undistorted ray (x, y) at z = 1 to a distorted one, r^2 = x^2 + y^2:
+
+    radial-tangential   x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), y' alike
+    fisheye             theta' = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8), theta = atan r
+
+The polynomials fold back at a large radius. Rays beyond the fold have no picture and are black, as are pixels outside
+the recorded picture: the size and the focal length are kept, so nothing is cropped or stretched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.captures.capture import Camera, Source
+from d2_plugin.captures.pictures import opencv
+from d2_plugin.errors import D2Error
+
+KEPT_MAPS = 8
+"""Cameras whose resampling map stays in memory (6 bytes per pixel each)."""
+
+COVERAGE_STEP = 8
+"""Every this many pixels one is looked at to tell how much of a picture is black."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """How a camera recorded: `K` [3, 3] in pixels, which may have skew, and the coefficients of a distortion model."""
+
+    K: np.ndarray
+    radial: tuple[float, ...] = ()  # k1, k2, ... in the order of powers
+    tangential: tuple[float, float] = (0.0, 0.0)  # p1, p2
+    fisheye: bool = False
+
+    @property
+    def bends(self) -> bool:
+        """Whether anything has to be undone: a distortion or skew."""
+        return self.fisheye or any(self.radial) or any(self.tangential) or self.K[0, 1] != 0
+
+    @property
+    def pinhole(self) -> np.ndarray:
+        """K [3, 3] of the undistorted picture: the same focal lengths and principal point, no skew."""
+        K = self.K.copy()
+        K[0, 1] = 0
+        return K
+
+    def distort(self, rays: np.ndarray) -> np.ndarray:
+        """Distorted rays [..., 2] of undistorted ones [..., 2] at z = 1; NaN beyond the fold of the polynomial."""
+        radius = np.linalg.norm(rays, axis=-1, keepdims=True)
+        argument = np.arctan(radius) if self.fisheye else radius
+        square = argument**2
+        factor = 1 + sum(k * square**power for power, k in enumerate(self.radial, start=1))
+        if self.fisheye:
+            factor = factor * np.where(radius > 0, argument / np.maximum(radius, 1e-300), 1)
+        folded = argument >= _fold(self.radial)
+        return np.where(folded, np.nan, rays * factor + self._decentring(rays))
+
+    def recorded_pixels(self, pixels: np.ndarray) -> np.ndarray:
+        """Where the undistorted picture's `pixels` [..., 2] lie in the recorded one (centres at i + 0.5)."""
+        K = self.pinhole
+        rays = self.distort((pixels - K[:2, 2]) / K[[0, 1], [0, 1]])
+        return rays @ self.K[:2, :2].T + self.K[:2, 2]
+
+    def _decentring(self, rays: np.ndarray) -> np.ndarray:
+        if not any(self.tangential):
+            return np.zeros_like(rays)
+        (p1, p2), x, y = self.tangential, rays[..., 0], rays[..., 1]
+        square = x * x + y * y
+        shift_x = 2 * p1 * x * y + p2 * (square + 2 * x * x)
+        shift_y = 2 * p2 * x * y + p1 * (square + 2 * y * y)
+        return np.stack([shift_x, shift_y], axis=-1)
+
+
+@dataclass(frozen=True)
+class UndistortedSource:
+    """The pictures of `source` as pinhole cameras would have taken them; maps lying on disk are of these already."""
+
+    source: Source
+    lenses: Mapping[str, Lens]
+    sizes: Mapping[str, tuple[int, int]]
+    _maps: dict[str, tuple[Any, Any]] = field(default_factory=dict, repr=False)
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        """RGB uint8 [H, W, 3], bilinear, black where nothing was recorded."""
+        picture = self.source.image(camera, frame)
+        if camera not in self.lenses:
+            return picture
+        width, height = self.sizes[camera]
+        if picture.shape[:2] != (height, width):
+            return picture  # `Capture.image` refuses it in its own words
+        cv2 = opencv("undoing lens distortion")
+        return cv2.remap(picture, *self._map(camera), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+
+    def depth(self, camera: str, frame: int) -> np.ndarray | None:
+        """True planar z of the undistorted picture as it lies on disk, or None."""
+        return self.source.depth(camera, frame)
+
+    def mono(self, camera: str, frame: int) -> np.ndarray | None:
+        """A monocular map of the undistorted picture as it lies on disk, or None."""
+        return self.source.mono(camera, frame)
+
+    def _map(self, camera: str) -> tuple[Any, Any]:
+        if camera not in self._maps:
+            cv2 = opencv("undoing lens distortion")
+            recorded = _recorded_grid(self.lenses[camera], self.sizes[camera], step=1)
+            positions = np.nan_to_num(recorded - 0.5, nan=-10.0).astype(np.float32)  # cv2 puts centres on integers
+            self._maps[camera] = cv2.convertMaps(positions, None, cv2.CV_16SC2)
+            while len(self._maps) > KEPT_MAPS:
+                del self._maps[next(iter(self._maps))]
+        return self._maps[camera]
+
+
+def opencv_lens(K: np.ndarray, coefficients: np.ndarray, where: str) -> Lens:
+    """The lens of OpenCV's coefficient vector k1 k2 p1 p2 [k3], where zeros mean none.
+
+    Raises:
+        D2Error: more coefficients than five that are not zero (rational, thin prism and tilted models).
+    """
+    values = np.zeros(max(5, np.size(coefficients)))
+    values[: np.size(coefficients)] = np.ravel(coefficients)
+    if not np.isfinite(values).all():
+        raise D2Error(f"{where} has a distortion coefficient that is not finite: correct the calibration")
+    if values[5:].any():
+        raise D2Error(
+            f"{where} has {np.size(coefficients)} distortion coefficients, expected k1 k2 p1 p2 and k3 only: "
+            "undistort the pictures first"
+        )
+    k1, k2, p1, p2, k3 = (float(value) for value in values[:5])
+    return Lens(K, (k1, k2, k3), (p1, p2))
+
+
+def black_share(lens: Lens, camera: Camera) -> float:
+    """Share of the undistorted picture that was not recorded, from a coarse grid."""
+    x, y = np.moveaxis(_recorded_grid(lens, (camera.width, camera.height), COVERAGE_STEP), -1, 0)
+    inside = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
+    return 1 - float(inside.mean())
+
+
+def _recorded_grid(lens: Lens, size: tuple[int, int], step: int) -> np.ndarray:
+    """Recorded positions [h, w, 2] of every `step`-th pixel's centre."""
+    columns, rows = (np.arange(0, length, step) + 0.5 for length in size)
+    return lens.recorded_pixels(np.stack(np.meshgrid(columns, rows), axis=-1))
+
+
+def _fold(radial: tuple[float, ...]) -> float:
+    """Smallest argument a > 0 where a (1 + k1 a^2 + k2 a^4 + ...) stops growing; infinite where it never does."""
+    slope = [1.0, *((2 * power + 1) * k for power, k in enumerate(radial, start=1))]
+    roots = np.roots(np.trim_zeros(slope[::-1], "f"))
+    real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1)) & (roots.real > 0)].real
+    return float(np.sqrt(real.min())) if real.size else np.inf

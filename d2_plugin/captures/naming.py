@@ -1,0 +1,88 @@
+"""Which camera and which frame a picture shows, told from its name, for data sets that list pictures one by one.
+
+Three habits are understood: CAMERA/FRAME.png, CAMERA_FRAME.png, and one picture per camera. Leading folders `images`
+and `.` mean nothing, and so does a folder `images` inside a camera's.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
+
+from d2_plugin.captures.files import FrameFiles
+from d2_plugin.captures.pictures import PICTURE_SUFFIXES
+from d2_plugin.errors import D2Error
+
+
+class Shot(NamedTuple):
+    """What a picture's name says it shows."""
+
+    camera: str
+    frame: int
+
+
+_FRAME = re.compile(r"(\d+)\D*$")
+_PREFIXED = re.compile(r"(?P<camera>.+)_(?P<frame>\d+)$")
+
+
+def shot_of(name: str) -> Shot | None:
+    """Camera and frame of cam00/0012.png or cam00_0012.png; None for a name that has only one of the two."""
+    *folders, stem = _parts(name)
+    if folders:
+        number = _FRAME.search(stem)
+        return Shot("_".join(folders), int(number[1])) if number else None
+    match = _PREFIXED.match(stem)
+    return Shot(match["camera"], int(match["frame"])) if match else None
+
+
+def arrange(names: Iterable[str], still: Callable[[list[str]], bool]) -> dict[str, Shot]:
+    """Camera and frame of every name, or every picture a camera of its own at frame 0 where the names do not tell.
+
+    `still` says whether the pictures of one presumed camera were taken from one pose. Where they were not, as in a
+    still scene photographed by one moving camera, all pictures become cameras of one instant.
+    """
+    names = list(names)
+    shots = {name: shot_of(name) for name in names}
+    if all(shots.values()):
+        groups: dict[str, list[str]] = {}
+        for name, shot in shots.items():
+            groups.setdefault(shot.camera, []).append(name)
+        if all(still(group) for group in groups.values()):
+            return shots
+    return one_instant(names)
+
+
+def one_instant(names: Iterable[str]) -> dict[str, Shot]:
+    """Every picture as a camera of its own at frame 0, named by its stem, or by its whole path where stems repeat."""
+    parts = {name: _parts(name) for name in names}
+    stems = Counter(part[-1] for part in parts.values())
+    repeated = max(stems.values(), default=0) > 1
+    return {name: Shot("_".join(part) if repeated else part[-1], 0) for name, part in parts.items()}
+
+
+def pictures_below(folder: Path) -> dict[str, Path]:
+    """Every picture under `folder` by its path relative to it, sorted."""
+    if not folder.is_dir():
+        raise D2Error(f"{folder} is no folder: expected the pictures of the capture there")
+    found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in PICTURE_SUFFIXES)
+    return {path.relative_to(folder).as_posix(): path for path in found}
+
+
+def by_camera(shots: Mapping[str, Shot], files: Mapping[str, Path]) -> dict[str, FrameFiles]:
+    """Frame -> file per camera, sorted by camera; refuses two files of one camera and frame."""
+    found: dict[str, FrameFiles] = {}
+    for name, (camera, frame) in shots.items():
+        taken = found.setdefault(camera, {})
+        if frame in taken:
+            raise D2Error(f"{taken[frame]} and {files[name]} are both frame {frame} of camera {camera}: remove one")
+        taken[frame] = files[name]
+    return {camera: dict(sorted(found[camera].items())) for camera in sorted(found)}
+
+
+def _parts(name: str) -> list[str]:
+    *folders, last = PurePosixPath(name.replace("\\", "/")).parts
+    stem = last[: -len(suffix)] if (suffix := PurePosixPath(last).suffix).lower() in PICTURE_SUFFIXES else last
+    return [folder for folder in folders if folder not in (".", "..", "/", "images")] + [stem]
