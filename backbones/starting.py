@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.rasterizer import RasterSettings
 
 from . import spherical_harmonics as sh
-from .densify import DensifySettings
 from .model import SplatSettings
 
 Settings = TypeVar("Settings", bound=SplatSettings)
@@ -56,14 +54,15 @@ def nearest_neighbour_scales(positions: Tensor, neighbours: int = 3) -> Tensor:
 
 
 def settings_of(kind: type[Settings], table: Mapping[str, object], temporal: bool) -> Settings:
-    """Settings of a backbone from a plain table with tables "densify" and "raster" inside.
+    """Settings of a backbone from a plain table, with a table inside for each setting that is a dataclass itself.
 
     Raises:
         D2Error: a name is unknown, or a table is none.
     """
     chosen = dict(table)
-    for name, part in (("densify", DensifySettings), ("raster", RasterSettings)):
-        chosen[name] = part(**_known(name, part, chosen.get(name, {})))
+    for name, part in ((entry.name, entry.default_factory) for entry in fields(kind)):
+        if is_dataclass(part):
+            chosen[name] = part(**_known(name, part, chosen.get(name, {})))
     return kind(temporal=temporal, **_known("backbone", kind, chosen, {"temporal"}))
 
 

@@ -1,0 +1,195 @@
+"""Canonical Gaussians and a deformation field: one set of 3D Gaussians, moved, turned and scaled at each instant.
+
+`field = "mlp"` is in the style of Deformable-3D-Gaussians, `field = "hexplane"` of 4DGaussians; where the scene has one
+instant or no motion the field is left out (`temporal=False`) and these are ordinary 3D Gaussians.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.rasterizer import Splats, View
+
+from .deform_fields import Box, Field, HexPlaneField, HexPlaneSettings, MlpField, MlpSettings, Offsets
+from .model import SplatModel, SplatSettings, decayed_rate, shared_rates
+from .rotation4d import rotation_matrices_3d
+from .slicing import slice_gaussians, unit_quaternions
+from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, settings_of
+from .trainer import Trainer, TrainSettings
+
+__all__ = ["Deform", "DeformSettings", "TrainSettings", "Trainer", "create", "initial_rows", "settings_from"]
+
+FIELDS = ("mlp", "hexplane")
+
+
+@dataclass(frozen=True)
+class DeformSettings(SplatSettings):
+    """Model and optimizers of the backbone; fractions are of the run's iterations."""
+
+    field: str = "mlp"
+    """"mlp" or "hexplane"."""
+    warm_up: float = 0.075
+    """Fraction of the run without deformation: the canonical Gaussians settle first (official: 3000 of 40000)."""
+    time_noise: float = 5e-3
+    """Standard deviation of the noise on a training step's time, as a fraction of the duration, at the first step; it
+    falls to zero at half of the run (official: a tenth of the frame interval, real scenes)."""
+    field_decay: float = 0.1
+    """Learning rates of the field at the last step, as a fraction of the first; exponential in between."""
+    seed: int = 0
+    """Of the field's start and of the noise on time; the global random state is never used."""
+    mlp: MlpSettings = dataclasses.field(default_factory=MlpSettings)
+    hexplane: HexPlaneSettings = dataclasses.field(default_factory=HexPlaneSettings)
+
+
+class Deform(SplatModel):
+    """N canonical Gaussians, their field, and an optimizer for each.
+
+    Parameters (raw) beside those of `SplatModel`: rotations [N, 4]. All Gaussians exist at all times.
+    """
+
+    settings: DeformSettings
+
+    def __init__(
+        self, rows: Mapping[str, Tensor], settings: DeformSettings, extent: float, duration: float, box: Box
+    ) -> None:
+        rates = shared_rates(settings, extent) | {"rotations": settings.rotation_rate}
+        super().__init__(rows, rates, settings, extent)
+        self.duration = max(duration, 1e-12)
+        self._generator = torch.Generator().manual_seed(settings.seed)
+        self.field: Field | None = None
+        self.deforms = False
+        self._noise = 0.0
+        if settings.temporal:
+            self.field = make_field(settings, box, self._generator).to(rows["positions"])
+            self.field_optimizer = torch.optim.Adam(self.field.parameter_groups(), eps=1e-15, fused=True)
+            self.deforms = settings.warm_up <= 0
+
+    @classmethod
+    def from_points(
+        cls, positions: Tensor, colors: Tensor, settings: DeformSettings, extent: float, duration: float
+    ) -> Deform:
+        """A model that starts at coloured points of any times: positions [N, 3] world, colors [N, 3] in 0..1."""
+        scales = nearest_neighbour_scales(positions).clamp(max=0.1 * extent)
+        opacities = torch.full_like(scales, settings.initial_opacity)
+        rows = initial_rows(positions, colors, scales, opacities, settings)
+        return cls(rows, settings, extent, duration, Box.around(positions, extent))
+
+    def slice_at(self, view: View) -> Splats:
+        """The 3D Gaussians at `view.time`, differentiable; before or after the scene they rest where they were or are.
+
+        With gradients enabled the time is that of the present training step, noise included.
+
+        Raises:
+            D2Error: the time is not a number.
+        """
+        if self.field is not None and math.isnan(view.time):
+            raise D2Error(f"the time of camera '{view.camera}', frame {view.frame} is NaN: give every view a time")
+        g = self.gaussians
+        raw = {name: g[name] for name in ("positions", "log_scales", "opacity_logits")} | {"left": g["rotations"]}
+        noise = self._noise if torch.is_grad_enabled() else 0.0
+        offsets = self.offsets(g["positions"], view.time + noise)
+        if offsets is not None:
+            raw["positions"] = raw["positions"] + offsets.positions
+            raw["log_scales"] = raw["log_scales"] + offsets.log_scales
+            raw["left"] = raw["left"] + offsets.rotations
+        return slice_gaussians(raw)
+
+    def offsets(self, positions: Tensor, time: float) -> Offsets | None:
+        """What the field adds at canonical `positions` [K, 3]; None where nothing is deformed (warm-up, no time)."""
+        if not self.deforms or not len(positions):
+            return None
+        return self.field(positions, time / self.duration)
+
+    def rotations(self, rows: Mapping[str, Tensor]) -> Tensor:
+        """Rotation matrices [3, 3, K] of raw rows."""
+        return rotation_matrices_3d(unit_quaternions(rows["rotations"]))
+
+    def regularization(self) -> Tensor | float:
+        """The field's own term."""
+        return self.field.regularization() if self.deforms else 0.0
+
+    def optimize(self, step: int, iterations: int) -> None:
+        """One step of both optimizers, gradients cleared; learning rates and noise for the next step set."""
+        super().optimize(step, iterations)
+        if self.field is None:
+            return
+        self.field_optimizer.step()
+        self.field_optimizer.zero_grad(set_to_none=True)
+        for group, start in zip(self.field_optimizer.param_groups, self.field.parameter_groups()):
+            group["lr"] = decayed_rate(start["lr"], start["lr"] * self.settings.field_decay, step, iterations)
+        self.deforms = step >= self.settings.warm_up * iterations
+        strength = max(1 - 2 * step / max(iterations, 1), 0.0) * self.settings.time_noise * self.duration
+        self._noise = strength * torch.randn((), generator=self._generator).item()
+
+    def state_dict(self) -> dict[str, object]:
+        """Gaussians and field with their optimizers, and the noise: enough for a bitwise continuation."""
+        state: dict[str, object] = {"gaussians": super().state_dict()}
+        if self.field is not None:
+            state |= {
+                "field": {name: value.clone() for name, value in self.field.state_dict().items()},
+                "field_optimizer": self.field_optimizer.state_dict(),
+                "generator": self._generator.get_state(),
+                "deforms": self.deforms,
+                "noise": self._noise,
+            }
+        return state
+
+    def load_state_dict(self, state: Mapping[str, object]) -> None:
+        """Continue from `state_dict()`."""
+        super().load_state_dict(state["gaussians"])
+        if self.field is not None:
+            self.field.load_state_dict(state["field"])
+            self.field_optimizer.load_state_dict(state["field_optimizer"])
+            self._generator.set_state(state["generator"])
+            self.deforms, self._noise = state["deforms"], state["noise"]
+
+
+def make_field(settings: DeformSettings, box: Box, generator: torch.Generator) -> Field:
+    """The field that `settings.field` names."""
+    if settings.field == "mlp":
+        return MlpField(box, settings.mlp, generator)
+    return HexPlaneField(box, settings.hexplane, generator)
+
+
+def initial_rows(
+    positions: Tensor, colors: Tensor, scales: Tensor, opacities: Tensor, settings: DeformSettings
+) -> dict[str, Tensor]:
+    """Raw rows of isotropic canonical Gaussians: positions [K, 3], colors [K, 3], scales [K], opacities [K]."""
+    rows = isotropic_rows(positions, colors, scales, opacities, settings.sh_degree)
+    return rows | {"rotations": identity_quaternions(len(positions), positions)}
+
+
+def settings_from(table: Mapping[str, object], temporal: bool = True) -> DeformSettings:
+    """`DeformSettings` from a plain table with tables "mlp", "hexplane", "densify" and "raster" inside.
+
+    Raises:
+        D2Error: a name is unknown.
+    """
+    settings = settings_of(DeformSettings, table, temporal)
+    if settings.field not in FIELDS:
+        raise unknown_name("deformation field", settings.field, FIELDS)
+    return settings
+
+
+def create(
+    positions: Tensor,
+    colors: Tensor,
+    times: Tensor,
+    *,
+    extent: float,
+    duration: float,
+    temporal: bool,
+    settings: Mapping[str, object] | None = None,
+) -> Deform:
+    """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults.
+
+    `times` is not used: the points of all instants are canonical, as in both official codes.
+    """
+    return Deform.from_points(positions, colors, settings_from(settings or {}, temporal), extent, duration)

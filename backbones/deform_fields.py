@@ -1,0 +1,249 @@
+"""Deformation fields: where a canonical Gaussian is, how it is turned and how large it is at an instant.
+
+`MlpField` follows ingra14m/Deformable-3D-Gaussians (positional encoding, skip connection, linear heads),
+`HexPlaneField` hustvl/4DGaussians (six planes at several resolutions, multiplied, small head). Two things are ours:
+widths and grids are small enough for a CPU, and the last layer starts at zero, so that motion starts from none.
+
+A field is evaluated for all N Gaussians at one instant: what depends on the instant alone is computed once. No gradient
+flows from it to the positions (Deformable-3D-Gaussians detaches them too).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+SPLITS = (3, 4, 3)
+"""Columns of the last layer: offsets of position, quaternion and log-scales."""
+
+SPACE_PAIRS = ((0, 1), (0, 2), (1, 2))
+"""Axes of the three planes of a HexPlane that lie in space: xy, xz, yz."""
+
+
+class Offsets(NamedTuple):
+    """What the field adds to the canonical parameters (4DGaussians: before their activations)."""
+
+    positions: Tensor  # [N, 3] world units
+    rotations: Tensor  # [N, 4] to raw quaternions
+    log_scales: Tensor  # [N, 3]
+
+
+@dataclass(frozen=True)
+class MlpSettings:
+    """Network of `MlpField`."""
+
+    width: int = 64
+    """Neurons of a hidden layer (official: 256, on a GPU)."""
+    depth: int = 4
+    """Hidden layers, with a skip connection to the middle one (official: 8)."""
+    position_octaves: int = 6
+    """Frequencies of the encoding of positions (official: 10)."""
+    time_octaves: int = 6
+    """Frequencies of the encoding of time (official: 10, or 6 for synthetic scenes)."""
+    rate: float = 1e-3
+    """Learning rate of the network at the first step (official: 8e-4)."""
+
+
+@dataclass(frozen=True)
+class HexPlaneSettings:
+    """Planes and network of `HexPlaneField`."""
+
+    features: int = 16
+    """Channels of each plane."""
+    resolutions: tuple[int, ...] = (16, 32)
+    """Nodes of the planes along each axis of space, one number per level (official: 64 and 128)."""
+    instants: int = 10
+    """Nodes of the planes along time (official: half the number of frames)."""
+    width: int = 64
+    """Neurons of the hidden layer."""
+    plane_rate: float = 1e-2
+    """Learning rate of the planes at the first step."""
+    network_rate: float = 1e-3
+    """Learning rate of the network at the first step."""
+    smooth_space: float = 2e-4
+    """Weight of the squared second differences of planes in space (official name: plane_tv_weight)."""
+    smooth_time: float = 1e-3
+    """Weight of the squared second differences along time (time_smoothness_weight)."""
+    still: float = 1e-4
+    """Weight of |1 - plane| of the planes with time: a plane of ones changes nothing (l1_time_planes)."""
+
+
+class Box(NamedTuple):
+    """The part of the world that a field is made for; `unit` is what its position offsets are measured in."""
+
+    centre: Tensor  # [3]
+    reach: Tensor  # [3] half of each side
+    unit: float
+
+    @classmethod
+    def around(cls, positions: Tensor, unit: float) -> Box:
+        """Of all points but the outermost hundredth on each side of each axis, a tenth larger; positions [N, 3]."""
+        if not len(positions):
+            return cls(positions.new_zeros(3), positions.new_full((3,), unit), unit)
+        low, high = torch.quantile(positions[:: 1 + len(positions) // 1_000_000], positions.new_tensor([0.01, 0.99]), 0)
+        return cls((low + high) / 2, 0.55 * (high - low).clamp(min=1e-3 * unit), unit)
+
+
+class Field(nn.Module, ABC):
+    """Offsets of Gaussians at one instant, from their canonical positions."""
+
+    centre: Tensor
+    reach: Tensor
+
+    def __init__(self, box: Box) -> None:
+        super().__init__()
+        self.register_buffer("centre", box.centre.detach().clone())
+        self.register_buffer("reach", box.reach.detach().clone())
+        self.unit = box.unit
+
+    def forward(self, positions: Tensor, fraction: float) -> Offsets:
+        """Offsets of `positions` [N, 3] (world; no gradient) at `fraction` of the duration, clamped to 0..1."""
+        columns = self.columns((positions.detach() - self.centre) / self.reach, min(max(fraction, 0.0), 1.0))
+        place, turn, size = columns.split(SPLITS, -1)
+        return Offsets(self.unit * place, turn, size)
+
+    @abstractmethod
+    def columns(self, places: Tensor, fraction: float) -> Tensor:
+        """The last layer [N, 10] for places [N, 3] in units of the box, -1..1 inside."""
+
+    @abstractmethod
+    def parameter_groups(self) -> list[dict[str, object]]:
+        """Groups for an optimizer: params, lr, name."""
+
+    def regularization(self) -> Tensor | float:
+        """A term of the training loss that keeps the field smooth."""
+        return 0.0
+
+
+class MlpField(Field):
+    """Positional encoding of place and time into a network with one skip connection."""
+
+    def __init__(self, box: Box, settings: MlpSettings, generator: torch.Generator) -> None:
+        super().__init__(box)
+        self.settings = settings
+        width, place = settings.width, 3 * (1 + 2 * settings.position_octaves)
+        instant = 1 + 2 * settings.time_octaves
+        hidden = settings.depth - 1
+        self.skip = hidden // 2
+        self.hidden = nn.ModuleList(linear(width, width, generator) for _ in range(hidden))
+        self.place = nn.ModuleList(linear(place, width, generator) for _ in range(2 if hidden else 1))
+        self.instant = nn.ModuleList(linear(instant, width, generator) for _ in self.place)
+        self.heads = zero_linear(width, sum(SPLITS))
+
+    def columns(self, places: Tensor, fraction: float) -> Tensor:
+        """See `Field.columns`; the encoded time enters as one row that all Gaussians share."""
+        place = octaves(places, self.settings.position_octaves)
+        instant = octaves(places.new_tensor([2 * fraction - 1]), self.settings.time_octaves)
+        enters = [at_place(place) + at_time(instant) for at_place, at_time in zip(self.place, self.instant)]
+        state = F.relu(enters[0])
+        for i, layer in enumerate(self.hidden):
+            state = layer(state)
+            state = F.relu(state + enters[1] if i == self.skip else state)
+        return self.heads(state)
+
+    def parameter_groups(self) -> list[dict[str, object]]:
+        """One group: the network."""
+        return [{"params": list(self.parameters()), "lr": self.settings.rate, "name": "network"}]
+
+
+class HexPlaneField(Field):
+    """The product of six feature planes at each of several resolutions, into a small network."""
+
+    def __init__(self, box: Box, settings: HexPlaneSettings, generator: torch.Generator) -> None:
+        super().__init__(box)
+        self.settings = settings
+        channels, instants = settings.features, settings.instants
+        grids = [torch.empty(3, channels, r, r).uniform_(0.1, 0.5, generator=generator) for r in settings.resolutions]
+        self.space = nn.ParameterList(grids)
+        self.time = nn.ParameterList(torch.ones(3, channels, instants, r) for r in settings.resolutions)
+        self.features = linear(channels * len(settings.resolutions), settings.width, generator)
+        self.heads = zero_linear(settings.width, sum(SPLITS))
+
+    def columns(self, places: Tensor, fraction: float) -> Tensor:
+        """See `Field.columns`; outside of the box the planes go on as they end."""
+        inside = places.clamp(-1, 1).T.contiguous()
+        levels = [self._level(space, time, inside, fraction) for space, time in zip(self.space, self.time)]
+        return self.heads(F.relu(self.features(torch.cat(levels).T)))
+
+    def parameter_groups(self) -> list[dict[str, object]]:
+        """Two groups: planes and network."""
+        planes = [*self.space, *self.time]
+        network = [*self.features.parameters(), *self.heads.parameters()]
+        return [
+            {"params": planes, "lr": self.settings.plane_rate, "name": "planes"},
+            {"params": network, "lr": self.settings.network_rate, "name": "network"},
+        ]
+
+    def regularization(self) -> Tensor:
+        """Smooth planes, and nothing that changes in time without need (4DGaussians, regulation.py)."""
+        s = self.settings
+        space = sum(bend(plane, -1) + bend(plane, -2) for plane in self.space)
+        time = sum(bend(plane, -2) for plane in self.time)
+        still = sum((1 - plane).abs().mean() for plane in self.time)
+        return s.smooth_space * space + s.smooth_time * time + s.still * still
+
+    @staticmethod
+    def _level(space: Tensor, time: Tensor, places: Tensor, fraction: float) -> Tensor:
+        """Features [C, N] of places [3, N] in -1..1, from planes [3, C, R, R] and [3, C, T, R]."""
+        pairs = torch.stack([torch.stack([places[b], places[a]], -1) for a, b in SPACE_PAIRS])
+        planes = F.grid_sample(space, pairs[:, None], align_corners=True, padding_mode="border")[:, :, 0]
+        lines = at_instant(time, fraction)
+        moving = lines @ hats(places, lines.shape[-1])
+        x, y, z = planes * moving  # xy with zt's partner and so on: the product of all six is what counts
+        return x * y * z
+
+
+def octaves(values: Tensor, count: int) -> Tensor:
+    """[..., D * (1 + 2 count)]: the values, and sine and cosine of pi times 1, 2, 4, ... of each; values [..., D]."""
+    angles = (values[..., None] * (math.pi * 2.0 ** torch.arange(count, device=values.device))).flatten(-2)
+    return torch.cat([values, angles.sin(), angles.cos()], -1)
+
+
+def at_instant(planes: Tensor, fraction: float) -> Tensor:
+    """Lines [3, C, R]: planes [3, C, T, R] interpolated at `fraction` (0..1) of their time."""
+    last = planes.shape[2] - 1
+    before = min(int(fraction * last), max(last - 1, 0))
+    weight = fraction * last - before
+    return torch.lerp(planes[:, :, before], planes[:, :, min(before + 1, last)], weight)
+
+
+def hats(places: Tensor, nodes: int) -> Tensor:
+    """Weights [3, R, N] of linear interpolation at places [3, N] in -1..1 on R nodes.
+
+    A line times these is its value at each place: on a CPU the dense product is faster than collecting two nodes each
+    and, backwards, adding to them.
+    """
+    position = (places + 1) * ((nodes - 1) / 2)
+    node = torch.arange(nodes, device=places.device, dtype=places.dtype)
+    return F.relu(1 - (position[:, None] - node[:, None]).abs())
+
+
+def bend(planes: Tensor, axis: int) -> Tensor:
+    """Mean square of the second differences along an axis; 0 where there are fewer than three nodes."""
+    if planes.shape[axis] < 3:
+        return planes.new_zeros(())
+    return torch.diff(planes, n=2, dim=axis).square().mean()
+
+
+def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    """A layer with torch's usual start, drawn from `generator`: the global random state stays as it is."""
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
+    bound = 1 / math.sqrt(inputs)
+    with torch.no_grad():
+        layer.weight.uniform_(-bound, bound, generator=generator)
+        layer.bias.uniform_(-bound, bound, generator=generator)
+    return layer
+
+
+def zero_linear(inputs: int, outputs: int) -> nn.Linear:
+    """A layer that starts at zero."""
+    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer
