@@ -33,7 +33,8 @@ KINDS = {
 }
 """What `error` is for each kind of row."""
 
-REQUIRED = ("kind", "case", "method", "setting", "error", "seconds", "failed", "device", "commit", "command")
+MEASURED = ("kind", "case", "method", "setting", "error", "seconds", "failed")
+REQUIRED = (*MEASURED, "device", "threads", "version", "commit", "torch", "command")
 
 
 def make_row(

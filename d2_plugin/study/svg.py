@@ -72,6 +72,13 @@ class Axis:
     low: float
     high: float
     log: bool = False
+    names: tuple[str, ...] = ()
+    """With names the axis is a list of them, at 0, 1, ..."""
+
+    @classmethod
+    def listing(cls, label: str, names: Sequence[str]) -> Axis:
+        """An axis of names, the first one at the top."""
+        return cls(label, len(names) - 0.4, -0.6, names=tuple(names))
 
     @classmethod
     def around(cls, label: str, values: Iterable[float], log: bool = False) -> Axis:
@@ -93,6 +100,8 @@ class Axis:
 
     def ticks(self, most: int = 7) -> list[tuple[float, str]]:
         """Round values within the range, with their text."""
+        if self.names:
+            return list(enumerate(self.names))
         values = self._decades(most) if self.log else self._steps(most)
         return [(value, number(value)) for value in values if self.low <= value <= self.high]
 
@@ -175,7 +184,8 @@ def _legend(entries: Sequence[tuple[str, int, bool]], width: float) -> tuple[str
 
 
 def _plot(plot: Plot, left: float, top: float, size: tuple[int, int]) -> str:
-    x0, x1 = left + MARGIN_LEFT, left + size[0] - MARGIN_RIGHT
+    names = LETTER * max((len(name) for name in plot.y.names), default=0)
+    x0, x1 = left + max(MARGIN_LEFT, names + 28), left + size[0] - MARGIN_RIGHT
     y0, y1 = top + size[1] - MARGIN_BOTTOM, top + MARGIN_TOP
     at = lambda x, y: (x0 + (x1 - x0) * plot.x.place(x), y0 + (y1 - y0) * plot.y.place(y))  # noqa: E731
     parts = [text(x0, top + 20, plot.title, "ink title")]

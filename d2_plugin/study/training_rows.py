@@ -12,14 +12,14 @@ from .provenance import circumstances
 from .report import read_metrics
 from .rows import Row, make_row
 
-SCORES = ("psnr", "ssim1", "ssim2", "lpips", "depth_absrel")
 HOOKS = ("prior", "densify", "prune", "depth_loss")
 
 
 def training_rows(folders: Sequence[Path]) -> list[Row]:
-    """One row per run folder; the error is the root mean square error of held-out colour that the PSNR stands for.
+    """One row per run folder: seconds of training, those of the prior beside them, held-out scores.
 
-    Device, versions and commit are those that the run recorded; a run that recorded none says so in `commit`.
+    The error is the root mean square error of colour that the PSNR stands for. Device, versions and commit are those
+    that the run recorded; a run that recorded none says so in their place.
 
     Raises:
         D2Error: a folder without metrics.json.
@@ -39,18 +39,16 @@ def _row(folder: Path) -> Row:
         method_of(metrics),
         f"{metrics['iterations']} steps" + (f", seed {settings['seed']}" if "seed" in settings else ""),
         error=10 ** (-scores["psnr"] / 20) if scores.get("psnr") is not None else None,
-        seconds=seconds["priors"] + seconds["train"],
+        seconds=seconds["train"],
         failed=None if scores.get("psnr") is not None else "no camera was held out",
         command=f"d2 train ... --output {folder.name}",
         run=folder.name,
-        priors_seconds=seconds["priors"],
-        train_seconds=seconds["train"],
+        prior_seconds=seconds["priors"],
         gaussians=metrics["gaussians"],
         iterations=metrics["iterations"],
         seed=settings.get("seed"),
         mono_emulated=metrics.get("mono_emulated", False),
-        peak_mb=metrics.get("peak_mb"),
-        **{name: scores.get(name) for name in SCORES},
+        scores=scores,
     )
     unknown = dict.fromkeys(circumstances(), "not recorded by the run")
     return found | (made or unknown)

@@ -1,0 +1,168 @@
+"""The parts of the report about whole runs: held-out score against time with the prior's included, and ablations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from statistics import mean, stdev
+
+from .rows import Row
+from .sections import Section, cases_of, sources_of
+from .svg import Axis, Plot, Point, Series, bars, figure
+from .work_precision import Table, pareto_front
+
+SCORES = (
+    ("PSNR", "psnr", 2),
+    ("SSIM1", "ssim1", 4),
+    ("SSIM2", "ssim2", 4),
+    ("LPIPS", "lpips", 4),
+    ("depth AbsRel", "depth_absrel", 4),
+)
+PAPER_TEXT = "Hollow marks are the paper's own figures, copied from its tables; its times are not published."
+
+
+def training(rows: Sequence[Row]) -> Section:
+    """Held-out PSNR against minutes of prior and training, their parts as stacked bars, and all scores."""
+    emulated = any(row.get("mono_emulated") for row in rows)
+    plots = [_quality(case, mine) for case, mine in cases_of(rows).items()]
+    means = [(case, name, group) for case, mine in cases_of(rows).items() for name, group in _variants(mine).items()]
+    stacked = [
+        (f"{case}: {name}", (_mean(group, "prior_seconds") / 60, _mean(group, "seconds") / 60))
+        for case, name, group in means
+    ]
+    header = ("capture", "method", "runs", *(title for title, _, _ in SCORES), "Gaussians", "prior s", "train s")
+    cells = tuple((case, name, str(len(mine)), *_score_cells(mine), *_cost_cells(mine)) for case, name, mine in means)
+    return Section(
+        "training",
+        "Training: held-out quality against time",
+        "PSNR of cameras that trained nothing, against the minutes that the prior and the training took together; "
+        "upper left is better. A prior that several runs share counts where it was built."
+        + (" Monocular depth of some captures is emulated, not predicted." if emulated else ""),
+        {
+            "training": figure(plots, "Held-out PSNR against minutes", columns=2, size=(480, 330)),
+            "training-time": bars(stacked, ("prior", "training"), "min", "Minutes of prior and training per method"),
+        },
+        (("Mean ± deviation over seeds", Table(header, cells, _best(means, cells))),),
+        sources=sources_of(rows),
+    )
+
+
+def _quality(case: str, rows: Sequence[Row]) -> Plot:
+    scored = [row for row in rows if _score(row, "psnr") is not None]
+    minutes = [(row["seconds"] + row["prior_seconds"]) / 60 for row in scored]
+    front = set(pareto_front([(time, row["error"]) for time, row in zip(minutes, scored)]))
+    series = []
+    for color, name in enumerate(dict.fromkeys(row["method"] for row in scored)):
+        mine = [i for i, row in enumerate(scored) if row["method"] == name]
+        points = [_quality_point(scored[i], minutes[i], i in front) for i in mine]
+        steps = [mine[i] for i in pareto_front([(minutes[i], scored[i]["error"]) for i in mine])]
+        line = tuple((minutes[i], _score(scored[i], "psnr")) for i in steps)
+        series.append(Series(name, tuple(points), line, color))
+    x = Axis.around("minutes, prior included", minutes, log=max(minutes, default=1) > 4 * min(minutes, default=1))
+    return Plot(case, x, Axis.around("held-out PSNR, dB", [p.y for s in series for p in s.points]), tuple(series))
+
+
+def _quality_point(row: Row, minutes: float, on_front: bool) -> Point:
+    psnr = _score(row, "psnr")
+    note = f"{row['method']}, {row['setting']}: {psnr:.2f} dB after {minutes:.2f} min, {row['gaussians']} Gaussians"
+    return Point(minutes, psnr, note, faded=not on_front)
+
+
+def _variants(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Rows of the same method and number of steps, which differ by seed."""
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(f"{row['method']}, {row['iterations']} steps", []).append(row)
+    return groups
+
+
+def ablation(rows: Sequence[Row]) -> Section:
+    """What each variant gains over the backbone alone, every seed a mark, and the scores as mean and deviation."""
+    plots = [_gains(case, mine) for case, mine in cases_of(rows).items()]
+    header = ("capture", "variant", "seeds", *(title for title, _, _ in SCORES), "Gaussians", "prior s", "train s")
+    groups = [
+        (case, name, [row for row in mine if row["method"] == name])
+        for case, mine in cases_of(rows).items()
+        for name in dict.fromkeys(row["method"] for row in mine)
+    ]
+    cells = tuple((case, name, str(len(mine)), *_score_cells(mine), *_cost_cells(mine)) for case, name, mine in groups)
+    height = 90 + 24 * max(len(plot.y.names) for plot in plots)
+    return Section(
+        "ablation",
+        "Ablation: what each part is worth",
+        f"Held-out PSNR beyond the mean of the backbone alone on the same capture. {PAPER_TEXT} The paper trained on "
+        "another recording at full length: compare the order, not the size.",
+        {"ablation": figure(plots, "Gain of each variant over the backbone", size=(720, height))},
+        (("Mean ± deviation over seeds", Table(header, cells, _best(groups, cells))),),
+        sources=sources_of(rows),
+    )
+
+
+def _gains(case: str, rows: Sequence[Row]) -> Plot:
+    scored = [row for row in rows if _score(row, "psnr") is not None]
+    names = list(dict.fromkeys(row["method"] for row in scored))
+    base = _backbones(scored)
+    points = []
+    for row in scored:
+        gain = _score(row, "psnr") - base[row["method"].partition(" ")[0]]
+        note = f"{row['method']}, {row['setting']}: {gain:+.2f} dB"
+        points.append(Point(gain, names.index(row["method"]), note))
+    series = [Series("here, one mark per seed", tuple(points))]
+    published = _published_gains(names)
+    if published:
+        series.append(Series("the paper (sear_steak, 4 views)", published, color=1, hollow=True))
+    x = Axis.around("dB over the backbone alone", [p.x for s in series for p in s.points])
+    return Plot(case, x, Axis.listing("", names), tuple(series))
+
+
+def _backbones(rows: Sequence[Row]) -> dict[str, float]:
+    """Mean PSNR of each backbone alone; where that was not run, of its worst variant."""
+    found: dict[str, float] = {}
+    for backbone in dict.fromkeys(row["method"].partition(" ")[0] for row in rows):
+        mine = [row for row in rows if row["method"].partition(" ")[0] == backbone]
+        alone = [row for row in mine if row["method"] == f"{backbone} backbone"]
+        found[backbone] = (
+            mean(_score(row, "psnr") for row in alone) if alone else min(_score(row, "psnr") for row in mine)
+        )
+    return found
+
+
+def _published_gains(names: Sequence[str]) -> tuple[Point, ...]:
+    return ()
+
+
+def _score(row: Row, name: str) -> float | None:
+    return (row.get("scores") or {}).get(name)
+
+
+def _mean(rows: Sequence[Row], name: str) -> float:
+    return mean(row[name] for row in rows)
+
+
+def _score_cells(rows: Sequence[Row]) -> list[str]:
+    return [_spread([_score(row, key) for row in rows], digits) for _, key, digits in SCORES]
+
+
+def _cost_cells(rows: Sequence[Row]) -> list[str]:
+    names = (("gaussians", 0), ("prior_seconds", 1), ("seconds", 1))
+    return [_spread([row[name] for row in rows], digits) for name, digits in names]
+
+
+def _spread(values: Sequence[float | None], digits: int) -> str:
+    known = [value for value in values if value is not None]
+    if not known:
+        return "-"
+    return f"{mean(known):.{digits}f}" + (f" ± {stdev(known):.{digits}f}" if len(known) > 1 else "")
+
+
+def _best(groups: Sequence[tuple[str, str, Sequence[Row]]], cells: Sequence[Sequence[str]]) -> frozenset:
+    """The cells with the best score of each capture."""
+    found = set()
+    for case in dict.fromkeys(case for case, _, _ in groups):
+        rows = [i for i, group in enumerate(groups) if group[0] == case]
+        for column, (_, key, _) in enumerate(SCORES, start=3):
+            scored = [i for i in rows if cells[i][column] != "-"]
+            values = {i: mean(s for row in groups[i][2] if (s := _score(row, key)) is not None) for i in scored}
+            if len(values) > 1:
+                choose = min if key in ("lpips", "depth_absrel") else max
+                found.add((choose(values, key=values.get), column))
+    return frozenset(found)
