@@ -7,8 +7,12 @@ import math
 import torch
 from torch import Tensor
 
+from d2_plugin.adapters.deform import DeformAdapter
 from d2_plugin.adapters.yang4d import Yang4DAdapter
+from d2_plugin.backbones.deform import Deform, DeformSettings
+from d2_plugin.backbones.deform_fields import HexPlaneSettings, MlpSettings
 from d2_plugin.backbones.densify import DensifySettings
+from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.trainer import Trainer, TrainSettings
 from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
 from d2_plugin.config import D2Config, DensifyConfig, DepthLossConfig, PruneConfig
@@ -16,6 +20,8 @@ from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Label, View
 
 WIDTH, HEIGHT, DISTANCE = 32, 24, 3.0
+BACKBONES = ("yang4d", "mlp", "hexplane")
+"""The bundled backbones, the one with a deformation field once for each kind of field."""
 
 
 def make_views() -> list[View]:
@@ -57,19 +63,26 @@ class TinyStore:
         return DepthPrior(depth, labels, torch.full((HEIGHT, WIDTH, 3), 128, dtype=torch.uint8))
 
 
-def make_model(count: int = 60, temporal: bool = True, seed: int = 0) -> Yang4D:
-    """Gaussians scattered between the cameras and beyond the plane."""
+def make_model(count: int = 60, temporal: bool = True, seed: int = 0, backbone: str = "yang4d") -> SplatModel:
+    """Gaussians scattered between the cameras and beyond the plane; `backbone` is one of `BACKBONES`."""
     generator = torch.Generator().manual_seed(seed)
     positions = torch.rand(count, 3, generator=generator) * torch.tensor([3.0, 2.0, 3.0]) + torch.tensor(
         [-1.5, -1, 1.5]
     )
-    settings = Yang4DSettings(
-        temporal=temporal,
-        initial_opacity=0.5,
-        densify=DensifySettings(start=0.1, stop=0.9, every=7, gradient=5e-3, budget=150),
-    )
+    growth = DensifySettings(start=0.1, stop=0.9, every=7, gradient=5e-3, budget=150)
     colors, times = torch.rand(count, 3, generator=generator), torch.rand(count, generator=generator) / 2
-    return Yang4D.from_points(positions, colors, times, settings, extent=2.0, duration=0.5)
+    shared = {"temporal": temporal, "initial_opacity": 0.5, "densify": growth}
+    if backbone == "yang4d":
+        settings = Yang4DSettings(**shared)
+        return Yang4D.from_points(positions, colors, times, settings, extent=2.0, duration=0.5)
+    fields = {"mlp": MlpSettings(width=16, depth=3), "hexplane": HexPlaneSettings(features=4, resolutions=(4, 8))}
+    settings = DeformSettings(**shared, field=backbone, **fields)
+    return Deform.from_points(positions, colors, settings, extent=2.0, duration=0.5)
+
+
+def make_adapter(model: SplatModel) -> Yang4DAdapter | DeformAdapter:
+    """The adapter of either bundled backbone."""
+    return Yang4DAdapter(model) if isinstance(model, Yang4D) else DeformAdapter(model)
 
 
 ALL_HOOKS = D2Config(
@@ -83,16 +96,19 @@ ALL_HOOKS = D2Config(
 def make_trainer(config: D2Config | None = None, iterations: int = 30, **model: object) -> Trainer:
     """A trainer of the tiny scene, with D2 attached where a configuration is given."""
 
-    def attach(model: Yang4D) -> D2Hooks:
-        return D2Hooks.from_config(config, backbone=Yang4DAdapter(model), store=TinyStore())
+    def attach(model: SplatModel) -> D2Hooks:
+        return D2Hooks.from_config(config, backbone=make_adapter(model), store=TinyStore())
 
     settings = TrainSettings(iterations=iterations, seed=3)
     return Trainer(make_model(**model), TinyFrames(), settings, attach if config is not None else None)
 
 
 def parameters(trainer: Trainer) -> dict[str, Tensor]:
-    """The model's parameters, detached."""
-    return {name: value.detach().clone() for name, value in trainer.model.gaussians.parameters.items()}
+    """The model's parameters, those of a deformation field included, detached."""
+    model = trainer.model
+    field = getattr(model, "field", None)
+    named = dict(model.gaussians.parameters) | (dict(field.named_parameters(prefix="field")) if field else {})
+    return {name: value.detach().clone() for name, value in named.items()}
 
 
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
