@@ -33,7 +33,7 @@ STATIC_FPS = 30.0
 SAME_POSE = 1e-5
 """Largest difference of the matrices of one camera; these files are converted, not estimated per picture."""
 
-TIME_DIGITS = 9
+TIME_DIGITS = 12
 """Decimals of a time that count: splits are written by programs that divide in another order."""
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -85,14 +85,14 @@ def _entries(path: Path) -> dict[str, _Entry]:
     for listed_in in (path / name for name in FILES if (path / name).is_file()):
         content = read_json(listed_in)
         frames = content.get("frames")
-        if not isinstance(frames, list) or not frames:
+        if not isinstance(frames, list):
             raise D2Error(f"{listed_in} has no list 'frames': write one entry per picture")
         common = {key: value for key, value in content.items() if key != "frames"}
         for frame in frames:
             entry = _entry(frame, common, listed_in)
             found.setdefault(entry.name, entry)  # a picture that several files list counts once
     if not found:
-        raise D2Error(f"{path} has no transforms.json and no transforms_train.json: give the folder that holds them")
+        raise D2Error(f"{path} has no transforms.json or transforms_train.json that lists pictures: give one that does")
     return found
 
 
@@ -133,11 +133,12 @@ def _present(entries: dict[str, _Entry], intersect: bool) -> tuple[dict[str, _En
 
 def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], float]:
     """Camera and frame of every picture, and frames per unit of time."""
+    declared = next(iter(entries.values())).intrinsics.get("fps")
     shots = arrange(entries, lambda group: _still([entries[name] for name in group]))
     times = {name: entry.time for name, entry in entries.items()}
     instants = set(times.values())
     if len(instants) == 1:
-        return shots, STATIC_FPS
+        return shots, declared if _is_rate(declared) else STATIC_FPS
     if None in instants:
         raise D2Error(f"some pictures listed in {path} have a time and others have none: give all of them one")
     if all(shot.frame == 0 for shot in shots.values()):
@@ -145,7 +146,12 @@ def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], flo
             f"{len(entries)} pictures listed in {path} were taken at {len(instants)} times by cameras that move or "
             "have no number in their names: expected cameras that stand still, and names like CAMERA_FRAME.png"
         )
-    return _timed(shots, times)
+    shots, rate = _timed(shots, times)
+    return shots, declared if _is_rate(declared) and math.isclose(declared, rate, rel_tol=1e-6) else rate
+
+
+def _is_rate(value: Any) -> bool:
+    return isinstance(value, int | float) and 0 < value < math.inf
 
 
 def _timed(shots: dict[str, Shot], times: dict[str, float]) -> tuple[dict[str, Shot], float]:

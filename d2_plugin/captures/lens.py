@@ -27,6 +27,9 @@ KEPT_MAPS = 8
 COVERAGE_STEP = 8
 """Every this many pixels one is looked at to tell how much of a picture is black."""
 
+NEVER = 1e-12
+"""A fold at 1 / a^2 below this lies a million times as far out as the focal length: nowhere."""
+
 
 @dataclass(frozen=True, eq=False)
 class Lens:
@@ -40,7 +43,7 @@ class Lens:
     @property
     def bends(self) -> bool:
         """Whether anything has to be undone: a distortion or skew."""
-        return self.fisheye or any(self.radial) or any(self.tangential) or self.K[0, 1] != 0
+        return self.fisheye or any(self.radial) or any(self.tangential) or bool(self.K[0, 1] != 0)
 
     @property
     def pinhole(self) -> np.ndarray:
@@ -150,6 +153,6 @@ def _recorded_grid(lens: Lens, size: tuple[int, int], step: int) -> np.ndarray:
 def _fold(radial: tuple[float, ...]) -> float:
     """Smallest argument a > 0 where a (1 + k1 a^2 + k2 a^4 + ...) stops growing; infinite where it never does."""
     slope = [1.0, *((2 * power + 1) * k for power, k in enumerate(radial, start=1))]
-    roots = np.roots(np.trim_zeros(slope[::-1], "f"))
-    real = roots[(np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1)) & (roots.real > 0)].real
-    return float(np.sqrt(real.min())) if real.size else np.inf
+    inverse = np.roots(slope)  # of 1 / a^2: the leading coefficient is 1, so tiny k cannot overflow
+    positive = (inverse.real > NEVER) & (np.abs(inverse.imag) < 1e-9 * np.abs(inverse))
+    return float(1 / np.sqrt(inverse.real[positive].max())) if positive.any() else np.inf

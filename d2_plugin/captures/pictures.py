@@ -14,6 +14,7 @@ from d2_plugin.errors import D2Error, missing_extra
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_RGBA = 6  # colour type in the header's byte 25
 _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0..15 without DHT, JPG, DAC
 
 
@@ -27,14 +28,19 @@ def opencv(purpose: str) -> ModuleType:
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """RGB uint8 [H, W, 3] of a PNG or JPEG file, in the pixel order it is stored in (no EXIF rotation)."""
+    """RGB uint8 [H, W, 3] of a PNG or JPEG file, in the pixel order it is stored in (no EXIF rotation).
+
+    A transparent PNG, as Blender scenes have, is laid over black.
+    """
     cv2 = opencv("reading pictures")
     encoded = _bytes_of(path)
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION  # the calibration belongs to the stored pixels
+    transparent = encoded.startswith(_PNG_SIGNATURE) and len(encoded) > 25 and encoded[25] == _PNG_RGBA
+    # The calibration belongs to the stored pixels: EXIF's orientation is ignored, as IMREAD_UNCHANGED does too.
+    flags = cv2.IMREAD_UNCHANGED if transparent else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), flags) if encoded else None
     if picture is None:
         raise _unreadable(path)
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    return _over_black(picture) if transparent else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
 def picture_size(path: Path) -> tuple[int, int]:
@@ -112,6 +118,13 @@ def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
         else:
             position += 2 + length
     raise _unreadable(path)
+
+
+def _over_black(picture: np.ndarray) -> np.ndarray:
+    """RGB uint8 of blue, green, red and opacity with 8 or 16 bits."""
+    full = np.iinfo(picture.dtype).max
+    opaque = picture[..., 2::-1].astype(np.float64) * (picture[..., 3:].astype(np.float64) / full)
+    return np.rint(opaque * (255 / full)).astype(np.uint8)
 
 
 def _png_chunk(kind: bytes, body: bytes) -> bytes:
