@@ -148,15 +148,15 @@ def test_auto_is_patchmatch_where_there_is_a_compiler(pair: Capture, monkeypatch
     from d2_plugin import compiler
 
     monkeypatch.setattr(compiler, "find_compiler", lambda: ["c++"])
-    assert choose_maker("auto", cameras) == "patchmatch"
+    assert choose_maker("auto") == "patchmatch"
 
     def none() -> list[str]:
         raise compiler.NoCompiler("no C++ compiler found")
 
     monkeypatch.setattr(compiler, "find_compiler", none)
-    assert choose_maker("auto", cameras) == "sweep"
+    assert choose_maker("auto") == "sweep"
     with pytest.raises(D2Error, match="did you mean 'patchmatch'"):
-        choose_maker("patch-match", cameras)
+        choose_maker("patch-match")
 
 
 def test_any_function_can_be_a_maker(pair: Capture, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,8 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.align import Alignment, align, aligned_depth, not_aligned
 from d2_plugin.priors.correct import corrected_depth
 from d2_plugin.priors.fuse import VARIANTS, FusedPrior, empty_prior, fuse, hanging_pixels
+from d2_plugin.priors.geometry import check_depth_range
+from d2_plugin.priors.recorded import recorded_depth
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.sources import (
     Frame,
@@ -130,13 +132,20 @@ class _Builder:
         _check(capture, names, settings)
         self.cameras = [capture.cameras[name] for name in names]
         self.mono = None if settings.variant == "mvs" else mono_source(capture, settings, output / "cache" / "mono")
+        recorded = recorded_depth(capture, names, settings.stereo)
         self.bounds: DepthBounds | None = None
         self.geometric: GeometricSource | None = None
-        if len(names) > 1:
-            self.bounds = _rounded(depth_bounds(self.cameras, points, settings.stereo.max_angle), settings.depth_range)
+        if recorded is not None:
+            self.notes.append(f"geometric depth: {recorded.about}")
+            self.bounds = _chosen_bounds(settings)
+        elif len(names) > 1:
+            self.bounds = _chosen_bounds(settings) or _rounded(
+                depth_bounds(self.cameras, points, settings.stereo.max_angle)
+            )
+        if recorded is not None or len(names) > 1:
             folder = output / "cache" / "stereo"
             self.geometric = GeometricSource(
-                self.cameras, self.bounds, settings.stereo, folder, capture.frames, self.read
+                self.cameras, self.bounds, settings.stereo, folder, capture.frames, self.read, recorded
             )
         self.settings, self.variant = settings, self._variant(settings.variant)
         self.store = PriorStore.create(output, names, capture.frames, {"capture": capture.name})
@@ -235,12 +244,15 @@ class _Builder:
         return align(prediction, geometric, kind=mono.kind, settings=self.settings.align)
 
 
+def _chosen_bounds(settings: PriorSettings) -> DepthBounds | None:
+    """The depth range of the settings, None where they leave it open."""
+    if settings.depth_range is None:
+        return None
+    return DepthBounds(*check_depth_range(settings.depth_range), "setting depth_range")
 
 
-def _rounded(bounds: DepthBounds, chosen: tuple[float, float] | None) -> DepthBounds:
+def _rounded(bounds: DepthBounds) -> DepthBounds:
     """Bounds to two digits, outwards: triangulation draws random samples, and its last digits must not void a cache."""
-    if chosen is not None:
-        return DepthBounds(*chosen, "setting depth_range")
 
     def outwards(value: float, towards: Callable[[float], int]) -> float:
         unit = 10.0 ** (math.floor(math.log10(value)) - 1)

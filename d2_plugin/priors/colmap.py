@@ -2,7 +2,7 @@
 
 COLMAP would estimate the geometry of every pair of pictures anew to tell good matches from bad ones. The poses are
 known here, so a match is kept when it lies on its epipolar line: no random sampling, and pairs with a handful of
-matches still count. This module is the only one that imports pycolmap.
+matches still count. No other module imports pycolmap into this process.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def triangulate(
     if len(images) != len(cameras):
         raise D2Error(f"{len(images)} pictures for {len(cameras)} cameras: give one picture per camera")
     settings = settings or TriangulationSettings()
-    pycolmap = _pycolmap()
+    pycolmap = import_pycolmap("triangulating sparse points")
     with _quiet(pycolmap), tempfile.TemporaryDirectory(prefix="d2_sparse_") as folder:
         features = [_extract(pycolmap, image, settings) for image in images]
         pairs = _matched_pairs(features, cameras, settings)
@@ -148,11 +148,16 @@ def triangulate_frames(
     return SparsePoints.joined(parts)
 
 
-def _pycolmap() -> ModuleType:
+def import_pycolmap(purpose: str) -> ModuleType:
+    """The `pycolmap` module, imported after zlib; `purpose` completes the sentence "<purpose> needs pycolmap".
+
+    Raises:
+        MissingExtra: where it is not installed.
+    """
     try:
         import pycolmap
     except ImportError:
-        raise missing_extra("pycolmap", "stereo", "triangulating sparse points") from None
+        raise missing_extra("pycolmap", "stereo", purpose) from None
     return pycolmap
 
 

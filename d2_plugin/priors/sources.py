@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,9 +17,10 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors.files import EntryFolder
 from d2_plugin.priors.filter import GeometricDepth
 from d2_plugin.priors.monocular import MonocularModel, upsample
+from d2_plugin.priors.recorded import RecordedDepth, filter_recorded
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.static import MatchMemory
-from d2_plugin.priors.stereo import DepthBounds, choose_maker, geometric_depth
+from d2_plugin.priors.stereo import WHOLE_PICTURES, DepthBounds, choose_maker, geometric_depth
 from d2_plugin.priors.store import DepthRange
 
 STEREO_VERSION = 1  # raise it when makers or filter change what they return, so that caches are not trusted
@@ -134,33 +135,39 @@ class GeometricSource:
     """Filtered geometric depth of all cameras, one timestamp at a time, cached as 16-bit logarithmic depth.
 
     Frames come in blocks within which matches of static pixels are carried over, so a frame depends on the pictures
-    before it in its block and on no other.
+    before it in its block and on no other. Depth that lies on disk is filtered and cached in the same way.
 
     Args:
         cameras: the cameras that are matched.
-        bounds: depth range that is searched.
+        bounds: depth range that is searched; None only where `recorded` is given, and then nothing is out of range.
         settings: matching, filtering, carrying over.
         cache: folder of the cache; the matches of unfinished blocks lie in `matches` beside it.
         frames: all frame numbers of the build, ascending.
         read: reads the pictures of one frame.
+        recorded: depth on disk, which is taken in place of matching.
     """
 
     def __init__(
         self,
         cameras: Sequence[Camera],
-        bounds: DepthBounds,
+        bounds: DepthBounds | None,
         settings: StereoSettings,
         cache: Path,
         frames: Sequence[int],
         read: Callable[[int], Frame],
+        recorded: RecordedDepth | None = None,
     ) -> None:
+        self.maker = choose_maker(settings.maker) if recorded is None else recorded.maker
+        if recorded is not None or self.maker in WHOLE_PICTURES:
+            settings = replace(settings, reuse_static=False)
         self.cameras, self.bounds, self.settings, self.read = list(cameras), bounds, settings, read
-        self.maker = choose_maker(settings.maker, self.cameras)
+        self.recorded = recorded
         self.entries, self.matches = EntryFolder(cache), cache.with_name("matches")
         self.blocks = frame_blocks(frames, settings)
         self._before = {after: before for block in self.blocks for before, after in pairwise(block)}
         self._keys: dict[int, str] = {}
         self._memory, self._remembered = MatchMemory(), ""
+        self._read_maps: tuple[int | None, list[np.ndarray]] = None, []
 
     def key(self, frame: Frame) -> str:
         """Hash of pictures, cameras, range and settings: of all views, since each depends on all."""
@@ -172,9 +179,10 @@ class GeometricSource:
                 STEREO_VERSION,
                 self.maker,
                 asdict(self.settings),
-                list(self.bounds[:2]),
+                None if self.bounds is None else list(self.bounds[:2]),
                 [describe_camera(camera) for camera in self.cameras],
                 [frame.hashes[camera.name] for camera in self.cameras],
+                None if self.recorded is None else [digest(depth) for depth in self._maps(frame.number)],
                 "" if before is None else self._keys[before],
             )
         return self._keys[frame.number]
@@ -194,8 +202,20 @@ class GeometricSource:
             return None
         return StoredDepth(DepthRange(*entry.record["depth_range"]).decode(entry.array()), entry.record)
 
+    def _maps(self, number: int) -> list[np.ndarray]:
+        """The maps on disk of one frame, float32 [H, W] per camera, 0 where unknown or out of range."""
+        if self._read_maps[0] != number:
+            near, far = (0.0, np.inf) if self.bounds is None else self.bounds[:2]
+            found = [(camera, self.recorded.depth(camera, number)) for camera in self.cameras]
+            whole = [np.zeros((c.height, c.width), np.float32) if depth is None else depth for c, depth in found]
+            self._read_maps = number, [np.where((d >= near) & (d <= far), d, np.float32(0)) for d in whole]
+        return self._read_maps[1]
+
     def _match(self, frame: Frame) -> list[GeometricDepth]:
         """Match one frame after making sure that the memory is that of the frame before it."""
+        if self.recorded is not None:
+            images = [frame.images[camera.name] for camera in self.cameras]
+            return filter_recorded(images, self.cameras, self._maps(frame.number), self.maker, self.settings)
         before = self._before.get(frame.number)
         folder = self.matches / f"{self._first(frame.number):05d}"
         if before is None:

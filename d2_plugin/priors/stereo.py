@@ -48,7 +48,19 @@ def _sweep(*arguments: Any) -> list[RawDepth]:
     return sweep(*arguments)
 
 
-MAKERS: dict[str, Maker] = {"patchmatch": _patchmatch, "sweep": _sweep}
+def _colmap(*arguments: Any) -> list[RawDepth]:
+    from d2_plugin.priors.colmap_mvs import colmap_patch_match
+
+    return colmap_patch_match(*arguments)
+
+
+MAKERS: dict[str, Maker] = {"patchmatch": _patchmatch, "sweep": _sweep, "colmap": _colmap}
+
+ON_DISK = ("sensor", "workspace")
+"""What `maker` may name besides: depth that lies beside a capture (`d2_plugin.priors.recorded`)."""
+
+WHOLE_PICTURES = ("colmap",)
+"""Makers that match every pixel whatever is wanted: carrying matches over would only make them older."""
 
 
 def geometric_depth(
@@ -78,7 +90,7 @@ def geometric_depth(
     """
     check_views(images, cameras)
     depth_range = check_depth_range(depth_range)
-    name = choose_maker(maker or settings.maker, cameras)
+    name = choose_maker(maker or settings.maker)
     small = [_shrunk(gray(image), camera, settings.max_pixels) for image, camera in zip(images, cameras)]
     grays, small_cameras = [pair[0] for pair in small], [pair[1] for pair in small]
     wanted = None if memory is None else memory.wanted(grays, settings)
@@ -90,14 +102,23 @@ def geometric_depth(
     return [enlarged(result, camera.width, camera.height) for result, camera in zip(filtered, cameras)]
 
 
-def choose_maker(name: str, cameras: Sequence[Camera]) -> str:
-    """The name of the maker that `auto` stands for on this machine, or `name` itself if it is known."""
+def choose_maker(name: str) -> str:
+    """The name of the matcher that `auto` stands for on this machine, or `name` itself if it is known.
+
+    Raises:
+        D2Error: an unknown name, or one that stands for depth on disk.
+    """
+    if name in ON_DISK:
+        raise D2Error(f"maker = {name} reads depth that lies beside a capture: build the priors of that capture")
     if name != "auto":
         if name not in MAKERS:
-            raise unknown_name("stereo maker", name, [*MAKERS, "auto"])
+            raise unknown_name("stereo maker", name, [*MAKERS, *ON_DISK, "auto"])
         return name
     from d2_plugin.compiler import NoCompiler, find_compiler
+    from d2_plugin.priors.colmap_mvs import why_not_usable
 
+    if not why_not_usable():
+        return "colmap"
     try:
         find_compiler()
     except NoCompiler:
