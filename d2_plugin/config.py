@@ -104,6 +104,10 @@ class D2Config:
     depth_loss: DepthLossConfig | None = None
     views_per_evaluation: int = 8
     """Training views surveyed at each structure update, taken in turn over all cameras and frames."""
+    retire_after: int = 5
+    """Evaluations in a row that change next to nothing after which a structure hook retires; 0: never."""
+    retire_below: float = 1e-3
+    """Share of the Gaussians; an evaluation that changes fewer has changed next to nothing."""
     seed: int = 0
     """Of D2's own random generator."""
 

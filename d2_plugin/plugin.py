@@ -7,6 +7,7 @@ d2.step(step)                                              # after optimizer.ste
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -22,11 +23,16 @@ from d2_plugin.hooks import Context, Densify, DepthLoss, Hook, PriorLoader, Prun
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Backbone, DepthPrior, Edit, Points, View
 
+_log = logging.getLogger(__name__)
+
+STRUCTURE = ("densify", "prune")
+"""Hooks that edit Gaussians; each of their evaluations surveys several views."""
+
 _CLASSES: dict[str, Callable[[Any], Hook]] = {"densify": Densify, "prune": Prune, "depth_loss": DepthLoss}
 
 
 class Trace(NamedTuple):
-    """One thing a hook did: `action` is "loss", "insert" or "remove"; `count` is the number of Gaussians."""
+    """One thing a hook did: `action` is "loss", "insert", "remove" or "retire"; `count` is the number of Gaussians."""
 
     step: int
     hook: str
@@ -56,12 +62,13 @@ class D2Hooks:
         self.trace: deque[Trace] = deque(maxlen=1000)
         self.generator = torch.Generator().manual_seed(config.seed)
         self._sampler = ViewSampler()
-        self._prior: PriorLoader | None = None
-        self._store = store
         self._count = len(backbone)
         self._warned = False
+        self._idle = dict.fromkeys(self.hooks, 0)  # evaluations in a row that changed next to nothing
+        self.retired: dict[str, int] = {}
+        """Hooks that stopped because their last evaluations changed next to nothing, and the step of the last one."""
         if self.hooks:
-            self._store = store if store is not None else _open_store(config.prior)
+            self._prior = PriorLoader(store if store is not None else _open_store(config.prior))
             backbone.on_resize(self._follow)
 
     @classmethod
@@ -102,7 +109,10 @@ class D2Hooks:
             return Report(gaussians=len(self.backbone))
         self._check_count()
         context = self._context(step, ())
-        edits = [(name, edit) for name, hook in self._due(step) if (edit := hook.edit(context)) is not None]
+        proposals = [(name, hook.edit(context)) for name, hook in self._due(step)]
+        edits = [(name, edit) for name, edit in proposals if edit is not None]
+        for name, edit in proposals:
+            self._retire_if_idle(step, name, edit, context)
         removed = self._remove(step, edits)
         inserted = self._insert(step, edits)
         return Report(inserted, removed, len(self.backbone))
@@ -113,6 +123,8 @@ class D2Hooks:
             "hooks": {name: hook.state_dict() for name, hook in self.hooks.items()},
             "views": self._sampler.state_dict(),
             "generator": self.generator.get_state(),
+            "idle": dict(self._idle),
+            "retired": dict(self.retired),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -127,24 +139,32 @@ class D2Hooks:
             hook.load_state_dict(state["hooks"][name])
         self._sampler.load_state_dict(state["views"])
         self.generator.set_state(state["generator"])
+        self._idle, self.retired = dict(state["idle"]), dict(state["retired"])
         self._count = len(self.backbone)
 
     def _due(self, step: int) -> list[tuple[str, Hook]]:
         active = getattr(self.backbone, "active", None)
         if active is not None and not active(step):
             return []
-        return [(name, hook) for name, hook in self.hooks.items() if hook.window.due(step)]
+        return [(name, hook) for name, hook in self.hooks.items() if name not in self.retired and hook.window.due(step)]
 
     def _context(self, step: int, views: Sequence) -> Context:
         def sample() -> Sequence:
             return self._sampler.sample(self.config.views_per_evaluation, self.generator)
 
-        return Context(step, self.backbone, views, self._load_prior, self.generator, sample)
+        return Context(step, self.backbone, views, self._prior, self.generator, sample)
 
-    def _load_prior(self, view: View) -> DepthPrior | None:
-        if self._prior is None:
-            self._prior = PriorLoader(self._store, view.K.device)
-        return self._prior(view)
+    def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
+        """Leave out a structure hook whose last evaluations changed next to nothing: its surveys cost time."""
+        config, hook = self.config, self.hooks[name]
+        if not config.retire_after or name not in STRUCTURE or not context.evaluation:
+            return
+        changed = edit is not None and edit.changes >= max(config.retire_below * len(self.backbone), 1)
+        self._idle[name] = 0 if changed else self._idle[name] + 1
+        if self._idle[name] >= config.retire_after + hook.settling:
+            self.retired[name] = step
+            self.trace.append(Trace(step, name, "retire", 0))
+            _log.info("%s retires at step %d: %d evaluations changed next to nothing", name, step, self._idle[name])
 
     def _remove(self, step: int, edits: Sequence[tuple[str, Edit]]) -> int:
         masks = [(name, edit.remove) for name, edit in edits if edit.remove is not None]

@@ -69,6 +69,12 @@ class Edit(NamedTuple):
     remove: Tensor | None = None
     insert: Points | None = None
 
+    @property
+    def changes(self) -> int:
+        """How many Gaussians it removes and inserts."""
+        removed = 0 if self.remove is None else int(self.remove.sum())
+        return removed + (0 if self.insert is None else len(self.insert.positions))
+
 
 class DepthPrior(NamedTuple):
     """D* of one view: `depth` [H, W] float32 (0 where there is none) and `labels` [H, W] uint8 (see `Label`).

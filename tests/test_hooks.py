@@ -16,7 +16,8 @@ from d2_plugin.hooks.densify import (
     sample_pixels,
     under_reconstructed,
 )
-from d2_plugin.hooks.depth_loss import charbonnier, depth_loss
+from d2_plugin.hooks.depth_loss import charbonnier, depth_loss, pixel_depth_loss
+from d2_plugin.hooks.prior import VerifiedPixels
 from d2_plugin.hooks.prune import depth_inconsistency, opacity_contribution, pruning_score
 from d2_plugin.hooks.rendered_depth import relative_discrepancy, rendered_depth
 from d2_plugin.protocol import View
@@ -127,6 +128,49 @@ class TestDepthLoss:
         mask = torch.ones(2, dtype=torch.bool)
         loss = depth_loss(tensor(1.1e-3, 1.1e6), mask, tensor(1e-3, 1e6), mask, 0.01)
         torch.testing.assert_close(loss, charbonnier(tensor(0.1), 0.01).squeeze(), rtol=1e-4, atol=0)
+
+
+class TestPixelDepthLoss:
+    """The fast form that the hook uses is the paper's formula, value and gradient."""
+
+    @staticmethod
+    def maps(
+        seed: int, shape: tuple[int, int] = (7, 9)
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+        generator = torch.Generator().manual_seed(seed)
+        depth_sum, alpha, prior, chance = torch.rand(4, *shape, generator=generator, dtype=torch.float64)
+        return depth_sum * 3, alpha, prior + 0.5, chance < 0.4
+
+    @given(st.integers(0, 10_000))
+    @settings(max_examples=50, deadline=None)
+    def test_equals_the_composed_formula_with_its_gradient(self, seed: int) -> None:
+        depth_sum, alpha, prior, verified = self.maps(seed)
+        pixels = VerifiedPixels(torch.nonzero(verified.flatten()).squeeze(1), prior[verified])
+        gradients = []
+        for fast in (False, True):
+            z, a = depth_sum.clone().requires_grad_(), alpha.clone().requires_grad_()
+            if fast:
+                loss = pixel_depth_loss(z, a, pixels, 0.5, 0.01)
+            else:
+                depth, valid = rendered_depth(z, a, 0.5)
+                loss = depth_loss(depth, valid, prior, verified, 0.01)
+            (3 * loss).backward()
+            gradients.append((loss.detach(), z.grad, a.grad))
+        for composed, closed in zip(*gradients, strict=True):
+            torch.testing.assert_close(closed, composed, rtol=1e-7, atol=1e-12)
+
+    def test_gradcheck(self) -> None:
+        depth_sum, alpha, prior, verified = self.maps(1)
+        alpha = torch.where((alpha - 0.5).abs() < 0.01, 0.6, alpha)  # away from the step at tau_v
+        pixels = VerifiedPixels(torch.nonzero(verified.flatten()).squeeze(1), prior[verified])
+        inputs = (depth_sum.requires_grad_(), alpha.requires_grad_())
+        assert torch.autograd.gradcheck(lambda z, a: pixel_depth_loss(z, a, pixels, 0.5, 0.01), inputs)
+
+    def test_is_finite_where_nothing_is_rendered(self) -> None:
+        z, a = torch.zeros(2, 3, requires_grad=True), torch.zeros(2, 3, requires_grad=True)
+        loss = pixel_depth_loss(z, a, VerifiedPixels(torch.tensor([0, 4]), torch.tensor([1e-3, 1e6])), 0.5, 0.01)
+        loss.backward()
+        assert loss == 0 and (z.grad == 0).all() and (a.grad == 0).all()
 
 
 class TestPruning:

@@ -13,6 +13,8 @@ from torch import Tensor
 from d2_plugin.protocol import Backbone, DepthPrior, Edit, Splats, Survey, View
 from d2_plugin.rasterizer import survey
 
+from .prior import PriorLoader
+
 
 @dataclass(frozen=True)
 class Window:
@@ -44,7 +46,7 @@ class Context:
     backbone: Backbone
     views: Sequence[View]
     """The views of the present training step."""
-    prior: Callable[[View], DepthPrior | None]
+    prior: PriorLoader
     generator: torch.Generator
     sample: Callable[[], Sequence[View]] = field(default=tuple)
     """The views to evaluate when structure is edited: a stratified sample of all training views."""
@@ -67,6 +69,8 @@ class Hook:
     """Base of all hooks: does nothing. Per-Gaussian state is declared by implementing `follow`."""
 
     window = Window()
+    settling = 0
+    """Evaluations at the start in which the hook only gathers evidence and so cannot change anything yet."""
 
     def loss(self, context: Context) -> Tensor | None:
         """A term to add to the training loss of this step, or None."""

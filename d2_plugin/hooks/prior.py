@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
+from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, View
@@ -17,12 +18,20 @@ class Store(Protocol):
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
 
 
-class PriorLoader:
-    """Looks up D* by camera and frame; keeps the last few on the device, since memory must not grow with frames."""
+class VerifiedPixels(NamedTuple):
+    """Omega^v of one view: where D* is verified, and D* there."""
 
-    def __init__(self, store: Store, device: torch.device, keep_bytes: int = 512 << 20) -> None:
-        self.store, self.device, self.keep_bytes = store, device, keep_bytes
+    index: Tensor  # [K] int64, row * width + column
+    depth: Tensor  # [K] float32
+
+
+class PriorLoader:
+    """Looks up D* by camera and frame, on the view's device; keeps the last few, since memory must not grow with frames."""
+
+    def __init__(self, store: Store, keep_bytes: int = 512 << 20) -> None:
+        self.store, self.keep_bytes = store, keep_bytes
         self._kept: OrderedDict[tuple[str, int], DepthPrior | None] = OrderedDict()
+        self._pixels: dict[tuple[str, int], VerifiedPixels] = {}
 
     def __call__(self, view: View) -> DepthPrior | None:
         """D* of the view, or None where the store has none; refuses one of another size than the view."""
@@ -33,11 +42,23 @@ class PriorLoader:
         prior = self.store.prior(*key)
         if prior is not None:
             self._check(view, prior)
-            prior = DepthPrior(*(None if t is None else t.to(self.device) for t in prior))
+            prior = DepthPrior(*(None if t is None else t.to(view.K.device) for t in prior))
         self._kept[key] = prior
         while len(self._kept) > 1 and sum(map(_bytes, self._kept.values())) > self.keep_bytes:
-            self._kept.popitem(last=False)
+            dropped, _ = self._kept.popitem(last=False)
+            self._pixels.pop(dropped, None)
         return prior
+
+    def verified(self, view: View) -> VerifiedPixels | None:
+        """The verified pixels of the view, or None where there is not one."""
+        key, prior = (view.camera, view.frame), self(view)
+        if prior is None:
+            return None
+        if key not in self._pixels:
+            index = torch.nonzero(prior.verified.flatten()).squeeze(1)
+            self._pixels[key] = VerifiedPixels(index, prior.depth.flatten()[index])
+        pixels = self._pixels[key]
+        return pixels if len(pixels.index) else None
 
     @staticmethod
     def _check(view: View, prior: DepthPrior) -> None:
@@ -50,4 +71,7 @@ class PriorLoader:
 
 
 def _bytes(prior: DepthPrior | None) -> int:
-    return 0 if prior is None else sum(t.numel() * t.element_size() for t in prior if t is not None)
+    """Of a prior on the device, and of as many verified pixels as it may have."""
+    if prior is None:
+        return 0
+    return sum(t.numel() * t.element_size() for t in prior if t is not None) + 12 * prior.depth.numel()

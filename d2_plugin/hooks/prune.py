@@ -57,6 +57,7 @@ class Prune(Hook):
     def __init__(self, config: PruneConfig) -> None:
         self.config = config
         self.window = Window(config.start, config.stop, config.every)
+        self.settling = config.patience - 1
         self.streak: Tensor | None = None  # [N] evaluations in a row with S_k > tau_p
 
     def edit(self, context: Context) -> Edit | None:

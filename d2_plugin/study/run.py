@@ -54,12 +54,17 @@ class Run:
         """Whether any hook of this run needs the depth prior."""
         return any(name in self.settings.hooks for name in HOOK_NAMES[1:])
 
-    def train(self) -> None:
-        """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one."""
+    def prepare(self, priors: bool = True) -> tuple[Extent, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Triangulate the sparse points and build the depth prior where they are missing; the extent and the points."""
         with self._timed("priors"):
             extent, sparse = self._points()
-            if self.uses_prior:
+            if priors and self.uses_prior:
                 build_priors_for(self.settings, self.scene, sparse[0], self.priors)
+        return extent, sparse
+
+    def train(self) -> None:
+        """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one."""
+        extent, sparse = self.prepare()
         trainer = self._trainer(extent, sparse)
         self._restore(trainer)
         iterations = self.settings.iterations

@@ -15,7 +15,7 @@ from d2_plugin.plan import ScenePlan, plan_scene
 from d2_plugin.priors.settings import PriorSettings
 
 HOOK_NAMES = ("prior", "densify", "prune", "depth_loss")
-TABLES = ("backbone", "densify", "prune", "depth_loss", "priors", "plan")
+TABLES = ("backbone", "d2", "densify", "prune", "depth_loss", "priors", "plan")
 """What a configuration file may hold."""
 OVERRIDABLE = ("temporal",)
 """Decisions of the plan that `[plan]` may take; the others follow from the cameras and depth sources that are given."""
@@ -120,5 +120,6 @@ def hook_config(settings: RunSettings, priors: Path) -> D2Config:
     tables = {name: settings.overrides.get(name, {}) for name in hooks}
     return D2Config.from_dict(
         {name: value for name, value in vars(config).items() if name not in hooks}
+        | dict(settings.overrides.get("d2", {}))
         | {name: vars(getattr(config, name)) | tables[name] for name in hooks}
     )
