@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from d2_plugin.protocol import Points
+
 DISTANCES_AT_ONCE = 1 << 24
 """Entries of the distance matrix that are held at a time (64 MiB in float32)."""
 
@@ -75,3 +77,33 @@ def neighbour_offsets(targets: Tensor, means: Tensor, offsets: Tensor) -> Tensor
 
 def _length(residual: Tensor) -> Tensor:
     return torch.nan_to_num(residual.norm(dim=-1), nan=torch.inf)
+
+
+@torch.no_grad()
+def invert_at_times(
+    points: Points, deformed: Callable[[Tensor, float], Tensor], present: Tensor, tolerance: float = 0.5
+) -> Inversion:
+    """Canonical positions of points that were each seen at their own time.
+
+    Args:
+        points: K points; `times` in the field's unit.
+        deformed: canonical positions [n, 3] and a time to deformed positions [n, 3].
+        present: canonical positions [N, 3] of the Gaussians that there are.
+        tolerance: largest accepted residual in standard deviations of each point: one that is off by half of its own
+            width still covers its pixel, whatever the unit of length.
+    """
+    positions = points.positions.clone()
+    accepted = torch.zeros_like(points.times, dtype=torch.bool)
+    residuals = torch.zeros_like(points.times)
+    for time in points.times.unique().tolist():
+        chosen = torch.nonzero(points.times == time).squeeze(-1)
+        moved = deformed(present, time)
+        found = invert_deformation(
+            lambda x, time=time: deformed(x, time),
+            points.positions[chosen],
+            moved,
+            moved - present,
+            tolerance * points.scales[chosen],
+        )
+        positions[chosen], accepted[chosen], residuals[chosen] = found
+    return Inversion(positions, accepted, residuals)

@@ -1,0 +1,82 @@
+"""Camera objects of the Inria family as views: one way that serves all their variants.
+
+What such a trainer draws is decided by `world_view_transform` and `projection_matrix`, both stored transposed.
+Intrinsics are read from the projection, not from the fields of view: those are -1 where fudan's reader found focal
+lengths, and say nothing of a principal point off the centre (SpacetimeGaussians, fudan).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from d2_plugin.errors import D2Error
+from d2_plugin.protocol import View
+
+from .keys import PriorKey
+
+
+def inria_view(camera: object, key: PriorKey, time: float, like: Tensor) -> View:
+    """The view of a camera object, on the device of `like`; `time` is in the trainer's unit.
+
+    Raises:
+        D2Error: an object without pose or intrinsics.
+    """
+    if not hasattr(camera, "world_view_transform"):
+        raise D2Error(
+            f"a camera of type {type(camera).__name__} has no world_view_transform: pass the trainer's own camera "
+            "object, or a d2_plugin View"
+        )
+    width, height = int(camera.image_width), int(camera.image_height)
+    pose = camera.world_view_transform.detach().T
+    return View(
+        camera=key.camera,
+        frame=key.frame,
+        time=time,
+        T_camera_world=pose.to(like).contiguous(),
+        K=intrinsics(camera, width, height).to(like),
+        width=width,
+        height=height,
+    )
+
+
+def intrinsics(camera: object, width: int, height: int) -> Tensor:
+    """K [3, 3] float64 in pixels, with pixel centres at i + 0.5, as the trainer's rasterizer has it.
+
+    From the projection P (clip = P camera, w = z): f_x = P_00 W / 2 and c_x = (P_02 + 1) W / 2, rows alike.
+    """
+    half = torch.tensor([width / 2, height / 2], dtype=torch.float64)
+    projection = getattr(camera, "projection_matrix", None)
+    if projection is not None:
+        P = projection.detach().T.double().cpu()
+        focal, centre = P.diagonal()[:2] * half, (P[:2, 2] + 1) * half
+    else:
+        angles = float(camera.FoVx), float(camera.FoVy)
+        if min(angles) <= 0:
+            raise D2Error(
+                f"camera '{camera.image_name}' has fields of view {angles[0]:g}, {angles[1]:g} and no projection "
+                "matrix: give it one of the two"
+            )
+        focal, centre = half / torch.tensor([math.tan(angle / 2) for angle in angles], dtype=torch.float64), half
+    K = torch.eye(3, dtype=torch.float64)
+    K[0, 0], K[1, 1], K[0, 2], K[1, 2] = *focal, *centre
+    return K
+
+
+def correct_fields_of_view(cameras: Iterable[object]) -> int:
+    """Give cameras whose FoVx is -1 the fields of view that their focal lengths mean; returns how many there were.
+
+    fudan's reader leaves -1 where transforms.json has fl_x (dataset_readers.py:276), and its rasterizer then takes
+    tan(-0.5) for the Jacobian of every Gaussian: footprints come out 1.69 and 1.27 times too large and sheared (issue
+    64 of fudan-zvg/4d-gaussian-splatting).
+    """
+    count = 0
+    for camera in cameras:
+        if camera.FoVx < 0 and camera.fl_x > 0:
+            camera.FoVx = 2 * math.atan(camera.image_width / (2 * camera.fl_x))
+            camera.FoVy = 2 * math.atan(camera.image_height / (2 * camera.fl_y))
+            count += 1
+    return count

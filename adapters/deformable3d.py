@@ -1,0 +1,93 @@
+"""ingra14m/Deformable-3D-Gaussians (CVPR 2024): canonical 3D Gaussians moved by an MLP, `DeformModel`.
+
+    d2 = D2Hooks.from_config("d2.toml", Deformable3DAdapter(gaussians, deform, warm_up=opt.warm_up))  # train.py:41
+    loss = loss + d2.loss(iteration, viewpoint_cam)                                                   # before :109
+    d2.step(iteration)                                                                                # after :163
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from d2_plugin.backbones.rotation4d import covariances_from_factors, rotation_matrices_3d
+from d2_plugin.protocol import Points, RasterSettings, Splats, View
+
+from .inria import InriaAdapter
+from .inverse_deformation import Inversion, invert_at_times
+from .keys import KeyOf
+
+
+class Deformable3DAdapter(InriaAdapter):
+    """A `GaussianModel` with its `DeformModel` as a `d2_plugin.protocol.Backbone`.
+
+    The slice is that of its render (gaussian_renderer/__init__.py:70-90): offsets of scales are added AFTER exp and may
+    leave a negative scale, offsets of rotations after normalising, and neither the Python side nor the rasterizer
+    normalises the sum: its length scales the covariance, and is kept. Before `warm_up` nothing is deformed. The noise
+    that training adds to times of real scenes is left out: it has mean zero.
+
+    Args:
+        gaussians: the model, after `training_setup`.
+        deform: its `DeformModel`.
+        warm_up: iteration from which the field is used (opt.warm_up).
+        is_6dof: whether the field returns rigid motions [N, 4, 4] (dataset.is_6dof); read from the network by default.
+        settings: constants of its rasterizer, where they were changed.
+        key: the prior of a camera, where its picture's name does not tell (poses_bounds.npy with pictures 0000.png).
+    """
+
+    def __init__(
+        self,
+        gaussians: object,
+        deform: object,
+        *,
+        warm_up: int = 3000,
+        is_6dof: bool | None = None,
+        settings: RasterSettings | None = None,
+        key: KeyOf | None = None,
+    ) -> None:
+        super().__init__(gaussians, settings, key)
+        self.deform, self.warm_up = deform, warm_up
+        self.is_6dof = bool(getattr(deform.deform, "is_6dof", False)) if is_6dof is None else is_6dof
+        self.inversion: Inversion | None = None
+        self._step = 0
+
+    def active(self, step: int) -> bool:
+        """Always; D2Hooks asks this first, which tells the present step and thereby whether the field is used yet."""
+        self._step = step
+        return True
+
+    def slice_at(self, view: View) -> Splats:
+        """The 3D Gaussians at `view.time`, differentiable in the model's and in the field's parameters."""
+        model = self.gaussians
+        rows = torch.arange(len(self), device=model._xyz.device)
+        opacities = torch.sigmoid(model._opacity.squeeze(-1))
+        means, scales, rotations = model._xyz, model._scaling.exp(), torch.nn.functional.normalize(model._rotation)
+        if self._step >= self.warm_up:
+            motion, rotation, scaling = self._field(model._xyz.detach(), view.time)
+            means, scales, rotations = self._moved(means, motion), scales + scaling, rotations + rotation
+        factors = rotation_matrices_3d(rotations.T) * scales.T
+        return Splats(means, covariances_from_factors(factors), opacities, rows)
+
+    def _field(self, positions: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
+        return self.deform.step(positions, positions.new_full((len(positions), 1), time))
+
+    def _moved(self, positions: Tensor, motion: Tensor) -> Tensor:
+        if not self.is_6dof:
+            return positions + motion
+        return torch.einsum("nij,nj->ni", motion[:, :3, :3], positions) + motion[:, :3, 3]
+
+    def _time(self, camera: object) -> float:
+        """`fid`, a tensor of one number."""
+        return float(camera.fid)
+
+    def _append(self, points: Points) -> None:
+        """Canonical Gaussians that the field moves onto the points at the points' times; they exist at all times."""
+        if self._step >= self.warm_up:
+            self.inversion = invert_at_times(points, self._deformed, self.gaussians._xyz.detach())
+            points = points._replace(positions=self.inversion.positions)
+        self.gaussians.densification_postfix(*self._raw_rows(points))
+
+    def _deformed(self, positions: Tensor, time: float) -> Tensor:
+        if not len(positions):
+            return positions
+        return self._moved(positions, self._field(positions, time)[0])

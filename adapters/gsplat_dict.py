@@ -1,0 +1,219 @@
+"""A gsplat dict of parameters with its dict of optimizers (examples/simple_trainer.py, gsplat.strategy).
+
+    adapter = GsplatAdapter(splats, optimizers, strategy_state)     # after strategy.initialize_state()
+    d2 = D2Hooks.from_config("d2.toml", adapter)
+    loss = loss + d2.loss(step, views)                              # before backward
+    d2.step(step)                                                   # after strategy.step_post_backward and zero_grad
+
+gsplat has no instance whose methods could be watched: strategies swap the dict's entries. But every operation on
+Gaussians carries along each tensor in the strategy's `state` (ops.py: duplicate, split, remove, relocate, sample_add),
+so a column of row numbers in there tells afterwards what became of each row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, MutableMapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from d2_plugin.backbones.rotation4d import covariances_from_factors, rotation_matrices_3d
+from d2_plugin.backbones.slicing import unit_quaternions
+from d2_plugin.errors import D2Error
+from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
+
+SH_C0 = 0.28209479177387814
+"""Y_0 of the spherical harmonics."""
+
+ROWS = "d2_rows"
+"""The column in the strategy's state: the number of each row plus one, since gsplat marks what is new with zeros."""
+
+SliceOf = Callable[[Mapping[str, Tensor], View], Splats]
+RowsOf = Callable[[Points], Mapping[str, Tensor]]
+
+
+class GsplatAdapter:
+    """A dict of parameters, one Adam each, as a `d2_plugin.protocol.Backbone`.
+
+    Args:
+        parameters: by name, [N, ...] each: means, scales (log), quats (w first), opacities [N] (logit), and sh0, shN or
+            colors (logit).
+        optimizers: one per name, as gsplat keeps them.
+        state: the strategy's state; without it, only appended rows are understood (MCMC's `sample_add`), and anything
+            else resets what hooks count, with a warning.
+        view: from the trainer's camera to a `View`; not needed where the trainer passes views.
+        slice_at: the 3D Gaussians of a view, for models that change over time; by default the parameters as they are.
+        new_rows: raw rows of further parameters (velocities, times, ...) for inserted points.
+        settings: constants of the rasterizer; by default gsplat's, whose near plane is .01.
+    """
+
+    def __init__(
+        self,
+        parameters: MutableMapping[str, Tensor],
+        optimizers: Mapping[str, torch.optim.Optimizer],
+        state: MutableMapping[str, Any] | None = None,
+        *,
+        view: Callable[[object], View] | None = None,
+        slice_at: SliceOf | None = None,
+        new_rows: RowsOf | None = None,
+        settings: RasterSettings | None = None,
+    ) -> None:
+        for name in ("means", "scales", "quats", "opacities"):
+            if name not in parameters:
+                raise D2Error(f"parameters have {', '.join(parameters)} but no '{name}', which gsplat's names include")
+        self.parameters, self.optimizers, self.state = parameters, optimizers, state
+        self.settings = settings or RasterSettings(near=0.01)
+        self._view, self._slice, self._new_rows = view, slice_at, new_rows
+        self._listeners: list[ResizeListener] = []
+        self._known = 0
+        self._renumber()
+
+    def __len__(self) -> int:
+        """N; what the strategy did since the last look is reported to the listeners first."""
+        self._report_changes()
+        return self._count
+
+    def view(self, camera: object) -> View:
+        """The view of the trainer's camera, or a `View` as it is."""
+        if isinstance(camera, View):
+            return camera
+        if self._view is None:
+            raise D2Error(
+                f"a camera of type {type(camera).__name__} is no View: pass views, or give the adapter a function `view`"
+            )
+        return self._view(camera)
+
+    def slice_at(self, view: View) -> Splats:
+        """The 3D Gaussians at `view.time`, differentiable."""
+        if self._slice is not None:
+            return self._slice(self.parameters, view)
+        p = self.parameters
+        factors = rotation_matrices_3d(unit_quaternions(p["quats"])) * p["scales"].T.exp()
+        rows = torch.arange(self._count, device=p["means"].device)
+        return Splats(p["means"], covariances_from_factors(factors), torch.sigmoid(p["opacities"]), rows)
+
+    @torch.no_grad()
+    def insert(self, points: Points) -> int:
+        """Isotropic Gaussians at the finite ones of the points, at the end; returns their number.
+
+        The strategy's evidence (grad2d, count, radii, ...) is kept, with zeros for the new rows.
+        """
+        self._report_changes()
+        finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
+        points = Points(*(value[finite] for value in points))
+        rows, count = self._rows(points), len(points.positions)
+        index = torch.arange(self._count + count, device=points.positions.device)
+        index[self._count :] = -1
+        for name in self.parameters:
+            self._replace(name, lambda old, new=rows[name]: torch.cat([old, new.to(old)]), new_moments=rows[name])
+        self._change_state(lambda old: torch.cat([old, old.new_zeros(count, *old.shape[1:])]), index)
+        return count
+
+    @torch.no_grad()
+    def remove(self, mask: Tensor) -> None:
+        """Delete the rows where `mask` [N] is True from parameters, moments and the strategy's state."""
+        self._report_changes()
+        index = torch.nonzero(~mask).squeeze(-1)
+        for name in self.parameters:
+            self._replace(name, lambda old: old[index])
+        self._change_state(lambda old: old[index], index)
+
+    def on_resize(self, listener: ResizeListener) -> None:
+        """Register a listener for every structural change; the strategy's own are seen at the next look."""
+        self._listeners.append(listener)
+
+    @property
+    def _count(self) -> int:
+        return len(self.parameters["means"])
+
+    def _rows(self, points: Points) -> dict[str, Tensor]:
+        """Raw rows of every parameter; refuses one whose start is not known."""
+        count, like = len(points.positions), points.positions
+        quats = like.new_zeros(count, 4)
+        quats[:, 0] = 1
+        known = {
+            "means": points.positions,
+            "scales": points.scales.log()[:, None].repeat(1, 3),
+            "quats": quats,
+            "opacities": torch.logit(points.opacities, eps=1e-6),
+            "sh0": ((points.colors - 0.5) / SH_C0)[:, None, :],
+            "colors": torch.logit(points.colors, eps=1e-3),
+        }
+        if "shN" in self.parameters:
+            known["shN"] = like.new_zeros(count, *self.parameters["shN"].shape[1:])
+        if self._new_rows is not None:
+            known |= self._new_rows(points)
+        for name, parameter in self.parameters.items():
+            if name not in known or known[name].shape[1:] != parameter.shape[1:]:
+                raise D2Error(
+                    f"parameter '{name}' of shape {tuple(parameter.shape)} is not one that gsplat starts: give the "
+                    "adapter a function `new_rows` that returns its rows for inserted points"
+                )
+        return {name: known[name] for name in self.parameters}
+
+    def _replace(self, name: str, change: Callable[[Tensor], Tensor], new_moments: Tensor | None = None) -> None:
+        """Swap one parameter in the dict and its optimizer, its moments changed alike or padded with zeros."""
+        old, optimizer = self.parameters[name], self.optimizers[name]
+        new = torch.nn.Parameter(change(old.detach()), requires_grad=old.requires_grad)
+        moments = optimizer.state.pop(old, {})
+        for key, value in moments.items():
+            if key == "step" or not isinstance(value, Tensor) or value.shape[:1] != old.shape[:1]:
+                continue
+            padded = new_moments is not None
+            moments[key] = torch.cat([value, torch.zeros_like(new_moments).to(value)]) if padded else change(value)
+        if moments:
+            optimizer.state[new] = moments
+        for group in optimizer.param_groups:
+            group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
+        self.parameters[name] = new
+
+    def _change_state(self, change: Callable[[Tensor], Tensor], index: Tensor) -> None:
+        for key, value in (self.state or {}).items():
+            if isinstance(value, Tensor) and value.shape[:1] == (self._known,):
+                self.state[key] = change(value)
+        self._renumber()
+        self._tell(index)
+
+    def _report_changes(self) -> None:
+        """Tell listeners what the strategy did: a row keeps its number, its copies and new rows are -1."""
+        numbers = None if self.state is None else self.state.get(ROWS)
+        if numbers is None or len(numbers) != self._count:
+            self._report_growth()
+        elif len(numbers) != self._known or not torch.equal(numbers, self._numbers()):
+            index = _first_occurrences(numbers - 1)
+            self._renumber()
+            self._tell(index)
+
+    def _report_growth(self) -> None:
+        """Without row numbers: growth appends (gsplat's sample_add); shrinking is left to the net of D2Hooks."""
+        if self._count > self._known:
+            index = self._numbers() - 1
+            index[self._known :] = -1
+            self._renumber()
+            self._tell(index)
+        elif self._count < self._known:
+            self._renumber()
+
+    def _renumber(self) -> None:
+        self._known = self._count
+        if self.state is not None:
+            self.state[ROWS] = self._numbers()
+
+    def _numbers(self) -> Tensor:
+        return torch.arange(1, self._count + 1, device=self.parameters["means"].device)
+
+    def _tell(self, index: Tensor) -> None:
+        for listener in self._listeners:
+            listener(index)
+
+
+def _first_occurrences(rows: Tensor) -> Tensor:
+    """`rows` [N] with -1 for every repetition of a number: a clone starts anew, its original goes on."""
+    order = torch.argsort(rows, stable=True)
+    ordered = rows[order]
+    repeated = torch.zeros_like(ordered, dtype=torch.bool)
+    repeated[1:] = ordered[1:] == ordered[:-1]
+    index = rows.clone()
+    index[order[repeated]] = -1
+    return index

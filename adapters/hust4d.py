@@ -1,0 +1,130 @@
+"""hustvl/4DGaussians (CVPR 2024): canonical 3D Gaussians deformed by a HexPlane field, trained in two stages.
+
+    d2 = D2Hooks.from_config("d2.toml", Hust4DAdapter(gaussians, scene, stage))   # train.py:52, in each stage
+    loss = loss + d2.loss(iteration, viewpoint_cams)                              # before :219, the whole batch
+    d2.step(iteration)                                                            # after :292, before the checkpoint
+
+`scene_reconstruction` runs once per stage and calls `training_setup` anew, so line 1 runs twice on one model; the
+adapter of the fine stage takes the place of the coarse one's. Iterations count from 1 in each.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from d2_plugin.backbones.rotation4d import covariances_from_factors, rotation_matrices_3d
+from d2_plugin.backbones.slicing import unit_quaternions
+from d2_plugin.errors import D2Error
+from d2_plugin.protocol import Points, RasterSettings, Splats, View
+
+from .inria import InriaAdapter
+from .inverse_deformation import Inversion, invert_at_times
+from .keys import KeyOf, PriorKey, key_from_picture
+
+STAGES = ("coarse", "fine")
+
+
+class Hust4DAdapter(InriaAdapter):
+    """A `GaussianModel` of hustvl/4DGaussians as a `d2_plugin.protocol.Backbone`.
+
+    The slice is that of its render (gaussian_renderer/__init__.py:79-98): offsets are added BEFORE the activations; in
+    the coarse stage there are none, and the model is one still scene for all frames.
+
+    Args:
+        gaussians: the model, after `training_setup`.
+        scene: its `Scene`; `image_name` and `uid` of a camera are only its place in the data set
+            (scene/dataset.py:39), so the picture's path, which says camera and frame, comes from
+            `scene.train_camera.dataset.image_paths`.
+        stage: "coarse" or "fine", the variable of that name in `scene_reconstruction`.
+        active_stages: the stages in which hooks run. The coarse one fits one still scene to all instants, which the
+            prior of a moving surface contradicts, so it is left alone by default.
+        settings: constants of its rasterizer, where they were changed.
+        key: the prior of a camera, where the picture's path does not tell.
+    """
+
+    evidence = InriaAdapter.evidence | {"_deformation_accum": 0.0}
+
+    def __init__(
+        self,
+        gaussians: object,
+        scene: object | None,
+        stage: str,
+        *,
+        active_stages: tuple[str, ...] = ("fine",),
+        settings: RasterSettings | None = None,
+        key: KeyOf | None = None,
+    ) -> None:
+        if stage not in STAGES:
+            raise D2Error(f"stage must be one of {', '.join(STAGES)}, got '{stage}': pass scene_reconstruction's own")
+        super().__init__(gaussians, settings, key)
+        self.stage, self.active_stages = stage, active_stages
+        self.inversion: Inversion | None = None
+        self._paths = getattr(getattr(getattr(scene, "train_camera", None), "dataset", None), "image_paths", None)
+
+    def active(self, step: int) -> bool:
+        """Whether hooks run in this stage."""
+        return self.stage in self.active_stages
+
+    def slice_at(self, view: View) -> Splats:
+        """The 3D Gaussians at `view.time`, differentiable in the model's and in the field's parameters."""
+        model = self.gaussians
+        positions, log_scales, rotations, logits = model._xyz, model._scaling, model._rotation, model._opacity
+        if self.stage == "fine" and len(self):
+            positions, log_scales, rotations, logits = self._field(positions, log_scales, rotations, logits, view.time)
+        factors = rotation_matrices_3d(unit_quaternions(rotations)) * log_scales.T.exp()
+        rows = torch.arange(len(self), device=positions.device)
+        return Splats(positions, covariances_from_factors(factors), torch.sigmoid(logits.squeeze(-1)), rows)
+
+    def _field(
+        self, positions: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, time: float
+    ) -> tuple[Tensor, ...]:
+        """Deformed raw attributes; colours are not needed, but its forward wants some."""
+        features = positions.new_zeros(len(positions), *self._feature_shape())
+        times = positions.new_full((len(positions), 1), time)
+        return self.gaussians._deformation(positions, log_scales, rotations, logits, features, times)[:4]
+
+    def _feature_shape(self) -> tuple[int, int]:
+        constant, rest = self.gaussians._features_dc, self.gaussians._features_rest
+        return constant.shape[1] + rest.shape[1], 3
+
+    def _time(self, camera: object) -> float:
+        """In 0..1 of the clip, unlike `timestamp` elsewhere."""
+        if isinstance(camera, dict):
+            raise D2Error("cameras of PanopticSports are dicts without a pose of their own: pass d2_plugin Views")
+        return float(camera.time)
+
+    def _default_key(self, camera: object) -> PriorKey:
+        if self._paths is None:
+            return key_from_picture(str(camera.image_name))
+        return key_from_picture(str(self._paths[int(camera.uid)]))
+
+    def _append(self, points: Points) -> None:
+        """Canonical Gaussians that the field moves onto the points; those outside its grid are left out.
+
+        Features are clamped to the border of the grid, whose box is that of the initial points (scene/__init__.py:83):
+        a Gaussian outside would move with whatever passes the border.
+        """
+        points = self._inside(points)
+        if self.stage == "fine" and len(points.positions):
+            self.inversion = invert_at_times(points, self._deformed, self.gaussians._xyz.detach())
+            points = self._inside(points._replace(positions=self.inversion.positions))
+        table = torch.ones(len(points.positions), dtype=torch.bool, device=points.positions.device)
+        self.gaussians.densification_postfix(*self._raw_rows(points), table)
+
+    def _inside(self, points: Points) -> Points:
+        corners = torch.stack([torch.as_tensor(corner).to(points.positions) for corner in self._box()])
+        low, high = corners.amin(0), corners.amax(0)
+        inside = ((points.positions >= low) & (points.positions <= high)).all(-1)
+        return Points(*(value[inside] for value in points))
+
+    def _box(self) -> tuple[Tensor, Tensor]:
+        box = self.gaussians._deformation.get_aabb
+        return box() if callable(box) else box
+
+    def _deformed(self, positions: Tensor, time: float) -> Tensor:
+        if not len(positions):
+            return positions
+        count = len(positions)
+        blank = positions.new_zeros(count, 3), positions.new_zeros(count, 4), positions.new_zeros(count, 1)
+        return self._field(positions, *blank, time)[0]

@@ -1,0 +1,241 @@
+"""What the adapters of all descendants of Inria's trainer share; each adds its slice and its raw rows.
+
+They keep Gaussians in attributes `_xyz`, `_features_dc`, `_features_rest`, `_opacity`, `_scaling`, `_rotation` with one
+named Adam group each, and change their number in two methods only: `densification_postfix` appends raw rows at the end
+and `prune_points` deletes those of a mask. Both are overridden on the instance, which internal calls through `self.`
+reach too; nothing of the repository is imported, its rasterizer included.
+"""
+
+from __future__ import annotations
+
+import logging
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from d2_plugin.errors import D2Error
+from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
+from d2_plugin.rasterizer import rasterize
+
+from .cameras import inria_view
+from .keys import KeyOf, PriorKey, key_from_picture
+from .probe import Probe, probe_package
+
+log = logging.getLogger(__name__)
+
+SH_C0 = 0.28209479177387814
+"""Y_0 of the spherical harmonics: an RGB value c is stored as (c - 0.5) / Y_0."""
+
+Report = Callable[[], Tensor]
+"""The index of a change, once it is done."""
+
+
+class RawRows(NamedTuple):
+    """Raw (pre-activation) rows of K new Gaussians that every descendant of Inria's model has."""
+
+    xyz: Tensor  # [K, 3]
+    features_dc: Tensor  # [K, 1, 3]
+    features_rest: Tensor  # [K, C - 1, 3]
+    opacity: Tensor  # [K, 1] logit
+    scaling: Tensor  # [K, S] log
+    rotation: Tensor  # [K, 4] identity
+
+
+class RenderedCamera(NamedTuple):
+    """A camera together with what the trainer has just rendered for it."""
+
+    camera: object
+    package: Mapping[str, Any]
+
+
+class InriaAdapter(ABC):
+    """Base of the adapters: everything of the contract but `slice_at` and `_append`.
+
+    `key` finds the prior of a camera object; by default it is read from the picture's name.
+    """
+
+    appending: ClassVar[tuple[str, ...]] = ("densification_postfix",)
+    """Methods that append rows at the end."""
+    pruning: ClassVar[tuple[str, ...]] = ("prune_points",)
+    """Methods that delete the rows of a mask [N], True = delete."""
+    evidence: ClassVar[dict[str, float]] = {"xyz_gradient_accum": 0.0, "denom": 0.0, "max_radii2D": 0.0}
+    """What an insertion would erase, though it is about the Gaussians that were there, and the value of a new row."""
+
+    def __init__(self, gaussians: object, settings: RasterSettings | None = None, key: KeyOf | None = None) -> None:
+        self.gaussians, self.settings = gaussians, settings or RasterSettings()
+        self.probe: Probe | None = None
+        self._key = key
+        self._listeners: list[ResizeListener] = []
+        self._rendered: tuple[View, Mapping[str, Any]] | None = None
+        self._overridden: dict[str, object] = {}
+        self._attach()
+
+    def __len__(self) -> int:
+        return len(self.gaussians._xyz)
+
+    def view(self, camera: object) -> View:
+        """The view of a camera object, of a `RenderedCamera` (see `rendered`), or a `View` as it is."""
+        package = None
+        if isinstance(camera, RenderedCamera):
+            camera, package = camera
+        if isinstance(camera, View):
+            return camera
+        view = inria_view(camera, self._key_of(camera), self._time(camera), self.gaussians._xyz)
+        if package is not None:
+            self._rendered = (view, package)
+        return view
+
+    @abstractmethod
+    def slice_at(self, view: View) -> Splats:
+        """The 3D Gaussians at `view.time`, differentiable."""
+
+    @torch.no_grad()
+    def insert(self, points: Points) -> int:
+        """Isotropic Gaussians at the points, by the repository's own function; returns how many were added.
+
+        Points that are not finite are dropped. The evidence that the backbone gathered for its own densification is
+        put back afterwards: its `densification_postfix` zeroes it for all Gaussians.
+        """
+        finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
+        before = len(self)
+        with self._evidence_kept():
+            self._append(Points(*(value[finite] for value in points)))
+        return len(self) - before
+
+    @torch.no_grad()
+    def remove(self, mask: Tensor) -> None:
+        """Delete the rows where `mask` [N] is True, by the repository's own function."""
+        self.gaussians.prune_points(mask)
+
+    def on_resize(self, listener: ResizeListener) -> None:
+        """Register a listener for every structural change, the backbone's own densification included."""
+        self._listeners.append(listener)
+
+    def rendered(self, camera: object, package: Mapping[str, Any]) -> RenderedCamera:
+        """Pass this to `D2Hooks.loss` instead of the camera where the trainer's `package` may save a second render.
+
+        Only a render with depth, alpha and gradients to both is used; the first one is probed, and the log says so.
+        """
+        return RenderedCamera(camera, package)
+
+    def rendered_depth(self, view: View) -> tuple[Tensor, Tensor] | None:
+        """Depth sum and alpha [H, W] of the package that came with this view, or None; hands it out once."""
+        rendered, self._rendered = self._rendered, None
+        if rendered is None or rendered[0] is not view:
+            return None
+        package = rendered[1]
+        if self.probe is None or not self.probe.final:
+            self.probe = self._probed(view, package)
+        if not self.probe.usable:
+            return None
+        return package["depth"].reshape(view.height, view.width), package["alpha"].reshape(view.height, view.width)
+
+    def detach(self) -> None:
+        """Give the instance its own methods back; another adapter of the same instance does this to the one before."""
+        for name, earlier in self._overridden.items():
+            if earlier is None:
+                delattr(self.gaussians, name)
+            else:
+                setattr(self.gaussians, name, earlier)
+        self._overridden.clear()
+        self._listeners.clear()
+
+    @abstractmethod
+    def _append(self, points: Points) -> None:
+        """Append the raw rows of finite points."""
+
+    def _time(self, camera: object) -> float:
+        """The instant of a camera in the backbone's unit."""
+        return float(camera.timestamp)
+
+    def _key_of(self, camera: object) -> PriorKey:
+        return self._key(camera) if self._key is not None else self._default_key(camera)
+
+    def _default_key(self, camera: object) -> PriorKey:
+        return key_from_picture(str(getattr(camera, "image_path", None) or camera.image_name))
+
+    def _attach(self) -> None:
+        """Override the structural methods; stages attach again to the same instance, so the last adapter wins."""
+        earlier = getattr(self.gaussians, "d2_adapter", None)
+        if earlier is not None:
+            earlier.detach()
+        for name in self.appending:
+            self._override(name, self._before_append)
+        for name in self.pruning:
+            if hasattr(self.gaussians, name):
+                self._override(name, self._before_prune)
+        object.__setattr__(self.gaussians, "d2_adapter", self)
+
+    def _override(self, name: str, prepare: Callable[..., Report]) -> None:
+        original = getattr(self.gaussians, name, None)
+        if original is None:
+            raise D2Error(
+                f"{type(self.gaussians).__name__} has no {name}, which {type(self).__name__} needs: "
+                "choose the adapter of this codebase"
+            )
+        self._overridden[name] = vars(self.gaussians).get(name)
+
+        def reporting(*arguments: Any, **named: Any) -> Any:
+            report = prepare(*arguments, **named)
+            result = original(*arguments, **named)
+            self._tell(report())
+            return result
+
+        object.__setattr__(self.gaussians, name, reporting)
+
+    def _before_append(self, *_: Any, **__: Any) -> Report:
+        count = len(self)
+
+        def report() -> Tensor:
+            index = torch.arange(len(self), device=self.gaussians._xyz.device)
+            index[count:] = -1
+            return index
+
+        return report
+
+    def _before_prune(self, mask: Tensor, *_: Any, **__: Any) -> Report:
+        index = torch.nonzero(~mask).squeeze(-1)
+        return lambda: index
+
+    def _tell(self, index: Tensor) -> None:
+        for listener in self._listeners:
+            listener(index)
+
+    @contextmanager
+    def _evidence_kept(self) -> Iterator[None]:
+        """Lets an insertion pass and puts the accumulators of the old rows back, with new ones for the new rows."""
+        found = {name: getattr(self.gaussians, name, None) for name in self.evidence}
+        before = {name: value for name, value in found.items() if isinstance(value, Tensor) and value.numel()}
+        yield
+        for name, value in before.items():
+            added = len(getattr(self.gaussians, name)) - len(value)
+            fresh = value.new_full((added, *value.shape[1:]), self.evidence[name])
+            setattr(self.gaussians, name, torch.cat([value, fresh]))
+
+    def _raw_rows(self, points: Points) -> RawRows:
+        """Raw rows of isotropic Gaussians in the shapes that this model has."""
+        model, count = self.gaussians, len(points.positions)
+        rotation = points.positions.new_zeros(count, 4)
+        rotation[:, 0] = 1
+        rest = getattr(model, "_features_rest", None)
+        return RawRows(
+            xyz=points.positions,
+            features_dc=((points.colors - 0.5) / SH_C0)[:, None, :],
+            features_rest=points.positions.new_zeros(count, *(rest.shape[1:] if rest is not None else (0, 3))),
+            opacity=torch.logit(points.opacities, eps=1e-6)[:, None],
+            scaling=points.scales.log()[:, None].repeat(1, model._scaling.shape[1]),
+            rotation=rotation,
+        )
+
+    def _probed(self, view: View, package: Mapping[str, Any]) -> Probe:
+        """What the trainer's render of this view is good for, beside our own render of the same view."""
+        with torch.no_grad():
+            splats = self.slice_at(view)
+            own = rasterize(splats, splats.means.new_zeros(len(splats.means), 1), view, self.settings)
+        probe = probe_package(package, own, (self.gaussians._xyz, self.gaussians._opacity))
+        log.info("%s", probe.sentence)
+        return probe

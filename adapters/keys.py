@@ -1,0 +1,100 @@
+"""Which camera and frame of the prior store a trainer's camera object stands for.
+
+What stays the same between runs differs by repository: the picture's name or path where the camera object carries one,
+never `uid` or `colmap_id`, which are positions in a list that some of them shuffle (scene/__init__.py:69 of
+fudan-zvg/4d-gaussian-splatting).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import PurePosixPath
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from d2_plugin.errors import D2Error
+
+
+class PriorKey(NamedTuple):
+    """The name of a camera and the number of a frame, as the prior store has them."""
+
+    camera: str
+    frame: int
+
+
+KeyOf = Callable[[object], PriorKey]
+"""From a trainer's camera object to the key of its prior; every adapter takes one as `key`."""
+
+_PREFIXED = re.compile(r"(?P<camera>.+)_(?P<frame>\d+)$")
+_NUMBER = re.compile(r"(\d+)\D*$")
+_NO_CAMERA = {"frame", "image", "img"}
+_NO_FOLDER = {"", ".", "..", "/", "images"}
+
+
+def key_from_picture(name: str) -> PriorKey:
+    """The key in the name or path of a picture: cam01_0003(.png), cam01/0003.png or cam01/images/frame_00003.png.
+
+    Raises:
+        D2Error: the name has no camera or no frame in it.
+    """
+    path = PurePosixPath(name.replace("\\", "/"))
+    stem = path.stem if path.suffix and not path.suffix[1:].isdigit() else path.name
+    match = _PREFIXED.match(stem)
+    if match and match["camera"].lower() not in _NO_CAMERA:
+        return PriorKey(match["camera"], int(match["frame"]))
+    folders = [folder for folder in path.parts[:-1] if folder not in _NO_FOLDER]
+    number = _NUMBER.search(stem)
+    if folders and number:
+        return PriorKey(folders[-1], int(number[1]))
+    raise D2Error(
+        f"picture '{name}' does not say its camera and frame: name it CAMERA_FRAME or CAMERA/FRAME, or give the "
+        "adapter a function `key` that returns PriorKey(camera, frame) for a camera object"
+    )
+
+
+def one_picture_each(camera: object) -> PriorKey:
+    """The key of a recording by one moving camera, where every picture is a camera of its own at frame 0."""
+    return PriorKey(PurePosixPath(str(camera.image_name)).stem, 0)
+
+
+def frame_of_time(time: float, frames: float, first: int = 0) -> int:
+    """The number of the frame at `time` where `frames` of them make one unit of time.
+
+    Raises:
+        D2Error: the time lies a quarter of a frame or more away from the nearest frame.
+    """
+    frame = round(time * frames)
+    if abs(time * frames - frame) > 0.25:
+        raise D2Error(
+            f"time {time:g} is frame {time * frames:.2f} of {frames:g}, not a whole one: give the adapter the number "
+            "of frames that the trainer divides by"
+        )
+    return first + frame
+
+
+class KeysByPose:
+    """Keys for camera objects that say nothing but where they stand: the known camera nearest in pose.
+
+    `cameras` maps the names in the prior store to T_camera_world [4, 4] in the trainer's world; `frame` gives the
+    frame of a camera object, for instance from its time. A camera that stands nowhere near a known one is refused.
+    """
+
+    def __init__(self, cameras: Mapping[str, Tensor], frame: Callable[[object], int], tolerance: float = 1e-3) -> None:
+        self.names = list(cameras)
+        self.poses = torch.stack([torch.as_tensor(pose).double().cpu() for pose in cameras.values()])
+        self.frame, self.tolerance = frame, tolerance
+
+    def __call__(self, camera: object) -> PriorKey:
+        """The key of a camera object of the Inria family."""
+        pose = camera.world_view_transform.detach().T.double().cpu()
+        distances = (self.poses - pose).abs().flatten(1).amax(1)
+        nearest = int(distances.argmin())
+        if distances[nearest] > self.tolerance * max(1.0, float(pose.abs().max())):
+            raise D2Error(
+                f"camera '{getattr(camera, 'image_name', camera)}' stands at none of the known poses (the nearest, "
+                f"{self.names[nearest]}, differs by {float(distances[nearest]):.3g}): give poses in the trainer's world"
+            )
+        return PriorKey(self.names[nearest], self.frame(camera))
