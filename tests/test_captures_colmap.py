@@ -190,7 +190,7 @@ def test_cameras_without_pictures_are_named_and_left_out_only_when_asked(tmp_pat
     two_cameras(tmp_path)
     for file in (tmp_path / "images").glob("cam10*"):
         file.unlink()
-    refused(tmp_path, "camera cam10 of the COLMAP model has no picture")
+    refused(tmp_path, "camera cam10 of .*0 has no picture")
     capture = open_capture(tmp_path, intersect=True)
     assert list(capture.cameras) == ["cam01"]
     assert any("cam10" in note for note in capture.notes)

@@ -17,11 +17,11 @@ from d2_plugin.captures.assembly import assembled
 from d2_plugin.captures.calibration import checked_camera, resized
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.colmap_model import ColmapImage, ColmapModel, find_model, read_model
-from d2_plugin.captures.files import FrameFiles, common_frames
+from d2_plugin.captures.files import FrameFiles, cameras_with_pictures, common_frames
 from d2_plugin.captures.lens import Lens
 from d2_plugin.captures.naming import Shot, arrange, by_camera, pictures_below, shot_of
 from d2_plugin.captures.pictures import picture_size
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error
 
 COLMAP_FPS = 30.0
 """Frame rate taken, and noted: a COLMAP model says nothing about time."""
@@ -41,7 +41,7 @@ def open_colmap(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
     files = pictures_below(path / "images")
     poses, shots, notes = _shots(model, files)
     shown = by_camera({name: shot for name, shot in shots.items() if name in files}, files)
-    names, missing = _agreed(list(poses), list(shown), cameras, intersect, path)
+    names, missing = cameras_with_pictures(poses, shown, cameras, intersect, model.folder)
     images = {name: shown[name] for name in names}
     frames, frame_notes = common_frames(images, path / "images")
     calibrated = {name: _camera(name, poses[name], model, images[name], frames) for name in names}
@@ -109,23 +109,6 @@ def _still(group: list[ColmapImage], spread: float) -> bool:
 
 def _centre(image: ColmapImage) -> np.ndarray:
     return -image.T_camera_world[:3, :3].T @ image.T_camera_world[:3, 3]
-
-
-def _agreed(
-    posed: list[str], pictured: list[str], asked: tuple[str, ...] | None, intersect: bool, path: Path
-) -> tuple[list[str], tuple[str, ...]]:
-    names = posed if asked is None else list(asked)
-    for name in names:
-        if name not in posed:
-            raise unknown_name("camera", name, posed)
-    missing = [name for name in names if name not in pictured]
-    if missing and (asked is not None or not intersect or len(missing) == len(names)):
-        raise D2Error(
-            f"camera {', '.join(missing)} of the COLMAP model has no picture in {path / 'images'}: "
-            "add its pictures or choose the cameras to read"
-        )
-    notes = (f"left out, pictures missing: {', '.join(missing)}",) if missing else ()
-    return [name for name in names if name in pictured], notes
 
 
 def _camera(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES
-from d2_plugin.errors import D2Error
+from d2_plugin.errors import D2Error, unknown_name
 
 FrameFiles = dict[int, Path]
 
@@ -47,3 +47,24 @@ def common_frames(files: Mapping[str, Iterable[int]], where: Path) -> tuple[tupl
         raise D2Error(f"no frame in {where} is there for all of {', '.join(files)}: give every camera the same frames")
     notes = (f"{len(every - shared)} frames left out because not every camera has them",) if every - shared else ()
     return tuple(sorted(shared)), notes
+
+
+def cameras_with_pictures(
+    calibrated: Iterable[str], pictured: Collection[str], asked: tuple[str, ...] | None, intersect: bool, where: Path
+) -> tuple[list[str], tuple[str, ...]]:
+    """(cameras to read, notes) of those that `where` describes; those that are `asked` for, or all.
+
+    Cameras without pictures are refused by name, or left out with a note where `intersect` and nothing was asked for.
+    """
+    known = list(calibrated)
+    names = known if asked is None else list(asked)
+    for name in names:
+        if name not in known:
+            raise unknown_name("camera", name, known)
+    missing = [name for name in names if name not in pictured]
+    if missing and (asked is not None or not intersect or len(missing) == len(names)):
+        raise D2Error(
+            f"camera {', '.join(missing)} of {where} has no picture: add its pictures or choose the cameras to read"
+        )
+    notes = (f"left out, pictures missing: {', '.join(missing)}",) if missing else ()
+    return [name for name in names if name in pictured], notes

@@ -20,11 +20,11 @@ from d2_plugin.captures.assembly import assembled
 from d2_plugin.captures.calibration import checked_camera, pinhole, rigid
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.colmap_model import rotation_of_quaternion
-from d2_plugin.captures.files import FrameFiles, common_frames
+from d2_plugin.captures.files import FrameFiles, cameras_with_pictures, common_frames
 from d2_plugin.captures.lens import Lens
 from d2_plugin.captures.naming import Shot, by_camera
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES, picture_size
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error
 
 PARAMETERS = "cameras_parameters.txt"
 UNDISTORTED, DISTORTED = 12, 14
@@ -57,7 +57,7 @@ def open_technicolor(path: Path, cameras: tuple[str, ...] | None = None, interse
     """
     rows = _rows(path / PARAMETERS)
     shown, scene = _pictures(path)
-    names, notes = _agreed(sorted(rows), shown, cameras, intersect, path)
+    names, notes = cameras_with_pictures(sorted(rows), shown, cameras, intersect, path / PARAMETERS)
     images, damage_notes = _repaired({name: shown[name] for name in names}, scene)
     frames, frame_notes = common_frames(images, path)
     calibrated = {name: _camera(name, rows[name], images[name][frames[0]], scene, path) for name in names}
@@ -105,23 +105,6 @@ def _pictures(path: Path) -> tuple[dict[str, FrameFiles], str]:
         raise D2Error(f"{folder} holds pictures of several scenes ({', '.join(sorted(scenes))}): give one folder each")
     shots, files = ({name: pair[place] for name, pair in found.items()} for place in (0, 1))
     return by_camera(shots, files), scenes.pop()
-
-
-def _agreed(
-    known: list[str], shown: dict[str, FrameFiles], asked: tuple[str, ...] | None, intersect: bool, path: Path
-) -> tuple[list[str], tuple[str, ...]]:
-    names = list(asked) if asked is not None else known
-    for name in names:
-        if name not in known:
-            raise unknown_name("camera", name, known)
-    missing = [name for name in names if name not in shown]
-    if missing and (not intersect or len(missing) == len(names)):
-        raise D2Error(
-            f"camera {', '.join(missing)} of {path / PARAMETERS} has no picture in {path}: add its pictures or choose "
-            "the cameras to read"
-        )
-    left_out = (f"left out, pictures missing: {', '.join(missing)}",) if missing else ()
-    return [name for name in names if name in shown], left_out
 
 
 def _repaired(images: dict[str, FrameFiles], scene: str) -> tuple[dict[str, FrameFiles], tuple[str, ...]]:

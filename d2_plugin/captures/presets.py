@@ -1,0 +1,144 @@
+"""Which cameras to train on with two, three or four views, and which frames are compared, by data set.
+
+The paper's own camera lists are in a supplement that is not public, and no public code holds lists for two or three
+views. Those here are this project's, but for N3DV's four views, which are 4C4D's. Each data set has one order: more
+views are fewer views and one camera more, so that scores over the number of views compare like with like.
+
+    preset:4          four views of the data set that the capture is recognised as
+    preset:n3dv:4     four views by the order of N3DV, whatever the capture is
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from d2_plugin.captures.capture import Capture
+from d2_plugin.captures.n3dv import UNSYNCHRONISED
+from d2_plugin.errors import D2Error, unknown_name
+
+PREFIX = "preset:"
+"""How a preset begins where camera names are expected."""
+
+
+class CameraSplit(NamedTuple):
+    """Cameras to train on and to score, and what is worth knowing about the choice."""
+
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The training cameras of a data set, most important first; `spare` ones stand in for those that are missing."""
+
+    order: tuple[str, ...]
+    spare: tuple[str, ...]
+    held_out: tuple[str, ...]
+    """Never trained on: what dense-view comparisons test with."""
+    source: str
+
+
+RIGS = {
+    "n3dv": Rig(
+        order=("cam01", "cam13", "cam10", "cam20"),
+        spare=("cam12", "cam14", "cam03", "cam08", "cam05"),
+        held_out=("cam00",),
+        source="four views as 4C4D's default; two and three are this project's choice among them",
+    ),
+    "technicolor": Rig(
+        order=("00", "15", "03", "12"),  # corners of the 4 x 4 rig: a diagonal, then the other one
+        spare=("01", "14", "02", "13"),
+        held_out=("10",),
+        source="the corners of the rig, this project's choice",
+    ),
+    "enerf": Rig(
+        # Along the arc stand 07 06 05 02 15 13 17 08 16 14 12 11 10 01 09 00 03 04: near the middle, then the sides.
+        order=("08", "12", "02", "09"),
+        spare=("17", "11", "15", "01"),
+        held_out=("00",),
+        source="spread along the arc of cameras, this project's choice",
+    ),
+}
+"""By layout; see `reference/datasets.md` for the rigs."""
+
+VIEWS = (2, 3, 4)
+
+FRAMES = {
+    "technicolor": {
+        "birthday": (151, 200),
+        "fabien": (51, 100),
+        "painter": (100, 149),
+        "theater": (51, 100),
+        "train": (151, 200),
+    },
+    "n3dv": {"": (0, 299)},
+}
+"""First and last frame that published comparisons use, by layout and scene ("" for all scenes)."""
+
+
+def is_preset(text: str) -> bool:
+    """Whether what stands in place of camera names is a preset."""
+    return text.startswith(PREFIX)
+
+
+def camera_preset(capture: Capture, preset: str) -> CameraSplit:
+    """Training and test cameras for `preset`, "preset:VIEWS" or "preset:DATASET:VIEWS".
+
+    Test cameras are all others but those known to be unsynchronised, which are never trained on either.
+
+    Raises:
+        D2Error: not a preset, a capture that is none of the data sets, or too few of the cameras are there.
+    """
+    dataset, views = _parsed(capture, preset)
+    rig = RIGS[dataset]
+    unsound = [name for name in UNSYNCHRONISED.get(capture.name, ()) if name in capture.cameras]
+    sound = [name for name in capture.cameras if name not in unsound]
+    candidates = [name for name in (*rig.order[:views], *rig.order[views:], *rig.spare) if name in sound]
+    if len(candidates) < views:
+        raise D2Error(
+            f"{preset} needs {views} of {', '.join((*rig.order, *rig.spare))} and {capture.name} has "
+            f"{', '.join(capture.cameras)}: name the training cameras instead"
+        )
+    chosen = candidates[:views]
+    replaced = [name for name in rig.order[:views] if name not in chosen]
+    notes = [f"{preset} trains on {', '.join(sorted(chosen))} ({rig.source})"]
+    if replaced:
+        notes.append(f"{', '.join(replaced)} missing or unsynchronised: the next in order stand in")
+    if unsound:
+        notes.append(f"{', '.join(unsound)} known to be unsynchronised: neither trained on nor scored")
+    return CameraSplit(tuple(sorted(chosen)), tuple(name for name in sound if name not in chosen), tuple(notes))
+
+
+def published_frames(capture: Capture) -> tuple[int, ...]:
+    """The frames of `capture` that published comparisons use; all of them where nothing is known."""
+    scenes = FRAMES.get(capture.layout, {})
+    for scene, (first, last) in scenes.items():
+        if capture.name.lower().startswith(scene):
+            chosen = tuple(frame for frame in capture.frames if first <= frame <= last)
+            return chosen or capture.frames
+    return capture.frames
+
+
+def _parsed(capture: Capture, preset: str) -> tuple[str, int]:
+    """(data set, number of views) of a preset's text."""
+    *dataset, views = preset.removeprefix(PREFIX).split(":")
+    if not is_preset(preset) or len(dataset) > 1 or views not in map(str, VIEWS):
+        raise D2Error(f"'{preset}' is no camera preset: expected preset:2, preset:3, preset:4 or preset:n3dv:4")
+    name = dataset[0] if dataset else _recognised(capture)
+    if name not in RIGS:
+        raise unknown_name("data set", name, RIGS)
+    return name, int(views)
+
+
+def _recognised(capture: Capture) -> str:
+    """The data set of a capture: by its layout, or N3DV by its camera names in any layout."""
+    if capture.layout in RIGS:
+        return capture.layout
+    if "cam00" in capture.cameras and all(name.startswith("cam") for name in capture.cameras):
+        return "n3dv"
+    raise D2Error(
+        f"{capture.name} (layout {capture.layout}) is none of the data sets with presets ({', '.join(RIGS)}): "
+        "name its training cameras, or the data set as in preset:n3dv:4"
+    )
