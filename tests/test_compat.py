@@ -16,7 +16,7 @@ from torch import Tensor
 from d2_plugin.backbones.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.compat import depth, fourd, inria, nearest, threedgs
 from d2_plugin.errors import D2Error
-from d2_plugin.protocol import View
+from d2_plugin.protocol import Splats, View
 from d2_plugin.rasterizer import rasterize
 
 
@@ -113,21 +113,19 @@ class TestThreeDGS:
         assert torch.autograd.gradcheck(color, [values[name] for name in names], atol=1e-6, fast_mode=True)
 
     def test_gradient_of_viewspace_points_is_per_normalised_device_coordinate(self, camera: dict) -> None:
-        """Moving every Gaussian on the screen is moving the principal point; densify_grad_threshold is in NDC."""
-        values, weights = gaussians(), torch.randn(3, 16, 24, dtype=torch.float64)
-
-        def loss(shift: float = 0.0) -> Tensor:
-            view = view_24x16()
-            K = view.K.clone()
-            K[0, 2] += shift
-            with_shift = inria_camera(View("", 0, 0.0, view.T_camera_world, K, 24, 16))
-            raster = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**with_shift))
-            return (raster(**values)[0] * weights).sum()
-
-        loss().backward()
-        pixels = (loss(1e-2) - loss(-1e-2)) / 2e-2
-        assert float(values["means2D"].grad[:, 0].sum()) == pytest.approx(float(pixels.detach()) * 12, rel=1e-3)
-        assert not values["means2D"].grad[:, 2].any()
+        """densify_grad_threshold is in that unit: pixels times half the image's width and height."""
+        values, weights = gaussians(), torch.linspace(-1, 1, 3 * 16 * 24, dtype=torch.float64).view(3, 16, 24)
+        raster = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera))
+        (raster(**values)[0] * weights).sum().backward()
+        offsets = torch.zeros(6, 2, dtype=torch.float64, requires_grad=True)
+        covariances = inria.covariances_of(values["scales"], values["rotations"], 1.0)
+        splats = Splats(values["means3D"], covariances, values["opacities"][:, 0], torch.arange(6))
+        seen = inria.colors_of(values["shs"], 3, values["means3D"], camera["campos"])
+        image = rasterize(splats, seen, view_24x16(), background=camera["bg"].double(), screen_offsets=offsets).color
+        (image.permute(2, 0, 1) * weights).sum().backward()
+        expected = torch.nn.functional.pad(offsets.grad * torch.tensor([12.0, 8.0]), (0, 1))
+        assert expected.abs().sum() > 0
+        torch.testing.assert_close(values["means2D"].grad, expected, atol=1e-5, rtol=1e-4)
 
     def test_values_of_viewspace_points_move_nothing(self, camera: dict) -> None:
         raster = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera))
@@ -198,7 +196,7 @@ class TestDepth:
         means = scene.means.requires_grad_()
         given = {"colors_precomp": scene.colors, "cov3D_precomp": scene.covariances}
         _, _, found = raster(means, torch.zeros(1, 3), scene.opacities[:, None], **given)
-        assert float(found[0, 7, 7]) == pytest.approx(0.5 * 4.0, rel=1e-4)
+        assert found[0, 7, 7].item() == pytest.approx(0.5 * 4.0, rel=1e-4)
         found[0, 7, 7].backward()
         assert float(means.grad[0, 2]) == pytest.approx(0.5, rel=0.1)
 
