@@ -1,4 +1,4 @@
-"""The `d2` command: demo, plan, priors, train, eval, compare, bench, doctor."""
+"""The `d2` command: demo, plan, priors, train, eval, compare, ablate, bench, doctor."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from typing import Any
 from d2_plugin import __version__
 from d2_plugin.errors import D2Error, unknown_name
 
+ROWS_HELP = "tables (ablation, pruning, main) or presets joined by commas; an unknown name is answered by the list"
 HOOKS_HELP = "all, none, or names of prior, densify, prune, depth_loss joined by commas"
 
 
@@ -35,7 +36,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"d2-4dgs {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_add_demo, _add_plan, _add_priors, _add_train, _add_eval, _add_compare, _add_bench, _add_doctor):
+    for add in (
+        _add_demo,
+        _add_plan,
+        _add_priors,
+        _add_train,
+        _add_eval,
+        _add_compare,
+        _add_ablate,
+        _add_bench,
+        _add_doctor,
+    ):
         add(commands)
     return parser
 
@@ -87,6 +98,18 @@ def _add_compare(commands: Any) -> None:
     parser.add_argument("run_folders", type=Path, nargs="+", help="the --output folders of d2 train")
 
 
+def _add_ablate(commands: Any) -> None:
+    parser = _command(commands, "ablate", _ablate, "The paper's ablation tables on this recording, over several seeds.")
+    _add_capture_options(parser)
+    parser.add_argument("--test-cameras", type=_names, default=None, help="names joined by commas; default all others")
+    parser.add_argument("--rows", type=_names, default="ablation,pruning", help=ROWS_HELP)
+    parser.add_argument("--backbones", type=_names, default="yang4d", help="names joined by commas")
+    parser.add_argument("--seeds", type=_numbers, default="0,1,2", help="numbers joined by commas")
+    parser.add_argument("--iterations", type=int, default=2000, help="optimizer steps of each run, one view each")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs at a time, one thread each")
+    parser.add_argument("--output", type=Path, required=True, help="folder of runs, shared priors and tables")
+
+
 def _add_priors(commands: Any) -> None:
     parser = _command(commands, "priors", _priors, "Build the depth prior of a recording; finished frames are kept.")
     _add_capture_options(parser)
@@ -120,6 +143,13 @@ BENCHMARKS = {"raster": "d2_plugin.study.bench_raster", "stereo": "d2_plugin.stu
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(name) for name in _names(text))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not whole numbers joined by commas") from None
 
 
 def _frames(text: str) -> tuple[int, ...]:
@@ -213,6 +243,23 @@ def _compare(options: argparse.Namespace) -> None:
     from d2_plugin.study.report import metrics_table, read_metrics
 
     print(metrics_table({folder.name: read_metrics(folder) for folder in options.run_folders}))
+
+
+def _ablate(options: argparse.Namespace) -> None:
+    from d2_plugin.study import ablate
+    from d2_plugin.study.presets import rows_named
+
+    presets = rows_named(options.rows)
+    base = _settings(options, test_cameras=options.test_cameras, iterations=options.iterations)
+    work = ablate.jobs(base, presets, options.backbones, options.seeds, options.output)
+    results = ablate.run_jobs(work, options.jobs)
+    print(ablate.write(results, presets, options.output, _command_line()))
+    print(f"tables and runs.jsonl in {options.output}")
+
+
+def _command_line() -> str:
+    """How this was started, without the folders of this machine."""
+    return " ".join(["d2", *(Path(word).name if word.startswith("/") else word for word in sys.argv[1:])])
 
 
 def _priors(options: argparse.Namespace) -> None:

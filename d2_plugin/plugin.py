@@ -21,7 +21,7 @@ from d2_plugin.config import HOOKS, D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Densify, DepthLoss, Hook, PriorLoader, Prune
 from d2_plugin.hooks.views import ViewSampler
-from d2_plugin.protocol import Backbone, DepthPrior, Edit, Points, View
+from d2_plugin.protocol import Backbone, Edit, Points
 
 _log = logging.getLogger(__name__)
 

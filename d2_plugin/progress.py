@@ -41,9 +41,26 @@ class _Rich:
         self._progress.update(self._task, completed=done, note=note)
 
 
+class _Nothing:
+    def update(self, done: int, note: str = "") -> None:
+        """Says nothing."""
+
+
+_silent = False
+
+
+def be_silent() -> None:
+    """No bars in this process from now on: for workers whose parent shows one."""
+    global _silent
+    _silent = True
+
+
 @contextmanager
 def progress_bar(title: str, total: int) -> Iterator[Bar]:
     """A bar for `total` units of work, written to stderr so that results on stdout stay clean."""
+    if _silent:
+        yield _Nothing()
+        return
     try:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

@@ -26,7 +26,7 @@ class VerifiedPixels(NamedTuple):
 
 
 class PriorLoader:
-    """Looks up D* by camera and frame, on the view's device; keeps the last few, since memory must not grow with frames."""
+    """Looks up D* by camera and frame, on the device of the view; keeps the last few: memory must not grow with frames."""
 
     def __init__(self, store: Store, keep_bytes: int = 512 << 20) -> None:
         self.store, self.keep_bytes = store, keep_bytes

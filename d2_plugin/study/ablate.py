@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import os
 import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -15,7 +13,7 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
-from d2_plugin.progress import progress_bar
+from d2_plugin.progress import be_silent, progress_bar
 from d2_plugin.study.presets import PRESETS, TABLES, Preset
 from d2_plugin.study.settings import RunSettings, prior_settings
 
@@ -30,7 +28,7 @@ COLUMNS = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Job:
     """One run of an ablation."""
 
@@ -43,10 +41,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Claim:
-    """One order that the paper's method implies, and by how much it holds here (dB of mean PSNR; negative: it fails)."""
+    """One order that the paper's method implies, and the margin by which it holds here."""
 
     sentence: str
     margin: float
+    """dB of mean PSNR; negative where the claim fails."""
 
     def __str__(self) -> str:
         return f"{'holds' if self.margin >= 0 else 'FAILS'}  {self.margin:+.2f} dB  {self.sentence}"
@@ -82,7 +81,7 @@ def run_jobs(work: Sequence[Job], workers: int) -> dict[Job, Metrics]:
         bar.update(len(results))
         if missing:
             _share(missing)
-        with ProcessPoolExecutor(max(workers, 1), get_context("spawn"), _single_thread) as pool:
+        with ProcessPoolExecutor(max(workers, 1), get_context("spawn"), _prepare_worker) as pool:
             started = {pool.submit(_run, job): job for job in missing}
             for future in as_completed(started):
                 job = started[future]
@@ -121,10 +120,11 @@ def _share(work: Sequence[Job]) -> None:
             first[job.settings.priors] = run
 
 
-def _single_thread() -> None:
+def _prepare_worker() -> None:
     import torch
 
     torch.set_num_threads(1)
+    be_silent()
 
 
 def _run(job: Job) -> Metrics:
@@ -232,25 +232,3 @@ def _row(make_row: Any, job: Job, metrics: Metrics, command: str) -> dict[str, A
         iterations=metrics["iterations"],
         prior_seconds=metrics["seconds"]["priors"],
     )
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `d2 ablate` beside those that name the capture."""
-    parser.add_argument(
-        "--rows",
-        default="ablation,pruning",
-        type=_names,
-        help=f"tables ({', '.join(TABLES)}) or presets ({', '.join(PRESETS)}), joined by commas",
-    )
-    parser.add_argument("--backbones", default="yang4d", type=_names, help="names joined by commas")
-    parser.add_argument(
-        "--seeds", default="0,1,2", type=lambda text: tuple(int(s) for s in _names(text)), help="joined by commas"
-    )
-    parser.add_argument("--iterations", type=int, default=2000, help="optimizer steps of each run, one view each")
-    parser.add_argument("--test-cameras", type=_names, default=None, help="names joined by commas; default all others")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs at a time, one thread each")
-    parser.add_argument("--output", type=Path, required=True, help="folder of runs, shared priors and tables")
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
