@@ -18,20 +18,20 @@ CSS = """
 --mark:#1d3350}}
 *{box-sizing:border-box}
 body{margin:0;background:var(--page);color:var(--ink);font:16px/1.55 system-ui,sans-serif}
-header,main,footer{max-width:1060px;margin:0 auto;padding:0 20px}
+header,main,footer{max-width:1160px;margin:0 auto;padding:0 20px}
 header{padding-top:44px}h1{font-size:2rem;line-height:1.2;margin:0 0 .4em}
 h2{font-size:1.35rem;margin:0 0 .3em}h3{font-size:1rem;margin:1.6em 0 .5em}
 p{max-width:72ch}.soft,figcaption,footer{color:var(--soft);font-size:.875rem}
 nav{position:sticky;top:0;background:var(--page);border-bottom:1px solid var(--line);z-index:1}
-nav ul{list-style:none;display:flex;flex-wrap:wrap;gap:4px 20px;max-width:1060px;margin:0 auto;padding:10px 20px}
+nav ul{list-style:none;display:flex;flex-wrap:wrap;gap:4px 20px;max-width:1160px;margin:0 auto;padding:10px 20px}
 a{color:inherit;text-underline-offset:3px}a:focus-visible,summary:focus-visible{outline:2px solid #2a78d6}
 section{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:24px;margin:24px 0;
 scroll-margin-top:60px}
 figure{margin:18px 0;overflow-x:auto}svg.plot{display:block;max-width:100%;height:auto}
 img{max-width:100%;border-radius:6px;display:block}
-.wide{overflow-x:auto}table{border-collapse:collapse;font-size:.875rem;font-variant-numeric:tabular-nums;width:100%}
-th,td{padding:5px 10px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
-th{color:var(--soft);font-weight:500;vertical-align:bottom}tbody tr:hover{background:var(--page)}
+.wide{overflow-x:auto}table{border-collapse:collapse;font-size:.8125rem;font-variant-numeric:tabular-nums;width:100%}
+th,td{padding:5px 8px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
+th{color:var(--soft);font-weight:500;vertical-align:bottom;white-space:normal}tbody tr:hover{background:var(--page)}
 th.words,td.words{text-align:left}td.long{white-space:normal;min-width:26ch;text-align:left}
 td.best{font-weight:650;background:var(--mark)}
 summary{cursor:pointer;margin-top:1.4em}code{font-size:.85em;overflow-wrap:anywhere}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import logging
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -15,8 +15,6 @@ from .rows import KINDS, Row, read_rows
 from .sections import SECTIONS, Section
 from .sections_training import ablation, training
 from .training_rows import method_of, picture_of, training_rows
-
-logger = logging.getLogger(__name__)
 
 BUILDERS: dict[str, Callable[[Sequence[Row]], Section]] = {"training": training, "ablation": ablation, **SECTIONS}
 """What makes a section of the rows of a kind, in the order of the page."""
@@ -57,14 +55,20 @@ def make_report(rows: Sequence[Row], output: Path, pictures: Sequence[Picture] =
 
 
 def collect(sources: Sequence[Path]) -> tuple[list[Row], list[Picture]]:
-    """Rows of all files, and rows and pictures of all run folders; a folder of runs stands for every run in it.
+    """Rows of all files and run folders, and a picture of each method; a folder of runs stands for every run in it.
 
     Raises:
         D2Error: a folder that holds no finished run, or a file that holds no rows.
     """
     folders = [folder for source in sources if source.is_dir() for folder in _runs(source)]
     rows = read_rows([source for source in sources if not source.is_dir()]) + training_rows(folders)
-    return rows, [picture for folder in folders if (picture := _picture(folder)) is not None]
+    first: dict[tuple[str, str], Picture] = {}
+    for folder in folders:
+        metrics = read_metrics(folder)
+        key = (metrics["capture"], method_of(metrics))
+        if key not in first and (picture := _picture(folder, *key)) is not None:
+            first[key] = picture
+    return rows, [first[key] for key in sorted(first)]
 
 
 def _runs(folder: Path) -> list[Path]:
@@ -74,12 +78,9 @@ def _runs(folder: Path) -> list[Path]:
     return found
 
 
-def _picture(folder: Path) -> Picture | None:
+def _picture(folder: Path, capture: str, method: str) -> Picture | None:
     found = picture_of(folder)
-    if found is None:
-        return None
-    metrics = read_metrics(folder)
-    return Picture(f"{method_of(metrics)}, {metrics['capture']}, held-out {found[0]} (run {folder.name})", found[1])
+    return None if found is None else Picture(f"{capture}, {method}: {found[0]} of run {folder.name}", found[1])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -97,5 +98,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     rows, pictures = collect(options.sources)
     written = make_report(rows, options.output, () if options.no_pictures else pictures)
-    logger.info("%d rows; open %s", len(rows), written[0])
+    sys.stdout.write(f"{len(rows)} rows; open {written[0]}\n")
     return 0

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from .bench_raster import exponent
 from .provenance import provenance
 from .rows import Row
 from .svg import Axis, Plot, Point, Series, figure, number
-from .work_precision import SMALLEST, Table, means_table, shown, work_precision
+from .work_precision import SMALLEST, Table, colors_of, means_table, shown, work_precision
 
 
 @dataclass(frozen=True)
@@ -39,16 +39,29 @@ def cases_of(rows: Sequence[Row]) -> dict[str, list[Row]]:
 def alignment(rows: Sequence[Row]) -> Section:
     """The Charbonnier fit: objective gap against milliseconds, one plot per share of outliers."""
     error, time = "F / F* - 1", "milliseconds per map"
-    plots = [work_precision(mine, case, error, time, 1e3) for case, mine in cases_of(rows).items()]
+    cases, colors = cases_of(rows), colors_of(rows)
+    plots = [work_precision(mine, case, error, time, 1e3, colors) for case, mine in cases.items()]
     return Section(
         "alignment",
         "Alignment: the positive-scale Charbonnier fit",
         "How far the objective is above the least value that any solver reached, in float64. Differences below "
         f"{number(SMALLEST)} are drawn there. Only d2 certifies its gap; the others do not know when they are done.",
-        {"alignment": figure(plots, "Objective gap against run time of the alignment", columns=2, size=(480, 330))},
-        tuple((case, means_table(mine, error, "ms", 1e3)) for case, mine in cases_of(rows).items()),
+        {"alignment": figure(plots, "Objective gap against run time of the alignment", columns=3, size=(340, 320))},
+        (("Error and milliseconds", _beside(cases, error)),),
         sources=sources_of(rows),
     )
+
+
+def _beside(cases: Mapping[str, Sequence[Row]], error: str) -> Table:
+    """One row per setting, for each case its error and milliseconds; what is on the case's front stands out."""
+    tables = [means_table(mine, error, "ms", 1e3) for mine in cases.values()]
+    header = ("method", "setting", *(title for case in cases for title in (f"{case}: {error}", "ms")))
+    lines = [
+        (*alike[0][:2], *(cell for line in alike for cell in (line[2], line[4])))
+        for alike in zip(*(table.rows for table in tables))
+    ]
+    best = {(row, 2 * i + 2 + (column == 4)) for i, table in enumerate(tables) for row, column in table.best}
+    return Table(header, tuple(lines), frozenset(best))
 
 
 def stereo(rows: Sequence[Row]) -> Section:
@@ -76,8 +89,14 @@ _STEREO = ("completeness", "f1", "median", "wrong", "cpu")
 
 def raster(rows: Sequence[Row]) -> Section:
     """The rasterizer: deviation from float64 against milliseconds, one mark per scene and size."""
-    known = [{**row, "setting": row["case"]} for row in rows]
     error, time = "colour error against float64, p99.9", "forward + backward, ms"
+    drawn = [row for row in rows if row["error"] and row["seconds"]]
+    series = [
+        Series(name, tuple(_raster_point(row) for row in drawn if row["method"] == name), color=color)
+        for name, color in colors_of(drawn).items()
+    ]
+    x = Axis.around(time, [point.x for each in series for point in each.points], log=True)
+    y = Axis.around(error, [point.y for each in series for point in each.points], log=True)
     header = ("method", "scene", "forward ms", "forward + backward ms", "survey ms", "peak MB", "colour p99.9")
     header += ("worst gradient",)
     return Section(
@@ -86,10 +105,16 @@ def raster(rows: Sequence[Row]) -> Section:
         "Median wall time. The error is the 99.9th percentile of the colour's deviation (0..1) from the same image in "
         "float64; the worst gradient is the largest relative L2 deviation of any input's gradient, without the pixels "
         "where rounding decided a threshold differently.",
-        {"raster": figure([work_precision(known, "Every scene and size", error, time, 1e3)], "Rasterizer error")},
+        {"raster": figure([Plot("Every scene and size", x, y, tuple(series))], "Rasterizer error against time")},
         (("Every scene and size", Table(header, tuple(_raster_cells(row) for row in rows))),),
         sources=sources_of(rows),
     )
+
+
+def _raster_point(row: Row) -> Point:
+    milliseconds = 1e3 * row["seconds"]
+    note = f"{row['method']}, {row['case']}: error {shown(row['error'])} in {milliseconds:.3g} ms"
+    return Point(milliseconds, row["error"], note, row["case"])
 
 
 def _raster_cells(row: Row) -> tuple[str, ...]:
@@ -106,39 +131,43 @@ def _raster_cells(row: Row) -> tuple[str, ...]:
 def stability(rows: Sequence[Row]) -> Section:
     """Sweeps to where numbers end: one plot per sweep, float32 beside float64."""
     plots = [_sweep(case, mine) for case, mine in cases_of(rows).items()]
-    header = ("sweep", "path", "range", "points", "ok", "gap", "failure", "largest error", "what is guarded, and how")
+    header = ("sweep", "precision", "range", "points", "ok", "gap", "failure", "largest error", "limit")
     cells = tuple(
         _sweep_cells(case, method, [row for row in mine if row["method"] == method])
         for case, mine in cases_of(rows).items()
         for method in dict.fromkeys(row["method"] for row in mine)
     )
+    meanings = tuple((case, mine[0]["measures"], mine[0]["guard"]) for case, mine in cases_of(rows).items())
+    guards = Table(("sweep", "the error is", "what is guarded, and how"), meanings)
     lost = [row for row in rows if row["verdict"] != "ok"]
-    listed = Table(
-        ("sweep", "path", "value", "verdict", "error", "limit", "why"),
-        tuple(
-            (
-                *(row["case"], row["method"], number(row["value"]), row["verdict"]),
-                *(shown(row["error"]), shown(row["limit"]), row["failed"] or row["guard"]),
-            )
-            for row in lost
-        ),
-    )
     return Section(
         "stability",
         "Stability: stiff and extreme cases",
         "Each parameter is swept to where other codebases break. ok: the error is below the sweep's limit; gap: it is "
         "above, and finite; failure: not finite, or refused where it should not be. Nothing is clamped in silence: "
-        "the last column of the table says what is guarded.",
+        "the second table says what is guarded.",
         {"stability": figure(plots, "Error over each swept parameter", columns=3, size=(360, 270))},
-        (("Sweeps", Table(header, cells)), *([("Points that are not ok", listed)] if lost else [])),
+        (("Sweeps", Table(header, cells)), ("Guards", guards), *([("Not ok", _lost(lost))] if lost else [])),
         sources=sources_of(rows),
     )
+
+
+def _lost(rows: Sequence[Row]) -> Table:
+    header = ("sweep", "precision", "value", "verdict", "error", "limit", "why")
+    cells = (
+        (
+            *(row["case"], row["method"], number(row["value"]), row["verdict"]),
+            *(shown(row["error"]), shown(row["limit"]), row["failed"] or row["guard"]),
+        )
+        for row in rows
+    )
+    return Table(header, tuple(cells))
 
 
 def _sweep(case: str, rows: Sequence[Row]) -> Plot:
     log = all(row["value"] > 0 for row in rows) and max(r["value"] for r in rows) > 50 * min(r["value"] for r in rows)
     series = []
-    for color, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
+    for method, color in colors_of(rows).items():
         mine = [row for row in rows if row["method"] == method and row["error"] is not None]
         places = [(row["value"], max(row["error"], SMALLEST)) for row in mine]
         points = tuple(
@@ -146,17 +175,20 @@ def _sweep(case: str, rows: Sequence[Row]) -> Plot:
             for (x, y), row in zip(places, mine)
         )
         series.append(Series(method, points, tuple(places), color))
+        limit = next(row["limit"] for row in rows if row["method"] == method)
+        ends = (min(row["value"] for row in rows), max(row["value"] for row in rows))
+        series.append(Series(f"limit of {method}", (), tuple((end, limit) for end in ends), color, hollow=True))
     x = Axis.around(rows[0]["parameter"], [row["value"] for row in rows], log)
-    y = Axis.around("error", [point.y for each in series for point in each.points], log=True)
+    y = Axis.around("error", [y for each in series for _, y in each.line], log=True)
     return Plot(case, x, y, tuple(series))
 
 
 def _sweep_cells(case: str, method: str, rows: Sequence[Row]) -> tuple[str, ...]:
     values = [row["value"] for row in rows]
     count = {verdict: sum(row["verdict"] == verdict for row in rows) for verdict in ("ok", "gap", "failure")}
-    span = f"{rows[0]['parameter']} {number(min(values))} .. {number(max(values))}"
+    span = f"{rows[0]['parameter']}: {number(min(values))} .. {number(max(values))}"
     worst = max((row["error"] for row in rows if row["error"] is not None), default=None)
-    return (case, method, span, str(len(rows)), *map(str, count.values()), shown(worst), rows[0]["guard"])
+    return (case, method, span, str(len(rows)), *map(str, count.values()), shown(worst), shown(rows[0]["limit"]))
 
 
 def plan(rows: Sequence[Row]) -> Section:
@@ -186,7 +218,7 @@ def scaling(rows: Sequence[Row]) -> Section:
     plots, cells = [], []
     for name, label in measured.items():
         series = []
-        for color, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
+        for method, color in colors_of(rows).items():
             mine = [row for row in rows if row["method"] == method and row.get(name)]
             places = tuple((row["frames"], row[name]) for row in mine)
             power = exponent(places) if len(mine) > 1 else None

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from statistics import mean, stdev
 
 from .rows import Row
 from .sections import Section, cases_of, sources_of
 from .svg import Axis, Plot, Point, Series, bars, figure
-from .work_precision import Table, pareto_front
+from .work_precision import Table, colors_of, pareto_front
 
 SCORES = (
     ("PSNR", "psnr", 2),
@@ -23,14 +23,14 @@ PAPER_TEXT = "Hollow marks are the paper's own figures, copied from its tables; 
 def training(rows: Sequence[Row]) -> Section:
     """Held-out PSNR against minutes of prior and training, their parts as stacked bars, and all scores."""
     emulated = any(row.get("mono_emulated") for row in rows)
-    plots = [_quality(case, mine) for case, mine in cases_of(rows).items()]
+    colors = colors_of(rows)
+    scored = cases_of([row for row in rows if _score(row, "psnr") is not None])
+    plots = [_quality(case, mine, colors) for case, mine in scored.items()]
     means = [(case, name, group) for case, mine in cases_of(rows).items() for name, group in _variants(mine).items()]
     stacked = [
         (f"{case}: {name}", (_mean(group, "prior_seconds") / 60, _mean(group, "seconds") / 60))
         for case, name, group in means
     ]
-    header = ("capture", "method", "runs", *(title for title, _, _ in SCORES), "Gaussians", "prior s", "train s")
-    cells = tuple((case, name, str(len(mine)), *_score_cells(mine), *_cost_cells(mine)) for case, name, mine in means)
     return Section(
         "training",
         "Training: held-out quality against time",
@@ -38,20 +38,19 @@ def training(rows: Sequence[Row]) -> Section:
         "upper left is better. A prior that several runs share counts where it was built."
         + (" Monocular depth of some captures is emulated, not predicted." if emulated else ""),
         {
-            "training": figure(plots, "Held-out PSNR against minutes", columns=2, size=(480, 330)),
+            "training": figure(plots, "Held-out PSNR against minutes", columns=3, size=(340, 320)),
             "training-time": bars(stacked, ("prior", "training"), "min", "Minutes of prior and training per method"),
         },
-        (("Mean ± deviation over seeds", Table(header, cells, _best(means, cells))),),
+        (("Mean ± deviation over seeds", _scores_table("method", means)),),
         sources=sources_of(rows),
     )
 
 
-def _quality(case: str, rows: Sequence[Row]) -> Plot:
-    scored = [row for row in rows if _score(row, "psnr") is not None]
+def _quality(case: str, scored: Sequence[Row], colors: Mapping[str, int]) -> Plot:
     minutes = [(row["seconds"] + row["prior_seconds"]) / 60 for row in scored]
     front = set(pareto_front([(time, row["error"]) for time, row in zip(minutes, scored)]))
     series = []
-    for color, name in enumerate(dict.fromkeys(row["method"] for row in scored)):
+    for name, color in colors.items():
         mine = [i for i, row in enumerate(scored) if row["method"] == name]
         points = [_quality_point(scored[i], minutes[i], i in front) for i in mine]
         steps = [mine[i] for i in pareto_front([(minutes[i], scored[i]["error"]) for i in mine])]
@@ -78,13 +77,11 @@ def _variants(rows: Sequence[Row]) -> dict[str, list[Row]]:
 def ablation(rows: Sequence[Row]) -> Section:
     """What each variant gains over the backbone alone, every seed a mark, and the scores as mean and deviation."""
     plots = [_gains(case, mine) for case, mine in cases_of(rows).items()]
-    header = ("capture", "variant", "seeds", *(title for title, _, _ in SCORES), "Gaussians", "prior s", "train s")
     groups = [
         (case, name, [row for row in mine if row["method"] == name])
         for case, mine in cases_of(rows).items()
         for name in dict.fromkeys(row["method"] for row in mine)
     ]
-    cells = tuple((case, name, str(len(mine)), *_score_cells(mine), *_cost_cells(mine)) for case, name, mine in groups)
     height = 90 + 24 * max(len(plot.y.names) for plot in plots)
     return Section(
         "ablation",
@@ -92,7 +89,7 @@ def ablation(rows: Sequence[Row]) -> Section:
         f"Held-out PSNR beyond the mean of the backbone alone on the same capture. {PAPER_TEXT} The paper trained on "
         "another recording at full length: compare the order, not the size.",
         {"ablation": figure(plots, "Gain of each variant over the backbone", size=(720, height))},
-        (("Mean ± deviation over seeds", Table(header, cells, _best(groups, cells))),),
+        (("Mean ± deviation over seeds", _scores_table("variant", groups)),),
         sources=sources_of(rows),
     )
 
@@ -138,15 +135,6 @@ def _mean(rows: Sequence[Row], name: str) -> float:
     return mean(row[name] for row in rows)
 
 
-def _score_cells(rows: Sequence[Row]) -> list[str]:
-    return [_spread([_score(row, key) for row in rows], digits) for _, key, digits in SCORES]
-
-
-def _cost_cells(rows: Sequence[Row]) -> list[str]:
-    names = (("gaussians", 0), ("prior_seconds", 1), ("seconds", 1))
-    return [_spread([row[name] for row in rows], digits) for name, digits in names]
-
-
 def _spread(values: Sequence[float | None], digits: int) -> str:
     known = [value for value in values if value is not None]
     if not known:
@@ -154,15 +142,30 @@ def _spread(values: Sequence[float | None], digits: int) -> str:
     return f"{mean(known):.{digits}f}" + (f" ± {stdev(known):.{digits}f}" if len(known) > 1 else "")
 
 
-def _best(groups: Sequence[tuple[str, str, Sequence[Row]]], cells: Sequence[Sequence[str]]) -> frozenset:
+def _scores_table(what: str, groups: Sequence[tuple[str, str, Sequence[Row]]]) -> Table:
+    """One row per (case, name, runs): scores that any run has, Gaussians and times; the best of a case stand out."""
+    scores = [each for each in SCORES if any(_score(row, each[1]) is not None for *_, mine in groups for row in mine)]
+    costs = (("Gaussians", "gaussians", 0), ("prior s", "prior_seconds", 1), ("train s", "seconds", 1))
+    header = ("capture", what, "runs", *(title for title, _, _ in (*scores, *costs)))
+    cells = []
+    for case, name, mine in groups:
+        scored = [_spread([_score(row, key) for row in mine], digits) for _, key, digits in scores]
+        spent = [_spread([row.get(key) for row in mine], digits) for _, key, digits in costs]
+        cells.append((case, name, str(len(mine)), *scored, *spent))
+    return Table(header, tuple(cells), _best(groups, [key for _, key, _ in scores]))
+
+
+def _best(groups: Sequence[tuple[str, str, Sequence[Row]]], keys: Sequence[str]) -> frozenset[tuple[int, int]]:
     """The cells with the best score of each capture."""
     found = set()
     for case in dict.fromkeys(case for case, _, _ in groups):
-        rows = [i for i, group in enumerate(groups) if group[0] == case]
-        for column, (_, key, _) in enumerate(SCORES, start=3):
-            scored = [i for i in rows if cells[i][column] != "-"]
-            values = {i: mean(s for row in groups[i][2] if (s := _score(row, key)) is not None) for i in scored}
+        for column, key in enumerate(keys, start=3):
+            values = {
+                index: mean(known)
+                for index, (of, _, mine) in enumerate(groups)
+                if of == case and (known := [s for row in mine if (s := _score(row, key)) is not None])
+            }
             if len(values) > 1:
                 choose = min if key in ("lpips", "depth_absrel") else max
-                found.add((choose(values, key=values.get), column))
+                found.add((choose(values, key=values.__getitem__), column))
     return frozenset(found)

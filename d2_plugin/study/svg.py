@@ -17,7 +17,7 @@ DARK = ("#5598e7", "#e0713f", "#2db584", "#d09a1d", "#d55181", "#9085e9", "#e667
 SHAPES = ("circle", "square", "diamond", "triangle", "cross", "wedge")
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-MARGIN_LEFT, MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 62, 18, 34, 46
+MARGIN_LEFT, MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 76, 18, 34, 46
 LETTER = 6.4
 """Mean width of a letter at 12 px, px."""
 EDGE = 0.06

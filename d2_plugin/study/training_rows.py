@@ -8,9 +8,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from d2_plugin.captures.pictures import opencv, read_picture, shrink_picture
+from d2_plugin.errors import MissingExtra
+
 from .provenance import circumstances
 from .report import read_metrics
 from .rows import Row, make_row
+
+PICTURE_WIDTH = 1600
+"""Pictures in the report are made at most this wide by averaging whole blocks, pixels."""
 
 HOOKS = ("prior", "densify", "prune", "depth_loss")
 
@@ -68,9 +74,23 @@ def method_of(metrics: dict[str, Any]) -> str:
 
 
 def picture_of(folder: Path) -> tuple[str, str] | None:
-    """(name, PNG as a data URI) of the held-out picture in the middle of a run's, or None where it kept none."""
+    """(name, data URI) of the held-out picture in the middle of a run's, or None where it kept none.
+
+    As a JPEG of at most `PICTURE_WIDTH` pixels where OpenCV is installed, else the file as it is.
+    """
     found = sorted((folder / "pictures").glob("*.png"))
     if not found:
         return None
     path = found[len(found) // 2]
-    return path.stem, "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+    try:
+        cv2 = opencv("making pictures smaller")
+    except MissingExtra:
+        return path.stem, _uri("png", path.read_bytes())
+    picture = read_picture(path)
+    picture = shrink_picture(picture, -(-picture.shape[1] // PICTURE_WIDTH))
+    encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])[1]
+    return path.stem, _uri("jpeg", encoded.tobytes())
+
+
+def _uri(kind: str, data: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"

@@ -7,7 +7,7 @@ setting, both axes logarithmic, lower left is better. What another setting beats
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -76,7 +76,19 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-def work_precision(rows: Sequence[Row], title: str, error_label: str, seconds_label: str, unit: float = 1) -> Plot:
+def colors_of(rows: Sequence[Row]) -> dict[str, int]:
+    """A colour for each method, the same in all plots of a section."""
+    return {name: color for color, name in enumerate(dict.fromkeys(row["method"] for row in rows))}
+
+
+def work_precision(
+    rows: Sequence[Row],
+    title: str,
+    error_label: str,
+    seconds_label: str,
+    unit: float = 1,
+    colors: Mapping[str, int] | None = None,
+) -> Plot:
     """The plot of all settings; `unit` is what seconds are multiplied by to match `seconds_label`.
 
     A setting that failed on some case is faded and never on the front: a mean over the easy cases is no result.
@@ -85,7 +97,7 @@ def work_precision(rows: Sequence[Row], title: str, error_label: str, seconds_la
     whole = [mean for mean in drawn if not mean.failures]
     front = {whole[i] for i in pareto_front([(mean.seconds, mean.error) for mean in whole])}
     series = []
-    for color, name in enumerate(dict.fromkeys(mean.method for mean in drawn)):
+    for name, color in (colors or colors_of(rows)).items():
         mine = [mean for mean in drawn if mean.method == name]
         points = tuple(_point(mean, unit, mean in front) for mean in mine)
         settled = [mean for mean in mine if not mean.failures]
