@@ -20,7 +20,7 @@ from tiny import ALL_HOOKS, TinyStore, is_finite, make_model, make_trainer, make
 from d2_plugin import D2Config, D2Error, D2Hooks
 from d2_plugin.adapters.yang4d import Yang4DAdapter
 from d2_plugin.backbones import trainer as trainer_module
-from d2_plugin.config import for_iterations
+from d2_plugin.config import DensifyConfig, PruneConfig, for_iterations
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Backbone, Points
 
@@ -234,3 +234,41 @@ def test_refinement_continues_after_structure_updates_stop() -> None:
     config = for_iterations(("densify", "prune", "depth_loss"), 900)
     assert config.densify.stop <= config.prune.stop < 900
     assert config.depth_loss.stop is None
+
+
+class TestRetirement:
+    """A hook whose last evaluations changed next to nothing costs no more surveys, and says so."""
+
+    @staticmethod
+    def config(**top: object) -> D2Config:
+        nothing = {
+            "densify": DensifyConfig(start=1, stop=None, every=1, max_gaussians=0),
+            "prune": PruneConfig(start=1, stop=None, every=1, patience=3, tau_p=1.0),
+        }
+        return D2Config(**nothing, views_per_evaluation=3, **top)
+
+    def test_idle_hooks_retire_once_their_evidence_could_have_acted(self) -> None:
+        trainer = make_trainer(self.config(retire_after=4), iterations=12)
+        trainer.run()
+        assert trainer.d2.retired == {"densify": 4, "prune": 6}  # patience 3: two more evaluations
+        assert [(t.step, t.hook) for t in trainer.d2.trace if t.action == "retire"] == [(4, "densify"), (6, "prune")]
+
+    def test_nothing_retires_where_that_is_switched_off(self) -> None:
+        trainer = make_trainer(self.config(retire_after=0), iterations=12)
+        trainer.run()
+        assert trainer.d2.retired == {}
+
+    def test_a_hook_that_still_edits_stays(self) -> None:
+        trainer = make_trainer(replace(ALL_HOOKS, prune=None, retire_after=2, retire_below=0.0))
+        trainer.run()
+        inserted = [t.step for t in trainer.d2.trace if t.action == "insert" and t.count]
+        assert inserted == [5, 10, 15, 20]
+        assert trainer.d2.retired == {}
+
+    def test_a_resumed_run_remembers_who_retired(self) -> None:
+        trainer = make_trainer(self.config(retire_after=4), iterations=12)
+        trainer.run(5)
+        resumed = make_trainer(self.config(retire_after=4), iterations=12)
+        resumed.load_state_dict(trainer.state_dict())
+        resumed.run()
+        assert resumed.d2.retired == {"densify": 4, "prune": 6}
