@@ -29,6 +29,9 @@ SH_C0 = 0.28209479177387814
 ROWS = "d2_rows"
 """The column in the strategy's state: the number of each row plus one, since gsplat marks what is new with zeros."""
 
+NO_ROWS = {"binoms"}
+"""Tensors in a strategy's state that have no row per Gaussian (MCMC's table of binomials)."""
+
 SliceOf = Callable[[Mapping[str, Tensor], View], Splats]
 RowsOf = Callable[[Points], Mapping[str, Tensor]]
 
@@ -80,7 +83,7 @@ class GsplatAdapter:
             return camera
         if self._view is None:
             raise D2Error(
-                f"a camera of type {type(camera).__name__} is no View: pass views, or give the adapter a function `view`"
+                f"a camera of type {type(camera).__name__} is no View: pass views, or give the adapter `view`"
             )
         return self._view(camera)
 
@@ -170,7 +173,7 @@ class GsplatAdapter:
 
     def _change_state(self, change: Callable[[Tensor], Tensor], index: Tensor) -> None:
         for key, value in (self.state or {}).items():
-            if isinstance(value, Tensor) and value.shape[:1] == (self._known,):
+            if isinstance(value, Tensor) and key not in NO_ROWS and value.shape[:1] == (self._known,):
                 self.state[key] = change(value)
         self._renumber()
         self._tell(index)

@@ -22,6 +22,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Densify, DepthLoss, Hook, PriorLoader, Prune
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Backbone, Edit, Points
+from d2_plugin.registry import ADAPTERS, load
 
 _log = logging.getLogger(__name__)
 
@@ -81,6 +82,16 @@ class D2Hooks:
         elif not isinstance(config, D2Config):
             config = D2Config.from_dict(config)
         return cls(config, backbone, store)
+
+    @classmethod
+    def attach(
+        cls, config: str | Path | Mapping[str, Any] | D2Config, adapter: str, *model: Any, **options: Any
+    ) -> D2Hooks:
+        """From a configuration and the name of a registered adapter, which gets the trainer's own objects.
+
+        The first of the three lines where there is an adapter: `d2 = D2Hooks.attach("d2.toml", "fudan", gaussians)`.
+        """
+        return cls.from_config(config, load(ADAPTERS, adapter)(*model, **options))
 
     def loss(self, step: int, views: object) -> Tensor | float:
         """The hooks' share of this step's loss: a scalar on the backbone's device, or 0.0 when there is none.

@@ -98,6 +98,13 @@ class DepthPrior(NamedTuple):
         return (self.labels == Label.VERIFIED) | (self.labels == Label.MONO)
 
 
+class CameraRecord(NamedTuple):
+    """The camera that a prior was built for, to be compared with the view that asks for it."""
+
+    K: Tensor  # [3, 3] float64, pixels
+    T_camera_world: Tensor  # [4, 4] float64
+
+
 @dataclass(frozen=True)
 class RasterSettings:
     """Constants of splatting; the defaults are those of the Inria rasterizer, which most backbones were tuned with."""

@@ -11,9 +11,14 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, View
 
+from .camera_check import CameraCheck
+
 
 class Store(Protocol):
-    """What the loader needs of a prior store (d2_plugin.priors.store.PriorStore)."""
+    """What the loader needs of a prior store (d2_plugin.priors.store.PriorStore).
+
+    Where it also has `camera(camera, frame) -> CameraRecord | None`, views are checked against it.
+    """
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
 
@@ -26,15 +31,16 @@ class VerifiedPixels(NamedTuple):
 
 
 class PriorLoader:
-    """Looks up D* by camera and frame, on the device of the view; keeps the last few: memory must not grow with frames."""
+    """Looks up D* by camera and frame, on the view's device; keeps the last few: memory must not grow with frames."""
 
     def __init__(self, store: Store, keep_bytes: int = 512 << 20) -> None:
         self.store, self.keep_bytes = store, keep_bytes
         self._kept: OrderedDict[tuple[str, int], DepthPrior | None] = OrderedDict()
+        self._cameras = CameraCheck()
         self._pixels: dict[tuple[str, int], VerifiedPixels] = {}
 
     def __call__(self, view: View) -> DepthPrior | None:
-        """D* of the view, or None where the store has none; refuses one of another size than the view."""
+        """D* of the view, or None where the store has none; refuses one made for another size, K or pose."""
         key = (view.camera, view.frame)
         if key in self._kept:
             self._kept.move_to_end(key)
@@ -60,14 +66,17 @@ class PriorLoader:
         pixels = self._pixels[key]
         return pixels if len(pixels.index) else None
 
-    @staticmethod
-    def _check(view: View, prior: DepthPrior) -> None:
+    def _check(self, view: View, prior: DepthPrior) -> None:
         height, width = prior.depth.shape
         if (width, height) != (view.width, view.height):
             raise D2Error(
                 f"the prior of camera {view.camera}, frame {view.frame} is {width}x{height} pixels but the view is "
                 f"{view.width}x{view.height}: build the prior at the resolution that is trained at"
             )
+        describe = getattr(self.store, "camera", None)
+        record = describe(view.camera, view.frame) if describe is not None else None
+        if record is not None:
+            self._cameras.check(view, record, prior.depth)
 
 
 def _bytes(prior: DepthPrior | None) -> int:

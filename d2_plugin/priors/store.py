@@ -24,7 +24,7 @@ import torch
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.files import Entry, EntryFolder, read_json, write_json
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.protocol import DepthPrior, Label
+from d2_plugin.protocol import CameraRecord, DepthPrior, Label
 
 FORMAT = 2
 PRIOR_DTYPE = np.dtype([("depth", "<u2"), ("label", "u1"), ("color", "u1", (3,))])
@@ -140,6 +140,14 @@ class PriorStore:
         """What is known about one prior: alignment, shares, settings, hashes; None where the store has none."""
         entry = self._entry(camera, frame)
         return None if entry is None else entry.record
+
+    def camera(self, camera: str, frame: int) -> CameraRecord | None:
+        """The camera that one prior was built for; None where the store has none or does not say."""
+        described = (self.record(camera, frame) or {}).get("camera")
+        if described is None:
+            return None
+        pose = torch.tensor(described["T_camera_world"], dtype=torch.float64)
+        return CameraRecord(torch.tensor(described["K"], dtype=torch.float64), pose)
 
     def is_current(self, camera: str, frame: int, key: str) -> bool:
         """Whether an intact prior built from exactly these inputs is there; a damaged one is named in the log."""
