@@ -41,7 +41,7 @@ def bench_stereo(
     Args:
         output: folder, created where absent; its three files are replaced.
         rigs: names of `load_rigs`.
-        makers: `patchmatch`, `sweep`, `sgbm`; all where empty.
+        makers: `patchmatch`, `sweep`, `sgbm`, and `colmap` where it runs; all where empty.
         defaults_only: leave out what is varied about a maker.
         data: folder with the captures `studio` and `middlebury`.
         width: of rendered pictures, pixels.
@@ -159,13 +159,15 @@ def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
         points = [(setting, _mean(group)) for setting, group in settings.items()]
         points = [(setting, mean) for setting, mean in points if not mean["failed"] and mean["wrong"] is not None]
         times = [mean["microseconds_per_pixel"] for _, mean in points]
-        errors = [[1 - mean["f1"], 1 - mean["completeness"], max(mean["wrong"], 1e-4)] for _, mean in points]
+        errors = [[1 - mean["f1"], 1 - mean["completeness"], mean["wrong"]] for _, mean in points]
         for panel, values in zip(panels, zip(*errors)):
             panel.scatter(times, values, label=name)
             for (setting, _), x, y in zip(points, times, values):
                 panel.annotate(setting, (x, y), fontsize=6, xytext=(3, 3), textcoords="offset points")
     for panel, title in zip(panels, ("1 - F at 1 %", "1 - completeness", "share off by more than 5 %")):
-        panel.set(xlabel="CPU microseconds per pixel and view", ylabel=title, xscale="log", yscale="log")
+        panel.set(xlabel="CPU microseconds per pixel and view", ylabel=title, xscale="log")
+        panel.margins(x=0.3)  # settings are written to the right of their marks
+        panel.set_ylim(bottom=0)
         panel.grid(True, which="both", alpha=0.3)
         if panel.get_legend_handles_labels()[0]:
             panel.legend(fontsize=7)
@@ -184,7 +186,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         help=f"{', '.join(RENDERED)} (rendered), {', '.join(FROM_DISK)} (in --data); default: all there are",
     )
     parser.add_argument("--data", type=Path, help="folder with the captures studio/ and middlebury/")
-    parser.add_argument("--makers", nargs="+", default=(), metavar="MAKER", help="patchmatch, sweep, sgbm; default all")
+    parser.add_argument("--makers", nargs="+", default=(), metavar="MAKER", help="patchmatch, sweep, sgbm, colmap (with CUDA)")
     parser.add_argument("--defaults-only", action="store_true", help="leave out what is varied about a maker")
     parser.add_argument("--width", type=int, default=320, help="width of rendered pictures (16:9), pixels; default 320")
     parser.add_argument("--widen", type=float, default=1.0, help="depth range too wide by this factor at both ends")

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error
+from d2_plugin.priors.colmap_mvs import why_not_usable
 from d2_plugin.priors.filter import GeometricDepth, filter_depths
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo import MAKERS, Maker, gray
@@ -30,7 +31,7 @@ class Method:
 
 
 def methods() -> list[Method]:
-    """Every maker and what is varied about it; the first row of each is its default."""
+    """Every maker that runs here and what is varied about it; the first row of each is its default."""
     default = StereoSettings()
     patchmatch = {
         "default": {},
@@ -49,9 +50,11 @@ def methods() -> list[Method]:
         "planes half a pixel apart": {"sweep_step": 0.5},
         "planes 2 pixels apart": {"sweep_step": 2},
     }
+    colmap = {} if why_not_usable() else {"default": {}, "photometric pass alone": {"colmap_geometric": False}}
     return [
         *(Method("patchmatch", name, MAKERS["patchmatch"], replace(default, **kw)) for name, kw in patchmatch.items()),
         *(Method("sweep", name, MAKERS["sweep"], replace(default, **kw)) for name, kw in sweep.items()),
+        *(Method("colmap", name, MAKERS["colmap"], replace(default, **kw)) for name, kw in colmap.items()),
         Method("sgbm", "default", sgbm, default),
     ]
 
