@@ -1,0 +1,258 @@
+"""`check_backbone` passes what keeps the contract and names, in a sentence, each way to break it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from tiny import BACKBONES, make_adapter, make_model, make_views
+
+from d2_plugin.adapters.watched import WatchedModel
+from d2_plugin.backbones.densify import grow
+from d2_plugin.protocol import RasterSettings, Splats
+from d2_plugin.testing import CHECKS, ContractError, Example, check_backbone
+
+
+def make(backbone: str = "yang4d", temporal: bool = True) -> Example:
+    """An example of a bundled backbone with everything that can be checked."""
+    model = make_model(backbone=backbone, temporal=temporal)
+    if getattr(model, "field", None) is not None:
+        model.deforms = True
+        with torch.no_grad():
+            for parameter in model.field.heads.parameters():
+                parameter.uniform_(-0.05, 0.05, generator=torch.Generator().manual_seed(1))
+
+    def split_some() -> None:
+        model.gaussians.statistics["seen"].fill_(1)
+        model.gaussians.statistics["screen_gradient"][:9] = 1
+        grow(model, model.settings.densify, torch.Generator().manual_seed(0))
+
+    return Example(
+        make_adapter(model),
+        cameras=make_views(),
+        optimizers=[model.gaussians.optimizer],
+        render=lambda view: model.render(view),
+        grow=split_some,
+        state_dict=model.state_dict,
+        load_state_dict=model.load_state_dict,
+    )
+
+
+@pytest.mark.parametrize("temporal", [True, False])
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_the_bundled_backbones_keep_the_contract(backbone: str, temporal: bool) -> None:
+    assert set(check_backbone(lambda: make(backbone, temporal))) == {*CHECKS, "state"}
+
+
+def test_what_the_example_lacks_is_not_checked() -> None:
+    made = check_backbone(lambda: Example(make().backbone, make_views()))
+    assert set(CHECKS) - set(made) == {"moments", "grow", "rendered depth"}
+    assert "state" not in made
+
+
+def broken(change: Callable[[WatchedModel], None]) -> str:
+    """What `check_backbone` says of the Yang-style backbone after `change` of its adapter."""
+
+    def make_broken() -> Example:
+        example = make()
+        change(example.backbone)
+        return example
+
+    with pytest.raises(ContractError) as caught:
+        check_backbone(make_broken)
+    assert caught.value.violations
+    assert all("\n" not in sentence for sentence in caught.value.violations)
+    return str(caught.value)
+
+
+def with_view(**changes: object) -> Callable[[WatchedModel], None]:
+    """An adapter whose views are different."""
+    return lambda adapter: setattr(
+        adapter, "view", lambda camera: replace(camera, **{k: f(camera) for k, f in changes.items()})
+    )
+
+
+def with_slice(change: Callable[[Splats], Splats]) -> Callable[[WatchedModel], None]:
+    """An adapter whose slices are different."""
+
+    def apply(adapter: WatchedModel) -> None:
+        inner = adapter.slice_at
+        adapter.slice_at = lambda view: change(inner(view))
+
+    return apply
+
+
+def silent(adapter: WatchedModel) -> None:
+    adapter._listeners = []
+    adapter.on_resize = lambda listener: None
+
+
+def one_listener(adapter: WatchedModel) -> None:
+    adapter.on_resize = lambda listener: setattr(adapter, "_listeners", [listener])
+
+
+def early(adapter: WatchedModel) -> None:
+    """Tells before the change."""
+    tell, select = adapter._tell, type(adapter.model).select
+
+    def tell_first(index: torch.Tensor) -> None:
+        tell(index)
+        select(adapter.model, index)
+
+    adapter.model.select = tell_first
+
+
+def reversed_rows(adapter: WatchedModel) -> None:
+    tell = adapter._tell
+    adapter._tell = lambda index: tell(index.flip(0))
+
+
+def keeps_instead(adapter: WatchedModel) -> None:
+    remove = adapter.remove
+    adapter.remove = lambda mask: remove(~mask)
+
+
+def overcounts(adapter: WatchedModel) -> None:
+    insert = adapter.insert
+    adapter.insert = lambda points: insert(points) + 1
+
+
+def elsewhere(adapter: WatchedModel) -> None:
+    insert = adapter.insert
+    adapter.insert = lambda points: insert(points._replace(positions=points.positions + 0.7))
+
+
+def wide(adapter: WatchedModel) -> None:
+    insert = adapter.insert
+    adapter.insert = lambda points: insert(points._replace(scales=points.scales * 5))
+
+
+def faint(adapter: WatchedModel) -> None:
+    insert = adapter.insert
+    adapter.insert = lambda points: insert(points._replace(opacities=points.opacities * 0.1))
+
+
+def forgets_moments(adapter: WatchedModel) -> None:
+    remove = adapter.remove
+
+    def forgetful(mask: torch.Tensor) -> None:
+        remove(mask)
+        adapter.model.gaussians.optimizer.state.clear()
+
+    adapter.remove = forgetful
+
+
+def stale_moments(adapter: WatchedModel) -> None:
+    """Moments of the first rows stay in front, whichever rows are kept."""
+    remove = adapter.remove
+
+    def stale(mask: torch.Tensor) -> None:
+        optimizer = adapter.model.gaussians.optimizer
+        old = {
+            group["name"]: optimizer.state[group["params"][0]]["exp_avg"].clone() for group in optimizer.param_groups
+        }
+        remove(mask)
+        for group in optimizer.param_groups:
+            state = optimizer.state[group["params"][0]]
+            state["exp_avg"].copy_(old[group["name"]][: len(state["exp_avg"])])
+
+    adapter.remove = stale
+
+
+def draws(adapter: WatchedModel) -> None:
+    insert = adapter.insert
+    adapter.insert = lambda points: (torch.rand(1), insert(points))[1]
+
+
+def normalised_depth(adapter: WatchedModel) -> None:
+    rendered = adapter.rendered_depth
+
+    def divided(view: object) -> object:
+        maps = rendered(view)
+        return maps and (maps[0] / (maps[1] + 1e-6), maps[1])
+
+    adapter.rendered_depth = divided
+
+
+def any_camera(adapter: WatchedModel) -> None:
+    adapter.rendered_depth = lambda view: adapter._rendered and adapter._rendered[1:]
+
+
+def refuses(adapter: WatchedModel) -> None:
+    def fail(points: object) -> int:
+        raise RuntimeError("no room")
+
+    adapter.insert = fail
+
+
+def transposed(view: object) -> torch.Tensor:
+    return view.T_camera_world.T
+
+
+def mirrored(view: object) -> torch.Tensor:
+    return torch.diag(torch.tensor([1.0, -1, 1, 1])) @ view.T_camera_world
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (with_view(T_camera_world=transposed), "the last row of T_camera_world is not 0 0 0 1"),
+        (with_view(T_camera_world=mirrored), "mirrors the world"),
+        (with_view(T_camera_world=lambda view: view.T_camera_world * 2), "is not orthonormal"),
+        (with_view(K=lambda view: -view.K), "positive focal lengths"),
+        (with_view(camera=lambda view: "one", frame=lambda view: 0), "6 cameras share 1 keys"),
+        (with_slice(lambda s: s._replace(means=s.means.detach())), "means of a slice have no gradient"),
+        (with_slice(lambda s: s._replace(means=s.means + torch.rand(1))), "another answer when asked twice"),
+        (with_slice(lambda s: s._replace(opacities=s.opacities * 4 - 1)), "outside 0..1"),
+        (with_slice(lambda s: s._replace(covariances=s.covariances[:, [0, 3, 5, 1, 2, 4]])), "negative eigenvalue"),
+        (with_slice(lambda s: s._replace(rows=torch.zeros_like(s.rows))), "name one Gaussian twice"),
+        (with_slice(lambda s: s._replace(rows=s.rows + 1000)), "rows of a slice must be int64 in 0.."),
+        (with_slice(lambda s: s._replace(means=s.means[:, :2])), r"means of a slice has shape \(60, 2\), expected"),
+        (with_slice(lambda s: s._replace(means=s.means - torch.tensor([0, 0, 99.0]))), "no camera sees any Gaussian"),
+        (with_slice(lambda s: s._replace(means=s.means * float("nan"))), "is not finite"),
+        (silent, "insert changes 60 Gaussians to 68 without telling on_resize"),
+        (silent, "own densification goes from 60 to .* without telling"),
+        (one_listener, "told to one listener only"),
+        (early, "tell after the change"),
+        (reversed_rows, "are not those of the rows that the report names"),
+        (keeps_instead, "remove was given 20 rows and took 40"),
+        (overcounts, "insert returns 9 but 8 Gaussians were added"),
+        (elsewhere, "are not where their points are"),
+        (wide, "have a standard deviation of .* asked for"),
+        (faint, "have an opacity of .* asked for"),
+        (forgets_moments, "has lost its state"),
+        (stale_moments, "does not stay on its row"),
+        (draws, "the global random state changes"),
+        (normalised_depth, "depth_sum is not the slice's"),
+        (any_camera, "render of one camera for another"),
+        (refuses, "insert: the backbone raised RuntimeError: no room"),
+    ],
+)
+def test_each_violation_gets_its_sentence(change: Callable[[WatchedModel], None], sentence: str) -> None:
+    assert re.search(sentence, broken(change))
+
+
+def test_members_that_are_missing_are_named_first() -> None:
+    class Nothing:
+        settings = RasterSettings()
+
+    with pytest.raises(ContractError, match=r"the backbone has no slice_at\(\)"):
+        check_backbone(lambda: Example(Nothing(), make_views()))
+
+
+def test_a_state_that_forgets_something_is_noticed() -> None:
+    def forgetful() -> Example:
+        example = make()
+
+        def load(state: dict) -> None:
+            example.load_state_dict(state)
+            with torch.no_grad():
+                example.backbone.model.gaussians["positions"].mul_(1.01)
+
+        return replace(example, load_state_dict=load)
+
+    with pytest.raises(ContractError, match="a resumed run would differ"):
+        check_backbone(forgetful)
