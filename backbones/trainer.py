@@ -100,7 +100,7 @@ class Trainer:
         """Continue from `state_dict()`."""
         self.step = state["step"]
         self.model.load_state_dict(state["model"])
-        self._generator.set_state(state["generator"])
+        self._generator.set_state(state["generator"].cpu())
         self._queue = list(state["queue"])
         if self.d2 is not None:
             self.d2.load_state_dict(state["d2"])

@@ -84,6 +84,7 @@ def _add_train(commands: Any) -> None:
     parser.add_argument("--output", type=Path, required=True, help="folder of the run; an unfinished run is continued")
     parser.add_argument("--priors", type=Path, default=None, help="folder of the depth prior; default OUTPUT/priors")
     parser.add_argument("--seed", type=int, default=0, help="of every random choice")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--export-ply", action="store_true", help="also write one 3DGS PLY per frame")
 
 
@@ -219,6 +220,7 @@ def _train(options: argparse.Namespace) -> None:
         iterations=options.iterations,
         hooks=_hooks(options.hooks),
         seed=options.seed,
+        device=options.device,
         priors=str(options.priors) if options.priors else None,
     )
     run = Run(settings, options.output)

@@ -149,7 +149,7 @@ class D2Hooks:
         for name, hook in self.hooks.items():
             hook.load_state_dict(state["hooks"][name])
         self._sampler.load_state_dict(state["views"])
-        self.generator.set_state(state["generator"])
+        self.generator.set_state(state["generator"].cpu())
         self._idle, self.retired = dict(state["idle"]), dict(state["retired"])
         self._count = len(self.backbone)
 

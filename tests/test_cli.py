@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from d2_plugin.captures.saving import save_capture
 from d2_plugin.captures.synthetic import synthetic_capture
@@ -208,6 +209,16 @@ class TestMistakes:
         message = refused(capsys, train(capture, tmp_path / "x", "--backbone", "yang"))
         assert "unknown backbone 'yang'" in message
         assert "did you mean 'yang4d'?" in message
+
+    def test_a_device_that_is_not_there(
+        self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        if torch.cuda.is_available():
+            pytest.skip("this machine has a CUDA device")
+        code = train(capture, tmp_path / "run", "--device", "cuda")
+        assert "leave out --device" in refused(capsys, code)
+        code = train(capture, tmp_path / "run", "--device", "cdua")
+        assert "cuda" in refused(capsys, code)
 
     def test_no_training_camera(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "no training camera" in refused(capsys, train(capture, tmp_path / "x", cameras=","))

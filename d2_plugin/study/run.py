@@ -77,9 +77,14 @@ class Run:
                 self._save(trainer)
 
     def evaluate(self, pictures: bool = True) -> dict[str, Any]:
-        """Score every held-out camera at every frame; writes metrics.json and pictures/ and returns the metrics."""
+        """Score every held-out camera at every frame; returns the metrics.
+
+        Writes metrics.json (per view, per frame, per camera, mean), the same as tables in metrics.md and metrics.tex,
+        and pictures/.
+        """
         from d2_plugin.study.evaluation import evaluate
         from d2_plugin.study.lpips import find_lpips
+        from d2_plugin.study.report import write_tables
 
         trainer, scene = self._trained(), self.scene
         cameras = scene.test_cameras or scene.train_cameras
@@ -91,7 +96,8 @@ class Run:
                 cameras,
                 scene.capture.frames,
                 self.folder / "pictures" if pictures else None,
-                lpips=find_lpips(),
+                lpips=find_lpips("alex"),
+                lpips_vgg=find_lpips("vgg"),
                 progress=lambda done, _: bar.update(done),
             )
         if not scene.test_cameras:
@@ -111,6 +117,7 @@ class Run:
             "made": circumstances(),
         }
         _write_json(self.folder / "metrics.json", metrics)
+        write_tables(metrics, self.folder)
         return metrics
 
     def export_ply(self) -> list[Path]:
@@ -120,7 +127,7 @@ class Run:
         trainer = self._trained()
         paths = []
         for frame in self.scene.capture.frames:
-            view = make_view(self.scene.capture, self.scene.train_cameras[0], frame)
+            view = make_view(self.scene.capture, self.scene.train_cameras[0], frame, self.settings.device)
             with torch.no_grad():
                 splats = trainer.model.slice_at(view)
                 colors = trainer.model.colors(view, splats)
@@ -148,16 +155,14 @@ class Run:
         points = initial_points(self.scene.capture, self.scene.train_cameras, sparse, extent, self.settings.seed)
         frames = self.scene.capture.frames
         model = backbone.create(
-            points.positions,
-            points.colors,
-            points.times,
+            *(values.to(self.settings.device) for values in (points.positions, points.colors, points.times)),
             extent=extent.radius,
             duration=self.scene.capture.seconds(frames[-1]),
             temporal=self.scene.plan.uses("temporal"),
             settings=self.settings.overrides.get("backbone", {}),
         )
         training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
-        pictures = TrainingFrames(self.scene.capture, self.scene.train_cameras)
+        pictures = TrainingFrames(self.scene.capture, self.scene.train_cameras, self.settings.device)
         return backbone.Trainer(model, pictures, training, self._attach if attach and self.uses_prior else None)
 
     def _trained(self) -> Any:
@@ -176,7 +181,8 @@ class Run:
     def _renderer(self, model: Any) -> Callable[[str, int], tuple[Tensor, Tensor]]:
         @torch.no_grad()
         def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
-            color, depth_sum, alpha = model.render(make_view(self.scene.capture, camera, frame))
+            view = make_view(self.scene.capture, camera, frame, self.settings.device)
+            color, depth_sum, alpha = (part.cpu() for part in model.render(view))
             solid = alpha > RENDERED_ALPHA
             depth = torch.where(solid, depth_sum / alpha.clamp(min=RENDERED_ALPHA), torch.zeros_like(alpha))
             return color.clamp(0, 1), depth
@@ -193,7 +199,7 @@ class Run:
         path = self.folder / "checkpoint.pt"
         if not path.is_file():
             return False
-        state = torch.load(path, weights_only=True)
+        state = torch.load(path, map_location=self.settings.device, weights_only=True)
         if trainer.d2 is None:
             state["d2"] = None
         trainer.load_state_dict(state)

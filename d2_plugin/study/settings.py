@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from d2_plugin import registry
 from d2_plugin.captures import Capture, open_capture
 from d2_plugin.config import D2Config, for_iterations
@@ -37,6 +39,8 @@ class RunSettings:
     mono_onnx: str | None = None
     mono_kind: str | None = None
     priors: str | None = None
+    device: str = "cpu"
+    """Where the trainer runs: cpu or cuda."""
     overrides: Mapping[str, Any] = field(default_factory=dict)
     """Tables over the defaults, see `TABLES`."""
 
@@ -70,6 +74,7 @@ def check(settings: RunSettings) -> RunSettings:
             raise unknown_name("hook", name, [*HOOK_NAMES, "all", "none"])
     if settings.mono_onnx and settings.mono_kind not in ("relative", "metric"):
         raise D2Error("--mono-onnx needs --mono-kind relative (inverse depth) or metric (depth): a file does not tell")
+    _check_device(settings.device)
     for name in settings.overrides:
         if name not in TABLES:
             raise unknown_name("table", name, TABLES)
@@ -83,6 +88,13 @@ def check(settings: RunSettings) -> RunSettings:
     paths = ("capture", "mono_onnx", "priors")
     absolute = {name: str(Path(path).resolve()) for name in paths if (path := getattr(settings, name)) is not None}
     return replace(settings, **absolute)  # a run is found again from any folder
+
+
+def _check_device(name: str) -> None:
+    if name not in ("cpu", "cuda"):
+        raise unknown_name("device", name, ("cpu", "cuda"))
+    if name == "cuda" and not torch.cuda.is_available():
+        raise D2Error("--device cuda, but torch finds no CUDA device here: leave out --device to train on the CPU")
 
 
 def _split(capture: Capture, settings: RunSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:
