@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import multiprocessing
-import re
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -16,6 +14,7 @@ from torch import Tensor
 
 from d2_plugin.rasterizer import DepthPrior, RasterSettings, Render, Splats, rasterize, reference, survey
 
+from .memory import in_fresh_process, peak_resident
 from .raster_scenes import Scene, load_scene
 
 SETTINGS = RasterSettings()
@@ -206,24 +205,11 @@ def peak_memory(case: Case, name: str, device: torch.device) -> float:
         before = torch.cuda.memory_allocated(device)
         _finish(work(), device)
         return (torch.cuda.max_memory_allocated(device) - before) / 1e6
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(_peak_resident, (case, name, torch.get_num_threads()))
+    return in_fresh_process(_peak_resident, case, name).result
 
 
-def _peak_resident(case: Case, name: str, threads: int) -> float:
-    status = Path("/proc/self/status")
-    if not status.exists():
-        return float("nan")
-    torch.set_num_threads(threads)
+def _peak_resident(case: Case, name: str) -> float:
     renderers: Mapping[str, RenderScene] = implementations(torch.device("cpu"), 0)
     # A small scene first: compiling, loading and thread stacks are not the rasterizer's memory.
     passes_of(renderers[name], load_scene("synth:100", 64, 48), torch.device("cpu"))["forward+backward"]()
-    work = passes_of(renderers[name], case.load(), torch.device("cpu"))["forward+backward"]
-    Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
-    before = _status_mb(status, "VmRSS")
-    work()
-    return _status_mb(status, "VmHWM") - before
-
-
-def _status_mb(status: Path, key: str) -> float:
-    return int(re.search(rf"{key}:\s+(\d+) kB", status.read_text()).group(1)) * 1024 / 1e6
+    return peak_resident(passes_of(renderers[name], case.load(), torch.device("cpu"))["forward+backward"]).peak_mb
