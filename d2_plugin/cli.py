@@ -1,8 +1,9 @@
-"""The `d2` command: demo, plan, priors, train, eval, compare, ablate, bench, doctor."""
+"""The `d2` command: from a recording to a prior, a trained model, its scores, and the tables of a study."""
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import sys
 import tomllib
@@ -22,12 +23,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Read when torch is first imported, further down. OpenMP threads that spin at each barrier cost a training step
     # on a busy machine 130 to 210 ms instead of 20 (two threads, 25,000 Gaussians, 240x135).
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    options = _parser().parse_args(arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
     try:
+        module = _module(words)
+        if module is not None:
+            return importlib.import_module(module).main(words[1:]) or 0
+        options = _parser().parse_args(words)
         return options.run(options) or 0
     except D2Error as error:
         sys.stderr.write(f"d2: {error}\n")
         return 2
+
+
+def _module(words: Sequence[str]) -> str | None:
+    """The module that serves a command all by itself, its `--help` included."""
+    if words[:1] == ["plan"] and "--verify" in words:
+        words.remove("--verify")
+        return "d2_plugin.study.plan_verify"
+    return MODULES[words[0]][0] if words and words[0] in MODULES else None
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -48,6 +61,8 @@ def _parser() -> argparse.ArgumentParser:
         _add_doctor,
     ):
         add(commands)
+    for name, (_, help) in MODULES.items():
+        commands.add_parser(name, help=help, add_help=False)
     return parser
 
 
@@ -120,6 +135,9 @@ def _add_priors(commands: Any) -> None:
 
 def _add_plan(commands: Any) -> None:
     parser = _command(commands, "plan", _plan, "What the method needs for a recording, and what is left out, and why.")
+    parser.add_argument(
+        "--verify", action="store_true", help="measure what each decision saves and costs; see its --help"
+    )
     _add_capture_options(parser)
 
 
@@ -139,7 +157,18 @@ def _add_doctor(commands: Any) -> None:
     _command(commands, "doctor", _doctor, "What is installed, what is missing for which feature, compiler and caches.")
 
 
-BENCHMARKS = {"raster": "d2_plugin.study.bench_raster", "stereo": "d2_plugin.study.bench_stereo"}
+BENCHMARKS = {
+    "align": "d2_plugin.study.bench_align",
+    "raster": "d2_plugin.study.bench_raster",
+    "scaling": "d2_plugin.study.bench_scaling",
+    "stereo": "d2_plugin.study.bench_stereo",
+}
+MODULES = {
+    "report": ("d2_plugin.study.report_page", "One page of everything measured: plots, tables, pictures."),
+    "stability": ("d2_plugin.study.stability", "Sweeps over stiff and extreme cases, in float32 and float64."),
+    "export-capture": ("d2_plugin.study.export_capture", "A recording in the input layout of another repository."),
+}
+"""Commands that a module of their own serves: its name, and one line of help."""
 
 
 def _names(text: str) -> tuple[str, ...]:
@@ -300,8 +329,6 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _bench(options: argparse.Namespace) -> int | None:
-    import importlib
-
     return importlib.import_module(BENCHMARKS[options.part]).main(options.rest)
 
 
