@@ -69,6 +69,18 @@ class PriorSummary:
         if record["refused"]:
             self.refused.append((camera, frame, record["refused"]))
 
+    def add_part(self, part: PriorSummary) -> None:
+        """Take in the summary of another part of the same build; notes that both have are kept once."""
+        self.built, self.kept = self.built + part.built, self.kept + part.kept
+        for camera, share in part.shares.items():
+            mean = self.shares.setdefault(camera, dict.fromkeys(share, 0.0))
+            total = self._counts[camera] + part._counts[camera]
+            for label, value in share.items():
+                mean[label] += (value - mean[label]) * part._counts[camera] / total
+            self._counts[camera] = total
+        self.refused = sorted([*self.refused, *part.refused], key=lambda refusal: refusal[1])
+        self.notes += [note for note in part.notes if note not in self.notes]
+
     def __str__(self) -> str:
         lines = [f"{self.built} priors built, {self.kept} kept", f"{'camera':12}verified  mono only  conflict   empty"]
         for camera, share in self.shares.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-import os
+import secrets
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,4 +133,5 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
 
 
 def _temporary(path: Path) -> Path:
-    return path.with_name(f".{path.name}.{os.getpid()}")
+    """A name that no other writer uses: several threads, processes and machines may write one folder."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(6)}")

@@ -1,7 +1,7 @@
 """What is measured about alignment: problems whose line is known, the methods that look for it, and their errors.
 
 A problem has anchors as a capture has them: depths of a room, a monocular value that is their line up to a few per cent
-of noise, and wrong geometric depths drawn anywhere in the room. Least squares, Huber's weights, RANSAC and the median
+of noise, and wrong geometric depths, which are those of other places in the room. Least squares, Huber's weights, RANSAC and the median
 rule of Inria's `make_depth_scale.py` are what other code bases align with; L-BFGS is a general solver for our problem.
 """
 
@@ -75,15 +75,15 @@ class AlignProblem:
 
 
 def align_problem(kind: MonoKind, anchors: int, outliers: float, seed: int = 0) -> AlignProblem:
-    """`anchors` of them, of which the share `outliers` has a geometric depth drawn uniformly from the room."""
+    """`anchors` of them, of which the share `outliers` has the geometric depth of another place in the room."""
     rng = np.random.default_rng([seed, anchors, round(100 * outliers)])
-    truth = np.exp(rng.uniform(*np.log(ROOM), anchors))
+    truth, elsewhere = np.exp(rng.uniform(*np.log(ROOM), (2, anchors)))
     target = 1 / truth if kind == "relative" else truth
     clean = (target - TRUE_LINE[1]) / TRUE_LINE[0]
     mono = (target * (1 + rng.normal(0, MONO_NOISE, anchors)) - TRUE_LINE[1]) / TRUE_LINE[0]
     geometric = truth * (1 + rng.normal(0, GEOMETRIC_NOISE, anchors))
     wrong = rng.permutation(anchors)[: round(outliers * anchors)]
-    geometric[wrong] = rng.uniform(*ROOM, wrong.size)
+    geometric[wrong] = elsewhere[wrong]
     return AlignProblem(kind, mono, geometric, clean, truth)
 
 

@@ -1,0 +1,142 @@
+"""Priors on a cluster: dask.distributed runs the parts that `build_priors(shard=...)` builds, on machines that share
+a file system.
+
+Every worker writes finished frames into the one store, so nothing but the summary travels back. A worker that dies
+loses the frames it was at work on; its part is started again elsewhere, and what it had finished is found there.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.captures.capture import Capture
+from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.priors.build import PriorSummary, Progress, build_priors
+from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.priors.sources import frame_blocks
+
+PARTS_PER_WORKER = 4
+"""Parts are handed out as workers become free: more of them even out frames that take longer, each loads the monocular
+network once."""
+
+logger = logging.getLogger(__name__)
+
+
+def build_priors_on_cluster(
+    capture: Capture,
+    cameras: Sequence[str],
+    output: Path | str,
+    settings: PriorSettings,
+    *,
+    scheduler: str | None = None,
+    workers: int = 2,
+    sparse_points: np.ndarray | None = None,
+    progress: Progress | None = None,
+) -> PriorSummary:
+    """`build_priors`, on many machines or on several processes of this one; the store is the same, byte for byte.
+
+    Started from a script of your own, local workers import that script: put the call under
+    `if __name__ == "__main__":`.
+
+    Args:
+        capture: the recording, whose files every worker can read under the same paths.
+        cameras, output, settings, sparse_points: as for `build_priors`; `output` must be the same folder for everyone.
+        scheduler: address of a dask scheduler, as `tcp://host:8786`; workers on this machine where None.
+        workers: number of processes on this machine, where there is no scheduler.
+        progress: called after every part, with pictures done and in all.
+
+    Raises:
+        D2Error: what `build_priors` refuses, no scheduler or no worker at the address, or a part whose workers died
+            again and again.
+        MissingExtra: dask.distributed is not installed.
+    """
+    folder = Path(output).absolute()
+    if capture.path is not None:
+        capture = replace(capture, path=capture.path.absolute())
+    with _client(scheduler, workers) as client, client.as_current():
+        count = _part_count(capture, settings, len(client.nthreads()))
+        points = None if sparse_points is None else np.asarray(sparse_points)
+        parts = [
+            client.submit(_build_part, capture, list(cameras), folder, settings, points, (index, count), pure=False)
+            for index in range(count)
+        ]
+        return _joined(parts, len(capture.frames) * len(cameras), progress)
+
+
+def _build_part(
+    capture: Capture,
+    cameras: list[str],
+    output: Path,
+    settings: PriorSettings,
+    points: np.ndarray | None,
+    shard: tuple[int, int],
+) -> PriorSummary:
+    """What a worker does."""
+    return build_priors(capture, cameras, output, settings, sparse_points=points, shard=shard)
+
+
+def _part_count(capture: Capture, settings: PriorSettings, workers: int) -> int:
+    """Parts are whole blocks, since frames within a block are built in order."""
+    return min(len(frame_blocks(capture.frames, settings.stereo)), PARTS_PER_WORKER * max(workers, 1))
+
+
+def _joined(parts: list[Any], total: int, progress: Progress | None) -> PriorSummary:
+    """The summary of all parts, in the order in which they end; the first mistake ends all of them."""
+    from distributed import KilledWorker, as_completed
+
+    summary, done = PriorSummary(), 0
+    for future in as_completed(parts):
+        try:
+            part: PriorSummary = future.result()
+        except KilledWorker as error:
+            raise D2Error(
+                f"a part of the priors killed {error.allowed_failures + 1} workers: look into their logs (mostly "
+                "it is memory), then build again, which keeps what is finished"
+            ) from None
+        summary.add_part(part)
+        done += part.built + part.kept
+        if progress is not None:
+            progress(done, total, f"a part of {part.built + part.kept} pictures")
+    return summary
+
+
+@contextmanager
+def _client(scheduler: str | None, workers: int) -> Iterator[Any]:
+    """A client of the scheduler at that address, or of processes that are started here and ended afterwards."""
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise missing_extra("dask.distributed", "cluster", "building priors on a cluster") from None
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout="10s", set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as error:
+            raise D2Error(
+                f"no dask scheduler answers at {scheduler} ({error}): start one with `dask scheduler`, or leave the "
+                "address out for workers on this machine"
+            ) from None
+        with client:
+            if not client.nthreads():
+                raise D2Error(f"the scheduler at {scheduler} has no worker: start some with `dask worker {scheduler}`")
+            yield client
+        return
+    if workers < 1:
+        raise D2Error(f"{workers} workers cannot build anything: give at least 1")
+    with (
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,  # frames are independent: processes of one thread waste nothing
+            processes=True,
+            dashboard_address=":0",
+            silence_logs=logging.ERROR,
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
