@@ -88,7 +88,7 @@ def make_adapter(model: SplatModel) -> Yang4DAdapter | DeformAdapter:
 ALL_HOOKS = D2Config(
     densify=DensifyConfig(start=5, stop=25, every=5, budget_per_view=20),
     prune=PruneConfig(start=5, stop=30, every=4, patience=2, tau_p=0.6),
-    depth_loss=DepthLossConfig(),
+    depth_loss=DepthLossConfig(every=1, weight=0.2),
     views_per_evaluation=3,
 )
 
