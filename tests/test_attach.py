@@ -1,0 +1,234 @@
+"""The official repositories, as mimics: three lines attach D2, none of the repository's own behaviour is lost."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from mimics import deformable3d, fudan, hust4d
+from mimics.inria import covariances, default_options
+from mimics.page import attached, changed_lines
+from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_views
+from torch import Tensor
+
+from d2_plugin import D2Config, D2Error, D2Hooks
+from d2_plugin.adapters.deformable3d import Deformable3DAdapter
+from d2_plugin.adapters.fudan import FudanAdapter
+from d2_plugin.adapters.hust4d import Hust4DAdapter
+from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
+from d2_plugin.priors.fuse import FusedPrior
+from d2_plugin.priors.store import PriorStore
+from d2_plugin.protocol import Backbone, Points
+from d2_plugin.rasterizer import rasterize
+from d2_plugin.registry import ADAPTERS, load
+
+MIMICS: dict[str, ModuleType] = {"fudan": fudan, "deformable3d": deformable3d, "hust4d": hust4d}
+HOOKS = replace(
+    ALL_HOOKS,
+    densify=DensifyConfig(start=5, stop=60, every=10, budget_per_view=15),
+    prune=PruneConfig(start=5, stop=90, every=10, patience=2, tau_p=0.6),
+    depth_loss=DepthLossConfig(every=1, weight=0.2),
+)
+
+
+def write_prior(folder: Path) -> None:
+    """The exact prior of the tiny scene, as `d2 priors` would leave it."""
+    store = PriorStore.create(folder, ["cam0", "cam1", "cam2"], [0, 1], {"capture": "tiny"})
+    for view in make_views():
+        prior = TinyStore().prior(view.camera, view.frame)
+        camera = {"K": view.K.tolist(), "T_camera_world": view.T_camera_world.tolist()}
+        fused = FusedPrior(prior.depth.numpy(), prior.labels.numpy())
+        picture = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+        store.write(view.camera, view.frame, fused, picture, {"camera": camera})
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a prior and a d2.toml, as the working directory of a trainer."""
+    write_prior(tmp_path / "prior")
+    (tmp_path / "d2.toml").write_text(replace(HOOKS, prior="prior").to_toml())
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(mimic: ModuleType, source: ModuleType | None = None, **options) -> SimpleNamespace:
+    """Train the mimic, or its attached `source`, from the same start."""
+    return (source or mimic).training(*mimic.make(), **options)
+
+
+def snapshot(model) -> dict[str, Tensor]:
+    values = {name: getattr(model, attribute).detach().clone() for name, attribute in model.columns}
+    moments = {
+        f"{group['name']} {key}": model.optimizer.state[group["params"][0]][key].clone()
+        for group in model.optimizer.param_groups
+        for key in model.optimizer.state.get(group["params"][0], {})
+        if key != "step"
+    }
+    return values | moments
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.mark.parametrize("name", MIMICS)
+class TestEveryRepository:
+    def test_three_lines_and_an_import_attach_d2(self, name: str) -> None:
+        lines = changed_lines(name)
+        assert len(lines) == 3
+        assert lines[0].startswith(f'd2 = D2Hooks.attach("d2.toml", "{name}", gaussians')
+        assert lines[1].startswith("loss = loss + d2.loss(iteration, viewpoint_cam")
+        assert lines[2] == "d2.step(iteration)"
+
+    def test_all_hooks_off_is_bitwise_the_bare_loop(self, name: str, workplace: Path) -> None:
+        mimic = MIMICS[name]
+        bare, source = run(mimic), attached(mimic, name)
+        (workplace / "d2.toml").write_text(D2Config().to_toml())
+        assert same(snapshot(bare.gaussians), snapshot(run(mimic, source).gaussians))
+        (workplace / "d2.toml").write_text(replace(HOOKS, prior="prior").to_toml())
+        full = run(mimic, source)
+        assert not same(snapshot(bare.gaussians), snapshot(full.gaussians)), "hooks changed nothing: this cannot fail"
+        assert {entry.hook for entry in full.d2.trace} == {"densify", "prune", "depth_loss"}
+        assert all(value.isfinite().all() for value in snapshot(full.gaussians).values())
+
+    def test_a_resumed_run_is_bitwise_the_uninterrupted_one(self, name: str, workplace: Path) -> None:
+        mimic = MIMICS[name]
+        source = attached(mimic, name, after_first="if D2_STATE and checkpoint: d2.load_state_dict(D2_STATE)")
+        source.D2_STATE = None
+        whole, first = run(mimic, source), run(mimic, source, stop=53)
+        checkpoint, state = copy.deepcopy((saved(first), 53)), copy.deepcopy(first.d2.state_dict())
+        forgetful = run(mimic, source, checkpoint=copy.deepcopy(checkpoint))
+        source.D2_STATE = state
+        assert same(snapshot(whole.gaussians), snapshot(run(mimic, source, checkpoint=checkpoint).gaussians))
+        assert not same(snapshot(whole.gaussians), snapshot(forgetful.gaussians)), "D2's state does not matter"
+
+    def test_the_slice_draws_what_the_repository_draws(self, name: str) -> None:
+        for adapter, camera, package in drawn(name):
+            view = adapter.view(camera)
+            splats = adapter.slice_at(view)
+            own = rasterize(splats, torch.zeros(len(splats.means), 1), view, adapter.settings)
+            torch.testing.assert_close(own.depth_sum, package["depth"][0], rtol=1e-4, atol=1e-4)
+
+    def test_an_insertion_keeps_the_densification_evidence(self, name: str) -> None:
+        adapter = next(iter(drawn(name)))[0]
+        model, count = adapter.gaussians, len(adapter)
+        for accumulator in adapter.evidence:
+            value = getattr(model, accumulator)
+            setattr(model, accumulator, torch.arange(1.0, 1 + value.numel()).view_as(value))
+        told: list[Tensor] = []
+        adapter.on_resize(told.append)
+        assert adapter.insert(some_points(5)) == 5
+        assert told[0].tolist() == [*range(count), *[-1] * 5]
+        for accumulator in adapter.evidence:
+            value = getattr(model, accumulator)
+            assert len(value) == count + 5, accumulator
+            assert torch.equal(value[:count].flatten(), torch.arange(1.0, 1 + value[:count].numel())), accumulator
+            assert not value[count:].any(), accumulator
+
+    def test_the_repositorys_own_edits_are_reported_row_by_row(self, name: str) -> None:
+        """Ids in positions and in Adam's moments follow the index that listeners are told."""
+        adapter = next(iter(drawn(name)))[0]
+        model = adapter.gaussians
+        sum((getattr(model, attribute) * 0).sum() for _, attribute in model.columns).backward()
+        model.optimizer.step()
+        ids = torch.arange(float(len(adapter)))
+        model._xyz.data[:, 0] = ids
+        model.optimizer.state[model._xyz]["exp_avg"][:, 0] = ids
+        followed = ids.clone()
+
+        def follow(index: Tensor) -> None:
+            nonlocal followed
+            followed = torch.where(index >= 0, followed[index.clamp(min=0)], torch.full_like(index, -1.0).float())
+
+        adapter.on_resize(follow)
+        with torch.no_grad():
+            grads = (torch.arange(len(adapter)) % 3).float()[:, None]
+            model.densify_and_clone(grads, 1.5, 1e9)
+            adapter.insert(some_points(4))
+            padded = torch.cat([grads, torch.zeros(len(adapter) - len(grads), 1)])
+            model.densify_and_split(padded, 0.5, 0.0)
+            adapter.remove(torch.arange(len(adapter)) % 7 == 0)
+        kept = followed >= 0
+        assert 0 < int(kept.sum()) < len(adapter)
+        assert torch.equal(model._xyz[kept, 0].detach(), followed[kept])
+        assert torch.equal(model.optimizer.state[model._xyz]["exp_avg"][kept, 0], followed[kept])
+
+    def test_the_adapter_is_registered_and_satisfies_the_contract(self, name: str) -> None:
+        adapter = next(iter(drawn(name)))[0]
+        assert isinstance(adapter, load(ADAPTERS, name))
+        assert isinstance(adapter, Backbone)
+
+    def test_attaching_twice_leaves_one_listener(self, name: str) -> None:
+        adapter, again = (next(iter(drawn(name, adapter_of)))[0] for adapter_of in ADAPTER_TWICE)
+        told: list[Tensor] = []
+        adapter.on_resize(told.append)
+        second = type(again)(adapter.gaussians, *again_arguments(again))
+        second.on_resize(told.append)
+        second.insert(some_points(2))
+        assert len(told) == 1
+
+
+ADAPTER_TWICE = (None, None)
+
+
+def again_arguments(adapter) -> tuple[object, ...]:
+    if isinstance(adapter, Deformable3DAdapter):
+        return (adapter.deform,)
+    return (None, adapter.stage) if isinstance(adapter, Hust4DAdapter) else ()
+
+
+def saved(first: SimpleNamespace) -> object:
+    """What the repository's checkpoint holds (for Deformable-3D, what it would have to)."""
+    params = first.gaussians.capture()
+    if hasattr(first, "deform"):
+        return params, first.deform.deform.state_dict(), first.deform.optimizer.state_dict()
+    return params
+
+
+def some_points(count: int) -> Points:
+    generator = torch.Generator().manual_seed(1)
+    positions = torch.rand(count, 3, generator=generator) + torch.tensor([-0.5, -0.5, 2.5])
+    ones = torch.ones(count)
+    return Points(positions, torch.rand(count, 3, generator=generator), ones / 2, ones / 10, ones / 2)
+
+
+def drawn(name: str, _=None):
+    """(adapter, camera, render package) of every camera, for every variant of the repository's model."""
+    if name == "fudan":
+        gaussians, scene = fudan.make()
+        gaussians.training_setup(default_options())
+        jitter(gaussians)
+        adapter = FudanAdapter(gaussians, scene)
+        yield from ((adapter, c, fudan.render(c, gaussians, [0, 0, 0])) for c in scene.train_cameras[1.0])
+    elif name == "hust4d":
+        for stage in ("fine", "coarse"):
+            gaussians, scene = hust4d.make()
+            gaussians.training_setup(default_options())
+            jitter(gaussians)
+            adapter = Hust4DAdapter(gaussians, scene, stage)
+            yield from ((adapter, c, hust4d.render(c, gaussians, [0, 0, 0], stage)) for c in scene.cameras)
+    else:
+        for is_6dof in (False, True):
+            gaussians, deform, scene = deformable3d.make(is_6dof)
+            gaussians.training_setup(default_options())
+            jitter(gaussians)
+            adapter = Deformable3DAdapter(gaussians, deform, warm_up=10)
+            adapter.active(10)
+            for camera in scene.cameras:
+                motion = deform.step(gaussians.get_xyz, camera.fid.expand(len(gaussians.get_xyz), 1))
+                yield adapter, camera, deformable3d.render(camera, gaussians, [0, 0, 0], *motion, is_6dof)
+
+
+def jitter(model) -> None:
+    """Shapes and rotations that are not those of a start."""
+    generator = torch.Generator().manual_seed(5)
+    for name in ("_rotation", "_scaling", "_rotation_r", "_scaling_t"):
+        if hasattr(model, name):
+            value = getattr(model, name).data
+            value += 0.4 * torch.randn(value.shape, generator=generator)
