@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 
 from .bench_raster import exponent
 from .provenance import provenance
 from .rows import Row
 from .svg import Axis, Plot, Point, Series, figure, number
-from .work_precision import SMALLEST, Table, colors_of, means_table, shown, work_precision
+from .work_precision import SMALLEST, Table, colors_of, means, means_table, shown, work_precision
 
 
 @dataclass(frozen=True)
@@ -36,32 +37,54 @@ def cases_of(rows: Sequence[Row]) -> dict[str, list[Row]]:
     return {case: [row for row in rows if row["case"] == case] for case in dict.fromkeys(row["case"] for row in rows)}
 
 
+ALIGNED_ANCHORS = 20_000
+"""Number of anchors that is plotted, or the nearest one that was measured."""
+
+
 def alignment(rows: Sequence[Row]) -> Section:
-    """The Charbonnier fit: objective gap against milliseconds, one plot per share of outliers."""
-    error, time = "F / F* - 1", "milliseconds per map"
-    cases, colors = cases_of(rows), colors_of(rows)
-    plots = [work_precision(mine, case, error, time, 1e3, colors) for case, mine in cases.items()]
+    """The fit: objective gap and error of aligned depth against milliseconds, one plot per share of wrong anchors."""
+    anchors = min({row["anchors"] for row in rows}, key=lambda count: abs(count - ALIGNED_ANCHORS))
+    chosen = [row for row in rows if row["anchors"] == anchors]
+    shares = {share: [row for row in chosen if row["outliers"] == share] for share in _distinct(chosen, "outliers")}
+    colors, time = colors_of(rows), "ms per fit"
+    worse = {share: [{**row, "error": row["depth_error"]} for row in mine] for share, mine in shares.items()}
+    plots = [
+        work_precision(mine, f"{share:.0%} wrong", label, time, 1e3, colors)
+        for label, of in (("F / F* - 1", shares), ("depth error", worse))
+        for share, mine in of.items()
+    ]
     return Section(
         "alignment",
         "Alignment: the positive-scale Charbonnier fit",
-        "How far the objective is above the least value that any solver reached, in float64. Differences below "
-        f"{number(SMALLEST)} are drawn there. Only d2 certifies its gap; the others do not know when they are done.",
-        {"alignment": figure(plots, "Objective gap against run time of the alignment", columns=3, size=(340, 320))},
-        (("Error and milliseconds", _beside(cases, error)),),
+        f"Fits of {anchors} anchors, geometric means over the kinds of map. Above: how far the objective is above its "
+        f"optimum (less than {number(SMALLEST)} is drawn there); only the certified solver knows its own gap. "
+        "Below: median relative error of aligned depth that is due to the line.",
+        {"alignment": figure(plots, "Gap and depth error of alignment", columns=len(shares), size=(276, 270))},
+        ((f"Depth error by share of wrong anchors, {anchors} anchors", _alignment_table(shares)),),
         sources=sources_of(rows),
     )
 
 
-def _beside(cases: Mapping[str, Sequence[Row]], error: str) -> Table:
-    """One row per setting, for each case its error and milliseconds; what is on the case's front stands out."""
-    tables = [means_table(mine, error, "ms", 1e3) for mine in cases.values()]
-    header = ("method", "setting", *(title for case in cases for title in (f"{case}: {error}", "ms")))
-    lines = [
-        (*alike[0][:2], *(cell for line in alike for cell in (line[2], line[4])))
-        for alike in zip(*(table.rows for table in tables))
-    ]
-    best = {(row, 2 * i + 2 + (column == 4)) for i, table in enumerate(tables) for row, column in table.best}
+def _alignment_table(shares: Mapping[float, Sequence[Row]]) -> Table:
+    """Per setting: depth error at each share, worst gap, milliseconds, refusals; the least depth errors stand out."""
+    every = [row for mine in shares.values() for row in mine]
+    header = ("method", "setting", *(f"{share:.0%} wrong" for share in shares), "worst gap", "ms", "refused")
+    lines: list[tuple[str, ...]] = []
+    errors: list[list[float]] = []
+    for mean in means(every):
+        of = lambda mine, m=mean: [r for r in mine if (r["method"], r["setting"]) == (m.method, m.setting)]  # noqa: E731
+        found = [[row["depth_error"] for row in of(mine) if not row["failed"]] for mine in shares.values()]
+        errors.append([max(each, default=inf) for each in found])
+        cells = (shown(value if value < inf else None) for value in errors[-1])
+        seconds = mean.seconds and mean.seconds * 1e3
+        lines.append((mean.method, mean.setting, *cells, shown(mean.worst), shown(seconds), str(mean.failures or "-")))
+    columns = range(len(shares))
+    best = {(min(range(len(lines)), key=lambda i: errors[i][column]), column + 2) for column in columns}
     return Table(header, tuple(lines), frozenset(best))
+
+
+def _distinct(rows: Sequence[Row], name: str) -> list[float]:
+    return sorted({row[name] for row in rows})
 
 
 def stereo(rows: Sequence[Row]) -> Section:
@@ -193,50 +216,55 @@ def _sweep_cells(case: str, method: str, rows: Sequence[Row]) -> tuple[str, ...]
 
 def plan(rows: Sequence[Row]) -> Section:
     """What is left out: its saving and its cost on the capture, measured with and without."""
-    header = ("capture", "decision", "by the plan", "run", "s", "peak MB", "Gaussians", "cost", "in")
-    cells = tuple(
-        (
-            *(row["case"], row["method"], row["planned"], row["setting"], shown(row["seconds"])),
-            *(shown(row.get("peak_mb")), str(row.get("gaussians") or "-")),
-            *(row["failed"] or shown(row.get("cost")), row.get("unit", "-")),
-        )
-        for row in rows
-    )
+    header = ("capture", "decision", "by the plan", "s", "peak MB", "Gaussians", "cost of leaving it out")
+    decisions = dict.fromkeys((row["case"], row["method"]) for row in rows)
+    cells = tuple(_decision([row for row in rows if (row["case"], row["method"]) == key]) for key in decisions)
     return Section(
         "plan",
-        "What a scene does not need",
-        "Each decision of the plan, taken both ways on the capture itself: time, memory and Gaussians with and "
-        "without, and what leaving it out costs (negative: it gains).",
+        "Scene plan: what is left out",
+        "Each decision of the plan, taken both ways on the capture itself: time, memory and Gaussians with the part → "
+        "without it, and what leaving it out costs (negative: it gains).",
         tables=(("Decisions", Table(header, cells)),),
         sources=sources_of(rows),
     )
 
 
+def _decision(rows: Sequence[Row]) -> tuple[str, ...]:
+    """One line of the table: with the part, an arrow, and without it."""
+    names = ("seconds", "peak_mb", "gaussians")
+    both = ("-" if rows[0].get(n) is None else " → ".join(_rounded(row[n]) for row in rows) for n in names)
+    first, last = rows[0], rows[-1]
+    cost = first["failed"] or ("-" if last["cost"] is None else f"{last['cost']:+.3f} {last['unit']}")
+    return (first["case"], first["method"], first["planned"], *both, cost)
+
+
+def _rounded(value: float) -> str:
+    """A count as it is, anything else in three digits."""
+    return str(value) if isinstance(value, int) else shown(value)
+
+
 def scaling(rows: Sequence[Row]) -> Section:
     """How time and memory grow with the number of frames."""
-    measured = {"seconds": "seconds", "peak_mb": "peak MB"}
+    lengths, colors = _distinct(rows, "frames"), colors_of(rows)
+    x = Axis.around("frames", lengths, log=True)
     plots, cells = [], []
-    for name, label in measured.items():
+    for name, label in (("seconds", "seconds"), ("peak_mb", "peak MB")):
         series = []
-        for method, color in colors_of(rows).items():
-            mine = [row for row in rows if row["method"] == method and row.get(name)]
-            places = tuple((row["frames"], row[name]) for row in mine)
-            power = exponent(places) if len(mine) > 1 else None
-            points = tuple(Point(*place, f"{method}: {number(place[1])} {label}") for place in places)
-            series.append(Series(method, points, places, color))
-            if places:
-                grows = "-" if power is None else f"frames^{power:.2f}"
-                cells.append((method, label, *(f"{frames}: {number(round(v, 2))}" for frames, v in places), grows))
-        values = [point.y for each in series for point in each.points]
-        x = Axis.around("frames", [row["frames"] for row in rows], log=True)
+        for method, color in colors.items():
+            places = {row["frames"]: row[name] for row in rows if row["method"] == method and row.get(name)}
+            line = tuple(places.items())
+            points = tuple(Point(*place, f"{method}, {place[0]} frames: {place[1]:.4g} {label}") for place in line)
+            series.append(Series(method, points, line, color))
+            power = exponent(line) if len(line) > 1 else None
+            grows = "-" if power is None else f"frames^{power:.2f}"
+            cells.append((method, label, *(shown(places.get(length)) for length in lengths), grows))
+        values = [y for each in series for _, y in each.line]
         plots.append(Plot(label, x, Axis.around(label, values, log=True), tuple(series)))
-    width = max(len(line) for line in cells)
-    cells = [(*line[:-1], *["-"] * (width - len(line)), line[-1]) for line in cells]
-    header = ("part", "of", *(f"frames, {i + 1}" for i in range(width - 3)), "grows as")
+    header = ("part", "of", *(f"{length:g} frames" for length in lengths), "grows as")
     return Section(
         "scaling",
-        "Growth with the number of frames",
-        "Priors may grow linearly; the memory of training stays flat, since frames are read when they are needed.",
+        "Scaling: growth with the number of frames",
+        "Priors should take no more than linearly longer, and training no more memory: frames are read when needed.",
         {"scaling": figure(plots, "Time and memory over the number of frames", columns=2, size=(400, 320))},
         (("Measured", Table(header, tuple(cells))),),
         sources=sources_of(rows),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from statistics import mean, stdev
 
+from .paper_tables import SOURCE, paper_rows
 from .rows import Row
 from .sections import Section, cases_of, sources_of
 from .svg import Axis, Plot, Point, Series, bars, figure
@@ -17,7 +18,7 @@ SCORES = (
     ("LPIPS", "lpips", 4),
     ("depth AbsRel", "depth_absrel", 4),
 )
-PAPER_TEXT = "Hollow marks are the paper's own figures, copied from its tables; its times are not published."
+PAPER_TEXT = "Hollow marks are the paper's own figures, made on other machines and splits; it publishes no times."
 
 
 def training(rows: Sequence[Row]) -> Section:
@@ -36,7 +37,8 @@ def training(rows: Sequence[Row]) -> Section:
         "Training: held-out quality against time",
         "PSNR of cameras that trained nothing, against the minutes that the prior and the training took together; "
         "upper left is better. A prior that several runs share counts where it was built."
-        + (" Monocular depth of some captures is emulated, not predicted." if emulated else ""),
+        + (" Monocular depth of some captures is emulated, not predicted." if emulated else "")
+        + (f" {PAPER_TEXT}" if any(series.hollow for plot in plots for series in plot.series) else ""),
         {
             "training": figure(plots, "Held-out PSNR against minutes", columns=3, size=(340, 320)),
             "training-time": bars(stacked, ("prior", "training"), "min", "Minutes of prior and training per method"),
@@ -56,7 +58,8 @@ def _quality(case: str, scored: Sequence[Row], colors: Mapping[str, int]) -> Plo
         steps = [mine[i] for i in pareto_front([(minutes[i], scored[i]["error"]) for i in mine])]
         line = tuple((minutes[i], _score(scored[i], "psnr")) for i in steps)
         series.append(Series(name, tuple(points), line, color))
-    x = Axis.around("minutes, prior included", minutes, log=max(minutes, default=1) > 4 * min(minutes, default=1))
+    x = Axis.around("minutes, prior included", minutes, log=max(minutes) > 4 * min(minutes))
+    series += _published_levels(case, x, len(colors))
     return Plot(case, x, Axis.around("held-out PSNR, dB", [p.y for s in series for p in s.points]), tuple(series))
 
 
@@ -64,6 +67,16 @@ def _quality_point(row: Row, minutes: float, on_front: bool) -> Point:
     psnr = _score(row, "psnr")
     note = f"{row['method']}, {row['setting']}: {psnr:.2f} dB after {minutes:.2f} min, {row['gaussians']} Gaussians"
     return Point(minutes, psnr, note, faded=not on_front)
+
+
+def _published_levels(case: str, x: Axis, color: int) -> list[Series]:
+    """The paper's PSNR on this capture, where its ablation is on it, as levels: its times are not published."""
+    return [
+        Series(row.label, (Point(x.high, row.psnr, f"{row.psnr:.2f} dB, {SOURCE}"),), ends, color + index, hollow=True)
+        for index, row in enumerate(paper_rows("ablation", presets=("backbone", "full")))
+        if row.scene and row.scene in case and f"{row.views} views" in case
+        for ends in [((x.low, row.psnr), (x.high, row.psnr))]
+    ]
 
 
 def _variants(rows: Sequence[Row]) -> dict[str, list[Row]]:
@@ -86,8 +99,8 @@ def ablation(rows: Sequence[Row]) -> Section:
     return Section(
         "ablation",
         "Ablation: what each part is worth",
-        f"Held-out PSNR beyond the mean of the backbone alone on the same capture. {PAPER_TEXT} The paper trained on "
-        "another recording at full length: compare the order, not the size.",
+        f"Held-out PSNR beyond the mean of the backbone alone on the same capture. {PAPER_TEXT} Compare the order, "
+        "not the size.",
         {"ablation": figure(plots, "Gain of each variant over the backbone", size=(720, height))},
         (("Mean ± deviation over seeds", _scores_table("variant", groups)),),
         sources=sources_of(rows),
@@ -124,7 +137,13 @@ def _backbones(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def _published_gains(names: Sequence[str]) -> tuple[Point, ...]:
-    return ()
+    """The paper's gains over its backbone, beside our variants of the same preset."""
+    published = {row.preset: row for row in paper_rows("ablation")}
+    return tuple(
+        Point(row.psnr - published["backbone"].psnr, place, f"{row.label}: {row.psnr:.2f} dB, {SOURCE}")
+        for place, name in enumerate(names)
+        if (row := published.get(name.partition(" ")[2])) is not None
+    )
 
 
 def _score(row: Row, name: str) -> float | None:

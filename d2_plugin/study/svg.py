@@ -20,6 +20,8 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 MARGIN_LEFT, MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 76, 18, 34, 46
 LETTER = 6.4
 """Mean width of a letter at 12 px, px."""
+LABELLED = 320
+"""Plots narrower than this leave the labels of marks to their tooltips, px."""
 EDGE = 0.06
 """Room between the outermost marks and the frame, as a share of the axis."""
 
@@ -175,7 +177,7 @@ def _legend(entries: Sequence[tuple[str, int, bool]], width: float) -> tuple[str
         return "", 6
     parts, x, y = [], 16.0, 18.0
     for name, color, hollow in entries:
-        wide = 30 + LETTER * len(name)
+        wide = 36 + 1.1 * LETTER * len(name)
         if x + wide > width - 10 and x > 16:
             x, y = 16.0, y + 20
         parts += [_mark(x + 6, y - 4, color, hollow), text(x + 18, y, name)]
@@ -204,7 +206,7 @@ def _plot(plot: Plot, left: float, top: float, size: tuple[int, int]) -> str:
             dashes = ' stroke-dasharray="5 4"' if series.hollow else ""
             parts.append(f'<path class="s{series.color % len(LIGHT)} front" d="M{path}"{dashes}/>')
         parts += [_mark(*at(p.x, p.y), series.color, series.hollow, p.note, p.faded) for p in series.points]
-    for series in plot.series:
+    for series in plot.series if size[0] >= LABELLED else ():
         parts += [_label(*at(p.x, p.y), p.label, taken, x1) for p in series.points if p.label]
     return "".join(parts)
 
