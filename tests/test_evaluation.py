@@ -52,6 +52,48 @@ def test_the_mean_over_views_is_the_mean_of_the_rows(capture: Capture) -> None:
     json.dumps(result)
 
 
+def test_every_frame_and_every_camera_has_its_mean(capture: Capture) -> None:
+    def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
+        return renderer(capture, offset=0.02 * (1 + frame) + 0.1 * (camera == "test1"))(camera, frame)
+
+    result = evaluate(render, capture, NAMES, iter(capture.frames))
+    assert [row["frame"] for row in result["per_frame"]] == [0, 1]
+    assert [row["camera"] for row in result["per_camera"]] == NAMES
+    for key, name in (("frame", "per_frame"), ("camera", "per_camera")):
+        for row in result[name]:
+            views = [view["psnr"] for view in result["per_view"] if view[key] == row[key]]
+            assert row["psnr"] == pytest.approx(np.mean(views))
+
+
+def test_flicker_is_the_error_of_change_and_belongs_to_one_camera(capture: Capture) -> None:
+    def blinking(camera: str, frame: int) -> tuple[Tensor, Tensor]:
+        return renderer(capture)(camera, frame)[0] * (0.5 if frame else 1.0), None
+
+    rows = evaluate(blinking, capture, NAMES, capture.frames)["per_view"]
+    assert [row["flicker"] is None for row in rows] == [True, False, True, False]
+    second = torch.from_numpy(capture.image("test1", 1).astype(np.float64) / 255)
+    assert rows[3]["flicker"] == pytest.approx((0.5 * second).mean().item(), abs=1e-6)
+    steady = evaluate(renderer(capture, offset=-0.0), capture, ["test0"], capture.frames)
+    assert steady["test"]["flicker"] == 0
+
+
+def test_both_lpips_networks_are_kept_apart(capture: Capture) -> None:
+    class Fixed:
+        def __init__(self, value: float, variant: str) -> None:
+            self.value, self.variant = value, variant
+
+        def __call__(self, image: Tensor, truth: Tensor) -> float:
+            return self.value
+
+    nets = {"lpips": Fixed(0.25, "on one"), "lpips_vgg": Fixed(0.5, "on another")}
+    result = evaluate(renderer(capture), capture, ["test0"], [0], **nets)
+    assert (result["test"]["lpips"], result["test"]["lpips_vgg"]) == (0.25, 0.5)
+    assert (result["variants"]["lpips"], result["variants"]["lpips_vgg"]) == ("on one", "on another")
+    alone = evaluate(renderer(capture), capture, ["test0"], [0], lpips=nets["lpips"])
+    assert alone["test"]["lpips_vgg"] is None
+    assert alone["variants"]["lpips_vgg"] == metrics.VARIANTS["lpips_vgg"]
+
+
 def test_scores_are_those_of_the_metric_functions(capture: Capture) -> None:
     [row] = evaluate(renderer(capture, 0.05, 1.1), capture, ["test1"], [1])["per_view"]
     color, depth = renderer(capture, 0.05, 1.1)("test1", 1)

@@ -130,6 +130,20 @@ def test_pictures_of_two_sizes_are_refused() -> None:
         metrics.depth_absrel(torch.rand(8, 8), torch.rand(4, 4))
 
 
+def test_flicker_is_blind_to_constant_errors_and_to_true_motion() -> None:
+    before, after = torch.rand(2, 6, 8, 3, generator=torch.Generator().manual_seed(0))
+    assert metrics.flicker(after, after, before, before) == 0
+    assert metrics.flicker(after + 0.2, after, before + 0.2, before) == pytest.approx(0, abs=1e-7)
+    assert metrics.flicker(after + 0.1, after, before - 0.1, before) == pytest.approx(0.2, abs=1e-7)
+    assert metrics.psnr(after + 0.1, after) == pytest.approx(metrics.psnr(before - 0.1, before), abs=1e-4)
+
+
+def test_flicker_needs_two_frames_of_one_camera() -> None:
+    small, large = torch.rand(4, 4, 3), torch.rand(8, 4, 3)
+    with pytest.raises(D2Error, match="no two frames of one camera"):
+        metrics.flicker(small, small, large, large)
+
+
 def test_depth_errors_count_true_pixels_only() -> None:
     truth = torch.tensor([[2.0, 4.0, 0.0, math.nan]])
     depth = torch.tensor([[2.2, 3.0, 9.0, 9.0]])
@@ -148,4 +162,8 @@ def test_leaving_depth_out_never_flatters(missing: float) -> None:
 
 
 def test_every_metric_has_its_definition_in_words() -> None:
-    assert {"psnr", "ssim1", "ssim2", "lpips", "depth_absrel"} <= set(metrics.VARIANTS)
+    named = {"psnr", "ssim1", "ssim2", "ssim_3dgs", "lpips", "lpips_vgg", "flicker", "depth_absrel", "depth_delta1"}
+    assert named == set(metrics.VARIANTS)
+    assert "range 1" in metrics.VARIANTS["ssim1"]
+    assert "range 2" in metrics.VARIANTS["ssim2"]
+    assert len(set(metrics.VARIANTS.values())) == len(named)

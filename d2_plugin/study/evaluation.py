@@ -39,6 +39,7 @@ def evaluate(
     output: Path | None = None,
     *,
     lpips: Lpips | None = None,
+    lpips_vgg: Lpips | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Compare renders with the capture's pictures, one view at a time.
@@ -49,41 +50,54 @@ def evaluate(
         cameras, frames: what to compare: every camera at every frame.
         output: folder for one picture per view, `<camera>_<frame>.png`: truth, render, rendered depth and error side
             by side (and true depth where there is one). No pictures where None.
-        lpips: from `find_lpips`; its score is null where None.
+        lpips, lpips_vgg: from `find_lpips`, on AlexNet and on VGG16; a score is null where its network is None.
         progress: called after every view.
 
     Returns:
         {"test": mean of each metric over the views that have it (null where none has),
-        "per_view": [{"camera", "frame", metric: value, ...}], "variants": {metric: definition}}.
+        "per_view": [{"camera", "frame", metric: value, ...}], "per_frame": [{"frame", mean over cameras}],
+        "per_camera": [{"camera", mean over frames}], "variants": {metric: definition}}. The first frame of a camera
+        has no flicker, the others are held against the frame before them in `frames`.
 
     Raises:
         D2Error: a render of another size than the camera's or with values that are not finite.
     """
-    views = [(camera, frame) for camera in cameras for frame in frames]
+    instants = list(frames)
+    views = [(camera, frame) for camera in cameras for frame in instants]
     if not views:
         raise D2Error("nothing to evaluate: give at least one camera and one frame")
     if output is not None:
         output.mkdir(parents=True, exist_ok=True)
-    rows = []
+    rows: list[dict[str, Any]] = []
+    before: tuple[str, Tensor, Tensor] | None = None  # camera, render and truth of the view before
     for done, (camera, frame) in enumerate(views, start=1):
         truth = torch.from_numpy(capture.image(camera, frame).astype(np.float32) / 255)
         color, depth = _checked(render(camera, frame), truth.shape, camera, frame)
         true_depth = capture.depth(camera, frame)
-        rows.append({"camera": camera, "frame": frame, **_scores(color, depth, truth, true_depth, lpips)})
+        scores = _scores(color, depth, truth, true_depth) | {
+            "lpips": None if lpips is None else lpips(color, truth),
+            "lpips_vgg": None if lpips_vgg is None else lpips_vgg(color, truth),
+            "flicker": metrics.flicker(color, truth, *before[1:]) if before and before[0] == camera else None,
+        }
+        rows.append({"camera": camera, "frame": frame, **{name: scores[name] for name in metrics.VARIANTS}})
+        before = (camera, color, truth)
         if output is not None:
             panels = _panels(rows[-1], truth.numpy(), color.numpy(), depth, true_depth)
             write_png(output / f"{camera}_{frame:05d}.png", side_by_side(panels))
         if progress is not None:
             progress(done, len(views))
+    networks = {"lpips": lpips, "lpips_vgg": lpips_vgg}
     return {
-        "test": {name: _mean(row[name] for row in rows) for name in metrics.VARIANTS},
+        "test": _means(rows),
         "per_view": rows,
-        "variants": dict(metrics.VARIANTS) | ({"lpips": lpips.variant} if lpips is not None else {}),
+        "per_frame": _grouped(rows, "frame"),
+        "per_camera": _grouped(rows, "camera"),
+        "variants": metrics.VARIANTS | {name: net.variant for name, net in networks.items() if net is not None},
     }
 
 
 def _scores(
-    color: Tensor, depth: Tensor | None, truth: Tensor, true_depth: np.ndarray | None, lpips: Lpips | None
+    color: Tensor, depth: Tensor | None, truth: Tensor, true_depth: np.ndarray | None
 ) -> dict[str, float | None]:
     comparable = depth is not None and true_depth is not None
     z = torch.from_numpy(true_depth) if comparable else None
@@ -92,7 +106,6 @@ def _scores(
         "ssim1": metrics.ssim_range1(color, truth),
         "ssim2": metrics.ssim_range2(color, truth),
         "ssim_3dgs": metrics.ssim_3dgs(color, truth),
-        "lpips": None if lpips is None else lpips(color, truth),
         "depth_absrel": metrics.depth_absrel(depth, z) if comparable else None,
         "depth_delta1": metrics.depth_delta1(depth, z) if comparable else None,
     }
@@ -110,6 +123,19 @@ def _checked(
     if not torch.isfinite(color).all():
         raise D2Error(f"{where} has values that are not finite: the model has diverged, train it again")
     return color.clamp(0, 1), depth
+
+
+def _means(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """The mean of each metric over the rows that have it."""
+    return {name: _mean(row[name] for row in rows) for name in metrics.VARIANTS}
+
+
+def _grouped(rows: Sequence[dict[str, Any]], key: str) -> list[dict[str, Any]]:
+    """The means of the rows that share a camera or a frame, in the order of their first appearance."""
+    groups: dict[Any, list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(row[key], []).append(row)
+    return [{key: value, **_means(group)} for value, group in groups.items()]
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

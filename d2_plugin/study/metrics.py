@@ -1,7 +1,7 @@
 """Image and depth metrics, each in the exact variant that published tables use.
 
 Images are tensors [H, W, 3] in 0..1 and every function returns one number per image; tables are means over images.
-All arithmetic is float64 on the CPU.
+All arithmetic is float64 on the CPU. `flicker` alone needs two instants.
 `VARIANTS` says in words which definition stands behind each key of metrics.json.
 
 The published SSIM_1 and SSIM_2 columns of dense-view papers are scikit-image's `structural_similarity` with a uniform
@@ -35,6 +35,8 @@ VARIANTS = {
     "ssim2": "uniform 7x7 window, sample covariance, 3 px border dropped, data range 2 (scikit-image)",
     "ssim_3dgs": "Gaussian 11x11 window with sigma 1.5, zero padding, biased covariance (3DGS)",
     "lpips": "version 0.1 on AlexNet, pictures in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)",
+    "lpips_vgg": "version 0.1 on VGG16, pictures in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)",
+    "flicker": "mean |(I_t - I_s) - (T_t - T_s)| of render I and truth T, s the frame compared before t (this project)",
     "depth_absrel": "mean |z - z*| / z* over true depth; a missing rendered depth counts as 1",
     "depth_delta1": "share of true depth with max(z / z*, z* / z) < 1.25; a missing rendered depth counts as a miss",
 }
@@ -73,6 +75,23 @@ def ssim_3dgs(image: Tensor, truth: Tensor) -> float:
     taps = [weight / sum(weights) for weight in weights]
     padded = [np.pad(picture, ((0, 0), (reach, reach), (reach, reach))) for picture in (image, truth)]
     return _ssim(*padded, taps, data_range=1.0, unbias=1.0)
+
+
+def flicker(image: Tensor, truth: Tensor, image_before: Tensor, truth_before: Tensor) -> float:
+    """Mean error of the change from one frame to the next, |(I_t - I_s) - (T_t - T_s)|, in 0..1; 0 is steady.
+
+    The data sets define no such metric, this is the project's own. It is blind to errors that stay the same, which
+    PSNR counts, and sees what PSNR hides: two renders equally wrong, once too bright and once too dark, flicker.
+    Compare figures of the same frames only: it grows with the time between them.
+    """
+    first, second = _pair(image, truth)
+    first_before, second_before = _pair(image_before, truth_before)
+    if first.shape != first_before.shape:
+        raise D2Error(
+            f"pictures of shape {tuple(image.shape)} and {tuple(image_before.shape)} are no two frames of one camera: "
+            "give frames of equal size"
+        )
+    return float(np.abs((first - first_before) - (second - second_before)).mean())
 
 
 def depth_absrel(depth: Tensor, truth: Tensor) -> float | None:

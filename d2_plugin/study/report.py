@@ -1,34 +1,93 @@
-"""Tables of metrics, as text and Markdown."""
+"""Tables of metrics, as Markdown for people and as LaTeX rows in the form of the paper's tables."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from d2_plugin.errors import D2Error
 
+Metrics = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Column:
+    """One metric of a table."""
+
+    title: str
+    latex: str
+    key: str
+    form: str
+    larger_is_better: bool
+    always: bool = True
+    """Otherwise the column is left out of a table in which nothing has it."""
+
+
 COLUMNS = (
-    ("PSNR", "psnr", ".2f"),
-    ("SSIM1", "ssim1", ".4f"),
-    ("SSIM2", "ssim2", ".4f"),
-    ("LPIPS", "lpips", ".4f"),
-    ("depth AbsRel", "depth_absrel", ".4f"),
+    Column("PSNR", r"PSNR$\uparrow$", "psnr", ".2f", True),
+    Column("SSIM1", r"SSIM$_1\uparrow$", "ssim1", ".4f", True),
+    Column("SSIM2", r"SSIM$_2\uparrow$", "ssim2", ".4f", True),
+    Column("LPIPS", r"LPIPS$\downarrow$", "lpips", ".4f", False),
+    Column("LPIPS vgg", r"LPIPS$_\mathrm{vgg}\downarrow$", "lpips_vgg", ".4f", False, always=False),
+    Column("SSIM 3DGS", r"SSIM$_\mathrm{3DGS}\uparrow$", "ssim_3dgs", ".4f", True, always=False),
+    Column("flicker", r"flicker$\downarrow$", "flicker", ".4f", False, always=False),
+    Column("depth AbsRel", r"AbsRel$\downarrow$", "depth_absrel", ".4f", False),
+    Column("depth delta1", r"$\delta_1\uparrow$", "depth_delta1", ".4f", True, always=False),
 )
 
+PAPER_COLUMNS = tuple(column for column in COLUMNS if column.key in ("psnr", "ssim1", "ssim2", "lpips"))
+"""The columns of the paper's tables, which print four digits."""
 
-def metrics_table(runs: Mapping[str, Mapping[str, Any]]) -> str:
+
+def metrics_table(runs: Mapping[str, Metrics]) -> str:
     """A Markdown table with one row per run of `metrics.json` contents; what was not measured shows as `-`."""
-    header = ["run", *(title for title, _, _ in COLUMNS), "Gaussians", "priors s", "train s"]
-    rows = [header, ["---"] * len(header)]
+    scored = {name: metrics.get("test") or {} for name, metrics in runs.items()}
+    columns = _columns(list(scored.values()))
+    lines = [["run", *(column.title for column in columns), "Gaussians", "priors s", "train s"]]
     for name, metrics in runs.items():
-        scores = metrics.get("test") or {}
-        cells = [_cell(scores.get(key), form) for _, key, form in COLUMNS]
         seconds = metrics["seconds"]
-        rows.append([name, *cells, str(metrics["gaussians"]), f"{seconds['priors']:.1f}", f"{seconds['train']:.1f}"])
-    widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
-    return "\n".join("| " + " | ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) + " |" for row in rows)
+        cells = [_cell(scored[name].get(column.key), column.form) for column in columns]
+        lines.append([name, *cells, str(metrics["gaussians"]), f"{seconds['priors']:.1f}", f"{seconds['train']:.1f}"])
+    return _markdown(lines)
+
+
+def latex_table(runs: Mapping[str, Metrics], columns: Sequence[Column] = PAPER_COLUMNS) -> str:
+    """The same runs as a LaTeX table in the form of the paper's (booktabs): four digits, the best of a column bold.
+
+    What was not measured shows as `--`.
+    """
+    scored = {name: metrics.get("test") or {} for name, metrics in runs.items()}
+    best = {column.key: _best(column, list(scored.values())) for column in columns}
+    head = " & ".join(["Method", *(column.latex for column in columns)])
+    rows = [
+        " & ".join([_escaped(name), *(_latex_cell(scores.get(c.key), best[c.key]) for c in columns)])
+        for name, scores in scored.items()
+    ]
+    lines = [rf"\begin{{tabular}}{{l{'c' * len(columns)}}}", r"\toprule", head + r" \\", r"\midrule"]
+    return "\n".join([*lines, *(row + r" \\" for row in rows), r"\bottomrule", r"\end{tabular}"])
+
+
+def view_tables(metrics: Metrics) -> str:
+    """Markdown of one run: the mean, then per camera, per frame and per view, and what each column means."""
+    means = {name: metrics[name] for name in ("test", "train") if metrics.get(name)}
+    parts = [_section(f"Mean over {name} views", [{"": "all", **scores}], [""]) for name, scores in means.items()]
+    parts.append(_section("Per camera", metrics["per_camera"], ["camera"]))
+    parts.append(_section("Per frame", metrics["per_frame"], ["frame"]))
+    parts.append(_section("Per view", metrics["per_view"], ["camera", "frame"]))
+    shown = _columns(metrics["per_view"])
+    variants = "\n".join(f"- {column.title}: {metrics['variants'][column.key]}" for column in shown)
+    return "\n\n".join([*parts, f"## What is measured\n\n{variants}"]) + "\n"
+
+
+def write_tables(metrics: Metrics, folder: Path) -> None:
+    """metrics.md (`view_tables`) and metrics.tex (`latex_table` with one row) beside metrics.json in `folder`."""
+    (folder / "metrics.md").write_text(view_tables(metrics))
+    name = f"{metrics['backbone']} {'+'.join(metrics['hooks']) or 'alone'}"
+    (folder / "metrics.tex").write_text(latex_table({name: metrics}) + "\n")
 
 
 def read_metrics(folder: Path) -> dict[str, Any]:
@@ -39,5 +98,47 @@ def read_metrics(folder: Path) -> dict[str, Any]:
         raise D2Error(f"{folder} has no metrics.json: finish `d2 train` there, or run `d2 eval`") from None
 
 
+def _columns(scored: Sequence[Mapping[str, Any]]) -> list[Column]:
+    return [c for c in COLUMNS if c.always or any(scores.get(c.key) is not None for scores in scored)]
+
+
+def _section(title: str, rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> str:
+    columns = _columns(rows)
+    lines = [[*keys, *(column.title for column in columns)]]
+    for row in rows:
+        cells = [_cell(row.get(column.key), column.form) for column in columns]
+        lines.append([*(str(row[key]) for key in keys), *cells])
+    return f"## {title}\n\n{_markdown(lines)}"
+
+
+def _markdown(lines: Sequence[Sequence[str]]) -> str:
+    """A table whose first line is its head."""
+    rows = [lines[0], ["---"] * len(lines[0]), *lines[1:]]
+    widths = [max(len(row[place]) for row in rows) for place in range(len(lines[0]))]
+    return "\n".join("| " + " | ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) + " |" for row in rows)
+
+
 def _cell(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
+
+
+def _best(column: Column, scored: Sequence[Mapping[str, Any]]) -> float | None:
+    """The best score of a column; None where fewer than two were measured, since the best of one says nothing."""
+    known = [scores[column.key] for scores in scored if scores.get(column.key) is not None]
+    if len(known) < 2:
+        return None
+    return max(known) if column.larger_is_better else min(known)
+
+
+def _latex_cell(value: float | None, best: float | None) -> str:
+    if value is None:
+        return "--"
+    text = f"{value:.4f}" if math.isfinite(value) else r"$\infty$"
+    return rf"\textbf{{{text}}}" if value == best else text
+
+
+def _escaped(text: str) -> str:
+    """A run's name, which LaTeX prints as it is."""
+    for symbol in "&%$#_{}":
+        text = text.replace(symbol, "\\" + symbol)
+    return text.replace("²", "$^2$")
