@@ -15,6 +15,7 @@ from d2_plugin.priors.filter import GeometricDepth
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo import choose_maker, depth_bounds, enlarged, geometric_depth, gray
 from d2_plugin.priors.sweep import RunningMinimum
+from d2_plugin.study.stereo_rigs import textured_rig
 
 pytest.importorskip("cv2")
 
@@ -126,6 +127,18 @@ def test_the_depth_range_comes_from_points_then_the_data_set_then_the_baselines(
     assert "cameras alone" in wide.origin
 
 
+@pytest.mark.parametrize("views", [2, 3, 4])
+def test_the_range_from_triangulated_points_holds_what_two_views_see(views: int) -> None:
+    pytest.importorskip("pycolmap")
+    from d2_plugin.priors.colmap import triangulate
+
+    rig = textured_rig(views)
+    bounds = depth_bounds(rig.cameras, triangulate(rig.images, rig.cameras).positions)
+    truth = np.concatenate([depth[seen] for depth, seen in zip(rig.truths, rig.covisible)])
+    assert np.mean((truth < bounds.near) | (truth > bounds.far)) < 1e-3
+    assert bounds.far / bounds.near < 4 * truth.max() / truth.min()
+
+
 def test_cameras_that_look_at_each_other_across_a_room_have_a_range_that_holds_it() -> None:
     """At wide angles disparity says nothing about the near end, but the frusta do."""
     room = synthetic_capture(cameras=3, held_out=0, frames=1, width=160, height=90, arc_degrees=120)
@@ -143,10 +156,11 @@ def test_points_behind_or_beside_the_camera_do_not_count(pair: Capture) -> None:
     assert "triangulated" not in depth_bounds(cameras, behind).origin
 
 
-def test_auto_is_patchmatch_where_there_is_a_compiler(pair: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    cameras = list(pair.cameras.values())
+def test_auto_without_a_gpu_is_patchmatch_where_there_is_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     from d2_plugin import compiler
+    from d2_plugin.priors import colmap_mvs
 
+    monkeypatch.setattr(colmap_mvs, "why_not_usable", lambda: "there is no CUDA device")
     monkeypatch.setattr(compiler, "find_compiler", lambda: ["c++"])
     assert choose_maker("auto") == "patchmatch"
 
@@ -157,6 +171,8 @@ def test_auto_is_patchmatch_where_there_is_a_compiler(pair: Capture, monkeypatch
     assert choose_maker("auto") == "sweep"
     with pytest.raises(D2Error, match="did you mean 'patchmatch'"):
         choose_maker("patch-match")
+    with pytest.raises(D2Error, match="maker = sensor reads depth that lies beside a capture"):
+        choose_maker("sensor")
 
 
 def test_any_function_can_be_a_maker(pair: Capture, monkeypatch: pytest.MonkeyPatch) -> None:

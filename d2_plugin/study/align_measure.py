@@ -1,8 +1,9 @@
 """What is measured about alignment: problems whose line is known, the methods that look for it, and their errors.
 
 A problem has anchors as a capture has them: depths of a room, a monocular value that is their line up to a few per cent
-of noise, and wrong geometric depths, which are those of other places in the room. Least squares, Huber's weights, RANSAC and the median
-rule of Inria's `make_depth_scale.py` are what other code bases align with; L-BFGS is a general solver for our problem.
+of noise, and wrong geometric depths, which are those of other places in the room. Least squares, Huber's weights,
+RANSAC and the median rule of Inria's `make_depth_scale.py` are what other code bases align with; L-BFGS is a general
+solver for our problem.
 """
 
 from __future__ import annotations

@@ -187,7 +187,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--data", type=Path, help="folder with the captures studio/ and middlebury/")
     parser.add_argument(
-        "--makers", nargs="+", default=(), metavar="MAKER", help="patchmatch, sweep, sgbm, colmap (with CUDA); default all"
+        "--makers", nargs="+", default=(), metavar="MAKER", help="patchmatch, sweep, sgbm, colmap (CUDA); default all"
     )
     parser.add_argument("--defaults-only", action="store_true", help="leave out what is varied about a maker")
     parser.add_argument("--width", type=int, default=320, help="width of rendered pictures (16:9), pixels; default 320")

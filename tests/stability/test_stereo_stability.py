@@ -11,6 +11,7 @@ from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.synthetic import synthetic_capture
 from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
+from d2_plugin.priors.colmap_mvs import why_not_usable
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo import depth_bounds, geometric_depth
 
@@ -19,7 +20,7 @@ pytest.importorskip("cv2")
 BOUNDS = (2.0, 9.0)
 
 
-@pytest.fixture(params=["sweep", "patchmatch"])
+@pytest.fixture(params=["sweep", "patchmatch", "colmap"])
 def maker(request: pytest.FixtureRequest) -> str:
     """Every maker that this machine has."""
     if request.param == "patchmatch":
@@ -27,6 +28,8 @@ def maker(request: pytest.FixtureRequest) -> str:
             find_compiler()
         except NoCompiler:
             pytest.skip("there is no C++ compiler for patchmatch")
+    if request.param == "colmap" and (reason := why_not_usable()):
+        pytest.skip(f"COLMAP's PatchMatch cannot run: {reason}")
     return request.param
 
 
