@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.colmap_model import ColmapImage, ColmapModel, read_model
-from d2_plugin.captures.naming import shot_of
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.colmap_maps import read_dense_array
 from d2_plugin.priors.settings import StereoSettings
@@ -52,6 +52,7 @@ class WorkspaceDepth:
         self.about = f"depth maps of the COLMAP workspace {place}"
         self._opened: Path | None = None
         self._model: ColmapModel | None = None
+        self._images: dict[tuple[str, int | None], ColmapImage] = {}
         self._scale = 1.0
 
     @classmethod
@@ -98,6 +99,7 @@ class WorkspaceDepth:
         """Read the model of a workspace and compare its poses with ours."""
         sparse = folder / "sparse"
         self._model = read_model(sparse / "0" if (sparse / "0").is_dir() else sparse)
+        self._images, strangers = _by_camera_and_frame(self._model, [camera.name for camera in self.cameras])
         found = {camera.name: self._image(camera.name, frame) for camera in self.cameras}
         poses = {name: image.T_camera_world for name, image in found.items() if image is not None}
         if not poses:
@@ -106,7 +108,6 @@ class WorkspaceDepth:
                 "CAMERA.png, or set maker = patchmatch"
             )
         self._scale = scale_of_world([camera for camera in self.cameras if camera.name in poses], poses, folder)
-        strangers = sorted(image.name for image in self._model.images.values() if _camera_of(image, found) is None)
         if strangers:
             logger.warning(
                 "the workspace %s saw %s as well: where a camera is held out, compute it without that camera",
@@ -116,14 +117,8 @@ class WorkspaceDepth:
         self._opened = folder
 
     def _image(self, camera: str, frame: int) -> ColmapImage | None:
-        """The picture of one camera and frame: CAMERA/FRAME.png, CAMERA_FRAME.png, or CAMERA.png of one instant."""
-        alone = None
-        for image in self._model.images.values():
-            if shot_of(image.name) == (camera, frame):
-                return image
-            if _stem(image) == camera:
-                alone = image
-        return alone
+        """The picture of one camera and frame, or of one camera where the workspace is of one instant."""
+        return self._images.get((camera, frame)) or self._images.get((camera, None))
 
     def _map(self, folder: Path, name: str) -> Path | None:
         paths = (folder / "stereo" / "depth_maps" / f"{name}.{kind}.bin" for kind in self.kinds)
@@ -140,14 +135,24 @@ class WorkspaceDepth:
         return np.diag([shape[1] / recorded.width, shape[0] / recorded.height, 1.0]) @ lens.K
 
 
-def _stem(image: ColmapImage) -> str:
-    return PurePosixPath(image.name).with_suffix("").as_posix()
+def _by_camera_and_frame(
+    model: ColmapModel, cameras: Sequence[str]
+) -> tuple[dict[tuple[str, int | None], ColmapImage], list[str]]:
+    """Pictures by camera and frame (None where the name tells none), and the names of those of no camera of ours.
 
-
-def _camera_of(image: ColmapImage, names: Iterable[str]) -> str | None:
-    """Which of our cameras a picture of the workspace is of, at whatever frame; None for none of them."""
-    shot = shot_of(image.name)
-    return next((name for name in names if name == _stem(image) or (shot is not None and name == shot.camera)), None)
+    CAMERA/FRAME.png, CAMERA_FRAME.png (with letters before the number, if any) and CAMERA.png are understood.
+    """
+    found: dict[tuple[str, int | None], ColmapImage] = {}
+    strangers = []
+    patterns = {camera: re.compile(rf"{re.escape(camera)}(?:[/_]\D*(\d+))?") for camera in cameras}
+    for image in model.images.values():
+        stem = PurePosixPath(image.name).with_suffix("").as_posix()
+        matches = {camera: match for camera, pattern in patterns.items() if (match := pattern.fullmatch(stem))}
+        if not matches:
+            strangers.append(image.name)
+        for camera, match in matches.items():
+            found[camera, None if match[1] is None else int(match[1])] = image
+    return found, sorted(strangers)
 
 
 def seen_by(camera: Camera, depth: np.ndarray, K: np.ndarray) -> np.ndarray:
