@@ -87,7 +87,7 @@ def _measure(
     rows = []
     for name, render in implementations(device, gaussians).items():
         passes = passes_of(render, scene, device)
-        times = {kind: timed(work, device, seconds) for kind, work in passes.items()}
+        times = timed(passes, device, seconds)
         errors = error_of(render, scene, device, truth) if truth else None
         rows.append(
             make_row(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -119,15 +119,26 @@ def passes_of(render: RenderScene, scene: Scene, device: torch.device) -> dict[s
     return passes
 
 
-def timed(work: Callable[[], object], device: torch.device, seconds: float) -> dict[str, Any]:
-    """Wall and CPU time of repeated calls for about `seconds`, at least three after one that is not counted; ms."""
-    _finish(work(), device)
-    wall, cpu, end = [], [], time.perf_counter() + seconds
-    while len(wall) < 3 or (time.perf_counter() < end and len(wall) < 200):
-        start, start_cpu = time.perf_counter(), time.process_time()
+def timed(works: Mapping[str, Callable[[], object]], device: torch.device, seconds: float) -> dict[str, dict[str, Any]]:
+    """Wall and CPU time of calls in ms, `works` in turn so that each sees the same machine.
+
+    One round that is not counted, then at least three, for about `seconds` per work or until each ran 200 times.
+    """
+    for work in works.values():
         _finish(work(), device)
-        wall.append(1e3 * (time.perf_counter() - start))
-        cpu.append(1e3 * (time.process_time() - start_cpu))
+    wall, cpu = ({name: [] for name in works} for _ in range(2))
+    end, rounds = time.perf_counter() + seconds * len(works), 0
+    while rounds < 3 or (time.perf_counter() < end and rounds < 200):
+        for name, work in works.items():
+            start, start_cpu = time.perf_counter(), time.process_time()
+            _finish(work(), device)
+            wall[name].append(1e3 * (time.perf_counter() - start))
+            cpu[name].append(1e3 * (time.process_time() - start_cpu))
+        rounds += 1
+    return {name: _summary(wall[name], cpu[name]) for name in works}
+
+
+def _summary(wall: Sequence[float], cpu: Sequence[float]) -> dict[str, Any]:
     low, middle, high = statistics.quantiles(wall, n=4)
     return {
         "median_ms": middle,
