@@ -130,7 +130,7 @@ def test_initial_points_are_those_given(original: Capture, tmp_path: Path) -> No
     ply = (folder / "sparse" / "0" / "points3D.ply").read_bytes()
     header, body = ply.split(b"end_header\n", 1)
     assert b"property uchar red" in header
-    assert len(body) == 40 * (7 * 4 + 3)  # x y z nx ny nz time as floats, three bytes of colour
+    assert len(body) == 40 * 8 * 4  # x y z nx ny nz time as floats, four bytes of colour: a whole number of floats
     np.testing.assert_allclose(np.frombuffer(body[:12], "<f4"), CLOUD.positions[0], rtol=1e-6)
 
 

@@ -86,7 +86,9 @@ def export_capture(
     folder = _empty(Path(path))
     export = Export(_without_skew(capture), _known(capture, test_cameras), cloud, folder)
     names = writers[layout](export)
-    description = {"source": capture.name, "layout": layout, "cameras": names, "frames": list(capture.frames)}
+    frames = {frame: number for number, frame in enumerate(capture.frames, 1)} if layout == "multipleview" else None
+    description = {"source": capture.name, "layout": layout, "cameras": names}
+    description["frames"] = frames or {frame: frame for frame in capture.frames}
     description |= {"fps": capture.fps, "test_cameras": [names[name] for name in export.test_cameras if name in names]}
     (folder / EXPORT_FILE).write_text(json.dumps(description, indent=1) + "\n")
     return folder

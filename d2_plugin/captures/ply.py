@@ -19,25 +19,28 @@ class PointCloud(NamedTuple):
 
 
 _NORMALS = ("nx", "ny", "nz")
+_CHANNELS = ("red", "green", "blue", "alpha")
 
 
 def write_point_cloud(path: Path, cloud: PointCloud) -> None:
-    """Write `cloud` as binary PLY: x y z nx ny nz (float), red green blue (uchar) and, where it has times, time.
+    """Write `cloud` as binary PLY: x y z nx ny nz (float), red green blue alpha (uchar) and, where it has times, time.
 
     These are the properties that the Inria family's `fetchPly` asks for; normals are zero, as in its own `storePly`.
-    fudan-zvg/4d-gaussian-splatting reads `time`, the others ignore it.
+    fudan-zvg/4d-gaussian-splatting reads `time` and makes a tensor of that column without a copy, which takes records
+    of a whole number of floats: hence alpha. The others ignore both.
     """
     count = len(cloud.positions)
     for name, values, shape in (("colors", cloud.colors, (count, 3)), ("times", cloud.times, (count,))):
         if values is not None and np.shape(values) != shape:
             raise D2Error(f"{name} of a point cloud have shape {np.shape(values)}, expected {shape}: one per position")
-    layout = [(axis, "<f4") for axis in ("x", "y", "z", *_NORMALS)] + [(c, "u1") for c in ("red", "green", "blue")]
+    layout = [(axis, "<f4") for axis in ("x", "y", "z", *_NORMALS)] + [(c, "u1") for c in _CHANNELS]
     layout += [("time", "<f4")] if cloud.times is not None else []
     rows = np.zeros(count, layout)
     for axis, values in zip("xyz", np.asarray(cloud.positions).T):
         rows[axis] = values
-    for channel, values in zip(("red", "green", "blue"), color_bytes(cloud.colors).T):
+    for channel, values in zip(_CHANNELS, color_bytes(cloud.colors).T):
         rows[channel] = values
+    rows["alpha"] = 255
     if cloud.times is not None:
         rows["time"] = cloud.times
     kinds = {"<f4": "float", "u1": "uchar"}

@@ -1,0 +1,56 @@
+"""Trainers that say device="cuda" and .cuda() everywhere, on a machine without a GPU: cuda means cpu from then on."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import torch
+from torch.overrides import TorchFunctionMode
+
+log = logging.getLogger(__name__)
+
+_NOTHING = ("empty_cache", "synchronize", "set_device", "reset_peak_memory_stats")
+_ZERO = ("memory_allocated", "max_memory_allocated", "memory_reserved", "max_memory_reserved")
+
+
+class CudaMeansCpu(TorchFunctionMode):
+    """While entered, every device argument `cuda` of a torch function is `cpu`."""
+
+    def __torch_function__(self, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        """Call `function` with devices replaced."""
+        named = {name: _cpu(value) for name, value in (kwargs or {}).items()}
+        return function(*[_cpu(value) for value in args], **named)
+
+
+class _Event:
+    """A CUDA event that measures nothing."""
+
+    def __init__(self, *_: Any, **__: Any) -> None: ...
+
+    def record(self, *_: Any) -> None: ...
+
+    def elapsed_time(self, _: Any) -> float:
+        return 0.0
+
+
+def run_on_cpu() -> None:
+    """Make `cuda` mean `cpu` in this process, from here on; cannot be undone."""
+    log.warning("there is no GPU: in this process device 'cuda' means 'cpu', and times of CUDA events are 0")
+    torch.Tensor.cuda = lambda self, *_, **__: self
+    torch.nn.Module.cuda = lambda self, *_, **__: self
+    torch.cuda.Event = _Event
+    for name in _NOTHING:
+        setattr(torch.cuda, name, lambda *_, **__: None)
+    for name in _ZERO:
+        setattr(torch.cuda, name, lambda *_, **__: 0)
+    CudaMeansCpu().__enter__()
+
+
+def _cpu(value: Any) -> Any:
+    if isinstance(value, torch.device):
+        return torch.device("cpu") if value.type == "cuda" else value
+    # Only whole device strings: "cuda" in another argument is not a torch function's.
+    if isinstance(value, str) and (value == "cuda" or value.startswith("cuda:")):
+        return "cpu"
+    return value

@@ -1,0 +1,109 @@
+"""The command line of the launcher."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import runpy
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import torch
+
+from d2_plugin.config import D2Config
+from d2_plugin.errors import D2Error
+
+from .cpu import run_on_cpu
+from .names import RenamedStore
+from .originals import provide
+from .recipes import RECIPES, recipe
+from .session import Session
+
+log = logging.getLogger(__name__)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run a script with D2 attached; a mistake in the input is one sentence on stderr and exit code 2."""
+    logging.basicConfig(level=logging.INFO, format="d2: %(message)s")
+    try:
+        session = launch(*_parsed(arguments))
+    except D2Error as error:
+        sys.stderr.write(f"d2: {error}\n")
+        return 2
+    if session is not None:
+        log.info("%s", session.summary())
+    return 0
+
+
+def launch(options: argparse.Namespace, command: Sequence[str]) -> Session | None:
+    """Prepare the process for the repository and run `command`, its script and arguments, inside it."""
+    script = Path(command[0])
+    if not script.is_file():
+        raise D2Error(f"no script at {script}: give the repository's train.py and its arguments behind --")
+    _check_device(options.cpu)
+    sys.argv = list(command)
+    sys.path.insert(0, str(script.resolve().parent))
+    found = recipe(options.repository)
+    provide(found.originals, script.parent, options.cpu)
+    if options.cpu:
+        run_on_cpu()
+    session = None
+    if options.d2 is not None:
+        config = D2Config.from_toml(options.d2)
+        session = Session(found, config, _store(config, options.exported))
+        session.wrap()
+    os.execv = _refuse_restart
+    runpy.run_path(str(script), run_name="__main__")
+    return session
+
+
+def _check_device(cpu: bool) -> None:
+    if torch.cuda.is_available() == (not cpu):
+        return
+    if cpu:
+        raise D2Error("--cpu is for machines without a GPU, and this one has one: leave it out")
+    raise D2Error("this trainer needs a GPU and torch finds none: add --cpu to try it on the CPU, which is slow")
+
+
+def _store(config: D2Config, exported: Path | None) -> Any:
+    """None lets D2Hooks open the store of the configuration."""
+    if exported is None or config.prior is None or not config.hooks:
+        return None
+    from d2_plugin.priors.store import PriorStore
+
+    return RenamedStore.of_export(PriorStore.open(config.prior), exported)
+
+
+def _refuse_restart(path: str, arguments: Sequence[str]) -> NoReturn:
+    """4DGaussians replaces its process when its loss is not a number, which would go on without D2, and for ever."""
+    raise D2Error(
+        f"the trainer wants to restart itself as {' '.join(map(str, arguments[:2]))}, as 4DGaussians does when its "
+        "loss is not a number (its issue 215): stopped here"
+    )
+
+
+def _parsed(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    arguments = list(arguments)
+    at = arguments.index("--") if "--" in arguments else len(arguments)
+    options, command = _parser().parse_args(arguments[:at]), arguments[at + 1 :]
+    if not command:
+        raise D2Error("no script to run: put the repository's train.py and its arguments behind --")
+    return options, command
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m d2_plugin.attach",
+        usage="%(prog)s REPOSITORY [--d2 FILE] [--exported DIR] [--cpu] -- train.py ARGUMENTS...",
+        description="Run another repository's train.py with D2 attached, no line of it edited.",
+    )
+    parser.add_argument("repository", choices=sorted(RECIPES), help="which codebase the script belongs to")
+    parser.add_argument("--d2", type=Path, default=None, help="configuration; without one the bare trainer is run")
+    parser.add_argument(
+        "--exported", type=Path, default=None, help="folder of d2 export-capture, where the prior is of its source"
+    )
+    parser.add_argument("--cpu", action="store_true", help="without a GPU: cuda means cpu, our modules replace builds")
+    return parser

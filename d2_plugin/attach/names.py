@@ -1,0 +1,45 @@
+"""A prior store under the names that an export gave to cameras and frames (see d2_plugin.captures.export)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from d2_plugin.captures.export import EXPORT_FILE
+from d2_plugin.errors import D2Error
+from d2_plugin.protocol import DepthPrior
+
+
+class RenamedStore:
+    """The priors of the source capture, asked for by the names of its export."""
+
+    def __init__(self, store: Any, cameras: dict[str, str], frames: dict[int, int]) -> None:
+        """`cameras` and `frames` map those of the export to those of the source."""
+        self.store, self.cameras, self.frames = store, cameras, frames
+
+    @classmethod
+    def of_export(cls, store: Any, folder: Path) -> RenamedStore:
+        """With the names of an exported folder, or of the source itself where it names them so already."""
+        path = folder / EXPORT_FILE
+        try:
+            described = json.loads(path.read_text())
+        except (OSError, json.JSONDecodeError) as failure:
+            raise D2Error(f"cannot read {path} ({failure}): give the folder that `d2 export-capture` wrote") from None
+        cameras = {exported: source for source, exported in described["cameras"].items()}
+        frames = {int(exported): int(source) for source, exported in described["frames"].items()}
+        return cls(store, cameras, frames)
+
+    def prior(self, camera: str, frame: int) -> DepthPrior | None:
+        """D* of one view, or None where there is none."""
+        return self._asked("prior", camera, frame)
+
+    def camera(self, camera: str, frame: int) -> Any:
+        """The camera that one prior was built for, or None where the store does not say."""
+        return self._asked("camera", camera, frame)
+
+    def _asked(self, what: str, camera: str, frame: int) -> Any:
+        if camera not in self.cameras or frame not in self.frames:
+            return None
+        ask = getattr(self.store, what, None)
+        return None if ask is None else ask(self.cameras[camera], self.frames[frame])

@@ -1,0 +1,162 @@
+"""What the launcher does to a running trainer: attach, add the loss inside render, edit after zero_grad."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+from collections.abc import Callable, Mapping
+from functools import wraps
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from d2_plugin.config import D2Config
+from d2_plugin.plugin import D2Hooks
+
+from .recipes import Objects, Recipe, adapter_of
+
+log = logging.getLogger(__name__)
+
+
+class AddGradient(torch.autograd.Function):
+    """The picture unchanged; its backward pass also sends `weight` into `term`, as if weight * term were in the loss.
+
+    A trainer that hands its picture to a loss of its own thereby minimises the sum, with nothing of it edited.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, picture: Tensor, term: Tensor, weight: float) -> Tensor:
+        """`picture` as it is."""
+        ctx.weight, ctx.like = weight, term.new_empty(())
+        return picture.view_as(picture)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
+        """The picture's own gradient, and the term's."""
+        return gradient, torch.full_like(ctx.like, ctx.weight), None
+
+
+class Session:
+    """One run of a foreign train.py with D2 attached.
+
+    Iterations are the trainer's own, as its `update_learning_rate(iteration)` says them, before or after rendering, and
+    counted from 1 where it has no such method.
+    Trainers that draw a batch divide their loss by its size or take the mean: D2's term is weighted likewise by the
+    number of pictures that the step before drew, and left out of the very first step, when nobody knows it yet.
+    """
+
+    def __init__(self, recipe: Recipe, config: D2Config, store: object | None = None) -> None:
+        self.recipe, self.config, self.store = recipe, config, store
+        self.objects = Objects()
+        self.hooks: D2Hooks | None = None
+        self.inserted = self.removed = 0
+        self._iteration, self._told = 0, False
+        self._drawn, self._batch = 0, 0
+
+    def wrap(self) -> None:
+        """Override the choke points of the repository's modules; call before its script runs."""
+        for name, place in self.recipe.seen.items():
+            self._remember(_found(*place), name)
+        model = _found(*self.recipe.model)
+        model.training_setup = self._attaching(model.training_setup)
+        if hasattr(model, "update_learning_rate"):
+            model.update_learning_rate = self._listening(model.update_learning_rate)
+        module, attribute = self.recipe.renderer
+        setattr(importlib.import_module(module), attribute, self._rendering(_found(module, attribute)))
+
+    def summary(self) -> str:
+        """What D2 did, in one line."""
+        if self.hooks is None:
+            return "the trainer never called training_setup: D2 was not attached"
+        hooks = ", ".join(self.hooks.hooks) or "no hook"
+        return f"{hooks}: {self.inserted} inserted, {self.removed} removed, {len(self.hooks.backbone)} Gaussians"
+
+    def _remember(self, kind: type, name: str) -> None:
+        original = kind.__init__
+
+        @wraps(original)
+        def remembering(instance: Any, *arguments: Any, **named: Any) -> None:
+            # Before the call: a scene builds its model inside, and may be asked for before it returns.
+            setattr(self.objects, name, instance)
+            original(instance, *arguments, **named)
+
+        kind.__init__ = remembering
+
+    def _attaching(self, training_setup: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(training_setup)
+        def attaching(model: Any, options: Any, *arguments: Any, **named: Any) -> Any:
+            result = training_setup(model, options, *arguments, **named)
+            self.objects.model, self.objects.options = model, options
+            backbone = self.recipe.build(adapter_of(self.recipe), self.objects)
+            self.hooks = D2Hooks(self.config, backbone, self.store)
+            self._watch(model.optimizer)
+            self._iteration, self._told, self._drawn, self._batch = 0, False, 0, 0
+            log.info("attached to %s with %d Gaussians", type(model).__name__, len(backbone))
+            return result
+
+        return attaching
+
+    def _listening(self, update_learning_rate: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(update_learning_rate)
+        def listening(model: Any, iteration: int, *arguments: Any, **named: Any) -> Any:
+            self._iteration, self._told = iteration, True
+            return update_learning_rate(model, iteration, *arguments, **named)
+
+        return listening
+
+    def _rendering(self, render: Callable[..., Mapping[str, Any]]) -> Callable[..., Mapping[str, Any]]:
+        @wraps(render)
+        def rendering(camera: Any, model: Any, *arguments: Any, **named: Any) -> Mapping[str, Any]:
+            package = render(camera, model, *arguments, **named)
+            training = torch.is_grad_enabled() and package["render"].requires_grad
+            if self.hooks is None or model is not self.objects.model or not training:
+                return package
+            if "stage" in named:
+                self.hooks.backbone.stage = named["stage"]
+            return self._with_loss(camera, package)
+
+        return rendering
+
+    def _with_loss(self, camera: Any, package: Mapping[str, Any]) -> Mapping[str, Any]:
+        if not self._told:
+            self._iteration, self._told = self._iteration + 1, True
+        self._drawn += 1
+        rendered = getattr(self.hooks.backbone, "rendered", None)
+        view = rendered(camera, package) if rendered is not None else camera
+        term = self.hooks.loss(self._iteration, [view])
+        if self._batch and isinstance(term, Tensor) and term.requires_grad:
+            package["render"] = AddGradient.apply(package["render"], term, 1 / self._batch)
+        return package
+
+    def _watch(self, optimizer: torch.optim.Optimizer) -> None:
+        """Run `D2Hooks.step` after the first zero_grad behind every step; on this instance alone."""
+        step, zero_grad, stepped = optimizer.step, optimizer.zero_grad, [False]
+
+        @wraps(step)
+        def stepping(*arguments: Any, **named: Any) -> Any:
+            stepped[0] = True
+            return step(*arguments, **named)
+
+        @wraps(zero_grad)
+        def zeroing(*arguments: Any, **named: Any) -> None:
+            zero_grad(*arguments, **named)
+            if stepped[0]:
+                stepped[0] = False
+                self._after_step()
+
+        optimizer.step, optimizer.zero_grad = stepping, zeroing
+
+    def _after_step(self) -> None:
+        report = self.hooks.step(self._iteration)
+        self._told, self._drawn, self._batch = False, 0, self._drawn
+        self.inserted, self.removed = self.inserted + report.inserted, self.removed + report.removed
+        if report.inserted or report.removed:
+            log.info(
+                "step %d: %d inserted, %d removed, %d Gaussians",
+                self._iteration, report.inserted, report.removed, report.gaussians,
+            )  # fmt: skip
+
+
+def _found(module: str, attribute: str) -> Any:
+    return getattr(importlib.import_module(module), attribute)
