@@ -120,6 +120,15 @@ def test_frames_are_counted_by_time_where_names_do_not_run_with_it(tmp_path: Pat
     assert (capture.image("test", 1) == 0).all()
 
 
+def test_folders_of_splits_are_no_cameras(tmp_path: Path) -> None:
+    names = ("train/cam01", "train/cam02", "test/cam00")
+    frames = [entry(f"{name}_{f:04d}", x=i, time=f / 30) for i, name in enumerate(names) for f in range(2)]
+    capture = open_capture(write(tmp_path, frames))
+    assert list(capture.cameras) == ["cam00", "cam01", "cam02"]
+    assert capture.frames == (0, 1)
+    assert capture.cameras["cam00"].centre[0] == 2
+
+
 def test_a_static_scene_is_one_instant_with_a_camera_per_picture(tmp_path: Path) -> None:
     capture = open_capture(write(tmp_path, [entry(f"./train/r_{i}", x=i) for i in range(3)]))
     assert list(capture.cameras) == ["r_0", "r_1", "r_2"]

@@ -10,6 +10,7 @@ import pytest
 from d2_plugin.captures import open_capture
 from d2_plugin.captures.enerf import rotation_of_vector
 from d2_plugin.captures.pictures import write_png
+from d2_plugin.captures.synthetic import synthetic_capture
 from d2_plugin.errors import D2Error
 
 cv2 = pytest.importorskip("cv2")
@@ -89,6 +90,29 @@ def test_poses_map_world_to_camera(tmp_path: Path) -> None:
     np.testing.assert_allclose(camera.T_camera_world[:3, :3], rotation, atol=2e-6)
     np.testing.assert_allclose(camera.centre, -rotation.T @ np.array(T_11), atol=1e-5)
     np.testing.assert_allclose(camera.K, [[40.1, 0, 25.06], [0, 40.3, 13.3], [0, 0, 1]])
+
+
+def test_a_capture_written_by_opencv_reads_back(tmp_path: Path) -> None:
+    original = synthetic_capture(cameras=2, held_out=1, frames=2, width=W, height=H)
+    files = {
+        name: cv2.FileStorage(str(tmp_path / f"{name}.yml"), cv2.FILE_STORAGE_WRITE) for name in ("intri", "extri")
+    }
+    for name, camera in original.cameras.items():
+        files["intri"].write(f"K_{name}", camera.K)
+        files["extri"].write(f"R_{name}", cv2.Rodrigues(camera.T_camera_world[:3, :3])[0])
+        files["extri"].write(f"T_{name}", camera.T_camera_world[:3, 3])
+        for frame in original.frames:
+            file = tmp_path / "images" / name / f"{frame:06d}.png"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_png(file, original.image(name, frame))
+    for file in files.values():
+        file.release()
+    found = open_capture(tmp_path)  # without a list of names, the folders say which cameras there are
+    assert sorted(found.cameras) == sorted(original.cameras)
+    for name, camera in original.cameras.items():
+        np.testing.assert_allclose(found.cameras[name].K, camera.K, atol=1e-12)
+        np.testing.assert_allclose(found.cameras[name].T_camera_world, camera.T_camera_world, atol=1e-9)
+        np.testing.assert_array_equal(found.image(name, 1), original.image(name, 1))
 
 
 def test_the_matrix_serves_where_the_vector_is_missing(tmp_path: Path) -> None:

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from d2_plugin.captures import open_capture
+from d2_plugin.captures.export_colmap import quaternion
 from d2_plugin.captures.pictures import write_png
+from d2_plugin.captures.synthetic import synthetic_capture
 from d2_plugin.errors import D2Error
 
 W, H = 32, 16
@@ -88,6 +90,23 @@ def test_known_damaged_pictures_are_replaced_and_named(tmp_path: Path) -> None:
     assert any("damaged and left out" in note for note in alone.notes)
     other = open_capture(rig(tmp_path / "other", cameras=10, frames=(172, 173), scene="Painter"))
     assert not other.notes
+
+
+def test_a_capture_written_in_the_layout_reads_back(tmp_path: Path) -> None:
+    original = synthetic_capture(cameras=2, held_out=1, frames=2, width=W, height=H)
+    lines = []
+    for number, camera in enumerate(original.cameras.values()):
+        K, T = camera.K, camera.T_camera_world
+        numbers = [K[0, 0], K[0, 2], K[1, 2], K[1, 1] / K[0, 0], 0.0, *quaternion(T[:3, :3]), *T[:3, 3]]
+        lines.append(" ".join(f"{value:.17g}" for value in numbers))
+        for frame in original.frames:
+            write_png(tmp_path / f"scene_undist_{frame:05d}_{number:02d}.png", original.image(camera.name, frame))
+    (tmp_path / "cameras_parameters.txt").write_text(HEADER + "\n".join(lines))
+    found = open_capture(tmp_path)
+    for ours, theirs in zip(original.cameras.values(), found.cameras.values(), strict=True):
+        np.testing.assert_allclose(theirs.K, ours.K, atol=1e-12)
+        np.testing.assert_allclose(theirs.T_camera_world, ours.T_camera_world, atol=1e-12)
+        np.testing.assert_array_equal(found.image(theirs.name, 1), original.image(ours.name, 1))
 
 
 def test_fields_may_be_separated_by_several_spaces(tmp_path: Path) -> None:

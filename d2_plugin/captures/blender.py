@@ -134,7 +134,7 @@ def _present(entries: dict[str, _Entry], intersect: bool) -> tuple[dict[str, _En
 def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], float]:
     """Camera and frame of every picture, and frames per unit of time."""
     declared = next(iter(entries.values())).intrinsics.get("fps")
-    shots = arrange(entries, lambda group: _still([entries[name] for name in group]))
+    shots, _ = arrange(entries, lambda group: _still([entries[name] for name in group]))
     times = {name: entry.time for name, entry in entries.items()}
     instants = set(times.values())
     if len(instants) == 1:
@@ -192,20 +192,8 @@ def _camera(name: str, entry: _Entry) -> tuple[Camera, Lens]:
 
 
 _NUMBERS = (
-    "w",
-    "h",
-    "fl_x",
-    "fl_y",
-    "cx",
-    "cy",
-    "camera_angle_x",
-    "camera_angle_y",
-    "k1",
-    "k2",
-    "k3",
-    "k4",
-    "p1",
-    "p2",
+    *("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"),
+    *("k1", "k2", "k3", "k4", "p1", "p2"),
 )
 
 

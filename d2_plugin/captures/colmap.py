@@ -19,7 +19,7 @@ from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.colmap_model import ColmapImage, ColmapModel, find_model, read_model
 from d2_plugin.captures.files import FrameFiles, cameras_with_pictures, common_frames
 from d2_plugin.captures.lens import Lens
-from d2_plugin.captures.naming import Shot, arrange, by_camera, pictures_below, shot_of
+from d2_plugin.captures.naming import Shot, arrange, by_camera, pictures_below
 from d2_plugin.captures.pictures import picture_size
 from d2_plugin.errors import D2Error
 
@@ -70,21 +70,20 @@ def _shots(model: ColmapModel, files: Iterable[str]) -> tuple[dict[str, ColmapIm
     """One registered picture per camera, camera and frame of every picture that has a pose, and notes."""
     registered = {image.name: image for image in model.images.values()}
     spread = _spread(model.images.values())
-    shots = arrange(registered, lambda group: _still([registered[name] for name in group], spread))
+    shots, reading = arrange(registered, lambda group: _still([registered[name] for name in group], spread))
     poses: dict[str, ColmapImage] = {}
     for name in sorted(shots, key=lambda name: shots[name].frame):
         poses.setdefault(shots[name].camera, registered[name])
-    by_name = all(shots[name] == shot_of(name) for name in shots)
     left_out = 0
     for name in files:
         if name not in shots:
-            shot = shot_of(name) if by_name else None
+            shot = reading(name) if reading else None
             if shot is not None and shot.camera in poses:
                 shots[name] = shot
             else:
                 left_out += 1
     notes = (f"{left_out} pictures left out because the COLMAP model has no pose for them",) if left_out else ()
-    if not by_name and len(poses) > 1:
+    if reading is None and len(poses) > 1:
         notes = (*notes, "every picture is a camera of its own at one instant, as their names or poses tell no frames")
     return dict(sorted(poses.items())), shots, notes
 

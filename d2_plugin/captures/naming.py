@@ -28,31 +28,45 @@ _FRAME = re.compile(r"(\d+)\D*$")
 _PREFIXED = re.compile(r"(?P<camera>.+)_(?P<frame>\d+)$")
 
 
-def shot_of(name: str) -> Shot | None:
-    """Camera and frame of cam00/0012.png or cam00_0012.png; None for a name that has only one of the two."""
+Reading = Callable[[str], Shot | None]
+"""One way to read a name; None for a name that does not say both camera and frame."""
+
+
+def in_folders(name: str) -> Shot | None:
+    """cam00/0012.png, or cam00_0012.png where there is no folder, as camera cam00 at frame 12."""
     *folders, stem = _parts(name)
+    number = _FRAME.search(stem)
     if folders:
-        number = _FRAME.search(stem)
         return Shot("_".join(folders), int(number[1])) if number else None
-    match = _PREFIXED.match(stem)
+    return by_prefix(name)
+
+
+def by_prefix(name: str) -> Shot | None:
+    """train/cam00_0012.png as camera cam00 at frame 12, whatever the folder says."""
+    match = _PREFIXED.match(_parts(name)[-1])
     return Shot(match["camera"], int(match["frame"])) if match else None
 
 
-def arrange(names: Iterable[str], still: Callable[[list[str]], bool]) -> dict[str, Shot]:
-    """Camera and frame of every name, or every picture a camera of its own at frame 0 where the names do not tell.
+def arrange(names: Iterable[str], still: Callable[[list[str]], bool]) -> tuple[dict[str, Shot], Reading | None]:
+    """Camera and frame of every name, and the reading that told them.
 
-    `still` says whether the pictures of one presumed camera were taken from one pose. Where they were not, as in a
-    still scene photographed by one moving camera, all pictures become cameras of one instant.
+    `still` says whether the pictures of one presumed camera were taken from one pose. Where that holds for no reading,
+    as in a still scene photographed by one moving camera, every picture is a camera of its own at frame 0 and the
+    reading is None.
     """
     names = list(names)
-    shots = {name: shot_of(name) for name in names}
-    if all(shots.values()):
-        groups: dict[str, list[str]] = {}
-        for name, shot in shots.items():
-            groups.setdefault(shot.camera, []).append(name)
-        if all(still(group) for group in groups.values()):
-            return shots
-    return one_instant(names)
+    for reading in (in_folders, by_prefix):
+        shots = {name: reading(name) for name in names}
+        if all(shots.values()) and all(still(group) for group in _by_camera_name(shots)):
+            return shots, reading
+    return one_instant(names), None
+
+
+def _by_camera_name(shots: Mapping[str, Shot]) -> Iterable[list[str]]:
+    groups: dict[str, list[str]] = {}
+    for name, shot in shots.items():
+        groups.setdefault(shot.camera, []).append(name)
+    return groups.values()
 
 
 def one_instant(names: Iterable[str]) -> dict[str, Shot]:
