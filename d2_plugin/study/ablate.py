@@ -85,7 +85,11 @@ def run_jobs(work: Sequence[Job], workers: int) -> dict[Job, Metrics]:
             started = {pool.submit(_run, job): job for job in missing}
             for future in as_completed(started):
                 job = started[future]
-                results[job] = future.result()
+                try:
+                    results[job] = future.result()
+                except BaseException:
+                    pool.shutdown(wait=False, cancel_futures=True)  # the rest would run to its end unheard
+                    raise
                 bar.update(len(results), f"{job.backbone} {job.preset} seed {job.seed}")
     return {job: results[job] for job in work}
 
