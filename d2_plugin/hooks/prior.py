@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.protocol import DepthPrior, View
+from d2_plugin.protocol import DepthPrior, Label, View
 
 from .camera_check import CameraCheck
 
@@ -48,7 +48,7 @@ class PriorLoader:
         prior = self.store.prior(*key)
         if prior is not None:
             self._check(view, prior)
-            prior = DepthPrior(*(None if t is None else t.to(view.K.device) for t in prior))
+            prior = _with_depth(DepthPrior(*(None if t is None else t.to(view.K.device) for t in prior)))
         self._kept[key] = prior
         while len(self._kept) > 1 and sum(map(_bytes, self._kept.values())) > self.keep_bytes:
             dropped, _ = self._kept.popitem(last=False)
@@ -77,6 +77,12 @@ class PriorLoader:
         record = describe(view.camera, view.frame) if describe is not None else None
         if record is not None:
             self._cameras.check(view, record, prior.depth)
+
+
+def _with_depth(prior: DepthPrior) -> DepthPrior:
+    """The same prior, empty where the depth is no finite positive number: no store can put NaN into a loss."""
+    usable = torch.isfinite(prior.depth) & (prior.depth > 0)
+    return prior if usable.all() else prior._replace(labels=torch.where(usable, prior.labels, int(Label.EMPTY)))
 
 
 def _bytes(prior: DepthPrior | None) -> int:
