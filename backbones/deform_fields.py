@@ -46,7 +46,7 @@ class MlpSettings:
     """Frequencies of the encoding of positions (official: 10)."""
     time_octaves: int = 6
     """Frequencies of the encoding of time (official: 10, or 6 for synthetic scenes)."""
-    rate: float = 1e-3
+    rate: float = 5e-4
     """Learning rate of the network at the first step (official: 8e-4)."""
 
 
