@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from d2_plugin.captures import open_capture
 from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.presets import RIGS, VIEWS, camera_preset, is_preset, published_frames
+from d2_plugin.captures.presets import RIGS, VIEWS, camera_preset, is_preset, published_frames, resolve_cameras
 from d2_plugin.captures.synthetic import synthetic_capture
 from d2_plugin.errors import D2Error
 
@@ -45,6 +46,15 @@ def test_what_dense_comparisons_test_with_is_never_trained_on(layout: str) -> No
     assert not {*rig.order, *rig.spare} & set(rig.held_out)
     assert {*rig.order, *rig.spare, *rig.held_out} <= set(NAMES[layout])
     assert set(rig.held_out) <= set(camera_preset(capture_of(layout), "preset:4").test)
+
+
+@pytest.mark.parametrize(("layout", "title"), [("n3dv", "N3DV"), ("technicolor", "Technicolor"), ("enerf", "ENeRF")])
+def test_the_documentation_has_the_same_lists(layout: str, title: str) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "captures.md").read_text()
+    [line] = [line for line in page.splitlines() if line.startswith(f"| {title}")]
+    two, three, four, spare = (cell.replace("+", " ").split() for cell in line.strip("|").split("|")[1:])
+    rig = RIGS[layout]
+    assert (tuple(two + three + four), tuple(spare)) == (rig.order, rig.spare)
 
 
 def test_four_views_of_n3dv_are_those_of_4c4d() -> None:
@@ -87,6 +97,17 @@ def test_too_few_known_cameras_are_refused() -> None:
         D2Error, match=r"needs 3 of cam01, cam13.* and scene has cam00, cam01, cam02: name the training"
     ):
         camera_preset(capture_of("n3dv", ("cam00", "cam01", "cam02")), "preset:3")
+
+
+def test_a_run_is_given_names_in_place_of_a_preset(shared_data) -> None:
+    path = shared_data("n3dv_sear_steak_t0")
+    train, test, notes = resolve_cameras(path, ("preset:2",))
+    assert (train, test) == (("cam03", "cam14"), ("cam00", "cam05", "cam08"))
+    assert notes
+    assert resolve_cameras(path, ("preset:2",), ("cam00",))[1] == ("cam00",)
+    assert resolve_cameras("nowhere", ("a", "b")) == (("a", "b"), None, ())
+    with pytest.raises(D2Error, match="mixes a preset with other names"):
+        resolve_cameras(path, ("preset:2", "cam00"))
 
 
 def test_published_frames_are_those_of_the_scene() -> None:

@@ -11,9 +11,10 @@ views are fewer views and one camera more, so that scores over the number of vie
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
-from d2_plugin.captures.capture import Capture
+from d2_plugin.captures import Capture, open_capture
 from d2_plugin.captures.n3dv import UNSYNCHRONISED
 from d2_plugin.errors import D2Error, unknown_name
 
@@ -109,6 +110,22 @@ def camera_preset(capture: Capture, preset: str) -> CameraSplit:
     if unsound:
         notes.append(f"{', '.join(unsound)} known to be unsynchronised: neither trained on nor scored")
     return CameraSplit(tuple(sorted(chosen)), tuple(name for name in sound if name not in chosen), tuple(notes))
+
+
+def resolve_cameras(
+    path: Path | str, train: tuple[str, ...], test: tuple[str, ...] | None = None
+) -> tuple[tuple[str, ...], tuple[str, ...] | None, tuple[str, ...]]:
+    """(training cameras, test cameras, notes) of a run on the capture in `path`.
+
+    Where `train` is one preset, the capture is opened (headers only) and the names are filled in, those of `test` only
+    where it is None. Names pass through unchanged.
+    """
+    if not any(map(is_preset, train)):
+        return train, test, ()
+    if len(train) > 1:
+        raise D2Error(f"'{', '.join(train)}' mixes a preset with other names: give the preset alone, or names only")
+    split = camera_preset(open_capture(path, intersect=True), train[0])
+    return split.train, split.test if test is None else test, split.notes
 
 
 def published_frames(capture: Capture) -> tuple[int, ...]:
