@@ -210,9 +210,10 @@ class InriaAdapter(ABC):
         """Lets an insertion pass and puts the accumulators of the old rows back, with new ones for the new rows."""
         found = {name: getattr(self.gaussians, name, None) for name in self.evidence}
         before = {name: value for name, value in found.items() if isinstance(value, Tensor) and value.numel()}
+        count = len(self.gaussians._xyz)
         yield
+        added = len(self.gaussians._xyz) - count
         for name, value in before.items():
-            added = len(getattr(self.gaussians, name)) - len(value)
             fresh = value.new_full((added, *value.shape[1:]), self.evidence[name])
             setattr(self.gaussians, name, torch.cat([value, fresh]))
 

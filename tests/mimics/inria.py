@@ -13,9 +13,10 @@ from tiny import HEIGHT, WIDTH, TinyFrames
 from torch import Tensor, nn
 
 from d2_plugin.protocol import View
-from d2_plugin.rasterizer import Splats, rasterize
+from d2_plugin.rasterizer import RasterSettings, Splats, rasterize
 
 SH_C0 = 0.28209479177387814
+INRIA = RasterSettings()
 
 
 class Camera:
@@ -67,7 +68,7 @@ def default_options(**changed: object) -> SimpleNamespace:
     options = {
         "iterations": 100, "percent_dense": 0.01, "position_lr_init": 2e-3, "feature_lr": 2e-2, "opacity_lr": 5e-2,
         "scaling_lr": 1e-2, "rotation_lr": 2e-3, "densify_from_iter": 10, "densify_until_iter": 80,
-        "densification_interval": 13, "densify_grad_threshold": 4e-4, "opacity_reset_interval": 41,
+        "densification_interval": 13, "densify_grad_threshold": 1e-3, "opacity_reset_interval": 41,
         "batch_size": 2, "warm_up": 30,
     }  # fmt: skip
     return SimpleNamespace(**(options | changed))
@@ -92,13 +93,16 @@ def covariances(scales: Tensor, rotations: Tensor) -> Tensor:
     return full[:, i, j]
 
 
-def draw(splats: Splats, colors: Tensor, camera: Camera, count: int, bg_color: list[int]) -> dict[str, Tensor]:
+def draw(
+    splats: Splats, colors: Tensor, camera: Camera, count: int, bg_color: list[int], settings: RasterSettings = INRIA
+) -> dict[str, Tensor]:
     """A render package of `count` Gaussians, of which those in `splats.rows` are drawn."""
     view = camera.drawn_view()
     points = torch.zeros(count, 3, requires_grad=True)
     half = torch.tensor([view.width / 2, view.height / 2])
     background = torch.tensor(bg_color, dtype=torch.float32)
-    out = rasterize(splats, colors, view, background=background, screen_offsets=points[splats.rows, :2] * half)
+    offsets = points[splats.rows, :2] * half
+    out = rasterize(splats, colors, view, settings, background=background, screen_offsets=offsets)
     with torch.no_grad():
         z = (splats.means @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3])[:, 2]
         size = 3 * splats.covariances[:, [0, 3, 5]].amax(-1).sqrt() * view.K[0, 0] / z
@@ -130,6 +134,7 @@ class InriaModel:
         ("rotation", "_rotation"),
     )
     accumulated = ("xyz_gradient_accum", "denom")
+    scaling_column = 4
 
     def __init__(self) -> None:
         self.optimizer, self.percent_dense, self.spatial_lr_scale = None, 0, 1.0
@@ -242,7 +247,7 @@ class InriaModel:
         offsets = torch.normal(torch.zeros_like(spread), spread)
         rotation = build_rotation(nn.functional.normalize(self._rotation[chosen])).repeat(N, 1, 1)
         rows[0] = rows[0] + (rotation @ offsets[..., None])[..., 0]
-        rows[4] = (spread / (0.8 * N)).log()
+        rows[self.scaling_column] = (spread / (0.8 * N)).log()
         self.densification_postfix(*rows)
         self.prune_points(torch.cat([chosen, torch.zeros(N * int(chosen.sum()), dtype=torch.bool)]))
 

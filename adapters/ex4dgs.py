@@ -1,0 +1,147 @@
+"""juno181/Ex4DGS (NeurIPS 2024): static Gaussians with a drift, and dynamic ones between key frames.
+
+    d2 = D2Hooks.attach("d2.toml", "ex4dgs", gaussians, near=dataset.near, far=dataset.far)   # train.py:50 (or restore)
+    loss = loss + d2.loss(iteration, viewpoint_cam)                                           # before :170
+    d2.step(iteration)                                                                        # after prune_nan_points
+
+The contract's rows are those of its render: all static Gaussians, then all dynamic ones. Rows that the repository
+appends to the first table therefore land in the middle of the second's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import PurePosixPath
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from d2_plugin.backbones.rotation4d import covariances_from_factors, rotation_matrices_3d
+from d2_plugin.protocol import Points, RasterSettings, Splats, View
+
+from .inria import InriaAdapter
+from .keys import KeyOf, PriorKey
+
+SMALL = 1e-6
+"""Guards of the rasterizer's opacity compensation (cuda_rasterizer/forward.cu, computeCov2D)."""
+
+FRUSTUM = 1.3
+"""Gaussians whose centre projects beyond this multiple of the half picture are not drawn (auxiliary.h, in_frustum)."""
+
+
+class Ex4DGSAdapter(InriaAdapter):
+    """A `CGaussianModel` as a `d2_plugin.protocol.Backbone`.
+
+    Static Gaussians keep raw quaternions, and the rasterizer does not normalise either: their length scales the
+    covariance. It blurs by `kernel_size` (0.1) and lowers opacities to match, and draws depths in near..far only.
+    Inserted Gaussians are static ones without drift; the repository makes dynamic ones of those that do not fit.
+
+    Args:
+        gaussians: the model, after `training_setup` and, when resuming, after `restore`.
+        near, far: dataset.near and dataset.far.
+        first_frame: number of the frame at timestamp 0.
+        settings: constants of its rasterizer, where they were changed.
+        key: the prior of a camera, where `image_name` is not the camera's name in the prior store.
+    """
+
+    appending = ("densification_postfix", "densification_postfix_onlystatic")
+    evidence = dict.fromkeys(
+        (*InriaAdapter.evidence, "xyz_error_accum", "xyz_ssim_error_accum", "error_denom"), 0.0
+    ) | {"min_radii2D": 1000.0, "xyz_error_min": 1000.0, "xyz_error_min_timestamp": -1.0}
+    """With the two that its own callers extend by hand, without which the next prune_points fails."""
+
+    def __init__(
+        self,
+        gaussians: object,
+        *,
+        near: float = 0.2,
+        far: float = 1e10,
+        first_frame: int = 0,
+        settings: RasterSettings | None = None,
+        key: KeyOf | None = None,
+    ) -> None:
+        constants = settings or replace(RasterSettings(), near=near, blur=float(gaussians.kernel_size))
+        super().__init__(gaussians, constants, key)
+        self.far, self.first_frame = far, first_frame
+        self._told = self._sizes()
+
+    def __len__(self) -> int:
+        return sum(self._sizes())
+
+    def slice_at(self, view: View) -> Splats:
+        """The 3D Gaussians at `view.time`, opacities compensated for the blur of this view's pixels."""
+        model, time = self.gaussians, view.time
+        means = model.get_xyz_at_t(time)
+        factors = rotation_matrices_3d(model.get_rotation_at_t(time).T) * model.get_scaling().T
+        covariances, opacities = covariances_from_factors(factors), model.get_opacity_at_t(time).squeeze(-1)
+        camera = means @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
+        rows = torch.nonzero(self._in_frustum(camera.detach(), view)).squeeze(-1)
+        compensation = self._compensation(camera[rows], covariances[rows], view)
+        return Splats(means[rows], covariances[rows], opacities[rows] * compensation, rows)
+
+    def _in_frustum(self, camera: Tensor, view: View) -> Tensor:
+        """Which centres [N, 3] in camera axes the rasterizer draws."""
+        z = camera[:, 2]
+        pixels = camera @ view.K.T[:, :2] / z[:, None].clamp_min(SMALL)
+        half = pixels.new_tensor([view.width / 2, view.height / 2])
+        return (z > self.settings.near) & (z <= self.far) & ((pixels / half - 1).abs() <= FRUSTUM).all(-1)
+
+    def _compensation(self, camera: Tensor, covariances: Tensor, view: View) -> Tensor:
+        """sqrt(det C / det (C + blur)) of the projected covariances C, [M], with the rasterizer's guards."""
+        x, y, z = camera.unbind(-1)
+        fx, fy = view.K[0, 0], view.K[1, 1]
+        zero = torch.zeros_like(z)
+        J = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], -1).view(-1, 2, 3)
+        i = covariances.new_tensor([0, 1, 2, 1, 3, 4, 2, 4, 5], dtype=torch.long)
+        A = J @ view.T_camera_world[:3, :3]
+        C = A @ covariances[:, i].view(-1, 3, 3) @ A.transpose(1, 2)
+        a, b, c = C[:, 0, 0], C[:, 0, 1], C[:, 1, 1]
+        blur = self.settings.blur
+        sharp = a * c - b * b
+        ratio = sharp.clamp_min(SMALL) / (((a + blur) * (c + blur) - b * b).clamp_min(SMALL) + SMALL)
+        return torch.where(sharp > SMALL, torch.sqrt(ratio + SMALL), zero)
+
+    @torch.no_grad()
+    def remove(self, mask: Tensor) -> None:
+        """Delete the rows where `mask` [N] is True, from both tables."""
+        static = self._sizes()[0]
+        self.gaussians.prune_points(mask[:static], mask[static:])
+
+    def _append(self, points: Points) -> None:
+        rows = self._raw_rows(points)
+        self.gaussians.densification_postfix_onlystatic(*rows, torch.zeros_like(rows.xyz))
+
+    def _default_key(self, camera: object) -> PriorKey:
+        """Camera by `image_name`, frame by `timestamp`, which counts frames."""
+        return PriorKey(PurePosixPath(str(camera.image_name)).stem, self.first_frame + round(self._time(camera)))
+
+    def _sizes(self) -> tuple[int, int]:
+        return len(self.gaussians._xyz), len(self.gaussians._xyz_motion)
+
+    def _before_append(self, *_: Any, **__: Any) -> Callable[[], Tensor]:
+        return lambda: self._index(*(torch.arange(size) for size in self._sizes()))
+
+    def _before_prune(self, static_mask: Tensor, dynamic_mask: Tensor) -> Callable[[], Tensor]:
+        kept = (torch.nonzero(~mask.bool()).squeeze(-1) for mask in (static_mask, dynamic_mask))
+        index = self._index(*kept)
+
+        def report() -> Tensor:
+            self._told = self._sizes()
+            return index
+
+        return report
+
+    def _index(self, static: Tensor, dynamic: Tensor) -> Tensor:
+        """Present rows of both tables as rows that listeners know of; -1 beyond those.
+
+        `extract_dynamic_points_from_static` appends to the second table by itself and then prunes the first, so what
+        it appended is first seen here.
+        """
+        told, self._told = self._told, self._sizes()
+        device = self.gaussians._xyz.device
+        static, dynamic = static.to(device), dynamic.to(device)
+        static = torch.where(static < told[0], static, -1)
+        dynamic = torch.where(dynamic < told[1], dynamic + told[0], -1)
+        return torch.cat([static, dynamic])

@@ -1,0 +1,96 @@
+"""oppo-us-research/SpacetimeGaussians (CVPR 2024): Gaussians with a temporal radial basis and polynomial motion.
+
+    d2 = D2Hooks.attach("d2.toml", "spacetime", gaussians, duration)   # train.py:87, after training_setup
+    loss = loss + d2.loss(iteration, viewpoint_cam)                    # before :208, inside the loop over cameras
+    d2.step(iteration)                                                 # after the optimizer's step at the end (:395)
+
+Line 2 runs once per view; gradients are averaged over the batch afterwards (`set_batch_gradient`), those of D2 too.
+"""
+
+from __future__ import annotations
+
+from pathlib import PurePosixPath
+
+import torch
+
+from d2_plugin.backbones.rotation4d import covariances_from_factors, rotation_matrices_3d
+from d2_plugin.backbones.slicing import unit_quaternions
+from d2_plugin.protocol import Points, RasterSettings, Splats, View
+
+from .inria import InriaAdapter
+from .keys import KeyOf, PriorKey, frame_of_time
+
+
+class SpacetimeAdapter(InriaAdapter):
+    """A `GaussianModel` of oursfull.py or ourslite.py as a `d2_plugin.protocol.Backbone`.
+
+    Its render (renderer/__init__.py:78-92) multiplies the opacity by exp(-(d / s)^2), without a half, with d the time
+    since the Gaussian's own, and moves it by a cubic in d through which no gradient flows to that time.
+
+    Args:
+        gaussians: the model, after `training_setup`.
+        duration: number of frames, the variable of that name in train.py; timestamps are frame / duration.
+        first_frame: number of the frame at time 0.
+        settings: constants of its rasterizer, where they were changed.
+        key: the prior of a camera, where `image_name` is not the camera's name in the prior store.
+    """
+
+    pruning = ("prune_points", "prune_pointswithemsmask")
+    evidence = InriaAdapter.evidence | {"omegamask": 1.0}
+    """From iteration 8001 on gradients of `_omega` are multiplied by `omegamask`, which insertion does not extend."""
+
+    def __init__(
+        self,
+        gaussians: object,
+        duration: int,
+        *,
+        first_frame: int = 0,
+        settings: RasterSettings | None = None,
+        key: KeyOf | None = None,
+    ) -> None:
+        super().__init__(gaussians, settings, key)
+        self.duration, self.first_frame = duration, first_frame
+
+    def slice_at(self, view: View) -> Splats:
+        """The 3D Gaussians at `view.time`; those too faint for the rasterizer to draw are left out."""
+        model = self.gaussians
+        with torch.no_grad():
+            faint = self._opacities(view.time, torch.arange(len(self), device=model._xyz.device))
+            rows = torch.nonzero(faint >= self.settings.alpha_min).squeeze(-1)
+        since = (view.time - model._trbf_center[rows]).detach()
+        first, second, third = model._motion[rows].split(3, 1)
+        means = model._xyz[rows] + first * since + second * since**2 + third * since**3
+        rotations = unit_quaternions(model._rotation[rows] + since * model._omega[rows])
+        factors = rotation_matrices_3d(rotations) * model._scaling[rows].T.exp()
+        return Splats(means, covariances_from_factors(factors), self._opacities(view.time, rows), rows)
+
+    def _opacities(self, time: float, rows: torch.Tensor) -> torch.Tensor:
+        model = self.gaussians
+        distance = (time - model._trbf_center[rows, 0]) / model._trbf_scale[rows, 0].exp()
+        return torch.sigmoid(model._opacity[rows, 0]) * torch.exp(-distance * distance)
+
+    def _default_key(self, camera: object) -> PriorKey:
+        """Camera by `image_name`, frame by time: one name stands for all instants."""
+        frame = frame_of_time(self._time(camera), self.duration, self.first_frame)
+        return PriorKey(PurePosixPath(str(camera.image_name)).stem, frame)
+
+    def _append(self, points: Points) -> None:
+        """Still Gaussians around the time of their frame, as wide in time as those of its own start.
+
+        Colours are stored as they are, twice in the full model, whose second half and `_features_t` feed its decoder.
+        """
+        model, rows, count = self.gaussians, self._raw_rows(points), len(points.positions)
+        zeros = points.positions.new_zeros
+        width = getattr(model, "trbfslinit", None)
+        model.densification_postfix(
+            rows.xyz,
+            points.colors.repeat(1, model._features_dc.shape[1] // 3),
+            rows.opacity,
+            rows.scaling,
+            rows.rotation,
+            points.times[:, None],
+            points.positions.new_full((count, 1), 1.0 if width is None else float(width)),
+            zeros(count, 9),
+            zeros(count, 4),
+            zeros(count, 3),
+        )

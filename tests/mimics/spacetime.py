@@ -1,0 +1,153 @@
+"""After oppo-us-research/SpacetimeGaussians: temporal radial basis, cubic motion, gradients cached over a batch."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import torch
+from torch import Tensor, nn
+
+from d2_plugin.rasterizer import Splats
+
+from .inria import (
+    Camera,
+    InriaModel,
+    cameras_of,
+    covariances,
+    default_options,
+    draw,
+    initial_points,
+    l1_loss,
+    shuffled,
+)
+
+
+class GaussianModel(InriaModel):
+    """The full model, its decoder left out."""
+
+    columns = (
+        ("xyz", "_xyz"), ("f_dc", "_features_dc"), ("opacity", "_opacity"), ("scaling", "_scaling"),
+        ("rotation", "_rotation"), ("trbf_center", "_trbf_center"), ("trbf_scale", "_trbf_scale"),
+        ("motion", "_motion"), ("omega", "_omega"), ("f_t", "_features_t"),
+    )  # fmt: skip
+    scaling_column = 3
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.trbfslinit, self.omegamask = -0.5, None
+
+    def create_from_pcd(self, points, colors, scale: float = 0.15) -> None:
+        super().create_from_pcd(points, colors, scale)
+        count = len(points)
+        self._set("_features_dc", torch.tensor(colors, dtype=torch.float32).repeat(1, 2))
+        self._set("_trbf_center", torch.linspace(0, 1, count)[:, None].clone())
+        self._set("_trbf_scale", torch.full((count, 1), self.trbfslinit))
+        for name, width in (("_motion", 9), ("_omega", 4), ("_features_t", 3)):
+            self._set(name, torch.zeros(count, width))
+
+    @property
+    def rgb(self) -> Tensor:
+        return self._features_dc[:, :3] + 0 * self._features_dc[:, 3:] + 0 * self._features_t
+
+    def rates(self, opt: SimpleNamespace) -> dict[str, float]:
+        further = ("trbf_center", "trbf_scale", "motion", "omega", "f_t")
+        return super().rates(opt) | dict.fromkeys(further, 1e-3)
+
+    def densification_postfix(
+        self, new_xyz, new_features_dc, new_opacities, new_scaling, new_rotation, new_trbf_center, new_trbfscale,
+        new_motion, new_omega, new_featuret,
+    ) -> None:  # fmt: skip
+        self._append((
+            new_xyz, new_features_dc, new_opacities, new_scaling, new_rotation, new_trbf_center, new_trbfscale,
+            new_motion, new_omega, new_featuret,
+        ))  # fmt: skip
+
+    def prune_points(self, mask: Tensor) -> None:
+        super().prune_points(mask)
+        if self.omegamask is not None:
+            self.omegamask = self.omegamask[~mask]
+
+    def zero_gradient_cache(self) -> None:
+        self._cache = {attribute: torch.zeros_like(getattr(self, attribute)) for _, attribute in self.columns}
+
+    def cache_gradient(self) -> None:
+        for attribute, total in self._cache.items():
+            total += getattr(self, attribute).grad.clone()
+
+    def set_batch_gradient(self, cnt: int) -> None:
+        for attribute, total in self._cache.items():
+            getattr(self, attribute).grad = total / cnt
+
+
+class Scene:
+    cameras_extent = 2.0
+
+    def __init__(self, cameras: list[Camera]) -> None:
+        for camera in cameras:
+            camera.image_name = camera.image_name[:4]
+        self.cameras = cameras
+
+    def getTrainCameras(self) -> list[Camera]:
+        return self.cameras
+
+
+def render(viewpoint_camera, pc, bg_color) -> dict[str, Tensor]:
+    """Median depth, as its rasterizers give it, without alpha."""
+    offset = viewpoint_camera.timestamp - pc._trbf_center
+    opacity = pc.get_opacity * torch.exp(-((offset / pc._trbf_scale.exp()) ** 2))
+    d = offset.detach()
+    motion = pc._motion
+    means = pc.get_xyz + motion[:, 0:3] * d + motion[:, 3:6] * d * d + motion[:, 6:9] * d * d * d
+    cov = covariances(pc.get_scaling, nn.functional.normalize(pc._rotation + d * pc._omega))
+    splats = Splats(means, cov, opacity.squeeze(-1), torch.arange(len(means)))
+    package = draw(splats, pc.rgb, viewpoint_camera, len(means), bg_color)
+    del package["alpha"]
+    return package
+
+
+def make() -> tuple[GaussianModel, Scene]:
+    gaussians = GaussianModel()
+    gaussians.create_from_pcd(*initial_points())
+    return gaussians, Scene(cameras_of(timestamp=lambda view: view.frame / 2))
+
+
+def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
+    opt, dataset = opt or default_options(), SimpleNamespace(white_background=False)
+    first_iter, duration = 0, 2
+    if checkpoint:
+        (model_params, first_iter) = checkpoint
+        gaussians.restore(model_params, opt)  # as many Gaussians as there were, before anything attaches
+    gaussians.training_setup(opt)
+
+    if checkpoint:
+        gaussians.restore(model_params, opt)
+    bg_color = [1, 1, 1] if dataset.white_background else [0, 0, 0]
+    cameras = scene.getTrainCameras()
+    traincamdict = {i: [cam for cam in cameras if cam.timestamp == i / duration] for i in range(duration)}
+    for iteration in range(first_iter + 1, min(opt.iterations, stop) + 1):
+        torch.manual_seed(iteration)
+        gaussians.zero_gradient_cache()
+        viewpointset = traincamdict[shuffled(duration, iteration)[0]]
+        for i in shuffled(len(viewpointset), iteration)[: opt.batch_size]:
+            viewpoint_cam = viewpointset[i]
+            render_pkg = render(viewpoint_cam, gaussians, bg_color)
+            loss = l1_loss(render_pkg["render"], viewpoint_cam.original_image)
+            loss.backward()
+            gaussians.cache_gradient()
+            gaussians.optimizer.zero_grad(set_to_none = True)#
+        gaussians.set_batch_gradient(opt.batch_size)
+        with torch.no_grad():
+            if iteration < opt.densify_until_iter:
+                seen, radii = render_pkg["visibility_filter"], render_pkg["radii"]
+                gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
+                gaussians.add_densification_stats(render_pkg["viewspace_points"].grad, seen)
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+                    gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005, scene.cameras_extent, None)
+            if iteration == 80:
+                gaussians.omegamask = torch.ones(len(gaussians._xyz), 1, dtype=torch.bool)
+            if iteration >= 80 and gaussians._omega.grad is not None:
+                gaussians._omega.grad *= gaussians.omegamask
+            if iteration < opt.iterations:
+                gaussians.optimizer.step()
+                gaussians.optimizer.zero_grad(set_to_none = True)
+    return SimpleNamespace(**locals())
