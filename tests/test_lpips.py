@@ -24,20 +24,24 @@ CONVOLUTIONS = {
 CHANNELS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
 
 
-def write_weights(folder: Path) -> dict[str, torch.Tensor]:
-    """Random weights of AlexNet and its linear layers, in files named and keyed like the published ones."""
+FILES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
+"""As torchvision publishes them."""
+
+
+def write_weights(folder: Path, net: str = "alex") -> dict[str, torch.Tensor]:
+    """Random weights of a network and its linear layers, in files named and keyed like the published ones."""
     generator = torch.Generator().manual_seed(0)
     state = {"classifier.1.weight": torch.zeros(2, 2)}  # ignored
-    for number, (out, width, kernel) in CONVOLUTIONS["alex"].items():
+    for number, (out, width, kernel) in CONVOLUTIONS[net].items():
         shape = (out, width, kernel, kernel)
         state[f"features.{number}.weight"] = torch.randn(shape, generator=generator) * (2 / (width * kernel**2)) ** 0.5
         state[f"features.{number}.bias"] = 0.1 * torch.randn(out, generator=generator)
     linear = {
         f"lin{i}.model.1.weight": torch.rand(1, channels, 1, 1, generator=generator)
-        for i, channels in enumerate(CHANNELS["alex"])
+        for i, channels in enumerate(CHANNELS[net])
     }
-    torch.save(state, folder / "alexnet-owt-7be5be79.pth")
-    torch.save(linear, folder / "alex.pth")
+    torch.save(state, folder / FILES[net])
+    torch.save(linear, folder / f"{net}.pth")
     return state | linear
 
 
@@ -72,6 +76,25 @@ def test_the_distance_is_the_published_formula_on_pictures_in_0_to_1(alex) -> No
         total += nn.functional.conv2d((unit[:1] - unit[1:]) ** 2, weights[f"lin{i}.model.1.weight"]).mean().item()
     assert distance(a, b) == pytest.approx(total, rel=1e-5)
     assert "alex" in distance.variant
+
+
+def test_the_distance_on_vgg_is_the_published_formula_too(tmp_path: Path) -> None:
+    weights = write_weights(tmp_path, "vgg")
+    distance = find_lpips("vgg", tmp_path)
+    assert distance is not None
+    assert "vgg" in distance.variant
+    a, b = torch.rand(2, 64, 64, 3, generator=torch.Generator().manual_seed(3))
+    shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+    x = torch.stack([((image - shift) / scale).permute(2, 0, 1) for image in (a, b)])
+    total = 0.0
+    for i, block in enumerate([(0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28)]):
+        x = nn.functional.max_pool2d(x, 2) if i else x
+        for number in block:
+            weight, bias = weights[f"features.{number}.weight"], weights[f"features.{number}.bias"]
+            x = nn.functional.conv2d(x, weight, bias, padding=1).relu()
+        unit = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
+        total += nn.functional.conv2d((unit[:1] - unit[1:]) ** 2, weights[f"lin{i}.model.1.weight"]).mean().item()
+    assert distance(a, b) == pytest.approx(total, rel=1e-5)
 
 
 @pytest.mark.parametrize("net", ["alex", "vgg"])

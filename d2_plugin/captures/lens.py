@@ -107,6 +107,9 @@ class UndistortedSource:
         """A monocular map of the undistorted picture as it lies on disk, or None."""
         return self.source.mono(camera, frame)
 
+    def __reduce__(self) -> tuple[Any, ...]:  # maps are made anew in another process
+        return UndistortedSource, (self.source, self.lenses, self.sizes)
+
     def _map(self, camera: str) -> tuple[Any, Any]:
         if camera not in self._maps:
             cv2 = opencv("undoing lens distortion")
