@@ -17,8 +17,8 @@ from d2_plugin.priors.colmap_maps import read_dense_array, write_dense_array
 from d2_plugin.priors.colmap_mvs import (
     NO_MATCH,
     colmap_patch_match,
+    mutual_sources,
     patch_match_options,
-    rotation_to_quaternion,
     run_patch_match,
     why_not_usable,
     write_workspace,
@@ -110,18 +110,6 @@ def test_colmap_finds_our_cameras_in_the_workspace(rig: Rig, grays: list[np.ndar
     assert (options.depth_min, options.depth_max, options.filter_min_triangulation_angle) == (1.0, 9.0, 1.0)
 
 
-def test_a_rotation_becomes_the_quaternion_that_colmap_reads() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        w, x, y, z = quaternion = rng.normal(size=4) * [rng.choice([0, 1e-9, 1]), 1, 1, 1]
-        quaternion /= np.linalg.norm(quaternion)
-        w, x, y, z = quaternion
-        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        found = rotation_to_quaternion(np.eye(3) + 2 * w * cross + 2 * cross @ cross)
-        assert found[0] >= 0
-        np.testing.assert_allclose(np.abs(found @ quaternion), 1, atol=1e-12)
-
-
 def test_maps_that_colmap_leaves_go_through_the_common_filter(rig: Rig, grays: list[np.ndarray]) -> None:
     raw = colmap_patch_match(grays, rig.cameras, rig.depth_range, SETTINGS, run=oracle(rig))
     filtered = filter_depths(grays, rig.cameras, *map(list, zip(*raw)), SETTINGS)
@@ -152,6 +140,12 @@ def test_a_view_that_no_other_meets_is_not_asked_for(rig: Rig, grays: list[np.nd
     cameras = [*rig.cameras[:2], replace(rig.cameras[2], T_camera_world=away)]
     raw = colmap_patch_match(grays, cameras, rig.depth_range, SETTINGS, run=oracle(rig))
     assert [bool(depth.any()) for depth, _ in raw] == [True, True, False]
+
+
+def test_a_view_without_sources_is_no_source_either_since_colmap_would_miss_its_map() -> None:
+    assert mutual_sources([[1, 2], [0], [0]]) == [[1, 2], [0], [0]]
+    assert mutual_sources([[1, 2], [0], []]) == [[1], [0], []]
+    assert mutual_sources([[1], [2], []]) == [[], [], []]
 
 
 def test_cameras_on_one_spot_need_no_colmap_to_have_no_depth(rig: Rig, grays: list[np.ndarray]) -> None:

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
+from d2_plugin.captures.export_colmap import quaternion
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.colmap import import_pycolmap
 from d2_plugin.priors.colmap_child import OPTIONS
@@ -99,30 +100,41 @@ def colmap_patch_match(
     check_views(grays, cameras)
     near, far = check_depth_range(depth_range)
     if run is None:
-        reason = why_not_usable()
-        if reason:
-            raise D2Error(
-                f"maker = colmap needs pycolmap with CUDA and a CUDA device, but {reason}: install pycolmap-cuda12 in "
-                "place of pycolmap on a machine with a GPU, or set maker = patchmatch"
-            )
-    sources = [choose_sources(index, cameras, (near, far), settings) for index in range(len(cameras))]
+        _refuse_without_cuda()
+    sources = mutual_sources([choose_sources(i, cameras, (near, far), settings) for i in range(len(cameras))])
     if not any(sources):
-        return [_nothing(camera) for camera in cameras]
+        return [_as_maker(np.zeros((camera.height, camera.width), np.float32)) for camera in cameras]
     with tempfile.TemporaryDirectory(prefix="d2_colmap_") as folder:
         workspace = Path(folder)
         write_workspace(workspace, grays, cameras, sources, patch_match_options((near, far), settings))
         (run or run_patch_match)(workspace, 60 * settings.colmap_minutes)
         kind = "geometric" if settings.colmap_geometric else "photometric"
-        maps = [
-            _checked_map(workspace / "stereo" / "depth_maps" / f"{_picture(index)}.{kind}.bin", camera)
-            if sources[index]
-            else np.zeros((camera.height, camera.width), np.float32)
-            for index, camera in enumerate(cameras)
-        ]
-    maps = [np.where((depth >= near) & (depth <= far), depth, 0).astype(np.float32) for depth in maps]
+        maps = _checked_maps(workspace / "stereo" / "depth_maps", kind, cameras, sources)
+    maps = [np.where((depth >= near) & (depth <= far), depth, np.float32(0)) for depth in maps]
     if not any(depth.any() for depth in maps):
         logger.warning("COLMAP found no depth in any view: no texture, a wrong depth range, or a GPU it is too old for")
-    return [(depth, np.where(depth > 0, 0, NO_MATCH).astype(np.float32)) for depth in maps]
+    return [_as_maker(depth) for depth in maps]
+
+
+def _refuse_without_cuda() -> None:
+    reason = why_not_usable()
+    if reason:
+        raise D2Error(
+            f"maker = colmap needs pycolmap with CUDA and a CUDA device, but {reason}: install pycolmap-cuda12 in "
+            "place of pycolmap on a machine with a GPU, or set maker = patchmatch"
+        )
+
+
+def mutual_sources(sources: Sequence[Sequence[int]]) -> list[list[int]]:
+    """Without views that have no sources of their own: COLMAP would look for their depth maps and abort."""
+    kept = [list(others) for others in sources]
+    while any(not kept[other] for others in kept for other in others):
+        kept = [[other for other in others if kept[other]] for others in kept]
+    return kept
+
+
+def _as_maker(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return depth.astype(np.float32), np.where(depth > 0, 0, NO_MATCH).astype(np.float32)
 
 
 def patch_match_options(depth_range: tuple[float, float], settings: StereoSettings) -> dict[str, object]:
@@ -176,30 +188,11 @@ def write_model(folder: Path, cameras: Sequence[Camera]) -> None:
         K = index_intrinsics(camera)
         numbers = " ".join(repr(float(value)) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
         lenses.append(f"{index + 1} PINHOLE {camera.width} {camera.height} {numbers}\n")
-        pose = (*rotation_to_quaternion(camera.T_camera_world[:3, :3]), *camera.T_camera_world[:3, 3])
+        pose = (*quaternion(camera.T_camera_world[:3, :3]), *camera.T_camera_world[:3, 3])
         pictures.append(f"{index + 1} {' '.join(repr(float(v)) for v in pose)} {index + 1} {_picture(index)}\n\n")
     (folder / "cameras.txt").write_text("".join(lenses))
     (folder / "images.txt").write_text("".join(pictures))
     (folder / "points3D.txt").write_text("")
-
-
-def rotation_to_quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion [4], w first and not negative, of a rotation [3, 3].
-
-    The largest eigenvector of a 4x4 matrix (Bar-Itzhack 2000): no case distinction, and the nearest rotation where
-    rounding left the matrix not quite orthogonal.
-    """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.asarray(rotation, np.float64)
-    matrix = np.array(
-        [
-            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-            [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-            [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-        ]
-    )
-    quaternion = np.linalg.eigh(matrix)[1][:, -1]
-    return -quaternion if quaternion[0] < 0 else quaternion
 
 
 def run_patch_match(workspace: Path, seconds: float, command: Sequence[str] | None = None) -> None:
@@ -247,6 +240,18 @@ def _last_words(text: str) -> str:
     return telling[-1][:300] if telling else "without a word"
 
 
+def _checked_maps(
+    folder: Path, kind: str, cameras: Sequence[Camera], sources: Sequence[Sequence[int]]
+) -> list[np.ndarray]:
+    """The maps that COLMAP left, zeros for views that it was not asked for."""
+    return [
+        _checked_map(folder / f"{_picture(index)}.{kind}.bin", camera)
+        if sources[index]
+        else np.zeros((camera.height, camera.width), np.float32)
+        for index, camera in enumerate(cameras)
+    ]
+
+
 def _checked_map(path: Path, camera: Camera) -> np.ndarray:
     if not path.is_file():
         raise D2Error(
@@ -265,11 +270,6 @@ def _checked_map(path: Path, camera: Camera) -> np.ndarray:
             "not finite: update pycolmap and the GPU's driver, or set maker = patchmatch"
         )
     return depth
-
-
-def _nothing(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    shape = (camera.height, camera.width)
-    return np.zeros(shape, np.float32), np.full(shape, NO_MATCH, np.float32)
 
 
 def _picture(index: int) -> str:
