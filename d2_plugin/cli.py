@@ -15,6 +15,11 @@ from d2_plugin import __version__
 from d2_plugin.errors import D2Error, unknown_name
 
 ROWS_HELP = "tables (ablation, pruning, main) or presets joined by commas; an unknown name is answered by the list"
+CAPTURE_HELP = (
+    "folder of the recording: images/CAMERA/FRAME.png with cameras.json, or as N3DV, Technicolor, ENeRF-Outdoor, "
+    "COLMAP or transforms.json lay it out"
+)
+CAMERAS_HELP = "names joined by commas, e.g. 00,02,05,07; or preset:2, preset:3, preset:4 for a known data set"
 HOOKS_HELP = "all, none, or names of prior, densify, prune, depth_loss joined by commas"
 
 
@@ -75,8 +80,8 @@ def _command(commands: Any, name: str, run: Any, help: str) -> argparse.Argument
 
 
 def _add_capture_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("capture", help="folder of the recording: images/CAMERA/FRAME.png with cameras.json, or N3DV")
-    parser.add_argument("--train-cameras", required=True, type=_names, help="names joined by commas, e.g. 00,02,05,07")
+    parser.add_argument("capture", help=CAPTURE_HELP)
+    parser.add_argument("--train-cameras", required=True, type=_names, help=CAMERAS_HELP)
     parser.add_argument("--frames", type=_frames, default=None, help="first:last or first:last:step; default all")
     parser.add_argument("--downscale", type=int, default=1, help="train on pictures this many times smaller (integer)")
     parser.add_argument("--mono-onnx", default=None, help="monocular depth network as an ONNX file")
@@ -213,11 +218,15 @@ def _hooks(text: str) -> tuple[str, ...]:
 
 
 def _settings(options: argparse.Namespace, **more: Any) -> Any:
+    from d2_plugin.captures.presets import resolve_cameras
     from d2_plugin.study.settings import RunSettings
 
+    train, test, notes = resolve_cameras(options.capture, options.train_cameras, more.pop("test_cameras", None))
+    _print_notes(notes)
     return RunSettings(
         capture=options.capture,
-        train_cameras=options.train_cameras,
+        train_cameras=train,
+        test_cameras=test,
         frames=options.frames,
         downscale=options.downscale,
         mono_onnx=options.mono_onnx,
@@ -253,6 +262,7 @@ def _train(options: argparse.Namespace) -> None:
         priors=str(options.priors) if options.priors else None,
     )
     run = Run(settings, options.output)
+    _print_notes(run.scene.capture.notes)
     _print_plan(run.scene.plan)
     run.train()
     metrics = run.evaluate()
@@ -302,6 +312,7 @@ def _priors(options: argparse.Namespace) -> None:
 
     settings = check(_settings(options))
     scene = Scene.open(settings)
+    _print_notes(scene.capture.notes)
     _print_plan(scene.plan)
     points = triangulated_points(scene.capture, scene.train_cameras)["positions"]
     print(build_priors_for(settings, scene, points, options.output, options.shard))
@@ -314,7 +325,14 @@ def _priors(options: argparse.Namespace) -> None:
 def _plan(options: argparse.Namespace) -> None:
     from d2_plugin.study.settings import Scene, check
 
-    _print_plan(Scene.open(check(_settings(options))).plan)
+    scene = Scene.open(check(_settings(options)))
+    _print_notes(scene.capture.notes)
+    _print_plan(scene.plan)
+
+
+def _print_notes(notes: Sequence[str]) -> None:
+    for note in notes:
+        print(f"     note  {note}")
 
 
 def _print_plan(plan: Any) -> None:

@@ -144,7 +144,10 @@ def test_doctor_names_compiler_device_and_extras(capsys: pytest.CaptureFixture[s
 
 def test_plan_names_each_decision_with_its_measurement(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", str(capture), "--train-cameras", CAMERAS]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    notes, lines = [], []
+    for line in capsys.readouterr().out.splitlines():
+        (notes if line.split()[0] == "note" else lines).append(line)
+    assert notes, "what is known about the recording is said"
     assert [line.split()[1] for line in lines] == ["temporal", "stereo", "monocular", "verification"]
     assert "% of a camera's pixels change" in lines[0]
     assert "(emulated)" in lines[2]

@@ -62,7 +62,7 @@ RIGS = {
         source="spread along the arc of cameras, this project's choice",
     ),
 }
-"""By layout; see `reference/datasets.md` for the rigs."""
+"""By layout, as each data set numbers its cameras."""
 
 VIEWS = (2, 3, 4)
 
