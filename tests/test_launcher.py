@@ -31,7 +31,7 @@ EDITS = D2Config(
     prune=PruneConfig(start=5, stop=30, every=10, patience=2, tau_p=0.6),
     depth_loss=DepthLossConfig(every=1, weight=0.2),
 )
-OPTIONS = default_options(iterations=30)
+OPTIONS = default_options(iterations=30, densify_until_iter=0)
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def trained():
     gaussians = GaussianModel()
     gaussians.create_from_pcd(*initial_points())
     scene = Scene(cameras_of(timestamp=lambda view: view.time))
-    return fudan.training(gaussians, scene, default_options(iterations=30)).gaussians
+    return fudan.training(gaussians, scene, default_options(iterations=30, densify_until_iter=0)).gaussians
 
 if __name__ == "__main__":
     torch.save([p.detach() for p in trained()._xyz[None]], sys.argv[1])
