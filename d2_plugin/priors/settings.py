@@ -101,7 +101,8 @@ class AlignSettings:
 
     residual: str = "relative"
     """`absolute` is the paper's a D^m + b - D^g; `relative` divides it by D^g, as verification does. Measured: median
-    error of aligned maps .041 with either on studio; with 60 % uniform outliers neither is better in all scenes."""
+    error of aligned maps .041 with either on studio; error of the line with 20, 40 % wrong anchors (`d2 bench align`):
+    .005, .011 absolute, .007, .022 relative. What passes the filter is wrong at 1 %."""
     epsilon: float = 0.02
     """Smoothing of the Charbonnier penalty: of the relative residual, or (absolute) times the median of the target."""
     max_anchors: int = 20_000
@@ -132,7 +133,9 @@ class AlignSettings:
     local_limit: float = 0.7
     """Anchors off by more than this in log depth (a factor of two) say nothing about the bend of the map."""
     leverage_guard: bool = False
-    """Fit only inliers of a least-median-of-squares line: every convex fit breaks at 40 % leverage outliers."""
+    """Fit only inliers of a least-median-of-squares line: every convex fit breaks at 40 % leverage outliers. Measured:
+    no difference on studio; with 20, 40, 60 % wrong anchors the error of the line is .002, .002, .008 (`d2 bench align`),
+    for 5 to 8 ms more."""
     seed: int = 0
     """Seed of the subsampling and of the leverage guard."""
 
