@@ -27,6 +27,7 @@ cv2 = pytest.importorskip("cv2")
 
 NAMES = ["train0", "train1", "train2"]
 AUTO = StereoSettings()
+SENSOR = StereoSettings(maker="sensor")
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +91,7 @@ def test_sensor_depth_comes_in_world_units(
     capture: Capture, description: dict, step: float, suffix: str
 ) -> None:
     write_sensor(capture, description, step, suffix)
-    found = recorded_depth(capture, NAMES, AUTO)
+    found = recorded_depth(capture, NAMES, SENSOR)
     assert found.maker == "sensor"
     depth = found.depth(capture.cameras["train1"], 1)
     np.testing.assert_allclose(depth, capture.depth("train1", 1), atol=0.51 * step if suffix == ".png" else 1e-6)
@@ -139,7 +140,13 @@ def test_a_sensor_of_fewer_pixels_gives_each_picture_pixel_its_nearest(capture: 
 def test_what_a_stored_number_means_must_be_declared(capture: Capture, description: object, message: str) -> None:
     write_sensor(capture, description)
     with pytest.raises(D2Error, match=message):
-        recorded_depth(capture, NAMES, AUTO)
+        recorded_depth(capture, NAMES, SENSOR)
+
+
+def test_sensors_are_taken_unasked_only_where_every_camera_has_one(capture: Capture) -> None:
+    write_sensor(capture, {"unit": "mm"})
+    assert recorded_depth(capture, NAMES, AUTO) is None
+    assert recorded_depth(capture, NAMES[:2], AUTO).maker == "sensor"
 
 
 def test_a_map_that_is_no_depth_is_named(capture: Capture) -> None:
@@ -191,14 +198,14 @@ def test_one_camera_with_a_depth_sensor_has_a_verified_prior(capture: Capture) -
 def test_depth_on_disk_is_read_again_where_it_changed_and_only_there(
     capture: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = write_sensor(capture, {"unit": "mm"})
-    build_priors(capture, NAMES, capture.path / "priors", PriorSettings())
+    folder, settings = write_sensor(capture, {"unit": "mm"}), PriorSettings(stereo=SENSOR)
+    build_priors(capture, NAMES, capture.path / "priors", settings)
     filtered = []
     original = sources.filter_recorded
     monkeypatch.setattr(sources, "filter_recorded", lambda *a: filtered.append(1) or original(*a))
-    assert build_priors(capture, NAMES, capture.path / "priors", PriorSettings()).built == 0
+    assert build_priors(capture, NAMES, capture.path / "priors", settings).built == 0
     assert cv2.imwrite(str(folder / "train0" / "00001.png"), np.full((90, 160), 3000, np.uint16))
-    assert build_priors(capture, NAMES, capture.path / "priors", PriorSettings()).built == 3
+    assert build_priors(capture, NAMES, capture.path / "priors", settings).built == 3
     assert filtered == [1]
 
 

@@ -77,6 +77,8 @@ class SensorDepth:
 def recorded_depth(capture: Capture, cameras: Sequence[str], settings: StereoSettings) -> RecordedDepth | None:
     """The depth on disk that settings and capture name, or None where geometric depth is to be matched.
 
+    Of its own accord (`auto`) no camera is left without depth: sensors are taken where every camera has one.
+
     Raises:
         D2Error: the settings ask for depth on disk and there is none.
     """
@@ -89,8 +91,9 @@ def recorded_depth(capture: Capture, cameras: Sequence[str], settings: StereoSet
     root = (capture.path or Path()).absolute()
     if settings.maker in ("auto", SensorDepth.maker):
         folder = root / (settings.folder or "depth")
-        if (folder / "depth.json").is_file():
-            return SensorDepth(folder, cameras)
+        sensor = SensorDepth(folder, cameras) if (folder / "depth.json").is_file() else None
+        if sensor is not None and (settings.maker == SensorDepth.maker or len(sensor.files) == len(cameras)):
+            return sensor
         if settings.maker == SensorDepth.maker:
             raise D2Error(f"maker = sensor but {folder} has no depth.json: write it beside CAMERA/FRAME.png or .npy")
     calibrations = [capture.cameras[name] for name in cameras]

@@ -16,8 +16,8 @@ class StereoSettings:
 
     maker: str = "auto"
     """Matchers: `patchmatch` (compiled), `sweep` (OpenCV), `colmap` (needs CUDA). Depth that lies on disk: `workspace`
-    (COLMAP's), `sensor`. `auto` takes the first there is of sensor, workspace, colmap, patchmatch, sweep. Measured on
-    eight rigs of 2 to 4 views: F of patchmatch is above the sweep's on each, on narrow pairs too."""
+    (COLMAP's), `sensor`. `auto` takes the first there is of sensor (of every camera), workspace, colmap, patchmatch,
+    sweep. Measured on eight rigs of 2 to 4 views: F of patchmatch is above the sweep's on each, narrow pairs too."""
     folder: str = ""
     """Where the depth on disk lies, relative to the capture; `{frame}` (as in `mvs/{frame:05d}`) stands for the frame
     number. Where empty: `depth` for `sensor`, `colmap/FRAME`, `colmap` or `dense` for `workspace`."""
@@ -134,8 +134,8 @@ class AlignSettings:
     """Anchors off by more than this in log depth (a factor of two) say nothing about the bend of the map."""
     leverage_guard: bool = False
     """Fit only inliers of a least-median-of-squares line: every convex fit breaks at 40 % leverage outliers. Measured:
-    no difference on studio; with 20, 40, 60 % wrong anchors the error of the line is .002, .002, .008 (`d2 bench align`),
-    for 5 to 8 ms more."""
+    no difference on studio; the error of the line with 20, 40, 60 % wrong anchors is .002, .002, .008, for 5 to 8 ms
+    more (`d2 bench align`)."""
     seed: int = 0
     """Seed of the subsampling and of the leverage guard."""
 
