@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from d2_plugin.captures.presets import resolve_cameras
+
 from .memory import Measured, in_fresh_process
 from .page import markdown_table
 from .rows import Row, append_rows, make_row
@@ -184,11 +186,21 @@ def table(rows: Sequence[Row]) -> str:
     return markdown_table(plan_section(rows).tables[0][1])
 
 
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _frames(text: str) -> tuple[int, ...]:
+    first, last, *step = (int(part) for part in text.split(":"))  # argparse names the option when this raises
+    return tuple(range(first, last + 1, *step))
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of `d2 plan CAPTURE --verify`."""
     parser = argparse.ArgumentParser(prog="d2 plan --verify", description=__doc__)
     parser.add_argument("capture", help="folder of the recording")
-    parser.add_argument("--train-cameras", required=True, help="names joined by commas, e.g. 00,02,05,07")
+    parser.add_argument("--train-cameras", required=True, type=_names, help="names joined by commas, or preset:4")
+    parser.add_argument("--frames", type=_frames, default=None, help="first:last or first:last:step; default all")
     parser.add_argument("--downscale", type=int, default=1, help="pictures this many times smaller (integer); 1")
     parser.add_argument("--mono-onnx", default=None, help="monocular depth network as an ONNX file")
     parser.add_argument("--mono-kind", choices=("relative", "metric"), default=None, help="inverse depth or depth")
@@ -196,9 +208,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--prior-frames", type=int, default=6, help="frames over which priors are built; 6")
     parser.add_argument("--output", type=Path, default=Path("runs.jsonl"), help="rows are added to it; runs.jsonl")
     options = parser.parse_args(arguments)
+    train, test, _ = resolve_cameras(options.capture, options.train_cameras, None)
     settings = RunSettings(
         options.capture,
-        tuple(options.train_cameras.split(",")),
+        train,
+        test_cameras=test,
+        frames=options.frames,
         downscale=options.downscale,
         mono_onnx=options.mono_onnx,
         mono_kind=options.mono_kind,
