@@ -43,8 +43,8 @@ class DeformSettings(SplatSettings):
     field_decay: float = 0.1
     """Learning rates of the field at the last step, as a fraction of the first; exponential in between."""
     stillness: float = 1.0
-    """Weight of the mean absolute offset (of positions in units of the extent, those of quaternions and log-scales count
-    a tenth): what no picture asks to move stays. Ours; with two to four views a field otherwise moves everything."""
+    """Weight of the mean absolute offset (of positions in units of the extent; those of quaternions and log-scales
+    count a tenth): what no picture asks to move stays. Ours: with few views a field otherwise moves everything."""
     seed: int = 0
     """Of the field's start and of the noise on time; the global random state is never used."""
     mlp: MlpSettings = dataclasses.field(default_factory=MlpSettings)

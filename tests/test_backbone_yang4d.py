@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from d2_plugin.backbones.densify import DensifySettings, grow, prune
 from d2_plugin.backbones.gaussians import Gaussians
 from d2_plugin.backbones.photometric import photometric_loss, ssim
 from d2_plugin.backbones.starting import nearest_neighbour_scales
+from d2_plugin.backbones.trainer import Trainer, TrainSettings
 from d2_plugin.backbones.yang4d import Yang4DSettings, create
 from d2_plugin.study.metrics import ssim_3dgs
 
@@ -43,6 +45,28 @@ class TestSlice:
         a, b = (model.slice_at(view) for view in (make_views()[0], make_views()[-1]))
         assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
         assert len(a.rows) == 60
+
+    def test_time_apart_from_space_leaves_every_gaussian_where_it_is(self) -> None:
+        rows = (torch.rand(9, 3), torch.rand(9, 3), torch.full((9,), 0.3))
+        apart, coupled = (
+            create(*rows, extent=1.0, duration=1.0, temporal=True, settings={"couples_time": coupled})
+            for coupled in (False, True)
+        )
+        assert "right" not in apart.gaussians.parameters
+        turned = torch.randn(9, 4, generator=torch.Generator().manual_seed(0))
+        views = [replace(make_views()[0], time=time) for time in (0.1, 0.7)]
+        for model in (apart, coupled):
+            with torch.no_grad():
+                model.gaussians["left"].copy_(turned)
+        for part in ("means", "covariances"):
+            early, late = (getattr(apart.slice_at(view), part) for view in views)
+            torch.testing.assert_close(early, late)
+        early, late = (coupled.slice_at(view).means for view in views)
+        assert (early - late).abs().max() > 0.01, "this test could not fail"
+        opacities = apart.slice_at(views[1]).opacities
+        offset = 0.7 - apart.gaussians["times"]
+        expected = torch.sigmoid(apart.gaussians["opacity_logits"]) * torch.exp(-0.5 * offset**2 / 0.2)
+        torch.testing.assert_close(opacities, expected)
 
     def test_initial_temporal_variance_is_a_fifth_of_the_duration(self) -> None:
         model = make_model()
@@ -183,6 +207,21 @@ def test_every_training_view_is_used_once_per_round() -> None:
     trainer = make_trainer()
     count = len(TinyFrames().views)
     assert sorted(trainer._next_view() for _ in range(count)) == list(range(count))
+
+
+@pytest.mark.parametrize("settings", [{"couples_time": False}, {"sh_degree": 1, "sh_time_degree": 2}])
+@pytest.mark.parametrize("temporal", [True, False])
+def test_every_variant_trains_and_grows(settings: dict[str, object], temporal: bool) -> None:
+    points = torch.rand(3, 60, 3, generator=torch.Generator().manual_seed(0))
+    growth = {"start": 0.0, "stop": 1.0, "every": 7, "gradient": 1e-3, "dense_fraction": 0.1}
+    model = create(
+        points[0] + torch.tensor([-0.5, -0.5, 2.5]), points[1], points[2, :, 0] / 2, extent=2.0, duration=0.5,
+        temporal=temporal, settings=settings | {"densify": growth},
+    )  # fmt: skip
+    trainer = Trainer(model, TinyFrames(), TrainSettings(iterations=30))
+    trainer.run()
+    assert is_finite(trainer)
+    assert len(model) > 60
 
 
 def test_settings_arrive_through_the_entry_point() -> None:
