@@ -15,6 +15,7 @@ from torch import Tensor
 
 from d2_plugin.backbones.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.compat import depth, fourd, inria, nearest, threedgs
+from d2_plugin.compiler import NoCompiler
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Splats, View
 from d2_plugin.rasterizer import rasterize
@@ -200,14 +201,34 @@ class TestDepth:
         found[0, 7, 7].backward()
         assert float(means.grad[0, 2]) == pytest.approx(0.5, rel=0.1)
 
-    def test_both_viewspace_tensors_of_deformable_3d_receive_the_gradient(self, camera: dict) -> None:
+    def test_absolute_gradients_are_summed_pixel_by_pixel(self, camera: dict) -> None:
+        """means2D_densify of Deformable-3D-Gaussians, against one backward pass for every pixel in float64."""
         raster = depth.GaussianRasterizer(depth.GaussianRasterizationSettings(**camera))
-        values = gaussians()
-        second = torch.zeros_like(values["means2D"]).requires_grad_()
-        color, *_ = raster(**values, means2D_densify=second)
+        values, weights = gaussians(), torch.linspace(-1, 1, 3 * 16 * 24, dtype=torch.float64).view(3, 16, 24)
+        densify = torch.zeros_like(values["means2D"]).requires_grad_()
+        (raster(**values, means2D_densify=densify)[0] * weights).sum().backward()
+        shares = (raster(**values)[0] * weights).sum(0).flatten()
+        expected = sum(
+            torch.autograd.grad(share, values["means2D"], retain_graph=True)[0].abs() for share in shares.unbind()
+        )
+        torch.testing.assert_close(densify.grad, expected, atol=1e-4, rtol=1e-4)
+        assert (densify.grad[:, :2] > values["means2D"].grad[:, :2].abs() + 1e-3).any()
+
+    def test_without_a_compiler_both_viewspace_tensors_receive_the_same(
+        self, camera: dict, monkeypatch: pytest.MonkeyPatch, caplog
+    ) -> None:
+        def no_compiler() -> None:
+            raise NoCompiler("no C++ compiler found")
+
+        monkeypatch.setattr(depth.absolute, "library", no_compiler)
+        depth._can_sum.cache_clear()
+        raster, values = depth.GaussianRasterizer(depth.GaussianRasterizationSettings(**camera)), gaussians()
+        densify = torch.zeros_like(values["means2D"]).requires_grad_()
+        color, *_ = raster(**values, means2D_densify=densify)
         color.square().sum().backward()
-        assert values["means2D"].grad.abs().sum() > 0
-        torch.testing.assert_close(values["means2D"].grad, second.grad)
+        depth._can_sum.cache_clear()
+        torch.testing.assert_close(values["means2D"].grad, densify.grad)
+        assert "receives signed gradients" in caplog.text
 
 
 GOLDEN = {  # backbones.md 4.1: mu, t0, scales, left, right, t -> covariance, F, mean

@@ -1,17 +1,20 @@
 """The depth variants of `diff_gaussian_rasterization`: color, radii and the un-normalised depth sum.
 
-hustvl/4DGaussians and ingra14m/Deformable-3D-Gaussians import these under the same name. The latter passes
-`means2D_densify`, which its CUDA source gives the sum of absolute per-pixel gradients; here it receives the signed sum
-that `means2D` receives, which is smaller: fewer Gaussians exceed the repository's densification threshold of 0.0007.
+hustvl/4DGaussians and ingra14m/Deformable-3D-Gaussians import these under the same name. The latter also passes
+`means2D_densify`, whose gradient is the sum over pixels of absolute values (its issue 72), of the colours' share of the
+loss here. Without a compiler it receives the signed sum that `means2D` receives, which is smaller, and the log says so.
 """
 
 from __future__ import annotations
 
+import functools
 import logging
 
 from torch import Tensor
 
-from . import threedgs
+from d2_plugin.compiler import NoCompiler
+
+from . import absolute, threedgs
 from .threedgs import GaussianRasterizationSettings
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
@@ -21,8 +24,6 @@ log = logging.getLogger(__name__)
 
 class GaussianRasterizer(threedgs.GaussianRasterizer):
     """As in 3DGS, and depth [1, H, W] = sum of w z with gradients."""
-
-    _told = False
 
     def forward(
         self,
@@ -37,17 +38,21 @@ class GaussianRasterizer(threedgs.GaussianRasterizer):
         means2D_densify: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
         """Color [3, H, W], radii [N] int32 and depth [1, H, W]."""
-        if means2D_densify is not None:
-            self._tell()
-            means2D = means2D + means2D_densify
-        drawn = self._draw(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        if means2D_densify is not None and not _can_sum():
+            means2D, means2D_densify = means2D + means2D_densify, None
+        gaussians = (means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        drawn = self._draw(*gaussians, absolute=means2D_densify)
         return drawn.color, drawn.radii, drawn.depth
 
-    @classmethod
-    def _tell(cls) -> None:
-        if not cls._told:
-            log.warning(
-                "means2D_densify receives signed gradients, not the sums of absolute ones of the original: fewer "
-                "Gaussians are densified at the same threshold"
-            )
-        cls._told = True
+
+@functools.cache
+def _can_sum() -> bool:
+    """Whether absolute gradients can be had; says once where they cannot."""
+    try:
+        absolute.library()
+    except NoCompiler as error:
+        log.warning(
+            "means2D_densify receives signed gradients, so fewer Gaussians exceed densify_grad_threshold: %s", error
+        )
+        return False
+    return True

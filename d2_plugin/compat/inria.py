@@ -15,6 +15,8 @@ from d2_plugin.protocol import RasterSettings, Splats, View
 from d2_plugin.rasterizer import rasterize
 from d2_plugin.rasterizer.reference import project
 
+from .absolute import Drawing, WithAbsoluteGradient
+
 log = logging.getLogger(__name__)
 
 SETTINGS = RasterSettings()
@@ -40,6 +42,7 @@ def draw(
     background: Tensor,
     means2D: Tensor | None,
     count: int,
+    absolute: Tensor | None = None,
 ) -> Drawn:
     """Composite `splats`, which are rows `splats.rows` of `count` Gaussians.
 
@@ -51,6 +54,7 @@ def draw(
         means2D: [N, 3] or [N, 2]; receives dL/d(normalised device coordinate) as its gradient, which is dL/d(pixel)
             times half the image's size: the unit that `densify_grad_threshold` is in. Its values are not used.
         count: N.
+        absolute: [N, 3]; receives the sum over pixels of absolute gradients in the same unit (`absolute.py`).
     """
     view = view_of(settings)
     offsets = None
@@ -58,9 +62,12 @@ def draw(
         chosen = means2D[splats.rows, :2]
         offsets = (chosen - chosen.detach()) * chosen.new_tensor([0.5 * view.width, 0.5 * view.height])
     image = rasterize(splats, colors, view, SETTINGS, background=background.to(colors), screen_offsets=offsets)
+    color = image.color
+    if absolute is not None and absolute.requires_grad:
+        color = WithAbsoluteGradient.apply(color, absolute, Drawing(splats, colors, view, SETTINGS))
     radii = torch.zeros(count, dtype=torch.int32, device=splats.means.device)
     radii[splats.rows] = screen_radii(splats, view)
-    return Drawn(image.color.permute(2, 0, 1), image.depth_sum[None], image.alpha[None], radii)
+    return Drawn(color.permute(2, 0, 1), image.depth_sum[None], image.alpha[None], radii)
 
 
 def view_of(settings: Any) -> View:

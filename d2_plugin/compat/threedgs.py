@@ -71,6 +71,7 @@ class GaussianRasterizer(nn.Module):
         scales: Tensor | None,
         rotations: Tensor | None,
         cov3D_precomp: Tensor | None,
+        absolute: Tensor | None = None,
     ) -> Drawn:
         settings = self.raster_settings
         exactly_one("shs or colors_precomp", shs, colors_precomp)
@@ -81,4 +82,4 @@ class GaussianRasterizer(nn.Module):
             colors_precomp = colors_of(shs, settings.sh_degree, means3D, settings.campos)
         rows = torch.arange(len(means3D), device=means3D.device)
         splats = Splats(means3D, cov3D_precomp, opacities.squeeze(-1), rows)
-        return draw(settings, splats, colors_precomp, settings.bg, means2D, len(rows))
+        return draw(settings, splats, colors_precomp, settings.bg, means2D, len(rows), absolute)
