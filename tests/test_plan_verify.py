@@ -1,4 +1,4 @@
-"""`d2 plan --verify` takes each decision both ways; `d2 bench scaling` tells growth; memory is that of the work alone."""
+"""`d2 plan --verify` takes each decision both ways; `d2 bench scaling` tells growth; memory is the work's alone."""
 
 from __future__ import annotations
 

@@ -185,6 +185,16 @@ def test_folders_of_runs_are_searched_and_a_picture_of_each_method_is_kept(tmp_p
         collect([tmp_path / "report"])
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_rows_of_which_none_has_a_result_still_make_a_report(tmp_path: Path, kind: str) -> None:
+    rows = [row for row in read_rows([RUNS]) if row["kind"] == kind][:2]
+    for row in rows:
+        row |= {"error": None, "failed": "refused: no such thing", "verdict": "failure", "scores": {}, "cost": None}
+        row |= {"depth_error": None, "peak_mb": None}
+    page = make_report(rows, tmp_path)[0].read_text()
+    assert f'<section id="{kind}">' in page
+
+
 def test_what_names_hold_is_text_and_never_markup(tmp_path: Path) -> None:
     row = make_row("plan", "<b>room</b>", "a & b", error=0.0, seconds=1.0, planned="used: x", cost=None, unit="dB")
     page, *_ = make_report([row], tmp_path, [Picture("<i>x</i>", "data:image/png;base64,")])

@@ -30,12 +30,13 @@ scroll-margin-top:60px}
 figure{margin:18px 0;overflow-x:auto}svg.plot{display:block;max-width:100%;height:auto}
 img{max-width:100%;border-radius:6px;display:block}
 .wide{overflow-x:auto}table{border-collapse:collapse;font-size:.8125rem;font-variant-numeric:tabular-nums;width:100%}
-th,td{padding:5px 8px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
+th,td{padding:5px 6px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
 th{color:var(--soft);font-weight:500;vertical-align:bottom;white-space:normal}tbody tr:hover{background:var(--page)}
 th.words,td.words{text-align:left}td.long{white-space:normal;min-width:26ch;text-align:left}
 td.best{font-weight:650;background:var(--mark)}
 summary{cursor:pointer;margin-top:1.4em}code{font-size:.85em;overflow-wrap:anywhere}
 footer{padding:10px 20px 50px}
+@media(max-width:700px){section{padding:16px}svg.plot{max-width:none}}
 @media print{nav{display:none}section{break-inside:avoid-page}}
 """
 

@@ -25,8 +25,7 @@ def training(rows: Sequence[Row]) -> Section:
     """Held-out PSNR against minutes of prior and training, their parts as stacked bars, and all scores."""
     emulated = any(row.get("mono_emulated") for row in rows)
     colors = colors_of(rows)
-    scored = cases_of([row for row in rows if _score(row, "psnr") is not None])
-    plots = [_quality(case, mine, colors) for case, mine in scored.items()]
+    plots = [_quality(case, mine, colors) for case, mine in cases_of(_scored(rows)).items()]
     means = [(case, name, group) for case, mine in cases_of(rows).items() for name, group in _variants(mine).items()]
     stacked = [
         (f"{case}: {name}", (_mean(group, "prior_seconds") / 60, _mean(group, "seconds") / 60))
@@ -89,13 +88,13 @@ def _variants(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 def ablation(rows: Sequence[Row]) -> Section:
     """What each variant gains over the backbone alone, every seed a mark, and the scores as mean and deviation."""
-    plots = [_gains(case, mine) for case, mine in cases_of(rows).items()]
+    plots = [_gains(case, mine) for case, mine in cases_of(_scored(rows)).items()]
     groups = [
         (case, name, [row for row in mine if row["method"] == name])
         for case, mine in cases_of(rows).items()
         for name in dict.fromkeys(row["method"] for row in mine)
     ]
-    height = 90 + 24 * max(len(plot.y.names) for plot in plots)
+    height = 90 + 24 * max((len(plot.y.names) for plot in plots), default=0)
     return Section(
         "ablation",
         "Ablation: what each part is worth",
@@ -107,8 +106,7 @@ def ablation(rows: Sequence[Row]) -> Section:
     )
 
 
-def _gains(case: str, rows: Sequence[Row]) -> Plot:
-    scored = [row for row in rows if _score(row, "psnr") is not None]
+def _gains(case: str, scored: Sequence[Row]) -> Plot:
     names = list(dict.fromkeys(row["method"] for row in scored))
     base = _backbones(scored)
     points = []
@@ -148,6 +146,11 @@ def _published_gains(names: Sequence[str]) -> tuple[Point, ...]:
 
 def _score(row: Row, name: str) -> float | None:
     return (row.get("scores") or {}).get(name)
+
+
+def _scored(rows: Sequence[Row]) -> list[Row]:
+    """The rows of runs that held a camera out."""
+    return [row for row in rows if _score(row, "psnr") is not None]
 
 
 def _mean(rows: Sequence[Row], name: str) -> float:

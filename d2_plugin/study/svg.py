@@ -144,8 +144,11 @@ def number(value: float) -> str:
 def figure(plots: Sequence[Plot], description: str, columns: int = 1, size: tuple[int, int] = (720, 380)) -> str:
     """All plots on a grid under one legend, as one SVG; `description` is what a screen reader says.
 
-    `size` is that of one plot, px.
+    `size` is that of one plot, px. Plots without a mark are left out.
     """
+    plots = [plot for plot in plots if any(series.points for series in plot.series)]
+    if not plots:
+        return document(text(size[0] / 2, 40, "nothing was measured", "soft", "middle"), size[0], 70, description)
     columns = min(columns, len(plots))
     names = dict.fromkeys((s.name, s.color, s.hollow) for plot in plots for s in plot.series if s.name)
     legend, top = _legend(list(names), columns * size[0])
