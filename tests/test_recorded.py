@@ -40,6 +40,12 @@ def capture(plain: Capture, tmp_path: Path) -> Capture:
     return replace(plain, path=tmp_path)
 
 
+@pytest.fixture
+def still(capture: Capture) -> Capture:
+    """One instant of it."""
+    return replace(capture, frames=(0,))
+
+
 def write_sensor(capture: Capture, description: dict, step: float = 1e-3, suffix: str = ".png") -> Path:
     """Sensor maps of the first two cameras, `step` world units a number."""
     folder = capture.path / "depth"
@@ -233,10 +239,22 @@ def test_a_workspace_is_found_where_it_usually_lies_or_where_the_settings_say(ca
     assert recorded_depth(capture, NAMES, AUTO) is None
     assert workspace(capture, "elsewhere/f{frame}").depth(capture.cameras["train0"], 1).any()
     write_maps(capture, "dense", 0)
-    assert recorded_depth(capture, NAMES, AUTO).about.endswith("dense")
+    assert recorded_depth(replace(capture, frames=(0,)), NAMES, AUTO).about.endswith("dense")
     assert recorded_depth(capture, NAMES, StereoSettings(maker="patchmatch")) is None
     with pytest.raises(D2Error, match="braces around other than frame"):
         workspace(capture, "elsewhere/{number}")
+
+
+def test_a_workspace_of_one_instant_is_not_the_depth_of_all(capture: Capture) -> None:
+    """Many captures keep the workspace that their initial points come from."""
+    write_maps(capture, "colmap", 0)
+    assert recorded_depth(capture, NAMES, AUTO) is None
+    with pytest.raises(D2Error, match="at frame 1: name pictures CAMERA/FRAME.png"):
+        workspace(capture).depth(capture.cameras["train0"], 1)
+    write_maps(capture, "colmap/00000", 0)
+    assert recorded_depth(capture, NAMES, AUTO) is None
+    write_maps(capture, "colmap/00001", 1)
+    assert recorded_depth(capture, NAMES, AUTO).place == "colmap/{frame:05d}"
 
 
 def test_pictures_of_all_frames_may_share_one_workspace(capture: Capture) -> None:
@@ -257,11 +275,11 @@ def test_pictures_of_all_frames_may_share_one_workspace(capture: Capture) -> Non
         np.testing.assert_allclose(source.depth(capture.cameras["train1"], frame), capture.depth("train1", frame))
 
 
-def test_maps_of_the_geometric_pass_come_first(capture: Capture) -> None:
-    folder = write_maps(capture, "colmap", 0)
+def test_maps_of_the_geometric_pass_come_first(still: Capture) -> None:
+    folder = write_maps(still, "colmap", 0)
     write_dense_array(folder / "stereo" / "depth_maps" / "train0.png.photometric.bin", np.ones((90, 160)))
     depth = [
-        recorded_depth(capture, NAMES, StereoSettings(colmap_geometric=wanted)).depth(capture.cameras["train0"], 0)
+        recorded_depth(still, NAMES, StereoSettings(colmap_geometric=wanted)).depth(still.cameras["train0"], 0)
         for wanted in (True, False)
     ]
     assert np.median(depth[0]) > 1.5
@@ -312,29 +330,29 @@ def test_a_workspace_of_another_rig_is_refused(capture: Capture) -> None:
     assert scale_of_world(cameras[:1], {"train0": cameras[0].T_camera_world}, Path("w")) == 1
 
 
-def test_a_workspace_of_other_pictures_says_how_to_name_them(capture: Capture) -> None:
-    folder = write_maps(capture, "colmap", 0)
+def test_a_workspace_of_other_pictures_says_how_to_name_them(still: Capture) -> None:
+    folder = write_maps(still, "colmap", 0)
     images = folder / "sparse" / "images.txt"
     images.write_text(images.read_text().replace("train", "view"))
-    with pytest.raises(D2Error, match="has no picture of train0, train1, train2: name pictures"):
-        workspace(capture).depth(capture.cameras["train0"], 0)
+    with pytest.raises(D2Error, match="has no picture of train0, train1, train2 at frame 0: name pictures"):
+        workspace(still).depth(still.cameras["train0"], 0)
 
 
-def test_a_workspace_that_saw_other_cameras_is_warned_of(capture: Capture, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_workspace_that_saw_other_cameras_is_warned_of(still: Capture, caplog: pytest.LogCaptureFixture) -> None:
     """Held-out cameras must not reach training by way of somebody's depth maps."""
-    write_maps(capture, "colmap", 0)
-    source = recorded_depth(capture, NAMES[:2], StereoSettings(maker="workspace"))
-    assert source.depth(capture.cameras["train0"], 0).any()
+    write_maps(still, "colmap", 0)
+    source = recorded_depth(still, NAMES[:2], StereoSettings(maker="workspace"))
+    assert source.depth(still.cameras["train0"], 0).any()
     assert "saw train2.png as well" in caplog.text
 
 
-def test_pictures_with_lens_distortion_are_refused(capture: Capture) -> None:
-    folder = write_maps(capture, "colmap", 0)
+def test_pictures_with_lens_distortion_are_refused(still: Capture) -> None:
+    folder = write_maps(still, "colmap", 0)
     cameras = folder / "sparse" / "cameras.txt"
     lines = [line.replace("PINHOLE", "OPENCV") + " 0.1 0 0 0" for line in cameras.read_text().splitlines()]
     cameras.write_text("\n".join(lines))
     with pytest.raises(D2Error, match="lens distortion: give the output of `colmap image_undistorter`"):
-        workspace(capture).depth(capture.cameras["train0"], 0)
+        workspace(still).depth(still.cameras["train0"], 0)
 
 
 def test_priors_from_a_workspace_pass_the_common_filter(capture: Capture) -> None:

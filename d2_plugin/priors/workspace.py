@@ -42,27 +42,38 @@ class WorkspaceDepth:
         place: path of the workspace; `{frame}` in it stands for the frame number.
         settings: `colmap_geometric` says whether maps of the geometric pass are wanted where there are any.
         cameras: the cameras whose poses are compared.
+        frames: of the capture. Where there are several, a picture is told from others by its frame: a workspace of one
+            instant, as many captures have for their initial points, must not become the depth of all instants.
     """
 
     maker = "workspace"
 
-    def __init__(self, root: Path, place: str, settings: StereoSettings, cameras: Sequence[Camera]) -> None:
+    def __init__(
+        self, root: Path, place: str, settings: StereoSettings, cameras: Sequence[Camera], frames: Sequence[int]
+    ) -> None:
         self.root, self.place, self.cameras = root, place, list(cameras)
+        self.one_instant = "{frame" in place or len(frames) == 1
         self.kinds = ("geometric", "photometric") if settings.colmap_geometric else ("photometric",)
         self.about = f"depth maps of the COLMAP workspace {place}"
-        self._opened: Path | None = None
+        self._read: Path | None = None
+        self._compared: Path | None = None
         self._model: ColmapModel | None = None
         self._images: dict[tuple[str, int | None], ColmapImage] = {}
+        self._strangers: list[str] = []
         self._scale = 1.0
 
     @classmethod
     def find(
         cls, root: Path, settings: StereoSettings, cameras: Sequence[Camera], frames: Sequence[int]
     ) -> WorkspaceDepth | None:
-        """The first place below `root` that has depth maps of any frame, or None."""
+        """The first place below `root` that has depth maps, or None.
+
+        Where it was not asked for, it must serve the first frame and the last.
+        """
         for place in [settings.folder] if settings.folder else PLACES:
-            source = cls(root, place, settings, cameras)
-            if any(source.has_maps(frame) for frame in frames):
+            source = cls(root, place, settings, cameras, frames)
+            asked = settings.maker == cls.maker and any(source.has_maps(frame) for frame in frames)
+            if asked or all(source.serves(frame) for frame in (frames[0], frames[-1])):
                 return source
         return None
 
@@ -70,6 +81,13 @@ class WorkspaceDepth:
         """Whether the workspace of that frame holds any depth map."""
         maps = self._folder(frame) / "stereo" / "depth_maps"
         return maps.is_dir() and next(maps.rglob("*.bin"), None) is not None
+
+    def serves(self, frame: int) -> bool:
+        """Whether there are maps, and the model knows one of our cameras at that frame."""
+        if not self.has_maps(frame):
+            return False
+        self._read_model(self._folder(frame))
+        return any(self._image(camera.name, frame) for camera in self.cameras)
 
     def depth(self, camera: Camera, frame: int) -> np.ndarray | None:
         """The map of one camera at one frame, at its size and in its world's units; None where there is none.
@@ -80,8 +98,9 @@ class WorkspaceDepth:
         folder = self._folder(frame)
         if not self.has_maps(frame):
             return None
-        if folder != self._opened:
-            self._open(folder, frame)
+        self._read_model(folder)
+        if folder != self._compared:
+            self._compare_poses(folder, frame)
         image = self._image(camera.name, frame)
         path = None if image is None else self._map(folder, image.name)
         if image is None or path is None:
@@ -95,30 +114,37 @@ class WorkspaceDepth:
         except (KeyError, IndexError, ValueError) as error:
             raise D2Error(f"stereo.folder {self.place} has braces around other than frame ({error}): mend it") from None
 
-    def _open(self, folder: Path, frame: int) -> None:
-        """Read the model of a workspace and compare its poses with ours."""
+    def _read_model(self, folder: Path) -> None:
+        """The cameras and pictures of a workspace, unless it is the one that was read last."""
+        if folder == self._read:
+            return
         sparse = folder / "sparse"
         self._model = read_model(sparse / "0" if (sparse / "0").is_dir() else sparse)
-        self._images, strangers = _by_camera_and_frame(self._model, [camera.name for camera in self.cameras])
+        self._images, self._strangers = _by_camera_and_frame(self._model, [camera.name for camera in self.cameras])
+        self._read = folder
+
+    def _compare_poses(self, folder: Path, frame: int) -> None:
+        """The scale of a workspace's world, once its cameras are known to be ours."""
         found = {camera.name: self._image(camera.name, frame) for camera in self.cameras}
         poses = {name: image.T_camera_world for name, image in found.items() if image is not None}
         if not poses:
             raise D2Error(
-                f"the workspace {folder} has no picture of {', '.join(found)}: name pictures CAMERA/FRAME.png or "
-                "CAMERA.png, or set maker = patchmatch"
+                f"the workspace {folder} has no picture of {', '.join(found)} at frame {frame}: name pictures "
+                "CAMERA/FRAME.png, or CAMERA.png where the folder is of one frame, or set maker = patchmatch"
             )
         self._scale = scale_of_world([camera for camera in self.cameras if camera.name in poses], poses, folder)
-        if strangers:
+        self._compared = folder
+        if self._strangers:
             logger.warning(
                 "the workspace %s saw %s as well: where a camera is held out, compute it without that camera",
                 folder,
-                ", ".join(strangers[:3]) + (", ..." if len(strangers) > 3 else ""),
+                ", ".join(self._strangers[:3]) + (", ..." if len(self._strangers) > 3 else ""),
             )
-        self._opened = folder
 
     def _image(self, camera: str, frame: int) -> ColmapImage | None:
         """The picture of one camera and frame, or of one camera where the workspace is of one instant."""
-        return self._images.get((camera, frame)) or self._images.get((camera, None))
+        found = self._images.get((camera, frame))
+        return self._images.get((camera, None)) if found is None and self.one_instant else found
 
     def _map(self, folder: Path, name: str) -> Path | None:
         paths = (folder / "stereo" / "depth_maps" / f"{name}.{kind}.bin" for kind in self.kinds)
