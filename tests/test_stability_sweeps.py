@@ -13,7 +13,7 @@ import torch
 from d2_plugin.errors import D2Error
 from d2_plugin.study.rows import Row
 from d2_plugin.study.stability import PRECISIONS, all_sweeps, main, measure, run_sweeps, summary
-from d2_plugin.study.stability_gaussians import difference, random_rotation, random_scene
+from d2_plugin.study.stability_gaussians import difference, largest, random_rotation, random_scene
 
 SWEEPS = {sweep.name: sweep for sweep in all_sweeps()}
 RANGES = {
@@ -67,6 +67,16 @@ def test_a_point_that_is_refused_or_not_finite_is_a_failure_and_one_above_its_li
         row = measure(replace(sweep, measure=lambda value, dtype, e=error: e), 1.0, "float64")
         assert row["verdict"] == verdict
         assert json.dumps(row, allow_nan=False)
+
+
+def test_a_nan_anywhere_is_not_lost_among_smaller_errors() -> None:
+    scene = random_scene()
+    image = scene.render(torch.float64)
+    for part in image._fields:
+        broken = image._replace(**{part: getattr(image, part) * torch.full((), math.nan, dtype=torch.float64)})
+        assert math.isnan(difference(broken, image))
+    assert math.isnan(largest(0.1, math.nan))
+    assert math.isnan(largest(math.nan, 0.1))
 
 
 def test_a_scene_that_is_another_one_is_seen_to_differ() -> None:

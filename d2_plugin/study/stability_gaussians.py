@@ -87,7 +87,12 @@ def difference(found: Render, expected: Render, unit: float = 1.0) -> float:
     seen = expected.alpha > 0.05
     depths = (found.depth_sum / found.alpha)[seen] / unit - (expected.depth_sum / expected.alpha)[seen]
     parts = (found.color - expected.color, found.alpha - expected.alpha, depths)
-    return max(part.abs().max().item() for part in parts)
+    return largest(*(part.abs().max().item() for part in parts))
+
+
+def largest(*errors: float) -> float:
+    """The largest error, or NaN where any of them is NaN, which `max` would lose."""
+    return math.nan if any(map(math.isnan, errors)) else max(errors)
 
 
 def anisotropy(ratio: float, dtype: torch.dtype) -> float:
@@ -124,7 +129,7 @@ def opacity_logit(logit: float, dtype: torch.dtype) -> float:
     drawn, clamped = exact > THRESHOLDS.alpha_min, exact > THRESHOLDS.alpha_max
     alpha = min(exact, THRESHOLDS.alpha_max) if drawn else 0.0
     slope = exact * (1 - exact) if drawn and not clamped else 0.0
-    return max(abs(middle.item() - alpha), abs(gradient.item() - slope))
+    return largest(abs(middle.item() - alpha), abs(gradient.item() - slope))
 
 
 def far_plane(far: float, dtype: torch.dtype) -> float:
@@ -141,7 +146,7 @@ def far_plane(far: float, dtype: torch.dtype) -> float:
     expected = torch.tensor([0.25, 0.5, 0.125], dtype=dtype)
     distance = (expected.double() * depths).sum().item()
     colors = (render.color[row, column] - expected).abs().max().item()
-    return max(colors, abs(render.depth_sum[row, column].item() / distance - 1))
+    return largest(colors, abs(render.depth_sum[row, column].item() / distance - 1))
 
 
 def one_gaussian(dtype: torch.dtype, **rows: list[float]) -> object:
@@ -165,7 +170,7 @@ def temporal_variance(variance: float, dtype: torch.dtype) -> float:
         return math.inf
     (slope,) = torch.autograd.grad(opacity.sum(), model.gaussians["times"])
     expected = 0.5 * math.exp(-0.5)
-    return max(abs(opacity.item() / expected - 1), abs(slope.item() * sigma / expected - 1))
+    return largest(abs(opacity.item() / expected - 1), abs(slope.item() * sigma / expected - 1))
 
 
 def fast_motion(speed: float, dtype: torch.dtype) -> float:

@@ -7,7 +7,7 @@ setting, both axes logarithmic, lower left is better. What another setting beats
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -99,7 +99,7 @@ def work_precision(
     series = []
     for name, color in (colors or colors_of(rows)).items():
         mine = [mean for mean in drawn if mean.method == name]
-        points = tuple(_point(mean, unit, mean in front) for mean in mine)
+        points = tuple(_point(mean, unit, mean in front, error_label, seconds_label) for mean in mine)
         settled = [mean for mean in mine if not mean.failures]
         steps = [settled[i] for i in pareto_front([(mean.seconds, mean.error) for mean in settled])]
         line = tuple((mean.seconds * unit, max(mean.error, SMALLEST)) for mean in steps)
@@ -109,8 +109,9 @@ def work_precision(
     return Plot(title, x, y, tuple(series))
 
 
-def _point(mean: Mean, unit: float, on_front: bool) -> Point:
-    note = f"{mean.method}, {mean.setting}: error {number(mean.error)}, {number(mean.seconds * unit)}"
+def _point(mean: Mean, unit: float, on_front: bool, error_label: str, seconds_label: str) -> Point:
+    measured = f"{error_label} {shown(mean.error)}, {seconds_label} {shown(mean.seconds * unit)}"
+    note = f"{mean.method}, {mean.setting}: {measured}"
     note += f"; failed on {mean.failures} of {mean.cases}" if mean.failures else ""
     label = mean.setting if on_front and mean.setting != "default" else ""
     return Point(mean.seconds * unit, max(mean.error, SMALLEST), note, label, faded=not on_front)
@@ -132,8 +133,6 @@ def means_table(rows: Sequence[Row], error_name: str, seconds_name: str, unit: f
     return Table(header, cells, frozenset((whole[i], column) for i in front for column in (2, 4)))
 
 
-def shown(value: float | None, form: Callable[[float], str] | None = None) -> str:
+def shown(value: float | None) -> str:
     """Three digits, or `-` where it was not measured."""
-    if value is None:
-        return "-"
-    return form(value) if form else number(float(f"{value:.3g}"))
+    return "-" if value is None else number(float(f"{value:.3g}"))
