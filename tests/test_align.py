@@ -8,6 +8,7 @@ import pytest
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.align import Alignment, AlignStatus, align, aligned_depth, not_aligned, rank_correlation
 from d2_plugin.priors.settings import AlignSettings
+from d2_plugin.study.align_measure import align_problem
 
 SHAPE = (90, 120)
 
@@ -134,6 +135,27 @@ def test_the_leverage_guard_saves_a_fit_that_every_convex_one_loses() -> None:
     assert plain.status is AlignStatus.BOUNDARY
     assert guarded.status is AlignStatus.OK
     assert guarded.scale == pytest.approx(2, rel=0.01)
+
+
+@pytest.mark.parametrize("wrong", [0.2, 0.4, 0.6])
+@pytest.mark.parametrize("kind", ["relative", "metric"])
+def test_with_the_leverage_guard_most_anchors_may_be_wrong(kind: str, wrong: float) -> None:
+    problem = align_problem(kind, 20_000, wrong)
+    found = align(
+        problem.mono[None], problem.geometric[None], kind=kind, settings=AlignSettings(leverage_guard=True)
+    )
+    assert found.accepted
+    assert found.gap <= 1e-9
+    assert np.median(problem.depth_error((found.scale, found.shift))) < 0.004
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_leverage_guard_finds_no_line_where_there_is_none(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    unrelated, depth = rng.uniform(0, 1, (2, 50, 80))
+    found = align(unrelated, 2 + 6 * depth, kind="metric", settings=AlignSettings(leverage_guard=True))
+    assert not found.accepted
+    assert found.t < AlignSettings().min_t
 
 
 @pytest.mark.parametrize(

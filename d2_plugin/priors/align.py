@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from enum import StrEnum
+from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,7 +46,8 @@ class Alignment:
 
     `domain` of a and b follows `kind`: relative maps give inverse depth a m + b, metric ones depth a m + b.
     `gap` bounds (F - F*) / F; `inliers` is the share of all anchors with discrepancy e below `inlier_error`; `t` is the
-    scale over its standard error; `rank_correlation` that of the map with 1 / D^g (relative) or D^g (metric).
+    scale over its standard error (with the leverage guard, see `_Selection`); `rank_correlation` that of the map with
+    1 / D^g (relative) or D^g (metric).
     """
 
     status: AlignStatus
@@ -98,10 +101,9 @@ def align(mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: 
     if _central_range(depth) <= settings.min_spread * np.median(depth):
         return Alignment(AlignStatus.ONE_DEPTH, kind, anchors=count)
     target = 1 / depth if kind == "relative" else depth
-    fit, epsilon = _fit(x, target, settings)
+    fit, epsilon, t = _fit(x, target, settings)
     error = np.abs(_depth(x, fit.scale, fit.shift, kind, np.inf) - depth) / depth
     inliers = float((error < settings.inlier_error).mean())
-    t = fit.scale / max(fit.scale_error, np.finfo(float).tiny)
     correlation = rank_correlation(x[:: max(1, x.size // RANKED)], target[:: max(1, x.size // RANKED)])
     return Alignment(
         status=_judge(fit, correlation, t, inliers, settings),
@@ -159,14 +161,18 @@ def _depth(mono: np.ndarray, scale: float, shift: float, kind: MonoKind, z_far: 
     return np.where((value > 0) & (value <= z_far), value, 0)
 
 
-def _fit(x: np.ndarray, target: np.ndarray, settings: AlignSettings) -> tuple[AffineFit, float]:
+def _fit(x: np.ndarray, target: np.ndarray, settings: AlignSettings) -> tuple[AffineFit, float, float]:
+    """The line, the smoothing it was fitted with, and how sure it is that there is one."""
+    relative = settings.residual == "relative"
+    selection = None
     if settings.leverage_guard:
-        keep = _median_line_inliers(x, target, settings.seed)
-        x, target = x[keep], target[keep]
-    if settings.residual == "relative":
-        return fit_affine(x, target, 1 / target, epsilon=settings.epsilon), settings.epsilon
-    epsilon = settings.epsilon * float(np.median(target))
-    return fit_affine(x, target, epsilon=epsilon), epsilon
+        weights = 1 / target if relative else np.ones_like(target)
+        selection = _near_best_line(x, target, weights, settings.min_inliers, settings.seed)
+        x, target = x[selection.keep], target[selection.keep]
+    epsilon = settings.epsilon if relative else settings.epsilon * float(np.median(target))
+    fit = fit_affine(x, target, 1 / target if relative else None, epsilon=epsilon)
+    t = fit.scale / max(fit.scale_error, np.finfo(float).tiny) if selection is None else selection.t
+    return fit, epsilon, t
 
 
 def _judge(
@@ -199,23 +205,46 @@ def _central_range(values: np.ndarray) -> float:
     return float(high - low)
 
 
-def _median_line_inliers(x: np.ndarray, y: np.ndarray, seed: int, trials: int = 200) -> np.ndarray:
-    """Rows within 2.5 robust deviations of the increasing line of least median residual through two random anchors."""
+class _Selection(NamedTuple):
+    """Anchors near one line, bool [N], and by how many standard deviations they are more than chance.
+
+    Anchors that were chosen to fit a line say nothing about whether there is one. Chance is how many would lie as near
+    if the map were shuffled.
+    """
+
+    keep: np.ndarray
+    t: float
+
+
+def _near_best_line(
+    x: np.ndarray, y: np.ndarray, weights: np.ndarray, share: float, seed: int, trials: int = 200, probes: int = 500
+) -> _Selection:
+    """Anchors near the rising line through two random ones that passes nearest to the best `share` of all anchors.
+
+    Least quantile of squares (Rousseeuw and Leroy 1987): it stands wrong anchors up to 1 - `share`, where the median
+    breaks at a half. Near is within 2.5 standard deviations, as that quantile tells them for normal residuals.
+    """
     rng = np.random.default_rng(seed)
     first, second = rng.integers(0, x.size, (2, trials))
-    probe = rng.integers(0, x.size, min(x.size, 2000))
-    best, line = np.inf, (0.0, 0.0)
-    for i, j in zip(first, second):
-        if x[i] == x[j] or (y[i] - y[j]) / (x[i] - x[j]) <= 0:
-            continue
-        scale = (y[i] - y[j]) / (x[i] - x[j])
-        shift = y[i] - scale * x[i]
-        median = float(np.median(np.abs(scale * x[probe] + shift - y[probe])))
-        if median < best:
-            best, line = median, (scale, shift)
-    residual = np.abs(line[0] * x + line[1] - y)
-    keep = residual <= 2.5 * 1.4826 * best
-    return keep if np.isfinite(best) and keep.sum() >= 2 else np.ones(x.size, bool)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scales = (y[first] - y[second]) / (x[first] - x[second])
+    rising = np.isfinite(scales) & (scales > 0)
+    if not rising.any():
+        return _Selection(np.ones(x.size, bool), 0.0)
+    scales, shifts = scales[rising], y[first[rising]] - scales[rising] * x[first[rising]]
+    probe = rng.integers(0, x.size, min(x.size, probes))
+    residuals = np.abs(scales[:, None] * x[probe] + shifts[:, None] - y[probe]) * weights[probe]
+    place = min(int(share * probe.size), probe.size - 1)
+    quantiles = np.partition(residuals, place, axis=1)[:, place]
+    best = quantiles.argmin()
+    reach = 2.5 * quantiles[best] / NormalDist().inv_cdf((1 + share) / 2)
+
+    def near(mono: np.ndarray) -> np.ndarray:
+        return np.abs(scales[best] * mono + shifts[best] - y) * weights <= reach
+
+    keep, chance = near(x), float(near(rng.permutation(x)).mean())
+    spread = np.sqrt(max(chance * (1 - chance), 1 / x.size) / x.size)
+    return _Selection(keep if keep.sum() >= 2 else np.ones(x.size, bool), float(keep.mean() - chance) / spread)
 
 
 def _check(mono: np.ndarray, geometric: np.ndarray, kind: str, settings: AlignSettings) -> None:
