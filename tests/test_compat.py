@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from splat_scenes import random_scene, single
 from torch import Tensor
 
+from d2_plugin.backbones.photometric import ssim
 from d2_plugin.backbones.spherical_harmonics import colors as harmonic_colors
-from d2_plugin.compat import depth, fourd, inria, nearest, threedgs
+from d2_plugin.compat import depth, fourd, inria, nearest, similarity, threedgs
 from d2_plugin.compiler import NoCompiler
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Splats, View
@@ -373,3 +374,19 @@ class TestNearest:
         assert nearest.distCUDA2(torch.rand(0, 3)).tolist() == []
         with pytest.raises(D2Error, match=r"points have shape \(4, 2\), expected \[N, 3\]"):
             nearest.distCUDA2(torch.rand(4, 2))
+
+
+class TestSimilarity:
+    def test_is_the_mean_over_the_batch_of_3dgs_similarity(self) -> None:
+        a = torch.rand(2, 3, 20, 24, generator=torch.Generator().manual_seed(0)).requires_grad_()
+        b = a.detach().roll(1, -1)
+        found = similarity.fused_ssim(a, b)
+        each = [ssim(x.permute(1, 2, 0), y.permute(1, 2, 0)) for x, y in zip(a, b)]
+        torch.testing.assert_close(found, torch.stack(each).mean())
+        assert similarity.fused_ssim(a, a.detach()).item() == pytest.approx(1.0, abs=1e-5)
+        found.backward()
+        assert a.grad.abs().sum() > 0
+
+    def test_another_padding_is_refused(self) -> None:
+        with pytest.raises(D2Error, match="this stand-in has 'same' only"):
+            similarity.fused_ssim(torch.rand(1, 3, 12, 12), torch.rand(1, 3, 12, 12), padding="valid")

@@ -78,6 +78,15 @@ RECIPES = {
             _KNN,
         ),
     ),
+    "4c4d": Recipe(
+        "fudan",
+        _fudan,
+        (
+            Original("diff_gaussian_rasterization", "d2_plugin.compat.fourd"),
+            _KNN,
+            Original("fused_ssim", "d2_plugin.compat.similarity"),
+        ),
+    ),
     "deformable3d": Recipe(
         "deformable3d",
         _deformable3d,
