@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from d2_plugin.captures.pictures import write_png
 from d2_plugin.errors import D2Error
@@ -36,7 +38,7 @@ def write_run(folder: Path, psnr: float | None = 25.0, **more: object) -> Path:
     metrics = {
         "test": None if psnr is None else {"psnr": psnr, "ssim1": 0.8},
         "seconds": {"priors": 60.0, "train": 30.0},
-        **{"gaussians": 1234, "iterations": 500, "capture": "room", "train_cameras": ["a", "b"], "backbone": "yang4d"},
+        **{"gaussians": 1234, "iterations": 500, "capture": "den", "train_cameras": ["a", "b"], "backbone": "yang4d"},
         "hooks": ["prior", "densify", "prune", "depth_loss"],
         "made": {"device": "a CPU", "threads": 2, "version": "1", "commit": "abc", "torch": "2"},
         **more,
@@ -157,7 +159,7 @@ def test_an_unknown_kind_and_an_absent_file_are_told(tmp_path: Path) -> None:
 
 def test_a_run_folder_becomes_a_row_with_the_priors_time_beside(tmp_path: Path) -> None:
     (row,) = training_rows([write_run(tmp_path / "run")])
-    assert (row["case"], row["method"], row["setting"]) == ("room, 2 views", "yang4d + D2", "500 steps, seed 7")
+    assert (row["case"], row["method"], row["setting"]) == ("den, 2 views", "yang4d + D2", "500 steps, seed 7")
     assert (row["seconds"], row["prior_seconds"], row["gaussians"]) == (30.0, 60.0, 1234)
     assert row["error"] == pytest.approx(10 ** (-25 / 20))
     assert (row["device"], row["commit"]) == ("a CPU", "abc")
@@ -167,7 +169,10 @@ def test_a_run_without_held_out_cameras_or_circumstances_says_so(tmp_path: Path)
     write_run(tmp_path / "run", psnr=None, made=None, hooks=["prior", "densify"])
     (row,) = training_rows([tmp_path / "run"])
     assert (row["error"], row["failed"]) == (None, "no camera was held out")
-    assert row["commit"] == "not recorded by the run"
+    assert (row["device"], row["commit"]) == (None, None)
+    text = make_report([row], tmp_path / "report")[1].read_text()
+    command = "d2 train den --train-cameras a,b --backbone yang4d --iterations 500 --hooks prior,densify --seed 7"
+    assert f"`{command} --output run`, which recorded neither machine nor commit." in text
     assert row["method"] == "yang4d + densify"
 
 
@@ -176,8 +181,8 @@ def test_folders_of_runs_are_searched_and_a_picture_of_each_method_is_kept(tmp_p
         write_run(tmp_path / "runs" / name)
     write_run(tmp_path / "runs" / "bare", psnr=20.0, hooks=[])
     rows, pictures = collect([RUNS, tmp_path / "runs"])
-    assert sum(row["case"] == "room, 2 views" for row in rows) == 3
-    assert [picture.caption.split(":")[0] for picture in pictures] == ["room, yang4d", "room, yang4d + D2"]
+    assert sum(row["case"] == "den, 2 views" for row in rows) == 3
+    assert [picture.caption.split(":")[0] for picture in pictures] == ["den, yang4d", "den, yang4d + D2"]
     assert all(picture.uri.startswith("data:image/") for picture in pictures)
     page = make_report(rows, tmp_path / "report", pictures)[0].read_text()
     assert page.count("<img ") == 2
@@ -213,6 +218,20 @@ def test_the_front_is_what_nothing_beats_in_both() -> None:
     points = [(1, 5), (2, 3), (3, 4), (4, 1), (2, 3), (1, 6)]
     assert pareto_front(points) == [0, 1, 3]
     assert pareto_front([]) == []
+
+
+@given(st.lists(st.tuples(st.floats(0, 1e9), st.floats(0, 1e9)), max_size=30))
+def test_every_point_off_the_front_is_beaten_by_one_on_it_and_none_of_the_front_is(points: list) -> None:
+    front = [points[i] for i in pareto_front(points)]
+    assert all(any(x <= p[0] and y <= p[1] for x, y in front) for p in points)
+    assert not any(a != b and a[0] <= b[0] and a[1] <= b[1] for a in front for b in front)
+
+
+@given(st.lists(st.floats(1e-16, 1e16), min_size=1, max_size=8), st.booleans())
+def test_any_range_of_values_has_an_axis_with_its_ticks_inside(values: list[float], log: bool) -> None:
+    axis = Axis.around("x", values, log)
+    assert all(0 < axis.place(value) < 1 for value in values)
+    assert 1 <= len(axis.ticks()) <= 20
 
 
 def test_means_over_cases_are_geometric_and_failures_keep_a_setting_off_the_front() -> None:

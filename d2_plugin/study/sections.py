@@ -29,7 +29,13 @@ class Section:
 
 def sources_of(rows: Sequence[Row]) -> tuple[str, ...]:
     """One sentence per machine, commit and command that the rows come from."""
-    return tuple(dict.fromkeys(provenance(row) for row in rows))
+    return tuple(dict.fromkeys(_source(row) for row in rows))
+
+
+def _source(row: Row) -> str:
+    if row["device"] is None:
+        return f"`{row['command']}`, which recorded neither machine nor commit."
+    return provenance(row)
 
 
 def cases_of(rows: Sequence[Row]) -> dict[str, list[Row]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ def training_rows(folders: Sequence[Path]) -> list[Row]:
     """One row per run folder: seconds of training, those of the prior beside them, held-out scores.
 
     The error is the root mean square error of colour that the PSNR stands for. Device, versions and commit are those
-    that the run recorded; a run that recorded none says so in their place.
+    that the run recorded, None where it recorded none.
 
     Raises:
         D2Error: a folder without metrics.json.
@@ -47,7 +48,7 @@ def _row(folder: Path) -> Row:
         error=10 ** (-scores["psnr"] / 20) if scores.get("psnr") is not None else None,
         seconds=seconds["train"],
         failed=None if scores.get("psnr") is not None else "no camera was held out",
-        command=f"d2 train ... --output {folder.name}",
+        command=command_of(metrics, settings, folder.name),
         run=folder.name,
         prior_seconds=seconds["priors"],
         gaussians=metrics["gaussians"],
@@ -56,8 +57,24 @@ def _row(folder: Path) -> Row:
         mono_emulated=metrics.get("mono_emulated", False),
         scores=scores,
     )
-    unknown = dict.fromkeys(circumstances(), "not recorded by the run")
-    return found | (made or unknown)
+    return found | (made or dict.fromkeys(circumstances()))
+
+
+def command_of(metrics: dict[str, Any], settings: dict[str, Any], output: str) -> str:
+    """The `d2 train` of a run as far as its folder tells: names instead of paths, and what differs from the default."""
+    hooks = metrics["hooks"]
+    words = ["d2", "train", metrics["capture"], "--train-cameras", ",".join(metrics["train_cameras"])]
+    words += ["--backbone", metrics["backbone"], "--iterations", str(metrics["iterations"])]
+    words += ["--hooks", "all" if set(hooks) == set(HOOKS) else ",".join(hooks) or "none"]
+    words += ["--seed", str(settings.get("seed", 0))]
+    for name in ("downscale", "mono_kind"):
+        if settings.get(name) not in (None, 1):
+            words += [f"--{name.replace('_', '-')}", str(settings[name])]
+    if settings.get("mono_onnx"):
+        words += ["--mono-onnx", Path(settings["mono_onnx"]).name]
+    if settings.get("overrides"):
+        words += ["--config", "TABLES"]
+    return shlex.join([*words, "--output", output])
 
 
 def case_of(metrics: dict[str, Any]) -> str:

@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from splat_scenes import Scene, random_scene, single
 from test_native_slice import CONSTANTS, random_rows
 from tiny import make_model, make_views
@@ -127,6 +129,20 @@ def test_case_24_the_depth_loss_does_not_depend_on_the_unit_of_length(unit: floa
     everywhere = torch.ones(8, 9, dtype=torch.bool)
     here, there = (depth_loss(1.05 * prior * u, everywhere, prior * u, everywhere, 0.01).item() for u in (1.0, unit))
     assert there == pytest.approx(here, rel=1e-4)
+
+
+@given(
+    layers=st.lists(st.tuples(st.floats(1e-3, 1e6), st.floats(1e-6, 1)), min_size=1, max_size=20),
+    tau_v=st.floats(1e-3, 0.9),
+)
+def test_case_41_rendered_depth_lies_between_its_nearest_and_its_farthest_gaussian(layers: list, tau_v: float) -> None:
+    depths, weights = torch.tensor(layers, dtype=torch.float64).unbind(1)
+    weights = weights / max(weights.sum().item(), 1)  # A(p) <= 1
+    depth, valid = rendered_depth((weights * depths).sum()[None], weights.sum()[None], tau_v)
+    if valid:
+        assert depths.min() * (1 - 2 * EPSILON / tau_v) <= depth <= depths.max() * (1 + 1e-12)
+    else:
+        assert depth == 0
 
 
 # ---------------------------------------------------------------- order, sizes, pixels
