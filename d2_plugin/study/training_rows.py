@@ -42,8 +42,8 @@ def _row(folder: Path) -> Row:
     made = metrics.get("made")
     found = make_row(
         "training",
-        case_of(metrics),
-        method_of(metrics),
+        case_of(metrics, settings),
+        method_of(metrics) + (", own settings" if settings.get("overrides") else ""),
         f"{metrics['iterations']} steps" + (f", seed {settings['seed']}" if "seed" in settings else ""),
         error=10 ** (-scores["psnr"] / 20) if scores.get("psnr") is not None else None,
         seconds=seconds["train"],
@@ -77,9 +77,11 @@ def command_of(metrics: dict[str, Any], settings: dict[str, Any], output: str) -
     return shlex.join([*words, "--output", output])
 
 
-def case_of(metrics: dict[str, Any]) -> str:
-    """The capture and how many cameras trained."""
-    return f"{metrics['capture']}, {len(metrics['train_cameras'])} views"
+def case_of(metrics: dict[str, Any], settings: dict[str, Any]) -> str:
+    """The capture, how many cameras trained, and the size where it is not the capture's own."""
+    smaller = settings.get("downscale", 1)
+    size = f", 1/{smaller} size" if smaller > 1 else ""
+    return f"{metrics['capture']}, {len(metrics['train_cameras'])} views{size}"
 
 
 def method_of(metrics: dict[str, Any]) -> str:
