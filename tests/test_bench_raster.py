@@ -12,7 +12,7 @@ import torch
 from d2_plugin.errors import D2Error
 from d2_plugin.rasterizer import RasterSettings, reference
 from d2_plugin.study.bench_raster import bench_raster, exponent, main, parse_size
-from d2_plugin.study.raster_measure import Case, peak_memory
+from d2_plugin.study.raster_measure import THRESHOLDS, Case, peak_memory, threshold_errors
 from d2_plugin.study.raster_scenes import load_scene
 
 
@@ -66,7 +66,8 @@ def test_bench_writes_rows_table_and_plot(tmp_path):
     pytest.importorskip("matplotlib")
     sizes = ["--sizes", "24x16", "--seconds", "0", "--no-memory", "--output", str(tmp_path)]
     assert main(["--scenes", "synth:30", "synth:60", *sizes]) == 0
-    rows = [json.loads(line) for line in (tmp_path / "raster.jsonl").read_text().splitlines()]
+    every = [json.loads(line) for line in (tmp_path / "raster.jsonl").read_text().splitlines()]
+    rows = [row for row in every if "thresholds" not in row]
     assert [(row["method"], row["gaussians"]) for row in rows] == [
         *(("d2", 30), ("torch reference", 30)),
         *(("d2", 60), ("torch reference", 60)),
@@ -84,6 +85,14 @@ def test_bench_writes_rows_table_and_plot(tmp_path):
     assert "| d2 | synth:60 | 24x16 |" in table
     assert "N^" in table
     assert (tmp_path / "raster.svg").stat().st_size > 1000
+
+
+def test_lower_thresholds_are_nearer_to_the_image_without_any(tmp_path):
+    found = threshold_errors(load_scene("synth:400", 64, 36), torch.device("cpu"))
+    assert list(found) == list(THRESHOLDS)
+    by_alpha = [found[f"alpha {name}"] for name in ("1/64, T 1e-4", "1/255, T 1e-4 (default)", "1e-4, T 1e-5")]
+    assert by_alpha == sorted(by_alpha, reverse=True)
+    assert found["alpha 1e-5, T 1e-6"] < 1e-4 < found["alpha 1/64, T 1e-4"]
 
 
 def test_beyond_the_limit_the_error_is_left_out_not_guessed(tmp_path):

@@ -15,7 +15,18 @@ import torch
 from d2_plugin.errors import D2Error, MissingExtra, missing_extra
 
 from .provenance import provenance
-from .raster_measure import Case, error_of, exact, implementations, passes_of, peak_memory, timed
+from .raster_measure import (
+    THRESHOLDS,
+    Case,
+    error_of,
+    exact,
+    implementations,
+    passes_of,
+    peak_memory,
+    threshold_errors,
+    timed,
+    with_thresholds,
+)
 from .rows import append_rows, make_row
 
 logger = logging.getLogger(__name__)
@@ -51,7 +62,8 @@ def bench_raster(
         command: how this was started, for the captions.
 
     Returns:
-        One row per implementation, scene and size.
+        One row per implementation, scene and size; the file also has one per setting of the thresholds, where errors
+        are measured.
     """
     output.mkdir(parents=True, exist_ok=True)
     names = [*scenes, *(["garden"] if garden and "garden" not in scenes else [])]
@@ -61,6 +73,9 @@ def bench_raster(
     for case in cases:
         measured = _measure(case, torch.device(device), seconds, error_limit, memory, command)
         append_rows(output / "raster.jsonl", measured)
+        if measured[0]["errors"]:
+            found = _measure_thresholds(case, torch.device(device), seconds, command)
+            append_rows(output / "raster.jsonl", found)
         rows += measured
     (output / "raster.md").write_text(table(rows))
     try:
@@ -107,6 +122,25 @@ def _measure(
         )
         logger.info("%s, %s at %dx%d is measured", name, *case[:3])
     return rows
+
+
+def _measure_thresholds(case: Case, device: torch.device, seconds: float, command: str) -> list[dict[str, Any]]:
+    """What the thresholds of splatting cost in error and save in time, one row each, for `d2 report`."""
+    scene, where = case.load(), f"{case.scene} at {case.width}x{case.height}"
+    works = {name: passes_of(with_thresholds(name), scene, device)["forward+backward"] for name in THRESHOLDS}
+    times, errors = timed(works, device, seconds), threshold_errors(scene, device)
+    logger.info("thresholds on %s are measured", where)
+    return [
+        make_row(
+            *("raster", where, "d2", name),
+            error=error,
+            seconds=times[name]["median_ms"] / 1e3,
+            command=command,
+            device=device,
+            thresholds=name,
+        )
+        for name, error in errors.items()
+    ]
 
 
 def exponent(points: Sequence[tuple[float, float]]) -> float | None:

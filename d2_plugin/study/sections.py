@@ -119,13 +119,16 @@ _STEREO = ("completeness", "f1", "median", "wrong", "cpu")
 def raster(rows: Sequence[Row]) -> Section:
     """The rasterizer: deviation from float64 against milliseconds, one mark per scene and size."""
     error, time = "colour error against float64, p99.9", "forward + backward, ms"
-    drawn = [row for row in rows if row["error"] and row["seconds"]]
+    swept = [row for row in rows if "thresholds" in row]
+    plain = [row for row in rows if "thresholds" not in row]
+    drawn = [row for row in plain if row["error"] and row["seconds"]]
     series = [
         Series(name, tuple(_raster_point(row) for row in drawn if row["method"] == name), color=color)
         for name, color in colors_of(drawn).items()
     ]
     x = Axis.around(time, [point.x for each in series for point in each.points], log=True)
     y = Axis.around(error, [point.y for each in series for point in each.points], log=True)
+    thresholds = [work_precision(m, case, "colour error, p99.9", time, 1e3) for case, m in cases_of(swept).items()]
     header = ("method", "scene", "forward ms", "forward + backward ms", "survey ms", "peak MB", "colour p99.9")
     header += ("worst gradient",)
     return Section(
@@ -133,10 +136,15 @@ def raster(rows: Sequence[Row]) -> Section:
         "Rasterizer: time and precision",
         "Median wall time. The error is the 99.9th percentile of the colour's deviation (0..1) from the same image in "
         "float64; the worst gradient is the largest relative L2 deviation of any input's gradient, without the pixels "
-        "where rounding decided a threshold differently.",
-        {"raster": figure([Plot("Every scene and size", x, y, tuple(series))], "Rasterizer error against time")},
-        (("Every scene and size", Table(header, tuple(_raster_cells(row) for row in rows))),),
-        sources=sources_of(rows),
+        "where rounding decided a threshold differently. The thresholds (contributions below alpha are left out, a "
+        "pixel is finished at a transmittance T) are compared with an image that has next to none.",
+        {
+            "raster": figure([Plot("Every scene and size", x, y, tuple(series))], "Rasterizer error against time"),
+            "raster-thresholds": figure(thresholds, "Cost of the thresholds of splatting", columns=2, size=(480, 320)),
+        },
+        (("Every scene and size", Table(header, tuple(_raster_cells(row) for row in plain))),),
+        (("Thresholds, mean over scenes and sizes", means_table(swept, "colour p99.9", "ms", 1e3)),),
+        sources_of(rows),
     )
 
 

@@ -1,7 +1,7 @@
 """Plots as small SVG files, drawn here: crisp at any size, readable by a diff, light and dark, no plotting library.
 
-Text stays text, every mark carries its numbers as a tooltip, series differ by shape as well as by colour, and the
-colours follow the reader's light or dark setting. The colours are told apart by readers with colour deficiencies.
+Text stays text, every mark carries its numbers as a tooltip, series differ by shape as well as by colour, and colours
+follow the reader's light or dark setting.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import NamedTuple
 
-LIGHT = ("#2a78d6", "#eb6834", "#1baf7a", "#b07c00", "#d0589a", "#4a3aa7", "#e34948", "#008300")
+LIGHT = ("#2a78d6", "#eb6834", "#149a69", "#b07c00", "#d0589a", "#4a3aa7", "#e34948", "#008300")
 DARK = ("#5598e7", "#e0713f", "#2db584", "#d09a1d", "#d55181", "#9085e9", "#e66767", "#4aa84a")
 SHAPES = ("circle", "square", "diamond", "triangle", "cross", "wedge")
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
