@@ -20,16 +20,7 @@ from .keys import PriorKey
 
 
 def inria_view(camera: object, key: PriorKey, time: float, like: Tensor) -> View:
-    """The view of a camera object, on the device of `like`; `time` is in the trainer's unit.
-
-    Raises:
-        D2Error: an object without pose or intrinsics.
-    """
-    if not hasattr(camera, "world_view_transform"):
-        raise D2Error(
-            f"a camera of type {type(camera).__name__} has no world_view_transform: pass the trainer's own camera "
-            "object, or a d2_plugin View"
-        )
+    """The view of a camera object, on the device of `like`; `time` is in the trainer's unit."""
     width, height = int(camera.image_width), int(camera.image_height)
     pose = camera.world_view_transform.detach().T
     return View(

@@ -211,6 +211,13 @@ class GsplatAdapter:
             listener(index)
 
 
+def gsplat_view(
+    camera: str, frame: int, time: float, camtoworld: Tensor, K: Tensor, width: int, height: int
+) -> View:
+    """The view of one camera of gsplat's data sets: camtoworld [4, 4] or [1, 4, 4] in OpenCV axes, K likewise."""
+    return View(camera, frame, time, torch.linalg.inv(camtoworld.reshape(4, 4)), K.reshape(3, 3), width, height)
+
+
 def _first_occurrences(rows: Tensor) -> Tensor:
     """`rows` [N] with -1 for every repetition of a number: a clone starts anew, its original goes on."""
     order = torch.argsort(rows, stable=True)

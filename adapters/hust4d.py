@@ -90,8 +90,6 @@ class Hust4DAdapter(InriaAdapter):
 
     def _time(self, camera: object) -> float:
         """In 0..1 of the clip, unlike `timestamp` elsewhere."""
-        if isinstance(camera, dict):
-            raise D2Error("cameras of PanopticSports are dicts without a pose of their own: pass d2_plugin Views")
         return float(camera.time)
 
     def _default_key(self, camera: object) -> PriorKey:

@@ -12,6 +12,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -45,8 +46,9 @@ class RawRows(NamedTuple):
     rotation: Tensor  # [K, 4] identity
 
 
-class RenderedCamera(NamedTuple):
-    """A camera together with what the trainer has just rendered for it."""
+@dataclass(frozen=True)
+class RenderedCamera:
+    """A camera together with what the trainer has just rendered for it; no tuple, which would be read as a batch."""
 
     camera: object
     package: Mapping[str, Any]
@@ -81,9 +83,14 @@ class InriaAdapter(ABC):
         """The view of a camera object, of a `RenderedCamera` (see `rendered`), or a `View` as it is."""
         package = None
         if isinstance(camera, RenderedCamera):
-            camera, package = camera
+            camera, package = camera.camera, camera.package
         if isinstance(camera, View):
             return camera
+        if not hasattr(camera, "world_view_transform"):
+            raise D2Error(
+                f"a camera of type {type(camera).__name__} has no world_view_transform: pass the trainer's own camera "
+                "object, or a d2_plugin View"
+            )
         view = inria_view(camera, self._key_of(camera), self._time(camera), self.gaussians._xyz)
         if package is not None:
             self._rendered = (view, package)

@@ -9,13 +9,12 @@ from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from mimics import deformable3d, ex4dgs, fudan, hust4d, spacetime
 from mimics.inria import default_options
 from mimics.page import attached, changed_lines
-from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_views
+from mimics.workplace import HOOKS, furnish, some_points
 from torch import Tensor
 
 from d2_plugin import D2Config
@@ -25,10 +24,7 @@ from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
 from d2_plugin.adapters.inria import InriaAdapter
 from d2_plugin.adapters.spacetime import SpacetimeAdapter
-from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
-from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.store import PriorStore
-from d2_plugin.protocol import Backbone, Points
+from d2_plugin.protocol import Backbone
 from d2_plugin.rasterizer import rasterize
 from d2_plugin.registry import ADAPTERS, load
 
@@ -39,32 +35,12 @@ MIMICS: dict[str, ModuleType] = {
     "spacetime": spacetime,
     "ex4dgs": ex4dgs,
 }
-HOOKS = replace(
-    ALL_HOOKS,
-    densify=DensifyConfig(start=5, stop=95, every=10, budget_per_view=15),
-    prune=PruneConfig(start=5, stop=90, every=10, patience=2, tau_p=0.6),
-    depth_loss=DepthLossConfig(every=1, weight=0.2),
-)
-
-
-def write_prior(folder: Path) -> None:
-    """The exact prior of the tiny scene, as `d2 priors` would leave it."""
-    store = PriorStore.create(folder, ["cam0", "cam1", "cam2"], [0, 1], {"capture": "tiny"})
-    for view in make_views():
-        prior = TinyStore().prior(view.camera, view.frame)
-        camera = {"K": view.K.tolist(), "T_camera_world": view.T_camera_world.tolist()}
-        fused = FusedPrior(prior.depth.numpy(), prior.labels.numpy())
-        picture = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
-        store.write(view.camera, view.frame, fused, picture, {"camera": camera})
 
 
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a prior and a d2.toml, as the working directory of a trainer."""
-    write_prior(tmp_path / "prior")
-    (tmp_path / "d2.toml").write_text(replace(HOOKS, prior="prior").to_toml())
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+    return furnish(tmp_path, monkeypatch)
 
 
 def run(mimic: ModuleType, source: ModuleType | None = None, **options) -> SimpleNamespace:
@@ -199,13 +175,6 @@ def saved(first: SimpleNamespace) -> object:
     if hasattr(first, "deform"):
         return params, first.deform.deform.state_dict(), first.deform.optimizer.state_dict()
     return params
-
-
-def some_points(count: int) -> Points:
-    generator = torch.Generator().manual_seed(1)
-    positions = torch.rand(count, 3, generator=generator) + torch.tensor([-0.5, -0.5, 2.5])
-    ones = torch.ones(count)
-    return Points(positions, torch.rand(count, 3, generator=generator), ones / 2, ones / 10, ones / 2)
 
 
 def drawn(name: str) -> Iterator[tuple[InriaAdapter, object, dict[str, Tensor]]]:

@@ -14,7 +14,7 @@ PAGES = Path(__file__).resolve().parents[2] / "docs" / "attach"
 def added_lines(page: str) -> list[tuple[str, str, str]]:
     """(context before, added line, context after) of every line that the page's first diff adds; all stripped."""
     text = (PAGES / f"{page}.md").read_text()
-    lines = re.search(r"```diff\n(.*?)```", text, re.S)[1].splitlines()
+    lines = ["", *re.search(r"```diff\n(.*?)```", text, re.S)[1].splitlines(), ""]
     assert not [line for line in lines if line.startswith("-") and not line.startswith("---")], "lines are only added"
     found = []
     for i, line in enumerate(lines):

@@ -1,0 +1,364 @@
+"""The traps of the official repositories, one by one: names, fields of view, batches, stages, probes, boxes."""
+
+from __future__ import annotations
+
+import logging
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+from mimics import deformable3d, ex4dgs, fudan, hust4d, spacetime
+from mimics.inria import cameras_of, default_options
+from mimics.workplace import HOOKS, some_points
+from tiny import TinyStore, make_views
+from torch import Tensor
+
+from d2_plugin import D2Config, D2Error, D2Hooks
+from d2_plugin.adapters.cameras import intrinsics
+from d2_plugin.adapters.deformable3d import Deformable3DAdapter
+from d2_plugin.adapters.ex4dgs import Ex4DGSAdapter
+from d2_plugin.adapters.fudan import FudanAdapter
+from d2_plugin.adapters.hust4d import Hust4DAdapter
+from d2_plugin.adapters.keys import KeysByPose, PriorKey, frame_of_time, key_from_picture, one_picture_each
+from d2_plugin.adapters.probe import probe_package
+from d2_plugin.adapters.spacetime import SpacetimeAdapter
+from d2_plugin.config import DepthLossConfig
+from d2_plugin.protocol import Points, View
+from d2_plugin.rasterizer import rasterize
+
+DEPTH_ALONE = D2Config(depth_loss=DepthLossConfig(every=1))
+
+
+def fudan_model(**attributes: object):
+    """Gaussians large enough to cover the pictures."""
+    model, scene = fudan.make()
+    model._scaling.data += 1.0
+    vars(model).update(attributes)
+    model.training_setup(default_options())
+    return model, scene
+
+
+class TestNames:
+    @pytest.mark.parametrize(
+        ("picture", "key"),
+        [
+            ("cam01_0003", ("cam01", 3)),
+            ("/data/scene/images/cam01_0003.png", ("cam01", 3)),
+            ("/data/scene/cam01/images/0003.png", ("cam01", 3)),
+            ("scene/cam07/frame_00012.jpg", ("cam07", 12)),
+            ("a_b_12.png", ("a_b", 12)),
+            (r"C:\scene\cam02\images\0004.png", ("cam02", 4)),
+        ],
+    )
+    def test_pictures_tell_camera_and_frame(self, picture: str, key: tuple[str, int]) -> None:
+        assert key_from_picture(picture) == key
+
+    def test_a_name_without_a_camera_is_refused_with_the_way_out(self) -> None:
+        with pytest.raises(D2Error, match=r"picture '0003.png' does not say its camera.*function `key`"):
+            key_from_picture("0003.png")
+
+    def test_a_moving_camera_has_a_prior_for_each_picture(self) -> None:
+        assert one_picture_each(SimpleNamespace(image_name="r_014.png")) == ("r_014", 0)
+
+    def test_a_time_between_frames_is_refused(self) -> None:
+        assert frame_of_time(0.06, 50, first=10) == 13
+        with pytest.raises(D2Error, match=r"time 0.0333333 is frame 1.67 of 50"):
+            frame_of_time(1 / 30, 50)
+
+    def test_cameras_without_names_are_found_by_their_pose(self) -> None:
+        poses = {view.camera: view.T_camera_world for view in make_views() if view.frame == 0}
+        keys = KeysByPose(poses, lambda camera: round(2 * camera.timestamp))
+        camera = cameras_of(timestamp=lambda view: view.time)[5]
+        assert keys(camera) == ("cam2", 1)
+        camera.world_view_transform = camera.world_view_transform + 0.5
+        with pytest.raises(D2Error, match="stands at none of the known poses"):
+            keys(camera)
+
+    def test_the_index_that_hust_calls_a_name_leads_to_the_path(self) -> None:
+        model, scene = hust4d.make()
+        adapter = Hust4DAdapter(model, scene, "fine")
+        assert [(adapter.view(c).camera, adapter.view(c).frame) for c in scene.cameras] == [
+            (view.camera, view.frame) for view in make_views()
+        ]
+
+    def test_spacetime_and_ex4dgs_count_frames_by_time(self) -> None:
+        model, scene = spacetime.make()
+        assert SpacetimeAdapter(model, 2).view(scene.cameras[4]).frame == 1
+        model, scene = ex4dgs.make()
+        view = Ex4DGSAdapter(model, first_frame=100).view(scene.cameras[4])
+        assert (view.camera, view.frame) == ("cam1", 101)
+
+    def test_a_key_of_ones_own_goes_before_everything(self) -> None:
+        model, scene = fudan.make()
+        view = FudanAdapter(model, key=lambda camera: PriorKey("mine", 9)).view(scene.train_cameras[1.0][0])
+        assert (view.camera, view.frame) == ("mine", 9)
+
+
+class TestFieldsOfView:
+    def test_intrinsics_come_from_the_projection_even_off_centre(self) -> None:
+        view = make_views()[0]
+        K = view.K.clone()
+        K[0, 2], K[1, 2] = 14.5, 13.0
+        camera = cameras_of()[0]
+        moved = type(camera)(View("c", 0, 0.0, view.T_camera_world, K, 32, 24), torch.zeros(24, 32, 3), by_focal=True)
+        torch.testing.assert_close(intrinsics(moved, 32, 24).float(), K)
+
+    def test_without_a_projection_they_come_from_the_angles(self) -> None:
+        camera = cameras_of()[0]
+        camera.projection_matrix = None
+        torch.testing.assert_close(intrinsics(camera, 32, 24).float(), make_views()[0].K)
+        camera.FoVx = -1.0
+        with pytest.raises(D2Error, match="fields of view -1"):
+            intrinsics(camera, 32, 24)
+
+    def test_minus_one_is_corrected_where_a_hook_is_on_and_left_alone_where_none_is(self) -> None:
+        for config, corrected in ((D2Config(), False), (DEPTH_ALONE, True)):
+            model, scene = self.scene_with_focal_lengths()
+            D2Hooks(config, FudanAdapter(model, scene), TinyStore())
+            angle = 2 * math.atan(32 / (2 * 30.0)) if corrected else -1.0
+            assert [camera.FoVx for camera in scene.train_cameras[1.0]] == pytest.approx([angle] * 6)
+        model, scene = self.scene_with_focal_lengths()
+        D2Hooks(DEPTH_ALONE, FudanAdapter(model, scene, correct_fov=False), TinyStore())
+        assert scene.train_cameras[1.0][0].FoVx == -1
+
+    def test_minus_one_that_cannot_be_corrected_is_named_once(self, caplog: pytest.LogCaptureFixture) -> None:
+        model, scene = self.scene_with_focal_lengths()
+        adapter = FudanAdapter(model)
+        for camera in scene.train_cameras[1.0]:
+            adapter.view(camera)
+        assert caplog.text.count("has a field of view of -1") == 1
+
+    @staticmethod
+    def scene_with_focal_lengths():
+        model, scene = fudan.make()
+        for camera in scene.train_cameras[1.0]:
+            camera.FoVx = camera.FoVy = -1.0
+            camera.fl_x = camera.fl_y = 30.0
+        return model, scene
+
+
+class TestFudan:
+    def test_the_depth_loss_is_a_mean_over_the_batch_like_the_photometric_one(self) -> None:
+        """Line 2 before the division by batch_size: a batch of twice the same view has the gradient of one."""
+        gradients = []
+        for batch_size in (1, 2):
+            model, scene = fudan_model()
+            d2 = D2Hooks(DEPTH_ALONE, FudanAdapter(model, scene), TinyStore())
+            for _ in range(batch_size):
+                (0 * model._xyz.sum() + d2.loss(1, scene.train_cameras[1.0][0]) / batch_size).backward()
+            gradients.append(model._xyz.grad)
+        torch.testing.assert_close(gradients[0], gradients[1])
+        assert gradients[0].any()
+
+    @pytest.mark.parametrize("prefilter_var", [0.04, -1.0])
+    @pytest.mark.parametrize("rot_4d", [True, False])
+    def test_the_variants_of_the_temporal_marginal(self, rot_4d: bool, prefilter_var: float) -> None:
+        """F(t) = exp(-dt^2 / 2 v) with v + prefilter_var, where v is exp(_scaling_t) itself without rot_4d."""
+        model, _ = fudan_model(rot_4d=rot_4d, prefilter_var=prefilter_var)
+        view = make_views()[0]
+        splats = FudanAdapter(model).slice_at(view)
+        scale = model._scaling_t[:, 0].exp()
+        variance = (scale**2 if rot_4d else scale) + max(prefilter_var, 0)
+        marginal = torch.exp(-0.5 * (view.time - model._t[:, 0]) ** 2 / variance)
+        rows = torch.nonzero(marginal > 0.05).squeeze(1)
+        assert torch.equal(splats.rows, rows)
+        torch.testing.assert_close(splats.opacities, (model.get_opacity[:, 0] * marginal)[rows])
+
+    def test_prefiltering_changes_the_marginal_and_nothing_else(self) -> None:
+        model, _ = fudan_model()
+        with torch.no_grad():
+            model._rotation += 0.3 * torch.randn(60, 4, generator=torch.Generator().manual_seed(0))
+        view = make_views()[3]
+        plain = FudanAdapter(model).slice_at(view)
+        model.prefilter_var = 1e-12
+        filtered = FudanAdapter(model).slice_at(view)
+        assert torch.equal(plain.rows, filtered.rows)
+        torch.testing.assert_close(plain.means, filtered.means)
+        torch.testing.assert_close(plain.covariances, filtered.covariances, rtol=1e-4, atol=1e-6)
+
+    def test_three_dimensional_models_and_forks_without_a_prefilter(self) -> None:
+        model, _ = fudan_model(gaussian_dim=3)
+        assert len(FudanAdapter(model).slice_at(make_views()[0]).rows) == 60
+        model, _ = fudan_model()
+        del model.prefilter_var
+        assert len(FudanAdapter(model).slice_at(make_views()[0]).rows) > 0
+
+    def test_inserted_gaussians_live_around_their_frame(self) -> None:
+        model, _ = fudan_model()
+        points = some_points(3)._replace(times=torch.tensor([0.0, 0.25, 0.5]))
+        FudanAdapter(model).insert(points)
+        assert model._t[-3:, 0].tolist() == [0.0, 0.25, 0.5]
+        assert model._scaling_t[-1].item() == pytest.approx(0.5 * math.log(0.5 / 5))
+
+    def test_points_that_are_not_finite_are_never_inserted(self) -> None:
+        model, _ = fudan_model()
+        points = some_points(4)
+        points.positions[0, 0], points.scales[1], points.scales[2] = math.nan, math.inf, 0.0
+        assert FudanAdapter(model).insert(points) == 1
+
+
+class TestDeformations:
+    def test_before_the_warm_up_nothing_is_deformed(self) -> None:
+        model, deform, _ = deformable3d.make()
+        adapter = Deformable3DAdapter(model, deform, warm_up=30)
+        adapter.active(29)
+        assert torch.equal(adapter.slice_at(make_views()[0]).means, model._xyz)
+        adapter.active(30)
+        assert not torch.equal(adapter.slice_at(make_views()[0]).means, model._xyz)
+
+    def test_the_length_of_a_quaternion_scales_the_covariance(self) -> None:
+        model, deform, _ = deformable3d.make()
+        adapter = Deformable3DAdapter(model, deform, warm_up=0)
+        with torch.no_grad():
+            deform.deform.gaussian_rotation.weight.zero_()
+            deform.deform.gaussian_rotation.bias.copy_(torch.tensor([0.0, 5.0, 0, 0]))
+        covariances = adapter.slice_at(make_views()[0]).covariances
+        with torch.no_grad():
+            deform.deform.gaussian_rotation.bias.zero_()
+        normalised = adapter.slice_at(make_views()[0]).covariances
+        assert (covariances[:, 5] / normalised[:, 5]).median() > 2
+
+    @pytest.mark.parametrize("name", ["mlp", "hexplane"])
+    def test_inserted_gaussians_are_seen_where_they_were_asked_for(self, name: str) -> None:
+        """Points of two instants, each found at its own instant after the field has moved it."""
+        if name == "mlp":
+            model, deform, _ = deformable3d.make()
+            model.training_setup(default_options())
+            adapter = Deformable3DAdapter(model, deform, warm_up=0)
+        else:
+            model, scene = hust4d.make()
+            model.training_setup(default_options())
+            adapter = Hust4DAdapter(model, scene, "fine")
+        points = some_points(40)._replace(times=torch.tensor([0.0, 0.5]).repeat(20))
+        added = adapter.insert(points)
+        assert added == 40
+        assert adapter.inversion.accepted.float().mean() > 0.9
+        for view in (make_views()[0], make_views()[3]):
+            means = adapter.slice_at(view).means[-40:]
+            chosen = (points.times == view.time) & adapter.inversion.accepted
+            assert ((means - points.positions)[chosen].norm(dim=-1) <= 0.5 * points.scales[chosen] + 1e-6).all()
+
+    def test_points_outside_the_grid_of_4dgaussians_are_left_out(self) -> None:
+        model, scene = hust4d.make()
+        model.training_setup(default_options())
+        points = some_points(5)
+        points.positions[:2] += 100.0
+        assert Hust4DAdapter(model, scene, "fine").insert(points) == 3
+        assert len(model._deformation_table) == len(model._xyz) == 63
+
+    def test_the_coarse_stage_is_left_alone_unless_asked(self) -> None:
+        model, scene = hust4d.make()
+        model.training_setup(default_options())
+        d2 = D2Hooks(HOOKS, Hust4DAdapter(model, scene, "coarse"), TinyStore())
+        assert d2.loss(10, scene.cameras[:2]) == 0.0
+        assert d2.step(10).inserted == 0
+        eager = D2Hooks(HOOKS, Hust4DAdapter(model, scene, "coarse", active_stages=("coarse", "fine")), TinyStore())
+        assert isinstance(eager.loss(10, scene.cameras[:2]), Tensor)
+        with pytest.raises(D2Error, match="stage must be one of coarse, fine, got 'medium'"):
+            Hust4DAdapter(model, scene, "medium")
+
+
+class TestProbe:
+    def test_fudans_own_render_is_used_and_equals_ours(self, caplog: pytest.LogCaptureFixture) -> None:
+        model, scene = fudan_model()
+        adapter = FudanAdapter(model, scene)
+        d2 = D2Hooks(DEPTH_ALONE, adapter, TinyStore())
+        camera = scene.train_cameras[1.0][1]
+        with caplog.at_level(logging.INFO, logger="d2_plugin.adapters.inria"):
+            reused = d2.loss(1, adapter.rendered(camera, fudan.render(camera, model, [0, 0, 0])))
+        assert "the trainer's own render has depth and alpha with gradients" in caplog.text
+        assert adapter.probe.usable
+        torch.testing.assert_close(reused, d2.loss(2, camera))
+        reused.backward()
+        assert model._xyz.grad.any()
+
+    @pytest.mark.parametrize(
+        ("mend", "sentence"),
+        [
+            (lambda p: p.pop("alpha"), "has no alpha"),
+            (lambda p: p.update(depth=p["depth"].detach()), "has a depth without a gradient"),
+            (lambda p: p.update(depth=p["depth"] / p["alpha"].clamp_min(1e-6)), "is divided by alpha"),
+            (lambda p: p.update(depth=p["depth"] * 1.5), "is not the sum of w z"),
+            (lambda p: p.update(alpha=p["alpha"] * 0.8), "an alpha that is not the sum of the weights"),
+            (lambda p: p.update(depth=p["depth"][:, :5]), "a depth of shape"),
+        ],
+    )
+    def test_any_other_meaning_of_depth_leads_to_our_own_rasterizer(self, mend, sentence: str) -> None:
+        model, scene = fudan_model()
+        adapter = FudanAdapter(model, scene)
+        camera = scene.train_cameras[1.0][0]
+        package = fudan.render(camera, model, [0, 0, 0])
+        mend(package)
+        d2 = D2Hooks(DEPTH_ALONE, adapter, TinyStore())
+        torch.testing.assert_close(d2.loss(1, adapter.rendered(camera, package)), d2.loss(2, camera))
+        assert not adapter.probe.usable
+        assert sentence in adapter.probe.sentence
+
+    def test_a_render_of_nothing_is_judged_again_later(self) -> None:
+        model, scene = fudan_model()
+        camera = scene.train_cameras[1.0][0]
+        package = fudan.render(camera, model, [0, 0, 0])
+        splats = FudanAdapter(model).slice_at(FudanAdapter(model).view(camera))
+        own = rasterize(splats, torch.zeros(len(splats.means), 1), camera.drawn_view())
+        empty = own._replace(alpha=torch.zeros_like(own.alpha))
+        assert not probe_package(package, empty, (model._xyz, model._opacity)).final
+        assert probe_package(package, own, (model._xyz, model._opacity)).usable
+
+    def test_ex4dgs_says_acc_and_divides_so_ours_is_used(self) -> None:
+        model, scene = ex4dgs.make()
+        model._scaling.data += 1.0
+        model.training_setup(default_options())
+        adapter = Ex4DGSAdapter(model)
+        d2 = D2Hooks(DEPTH_ALONE, adapter, TinyStore())
+        d2.loss(1, adapter.rendered(scene.cameras[0], ex4dgs.render(scene.cameras[0], model, [0, 0, 0])))
+        assert "has no alpha" in adapter.probe.sentence
+
+
+class TestEx4DGS:
+    def test_static_rows_that_become_dynamic_are_followed(self) -> None:
+        model, _ = ex4dgs.make()
+        model.training_setup(default_options())
+        adapter, told = Ex4DGSAdapter(model), []
+        adapter.on_resize(told.append)
+        model.xyz_error_min_timestamp.zero_()
+        with torch.no_grad():
+            model._xyz_disp[:6] = 1.0
+            model.extract_dynamic_points_from_static()
+        assert len(told) == 1
+        assert told[0].tolist() == [*range(6, 60), *[-1] * 6]
+        adapter.insert(some_points(2))
+        assert told[1].tolist() == [*range(54), -1, -1, *range(54, 60)], "appended static rows land in the middle"
+        adapter.remove(torch.arange(62) >= 58)
+        assert told[2].tolist() == list(range(58))
+        assert len(model._xyz_motion) == 2
+
+    def test_inserted_rows_survive_the_next_prune(self) -> None:
+        """Two statistics are extended by its own callers by hand; without them the next prune_points fails."""
+        model, _ = ex4dgs.make()
+        model.training_setup(default_options())
+        adapter = Ex4DGSAdapter(model)
+        adapter.insert(some_points(3))
+        assert model.xyz_error_min[-3:].tolist() == [[1000.0]] * 3
+        assert model.min_radii2D[-3:].tolist() == [1000.0] * 3
+        with torch.no_grad():
+            model.prune_points(torch.arange(63) < 10, torch.empty(0))
+        assert len(adapter) == 53
+
+
+def test_another_codebase_than_the_adapters_is_refused() -> None:
+    with pytest.raises(D2Error, match="SimpleNamespace has no densification_postfix, which FudanAdapter needs"):
+        FudanAdapter(SimpleNamespace(_xyz=torch.zeros(3, 3)))
+    model, _ = fudan.make()
+    with pytest.raises(D2Error, match="a camera of type dict has no world_view_transform"):
+        FudanAdapter(model, key=lambda camera: PriorKey("a", 0)).view({})
+
+
+def test_points_inside_spacetime_have_its_own_start() -> None:
+    model, _ = spacetime.make()
+    model.training_setup(default_options())
+    SpacetimeAdapter(model, 2).insert(Points(*(value for value in some_points(2))))
+    assert model._trbf_center[-1].item() == 0.5
+    assert model._trbf_scale[-1].item() == pytest.approx(model.trbfslinit)
+    torch.testing.assert_close(model._features_dc[-2:, :3], some_points(2).colors)
+    torch.testing.assert_close(model._features_dc[-2:, 3:], some_points(2).colors)
