@@ -122,6 +122,14 @@ def test_multipleview_has_the_names_that_4dgaussians_makes_up(original: Capture,
     assert np.load(folder / "poses_bounds_multipleview.npy").shape == (2, 17)
 
 
+def test_a_colmap_model_is_of_one_instant(original: Capture, tmp_path: Path) -> None:
+    """4C4D refuses a model that registers more than one picture of a camera."""
+    folder = export_capture(original, "colmap", tmp_path / "scene")
+    registered = [image.name for image in read_model(folder / "sparse" / "0").images.values()]
+    assert registered == [f"{name}_{original.frames[0]:04d}.png" for name in original.cameras]
+    assert len(list((folder / "images").iterdir())) == len(original.cameras) * len(original.frames)
+
+
 def test_initial_points_are_those_given(original: Capture, tmp_path: Path) -> None:
     folder = export_capture(original, "colmap", tmp_path / "scene", cloud=CLOUD)
     points = read_points(folder / "sparse" / "0")

@@ -31,17 +31,17 @@ class _Picture(NamedTuple):
 
 
 def write_colmap(export: Export) -> Names:
-    """sparse/0/{cameras,images,points3D}.bin and images/CAMERA_FRAME.png; every frame is a picture of the model.
+    """sparse/0/{cameras,images,points3D}.bin and images/CAMERA_FRAME.png; names are kept.
 
-    Names are kept. COLMAP's models know no time: trainers that read them take every picture for an instant of its own,
-    unless they read the frame from the name, as 4C4D does.
+    COLMAP's models know no time, so the first frame alone is registered: a trainer of still scenes sees one instant,
+    and 4C4D gives further pictures of a camera (named camNN) that camera's pose, as `open_capture` does.
     """
     capture = export.capture
     export.write_pictures(lambda camera, frame: export.folder / "images" / f"{camera}_{frame:04d}.png")
+    first = capture.frames[0]
     pictures = [
-        _Picture(f"{name}_{frame:04d}.png", index + 1, camera)
+        _Picture(f"{name}_{first:04d}.png", index + 1, camera)
         for index, (name, camera) in enumerate(capture.cameras.items())
-        for frame in capture.frames
     ]
     _write_model(export.folder / "sparse" / "0", pictures, export.cloud)
     if export.cloud is not None:
