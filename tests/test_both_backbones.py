@@ -145,6 +145,9 @@ def test_all_hooks_off_is_bitwise_the_bare_trainer(backbone: str, temporal: bool
     bare.run()
     off.run()
     assert same(parameters(bare), parameters(off))
+    full = make_trainer(ALL_HOOKS, temporal=temporal, backbone=backbone)
+    full.run()
+    assert not same(parameters(bare), parameters(full)), "the hooks changed nothing: this test could not fail"
 
 
 @pytest.mark.parametrize("hooks", [True, False], ids=["all hooks", "no hooks"])
