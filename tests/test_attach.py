@@ -27,6 +27,7 @@ from d2_plugin.adapters.spacetime import SpacetimeAdapter
 from d2_plugin.protocol import Backbone
 from d2_plugin.rasterizer import rasterize
 from d2_plugin.registry import ADAPTERS, load
+from d2_plugin.testing import Example, check_backbone
 
 MIMICS: dict[str, ModuleType] = {
     "fudan": fudan,
@@ -155,6 +156,15 @@ class TestEveryRepository:
         assert isinstance(adapter, load(ADAPTERS, name))
         assert isinstance(adapter, Backbone)
 
+    def test_the_public_contract_holds(self, name: str) -> None:
+        def make() -> Example:
+            model, adapter, cameras, _ = next(iter(variants(name)))
+            model.training_setup(default_options())
+            model._scaling.data += 1.0
+            return Example(adapter(), cameras, optimizers=lambda: [model.optimizer], grow=partial(clone_some, model))
+
+        assert {"moments", "grow"} <= set(check_backbone(make))
+
     def test_attaching_again_takes_the_place_of_the_first(self, name: str) -> None:
         """Stages of one run attach to one model more than once."""
         adapter = next(iter(drawn(name)))[0]
@@ -223,6 +233,12 @@ def warm(model, deform) -> Deformable3DAdapter:
 def draw_deformed(model, deform, background: list[int], camera) -> dict[str, Tensor]:
     motion = deform.step(model.get_xyz, camera.fid.expand(len(model.get_xyz), 1))
     return deformable3d.render(camera, model, background, *motion, deform.deform.is_6dof)
+
+
+def clone_some(model) -> None:
+    """The repository's own growth."""
+    with torch.no_grad():
+        model.densify_and_clone((torch.arange(len(model._xyz)) % 3).float()[:, None], 1.5, 1e9)
 
 
 def jitter(model) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,7 @@ from d2_plugin.adapters.gsplat_dict import GsplatAdapter, gsplat_view
 from d2_plugin.protocol import Backbone
 from d2_plugin.rasterizer import rasterize
 from d2_plugin.registry import ADAPTERS, load
+from d2_plugin.testing import Example, check_backbone
 
 
 def snapshot(splats) -> dict[str, Tensor]:
@@ -145,6 +147,17 @@ def test_the_adapter_is_registered_and_satisfies_the_contract() -> None:
     adapter, _ = make_adapter()
     assert isinstance(adapter, load(ADAPTERS, "gsplat"))
     assert isinstance(adapter, Backbone)
+
+
+def test_the_public_contract_holds() -> None:
+    def make() -> Example:
+        adapter, (splats, optimizers, state) = make_adapter()
+        splats["scales"].data += 1.0
+        mask = torch.arange(60) % 3 == 0
+        grow = partial(gsplat.duplicate, splats, optimizers, state, mask)
+        return Example(adapter, make_views(), optimizers=list(optimizers.values()), grow=grow)
+
+    assert "moments" in check_backbone(make)
 
 
 def test_cameras_are_views_and_anything_else_is_refused() -> None:
