@@ -22,6 +22,7 @@ class Label(IntEnum):
     MONO = 1  # aligned monocular depth only: may propose a Gaussian, never judge one
     VERIFIED = 2  # geometric depth confirmed by aligned monocular depth (Omega^v)
     CONFLICT = 3  # the two sources disagree: discarded
+    AGREED = 4  # no geometric depth, but aligned monocular depths of two cameras agree: an addition to the paper
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,13 +90,18 @@ class DepthPrior(NamedTuple):
 
     @property
     def verified(self) -> Tensor:
-        """Omega^v: pixels that may prune and supervise, bool [H, W]."""
+        """Omega^v: pixels where geometric and monocular depth confirm each other, bool [H, W]."""
         return self.labels == Label.VERIFIED
 
     @property
+    def trusted(self) -> Tensor:
+        """Pixels that may prune and supervise, bool [H, W]: Omega^v, and what two cameras agree on."""
+        return self.verified | (self.labels == Label.AGREED)
+
+    @property
     def support(self) -> Tensor:
-        """Omega^p: pixels that have a depth at all (verified or mono-only), bool [H, W]."""
-        return (self.labels == Label.VERIFIED) | (self.labels == Label.MONO)
+        """Omega^p: pixels that have a depth at all (trusted or mono-only), bool [H, W]."""
+        return self.trusted | (self.labels == Label.MONO)
 
 
 class CameraRecord(NamedTuple):

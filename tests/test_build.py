@@ -86,23 +86,30 @@ def no_stereo(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sources, "geometric_depth", refuse)
 
 
-def errors_of(capture: Capture, store: PriorStore, label: Label) -> np.ndarray:
-    """Relative errors at frame 0 of all pixels that carry a label."""
+def errors_of(capture: Capture, store: PriorStore, *labels: Label) -> np.ndarray:
+    """Relative errors at frame 0 of all pixels that carry one of the labels."""
     found = []
     for camera in NAMES:
         truth, prior = capture.depth(camera, 0), store.prior(camera, 0)
-        mask = prior.labels.numpy() == label
+        mask = np.isin(prior.labels.numpy(), labels)
         found.append(np.abs(prior.depth.numpy() - truth)[mask] / truth[mask])
     return np.concatenate(found)
 
 
 def test_verified_pixels_are_right_and_mono_only_ones_roughly(plain: Capture, built: tuple) -> None:
     store = PriorStore.open(built[0])
-    verified, mono = errors_of(plain, store, Label.VERIFIED), errors_of(plain, store, Label.MONO)
+    verified, mono = errors_of(plain, store, Label.VERIFIED), errors_of(plain, store, Label.MONO, Label.AGREED)
     assert verified.size > 0.1 * 3 * 160 * 90
     assert np.median(verified) < 0.006
     assert (verified > 0.05).mean() < 0.01
     assert np.median(mono) < 0.08
+
+
+def test_where_two_cameras_agree_monocular_depth_is_better_than_where_they_do_not(plain: Capture, built: tuple) -> None:
+    store = PriorStore.open(built[0])
+    agreed, alone = errors_of(plain, store, Label.AGREED), errors_of(plain, store, Label.MONO)
+    assert agreed.size > 0.02 * 3 * 160 * 90
+    assert np.median(agreed) < 0.5 * np.median(alone)
 
 
 def test_the_summary_tells_shares_per_camera(built: tuple) -> None:
@@ -179,9 +186,7 @@ def test_a_changed_picture_rebuilds_its_timestamp_and_no_other(capture: Capture,
     assert (summary.built, summary.kept) == (3, 3)
 
 
-def test_a_damaged_prior_is_rebuilt_and_named(
-    plain: Capture, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_damaged_prior_is_rebuilt_and_named(plain: Capture, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     build_priors(plain, NAMES, tmp_path, SETTINGS)
     intact = contents(tmp_path)
     file = tmp_path / "priors" / "train2" / "00001.npy"
@@ -295,14 +300,12 @@ def test_the_papers_plain_construction_is_a_preset_and_less_exact(plain: Capture
     conflict, less = (np.mean([share["conflict"] for share in s.shares.values()]) for s in (summary, built[1]))
     assert conflict > less
     plain_error, corrected = (
-        np.median(errors_of(plain, PriorStore.open(path), Label.MONO)) for path in (tmp_path, built[0])
+        np.median(errors_of(plain, PriorStore.open(path), Label.MONO, Label.AGREED)) for path in (tmp_path, built[0])
     )
     assert corrected < 0.9 * plain_error
 
 
-def test_a_network_is_asked_once_per_picture(
-    plain: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_network_is_asked_once_per_picture(plain: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("onnxruntime")
     from d2_plugin.priors.monocular import MonocularModel
 

@@ -61,7 +61,7 @@ class PriorLoader:
         if prior is None:
             return None
         if key not in self._pixels:
-            index = torch.nonzero(prior.verified.flatten()).squeeze(1)
+            index = torch.nonzero(prior.trusted.flatten()).squeeze(1)
             self._pixels[key] = VerifiedPixels(index, prior.depth.flatten()[index])
         pixels = self._pixels[key]
         return pixels if len(pixels.index) else None

@@ -14,6 +14,7 @@ import numpy as np
 
 from d2_plugin.captures.capture import Capture
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.priors.agree import with_agreement
 from d2_plugin.priors.align import Alignment, align, aligned_depth, not_aligned
 from d2_plugin.priors.correct import corrected_depth
 from d2_plugin.priors.fuse import VARIANTS, FusedPrior, empty_prior, fuse, hanging_pixels
@@ -35,7 +36,10 @@ from d2_plugin.priors.store import PriorStore
 
 __all__ = ["PriorSettings", "PriorSummary", "build_priors"]
 
-FUSION_VERSION = 2  # raise it when alignment or fusion change what they return
+FUSION_VERSION = 3  # raise it when alignment or fusion change what they return
+
+SHOWN = {"verified": "verified", "agreed": "agreed", "mono only": "mono", "conflict": "conflict", "empty": "empty"}
+"""Columns of the summary, and the share each shows."""
 
 NO_GEOMETRY = "no geometric depth survived the filter"
 NO_MAP = "there is no monocular map of this frame"
@@ -82,10 +86,13 @@ class PriorSummary:
         self.notes += [note for note in part.notes if note not in self.notes]
 
     def __str__(self) -> str:
-        lines = [f"{self.built} priors built, {self.kept} kept", f"{'camera':12}verified  mono only  conflict   empty"]
+        lines = [
+            f"{self.built} priors built, {self.kept} kept",
+            f"{'camera':12}" + "  ".join(f"{name:>9}" for name in SHOWN),
+        ]
         for camera, share in self.shares.items():
-            values = (share[name] for name in ("verified", "mono", "conflict", "empty"))
-            lines.append(f"{camera:12}" + "  ".join(f"{value:8.1%}" for value in values))
+            values = (share[label] for label in SHOWN.values())
+            lines.append(f"{camera:12}" + "  ".join(f"{value:9.1%}" for value in values))
         reasons = Counter(reason for _, _, reason in self.refused)
         for reason, count in reasons.most_common():
             examples = [f"{camera}/{frame}" for camera, frame, why in self.refused if why == reason][:3]
@@ -187,12 +194,32 @@ class _Builder:
         frame = self.read(number)
         keys = {name: self._key(name, frame) for name in self.names}
         missing = [name for name in self.names if not self.store.is_current(name, number, keys[name])]
-        geometric = self.geometric.depths(frame) if self.geometric is not None and missing else {}
+        priors = self._priors(frame, missing)
         for name in self.names:
             if name in missing:
-                prior, record = self._prior(name, frame, geometric.get(name))
-                self.store.write(name, number, prior, frame.images[name], {**record, "key": keys[name]})
+                prior, record = priors[name]
+                record |= {"shares": prior.shares(), "key": keys[name]}
+                self.store.write(name, number, prior, frame.images[name], record)
             yield name, self.store.record(name, number), name in missing
+
+    def _priors(self, frame: Frame, missing: Sequence[str]) -> dict[str, tuple[FusedPrior, dict[str, Any]]]:
+        """D* and record of the `missing` cameras of one frame; cameras that must agree need each other's."""
+        if not missing:
+            return {}
+        geometric = self.geometric.depths(frame) if self.geometric is not None else {}
+        names = self.names if self._agrees else missing
+        made = {name: self._prior(name, frame, geometric.get(name)) for name in names}
+        if self._agrees:
+            fused = {name: prior for name, (prior, _) in made.items()}
+            agreed = with_agreement(
+                fused, dict(zip(self.names, self.cameras, strict=True)), self.settings.agreement, self.settings.tau_c
+            )
+            made = {name: (agreed[name], record) for name, (_, record) in made.items()}
+        return made
+
+    @property
+    def _agrees(self) -> bool:
+        return self.settings.agreement > 0 and self.variant == "dual" and len(self.names) > 1
 
     def _key(self, name: str, frame: Frame) -> str:
         return hash_of(
@@ -204,6 +231,7 @@ class _Builder:
             asdict(self.settings.align),
             None if self.geometric is None else self.geometric.key(frame),
             None if self.mono is None else self.mono.key(name, frame),
+            [self.settings.agreement, *(self.mono.key(other, frame) for other in self.names)] if self._agrees else None,
         )
 
     def _prior(self, name: str, frame: Frame, stereo: StoredDepth | None) -> tuple[FusedPrior, dict[str, Any]]:
@@ -215,7 +243,6 @@ class _Builder:
         prior = empty_prior(shape) if refused else fused
         record = {
             "refused": refused,
-            "shares": prior.shares(),
             "variant": self.variant,
             "alignment": None if alignment is None else alignment.as_json(),
             "monocular": None if self.mono is None else self.mono.about,
@@ -227,9 +254,7 @@ class _Builder:
         }
         return prior, record
 
-    def _aligned(
-        self, name: str, frame: Frame, geometric: np.ndarray
-    ) -> tuple[Alignment | None, np.ndarray, str]:
+    def _aligned(self, name: str, frame: Frame, geometric: np.ndarray) -> tuple[Alignment | None, np.ndarray, str]:
         """The alignment, aligned monocular depth [H, W], and why the view is refused (empty where it is not)."""
         nothing = np.zeros_like(geometric)
         if self.mono is None:

@@ -155,6 +155,9 @@ class PriorSettings:
     hanging_limit: float = 0.08
     """Mono-only pixels are left empty where monocular depth spans more than this share within 1 % of the picture's
     width: they hang between two surfaces. 0 keeps them, as the paper does."""
+    agreement: float = 0.02
+    """Mono-only pixels whose depth another camera's confirms within this share may prune and supervise as well (`dual`
+    alone); 0 leaves that out, as the paper does. Measured: see `d2_plugin.priors.agree`."""
     depth_range: tuple[float, float] | None = None
     """Near and far of the stereo search, world units; by default from sparse points, the data set, or the baselines."""
     mono_onnx: str | None = None
@@ -172,9 +175,10 @@ class PriorSettings:
 
     @classmethod
     def paper(cls, **changes: Any) -> PriorSettings:
-        """The paper's construction and nothing else: absolute residuals, one scale and shift, blurred edges kept."""
+        """The paper's construction and nothing else: absolute residuals, one scale and shift, blurred edges kept,
+        each camera for itself."""
         align = AlignSettings(residual="absolute", epsilon=0.01, local_scales=())
-        return cls(hanging_limit=0.0, align=align, **changes)
+        return cls(hanging_limit=0.0, agreement=0.0, align=align, **changes)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> PriorSettings:

@@ -18,6 +18,7 @@ LABEL_COLORS = {
     Label.MONO: (70, 110, 200),
     Label.VERIFIED: (80, 190, 90),
     Label.CONFLICT: (210, 70, 60),
+    Label.AGREED: (60, 190, 200),
 }
 """RGB of each label in the sheet."""
 
@@ -74,7 +75,7 @@ def depth_colors(depth: np.ndarray) -> np.ndarray:
 
 
 def label_colors(labels: np.ndarray) -> np.ndarray:
-    """RGB uint8 [H, W, 3]: grey empty, blue mono-only, green verified, red conflict."""
+    """RGB uint8 [H, W, 3]: grey empty, blue mono-only, green verified, red conflict, cyan agreed."""
     palette = np.array([LABEL_COLORS[label] for label in Label], np.uint8)
     return palette[labels]
 

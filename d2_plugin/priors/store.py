@@ -190,6 +190,7 @@ def _check(prior: FusedPrior, what: str) -> None:
         raise D2Error(f"{what} has {int(bad.sum())} depths that are NaN, infinite or negative: use 0 for unknown depth")
     if labels.max(initial=0) > max(Label):
         raise D2Error(f"{what} has label {int(labels.max())}: labels are 0 to {int(max(Label))}")
-    supported = (labels == Label.MONO) | (labels == Label.VERIFIED)
+    supported = np.isin(labels, (Label.MONO, Label.VERIFIED, Label.AGREED))
     if not np.array_equal(supported, depth > 0):
-        raise D2Error(f"{what} has labels that contradict its depth: exactly mono and verified pixels have a depth")
+        known = "mono-only, verified and agreed"
+        raise D2Error(f"{what} has labels that contradict its depth: exactly {known} pixels have a depth")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -55,11 +54,12 @@ def survey(splats: Splats, view: View, prior: DepthPrior, settings: RasterSettin
 
 
 def _verified(labels: Tensor) -> Tensor:
-    """`DepthPrior.verified`; by numpy on the CPU, since torch would wake its own threads for a microsecond of work and
+    """`DepthPrior.trusted`; by numpy on the CPU, since torch would wake its own threads for a microsecond of work and
     wait for them, which takes milliseconds where the cores are busy."""
     if labels.device.type == "cpu":
-        return torch.from_numpy(np.equal(labels.numpy(), Label.VERIFIED))
-    return labels == Label.VERIFIED
+        codes = labels.numpy()
+        return torch.from_numpy((codes == Label.VERIFIED) | (codes == Label.AGREED))
+    return (labels == Label.VERIFIED) | (labels == Label.AGREED)
 
 
 def _constants(settings: RasterSettings) -> list[float]:

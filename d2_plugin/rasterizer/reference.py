@@ -92,7 +92,7 @@ def survey(splats: Splats, view: View, prior: DepthPrior, settings: RasterSettin
     weight, error, max_weight = (empty(len(splats.means)) for _ in range(3))
     hits = torch.zeros(len(splats.means), dtype=torch.int32, device=kept.device)
     depth_sum, alpha = empty(view.height, view.width), empty(view.height, view.width)
-    verified = prior.verified & torch.isfinite(prior.depth) & (prior.depth > 0)
+    verified = prior.trusted & torch.isfinite(prior.depth) & (prior.depth > 0)
     truth = torch.where(verified, prior.depth, 1).to(screen.depths)
     for y in range(0, view.height, TILE):
         for x in range(0, view.width, TILE):
