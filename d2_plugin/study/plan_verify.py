@@ -24,7 +24,7 @@ from d2_plugin.captures.presets import resolve_cameras
 from .memory import Measured, in_fresh_process
 from .page import markdown_table
 from .rows import Row, append_rows, make_row
-from .sections import plan as plan_section
+from .sections_limits import plan as plan_section
 from .settings import HOOK_NAMES, RunSettings, Scene, check
 
 USED, LEFT_OUT = "used", "left out"

@@ -12,11 +12,15 @@ from d2_plugin.errors import D2Error
 from .page import Picture, html, markdown
 from .report import read_metrics
 from .rows import KINDS, Row, read_rows
-from .sections import SECTIONS, Section
+from .sections import Section
+from .sections_limits import plan, scaling, stability
+from .sections_precision import alignment, raster, stereo
 from .sections_training import ablation, training
 from .training_rows import method_of, picture_of, training_rows
 
-BUILDERS: dict[str, Callable[[Sequence[Row]], Section]] = {"training": training, "ablation": ablation, **SECTIONS}
+BUILDERS: dict[str, Callable[[Sequence[Row]], Section]] = {
+    build.__name__: build for build in (training, ablation, alignment, stereo, raster, stability, plan, scaling)
+}
 """What makes a section of the rows of a kind, in the order of the page."""
 
 LEAD = (
