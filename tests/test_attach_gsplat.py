@@ -45,6 +45,7 @@ def make_adapter() -> tuple[GsplatAdapter, tuple]:
     sum((p * 0).sum() for p in splats.values()).backward()
     for optimizer in optimizers.values():
         optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
     return GsplatAdapter(splats, optimizers, state), (splats, optimizers, state)
 
 
