@@ -8,7 +8,7 @@ from math import inf
 from .rows import Row
 from .sections import Section, cases_of, distinct, sources_of
 from .svg import Axis, Plot, Point, Series, figure, number
-from .work_precision import SMALLEST, Table, colors_of, means, means_table, shown, work_precision
+from .work_precision import SMALLEST, Mean, Table, colors_of, means, means_table, shown, work_precision
 
 ALIGNED_ANCHORS = 20_000
 """Number of anchors that is plotted, or the nearest one that was measured."""
@@ -42,18 +42,24 @@ def _alignment_table(shares: Mapping[float, Sequence[Row]]) -> Table:
     """Per setting: depth error at each share, worst gap, milliseconds, refusals; the least depth errors stand out."""
     every = [row for mine in shares.values() for row in mine]
     header = ("method", "setting", *(f"{share:.0%} wrong" for share in shares), "worst gap", "ms", "refused")
-    lines: list[tuple[str, ...]] = []
-    errors: list[list[float]] = []
-    for mean in means(every):
-        of = lambda mine, m=mean: [r for r in mine if (r["method"], r["setting"]) == (m.method, m.setting)]  # noqa: E731
-        found = [[row["depth_error"] for row in of(mine) if not row["failed"]] for mine in shares.values()]
-        errors.append([max(each, default=inf) for each in found])
-        cells = (shown(value if value < inf else None) for value in errors[-1])
-        seconds = mean.seconds and mean.seconds * 1e3
-        lines.append((mean.method, mean.setting, *cells, shown(mean.worst), shown(seconds), str(mean.failures or "-")))
+    found = means(every)
+    errors = [[_worst_depth_error(mine, mean) for mine in shares.values()] for mean in found]
+    lines = [
+        (
+            *(mean.method, mean.setting, *(shown(error if error < inf else None) for error in mine)),
+            *(shown(mean.worst), shown(mean.seconds and mean.seconds * 1e3), str(mean.failures or "-")),
+        )
+        for mean, mine in zip(found, errors)
+    ]
     columns = range(len(shares))
     best = {(min(range(len(lines)), key=lambda i: errors[i][column]), column + 2) for column in columns}
     return Table(header, tuple(lines), frozenset(best))
+
+
+def _worst_depth_error(rows: Sequence[Row], of: Mean) -> float:
+    """The largest depth error of one setting; infinite where all its fits were refused."""
+    mine = (row for row in rows if (row["method"], row["setting"]) == (of.method, of.setting) and not row["failed"])
+    return max((row["depth_error"] for row in mine), default=inf)
 
 
 def stereo(rows: Sequence[Row]) -> Section:
