@@ -35,7 +35,7 @@ class Hust4DAdapter(InriaAdapter):
         gaussians: the model, after `training_setup`.
         scene: its `Scene`; `image_name` and `uid` of a camera are only its place in the data set
             (scene/dataset.py:39), so the picture's path, which says camera and frame, comes from
-            `scene.train_camera.dataset.image_paths`.
+            `scene.train_camera.dataset`.
         stage: "coarse" or "fine", the variable of that name in `scene_reconstruction`.
         active_stages: the stages in which hooks run. The coarse one fits one still scene to all instants, which the
             prior of a moving surface contradicts, so it is left alone by default.
@@ -60,7 +60,7 @@ class Hust4DAdapter(InriaAdapter):
         super().__init__(gaussians, settings, key)
         self.stage, self.active_stages = stage, active_stages
         self.inversion: Inversion | None = None
-        self._paths = getattr(getattr(getattr(scene, "train_camera", None), "dataset", None), "image_paths", None)
+        self._dataset = getattr(getattr(scene, "train_camera", None), "dataset", None)
 
     def active(self, step: int) -> bool:
         """Whether hooks run in this stage."""
@@ -93,9 +93,11 @@ class Hust4DAdapter(InriaAdapter):
         return float(camera.time)
 
     def _default_key(self, camera: object) -> PriorKey:
-        if self._paths is None:
+        if self._dataset is None:
             return key_from_picture(str(camera.image_name))
-        return key_from_picture(str(self._paths[int(camera.uid)]))
+        paths = getattr(self._dataset, "image_paths", None)
+        index = int(camera.uid)  # data sets of Blender and COLMAP are lists of CameraInfo instead
+        return key_from_picture(str(paths[index] if paths is not None else self._dataset[index].image_path))
 
     def _append(self, points: Points) -> None:
         """Canonical Gaussians that the field moves onto the points; those outside its grid are left out.

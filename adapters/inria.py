@@ -74,6 +74,7 @@ class InriaAdapter(ABC):
         self._listeners: list[ResizeListener] = []
         self._rendered: tuple[View, Mapping[str, Any]] | None = None
         self._overridden: dict[str, object] = {}
+        self._said: set[str] = set()
         self._attach()
 
     def __len__(self) -> int:
@@ -133,6 +134,7 @@ class InriaAdapter(ABC):
         """Depth sum and alpha [H, W] of the package that came with this view, or None; hands it out once."""
         rendered, self._rendered = self._rendered, None
         if rendered is None or rendered[0] is not view:
+            self._say_once("no render of the trainer was passed along: D2 renders depth with its own rasterizer")
             return None
         package = rendered[1]
         if self.probe is None or not self.probe.final:
@@ -140,6 +142,11 @@ class InriaAdapter(ABC):
         if not self.probe.usable:
             return None
         return package["depth"].reshape(view.height, view.width), package["alpha"].reshape(view.height, view.width)
+
+    def _say_once(self, sentence: str) -> None:
+        if sentence not in self._said:
+            self._said.add(sentence)
+            log.info("%s", sentence)
 
     def detach(self) -> None:
         """Give the instance its own methods back; another adapter of the same instance does this to the one before."""
@@ -245,5 +252,5 @@ class InriaAdapter(ABC):
             splats = self.slice_at(view)
             own = rasterize(splats, splats.means.new_zeros(len(splats.means), 1), view, self.settings)
         probe = probe_package(package, own, (self.gaussians._xyz, self.gaussians._opacity))
-        log.info("%s", probe.sentence)
+        self._say_once(probe.sentence)
         return probe

@@ -82,6 +82,10 @@ class TestNames:
             (view.camera, view.frame) for view in make_views()
         ]
 
+        infos = [SimpleNamespace(image_path=path) for path in scene.train_camera.dataset.image_paths]
+        listed = SimpleNamespace(train_camera=SimpleNamespace(dataset=infos))
+        assert Hust4DAdapter(model, listed, "fine").view(scene.cameras[4]).camera == "cam1"
+
     def test_spacetime_and_ex4dgs_count_frames_by_time(self) -> None:
         model, scene = spacetime.make()
         assert SpacetimeAdapter(model, 2).view(scene.cameras[4]).frame == 1
@@ -260,6 +264,14 @@ class TestDeformations:
 
 
 class TestProbe:
+    def test_without_a_package_one_sentence_says_who_renders(self, caplog: pytest.LogCaptureFixture) -> None:
+        model, scene = fudan_model()
+        d2 = D2Hooks(DEPTH_ALONE, FudanAdapter(model, scene), TinyStore())
+        with caplog.at_level(logging.INFO, logger="d2_plugin.adapters.inria"):
+            for step in (1, 2):
+                d2.loss(step, scene.train_cameras[1.0][0])
+        assert caplog.text.count("no render of the trainer was passed along") == 1
+
     def test_fudans_own_render_is_used_and_equals_ours(self, caplog: pytest.LogCaptureFixture) -> None:
         model, scene = fudan_model()
         adapter = FudanAdapter(model, scene)

@@ -54,6 +54,15 @@ def test_a_world_of_another_scale_is_refused_with_both_positions() -> None:
         load_all(scaled)
 
 
+def test_a_pose_that_is_sloppily_orthonormal_is_no_other_pose() -> None:
+    def sloppy(view: View) -> View:
+        pose = view.T_camera_world.clone()
+        pose[0, 0] += 2e-4 * (view.camera == "cam1")
+        return replace(view, T_camera_world=pose)
+
+    load_all(sloppy)
+
+
 def test_swapped_camera_names_are_refused() -> None:
     names = {"cam0": "cam0", "cam1": "cam2", "cam2": "cam1"}
     with pytest.raises(D2Error, match="the key names another camera"):

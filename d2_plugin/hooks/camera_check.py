@@ -72,8 +72,7 @@ class CameraCheck:
     def _check_pose(self, view: View, here: Tensor, built: Tensor, slack: float) -> None:
         """Compare poses [4, 4] relative to the first view's; `slack` is a distance."""
         first = self._first[0]
-        turned = here[:3, :3] @ built[:3, :3].T
-        angle = math.degrees(math.acos(max(-1.0, min(1.0, float((turned.diagonal().sum() - 1) / 2)))))
+        angle = _angle(here[:3, :3] @ built[:3, :3].T)
         centres = _centre(here), _centre(built)
         if angle > ANGLE_TOLERANCE or float((centres[0] - centres[1]).norm()) > slack:
             raise D2Error(
@@ -86,6 +85,12 @@ class CameraCheck:
 def _relative(pose: Tensor, first: Tensor) -> Tensor:
     """From the first camera's axes to this camera's; no rigid motion of the world changes it."""
     return pose @ torch.linalg.inv(first)
+
+
+def _angle(rotation: Tensor) -> float:
+    """Degrees; by its skew part, since the cosine alone turns an orthonormality of 1e-4 into half a degree."""
+    sine = float((rotation - rotation.T).norm()) / (2 * math.sqrt(2))
+    return math.degrees(math.atan2(sine, float((rotation.diagonal().sum() - 1) / 2)))
 
 
 def _centre(pose: Tensor) -> Tensor:
