@@ -168,9 +168,10 @@ def test_mistakes_are_one_sentence(original: Capture, tmp_path: Path) -> None:
         export_capture(original, "colmap", tmp_path / "full")
 
 
-def test_the_command_writes_points_and_says_where(shared_data, tmp_path: Path) -> None:
+def test_the_command_writes_points_and_says_where(shared_data, tmp_path: Path, capsys) -> None:
     command = f"{shared_data('studio')} --format transforms --output {tmp_path / 'scene'} --train-cameras 00,02"
     main([*command.split(), "--test-cameras", "01", "--frames", "0:1", "--downscale", "4", "--points", "50"])
+    assert f"in {tmp_path / 'scene'} (transforms)" in capsys.readouterr().out
     content = json.loads((tmp_path / "scene" / "export.json").read_text())
     assert (list(content["cameras"]), content["test_cameras"]) == (["00", "02", "01"], ["01"])
     header = (tmp_path / "scene" / "points3d.ply").read_bytes().split(b"end_header")[0].decode()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import logging
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,8 +14,6 @@ from d2_plugin.captures.export import export_capture
 from d2_plugin.captures.ply import PointCloud
 
 from .scene import MIN_POINTS, initial_points, scene_extent, triangulated_points
-
-log = logging.getLogger(__name__)
 
 FORMATS = ("transforms", "n3dv", "multipleview", "colmap")
 
@@ -28,7 +26,10 @@ def main(arguments: Sequence[str]) -> None:
     capture = select_cameras(capture, [*train, *(name for name in options.test_cameras if name not in train)])
     cloud = start_cloud(capture, train, options.points, options.seed) if options.points > 0 else None
     export_capture(capture, options.format, options.output, test_cameras=options.test_cameras, cloud=cloud)
-    log.info("%s written for %s", options.output, ", ".join(capture.cameras))
+    points = "no initial points" if cloud is None else f"{len(cloud.positions)} initial points"
+    sys.stdout.write(
+        f"{len(capture.cameras)} cameras, {len(capture.frames)} frames, {points} in {options.output} ({options.format})\n"
+    )
 
 
 def start_cloud(capture: Capture, cameras: Sequence[str], minimum: int = MIN_POINTS, seed: int = 0) -> PointCloud:
