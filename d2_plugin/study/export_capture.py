@@ -26,10 +26,9 @@ def main(arguments: Sequence[str]) -> None:
     capture = select_cameras(capture, [*train, *(name for name in options.test_cameras if name not in train)])
     cloud = start_cloud(capture, train, options.points, options.seed) if options.points > 0 else None
     export_capture(capture, options.format, options.output, test_cameras=options.test_cameras, cloud=cloud)
-    points = "no initial points" if cloud is None else f"{len(cloud.positions)} initial points"
-    sys.stdout.write(
-        f"{len(capture.cameras)} cameras, {len(capture.frames)} frames, {points} in {options.output} ({options.format})\n"
-    )
+    points = "no" if cloud is None else len(cloud.positions)
+    written = f"{len(capture.cameras)} cameras, {len(capture.frames)} frames, {points} initial points"
+    sys.stdout.write(f"{written} in {options.output} ({options.format})\n")
 
 
 def start_cloud(capture: Capture, cameras: Sequence[str], minimum: int = MIN_POINTS, seed: int = 0) -> PointCloud:
