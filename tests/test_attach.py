@@ -11,6 +11,8 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mimics import deformable3d, ex4dgs, fudan, hust4d, spacetime
 from mimics.inria import default_options
 from mimics.page import attached, changed_lines
@@ -151,6 +153,27 @@ class TestEveryRepository:
         assert torch.equal(model._xyz[kept, 0].detach(), followed[kept])
         assert torch.equal(model.optimizer.state[model._xyz]["exp_avg"][kept, 0], followed[kept])
 
+    @settings(max_examples=40, deadline=None)
+    @given(sequence=st.lists(st.sampled_from(["clone", "split", "insert", "remove", "extract"]), max_size=8))
+    def test_rows_are_followed_through_any_edits(self, name: str, sequence: list[str]) -> None:
+        """Rows are numbered anew before every edit; what listeners are told must lead back to the numbers."""
+        model, make_adapter, _, _ = next(iter(variants(name)))
+        model.training_setup(default_options())
+        adapter, told = make_adapter(), []
+        adapter.on_resize(told.append)
+        for seed, action in enumerate(sequence):
+            told.clear()
+            numbers = torch.arange(float(len(adapter)))
+            for part, values in zip(tables(model), numbers.split([len(part) for part in tables(model)]), strict=True):
+                part.copy_(values)
+            edit(adapter, model, action, torch.Generator().manual_seed(seed))
+            index = torch.arange(len(numbers))
+            for step in told:
+                index = torch.where(step >= 0, index[step.clamp(min=0)], -1)
+            now = torch.cat(tables(model))
+            assert len(now) == len(index) == len(adapter)
+            assert torch.equal(now[index >= 0], numbers[index[index >= 0]])
+
     def test_the_adapter_is_registered_and_satisfies_the_contract(self, name: str) -> None:
         adapter = next(iter(drawn(name)))[0]
         assert isinstance(adapter, load(ADAPTERS, name))
@@ -234,6 +257,30 @@ def warm(model, deform) -> Deformable3DAdapter:
 def draw_deformed(model, deform, background: list[int], camera) -> dict[str, Tensor]:
     motion = deform.step(model.get_xyz, camera.fid.expand(len(model.get_xyz), 1))
     return deformable3d.render(camera, model, background, *motion, deform.deform.is_6dof)
+
+
+def tables(model) -> list[Tensor]:
+    """The first coordinate of every row, in the contract's order."""
+    parts = [model._xyz.data[:, 0]]
+    return [*parts, model._xyz_motion.data[:, 0, 0]] if hasattr(model, "_xyz_motion") else parts
+
+
+@torch.no_grad()
+def edit(adapter: InriaAdapter, model, action: str, generator: torch.Generator) -> None:
+    """One edit by the repository or by D2; those that a repository does not have are left out."""
+    grads = torch.rand(len(model._xyz), 1, generator=generator)
+    if action == "insert":
+        adapter.insert(some_points(3))
+    elif action == "remove":
+        adapter.remove(torch.rand(len(adapter), generator=generator) < 0.2)
+    elif action == "clone":
+        model.densify_and_clone(grads, 0.7, 1e9)
+    elif action == "split" and not hasattr(model, "_xyz_motion"):
+        model.densify_and_split(grads, 0.7, 0.0)
+    elif action == "extract" and hasattr(model, "_xyz_motion"):
+        model.xyz_error_min_timestamp.zero_()
+        model._xyz_disp.data[:, 0] = grads[:, 0]
+        model.extract_dynamic_points_from_static()
 
 
 def clone_some(model) -> None:
