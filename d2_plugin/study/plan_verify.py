@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import mean
+from statistics import mean, stdev
 from typing import Any
 
 import numpy as np
@@ -42,13 +42,20 @@ class Question:
     settled: str | None = None
 
 
-def verify(settings: RunSettings, iterations: int = 300, prior_frames: int = 6, command: str = "") -> list[Row]:
-    """Two rows per decision: with the part and without it.
+def verify(
+    settings: RunSettings,
+    iterations: int = 300,
+    prior_frames: int = 6,
+    seeds: Sequence[int] = (0, 1, 2),
+    command: str = "",
+) -> list[Row]:
+    """Two rows per decision: with the part and without it, means over the seeds.
 
     Args:
         settings: capture, cameras and monocular source, as for a run.
         iterations: optimizer steps of each training, on all frames.
         prior_frames: frames over which priors are built, from the first one.
+        seeds: of the trainings; a single one tells nothing about differences below a few tenths of a dB.
         command: how this was started.
 
     Raises:
@@ -59,7 +66,7 @@ def verify(settings: RunSettings, iterations: int = 300, prior_frames: int = 6, 
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for question in questions(base, scene, prior_frames):
-            rows += _answer(question, scene.capture.name, Path(folder), command)
+            rows += _answer(question, scene.capture.name, Path(folder), seeds, command)
     return rows
 
 
@@ -110,35 +117,51 @@ def _with(settings: RunSettings, table: str, **values: Any) -> RunSettings:
     return replace(settings, overrides=overrides)
 
 
-def _answer(question: Question, case: str, folder: Path, command: str) -> list[Row]:
+def _answer(question: Question, case: str, folder: Path, seeds: Sequence[int], command: str) -> list[Row]:
     about = {"planned": question.planned, "unit": question.unit, "command": command}
     if question.settled is not None:
         return [make_row("plan", case, question.name, "-", error=None, seconds=None, failed=question.settled, **about)]
-    work = _train if question.trains else _build
-    shared = folder / "priors"  # both ways of training look at the same prior
-    found: dict[str, Measured] = {}
-    for way, settings in question.settings.items():
-        if question.trains and settings.hooks:
-            settings = replace(settings, priors=str(shared))
-        found[way] = in_fresh_process(work, settings, folder / question.name.replace(" ", "-") / way.replace(" ", "-"))
+    found = {way: _runs(question, way, folder, seeds) for way in question.settings}
     return [
         make_row(
             *("plan", case, question.name, way),
-            error=lost,
-            seconds=result["seconds"],
-            peak_mb=peak,
-            cost=lost,
-            gaussians=result.get("gaussians"),
-            details=result,
+            error=mean(costs) if costs else None,
+            seconds=mean(run.result["seconds"] for run in runs),
+            peak_mb=mean(run.peak_mb for run in runs),
+            cost=mean(costs) if costs else None,
+            cost_deviation=stdev(costs) if len(costs) > 1 else None,
+            gaussians=round(mean(run.result["gaussians"] for run in runs)) if question.trains else None,
+            seeds=list(seeds) if question.trains else None,
+            details=[run.result for run in runs],
             **about,
         )
-        for way, (result, peak) in found.items()
-        for lost in [_cost(found[USED].result, result)]
+        for way, runs in found.items()
+        for costs in [_costs(found[USED], runs)]
     ]
 
 
-def _cost(used: Mapping[str, Any], this: Mapping[str, Any]) -> float | None:
-    return None if used["score"] is None or this["score"] is None else used["score"] - this["score"]
+def _runs(question: Question, way: str, folder: Path, seeds: Sequence[int]) -> list[Measured]:
+    """One training per seed, all looking at one prior, or a build of the prior."""
+    place = folder / question.name.replace(" ", "-") / way.replace(" ", "-")
+    settings = question.settings[way]
+    if not question.trains:
+        return [in_fresh_process(_build, settings, place)]
+    if settings.hooks:
+        settings = replace(settings, priors=str(folder / "priors"))
+        in_fresh_process(_prepare, settings, place / "prepared")  # building the prior is in nobody's memory
+    return [in_fresh_process(_train, replace(settings, seed=seed), place / str(seed)) for seed in seeds]
+
+
+def _costs(used: Sequence[Measured], runs: Sequence[Measured]) -> list[float]:
+    """What each seed loses against the same seed with the part; empty where there was no score."""
+    pairs = [(one.result["score"], other.result["score"]) for one, other in zip(used, runs)]
+    return [] if any(None in pair for pair in pairs) else [one - other for one, other in pairs]
+
+
+def _prepare(settings: RunSettings, folder: Path) -> None:
+    from .run import Run
+
+    Run(settings, folder).prepare()
 
 
 def _train(settings: RunSettings, folder: Path) -> dict[str, Any]:
@@ -190,6 +213,10 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
+def _seeds(text: str) -> tuple[int, ...]:
+    return tuple(int(number) for number in _names(text))
+
+
 def _frames(text: str) -> tuple[int, ...]:
     first, last, *step = (int(part) for part in text.split(":"))  # argparse names the option when this raises
     return tuple(range(first, last + 1, *step))
@@ -206,6 +233,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--mono-kind", choices=("relative", "metric"), default=None, help="inverse depth or depth")
     parser.add_argument("--iterations", type=int, default=300, help="optimizer steps of each training; 300")
     parser.add_argument("--prior-frames", type=int, default=6, help="frames over which priors are built; 6")
+    parser.add_argument("--seeds", type=_seeds, default=(0, 1, 2), help="of the trainings, joined by commas; 0,1,2")
     parser.add_argument("--output", type=Path, default=Path("runs.jsonl"), help="rows are added to it; runs.jsonl")
     options = parser.parse_args(arguments)
     train, test, _ = resolve_cameras(options.capture, options.train_cameras, None)
@@ -219,7 +247,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         mono_kind=options.mono_kind,
     )
     command = shlex.join(["d2", "plan", "--verify", *(arguments or ())])
-    rows = verify(settings, options.iterations, options.prior_frames, command)
+    rows = verify(settings, options.iterations, options.prior_frames, options.seeds, command)
     append_rows(options.output, rows)
     sys.stdout.write(f"{table(rows)}\nrows are in {options.output}\n")
     return 0

@@ -94,8 +94,12 @@ def _decision(rows: Sequence[Row]) -> tuple[str, ...]:
     names = ("seconds", "peak_mb", "gaussians")
     both = ("-" if rows[0].get(n) is None else " → ".join(_rounded(row[n]) for row in rows) for n in names)
     first, last = rows[0], rows[-1]
-    cost = first["failed"] or ("-" if last["cost"] is None else f"{last['cost']:+.3f} {last['unit']}")
+    cost = first["failed"] or ("-" if last["cost"] is None else f"{last['cost']:+.3f}{_spread(last)} {last['unit']}")
     return (first["case"], first["method"], first["planned"], *both, cost)
+
+
+def _spread(row: Row) -> str:
+    return "" if row.get("cost_deviation") is None else f" ± {row['cost_deviation']:.3f}"
 
 
 def _rounded(value: float) -> str:
