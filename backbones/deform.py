@@ -42,9 +42,6 @@ class DeformSettings(SplatSettings):
     falls to zero at half of the run (official: a tenth of the frame interval, real scenes)."""
     field_decay: float = 0.1
     """Learning rates of the field at the last step, as a fraction of the first; exponential in between."""
-    stillness: float = 1.0
-    """Weight of the mean absolute offset (of positions in units of the extent; those of quaternions and log-scales
-    count a tenth): what no picture asks to move stays. Ours: with few views a field otherwise moves everything."""
     seed: int = 0
     """Of the field's start and of the noise on time; the global random state is never used."""
     mlp: MlpSettings = dataclasses.field(default_factory=MlpSettings)
@@ -69,7 +66,6 @@ class Deform(SplatModel):
         self.field: Field | None = None
         self.deforms = False
         self._noise = 0.0
-        self._last_offsets: Offsets | None = None
         if settings.temporal:
             self.field = make_field(settings, box, self._generator).to(rows["positions"])
             self.field_optimizer = torch.optim.Adam(self.field.parameter_groups(), eps=1e-15, fused=True)
@@ -99,7 +95,6 @@ class Deform(SplatModel):
         raw = {name: g[name] for name in ("positions", "log_scales", "opacity_logits")} | {"left": g["rotations"]}
         noise = self._noise if torch.is_grad_enabled() else 0.0
         offsets = self.offsets(g["positions"], view.time + noise)
-        self._last_offsets = offsets if torch.is_grad_enabled() else None
         if offsets is not None:
             raw["positions"] = raw["positions"] + offsets.positions
             raw["log_scales"] = raw["log_scales"] + offsets.log_scales
@@ -117,13 +112,8 @@ class Deform(SplatModel):
         return rotation_matrices_3d(unit_quaternions(rows["rotations"]))
 
     def regularization(self) -> Tensor | float:
-        """The field's own term, and the stillness of what was rendered last."""
-        offsets, self._last_offsets = self._last_offsets, None
-        if offsets is None:
-            return 0.0
-        place, turn, size = (part.abs().sum(-1).mean() for part in offsets)
-        still = place / self.extent + 0.1 * (turn + size)
-        return self.field.regularization() + self.settings.stillness * still
+        """What keeps the field smooth."""
+        return self.field.regularization() if self.deforms else 0.0
 
     def optimize(self, step: int, iterations: int) -> None:
         """One step of both optimizers, gradients cleared; learning rates and noise for the next step set."""

@@ -46,8 +46,9 @@ class MlpSettings:
     """Frequencies of the encoding of positions (official: 10)."""
     time_octaves: int = 6
     """Frequencies of the encoding of time (official: 10, or 6 for synthetic scenes)."""
-    rate: float = 5e-4
-    """Learning rate of the network at the first step (official: 8e-4)."""
+    rate: float = 2e-4
+    """Learning rate of the network at the first step (official: 8e-4; studio, four views, backbone alone, 2000 steps,
+    held-out PSNR of seeds 0 and 1: 24.5, 24.6 dB at 2e-4; of seed 0: 23.5 at 5e-4)."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,8 @@ class HexPlaneSettings:
     """Neurons of the hidden layer."""
     plane_rate: float = 1e-2
     """Learning rate of the planes at the first step."""
-    network_rate: float = 1e-3
-    """Learning rate of the network at the first step."""
+    network_rate: float = 3e-4
+    """Learning rate of the network at the first step (as above: 25.8, 25.0 dB at 3e-4; of seed 0: 25.3 at 1e-3)."""
     smooth_space: float = 2e-4
     """Weight of the squared second differences of planes in space (official name: plane_tv_weight)."""
     smooth_time: float = 1e-3

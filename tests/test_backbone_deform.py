@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +26,10 @@ from d2_plugin.backbones.deform_fields import (
     hats,
     octaves,
 )
+from d2_plugin.captures.saving import save_capture
+from d2_plugin.captures.synthetic import synthetic_capture
+from d2_plugin.study.run import Run
+from d2_plugin.study.settings import RunSettings
 
 FIELDS = ("mlp", "hexplane")
 
@@ -298,6 +303,24 @@ def test_defaults_are_documented_settings() -> None:
     settings = DeformSettings()
     assert settings.field in FIELDS
     assert 0 < settings.warm_up < 0.5
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_d2_train_runs_resumes_and_scores_it(field: str, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
+    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+    capture = save_capture(synthetic_capture(cameras=2, held_out=1, frames=2, width=64, height=36), tmp_path / "room")
+    settings = RunSettings(
+        str(capture), ("train0", "train1"), backbone="deform", iterations=24, overrides={"backbone": {"field": field}}
+    )
+    run = Run(settings, tmp_path / "run")
+    run.train()
+    again = Run.load(tmp_path / "run")
+    metrics = again.evaluate(pictures=False)
+    assert metrics["backbone"] == "deform"
+    assert metrics["iterations"] == 24
+    assert metrics["test"]["psnr"] > 8
+    assert len(again.export_ply()) == 2
 
 
 def bilinear(plane: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> torch.Tensor:
