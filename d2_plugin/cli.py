@@ -136,6 +136,8 @@ def _add_priors(commands: Any) -> None:
     _add_capture_options(parser)
     parser.add_argument("--output", type=Path, required=True, help="folder of the prior store")
     parser.add_argument("--shard", type=_shard, default=None, help="build part I of N only, as I/N with I from 1 to N")
+    parser.add_argument("--workers", type=int, default=None, help="build with this many processes of this machine")
+    parser.add_argument("--scheduler", default=None, help="address of a dask cluster to build on, e.g. tcp://host:8786")
 
 
 def _add_plan(commands: Any) -> None:
@@ -315,11 +317,22 @@ def _priors(options: argparse.Namespace) -> None:
     _print_notes(scene.capture.notes)
     _print_plan(scene.plan)
     points = triangulated_points(scene.capture, scene.train_cameras)["positions"]
-    print(build_priors_for(settings, scene, points, options.output, options.shard))
+    print(build_priors_for(settings, scene, points, options.output, shard=options.shard, cluster=_cluster(options)))
     if options.shard is None:
         sheet = options.output / "contact_sheet.png"
         contact_sheet(PriorStore.open(options.output), scene.capture, sheet)
         print(f"look at {sheet}")
+
+
+def _cluster(options: argparse.Namespace) -> dict[str, Any] | None:
+    """What to hand the frames to, where that is wanted."""
+    if options.workers is None and options.scheduler is None:
+        return None
+    if options.shard is not None:
+        raise D2Error("--shard builds one part on this machine: leave it out with --workers or --scheduler")
+    if options.scheduler is not None:
+        return {"scheduler": options.scheduler}
+    return {"workers": options.workers}
 
 
 def _plan(options: argparse.Namespace) -> None:

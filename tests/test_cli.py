@@ -125,6 +125,11 @@ def test_priors_are_built_in_parts_and_shown_on_a_sheet(
         assert np.array_equal(whole.prior(camera, 1).depth, joined.prior(camera, 1).depth)
 
 
+def test_a_part_is_not_built_on_a_cluster(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    build = ["priors", str(capture), "--train-cameras", CAMERAS, "--output", str(tmp_path / "priors")]
+    assert "leave it out" in refused(capsys, main([*build, "--shard", "1/2", "--workers", "2"]))
+
+
 def test_compare_tabulates_what_was_measured(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", str(finished)]) == 0
     header, _, row = capsys.readouterr().out.splitlines()

@@ -135,8 +135,8 @@ class AlignSettings:
     leverage_guard: bool = False
     """Fit only anchors near the line that passes nearest to the best `min_inliers` of them: every convex fit breaks at
     40 % leverage outliers. Measured (`d2 bench align`): with 20 to 60 % wrong anchors the error of the line is .001 to
-    .003 with, .007 to .16 without, in the same time; on studio, whose filtered anchors are wrong at 1 %, no difference.
-    The certificate then holds for the anchors that were kept."""
+    .003 with, .007 to .16 without, in the same time. Off, because filtered anchors are wrong at 1 % (studio) and the
+    guard has not been measured on recordings. The certificate then holds for the anchors that were kept."""
     seed: int = 0
     """Seed of the subsampling and of the leverage guard."""
 

@@ -10,6 +10,7 @@ import platform
 import torch
 
 from d2_plugin import __version__, compiler, registry
+from d2_plugin.priors import colmap_mvs
 from d2_plugin.rasterizer import nvrtc
 
 OPTIONAL = {
@@ -19,6 +20,7 @@ OPTIONAL = {
     "kornia": ("image", "image operations that tests compare with"),
     "rich": ("cli", "progress bars"),
     "matplotlib": ("report", "plots of `d2 bench`"),
+    "distributed": ("cluster", "priors built by several processes or machines"),
 }
 
 
@@ -32,7 +34,7 @@ def report() -> str:
         f"backbones   {', '.join(registry.names(registry.BACKBONES))}",
     ]
     lines += [f"{module:12}{_state(module, extra, purpose)}" for module, (extra, purpose) in OPTIONAL.items()]
-    return "\n".join(lines)
+    return "\n".join([*lines, f"{'COLMAP':12}{colmap_mvs.why_not_usable() or 'PatchMatch on CUDA'}"])
 
 
 def _device() -> str:

@@ -216,24 +216,29 @@ class Run:
 
 
 def build_priors_for(
-    settings: RunSettings, scene: Scene, points: np.ndarray, folder: Path, shard: tuple[int, int] | None = None
+    settings: RunSettings,
+    scene: Scene,
+    points: np.ndarray,
+    folder: Path,
+    *,
+    shard: tuple[int, int] | None = None,
+    cluster: Mapping[str, Any] | None = None,
 ) -> Any:
     """Build what is missing of the depth prior in `folder`; `points` [P, 3] bound the depths that are searched.
 
-    `shard` (index from 0, count) builds one part of it, which any scheduler may run beside the others.
+    `shard` (index from 0, count) builds one part of it, which any scheduler may run beside the others; `cluster`
+    (`scheduler` or `workers`) hands the frames to dask.distributed instead.
     """
-    from d2_plugin.priors.build import build_priors
-
     with progress_bar("priors", len(scene.capture.frames) * len(scene.train_cameras)) as bar:
-        return build_priors(
-            scene.capture,
-            scene.train_cameras,
-            folder,
-            prior_settings(settings),
-            sparse_points=points,
-            progress=lambda done, total, note="": bar.update(done, note),
-            shard=shard,
-        )
+        what = (scene.capture, scene.train_cameras, folder, prior_settings(settings))
+        how = {"sparse_points": points, "progress": lambda done, total, note="": bar.update(done, note)}
+        if cluster is not None:
+            from d2_plugin.priors.cluster import build_priors_on_cluster
+
+            return build_priors_on_cluster(*what, **how, **cluster)
+        from d2_plugin.priors.build import build_priors
+
+        return build_priors(*what, **how, shard=shard)
 
 
 def _claim(folder: Path, settings: RunSettings) -> None:
