@@ -110,6 +110,16 @@ def reversed_rows(adapter: WatchedModel) -> None:
     adapter._tell = lambda index: tell(index.flip(0))
 
 
+def past_the_end(adapter: WatchedModel) -> None:
+    tell = adapter._tell
+    adapter._tell = lambda index: tell(index + 100)
+
+
+def as_mask(adapter: WatchedModel) -> None:
+    tell = adapter._tell
+    adapter._tell = lambda index: tell(index >= 0)
+
+
 def keeps_instead(adapter: WatchedModel) -> None:
     remove = adapter.remove
     adapter.remove = lambda mask: remove(~mask)
@@ -218,6 +228,8 @@ def mirrored(view: object) -> torch.Tensor:
         (one_listener, "told to one listener only"),
         (early, "tell after the change"),
         (reversed_rows, "are not those of the rows that the report names"),
+        (past_the_end, "reports rows outside -1..59"),
+        (as_mask, "reports torch.bool .* expected an index"),
         (keeps_instead, "remove was given 20 rows and took 40"),
         (overcounts, "insert returns 9 but 8 Gaussians were added"),
         (elsewhere, "are not where their points are"),

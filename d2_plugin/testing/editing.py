@@ -51,17 +51,22 @@ def _edited(example: Example, what: str, edit: Callable[[], object]) -> tuple[li
         return [f"{what} is told to one listener only: on_resize must keep them all"], torch.empty(0)
     if not listener.reports and len(backbone) != count:
         return [f"{what} changes {count} Gaussians to {len(backbone)} without telling on_resize"], torch.empty(0)
-    for index, now in zip(listener.reports, listener.counts):
-        if index.dtype != torch.int64 or index.ndim != 1:
-            return [f"{what} reports {index.dtype} {tuple(index.shape)}, expected an index, int64 [N_new]"], index
-        if len(index) != now:
-            return [
-                f"{what} reports an index of {len(index)} rows when there are {now}: tell after the change, N_new rows"
-            ], index
+    for index, was, now in zip(listener.reports, [count, *listener.counts], listener.counts):
+        if mistake := _mistake(what, index, was, now):
+            return [mistake], index
     index = listener.total(count)
-    if ((index < -1) | (index >= count)).any():
-        return [f"{what} reports rows outside -1..{count - 1}: row r of the index is where row r was, -1 if new"], index
     return list(_unchanged(example, what, before, index)), index
+
+
+def _mistake(what: str, index: Tensor, was: int, now: int) -> str | None:
+    """What is wrong with one report of a change from `was` to `now` Gaussians, if anything."""
+    if index.dtype != torch.int64 or index.ndim != 1:
+        return f"{what} reports {index.dtype} {tuple(index.shape)}, expected an index, int64 [N_new]"
+    if len(index) != now:
+        return f"{what} reports an index of {len(index)} rows when there are {now}: tell after the change, N_new rows"
+    if ((index < -1) | (index >= was)).any():
+        return f"{what} reports rows outside -1..{was - 1}: row r of the index is where row r was, -1 if new"
+    return None
 
 
 def _unchanged(example: Example, what: str, before: Splats, index: Tensor) -> Iterator[str]:
