@@ -113,6 +113,15 @@ def test_no_number_of_a_table_is_typed_in(report: Path) -> None:
     assert shown not in text
 
 
+def test_the_top_of_the_page_tells_what_the_sections_found(report: Path) -> None:
+    top, _, _ = (report / "report.md").read_text().partition("\n## ")
+    assert "- Training: " in top
+    assert "yang4d + D2" in top
+    rows = [row for row in read_rows([RUNS]) if row["kind"] == "stability"]
+    assert f"{sum(row['verdict'] == 'ok' for row in rows)} of {len(rows)} points ok" in top
+    assert "world offset in float32" in top
+
+
 def test_nothing_to_report_is_told(tmp_path: Path) -> None:
     (tmp_path / "empty.jsonl").write_text("")
     with pytest.raises(D2Error, match="there is nothing to report"):

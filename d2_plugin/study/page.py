@@ -20,6 +20,8 @@ CSS = """
 body{margin:0;background:var(--page);color:var(--ink);font:16px/1.55 system-ui,sans-serif}
 header,main,footer{max-width:1160px;margin:0 auto;padding:0 20px}
 header{padding-top:44px}h1{font-size:2rem;line-height:1.2;margin:0 0 .4em}
+dl{display:grid;grid-template-columns:max-content 1fr;gap:4px 18px;margin:0 0 1.2em}
+dt{color:var(--soft)}dd{grid-column:2;margin:0}
 h2{font-size:1.35rem;margin:0 0 .3em}h3{font-size:1rem;margin:1.6em 0 .5em}
 p{max-width:72ch}.soft,figcaption,footer{color:var(--soft);font-size:.875rem}
 nav{position:sticky;top:0;background:var(--page);border-bottom:1px solid var(--line);z-index:1}
@@ -50,7 +52,7 @@ class Picture(NamedTuple):
 
 def html(sections: Sequence[Section], pictures: Sequence[Picture], lead: str) -> str:
     """The page; `lead` is the paragraph at its top."""
-    entries = [(section.name, section.title.partition(":")[0]) for section in sections]
+    entries = [(section.name, _short(section)) for section in sections]
     entries += [("pictures", "Pictures")] if pictures else []
     links = "".join(f'<li><a href="#{name}">{escape(title)}</a></li>' for name, title in entries)
     body = "".join(map(_section, sections)) + (_gallery(pictures) if pictures else "")
@@ -58,11 +60,26 @@ def html(sections: Sequence[Section], pictures: Sequence[Picture], lead: str) ->
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f"<title>{TITLE}</title><style>{CSS}{style()}</style></head>\n"
-        f"<body><header><h1>{TITLE}</h1><p>{escape(lead)}</p></header>\n"
+        f"<body><header><h1>{TITLE}</h1><p>{escape(lead)}</p>{_glance(sections)}</header>\n"
         f'<nav aria-label="Sections"><ul>{links}</ul></nav>\n<main>{body}</main>\n'
         "<footer><p>Made by <code>d2 report</code> from the rows that the commands above wrote; nothing is typed in. "
         "Marks carry their numbers as tooltips.</p></footer></body></html>\n"
     )
+
+
+def _glance(sections: Sequence[Section]) -> str:
+    """What the sections found, in a line or a few each."""
+    items = "".join(
+        f"<dt>{escape(_short(section))}</dt>" + "".join(f"<dd>{escape(line)}</dd>" for line in section.headlines)
+        for section in sections
+        if any(section.headlines)
+    )
+    return f"<dl>{items}</dl>" if items else ""
+
+
+def _short(section: Section) -> str:
+    """The title up to its colon."""
+    return section.title.partition(":")[0]
 
 
 def _section(section: Section) -> str:
@@ -131,7 +148,8 @@ def _gallery(pictures: Sequence[Picture]) -> str:
 
 def markdown(sections: Sequence[Section], lead: str) -> str:
     """The same without pictures; the plots are the files `NAME.svg` beside it."""
-    parts = [f"# {TITLE}", lead]
+    glance = [f"- {_short(section)}: {line}" for section in sections for line in section.headlines if line]
+    parts = [f"# {TITLE}", lead, *(["\n".join(glance)] if glance else [])]
     for section in sections:
         parts += [f"## {section.title}", section.text]
         parts += [f"![{section.title}]({name}.svg)" for name in section.figures]

@@ -22,6 +22,8 @@ class Section:
     details: tuple[tuple[str, Table], ...] = ()
     """Longer tables, which the page folds and the Markdown leaves out."""
     sources: tuple[str, ...] = ()
+    headlines: tuple[str, ...] = ()
+    """The section in a few of its figures, for the top of the page."""
 
 
 def sources_of(rows: Sequence[Row]) -> tuple[str, ...]:

@@ -32,7 +32,15 @@ def stability(rows: Sequence[Row]) -> Section:
         {"stability": figure(plots, "Error over each swept parameter", columns=3, size=(360, 270))},
         (("Sweeps", Table(header, cells)), ("Guards", guards), *([("Not ok", _lost(lost))] if lost else [])),
         sources=sources_of(rows),
+        headlines=(_stability_headline(rows),),
     )
+
+
+def _stability_headline(rows: Sequence[Row]) -> str:
+    count = {verdict: sum(row["verdict"] == verdict for row in rows) for verdict in ("ok", "gap", "failure")}
+    where = ", ".join(dict.fromkeys(f"{row['case']} in {row['method']}" for row in rows if row["verdict"] != "ok"))
+    told = f"{count['ok']} of {len(rows)} points ok, {count['gap']} gaps, {count['failure']} failures"
+    return told + (f" ({where})" if where else "")
 
 
 def _lost(rows: Sequence[Row]) -> Table:
@@ -120,7 +128,7 @@ def scaling(rows: Sequence[Row]) -> Section:
             points = tuple(Point(*place, f"{method}, {place[0]} frames: {place[1]:.4g} {label}") for place in line)
             series.append(Series(method, points, line, color))
             power = exponent(line) if len(line) > 1 else None
-            grows = "-" if power is None else f"frames^{power:.2f}"
+            grows = "-" if power is None else f"frames^{round(power, 2) + 0.0:.2f}"
             cells.append((method, label, *(shown(places.get(length)) for length in lengths), grows))
         values = [y for each in series for _, y in each.line]
         plots.append(Plot(label, x, Axis.around(label, values, log=True), tuple(series)))
@@ -132,4 +140,5 @@ def scaling(rows: Sequence[Row]) -> Section:
         {"scaling": figure(plots, "Time and memory over the number of frames", columns=2, size=(400, 320))},
         (("Measured", Table(header, tuple(cells))),),
         sources=sources_of(rows),
+        headlines=("; ".join(f"{cell[0]}, {cell[1]}: as {cell[-1]}" for cell in cells if cell[-1] != "-"),),
     )

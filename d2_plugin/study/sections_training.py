@@ -44,7 +44,18 @@ def training(rows: Sequence[Row]) -> Section:
         },
         (("Mean ± deviation over seeds", _scores_table("method", means)),),
         sources=sources_of(rows),
+        headlines=tuple(line for case, mine in cases_of(_scored(rows)).items() if (line := _headline(case, mine))),
     )
+
+
+def _headline(case: str, scored: Sequence[Row]) -> str:
+    """The backbone alone and with D2 on one capture, mean PSNR and minutes; empty where one of them is missing."""
+    told = []
+    for name in dict.fromkeys(row["method"] for row in scored):
+        mine = [row for row in scored if row["method"] == name]
+        minutes = (_mean(mine, "seconds") + _mean(mine, "prior_seconds")) / 60
+        told.append(f"{name} {mean(_score(row, 'psnr') for row in mine):.2f} dB in {minutes:.2g} min")
+    return f"{case}: {', '.join(told)}" if len(told) > 1 else ""
 
 
 def _quality(case: str, scored: Sequence[Row], colors: Mapping[str, int]) -> Plot:
