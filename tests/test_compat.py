@@ -104,6 +104,12 @@ class TestThreeDGS:
         torch.testing.assert_close(found.K, K, atol=1e-4, rtol=0)
         torch.testing.assert_close(found.T_camera_world, pose.float(), atol=1e-6, rtol=0)
 
+    def test_matrices_may_come_as_a_batch_of_one(self, camera: dict) -> None:
+        """As in the cameras that 4DGaussians makes for PanopticSports."""
+        batched = {**camera, "viewmatrix": camera["viewmatrix"][None], "projmatrix": camera["projmatrix"][None]}
+        found = inria.view_of(threedgs.GaussianRasterizationSettings(**batched))
+        torch.testing.assert_close(found.K, view_24x16().K, atol=1e-5, rtol=0)
+
     def test_passes_gradcheck(self, camera: dict) -> None:
         raster = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera))
         values = gaussians(4)

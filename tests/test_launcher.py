@@ -183,13 +183,21 @@ def test_stages_of_4dgaussians_reach_the_adapter() -> None:
     assert session.hooks.backbone.active(1)
 
 
+def test_a_script_of_another_repository_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(D2Error, match="the script's folder has no scene.Scene .* give the repository that the script"):
+        Session(recipe("fudan"), DEPTH_LOSS, TinyStore()).wrap()
+
+
 class TestNames:
     def test_priors_are_found_under_the_names_of_an_export(self, tmp_path: Path) -> None:
         described = {"cameras": {"cam0": "cam01"}, "frames": {"0": 1, "1": 2}}
         (tmp_path / "export.json").write_text(json.dumps(described))
         store = RenamedStore.of_export(TinyStore(), tmp_path)
         assert torch.equal(store.prior("cam01", 2).depth, TinyStore().prior("cam0", 1).depth)
-        assert store.prior("cam0", 1) is None
+        assert store.prior("cam01", 9) is None
+        with pytest.raises(D2Error, match="unknown camera of the export 'cam0': have cam01; did you mean 'cam01'"):
+            store.prior("cam0", 1)
         assert store.camera("cam01", 2) is None  # TinyStore does not say
 
     def test_a_folder_without_export_is_refused(self, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin.captures.export import EXPORT_FILE
-from d2_plugin.errors import D2Error
+from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.protocol import DepthPrior
 
 
@@ -31,7 +31,7 @@ class RenamedStore:
         return cls(store, cameras, frames)
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None:
-        """D* of one view, or None where there is none."""
+        """D* of one view, or None where there is none; a camera that the export does not have is refused."""
         return self._asked("prior", camera, frame)
 
     def camera(self, camera: str, frame: int) -> Any:
@@ -39,7 +39,9 @@ class RenamedStore:
         return self._asked("camera", camera, frame)
 
     def _asked(self, what: str, camera: str, frame: int) -> Any:
-        if camera not in self.cameras or frame not in self.frames:
+        if camera not in self.cameras:
+            raise unknown_name("camera of the export", camera, self.cameras)
+        if frame not in self.frames:
             return None
         ask = getattr(self.store, what, None)
         return None if ask is None else ask(self.cameras[camera], self.frames[frame])

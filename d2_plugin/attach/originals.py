@@ -58,7 +58,8 @@ def _import_file(name: str, path: Path) -> None:
 def _put(original: Original) -> None:
     """Our module under the original's name, with a package above it where there is none."""
     parent, _, _ = original.name.rpartition(".")
-    if parent and original.file is None and importlib.util.find_spec(parent) is None:
+    absent = parent not in sys.modules and original.file is None and importlib.util.find_spec(parent or "sys") is None
+    if parent and absent:
         package = types.ModuleType(parent)
         package.__path__ = []
         sys.modules[parent] = package

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.config import D2Config
+from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
 
 from .recipes import Objects, Recipe, adapter_of
@@ -126,7 +127,7 @@ class Session:
         view = rendered(camera, package) if rendered is not None else camera
         term = self.hooks.loss(self._iteration, [view])
         if self._batch and isinstance(term, Tensor) and term.requires_grad:
-            package["render"] = AddGradient.apply(package["render"], term, 1 / self._batch)
+            return {**package, "render": AddGradient.apply(package["render"], term, 1 / self._batch)}
         return package
 
     def _watch(self, optimizer: torch.optim.Optimizer) -> None:
@@ -159,4 +160,12 @@ class Session:
 
 
 def _found(module: str, attribute: str) -> Any:
-    return getattr(importlib.import_module(module), attribute)
+    """An attribute of one of the repository's modules; its own imports may fail with errors of their own."""
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ModuleNotFoundError, AttributeError) as error:
+        if isinstance(error, ModuleNotFoundError) and not f"{module}.".startswith(f"{error.name}."):
+            raise
+        raise D2Error(
+            f"the script's folder has no {module}.{attribute} ({error}): give the repository that the script belongs to"
+        ) from None

@@ -87,7 +87,7 @@ def absolute_gradient(drawing: Drawing, picture: Tensor, gradient: Tensor) -> Te
     """
     splats, values, view, settings = drawing
     kept = visible(splats, None, view, settings)
-    part = Splats(*(field.detach()[kept] for field in splats))
+    part = Splats(*(field[kept] for field in splats))
     screen = project(part, view, settings)
     order = torch.sort(screen.depths, stable=True).indices
     ux, vy = screen.variance_x_given_y.rsqrt(), screen.variance_y.rsqrt()

@@ -64,7 +64,8 @@ def draw(
     image = rasterize(splats, colors, view, SETTINGS, background=background.to(colors), screen_offsets=offsets)
     color = image.color
     if absolute is not None and absolute.requires_grad:
-        color = WithAbsoluteGradient.apply(color, absolute, Drawing(splats, colors, view, SETTINGS))
+        drawing = Drawing(Splats(*(field.detach() for field in splats)), colors.detach(), view, SETTINGS)
+        color = WithAbsoluteGradient.apply(color, absolute, drawing)
     radii = torch.zeros(count, dtype=torch.int32, device=splats.means.device)
     radii[splats.rows] = screen_radii(splats, view)
     return Drawn(color.permute(2, 0, 1), image.depth_sum[None], image.alpha[None], radii)
@@ -77,8 +78,9 @@ def view_of(settings: Any) -> View:
     the field of view cannot say.
     """
     width, height = int(settings.image_width), int(settings.image_height)
-    world_view = settings.viewmatrix.detach().double()
-    projection = torch.linalg.solve(world_view, settings.projmatrix.detach().double()).T
+    # Cameras of PanopticSports have a batch of one; the CUDA sources read sixteen numbers.
+    world_view, full = (matrix.detach().double().reshape(4, 4) for matrix in (settings.viewmatrix, settings.projmatrix))
+    projection = torch.linalg.solve(world_view, full).T
     K = torch.zeros(3, 3, dtype=torch.float64, device=world_view.device)
     K[0, 0], K[1, 1], K[2, 2] = 0.5 * width * projection[0, 0], 0.5 * height * projection[1, 1], 1.0
     K[0, 2], K[1, 2] = 0.5 * width * (1 + projection[0, 2]), 0.5 * height * (1 + projection[1, 2])
@@ -146,7 +148,7 @@ def screen_radii(splats: Splats, view: View) -> Tensor:
 @torch.no_grad()
 def in_front(positions: Tensor, viewmatrix: Tensor) -> Tensor:
     """bool [N]: the near test of markVisible, which is all that Inria's sources do there."""
-    forward = viewmatrix[:, 2].to(positions)
+    forward = viewmatrix.reshape(4, 4)[:, 2].to(positions)
     return positions @ forward[:3] + forward[3] > SETTINGS.near
 
 
