@@ -68,7 +68,7 @@ def default_options(**changed: object) -> SimpleNamespace:
     options = {
         "iterations": 100, "percent_dense": 0.01, "position_lr_init": 2e-3, "feature_lr": 2e-2, "opacity_lr": 5e-2,
         "scaling_lr": 1e-2, "rotation_lr": 2e-3, "densify_from_iter": 10, "densify_until_iter": 80,
-        "densification_interval": 13, "densify_grad_threshold": 1e-3, "opacity_reset_interval": 41,
+        "densification_interval": 13, "densify_grad_threshold": 3e-3, "opacity_reset_interval": 41,
         "batch_size": 2, "warm_up": 30,
     }  # fmt: skip
     return SimpleNamespace(**(options | changed))
