@@ -1,7 +1,7 @@
 """Any capture written out in the input layout of the public 4DGS repositories, from which it reads back the same.
 
     transforms   fudan-zvg/4d-gaussian-splatting: transforms_train.json, transforms_test.json, images/, points3d.ply
-    n3dv         ingra14m/Deformable-3D-Gaussians (frames/), 4:3 pictures in hustvl/4DGaussians: poses_bounds.npy
+    n3dv         ingra14m/Deformable-3D-Gaussians: poses_bounds.npy, frames/, points3D.ply
     multipleview hustvl/4DGaussians, its layout for own recordings: sparse_/, camNN/frame_NNNNN.jpg
     colmap       everything that reads a COLMAP model: sparse/0, images/
 

@@ -1,7 +1,8 @@
-"""The layout of Neural 3D Video with extracted frames, which Deformable-3D-Gaussians and 4DGaussians read.
+"""The layout of Neural 3D Video with extracted frames, which Deformable-3D-Gaussians reads.
 
-Both take the focal length of the first row for all cameras and hold out the first camera; 4DGaussians also expects
-pictures of 1352 x 1014 pixels under rows that say 2704 x 2028: own recordings go there in the layout `multipleview`.
+It takes the focal length of the first row for all cameras, holds out the first camera and reads 24 frames. 4DGaussians
+wants the videos beside the frames, pictures of 1352 x 1014 pixels and rows that say 2704 x 2028: own recordings go there
+in the layout `multipleview`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 def write_n3dv(export: Export) -> Names:
-    """poses_bounds.npy, CAMERA/images/CAMERA_FRAME.png, frames/ with a link to each, and points under both names.
+    """poses_bounds.npy, CAMERA/images/CAMERA_FRAME.png, frames/ with a link to each, and points3D.ply.
 
     A camera keeps its name where all begin with `cam` and the held-out one comes first in sorted order; a name of
     digits gets `cam` before it; otherwise they become cam00, cam01, ..., the held-out ones first.
@@ -42,8 +43,7 @@ def write_n3dv(export: Export) -> Names:
     rows = {names[name]: llff_row(camera, depth_bounds(camera, export.cloud)) for name, camera in cameras.items()}
     np.save(export.folder / "poses_bounds.npy", np.stack([rows[name] for name in sorted(rows)]))
     if export.cloud is not None:
-        for name in ("points3D.ply", "points3D_downsample2.ply"):
-            write_point_cloud(export.folder / name, export.cloud)
+        write_point_cloud(export.folder / "points3D.ply", export.cloud)
     return names
 
 
