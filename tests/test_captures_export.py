@@ -17,6 +17,7 @@ from d2_plugin.captures.calibration import pinhole
 from d2_plugin.captures.colmap_model import read_model, read_points, rotation_of_quaternion
 from d2_plugin.captures.export import export_capture
 from d2_plugin.captures.export_colmap import quaternion
+from d2_plugin.captures.export_n3dv import sorted_names
 from d2_plugin.captures.ply import PointCloud
 from d2_plugin.captures.synthetic import synthetic_capture
 from d2_plugin.errors import D2Error
@@ -108,6 +109,13 @@ def test_the_held_out_camera_comes_first_in_n3dv(original: Capture, tmp_path: Pa
     assert names_of(folder)[held_out] == first
     assert sorted(path.name for path in (folder / "frames").iterdir()) == sorted(names_of(folder).values())
     assert (folder / "frames" / first / f"{first}_{original.frames[0]:04d}.png").is_file()
+
+
+def test_a_hundred_cameras_still_sort_in_order() -> None:
+    names = list(sorted_names([f"left{i}" for i in range(101)], 1).values())
+    assert names == sorted(names)
+    assert sorted_names(["01", "00"], 1) == {"01": "cam00", "00": "cam01"}
+    assert sorted_names(["00", "01"], 1) == {"00": "cam00", "01": "cam01"}
 
 
 def test_multipleview_has_the_names_that_4dgaussians_makes_up(original: Capture, tmp_path: Path) -> None:

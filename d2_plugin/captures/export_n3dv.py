@@ -1,8 +1,8 @@
 """The layout of Neural 3D Video with extracted frames, which Deformable-3D-Gaussians reads.
 
 It takes the focal length of the first row for all cameras, holds out the first camera and reads 24 frames. 4DGaussians
-wants the videos beside the frames, pictures of 1352 x 1014 pixels and rows that say 2704 x 2028: own recordings go there
-in the layout `multipleview`.
+wants the videos beside the frames, pictures of 1352 x 1014 pixels and rows that say 2704 x 2028: for own recordings it
+has another layout, `multipleview`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ from d2_plugin.errors import D2Error
 
 log = logging.getLogger(__name__)
 
+READ_FRAMES = 24
+"""Frames of each camera that Deformable-3D-Gaussians reads (scene/__init__.py), whatever there is."""
+
 
 def write_n3dv(export: Export) -> Names:
     """poses_bounds.npy, CAMERA/images/CAMERA_FRAME.png, frames/ with a link to each, and points3D.ply.
@@ -29,7 +32,7 @@ def write_n3dv(export: Export) -> Names:
     cameras = export.capture.cameras
     for camera in cameras.values():
         refuse_off_centre(camera, "n3dv")
-    _say_focal_lengths(list(cameras.values()))
+    _say_what_is_lost(list(cameras.values()), len(export.capture.frames))
     names = sorted_names([*export.test_cameras, *export.train_cameras], len(export.test_cameras))
     for name in cameras:
         pictures = export.folder / names[name] / "images"
@@ -54,7 +57,8 @@ def sorted_names(cameras: list[str], held_out: int) -> Names:
     ordered = sorted(kept.values())
     if plain and set(ordered[:held_out]) == {kept[name] for name in cameras[:held_out]}:
         return kept
-    return {name: f"cam{index:02d}" for index, name in enumerate(cameras)}
+    digits = max(2, len(str(len(cameras) - 1)))
+    return {name: f"cam{index:0{digits}d}" for index, name in enumerate(cameras)}
 
 
 def llff_row(camera: Camera, near_far: tuple[float, float]) -> np.ndarray:
@@ -80,11 +84,13 @@ def depth_bounds(camera: Camera, cloud: PointCloud | None) -> tuple[float, float
     )
 
 
-def _say_focal_lengths(cameras: list[Camera]) -> None:
+def _say_what_is_lost(cameras: list[Camera], frames: int) -> None:
+    if frames > READ_FRAMES:
+        log.warning("%d frames written, but Deformable-3D-Gaussians reads the first %d", frames, READ_FRAMES)
     focals = sorted({round(float(camera.K[0, 0]), 3) for camera in cameras})
     if len(focals) > 1:
         log.warning(
-            "focal lengths differ (%g to %g pixels), but the readers of this layout take the first camera's for all: "
+            "focal lengths differ (%g to %g pixels), but the reader of this layout takes the first camera's for all: "
             "choose the layout transforms",
             focals[0],
             focals[-1],
