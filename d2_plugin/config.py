@@ -36,7 +36,7 @@ class DensifyConfig:
     """Samples drawn per evaluated view. Studio, 2000 steps, training time on one CPU thread against the bare trainer's:
     29.2 dB at 60 for 1.13 times, 29.4 dB at 150 for 1.3 times, 30.9 dB at 500 for 1.8 times (the last two with 8 views
     per evaluation and the loss at every step); more than 500 loses again."""
-    max_gaussians: int = 200_000
+    max_gaussians: int = 1_000_000
     """No insertion beyond this number of Gaussians."""
     scale: float = 1.0
     """Standard deviation of a new Gaussian in units of the distance between samples (studio: 29.3 dB at 0.5, 30.7 at
