@@ -267,6 +267,7 @@ def _train(options: argparse.Namespace) -> None:
     _print_notes(run.scene.capture.notes)
     _print_plan(run.scene.plan)
     run.train()
+    _print_notes([f"{name} retired at step {step}: it changed next to nothing" for name, step in run.retired.items()])
     metrics = run.evaluate()
     if options.export_ply:
         print(f"{len(run.export_ply())} PLY files in {options.output / 'ply'}")

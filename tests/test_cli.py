@@ -125,6 +125,17 @@ def test_priors_are_built_in_parts_and_shown_on_a_sheet(
         assert np.array_equal(whole.prior(camera, 1).depth, joined.prior(camera, 1).depth)
 
 
+def test_a_hook_that_changes_nothing_retires_and_the_scores_say_so(
+    capture: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "config.toml"
+    config.write_text("[d2]\nretire_after = 2\n[densify]\nmax_gaussians = 0\n")
+    hooks = ["--hooks", "densify", "--priors", str(finished / "priors"), "--config", str(config)]
+    assert train(capture, tmp_path / "idle", *hooks) == 0
+    assert "densify retired at step 4: it changed next to nothing" in capsys.readouterr().out
+    assert json.loads((tmp_path / "idle" / "metrics.json").read_text())["retired"] == {"densify": 4}
+
+
 def test_a_part_is_not_built_on_a_cluster(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     build = ["priors", str(capture), "--train-cameras", CAMERAS, "--output", str(tmp_path / "priors")]
     assert "leave it out" in refused(capsys, main([*build, "--shard", "1/2", "--workers", "2"]))

@@ -38,6 +38,8 @@ class Run:
         self.scene = Scene.open(self.settings)
         _claim(folder, self.settings)
         self.seconds = {"priors": 0.0, "train": 0.0, "eval": 0.0}
+        self.retired: dict[str, int] = {}
+        """Hooks that stopped because they changed next to nothing, and at which step."""
 
     @classmethod
     def load(cls, folder: Path) -> Run:
@@ -75,6 +77,7 @@ class Run:
                 with self._timed("train"):
                     trainer.run(until, lambda step, loss: bar.update(step, f"loss {loss:.4f}"))
                 self._save(trainer)
+        self.retired = {} if trainer.d2 is None else dict(trainer.d2.retired)
 
     def evaluate(self, pictures: bool = True) -> dict[str, Any]:
         """Score every held-out camera at every frame; returns the metrics.
@@ -110,6 +113,7 @@ class Run:
             "test_cameras": list(scene.test_cameras),
             "backbone": self.settings.backbone,
             "hooks": list(self.settings.hooks),
+            "retired": self.retired,
             "plan": scene.plan.as_dict(),
             "capture": scene.capture.name,
             "mono_emulated": scene.capture.mono_emulated,
@@ -200,6 +204,7 @@ class Run:
         if not path.is_file():
             return False
         state = torch.load(path, map_location=self.settings.device, weights_only=True)
+        self.retired = dict(state["d2"]["retired"]) if state["d2"] else {}
         if trainer.d2 is None:
             state["d2"] = None
         trainer.load_state_dict(state)
