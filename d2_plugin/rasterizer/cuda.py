@@ -23,6 +23,8 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Survey
 
+from .frame import RECORD, PointingFrame
+
 KERNELS = Path(__file__).parent / "kernels"
 SOURCE, HEADERS = KERNELS / "gpu.cu", (KERNELS / "splat.h",)
 
@@ -30,8 +32,6 @@ THREADS = 256
 """Of a block; THREADS of gpu.cu."""
 TILE = 16
 """Side of a tile in pixels; TILE of gpu.cu."""
-RECORD = 16
-"""Floats of a projected Gaussian; also `native.RECORD`, so that the operators have one shape on every device."""
 GATHERERS, WARP, MOMENTS, STATISTICS = 8, 32, 7, 4
 """As in gpu.cu."""
 MOST_PAIRS = 2**31 - 1
@@ -40,7 +40,7 @@ MOST_PAIRS = 2**31 - 1
 _float, _int, _long, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_int64, ctypes.c_void_p
 
 
-class Frame(ctypes.Structure):
+class Frame(PointingFrame):
     """d2::Frame of kernels/gpu.cu: everything that one call works on; absent pointers stay null."""
 
     _fields_ = (
@@ -63,14 +63,6 @@ class Frame(ctypes.Structure):
             )
         ),
     )
-
-    def point(self, **tensors: Tensor | None) -> Frame:
-        """Set pointers by name and keep their tensors alive as long as the frame."""
-        for name, tensor in tensors.items():
-            if tensor is not None:
-                setattr(self, name, tensor.data_ptr())
-        self.kept = (*getattr(self, "kept", ()), tensors)
-        return self
 
     @property
     def tiles(self) -> int:

@@ -20,6 +20,7 @@ from d2_plugin.compiler import NoCompiler, load_library
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Survey
 
+from .frame import RECORD, PointingFrame
 from .reference import refuse_skew
 
 KERNELS = Path(__file__).parent / "kernels"
@@ -28,13 +29,10 @@ HEADERS = tuple(KERNELS / name for name in ("splat.h", "simd.h", "parallel.h", "
 FLAGS = ("-ffp-contract=off",)
 """The same formula must give the same bits wherever it is inlined; see kernels/simd.h."""
 
-RECORD = 16
-"""Floats of a projected Gaussian, one cache line."""
-
 _float, _int, _long, _bool, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_int64, ctypes.c_bool, ctypes.c_void_p
 
 
-class Frame(ctypes.Structure):
+class Frame(PointingFrame):
     """d2::Frame of kernels/frame.h: everything that one call works on; absent pointers stay null."""
 
     _fields_ = (
@@ -58,14 +56,6 @@ class Frame(ctypes.Structure):
             )
         ),
     )
-
-    def point(self, **tensors: Tensor | None) -> Frame:
-        """Set pointers by name and keep their tensors alive as long as the frame."""
-        for name, tensor in tensors.items():
-            if tensor is not None:
-                setattr(self, name, tensor.data_ptr())
-        self.kept = (*getattr(self, "kept", ()), tensors)
-        return self
 
 
 @functools.cache

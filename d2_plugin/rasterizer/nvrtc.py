@@ -30,6 +30,7 @@ logger = logging.getLogger(__name__)
 FLAGS = ("--std=c++17", "--fmad=false")
 """No contraction: the forward and the backward pass must decide alike which fragments count; splat.h asks for fma."""
 
+
 class NoCuda(D2Error):
     """The kernels cannot be had on this GPU; whoever has a slower way should take it."""
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from d2_plugin.protocol import DepthPrior, Label, RasterSettings, Render, Splats, Survey, View
 
 from . import cuda, native
+from .frame import RECORD
 
 _CAMERA = "Tensor T_camera_world, Tensor K"
 _SPLATS = "Tensor means, Tensor covariances, Tensor opacities"
@@ -106,7 +107,7 @@ def _(means, covariances, opacities, colors, background, screen_offsets, T_camer
         means.new_empty(height, width, colors.shape[1]),
         means.new_empty(height, width),
         means.new_empty(height, width),
-        means.new_empty(means.shape[0], native.RECORD),
+        means.new_empty(means.shape[0], RECORD),
         means.new_empty(pairs, dtype=torch.int32),
     )
 

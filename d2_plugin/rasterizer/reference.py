@@ -131,9 +131,7 @@ def visible(
     return kept[touches.all(1)]
 
 
-def project(
-    splats: Splats, view: View, settings: RasterSettings, screen_offsets: Tensor | None = None
-) -> Projection:
+def project(splats: Splats, view: View, settings: RasterSettings, screen_offsets: Tensor | None = None) -> Projection:
     """Elliptical weighted average projection (Zwicker et al. 2001) of Gaussians in front of the camera.
 
     The Jacobian is taken at x/z and y/z clamped to `fov_clamp` half fields of view around the image centre, since the
@@ -176,9 +174,7 @@ def _take(splats: Splats, index: Tensor) -> Splats:
     return Splats(splats.means[index], splats.covariances[index], splats.opacities[index], index)
 
 
-def _tile_weights(
-    screen: Projection, view: View, settings: RasterSettings, x: int, y: int
-) -> tuple[Tensor, Tensor]:
+def _tile_weights(screen: Projection, view: View, settings: RasterSettings, x: int, y: int) -> tuple[Tensor, Tensor]:
     """Compositing weights [P, K] at the pixels of the tile whose corner is (x, y), and who the K columns are."""
     columns = torch.arange(x, min(x + TILE, view.width)).to(screen.depths) + 0.5
     lines = torch.arange(y, min(y + TILE, view.height)).to(screen.depths) + 0.5
