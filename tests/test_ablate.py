@@ -100,6 +100,13 @@ class TestTables:
         assert str(found["D²-4DGS is above w/o Pruning"]).startswith("FAILS  -0.50 dB")
         assert len(found) == 2  # nothing is claimed about rows that were not run
 
+    def test_the_papers_own_figures_stand_beside_labelled(self) -> None:
+        made = results(**{name: [28.0] for name in TABLES["pruning"]})
+        text = ablate.report(made, rows_named(["pruning"]))
+        assert "○ paper's PSNR" in text
+        assert "| 22.21 |" in text
+        assert "not measured here" in text
+
     def test_statistics_leave_out_what_was_not_measured(self) -> None:
         assert ablate.statistics([None, 2.0, None]) == (2.0, 0.0)
         assert ablate.statistics([None]) is None

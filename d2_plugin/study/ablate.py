@@ -14,6 +14,8 @@ from statistics import mean, stdev
 from typing import Any
 
 from d2_plugin.progress import be_silent, progress_bar
+from d2_plugin.study.paper_tables import MARK, SOURCE, paper_rows
+from d2_plugin.study.paper_tables import TABLES as PAPER_TABLES
 from d2_plugin.study.presets import PRESETS, TABLES, Preset
 from d2_plugin.study.settings import RunSettings, prior_settings
 
@@ -147,13 +149,29 @@ def statistics(values: Sequence[float | None]) -> tuple[float, float] | None:
     return mean(known), stdev(known) if len(known) > 1 else 0.0
 
 
-def table(results: Mapping[Job, Metrics], backbone: str, rows: Sequence[str], latex: bool = False) -> str:
-    """One table, Markdown or LaTeX: mean ± deviation over seeds per preset; what was not measured shows as `-`."""
+def table(
+    results: Mapping[Job, Metrics],
+    backbone: str,
+    rows: Sequence[str],
+    latex: bool = False,
+    published: Mapping[str, float] | None = None,
+) -> str:
+    """One table, Markdown or LaTeX: mean ± deviation over seeds per preset; what was not measured shows as `-`.
+
+    `published` holds the paper's PSNR by preset: it stands in a column of its own, labelled as the paper's.
+    """
     titles = ["variant", *(title for title, _, _ in COLUMNS), "Gaussians", "train s"]
     lines = [[PRESETS[name].title, *_cells(_of(results, backbone, name), latex)] for name in rows]
+    if published:
+        titles.append(f"{MARK} paper's PSNR")
+        lines = [[*line, f"{published[name]:.2f}" if name in published else "-"] for line, name in zip(lines, rows)]
     if latex:
         head = f"\\begin{{tabular}}{{l{'c' * (len(titles) - 1)}}}\n\\toprule\n"
-        body = "\n".join(" & ".join(line) + r" \\" for line in [titles, *lines]).replace("²", "$^2$")
+        body = (
+            "\n".join(" & ".join(line) + r" \\" for line in [titles, *lines])
+            .replace("²", "$^2$")
+            .replace(MARK, r"$\circ$")
+        )
         return head + body.replace(r"\\", "\\\\\n\\midrule", 1) + "\n\\bottomrule\n\\end{tabular}"
     rule = ["---"] * len(titles)
     return "\n".join("| " + " | ".join(line) + " |" for line in [titles, rule, *lines])
@@ -199,9 +217,13 @@ def report(results: Mapping[Job, Metrics], presets: Sequence[Preset], latex: boo
     parts = []
     for backbone in dict.fromkeys(job.backbone for job in results):
         parts.append(f"% {backbone}" if latex else f"## {backbone}")
-        complete = [rows for title, rows in TABLES.items() if title != "main" and set(rows) <= names]
-        for rows in complete or [tuple(preset.name for preset in presets)]:
-            parts.append(table(results, backbone, rows, latex))
+        complete = [title for title, rows in TABLES.items() if title != "main" and set(rows) <= names]
+        for title in complete:
+            published = {row.preset: row.psnr for row in paper_rows(title)}
+            parts.append(table(results, backbone, TABLES[title], latex, published))
+            parts.append(f"{'% ' if latex else ''}{MARK} {SOURCE} ({PAPER_TABLES[title]}).")
+        if not complete:
+            parts.append(table(results, backbone, [preset.name for preset in presets], latex))
         if not latex:
             parts.append("\n".join(str(claim) for claim in claims(results, backbone)))
     return "\n\n".join(part for part in parts if part) + "\n"
