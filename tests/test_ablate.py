@@ -97,8 +97,15 @@ class TestTables:
             c.sentence: c for c in ablate.claims(results(full=[28.0], backbone=[25.0], no_pruning=[28.5]), "yang4d")
         }
         assert found["D²-4DGS is above Backbone"].margin == pytest.approx(3)
-        assert str(found["D²-4DGS is above w/o Pruning"]).startswith("FAILS  -0.50 dB")
+        assert str(found["D²-4DGS is above w/o Pruning"]).startswith("- fails")
         assert len(found) == 2  # nothing is claimed about rows that were not run
+
+    def test_an_order_within_the_spread_of_the_seeds_is_undecided(self) -> None:
+        found = ablate.claims(
+            results(full=[28.0, 29.0, 30.0], backbone=[25.0, 25.1], no_pruning=[29.3, 29.5]), "yang4d"
+        )
+        assert [claim.verdict for claim in found] == ["holds", "undecided"]
+        assert found[1].error == pytest.approx((1 / 3 + 0.02 / 2) ** 0.5)
 
     def test_the_papers_own_figures_stand_beside_labelled(self) -> None:
         made = results(**{name: [28.0] for name in TABLES["pruning"]})

@@ -47,10 +47,19 @@ class Claim:
 
     sentence: str
     margin: float
-    """dB of mean PSNR; negative where the claim fails."""
+    """dB of mean PSNR; negative where it is the other way round."""
+    error: float
+    """Standard error of the margin over the seeds, dB."""
+
+    @property
+    def verdict(self) -> str:
+        """ "holds" or "fails" where the margin is more than two standard errors, otherwise "undecided"."""
+        if abs(self.margin) <= 2 * self.error:
+            return "undecided"
+        return "holds" if self.margin > 0 else "fails"
 
     def __str__(self) -> str:
-        return f"{'holds' if self.margin >= 0 else 'FAILS'}  {self.margin:+.2f} dB  {self.sentence}"
+        return f"- {self.verdict}: {self.sentence} ({self.margin:+.2f} ± {self.error:.2f} dB)"
 
 
 def jobs(
@@ -198,17 +207,15 @@ def _cell(value: tuple[float, float] | None, digits: int, latex: bool) -> str:
 def claims(results: Mapping[Job, Metrics], backbone: str) -> list[Claim]:
     """What the paper's two tables say about the method, tested on these runs; only claims whose rows were run."""
 
-    def psnr(name: str) -> float:
-        value = statistics([run["test"]["psnr"] for run in _of(results, backbone, name) if run["test"]])
-        return math.nan if value is None else value[0]
+    scores = {name: [run["test"]["psnr"] for run in _of(results, backbone, name) if run["test"]] for name in PRESETS}
+    others = (*TABLES["ablation"][:8], "opacity_only", "depth_only")
+    return [_claim(scores, other) for other in others if scores["full"] and scores[other]]
 
-    wanted = [("full", other) for other in TABLES["ablation"][:8]] + [("full", "opacity_only"), ("full", "depth_only")]
-    margins = {(better, other): psnr(better) - psnr(other) for better, other in wanted}
-    return [
-        Claim(f"{PRESETS[better].title} is above {PRESETS[other].title}", margin)
-        for (better, other), margin in margins.items()
-        if not math.isnan(margin)
-    ]
+
+def _claim(scores: Mapping[str, Sequence[float]], other: str) -> Claim:
+    (ours, spread), (theirs, their_spread) = statistics(scores["full"]), statistics(scores[other])
+    error = math.sqrt(spread**2 / len(scores["full"]) + their_spread**2 / len(scores[other]))
+    return Claim(f"{PRESETS['full'].title} is above {PRESETS[other].title}", ours - theirs, error)
 
 
 def report(results: Mapping[Job, Metrics], presets: Sequence[Preset], latex: bool = False) -> str:
