@@ -133,10 +133,11 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(
     table = (tmp_path / "out" / "ablation.md").read_text()
     assert "| Backbone |" in table
     assert "| w/o Pruning |" in table
-    assert [path.name for path in (tmp_path / "out" / "priors").iterdir()] == ["dual"]
+    assert {path.name for path in (tmp_path / "out" / "priors").iterdir()} == {"dual", "dual.seconds.json"}
     rows = [json.loads(line) for line in (tmp_path / "out" / "runs.jsonl").read_text().splitlines()]
     assert len(rows) == 6
     assert all(row["kind"] == "ablation" and row["error"] > 0 for row in rows)
+    assert [row["prior_seconds"] > 0 for row in rows] == [False, False, True, True, True, True]
     checkpoints = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("checkpoint.pt")}
     assert len(checkpoints) == 6
     assert main(command) == 0

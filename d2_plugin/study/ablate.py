@@ -133,6 +133,21 @@ def _share(work: Sequence[Job]) -> None:
         if run.uses_prior and job.settings.priors not in first:
             run.prepare()
             first[job.settings.priors] = run
+            measured = _prior_seconds_file(job.settings)
+            if not measured.exists():  # a build that goes on would only tell its rest
+                measured.write_text(json.dumps(run.seconds["priors"]))
+
+
+def _prior_seconds_file(settings: RunSettings) -> Path:
+    return Path(f"{settings.priors}.seconds.json")
+
+
+def _prior_seconds(settings: RunSettings) -> float | None:
+    """How long the prior of a run took, which others share; 0 without a prior, None where it was not measured."""
+    if not settings.hooks:
+        return 0.0
+    measured = _prior_seconds_file(settings)
+    return json.loads(measured.read_text()) if measured.exists() else None
 
 
 def _prepare_worker() -> None:
@@ -263,5 +278,5 @@ def _row(make_row: Any, job: Job, metrics: Metrics, command: str) -> dict[str, A
         scores=scores,
         gaussians=metrics["gaussians"],
         iterations=metrics["iterations"],
-        prior_seconds=metrics["seconds"]["priors"],
+        prior_seconds=_prior_seconds(job.settings),
     )
