@@ -49,10 +49,12 @@ def training(rows: Sequence[Row]) -> Section:
 
 
 def _headline(case: str, scored: Sequence[Row]) -> str:
-    """The backbone alone and with D2 on one capture, mean PSNR and minutes; empty where one of them is missing."""
+    """PSNR and minutes, means of the longest runs, of the backbone alone and with D2 on one capture; empty where one of
+    them is missing."""
     told = []
     for name in dict.fromkeys(row["method"] for row in scored):
-        mine = [row for row in scored if row["method"] == name]
+        longest = max(row["iterations"] for row in scored if row["method"] == name)
+        mine = [row for row in scored if row["method"] == name and row["iterations"] == longest]
         minutes = (_mean(mine, "seconds") + _mean(mine, "prior_seconds")) / 60
         told.append(f"{name} {mean(_score(row, 'psnr') for row in mine):.2f} dB in {minutes:.2g} min")
     return f"{case}: {', '.join(told)}" if len(told) > 1 else ""
