@@ -15,7 +15,7 @@ import math
 import torch
 from torch import Tensor
 
-from d2_plugin.backbones.rotation4d import (
+from d2_plugin.gaussians.rotation4d import (
     condition_on_time,
     covariances_from_factors,
     rotation_matrices_3d,
@@ -23,7 +23,7 @@ from d2_plugin.backbones.rotation4d import (
     temporal_marginal,
     time_row,
 )
-from d2_plugin.backbones.slicing import MARGINAL_CUT, slice_gaussians, unit_quaternions
+from d2_plugin.gaussians.slicing import MARGINAL_CUT, slice_gaussians, unit_quaternions
 from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
 
 from .cameras import correct_fields_of_view

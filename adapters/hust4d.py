@@ -13,9 +13,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from d2_plugin.backbones.rotation4d import covariances_from_factors, rotation_matrices_3d
-from d2_plugin.backbones.slicing import unit_quaternions
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
+from d2_plugin.gaussians.slicing import unit_quaternions
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from .inria import InriaAdapter

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.gaussians.rotation4d import rotation_matrices_3d
+from d2_plugin.gaussians.slicing import slice_gaussians, unit_quaternions
 from d2_plugin.rasterizer import Splats, View
 
 from .deform_fields import Box, Field, HexPlaneField, HexPlaneSettings, MlpField, MlpSettings, Offsets
 from .model import SplatModel, SplatSettings, decayed_rate, shared_rates
-from .rotation4d import rotation_matrices_3d
-from .slicing import slice_gaussians, unit_quaternions
 from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, settings_of
 from .trainer import Trainer, TrainSettings
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 
-from . import spherical_harmonics as sh
 from .densify import DensifySettings, densify
 from .gaussians import Gaussians
 

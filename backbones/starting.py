@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.gaussians import spherical_harmonics as sh
 
-from . import spherical_harmonics as sh
 from .model import SplatSettings
 
 Settings = TypeVar("Settings", bound=SplatSettings)

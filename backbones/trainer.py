@@ -12,9 +12,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from d2_plugin.gaussians.photometric import photometric_loss
 from d2_plugin.rasterizer import Render, View
-
-from .photometric import photometric_loss
 
 
 class Model(Protocol):

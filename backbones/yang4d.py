@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL
+from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, rotation_matrices_4d
+from d2_plugin.gaussians.slicing import slice_gaussians, unit_quaternions
 from d2_plugin.rasterizer import Splats, View
 
 from .model import SplatModel, SplatSettings, shared_rates
-from .native_slice import STATIC, TEMPORAL
-from .rotation4d import rotation_matrices_3d, rotation_matrices_4d
-from .slicing import slice_gaussians, unit_quaternions
 from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, settings_of
 from .trainer import Trainer, TrainSettings
 

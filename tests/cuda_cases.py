@@ -14,7 +14,7 @@ from d2_plugin.compiler import load_library
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
 from d2_plugin.rasterizer import cuda, ops, reference
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parent / "rasterizer"
 FORWARD_TOLERANCE, GRADIENT_TOLERANCE = 1e-4, 1e-3
 THRESHOLD_MARGIN = 1e-4
 """Relative distance to alpha_min within which float32 may decide otherwise; 100 times that for transmittance_min."""

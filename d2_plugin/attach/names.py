@@ -1,4 +1,4 @@
-"""A prior store under the names that an export gave to cameras and frames (see d2_plugin.captures.export)."""
+"""A prior store under the names that an export gave to cameras and frames (see d2_plugin.captures.export.export)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from d2_plugin.captures.export import EXPORT_FILE
+from d2_plugin.captures.export.export import EXPORT_FILE
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.protocol import DepthPrior
 

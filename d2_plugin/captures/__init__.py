@@ -6,18 +6,18 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from d2_plugin.captures.blender import FILES as TRANSFORMS_FILES
-from d2_plugin.captures.blender import open_transforms
 from d2_plugin.captures.capture import Camera, Capture, MonoKind, Source
-from d2_plugin.captures.colmap import open_colmap
-from d2_plugin.captures.colmap_model import find_model
-from d2_plugin.captures.enerf import open_enerf
-from d2_plugin.captures.folder import open_folder
-from d2_plugin.captures.n3dv import open_n3dv
-from d2_plugin.captures.technicolor import PARAMETERS as TECHNICOLOR_FILE
-from d2_plugin.captures.technicolor import open_technicolor
-from d2_plugin.captures.transforms import downscale as _downscale
-from d2_plugin.captures.transforms import select_cameras, select_frames
+from d2_plugin.captures.readers.colmap import open_colmap
+from d2_plugin.captures.readers.colmap_model import find_model
+from d2_plugin.captures.readers.enerf import open_enerf
+from d2_plugin.captures.readers.folder import open_folder
+from d2_plugin.captures.readers.n3dv import open_n3dv
+from d2_plugin.captures.readers.technicolor import PARAMETERS as TECHNICOLOR_FILE
+from d2_plugin.captures.readers.technicolor import open_technicolor
+from d2_plugin.captures.readers.transforms_json import FILES as TRANSFORMS_FILES
+from d2_plugin.captures.readers.transforms_json import open_transforms
+from d2_plugin.captures.selection import downscale as _downscale
+from d2_plugin.captures.selection import select_cameras, select_frames
 from d2_plugin.errors import D2Error, unknown_name
 
 __all__ = ["LAYOUTS", "Camera", "Capture", "MonoKind", "Source", "open_capture", "select_cameras", "select_frames"]

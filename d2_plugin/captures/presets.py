@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from d2_plugin.captures import Capture, open_capture
-from d2_plugin.captures.n3dv import UNSYNCHRONISED
+from d2_plugin.captures.readers.n3dv import UNSYNCHRONISED
 from d2_plugin.errors import D2Error, unknown_name
 
 PREFIX = "preset:"

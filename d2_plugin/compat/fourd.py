@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from d2_plugin.backbones.rotation4d import covariances_from_factors, rotation_matrices_4d, time_row
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_4d, time_row
 from d2_plugin.protocol import Splats
 
 from .inria import colors_of, covariances_of, draw, exactly_one, harmonics, in_front, shape_given

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from d2_plugin.backbones.rotation4d import covariances_from_factors, rotation_matrices_3d
-from d2_plugin.backbones.spherical_harmonics import basis
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
+from d2_plugin.gaussians.spherical_harmonics import basis
 from d2_plugin.protocol import RasterSettings, Splats, View
 from d2_plugin.rasterizer import rasterize
 from d2_plugin.rasterizer.reference import project

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from d2_plugin.backbones.photometric import ssim
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.photometric import ssim
 
 
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:

@@ -14,12 +14,12 @@ import numpy as np
 
 from d2_plugin.captures.capture import Capture
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.priors.agree import with_agreement
-from d2_plugin.priors.align import Alignment, align, aligned_depth, not_aligned
-from d2_plugin.priors.correct import corrected_depth
+from d2_plugin.priors.depth_on_disk import recorded_depth
 from d2_plugin.priors.fuse import VARIANTS, FusedPrior, empty_prior, fuse, hanging_pixels
 from d2_plugin.priors.geometry import check_depth_range
-from d2_plugin.priors.recorded import recorded_depth
+from d2_plugin.priors.monocular.agree import with_agreement
+from d2_plugin.priors.monocular.align import Alignment, align, aligned_depth, not_aligned
+from d2_plugin.priors.monocular.correct import corrected_depth
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.sources import (
     Frame,
@@ -31,7 +31,7 @@ from d2_plugin.priors.sources import (
     hash_of,
     mono_source,
 )
-from d2_plugin.priors.stereo import DepthBounds, depth_bounds
+from d2_plugin.priors.stereo.geometric_depth import DepthBounds, depth_bounds
 from d2_plugin.priors.store import PriorStore
 
 __all__ = ["PriorSettings", "PriorSummary", "build_priors"]

@@ -127,7 +127,7 @@ class AlignSettings:
     """Rank correlation of the map with what it is declared to be; below this the declared kind is contradicted."""
     local_scales: tuple[float, ...] = (0.25, 0.12, 0.06, 0.03)
     """Standard deviations of the windows of the local correction, coarse to fine, in picture widths; none is the paper.
-    Measured: mono-only error .0425 without, .027 with (studio); see `d2_plugin.priors.correct`."""
+    Measured: mono-only error .0425 without, .027 with (studio); see `d2_plugin.priors.monocular.correct`."""
     local_prior: float = 0.05
     """Weight of "no correction": a window in which this share of the pixels is known is corrected by half."""
     local_limit: float = 0.7
@@ -157,7 +157,7 @@ class PriorSettings:
     width: they hang between two surfaces. 0 keeps them, as the paper does."""
     agreement: float = 0.02
     """Mono-only pixels whose depth another camera's confirms within this share may prune and supervise as well (`dual`
-    alone); 0 leaves that out, as the paper does. Measured: see `d2_plugin.priors.agree`."""
+    alone); 0 leaves that out, as the paper does. Measured: see `d2_plugin.priors.monocular.agree`."""
     depth_range: tuple[float, float] | None = None
     """Near and far of the stereo search, world units; by default from sparse points, the data set, or the baselines."""
     mono_onnx: str | None = None

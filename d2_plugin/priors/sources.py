@@ -14,13 +14,13 @@ import numpy as np
 
 from d2_plugin.captures.capture import Camera, Capture, MonoKind
 from d2_plugin.errors import D2Error
+from d2_plugin.priors.depth_on_disk import RecordedDepth, filter_recorded
 from d2_plugin.priors.files import EntryFolder
-from d2_plugin.priors.filter import GeometricDepth
-from d2_plugin.priors.monocular import MonocularModel, upsample
-from d2_plugin.priors.recorded import RecordedDepth, filter_recorded
+from d2_plugin.priors.monocular.network import MonocularModel, upsample
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
-from d2_plugin.priors.static import MatchMemory
-from d2_plugin.priors.stereo import WHOLE_PICTURES, DepthBounds, choose_maker, geometric_depth
+from d2_plugin.priors.stereo.filter import GeometricDepth
+from d2_plugin.priors.stereo.geometric_depth import WHOLE_PICTURES, DepthBounds, choose_maker, geometric_depth
+from d2_plugin.priors.stereo.reuse import MatchMemory
 from d2_plugin.priors.store import DepthRange
 
 STEREO_VERSION = 1  # raise it when makers or filter change what they return, so that caches are not trusted

@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.captures.presets import resolve_cameras
+from d2_plugin.runs.scene import Scene
+from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check
+from d2_plugin.study.bench.memory import Measured, in_fresh_process
+from d2_plugin.study.report.limits import plan as plan_section
+from d2_plugin.study.report.page import markdown_table
 
-from .memory import Measured, in_fresh_process
-from .page import markdown_table
 from .rows import Row, append_rows, make_row
-from .sections_limits import plan as plan_section
-from .settings import HOOK_NAMES, RunSettings, Scene, check
 
 USED, LEFT_OUT = "used", "left out"
 
@@ -159,14 +160,14 @@ def _costs(used: Sequence[Measured], runs: Sequence[Measured]) -> list[float]:
 
 
 def _prepare(settings: RunSettings, folder: Path) -> None:
-    from .run import Run
+    from d2_plugin.runs.run import Run
 
     Run(settings, folder).prepare()
 
 
 def _train(settings: RunSettings, folder: Path) -> dict[str, Any]:
     """Train and score; the seconds are those of training alone."""
-    from .run import Run
+    from d2_plugin.runs.run import Run
 
     run = Run(settings, folder)
     run.prepare()
@@ -179,9 +180,8 @@ def _train(settings: RunSettings, folder: Path) -> dict[str, Any]:
 def _build(settings: RunSettings, folder: Path) -> dict[str, Any]:
     """Build the priors; the score is the verified share, with the median error of those pixels where truth is known."""
     from d2_plugin.priors.store import PriorStore
-
-    from .run import build_priors_for
-    from .scene import triangulated_points
+    from d2_plugin.runs.run import build_priors_for
+    from d2_plugin.runs.start import triangulated_points
 
     scene = Scene.open(settings)
     points = triangulated_points(scene.capture, scene.train_cameras)["positions"]

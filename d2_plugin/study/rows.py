@@ -16,8 +16,7 @@ from typing import Any
 import torch
 
 from d2_plugin.errors import D2Error, unknown_name
-
-from .provenance import circumstances
+from d2_plugin.runs.provenance import circumstances
 
 Row = dict[str, Any]
 

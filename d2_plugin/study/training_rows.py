@@ -11,9 +11,9 @@ from typing import Any
 
 from d2_plugin.captures.pictures import opencv, read_picture, shrink_picture
 from d2_plugin.errors import MissingExtra
+from d2_plugin.runs.provenance import circumstances
+from d2_plugin.runs.tables import read_metrics
 
-from .provenance import circumstances
-from .report import read_metrics
 from .rows import Row, make_row
 
 PICTURE_WIDTH = 1600

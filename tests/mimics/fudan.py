@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor
 
-from d2_plugin.backbones.slicing import slice_gaussians
+from d2_plugin.gaussians.slicing import slice_gaussians
 
 from .inria import Camera, InriaModel, cameras_of, default_options, draw, initial_points, l1_loss, shuffled
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from d2_plugin.priors.affine import fit_affine
-from d2_plugin.priors.align import AlignStatus, align, aligned_depth
+from d2_plugin.priors.monocular.affine import fit_affine
+from d2_plugin.priors.monocular.align import AlignStatus, align, aligned_depth
 from d2_plugin.priors.settings import AlignSettings
 
 CERTIFIED = 1e-9

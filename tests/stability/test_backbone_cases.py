@@ -27,8 +27,8 @@ from tiny import (
 
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.backbones.model import SplatModel
-from d2_plugin.backbones.photometric import photometric_loss
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
+from d2_plugin.gaussians.photometric import photometric_loss
 from d2_plugin.hooks.depth_loss import charbonnier
 from d2_plugin.protocol import DepthPrior, Label
 

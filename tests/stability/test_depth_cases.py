@@ -18,15 +18,15 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from d2_plugin import D2Error
-from d2_plugin.backbones.photometric import photometric_loss, ssim
-from d2_plugin.backbones.slicing import reference_slice
 from d2_plugin.backbones.starting import nearest_neighbour_scales
-from d2_plugin.captures.synthetic import synthetic_capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.gaussians.photometric import photometric_loss, ssim
+from d2_plugin.gaussians.slicing import reference_slice
 from d2_plugin.hooks.depth_loss import charbonnier, depth_loss
 from d2_plugin.hooks.rendered_depth import EPSILON, rendered_depth
 from d2_plugin.priors.geometry import back_project, pixel_grid, view_pair
 from d2_plugin.rasterizer import Splats, rasterize
-from d2_plugin.study import metrics
+from d2_plugin.runs import metrics
 
 TAU_V = 0.5
 both = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.synthetic import arc_cameras
+from d2_plugin.captures.synthetic.room import arc_cameras
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.colmap_mvs import colmap_patch_match, run_patch_match, why_not_usable
+from d2_plugin.priors.colmap.mvs import colmap_patch_match, run_patch_match, why_not_usable
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo import geometric_depth
+from d2_plugin.priors.stereo.geometric_depth import geometric_depth
 
 pytest.importorskip("cv2")
 
@@ -38,7 +38,7 @@ def test_case_42_compression_survives_pycolmap_whatever_is_imported_first(order:
     imports = {
         "torch": "import torch",
         "zlib": "import zlib",
-        "colmap": "from d2_plugin.priors import colmap; colmap.import_pycolmap('a test')",
+        "colmap": "from d2_plugin.priors.colmap import points; points.import_pycolmap('a test')",
     }
     code = "\n".join([*(imports[name] for name in order.split(", ")), "zlib.compress(bytes(10**5)); print('alive')"])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

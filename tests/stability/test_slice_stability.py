@@ -14,10 +14,10 @@ from tiny import make_model, make_views
 from torch import Tensor
 
 from d2_plugin import D2Error
-from d2_plugin.backbones import native_slice as kernel
-from d2_plugin.backbones.native_slice import native_slice
-from d2_plugin.backbones.rotation4d import condition_on_time, normalized_quaternions, rotation_matrices_4d
-from d2_plugin.backbones.slicing import reference_slice
+from d2_plugin.gaussians import native_slice as kernel
+from d2_plugin.gaussians.native_slice import native_slice
+from d2_plugin.gaussians.rotation4d import condition_on_time, normalized_quaternions, rotation_matrices_4d
+from d2_plugin.gaussians.slicing import reference_slice
 from d2_plugin.rasterizer import Splats, rasterize
 
 PATHS = {

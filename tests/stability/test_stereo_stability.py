@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.synthetic import synthetic_capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.colmap_mvs import why_not_usable
+from d2_plugin.priors.colmap.mvs import why_not_usable
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo import depth_bounds, geometric_depth
+from d2_plugin.priors.stereo.geometric_depth import depth_bounds, geometric_depth
 
 pytest.importorskip("cv2")
 

@@ -1,0 +1,131 @@
+"""COLMAP models with known poses, in the places where trainers look for them."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from d2_plugin.captures.capture import Camera
+from d2_plugin.captures.export.export import Export, Names, refuse_off_centre
+from d2_plugin.captures.export.n3dv import depth_bounds, llff_row
+from d2_plugin.captures.export.ply import PointCloud, color_bytes, write_point_cloud
+from d2_plugin.captures.pictures import opencv
+from d2_plugin.errors import D2Error
+
+PINHOLE = 1
+"""COLMAP's number of the camera model with fx, fy, cx, cy."""
+
+JPEG_QUALITY = 98
+"""Of the pictures that 4DGaussians insists to be JPEG."""
+
+
+class _Picture(NamedTuple):
+    """A registered picture: its file name and the number and calibration of its camera."""
+
+    name: str
+    number: int
+    camera: Camera
+
+
+def write_colmap(export: Export) -> Names:
+    """sparse/0/{cameras,images,points3D}.bin and images/CAMERA_FRAME.png; names are kept.
+
+    COLMAP's models know no time, so the first frame alone is registered: a trainer of still scenes sees one instant,
+    and 4C4D gives further pictures of a camera (named camNN) that camera's pose, as `open_capture` does.
+    """
+    capture = export.capture
+    export.write_pictures(lambda camera, frame: export.folder / "images" / f"{camera}_{frame:04d}.png")
+    first = capture.frames[0]
+    pictures = [
+        _Picture(f"{name}_{first:04d}.png", index + 1, camera)
+        for index, (name, camera) in enumerate(capture.cameras.items())
+    ]
+    _write_model(export.folder / "sparse" / "0", pictures, export.cloud)
+    if export.cloud is not None:
+        write_point_cloud(export.folder / "sparse" / "0" / "points3D.ply", export.cloud)
+    return {name: name for name in capture.cameras}
+
+
+def write_multipleview(export: Export) -> Names:
+    """4DGaussians' layout of own recordings: sparse_/, camNN/frame_NNNNN.jpg, points3D_multipleview.ply and
+    poses_bounds_multipleview.npy.
+
+    Cameras become cam01, cam02, ... and frames count from 1, since its reader makes up these names. It takes the first
+    camera's focal length for all, and tests on frames of the cameras it trains on: held-out cameras are not written.
+    """
+    if export.cloud is None:
+        raise D2Error("the layout multipleview needs initial points, which its reader does not make up: give some")
+    kept = {name: export.capture.cameras[name] for name in export.train_cameras}
+    for camera in kept.values():
+        refuse_off_centre(camera, "multipleview")
+    names = {name: f"cam{index + 1:02d}" for index, name in enumerate(kept)}
+    for name in kept:
+        for index, frame in enumerate(export.capture.frames):
+            _write_jpeg(export.folder / names[name] / f"frame_{index + 1:05d}.jpg", export.capture.image(name, frame))
+    # Its reader takes the digits behind the fifth letter of a picture's name for the number of the camera.
+    pictures = [_Picture(f"image{index + 1}.jpg", index + 1, camera) for index, camera in enumerate(kept.values())]
+    _write_model(export.folder / "sparse_", pictures, export.cloud)
+    rows = [llff_row(camera, depth_bounds(camera, export.cloud)) for camera in kept.values()]
+    np.save(export.folder / "poses_bounds_multipleview.npy", np.stack(rows))
+    write_point_cloud(export.folder / "points3D_multipleview.ply", export.cloud)
+    return names
+
+
+def _write_model(folder: Path, pictures: list[_Picture], cloud: PointCloud | None) -> None:
+    """cameras.bin, images.bin and points3D.bin; pictures have no observations and points no tracks."""
+    folder.mkdir(parents=True)
+    cameras = {picture.number: picture.camera for picture in pictures}
+    (folder / "cameras.bin").write_bytes(
+        struct.pack("<Q", len(cameras)) + b"".join(_camera_record(*item) for item in cameras.items())
+    )
+    records = [_image_record(index + 1, picture) for index, picture in enumerate(pictures)]
+    (folder / "images.bin").write_bytes(struct.pack("<Q", len(pictures)) + b"".join(records))
+    (folder / "points3D.bin").write_bytes(_point_records(cloud))
+
+
+def _camera_record(number: int, camera: Camera) -> bytes:
+    intrinsics = (camera.K[place] for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return struct.pack("<iiQQ4d", number, PINHOLE, camera.width, camera.height, *intrinsics)
+
+
+def _image_record(identity: int, picture: _Picture) -> bytes:
+    pose = picture.camera.T_camera_world
+    head = struct.pack("<I7dI", identity, *quaternion(pose[:3, :3]), *pose[:3, 3], picture.number)
+    return head + picture.name.encode() + b"\0" + struct.pack("<Q", 0)
+
+
+def _point_records(cloud: PointCloud | None) -> bytes:
+    if cloud is None:
+        return struct.pack("<Q", 0)
+    colors = color_bytes(cloud.colors).tolist()
+    rows = zip(np.asarray(cloud.positions, float).tolist(), colors)
+    records = [struct.pack("<Q3d3BdQ", index + 1, *xyz, *rgb, 0.0, 0) for index, (xyz, rgb) in enumerate(rows)]
+    return struct.pack("<Q", len(records)) + b"".join(records)
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternion [4], w first and not negative, of the rotation nearest to `rotation` [3, 3].
+
+    It is the leading eigenvector of a symmetric matrix (Bar-Itzhack 2000), which loses no digits at any angle.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)
+    symmetric = [
+        [a + e + i, h - f, c - g, d - b],
+        [h - f, a - e - i, b + d, c + g],
+        [c - g, b + d, e - a - i, f + h],
+        [d - b, c + g, f + h, i - a - e],
+    ]
+    found = np.linalg.eigh(np.array(symmetric))[1][:, -1]
+    return found if found[0] >= 0 else -found
+
+
+def _write_jpeg(path: Path, picture: np.ndarray) -> None:
+    cv2 = opencv("writing the JPEG pictures of the layout multipleview")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    written, encoded = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not written:
+        raise D2Error(f"cannot encode {path} of {picture.shape[1]}x{picture.shape[0]} pixels as JPEG: downscale it")
+    path.write_bytes(encoded.tobytes())

@@ -1,0 +1,1 @@
+"""Recordings that are rendered exactly, with true depth."""

@@ -1,0 +1,1 @@
+"""Mathematics of 4D Gaussians that backbones, adapters and stand-ins share."""

@@ -1,0 +1,1 @@
+"""What COLMAP does for the priors: sparse points, its PatchMatch, its workspaces."""

@@ -1,0 +1,287 @@
+"""Sparse surface points from cameras whose poses are known: SIFT features, matched, triangulated by COLMAP.
+
+COLMAP would estimate the geometry of every pair of pictures anew to tell good matches from bad ones. The poses are
+known here, so a match is kept when it lies on its epipolar line: no random sampling, and pairs with a handful of
+matches still count. No other module imports pycolmap into this process.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import tempfile
+import zipfile
+import zlib  # before pycolmap, whose own copy of zlib would otherwise be bound and crash later calls
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.priors.colmap.matching import Features, epipolar_matches, fundamental_matrix, same_spot
+
+LUMA = np.array([0.299, 0.587, 0.114])
+"""Weights of red, green and blue in the grey picture that features are found in (ITU-R BT.601)."""
+
+DESCRIPTOR_LENGTH = 128
+"""Numbers in a SIFT descriptor."""
+
+
+@dataclass(frozen=True)
+class TriangulationSettings:
+    """What counts as a feature, a match and a point."""
+
+    peak_threshold: float = 0.0033
+    """SIFT contrast threshold; half of COLMAP's, since the epipolar test is strict."""
+    max_features: int = 8192
+    """Strongest features kept per picture."""
+    max_ratio: float = 0.8
+    """Angle to the best match over angle to the second best (Lowe's ratio test)."""
+    max_angle: float = 0.7
+    """Largest angle between matching descriptors, radians."""
+    epipolar_error: float = 1.0
+    """Largest Sampson distance of a match from the known epipolar geometry, pixels."""
+    reprojection_error: float = 2.0
+    """Largest reprojection error of a point, pixels."""
+    min_angle: float = 0.5
+    """Smallest angle between two rays that meet in a point, degrees."""
+
+
+@dataclass(frozen=True, eq=False)
+class SparsePoints:
+    """Triangulated surface points of one or several frames."""
+
+    positions: np.ndarray  # [P, 3] float64, world
+    colors: np.ndarray  # [P, 3] float32 in 0..1, mean over the pictures that see the point
+    errors: np.ndarray  # [P] float32, mean reprojection error in pixels
+    track_lengths: np.ndarray  # [P] int32, number of pictures that see the point
+    frames: np.ndarray  # [P] int64, frame the point was seen in
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @classmethod
+    def empty(cls) -> SparsePoints:
+        """No points."""
+        return cls(
+            np.zeros((0, 3)),
+            np.zeros((0, 3), np.float32),
+            np.zeros(0, np.float32),
+            np.zeros(0, np.int32),
+            np.zeros(0, np.int64),
+        )
+
+    @classmethod
+    def joined(cls, parts: Iterable[SparsePoints]) -> SparsePoints:
+        """The points of all `parts`, in their order."""
+        together = [cls.empty(), *parts]
+        return cls(*(np.concatenate([getattr(part, field.name) for part in together]) for field in fields(cls)))
+
+    def save(self, path: Path) -> None:
+        """Write a compressed .npz with one array per attribute."""
+        with open(path, "wb") as file:  # np.savez would append .npz to another suffix
+            np.savez_compressed(file, **{field.name: getattr(self, field.name) for field in fields(self)})
+
+    @classmethod
+    def load(cls, path: Path) -> SparsePoints:
+        """Read what `save` wrote."""
+        try:
+            with open(path, "rb") as file, np.load(file) as arrays:  # np.load leaves a damaged file open
+                return cls(*(arrays[field.name] for field in fields(cls)))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as failure:
+            raise D2Error(
+                f"cannot read sparse points from {path} ({failure}): delete the file and build again"
+            ) from None
+
+
+def triangulate(
+    images: Sequence[np.ndarray],
+    cameras: Sequence[Camera],
+    frame: int = 0,
+    settings: TriangulationSettings | None = None,
+) -> SparsePoints:
+    """Surface points seen by at least two of `cameras` at one instant.
+
+    Args:
+        images: RGB uint8 [H, W, 3], one per camera.
+        cameras: their calibrations.
+        frame: what to note as the points' frame.
+        settings: thresholds; the defaults where None.
+
+    Returns:
+        The points, in an order that does not depend on threads; none for a single camera, cameras that stand on one
+        spot, or pictures without texture.
+
+    Raises:
+        MissingExtra: pycolmap is not installed.
+    """
+    if len(images) != len(cameras):
+        raise D2Error(f"{len(images)} pictures for {len(cameras)} cameras: give one picture per camera")
+    settings = settings or TriangulationSettings()
+    pycolmap = import_pycolmap("triangulating sparse points")
+    with _quiet(pycolmap), tempfile.TemporaryDirectory(prefix="d2_sparse_") as folder:
+        features = [_extract(pycolmap, image, settings) for image in images]
+        pairs = _matched_pairs(features, cameras, settings)
+        if not pairs:
+            return SparsePoints.empty()
+        model = _triangulated(pycolmap, Path(folder), cameras, features, pairs, settings)
+        return _collected(model, images, frame)
+
+
+def triangulate_frames(
+    capture: Capture,
+    cameras: Sequence[str],
+    frames: Iterable[int],
+    settings: TriangulationSettings | None = None,
+) -> SparsePoints:
+    """`triangulate` for each of `frames` of a capture, joined; pictures are read one instant at a time."""
+    calibrations = [capture.cameras[name] for name in cameras]
+    parts = []
+    for frame in frames:
+        images = [capture.image(name, frame) for name in cameras]
+        parts.append(triangulate(images, calibrations, frame, settings))
+    return SparsePoints.joined(parts)
+
+
+def import_pycolmap(purpose: str) -> ModuleType:
+    """The `pycolmap` module, imported after zlib; `purpose` completes the sentence "<purpose> needs pycolmap".
+
+    Raises:
+        MissingExtra: where it is not installed.
+    """
+    try:
+        import pycolmap
+    except ImportError:
+        raise missing_extra("pycolmap", "stereo", purpose) from None
+    return pycolmap
+
+
+@contextmanager
+def _quiet(pycolmap: ModuleType) -> Iterator[None]:
+    """COLMAP reports progress on stderr; errors still come through as exceptions."""
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = 2
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def _extract(pycolmap: ModuleType, image: np.ndarray, settings: TriangulationSettings) -> Features:
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = os.cpu_count() or 1
+    options.sift.peak_threshold = settings.peak_threshold
+    options.sift.max_num_features = settings.max_features
+    extractor = pycolmap.FeatureExtractor.create(options, device=pycolmap.Device.cpu)
+    gray = np.rint(image @ LUMA).astype(np.uint8)
+    keypoints, descriptors = extractor.extract_from_uint8_array(gray)
+    pixels = np.array([(point.x, point.y) for point in keypoints], np.float64).reshape(-1, 2)
+    vectors = np.asarray(descriptors.data, np.float32).reshape(len(pixels), DESCRIPTOR_LENGTH)
+    return Features(pixels, vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
+
+
+def _matched_pairs(
+    features: Sequence[Features], cameras: Sequence[Camera], settings: TriangulationSettings
+) -> dict[tuple[int, int], np.ndarray]:
+    """Matches [M, 2] of every pair of pictures that has any."""
+    pairs = {}
+    for i, j in itertools.combinations(range(len(cameras)), 2):
+        if not same_spot(cameras[i], cameras[j]):
+            fundamental = fundamental_matrix(cameras[i], cameras[j])
+            pairs[i, j] = epipolar_matches(
+                features[i],
+                features[j],
+                fundamental,
+                settings.max_ratio,
+                settings.max_angle,
+                settings.epipolar_error,
+            )
+    return {pair: matches for pair, matches in pairs.items() if len(matches)}
+
+
+def _triangulated(
+    pycolmap: ModuleType,
+    folder: Path,
+    cameras: Sequence[Camera],
+    features: Sequence[Features],
+    pairs: dict[tuple[int, int], np.ndarray],
+    settings: TriangulationSettings,
+) -> Any:
+    """The pycolmap.Reconstruction with points; picture i has the id i + 1."""
+    model = _posed_model(pycolmap, cameras)
+    _write_database(pycolmap, folder / "database.db", model, features, pairs)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.extract_colors = False
+    options.min_num_matches = 1
+    options.random_seed = options.triangulation.random_seed = 0
+    options.triangulation.ignore_two_view_tracks = False  # the default leaves a pair of cameras without a single point
+    options.triangulation.min_angle = options.mapper.filter_min_tri_angle = settings.min_angle
+    options.mapper.filter_max_reproj_error = settings.reprojection_error
+    (folder / "model").mkdir()
+    return pycolmap.triangulate_points(model, folder / "database.db", folder, folder / "model", options=options)
+
+
+def _posed_model(pycolmap: ModuleType, cameras: Sequence[Camera]) -> Any:
+    model = pycolmap.Reconstruction()
+    for number, camera in enumerate(cameras, start=1):
+        K, transform = camera.K, camera.T_camera_world
+        parameters = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]  # COLMAP's pixel centres are at i + 0.5, as ours
+        lens = pycolmap.Camera(
+            camera_id=number, model="PINHOLE", width=camera.width, height=camera.height, params=parameters
+        )
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(transform[:3, :3]), transform[:3, 3])
+        model.add_camera_with_trivial_rig(lens)
+        picture = pycolmap.Image(name=f"{number}", camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(picture, pose)
+    return model
+
+
+def _write_database(
+    pycolmap: ModuleType,
+    path: Path,
+    model: Any,
+    features: Sequence[Features],
+    pairs: dict[tuple[int, int], np.ndarray],
+) -> None:
+    database = pycolmap.Database.open(path)
+    for camera in model.cameras.values():
+        database.write_camera(camera, use_camera_id=True)
+    for rig in model.rigs.values():
+        database.write_rig(rig, use_rig_id=True)
+    for frame in model.frames.values():  # before the images, which must find their frame
+        database.write_frame(frame, use_frame_id=True)
+    for number, image in model.images.items():
+        database.write_image(image, use_image_id=True)
+        database.write_keypoints(number, features[number - 1].pixels.astype(np.float32))
+    for (i, j), matches in pairs.items():
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.config = int(pycolmap.TwoViewGeometryConfiguration.CALIBRATED)
+        geometry.inlier_matches = matches.astype(np.uint32)
+        database.write_two_view_geometry(i + 1, j + 1, geometry)
+    database.close()
+
+
+def _collected(model: Any, images: Sequence[np.ndarray], frame: int) -> SparsePoints:
+    points = sorted(model.points3D.values(), key=lambda point: tuple(point.xyz))
+    if not points:
+        return SparsePoints.empty()
+    colors = [np.mean([_color(model, images, seen) for seen in point.track.elements], axis=0) for point in points]
+    return SparsePoints(
+        positions=np.array([point.xyz for point in points], np.float64),
+        colors=np.array(colors, np.float32) / 255,
+        errors=np.array([point.error for point in points], np.float32),
+        track_lengths=np.array([point.track.length() for point in points], np.int32),
+        frames=np.full(len(points), frame, np.int64),
+    )
+
+
+def _color(model: Any, images: Sequence[np.ndarray], seen: Any) -> np.ndarray:
+    column, row = model.images[seen.image_id].points2D[seen.point2D_idx].xy
+    image = images[seen.image_id - 1]
+    return image[min(int(row), image.shape[0] - 1), min(int(column), image.shape[1] - 1)]

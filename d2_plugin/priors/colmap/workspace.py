@@ -1,0 +1,235 @@
+"""Depth maps of COLMAP workspaces that the user has: `sparse/` with the cameras, `stereo/depth_maps/` with the maps.
+
+A workspace holds pinhole pictures of its own, seldom the size or the intrinsics of ours, and often a world of its own
+scale. So maps are looked up ray by ray, and depth is scaled by the ratio of the baselines, after the poses were checked
+to be the same up to a similarity.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from d2_plugin.captures.capture import Camera
+from d2_plugin.captures.readers.colmap_model import ColmapImage, ColmapModel, read_model
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.colmap.dense_arrays import read_dense_array
+from d2_plugin.priors.settings import StereoSettings
+
+PLACES = ("colmap/{frame:05d}", "colmap", "dense", "colmap/{frame:05d}/dense", "colmap/dense")
+"""Where a workspace is looked for below a capture, in this order."""
+
+ROTATION = 1.0
+"""Relative rotations of two cameras may differ by this between capture and workspace, degrees: bundle adjustment
+moves them by a few tenths."""
+
+TRANSLATION = 0.03
+"""And their relative translation, after scaling, by this share of it."""
+
+logger = logging.getLogger(__name__)
+
+
+class WorkspaceDepth:
+    """Depth maps of one workspace for all frames, or of one per frame.
+
+    Args:
+        root: folder that `place` is relative to.
+        place: path of the workspace; `{frame}` in it stands for the frame number.
+        settings: `colmap_geometric` says whether maps of the geometric pass are wanted where there are any.
+        cameras: the cameras whose poses are compared.
+        frames: of the capture. Where there are several, a picture is told from others by its frame: a workspace of one
+            instant, as many captures have for their initial points, must not become the depth of all instants.
+    """
+
+    maker = "workspace"
+
+    def __init__(
+        self, root: Path, place: str, settings: StereoSettings, cameras: Sequence[Camera], frames: Sequence[int]
+    ) -> None:
+        self.root, self.place, self.cameras = root, place, list(cameras)
+        self.one_instant = "{frame" in place or len(frames) == 1
+        self.kinds = ("geometric", "photometric") if settings.colmap_geometric else ("photometric",)
+        self.about = f"depth maps of the COLMAP workspace {place}"
+        self._read: Path | None = None
+        self._compared: Path | None = None
+        self._model: ColmapModel | None = None
+        self._images: dict[tuple[str, int | None], ColmapImage] = {}
+        self._strangers: list[str] = []
+        self._scale = 1.0
+
+    @classmethod
+    def find(
+        cls, root: Path, settings: StereoSettings, cameras: Sequence[Camera], frames: Sequence[int]
+    ) -> WorkspaceDepth | None:
+        """The first place below `root` that has depth maps, or None.
+
+        Where it was not asked for, it must serve the first frame and the last.
+        """
+        for place in [settings.folder] if settings.folder else PLACES:
+            source = cls(root, place, settings, cameras, frames)
+            asked = settings.maker == cls.maker and any(source.has_maps(frame) for frame in frames)
+            if asked or all(source.serves(frame) for frame in (frames[0], frames[-1])):
+                return source
+        return None
+
+    def has_maps(self, frame: int) -> bool:
+        """Whether the workspace of that frame holds any depth map."""
+        maps = self._folder(frame) / "stereo" / "depth_maps"
+        return maps.is_dir() and next(maps.rglob("*.bin"), None) is not None
+
+    def serves(self, frame: int) -> bool:
+        """Whether there are maps, and the model knows one of our cameras at that frame."""
+        if not self.has_maps(frame):
+            return False
+        self._read_model(self._folder(frame))
+        return any(self._image(camera.name, frame) for camera in self.cameras)
+
+    def depth(self, camera: Camera, frame: int) -> np.ndarray | None:
+        """The map of one camera at one frame, at its size and in its world's units; None where there is none.
+
+        Raises:
+            D2Error: poses that are not those of the capture, a lens that is no pinhole, a damaged map.
+        """
+        folder = self._folder(frame)
+        if not self.has_maps(frame):
+            return None
+        self._read_model(folder)
+        if folder != self._compared:
+            self._compare_poses(folder, frame)
+        image = self._image(camera.name, frame)
+        path = None if image is None else self._map(folder, image.name)
+        if image is None or path is None:
+            return None
+        depth = read_dense_array(path)
+        return seen_by(camera, depth, self._intrinsics(image, depth.shape)) * np.float32(self._scale)
+
+    def _folder(self, frame: int) -> Path:
+        try:
+            return self.root / self.place.format(frame=frame)
+        except (KeyError, IndexError, ValueError) as error:
+            raise D2Error(f"stereo.folder {self.place} has braces around other than frame ({error}): mend it") from None
+
+    def _read_model(self, folder: Path) -> None:
+        """The cameras and pictures of a workspace, unless it is the one that was read last."""
+        if folder == self._read:
+            return
+        sparse = folder / "sparse"
+        self._model = read_model(sparse / "0" if (sparse / "0").is_dir() else sparse)
+        self._images, self._strangers = _by_camera_and_frame(self._model, [camera.name for camera in self.cameras])
+        self._read = folder
+
+    def _compare_poses(self, folder: Path, frame: int) -> None:
+        """The scale of a workspace's world, once its cameras are known to be ours."""
+        found = {camera.name: self._image(camera.name, frame) for camera in self.cameras}
+        poses = {name: image.T_camera_world for name, image in found.items() if image is not None}
+        if not poses:
+            raise D2Error(
+                f"the workspace {folder} has no picture of {', '.join(found)} at frame {frame}: name pictures "
+                "CAMERA/FRAME.png, or CAMERA.png where the folder is of one frame, or set maker = patchmatch"
+            )
+        self._scale = scale_of_world([camera for camera in self.cameras if camera.name in poses], poses, folder)
+        self._compared = folder
+        if self._strangers:
+            logger.warning(
+                "the workspace %s saw %s as well: where a camera is held out, compute it without that camera",
+                folder,
+                ", ".join(self._strangers[:3]) + (", ..." if len(self._strangers) > 3 else ""),
+            )
+
+    def _image(self, camera: str, frame: int) -> ColmapImage | None:
+        """The picture of one camera and frame, or of one camera where the workspace is of one instant."""
+        found = self._images.get((camera, frame))
+        return self._images.get((camera, None)) if found is None and self.one_instant else found
+
+    def _map(self, folder: Path, name: str) -> Path | None:
+        paths = (folder / "stereo" / "depth_maps" / f"{name}.{kind}.bin" for kind in self.kinds)
+        return next((path for path in paths if path.is_file()), None)
+
+    def _intrinsics(self, image: ColmapImage, shape: tuple[int, ...]) -> np.ndarray:
+        """K [3, 3] of a map, which COLMAP may have computed at less than the size of its picture."""
+        recorded = self._model.cameras[image.camera]
+        lens = recorded.lens(str(self._model.folder))
+        if lens.bends:
+            raise D2Error(
+                f"{self._model.folder} has pictures with lens distortion: give the output of `colmap image_undistorter`"
+            )
+        return np.diag([shape[1] / recorded.width, shape[0] / recorded.height, 1.0]) @ lens.K
+
+
+def _by_camera_and_frame(
+    model: ColmapModel, cameras: Sequence[str]
+) -> tuple[dict[tuple[str, int | None], ColmapImage], list[str]]:
+    """Pictures by camera and frame (None where the name tells none), and the names of those of no camera of ours.
+
+    CAMERA/FRAME.png, CAMERA_FRAME.png (with letters before the number, if any) and CAMERA.png are understood.
+    """
+    found: dict[tuple[str, int | None], ColmapImage] = {}
+    strangers = []
+    patterns = {camera: re.compile(rf"{re.escape(camera)}(?:[/_]\D*(\d+))?") for camera in cameras}
+    for image in model.images.values():
+        stem = PurePosixPath(image.name).with_suffix("").as_posix()
+        matches = {camera: match for camera, pattern in patterns.items() if (match := pattern.fullmatch(stem))}
+        if not matches:
+            strangers.append(image.name)
+        for camera, match in matches.items():
+            found[camera, None if match[1] is None else int(match[1])] = image
+    return found, sorted(strangers)
+
+
+def seen_by(camera: Camera, depth: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """The map [h, w] of a pinhole K as another pinhole in the same place and pose sees it, float32 [H, W].
+
+    Planar depth does not change between them; each ray takes the pixel it passes through, 0 outside of the map.
+    """
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    lookup = K @ np.linalg.inv(camera.K)
+    pixels = np.stack([x, y, np.ones_like(x)], axis=-1) @ lookup.T
+    # A ray may leave through the border by rounding alone, where both cameras are one and the same.
+    column, row = (np.floor(pixels[..., axis] / pixels[..., 2] + 1e-6).astype(np.int64) for axis in (0, 1))
+    inside = (column >= 0) & (row >= 0) & (column < depth.shape[1]) & (row < depth.shape[0])
+    values = depth[np.where(inside, row, 0), np.where(inside, column, 0)]
+    return np.where(inside & np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+
+
+def scale_of_world(cameras: Sequence[Camera], poses: dict[str, np.ndarray], folder: Path) -> float:
+    """Our world units per unit of the workspace, from the translations between cameras.
+
+    Args:
+        cameras: ours.
+        poses: T_camera_world [4, 4] in the workspace's world, by name.
+        folder: of the workspace, for the message.
+
+    Raises:
+        D2Error: the poses differ by more than a similarity, or a single camera's by anything at all.
+    """
+    if len(cameras) == 1:
+        if np.allclose(cameras[0].T_camera_world, poses[cameras[0].name], atol=1e-4):
+            return 1.0
+        raise _other_poses(folder, "one camera in another world, whose scale cannot be known")
+    ours, theirs = [], []
+    for first, second in itertools.combinations(cameras, 2):
+        here = second.T_camera_world @ np.linalg.inv(first.T_camera_world)
+        there = poses[second.name] @ np.linalg.inv(poses[first.name])
+        turned = np.arccos(np.clip((np.trace(here[:3, :3].T @ there[:3, :3]) - 1) / 2, -1, 1))
+        if np.rad2deg(turned) > ROTATION:
+            raise _other_poses(folder, f"{first.name} and {second.name} are {np.rad2deg(turned):.1f} degrees off")
+        ours.append(here[:3, 3])
+        theirs.append(there[:3, 3])
+    here, there = np.concatenate(ours), np.concatenate(theirs)
+    length = float(there @ there)
+    scale = float(here @ there) / length if length else 0.0
+    if not scale > 0 or np.linalg.norm(here - scale * there) > TRANSLATION * np.linalg.norm(here):
+        raise _other_poses(folder, "the cameras stand in another arrangement")
+    return scale
+
+
+def _other_poses(folder: Path, difference: str) -> D2Error:
+    return D2Error(
+        f"the cameras of the workspace {folder} are not those of the capture ({difference}): compute it from the "
+        "capture's poses, or set maker = patchmatch"
+    )

@@ -1,0 +1,1 @@
+"""Monocular depth: predicted, aligned to geometric depth, corrected."""

@@ -1,0 +1,1 @@
+"""Geometric depth from several cameras."""

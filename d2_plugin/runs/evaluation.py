@@ -1,0 +1,182 @@
+"""Scores of a trained model at cameras it has not seen, and pictures that show them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from d2_plugin.captures.capture import Capture
+from d2_plugin.captures.pictures import write_png
+from d2_plugin.errors import D2Error
+from d2_plugin.runs import metrics
+from d2_plugin.runs.drawing import Panel, color_scale, colorize, side_by_side
+from d2_plugin.runs.lpips import Lpips
+
+RenderView = Callable[[str, int], tuple[Tensor, Tensor | None]]
+"""(camera name, frame) -> (RGB [H, W, 3] in 0..1, planar depth [H, W] or None).
+
+The depth is 0 where the model has too little opacity to say one. Such a pixel counts as wrong wherever there is true
+depth (see `metrics.depth_absrel`), so leaving depth out never improves a score.
+"""
+
+Progress = Callable[[int, int], None]
+"""(views done, views in total)."""
+
+ERROR_SHOWN = 0.25
+"""Absolute colour error, mean over channels, at the bright end of the error picture's scale."""
+
+
+def evaluate(
+    render: RenderView,
+    capture: Capture,
+    cameras: Sequence[str],
+    frames: Iterable[int],
+    output: Path | None = None,
+    *,
+    lpips: Lpips | None = None,
+    lpips_vgg: Lpips | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Compare renders with the capture's pictures, one view at a time.
+
+    Args:
+        render: draws one view; colours are clamped to 0..1 here.
+        capture: the truth.
+        cameras, frames: what to compare: every camera at every frame.
+        output: folder for one picture per view, `<camera>_<frame>.png`: truth, render, rendered depth and error side
+            by side (and true depth where there is one). No pictures where None.
+        lpips, lpips_vgg: from `find_lpips`, on AlexNet and on VGG16; a score is null where its network is None.
+        progress: called after every view.
+
+    Returns:
+        {"test": mean of each metric over the views that have it (null where none has),
+        "per_view": [{"camera", "frame", metric: value, ...}], "per_frame": [{"frame", mean over cameras}],
+        "per_camera": [{"camera", mean over frames}], "variants": {metric: definition}}. The first frame of a camera
+        has no flicker, the others are held against the frame before them in `frames`.
+
+    Raises:
+        D2Error: a render of another size than the camera's or with values that are not finite.
+    """
+    instants = list(frames)
+    views = [(camera, frame) for camera in cameras for frame in instants]
+    if not views:
+        raise D2Error("nothing to evaluate: give at least one camera and one frame")
+    if output is not None:
+        output.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    before: tuple[str, Tensor, Tensor] | None = None  # camera, render and truth of the view before
+    for done, (camera, frame) in enumerate(views, start=1):
+        truth = torch.from_numpy(capture.image(camera, frame).astype(np.float32) / 255)
+        color, depth = _checked(render(camera, frame), truth.shape, camera, frame)
+        true_depth = capture.depth(camera, frame)
+        scores = _scores(color, depth, truth, true_depth) | {
+            "lpips": None if lpips is None else lpips(color, truth),
+            "lpips_vgg": None if lpips_vgg is None else lpips_vgg(color, truth),
+            "flicker": metrics.flicker(color, truth, *before[1:]) if before and before[0] == camera else None,
+        }
+        rows.append({"camera": camera, "frame": frame, **{name: scores[name] for name in metrics.VARIANTS}})
+        before = (camera, color, truth)
+        if output is not None:
+            panels = _panels(rows[-1], truth.numpy(), color.numpy(), depth, true_depth)
+            write_png(output / f"{camera}_{frame:05d}.png", side_by_side(panels))
+        if progress is not None:
+            progress(done, len(views))
+    networks = {"lpips": lpips, "lpips_vgg": lpips_vgg}
+    return {
+        "test": _means(rows),
+        "per_view": rows,
+        "per_frame": _grouped(rows, "frame"),
+        "per_camera": _grouped(rows, "camera"),
+        "variants": metrics.VARIANTS | {name: net.variant for name, net in networks.items() if net is not None},
+    }
+
+
+def _scores(
+    color: Tensor, depth: Tensor | None, truth: Tensor, true_depth: np.ndarray | None
+) -> dict[str, float | None]:
+    comparable = depth is not None and true_depth is not None
+    z = torch.from_numpy(true_depth) if comparable else None
+    return {
+        "psnr": metrics.psnr(color, truth),
+        "ssim1": metrics.ssim_range1(color, truth),
+        "ssim2": metrics.ssim_range2(color, truth),
+        "ssim_3dgs": metrics.ssim_3dgs(color, truth),
+        "depth_absrel": metrics.depth_absrel(depth, z) if comparable else None,
+        "depth_delta1": metrics.depth_delta1(depth, z) if comparable else None,
+    }
+
+
+def _checked(
+    rendered: tuple[Tensor, Tensor | None], shape: torch.Size, camera: str, frame: int
+) -> tuple[Tensor, Tensor | None]:
+    """Colour in 0..1 and depth on the CPU, float32."""
+    color, depth = (None if part is None else part.detach().cpu().float() for part in rendered)
+    where = f"the render of camera {camera} at frame {frame}"
+    if color.shape != shape or (depth is not None and depth.shape != shape[:2]):
+        sizes = f"{tuple(color.shape)}" + ("" if depth is None else f" and depth {tuple(depth.shape)}")
+        raise D2Error(f"{where} is {sizes}, expected {tuple(shape)}: render at the size of the capture's camera")
+    if not torch.isfinite(color).all():
+        raise D2Error(f"{where} has values that are not finite: the model has diverged, train it again")
+    return color.clamp(0, 1), depth
+
+
+def _means(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
+    """The mean of each metric over the rows that have it."""
+    return {name: _mean(row[name] for row in rows) for name in metrics.VARIANTS}
+
+
+def _grouped(rows: Sequence[dict[str, Any]], key: str) -> list[dict[str, Any]]:
+    """The means of the rows that share a camera or a frame, in the order of their first appearance."""
+    groups: dict[Any, list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(row[key], []).append(row)
+    return [{key: value, **_means(group)} for value, group in groups.items()]
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _panels(
+    row: dict[str, Any], truth: np.ndarray, color: np.ndarray, depth: Tensor | None, true_depth: np.ndarray | None
+) -> list[Panel]:
+    panels = [
+        Panel(f"truth  {row['camera']}  frame {row['frame']}", _bytes(truth)),
+        Panel(f"rendered  {row['psnr']:.2f} dB", _bytes(color)),
+    ]
+    shown = {"depth": None if depth is None else depth.numpy(), "true depth": true_depth}
+    shown = {title: array for title, array in shown.items() if array is not None}
+    if shown:
+        low, high = _depth_range(list(shown.values())[-1])  # the true one's where there is one
+        panels += [_depth_panel(title, array, low, high, row["depth_absrel"]) for title, array in shown.items()]
+    error = np.abs(color - truth).mean(axis=-1)
+    fire = color_scale("inferno")
+    panels.append(Panel(f"error  0 .. {ERROR_SHOWN:g}", colorize(error, 0, ERROR_SHOWN, fire), fire))
+    return panels
+
+
+def _depth_panel(title: str, depth: np.ndarray, low: float, high: float, error: float | None) -> Panel:
+    scale = color_scale("viridis")
+    known = np.isfinite(depth) & (depth > 0)
+    picture = colorize(np.where(known, depth, 0), low, high, scale)
+    score = f"  AbsRel {error:.3f}" if error is not None and title == "depth" else ""
+    return Panel(f"{title}  {low:.3g} .. {high:.3g}{score}", np.where(known[..., None], picture, np.uint8(0)), scale)
+
+
+def _depth_range(depth: np.ndarray) -> tuple[float, float]:
+    """1st and 99th percentile of the known depths; (0, 1) where none is known."""
+    known = depth[np.isfinite(depth) & (depth > 0)]
+    if known.size == 0:
+        return 0.0, 1.0
+    low, high = np.percentile(known, (1, 99))
+    return float(low), float(high)
+
+
+def _bytes(picture: np.ndarray) -> np.ndarray:
+    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)

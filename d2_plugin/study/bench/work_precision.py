@@ -1,0 +1,138 @@
+"""Error against run time: means over cases, the Pareto front, the plot and the table under it.
+
+After the work-precision diagrams of SciML and the fronts of ann-benchmarks: one series per method, one mark per
+setting, both axes logarithmic, lower left is better. What another setting beats in both is faded.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from d2_plugin.study.report.svg import Axis, Plot, Point, Series, number
+from d2_plugin.study.rows import Row
+
+SMALLEST = 1e-16
+"""Errors below this are drawn here: they are rounding, and a logarithm needs a floor."""
+
+
+class Table(NamedTuple):
+    """A table of texts; `best` are the cells (row, column) that stand out."""
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    best: frozenset[tuple[int, int]] = frozenset()
+
+
+@dataclass(frozen=True)
+class Mean:
+    """One setting of one method over all its cases: geometric means where it worked, and where it did not."""
+
+    method: str
+    setting: str
+    error: float | None
+    worst: float | None
+    seconds: float | None
+    cases: int
+    failures: int
+
+    @property
+    def drawn(self) -> bool:
+        """Whether error and time are both known."""
+        return self.error is not None and bool(self.seconds)
+
+
+def means(rows: Sequence[Row]) -> list[Mean]:
+    """One `Mean` per (method, setting), in order of appearance."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["method"], row["setting"]), []).append(row)
+    return [_mean(*key, group) for key, group in groups.items()]
+
+
+def _mean(method: str, setting: str, group: Sequence[Row]) -> Mean:
+    errors = [row["error"] for row in group if row["error"] is not None]
+    seconds = [row["seconds"] for row in group if row["seconds"]]
+    failures = sum(bool(row["failed"]) for row in group)
+    worst = max(errors, default=None)
+    return Mean(method, setting, _geometric(errors), worst, _geometric(seconds), len(group), failures)
+
+
+def _geometric(values: Sequence[float]) -> float | None:
+    if not values:
+        return None
+    return math.exp(sum(math.log(max(value, SMALLEST)) for value in values) / len(values))
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the points that no other one beats in both coordinates (lower is better), by the first one."""
+    front, best = [], math.inf
+    for index in sorted(range(len(points)), key=lambda i: points[i]):
+        if points[index][1] < best:
+            best = points[index][1]
+            front.append(index)
+    return front
+
+
+def colors_of(rows: Sequence[Row]) -> dict[str, int]:
+    """A colour for each method, the same in all plots of a section."""
+    return {name: color for color, name in enumerate(dict.fromkeys(row["method"] for row in rows))}
+
+
+def work_precision(
+    rows: Sequence[Row],
+    title: str,
+    error_label: str,
+    seconds_label: str,
+    unit: float = 1,
+    colors: Mapping[str, int] | None = None,
+) -> Plot:
+    """The plot of all settings; `unit` is what seconds are multiplied by to match `seconds_label`.
+
+    A setting that failed on some case is faded and never on the front: a mean over the easy cases is no result.
+    """
+    drawn = [mean for mean in means(rows) if mean.drawn]
+    whole = [mean for mean in drawn if not mean.failures]
+    front = {whole[i] for i in pareto_front([(mean.seconds, mean.error) for mean in whole])}
+    series = []
+    for name, color in (colors or colors_of(rows)).items():
+        mine = [mean for mean in drawn if mean.method == name]
+        points = tuple(_point(mean, unit, mean in front, error_label, seconds_label) for mean in mine)
+        settled = [mean for mean in mine if not mean.failures]
+        steps = [settled[i] for i in pareto_front([(mean.seconds, mean.error) for mean in settled])]
+        line = tuple((mean.seconds * unit, max(mean.error, SMALLEST)) for mean in steps)
+        series.append(Series(name, points, line, color))
+    x = Axis.around(seconds_label, [mean.seconds * unit for mean in drawn], log=True)
+    y = Axis.around(error_label, [max(mean.error, SMALLEST) for mean in drawn], log=True)
+    return Plot(title, x, y, tuple(series))
+
+
+def _point(mean: Mean, unit: float, on_front: bool, error_label: str, seconds_label: str) -> Point:
+    measured = f"{error_label} {shown(mean.error)}, {seconds_label} {shown(mean.seconds * unit)}"
+    note = f"{mean.method}, {mean.setting}: {measured}"
+    note += f"; failed on {mean.failures} of {mean.cases}" if mean.failures else ""
+    label = mean.setting if on_front and mean.setting != "default" else ""
+    return Point(mean.seconds * unit, max(mean.error, SMALLEST), note, label, faded=not on_front)
+
+
+def means_table(rows: Sequence[Row], error_name: str, seconds_name: str, unit: float = 1) -> Table:
+    """Method, setting, error (geometric mean and worst case), time, failures; settings on the front stand out."""
+    header = ("method", "setting", error_name, "worst case", seconds_name, "cases", "failed")
+    found = means(rows)
+    whole = [i for i, mean in enumerate(found) if mean.drawn and not mean.failures]
+    front = pareto_front([(found[i].seconds, found[i].error) for i in whole])
+    cells = tuple(
+        (
+            *(mean.method, mean.setting, shown(mean.error), shown(mean.worst)),
+            *(shown(mean.seconds and mean.seconds * unit), str(mean.cases), str(mean.failures or "-")),
+        )
+        for mean in found
+    )
+    return Table(header, cells, frozenset((whole[i], column) for i in front for column in (2, 4)))
+
+
+def shown(value: float | None) -> str:
+    """Three digits, or `-` where it was not measured."""
+    return "-" if value is None else number(float(f"{value:.3g}"))

@@ -1,0 +1,106 @@
+"""`d2 report`: everything that was measured as one page, with plots, tables and pictures, from rows and run folders."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from d2_plugin.errors import D2Error
+from d2_plugin.runs.tables import read_metrics
+from d2_plugin.study.rows import KINDS, Row, read_rows
+from d2_plugin.study.training_rows import method_of, picture_of, training_rows
+
+from .limits import plan, scaling, stability
+from .page import Picture, html, markdown
+from .precision import alignment, raster, stereo
+from .sections import Section
+from .training import ablation, training
+
+BUILDERS: dict[str, Callable[[Sequence[Row]], Section]] = {
+    build.__name__: build for build in (training, ablation, alignment, stereo, raster, stability, plan, scaling)
+}
+"""What makes a section of the rows of a kind, in the order of the page."""
+
+LEAD = (
+    "Every figure here was measured by a command of this package and is shown with the machine, the commit and the "
+    "command that made it. Errors are on the vertical axis, run time on the horizontal one."
+)
+
+
+def make_report(rows: Sequence[Row], output: Path, pictures: Sequence[Picture] = ()) -> list[Path]:
+    """Write report.html, report.md and one SVG per plot into `output`.
+
+    Args:
+        rows: of any kinds, see `d2_plugin.study.rows`.
+        output: folder, created where absent; files of the same names are replaced.
+        pictures: for the page; the Markdown has none.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        D2Error: there is no row.
+    """
+    if not rows:
+        raise D2Error("there is nothing to report: give a runs.jsonl with rows in it, or the folder of a finished run")
+    sections = [
+        build([row for row in rows if row["kind"] == kind])
+        for kind, build in BUILDERS.items()
+        if any(row["kind"] == kind for row in rows)
+    ]
+    output.mkdir(parents=True, exist_ok=True)
+    texts = {"report.html": html(sections, pictures, LEAD), "report.md": markdown(sections, LEAD)}
+    texts |= {f"{name}.svg": svg for section in sections for name, svg in section.figures.items()}
+    for name, content in texts.items():
+        (output / name).write_text(content)
+    return [output / name for name in texts]
+
+
+def collect(sources: Sequence[Path]) -> tuple[list[Row], list[Picture]]:
+    """Rows of all files and run folders, and a picture of each method; a folder of runs stands for every run in it.
+
+    Raises:
+        D2Error: a folder that holds no finished run, or a file that holds no rows.
+    """
+    folders = [folder for source in sources if source.is_dir() for folder in _runs(source)]
+    rows = read_rows([source for source in sources if not source.is_dir()]) + training_rows(folders)
+    first: dict[tuple[str, str], Picture] = {}
+    for folder in folders:
+        metrics = read_metrics(folder)
+        key = (metrics["capture"], method_of(metrics))
+        if key not in first and (picture := _picture(folder, *key)) is not None:
+            first[key] = picture
+    return rows, [first[key] for key in sorted(first)]
+
+
+def _runs(folder: Path) -> list[Path]:
+    found = sorted(path.parent for path in folder.rglob("metrics.json"))
+    if not found:
+        raise D2Error(f"no finished run lies in {folder}: expected metrics.json, as `d2 train` writes it")
+    return found
+
+
+def _picture(folder: Path, capture: str, method: str) -> Picture | None:
+    found = picture_of(folder)
+    return None if found is None else Picture(f"{capture}, {method}: {found[0]} of run {folder.name}", found[1])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point of `d2 report`."""
+    parser = argparse.ArgumentParser(prog="d2 report", description=__doc__)
+    parser.add_argument(
+        "sources",
+        nargs="+",
+        type=Path,
+        metavar="RUNS",
+        help=f"files of rows (runs.jsonl; kinds {', '.join(KINDS)}) and output folders of d2 train, in any number",
+    )
+    parser.add_argument("--output", type=Path, default=Path("report"), help="folder of the report; default: report")
+    parser.add_argument("--no-pictures", action="store_true", help="leave the pictures of the runs out of the page")
+    options = parser.parse_args(arguments)
+    rows, pictures = collect(options.sources)
+    written = make_report(rows, options.output, () if options.no_pictures else pictures)
+    sys.stdout.write(f"{len(rows)} rows; open {written[0]}\n")
+    return 0

@@ -1,0 +1,398 @@
+"""The drop-in modules: the signatures of the Inria family, the numbers of this plugin's rasterizer."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from splat_scenes import random_scene, single
+from torch import Tensor
+
+from d2_plugin.compat import depth, fourd, inria, nearest, similarity, threedgs
+from d2_plugin.compiler import NoCompiler
+from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.photometric import ssim
+from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
+from d2_plugin.protocol import Splats, View
+from d2_plugin.rasterizer import rasterize
+
+
+def inria_camera(view: View, world_view: Tensor | None = None) -> dict:
+    """The two matrices as the repositories make them (utils/graphics_utils.py), acting on row vectors."""
+    near, far = 0.01, 100.0
+    K, width, height = view.K.double(), view.width, view.height
+    projection = torch.zeros(4, 4, dtype=torch.float64)
+    projection[0, 0], projection[1, 1] = 2 * K[0, 0] / width, 2 * K[1, 1] / height
+    projection[0, 2], projection[1, 2] = 2 * K[0, 2] / width - 1, 2 * K[1, 2] / height - 1
+    projection[2, 2], projection[2, 3], projection[3, 2] = far / (far - near), -far * near / (far - near), 1
+    world_view = view.T_camera_world.double().T if world_view is None else world_view
+    return {
+        "image_height": height,
+        "image_width": width,
+        "tanfovx": float(width / (2 * K[0, 0])),
+        "tanfovy": float(height / (2 * K[1, 1])),
+        "bg": torch.tensor([0.1, 0.2, 0.3]),
+        "scale_modifier": 1.0,
+        "viewmatrix": world_view,
+        "projmatrix": world_view @ projection.T,
+        "sh_degree": 3,
+        "campos": world_view.inverse()[3, :3],
+    }
+
+
+FOUR = {"sh_degree_t": 2, "timestamp": 0.3, "time_duration": 1.0, "rot_4d": True, "gaussian_dim": 4}
+
+
+def gaussians(count: int = 6, seed: int = 0, coefficients: int = 16) -> dict[str, Tensor]:
+    """Arguments of a rasterizer, float64 leaves."""
+    scene, g = random_scene(seed, count, 24, 16), torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    values = {
+        "means3D": scene.means,
+        "means2D": torch.zeros(count, 3, dtype=torch.float64),
+        "opacities": scene.opacities[:, None],
+        "shs": 0.3 * normal(count, coefficients, 3),
+        "scales": torch.exp(0.3 * normal(count, 3)) * 0.15,
+        "rotations": normal(count, 4),
+    }
+    return {name: value.clone().requires_grad_() for name, value in values.items()}
+
+
+def four_dimensional(count: int = 6, seed: int = 0) -> dict[str, Tensor]:
+    values, g = gaussians(count, seed, 48), torch.Generator().manual_seed(seed + 1)
+    values["rotations"] = torch.nn.functional.normalize(values["rotations"].detach(), dim=-1).requires_grad_()
+    right = torch.nn.functional.normalize(torch.randn(count, 4, generator=g, dtype=torch.float64), dim=-1)
+    values["ts"] = torch.full((count, 1), 0.25, dtype=torch.float64, requires_grad=True)
+    values["scales_t"] = torch.full((count, 1), 0.4, dtype=torch.float64, requires_grad=True)
+    return {**values, "rotations_r": right.requires_grad_()}
+
+
+def view_24x16() -> View:
+    return random_scene(0, 1, 24, 16).view
+
+
+@pytest.fixture
+def camera() -> dict:
+    return inria_camera(view_24x16())
+
+
+class TestThreeDGS:
+    def test_draws_what_the_plugin_s_rasterizer_draws(self, camera: dict) -> None:
+        scene = random_scene(3, 40, 24, 16)
+        given = {"means3D": scene.means, "opacities": scene.opacities[:, None], "means2D": torch.zeros(40, 3)}
+        raster = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera))
+        color, radii = raster(**given, colors_precomp=scene.colors, cov3D_precomp=scene.covariances)
+        expected = rasterize(scene.splats, scene.colors, scene.view, background=camera["bg"].double())
+        torch.testing.assert_close(color, expected.color.permute(2, 0, 1), atol=1e-6, rtol=1e-6)
+        assert radii.dtype == torch.int32
+
+    def test_camera_is_recovered_from_the_two_matrices(self) -> None:
+        turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))[0]
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3], pose[:3, 3] = turn * torch.linalg.det(turn), torch.tensor([0.3, -0.2, 1.5])
+        K = torch.tensor([[300.0, 0, 150.25], [0, 310.0, 95.5], [0, 0, 1]])
+        view = View("", 0, 0.0, pose, K, 320, 180)
+        found = inria.view_of(threedgs.GaussianRasterizationSettings(**inria_camera(view)))
+        torch.testing.assert_close(found.K, K, atol=1e-4, rtol=0)
+        torch.testing.assert_close(found.T_camera_world, pose.float(), atol=1e-6, rtol=0)
+
+    def test_matrices_may_come_as_a_batch_of_one(self, camera: dict) -> None:
+        """As in the cameras that 4DGaussians makes for PanopticSports."""
+        batched = {**camera, "viewmatrix": camera["viewmatrix"][None], "projmatrix": camera["projmatrix"][None]}
+        found = inria.view_of(threedgs.GaussianRasterizationSettings(**batched))
+        torch.testing.assert_close(found.K, view_24x16().K, atol=1e-5, rtol=0)
+
+    def test_passes_gradcheck(self, camera: dict) -> None:
+        raster = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera))
+        values = gaussians(4)
+        names = [name for name in values if name != "means2D"]
+
+        def color(*tensors: Tensor) -> Tensor:
+            return raster(means2D=values["means2D"].detach(), **dict(zip(names, tensors)))[0]
+
+        assert torch.autograd.gradcheck(color, [values[name] for name in names], atol=1e-6, fast_mode=True)
+
+    def test_gradient_of_viewspace_points_is_per_normalised_device_coordinate(self, camera: dict) -> None:
+        """densify_grad_threshold is in that unit: pixels times half the image's width and height."""
+        values, weights = gaussians(), torch.linspace(-1, 1, 3 * 16 * 24, dtype=torch.float64).view(3, 16, 24)
+        raster = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera))
+        (raster(**values)[0] * weights).sum().backward()
+        offsets = torch.zeros(6, 2, dtype=torch.float64, requires_grad=True)
+        covariances = inria.covariances_of(values["scales"], values["rotations"], 1.0)
+        splats = Splats(values["means3D"], covariances, values["opacities"][:, 0], torch.arange(6))
+        seen = inria.colors_of(values["shs"], 3, values["means3D"], camera["campos"])
+        image = rasterize(splats, seen, view_24x16(), background=camera["bg"].double(), screen_offsets=offsets).color
+        (image.permute(2, 0, 1) * weights).sum().backward()
+        expected = torch.nn.functional.pad(offsets.grad * torch.tensor([12.0, 8.0]), (0, 1))
+        assert expected.abs().sum() > 0
+        torch.testing.assert_close(values["means2D"].grad, expected, atol=1e-5, rtol=1e-4)
+
+    def test_values_of_viewspace_points_move_nothing(self, camera: dict) -> None:
+        raster = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera))
+        values = gaussians()
+        shifted = {**values, "means2D": (values["means2D"] + 5).detach().requires_grad_()}
+        torch.testing.assert_close(raster(**values)[0], raster(**shifted)[0], atol=0, rtol=0)
+
+    def test_scales_and_rotations_are_the_covariance(self, camera: dict) -> None:
+        """R S S^T R^T, with the modifier on the scales; a longer quaternion scales the Gaussian, as in CUDA."""
+        scales, turned = torch.tensor([[0.1, 0.2, 0.4]]), torch.tensor([[math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]])
+        found = inria.covariances_of(scales, turned, 2.0)
+        torch.testing.assert_close(found, 4 * torch.tensor([[0.04, 0, 0, 0.01, 0, 0.16]]), atol=1e-7, rtol=1e-6)
+        longer = inria.covariances_of(scales, torch.tensor([[2.0, 0, 0, 0.0]]), 1.0)
+        torch.testing.assert_close(longer, inria.covariances_of(scales, torch.tensor([[1.0, 0, 0, 0]]), 1.0))
+        oblique = inria.covariances_of(scales, torch.tensor([[0.0, 0, 0, 2.0]]), 1.0)
+        torch.testing.assert_close(oblique[0, 0], torch.tensor(0.01 * 49))  # (1 - 2 z^2) = -7
+
+    def test_radius_is_three_deviations_and_zero_where_nothing_is_drawn(self, camera: dict) -> None:
+        raster = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera))
+        means = torch.tensor([[0, 0, 2.0], [0, 0, -2.0], [0, 0, 0.2], [50, 0, 2.0]])
+        round_ones = torch.tensor([[0.01, 0, 0, 0.01, 0, 0.01]]).repeat(4, 1)
+        _, radii = raster(
+            means, torch.zeros(4, 3), torch.ones(4, 1), colors_precomp=torch.ones(4, 3), cov3D_precomp=round_ones
+        )
+        variance = (0.85 * 24 * 0.1 / 2) ** 2 + 0.3
+        assert radii.tolist() == [math.ceil(3 * math.sqrt(variance + math.sqrt(0.1))), 0, 0, 0]
+        assert raster.markVisible(means).tolist() == [True, False, False, True]
+
+    def test_harmonics_see_the_gaussian_from_the_camera(self) -> None:
+        values = gaussians(5)
+        centre = torch.tensor([0.5, 0.1, -1.0], dtype=torch.float64)
+        found = inria.colors_of(values["shs"], 2, values["means3D"], centre)
+        expected = harmonic_colors(values["shs"][:, :9], values["means3D"] - centre, None, 2, 0)
+        torch.testing.assert_close(found, expected)
+
+    def test_no_gaussians_are_the_background(self, camera: dict) -> None:
+        raster = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera))
+        empty = {name: value.detach()[:0].float() for name, value in gaussians().items()}
+        color, radii = raster(**empty)
+        torch.testing.assert_close(color[:, 0, 0], camera["bg"])
+        assert radii.shape == (0,)
+
+    def test_a_field_of_view_of_minus_one_is_mended_and_said(self, camera: dict, caplog) -> None:
+        """fudan-zvg/4d-gaussian-splatting issue 64: tanfov = tan(-0.5) where fl_x is given."""
+        values = gaussians()
+        right = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera))(**values)[0]
+        broken = {**camera, "tanfovx": math.tan(-0.5), "tanfovy": math.tan(-0.5)}
+        inria._contradictions.clear()
+        with caplog.at_level(logging.WARNING):
+            found = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**broken))(**values)[0]
+        torch.testing.assert_close(found, right, atol=0, rtol=0)
+        assert "the projection matrix has 20.4" in caplog.text
+
+    def test_mistakes_are_one_sentence(self, camera: dict) -> None:
+        raster, values = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera)), gaussians()
+        with pytest.raises(D2Error, match="either shs or colors_precomp, got both: give exactly one"):
+            raster(**values, colors_precomp=torch.ones(6, 3))
+        with pytest.raises(D2Error, match="scales and rotations together"):
+            raster(**{**values, "scales": None})
+        with pytest.raises(D2Error, match="antialiasing needs the original"):
+            threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera, antialiasing=True))
+
+
+class TestDepth:
+    def test_depth_is_not_normalised_and_has_gradients(self) -> None:
+        scene = single(depth=4.0, opacity=0.5, size=15)
+        raster = depth.GaussianRasterizer(depth.GaussianRasterizationSettings(**inria_camera(scene.view)))
+        means = scene.means.requires_grad_()
+        given = {"colors_precomp": scene.colors, "cov3D_precomp": scene.covariances}
+        _, _, found = raster(means, torch.zeros(1, 3), scene.opacities[:, None], **given)
+        assert found[0, 7, 7].item() == pytest.approx(0.5 * 4.0, rel=1e-4)
+        found[0, 7, 7].backward()
+        assert float(means.grad[0, 2]) == pytest.approx(0.5, rel=0.1)
+
+    def test_absolute_gradients_are_summed_pixel_by_pixel(self, camera: dict) -> None:
+        """means2D_densify of Deformable-3D-Gaussians, against one backward pass for every pixel in float64."""
+        raster = depth.GaussianRasterizer(depth.GaussianRasterizationSettings(**camera))
+        values, weights = gaussians(), torch.linspace(-1, 1, 3 * 16 * 24, dtype=torch.float64).view(3, 16, 24)
+        densify = torch.zeros_like(values["means2D"]).requires_grad_()
+        (raster(**values, means2D_densify=densify)[0] * weights).sum().backward()
+        shares = (raster(**values)[0] * weights).sum(0).flatten()
+        expected = sum(
+            torch.autograd.grad(share, values["means2D"], retain_graph=True)[0].abs() for share in shares.unbind()
+        )
+        torch.testing.assert_close(densify.grad, expected, atol=1e-4, rtol=1e-4)
+        assert (densify.grad[:, :2] > values["means2D"].grad[:, :2].abs() + 1e-3).any()
+
+    def test_without_a_compiler_both_viewspace_tensors_receive_the_same(
+        self, camera: dict, monkeypatch: pytest.MonkeyPatch, caplog
+    ) -> None:
+        def no_compiler() -> None:
+            raise NoCompiler("no C++ compiler found")
+
+        monkeypatch.setattr(depth.absolute, "library", no_compiler)
+        depth._can_sum.cache_clear()
+        raster, values = depth.GaussianRasterizer(depth.GaussianRasterizationSettings(**camera)), gaussians()
+        densify = torch.zeros_like(values["means2D"]).requires_grad_()
+        color, *_ = raster(**values, means2D_densify=densify)
+        color.square().sum().backward()
+        depth._can_sum.cache_clear()
+        torch.testing.assert_close(values["means2D"].grad, densify.grad)
+        assert "receives signed gradients" in caplog.text
+
+
+GOLDEN = {  # backbones.md 4.1: mu, t0, scales, left, right, t -> covariance, F, mean
+    "B": (
+        [0, 0, 2], 0, [0.1, 0.2, 0.3, 0.5], [1, 0.2, -0.1, 0.05], [0.9, -0.1, 0.3, 0.2], 0.4,
+        [0.01544891, 0.00192817, -0.01986139, 0.04780662, 0.0069878, 0.08927245], 0.6676256617997561,
+        [-0.07657938, -0.13313971, 2.09110397],
+    ),
+    "C": (
+        [-1, 0.5, 4], 1, [0.05, 0.02, 0.04, math.sqrt(2)], [2, 0.4, 0.2, -0.6], [0.5, 0.1, 0.05, 0.15], 2.5,
+        [0.00307141, -0.00098906, 0.00024459, 0.00077273, -0.00013639, 0.0016432], 0.4525663865678813,
+        [-1.93595609, 0.68695754, 3.90645446],
+    ),
+}  # fmt: skip
+
+
+class TestFourD:
+    @pytest.mark.parametrize("name", GOLDEN)
+    def test_slices_like_the_cuda_source(self, camera: dict, name: str) -> None:
+        mean, t0, scales, left, right, t, covariance, marginal, sliced = GOLDEN[name]
+        left, right = (torch.tensor([q], dtype=torch.float64) for q in (left, right))
+        arguments = {
+            "means3D": torch.tensor([mean], dtype=torch.float64),
+            "means2D": torch.zeros(1, 3),
+            "opacities": torch.tensor([[0.9]], dtype=torch.float64),
+            "colors_precomp": torch.ones(1, 3, dtype=torch.float64),
+            "ts": torch.tensor([[t0]], dtype=torch.float64),
+            "scales": torch.tensor([scales[:3]], dtype=torch.float64),
+            "scales_t": torch.tensor([scales[3:]], dtype=torch.float64),
+            "rotations": left / left.norm(),
+            "rotations_r": right / right.norm(),
+        }
+        at = {**camera, **FOUR, "timestamp": t, "force_sh_3d": False}
+        raster = fourd.GaussianRasterizer(fourd.GaussianRasterizationSettings(**at))
+        *_, covariances = raster(**arguments)
+        np.testing.assert_allclose(covariances[0], covariance, atol=1e-8)
+        expected = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera))(
+            torch.tensor([sliced], dtype=torch.float64),
+            torch.zeros(1, 3),
+            torch.tensor([[0.9 * marginal]], dtype=torch.float64),
+            colors_precomp=arguments["colors_precomp"],
+            cov3D_precomp=torch.tensor([covariance], dtype=torch.float64),
+        )[0]
+        torch.testing.assert_close(raster(**arguments)[0], expected, atol=1e-5, rtol=1e-5)
+
+    def test_passes_gradcheck_through_time(self, camera: dict) -> None:
+        raster = fourd.GaussianRasterizer(fourd.GaussianRasterizationSettings(**camera, **FOUR, force_sh_3d=False))
+        values = four_dimensional(4)
+        names = [name for name in values if name != "means2D"]
+
+        def outputs(*tensors: Tensor) -> tuple[Tensor, ...]:
+            color, _, depth, alpha, _, _ = raster(means2D=None, **dict(zip(names, tensors)))
+            return color, depth, alpha
+
+        assert torch.autograd.gradcheck(outputs, [values[name] for name in names], atol=1e-6, fast_mode=True)
+
+    def test_gaussians_outside_their_support_are_skipped(self, camera: dict) -> None:
+        """F <= 0.05 is beyond 2.4477 standard deviations; no radius, no covariance, no gradient."""
+        values = four_dimensional(2)
+        sigma = 0.4  # scales differ, so does the temporal deviation; far beyond all of them for row 1
+        values["ts"] = torch.tensor([[0.3], [0.3 + 100 * sigma]], dtype=torch.float64, requires_grad=True)
+        raster = fourd.GaussianRasterizer(fourd.GaussianRasterizationSettings(**camera, **FOUR, force_sh_3d=False))
+        color, radii, *_, covariances = raster(**values)
+        color.sum().backward()
+        assert radii[1] == 0
+        assert not covariances[1].any()
+        assert not values["means3D"].grad[1].any()
+        assert covariances[0].any()
+
+    def test_harmonics_in_time_join_at_the_full_degree_only(self, camera: dict) -> None:
+        values = four_dimensional()
+
+        def colors(degree: int) -> Tensor:
+            four = fourd.GaussianRasterizationSettings(**{**camera, **FOUR, "sh_degree": degree}, force_sh_3d=False)
+            rows = torch.arange(6)
+            return fourd.GaussianRasterizer(four)._colors(values["shs"], values["means3D"], values["ts"], rows)
+
+        phase = (values["ts"][:, 0] - 0.3) / 1.0
+        directions = values["means3D"] - camera["campos"]
+        torch.testing.assert_close(colors(3), harmonic_colors(values["shs"], directions, phase, 3, 2))
+        torch.testing.assert_close(colors(2), harmonic_colors(values["shs"][:, :9], directions, None, 2, 0))
+
+    def test_without_a_right_quaternion_scale_t_is_the_variance(self, camera: dict) -> None:
+        flat = {**camera, **FOUR, "rot_4d": False, "timestamp": 0.65, "force_sh_3d": True, "sh_degree": 0}
+        scene = single(depth=2.0, opacity=0.8)
+        view = inria_camera(scene.view)
+        raster = fourd.GaussianRasterizer(fourd.GaussianRasterizationSettings(**{**flat, **view, "sh_degree": 0}))
+        *_, alpha, _, _ = raster(
+            scene.means,
+            torch.zeros(1, 3),
+            scene.opacities[:, None],
+            colors_precomp=scene.colors,
+            ts=torch.tensor([[0.25]]),
+            scales=torch.full((1, 3), 0.1, dtype=torch.float64),
+            scales_t=torch.tensor([[0.4]]),
+            rotations=torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64),
+        )
+        assert float(alpha[0, 7, 7]) == pytest.approx(0.8 * math.exp(-0.5 * 0.4**2 / 0.4), rel=1e-4)
+
+    def test_flow_is_composited_like_a_colour(self, camera: dict) -> None:
+        values = four_dimensional()
+        raster = fourd.GaussianRasterizer(fourd.GaussianRasterizationSettings(**camera, **FOUR, force_sh_3d=False))
+        flow_2d = torch.tensor([[1.0, -2.0]], dtype=torch.float64).repeat(6, 1).requires_grad_()
+        color, _, _, alpha, flow, _ = raster(**values, flow_2d=flow_2d)
+        torch.testing.assert_close(flow, torch.cat([alpha, -2 * alpha]))
+        torch.testing.assert_close(color, raster(**values, flow_2d=torch.zeros(6, 2))[0])
+        flow.sum().backward()
+        assert flow_2d.grad.abs().sum() > 0
+
+    def test_missing_time_is_one_sentence(self, camera: dict) -> None:
+        raster = fourd.GaussianRasterizer(fourd.GaussianRasterizationSettings(**camera, **FOUR, force_sh_3d=False))
+        with pytest.raises(D2Error, match="4D Gaussians need ts and scales_t"):
+            raster(**gaussians())
+
+
+class TestNearest:
+    @staticmethod
+    def brute(points: np.ndarray) -> np.ndarray:
+        squared = ((points[:, None] - points[None]) ** 2).sum(-1)
+        np.fill_diagonal(squared, np.inf)
+        return np.sort(squared, 1)[:, : min(3, len(points) - 1)].mean(1)
+
+    @settings(max_examples=60, deadline=None)
+    @given(st.integers(2, 60), st.integers(0, 1000), st.sampled_from(["even", "line", "outliers", "repeated"]))
+    def test_is_the_mean_of_the_three_smallest_squared_distances(self, count: int, seed: int, kind: str) -> None:
+        points = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
+        if kind == "line":
+            points[:, 1:] = 0
+        elif kind == "outliers":
+            points[::7] *= 1e5
+        elif kind == "repeated":
+            points[count // 2 :] = points[: count - count // 2]
+        pairs, nearest.PAIRS = nearest.PAIRS, 64  # so that small clouds go through the grid, too
+        try:
+            found = nearest.distCUDA2(torch.from_numpy(points))
+        finally:
+            nearest.PAIRS = pairs
+        np.testing.assert_allclose(found, self.brute(points.astype(np.float64)), rtol=1e-6, atol=1e-12)
+
+    def test_one_point_or_none_has_no_distance(self) -> None:
+        assert nearest.distCUDA2(torch.rand(1, 3)).tolist() == [0.0]
+        assert nearest.distCUDA2(torch.rand(0, 3)).tolist() == []
+        with pytest.raises(D2Error, match=r"points have shape \(4, 2\), expected \[N, 3\]"):
+            nearest.distCUDA2(torch.rand(4, 2))
+
+
+class TestSimilarity:
+    def test_is_the_mean_over_the_batch_of_3dgs_similarity(self) -> None:
+        a = torch.rand(2, 3, 20, 24, generator=torch.Generator().manual_seed(0)).requires_grad_()
+        b = a.detach().roll(1, -1)
+        found = similarity.fused_ssim(a, b)
+        each = [ssim(x.permute(1, 2, 0), y.permute(1, 2, 0)) for x, y in zip(a, b)]
+        torch.testing.assert_close(found, torch.stack(each).mean())
+        assert similarity.fused_ssim(a, a.detach()).item() == pytest.approx(1.0, abs=1e-5)
+        found.backward()
+        assert a.grad.abs().sum() > 0
+
+    def test_another_padding_is_refused(self) -> None:
+        with pytest.raises(D2Error, match="this stand-in has 'same' only"):
+            similarity.fused_ssim(torch.rand(1, 3, 12, 12), torch.rand(1, 3, 12, 12), padding="valid")

@@ -1,0 +1,271 @@
+"""The launcher: somebody else's train.py with D2 attached and no line of it edited."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from mimics import fudan, hust4d
+from mimics.inria import default_options
+from tiny import TinyStore
+
+from d2_plugin import D2Config, D2Error, D2Hooks
+from d2_plugin.adapters.fudan import FudanAdapter
+from d2_plugin.adapters.hust4d import Hust4DAdapter
+from d2_plugin.attach import originals
+from d2_plugin.attach.launch import main
+from d2_plugin.attach.names import RenamedStore
+from d2_plugin.attach.recipes import Original, recipe
+from d2_plugin.attach.session import AddGradient, Session
+from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
+
+DEPTH_LOSS = D2Config(depth_loss=DepthLossConfig(start=2))
+EDITS = D2Config(
+    densify=DensifyConfig(start=5, stop=30, every=10, budget_per_view=15),
+    prune=PruneConfig(start=5, stop=30, every=10, patience=2, tau_p=0.6),
+    depth_loss=DepthLossConfig(every=1, weight=0.2),
+)
+OPTIONS = default_options(iterations=30, densify_until_iter=0)
+
+
+@pytest.fixture
+def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with the modules that fudan-zvg/4d-gaussian-splatting has, classes of its own for every test."""
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "gaussian_renderer").mkdir()
+    (tmp_path / "scene" / "__init__.py").write_text("from mimics import fudan\nclass Scene(fudan.Scene): pass\n")
+    model = "from mimics import fudan\nclass GaussianModel(fudan.GaussianModel): pass\n"
+    (tmp_path / "scene" / "gaussian_model.py").write_text(model)
+    (tmp_path / "gaussian_renderer" / "__init__.py").write_text("from mimics.fudan import render\n")
+    (tmp_path / "train.py").write_text(TRAIN)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    for name in [name for name in sys.modules if name.split(".")[0] in ("scene", "gaussian_renderer")]:
+        del sys.modules[name]
+
+
+TRAIN = """
+import sys
+import torch
+from gaussian_renderer import render
+from scene import Scene
+from scene.gaussian_model import GaussianModel
+from mimics import fudan
+from mimics.inria import cameras_of, default_options, initial_points
+
+def trained():
+    fudan.render = render
+    gaussians = GaussianModel()
+    gaussians.create_from_pcd(*initial_points())
+    scene = Scene(cameras_of(timestamp=lambda view: view.time))
+    return fudan.training(gaussians, scene, default_options(iterations=30, densify_until_iter=0)).gaussians
+
+if __name__ == "__main__":
+    torch.save([p.detach() for p in trained()._xyz[None]], sys.argv[1])
+"""
+
+
+def run_wrapped(config: D2Config | None, monkeypatch: pytest.MonkeyPatch) -> tuple[torch.Tensor, Session | None]:
+    """Positions after training the repository's script, with D2 wrapped around it or bare."""
+    session = None
+    monkeypatch.setattr(fudan, "render", fudan.render)  # put back after the test, since the script replaces it
+    if config is not None:
+        session = Session(recipe("fudan"), config, TinyStore())
+        session.wrap()
+    script: dict = {"__name__": "train"}
+    exec(compile(TRAIN, "train.py", "exec"), script)
+    return script["trained"]()._xyz.detach(), session
+
+
+@pytest.mark.usefixtures("repository")
+class TestSession:
+    def test_without_hooks_is_bitwise_the_bare_trainer(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        bare, _ = run_wrapped(None, monkeypatch)
+        attached, _ = run_wrapped(D2Config(), monkeypatch)
+        assert torch.equal(bare, attached)
+
+    def test_the_loss_is_that_of_the_three_lines(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The term is weighted like the trainer's own loss, which is divided by the batch size."""
+        bare, _ = run_wrapped(None, monkeypatch)
+        launched, _ = run_wrapped(DEPTH_LOSS, monkeypatch)
+        three_lines = _fudan_with_three_lines(DEPTH_LOSS)
+        assert (launched - bare).abs().max() > 1e-3
+        torch.testing.assert_close(launched, three_lines, atol=2e-5, rtol=1e-4)
+
+    def test_edits_happen_after_zero_grad_and_are_counted(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        positions, session = run_wrapped(EDITS, monkeypatch)
+        assert session.inserted > 0
+        assert len(positions) == len(session.hooks.backbone)
+        assert session.summary().startswith(f"densify, prune, depth_loss: {session.inserted} inserted")
+
+    def test_renders_without_gradients_are_not_part_of_the_training(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        session = Session(recipe("fudan"), DEPTH_LOSS, TinyStore())
+        session.wrap()
+        from gaussian_renderer import render
+        from scene.gaussian_model import GaussianModel
+
+        gaussians, scene = fudan.make()
+        gaussians.__class__ = GaussianModel
+        session.objects.scene = scene
+        gaussians.training_setup(OPTIONS)
+        with torch.no_grad():
+            render(scene.train_cameras[1.0][0], gaussians, [0, 0, 0])
+        assert session._drawn == 0
+        render(scene.train_cameras[1.0][0], gaussians, [0, 0, 0])
+        assert session._drawn == 1
+
+    def test_iterations_are_the_trainer_s_own(self) -> None:
+        """fudan says them before rendering and begins with 2, Deformable-3D-Gaussians after the step."""
+        session = Session(recipe("fudan"), DEPTH_LOSS, TinyStore())
+        session.wrap()
+        from scene.gaussian_model import GaussianModel
+
+        assert not hasattr(GaussianModel, "update_learning_rate")
+        listening = session._listening(lambda model, iteration: iteration)
+        assert listening(None, 7) == 7
+        assert (session._iteration, session._told) == (7, True)
+
+
+def _fudan_with_three_lines(config: D2Config) -> torch.Tensor:
+    """The mimic's training with D2's loss added before the division by the batch size."""
+    gaussians, scene = fudan.make()
+    state: dict = {}
+    setup, loss_of = gaussians.training_setup, fudan.l1_loss
+
+    def training_setup(options: object) -> None:
+        setup(options)
+        state["d2"], state["drawn"] = D2Hooks(config, FudanAdapter(gaussians, scene), TinyStore()), []
+
+    def render(camera: object, model: object, background: list[int]) -> dict:
+        state["drawn"].append(camera)
+        return original(camera, model, background)
+
+    def l1_loss(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+        iteration = (len(state["drawn"]) + 1) // OPTIONS.batch_size
+        return loss_of(image, truth) + state["d2"].loss(iteration, state["drawn"][-1])
+
+    original, gaussians.training_setup = fudan.render, training_setup
+    fudan.render, fudan.l1_loss = render, l1_loss
+    try:
+        return fudan.training(gaussians, scene, OPTIONS).gaussians._xyz.detach()
+    finally:
+        fudan.render, fudan.l1_loss = original, loss_of
+
+
+def test_the_picture_passes_unchanged_and_the_term_gets_its_weight() -> None:
+    picture, x = torch.rand(3, 2, 2, requires_grad=True), torch.tensor(2.0, requires_grad=True)
+    out = AddGradient.apply(picture, x**2, 0.25)
+    assert torch.equal(out, picture)
+    (3 * out).sum().backward()
+    assert torch.equal(picture.grad, torch.full_like(picture, 3.0))
+    assert x.grad == 0.25 * 4
+
+
+def test_stages_of_4dgaussians_reach_the_adapter() -> None:
+    """Its render is told the stage by name; the coarse one is left alone."""
+    session = Session(recipe("hust4d"), DEPTH_LOSS, TinyStore())
+    gaussians, scene = hust4d.make()
+    session.objects.model, session.objects.scene = gaussians, scene
+    session.hooks = D2Hooks(DEPTH_LOSS, Hust4DAdapter(gaussians, scene, "coarse"), TinyStore())
+
+    def render(camera: object, model: object, stage: str) -> dict:
+        return {"render": gaussians._xyz.sum() * torch.ones(3, 2, 2)}
+
+    rendering = session._rendering(render)
+    rendering(scene.getTrainCameras()[0], gaussians, stage="fine")
+    assert session.hooks.backbone.stage == "fine"
+    assert session.hooks.backbone.active(1)
+
+
+def test_a_script_of_another_repository_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(D2Error, match="the script's folder has no scene.Scene .* give the repository that the script"):
+        Session(recipe("fudan"), DEPTH_LOSS, TinyStore()).wrap()
+
+
+class TestNames:
+    def test_priors_are_found_under_the_names_of_an_export(self, tmp_path: Path) -> None:
+        described = {"cameras": {"cam0": "cam01"}, "frames": {"0": 1, "1": 2}}
+        (tmp_path / "export.json").write_text(json.dumps(described))
+        store = RenamedStore.of_export(TinyStore(), tmp_path)
+        assert torch.equal(store.prior("cam01", 2).depth, TinyStore().prior("cam0", 1).depth)
+        assert store.prior("cam01", 9) is None
+        with pytest.raises(D2Error, match="unknown camera of the export 'cam0': have cam01; did you mean 'cam01'"):
+            store.prior("cam0", 1)
+        assert store.camera("cam01", 2) is None  # TinyStore does not say
+
+    def test_a_folder_without_export_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(D2Error, match="give the folder that `d2 export-capture` wrote"):
+            RenamedStore.of_export(TinyStore(), tmp_path)
+
+
+class TestOriginals:
+    NAME = "a_module_built_in_cuda"
+
+    @pytest.fixture(autouse=True)
+    def _forgotten(self) -> Iterator[None]:
+        yield
+        for name in [name for name in sys.modules if name.split(".")[0] == self.NAME]:
+            del sys.modules[name]
+
+    def test_what_can_be_imported_stays(self, tmp_path: Path) -> None:
+        (tmp_path / "built.py").write_text("value = 1\n")
+        originals.provide((Original(self.NAME, "d2_plugin.compat.nearest", "built.py"),), tmp_path, on_cpu=False)
+        assert sys.modules[self.NAME].value == 1
+
+    def test_ours_takes_the_place_of_what_cannot_and_says_why(self, tmp_path: Path, caplog) -> None:
+        (tmp_path / "built.py").write_text("raise RuntimeError('no nvcc')\n")
+        wanted = Original(f"{self.NAME}.part", "d2_plugin.compat.nearest", "built.py")
+        installed = Original(f"{self.NAME}._C", "d2_plugin.compat.nearest")
+        originals.provide((wanted, installed), tmp_path, on_cpu=False)
+        assert sys.modules[f"{self.NAME}.part"].distCUDA2(torch.rand(0, 3)).shape == (0,)
+        exec(f"from {self.NAME}._C import distCUDA2")
+        assert "d2_plugin.compat.nearest stands in for it (its import failed: no nvcc)" in caplog.text
+
+    def test_a_file_that_is_not_there_is_named(self, tmp_path: Path, caplog) -> None:
+        originals.provide((Original(self.NAME, "d2_plugin.compat.nearest", "built.py"),), tmp_path, on_cpu=False)
+        assert "(no file built.py)" in caplog.text
+
+
+def launched(*arguments: str, folder: Path) -> subprocess.CompletedProcess:
+    """The launcher in a process of its own without a GPU, since it changes torch for good."""
+    tests = Path(__file__).parents[1]
+    environment = os.environ | {"CUDA_VISIBLE_DEVICES": "", "PYTHONPATH": f"{tests}", "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "d2_plugin.attach", *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
+
+
+class TestCommand:
+    def test_an_unedited_script_trains_on_the_cpu(self, repository: Path) -> None:
+        """It says device="cuda" as they all do; here a line before the training of the mimic."""
+        asked = 'import torch\nassert torch.zeros(1, device="cuda").cuda().device.type == "cpu"\n'
+        (repository / "train.py").write_text(asked + TRAIN)
+        done = launched("fudan", "--cpu", "--", "train.py", "out.pt", folder=repository)
+        assert done.returncode == 0, done.stderr
+        assert "d2_plugin.compat.fourd stands in for it (it needs a GPU)" in done.stderr
+        assert "device 'cuda' means 'cpu'" in done.stderr
+        assert (repository / "out.pt").is_file()
+
+    def test_a_restart_of_the_trainer_is_refused(self, repository: Path) -> None:
+        (repository / "train.py").write_text("import os, sys\nos.execv(sys.executable, ['python', 'train.py'])\n")
+        done = launched("hust4d", "--cpu", "--", "train.py", folder=repository)
+        assert done.returncode == 2
+        assert "d2: the trainer wants to restart itself as python train.py" in done.stderr
+
+    def test_mistakes_are_one_sentence(self, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+        assert main(["fudan", "--d2", "d2.toml"]) == 2
+        assert "put the repository's train.py and its arguments behind --" in capsys.readouterr().err
+        assert main(["fudan", "--", str(tmp_path / "train.py")]) == 2
+        assert "no script at" in capsys.readouterr().err
+
+    @pytest.mark.skipif(torch.cuda.is_available(), reason="asks what happens without a GPU")
+    def test_without_a_gpu_the_cpu_has_to_be_asked_for(self, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+        (tmp_path / "train.py").touch()
+        assert main(["fudan", "--", str(tmp_path / "train.py")]) == 2
+        assert "add --cpu to try it on the CPU" in capsys.readouterr().err

@@ -1,0 +1,239 @@
+"""The bundled Yang-style backbone: what it draws, how it grows, what it leaves out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from tiny import TinyFrames, is_finite, make_model, make_trainer, make_views, parameters
+
+from d2_plugin.backbones.densify import DensifySettings, grow, prune
+from d2_plugin.backbones.gaussians import Gaussians
+from d2_plugin.backbones.starting import nearest_neighbour_scales
+from d2_plugin.backbones.trainer import Trainer, TrainSettings
+from d2_plugin.backbones.yang4d import Yang4DSettings, create
+from d2_plugin.gaussians import spherical_harmonics as sh
+from d2_plugin.gaussians.photometric import photometric_loss, ssim
+from d2_plugin.runs.metrics import ssim_3dgs
+
+
+class TestSlice:
+    def test_gaussians_outside_their_temporal_support_are_not_projected(self) -> None:
+        model = make_model()
+        with torch.no_grad():
+            model.gaussians["log_time_scales"].fill_(math.log(0.01))
+            model.gaussians["times"].copy_(torch.linspace(0, 1, 60))
+        splats = model.slice_at(make_views()[0])  # at time 0
+        offsets = torch.linspace(0, 1, 60)[splats.rows]
+        assert 0 < len(splats.rows) < 60
+        assert offsets.max() < 2.4478 * 0.01, "F(t) = 0.05 is 2.4477 standard deviations away"
+
+    def test_opacity_includes_the_temporal_factor(self) -> None:
+        model = make_model()
+        with torch.no_grad():
+            model.gaussians["log_time_scales"].fill_(math.log(0.4))
+            model.gaussians["times"].fill_(0.2)
+        expected = 0.5 * math.exp(-0.5 * (0.2 / 0.4) ** 2)
+        torch.testing.assert_close(model.slice_at(make_views()[0]).opacities, torch.full((60,), expected))
+
+    def test_without_time_these_are_ordinary_3d_gaussians(self) -> None:
+        model = make_model(temporal=False)
+        assert {"times", "log_time_scales", "right"}.isdisjoint(model.gaussians.parameters)
+        a, b = (model.slice_at(view) for view in (make_views()[0], make_views()[-1]))
+        assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+        assert len(a.rows) == 60
+
+    def test_time_apart_from_space_leaves_every_gaussian_where_it_is(self) -> None:
+        rows = (torch.rand(9, 3), torch.rand(9, 3), torch.full((9,), 0.3))
+        apart, coupled = (
+            create(*rows, extent=1.0, duration=1.0, temporal=True, settings={"couples_time": coupled})
+            for coupled in (False, True)
+        )
+        assert "right" not in apart.gaussians.parameters
+        turned = torch.randn(9, 4, generator=torch.Generator().manual_seed(0))
+        views = [replace(make_views()[0], time=time) for time in (0.28, 0.32)]
+        for model in (apart, coupled):
+            with torch.no_grad():
+                model.gaussians["left"].copy_(turned)
+        for part in ("means", "covariances"):
+            early, late = (getattr(apart.slice_at(view), part) for view in views)
+            torch.testing.assert_close(early, late)
+        early, late = (coupled.slice_at(view).means for view in views)
+        assert (early - late).abs().max() > 1e-3, "this test could not fail"
+        opacities = apart.slice_at(views[1]).opacities
+        offset = 0.32 - apart.gaussians["times"]
+        expected = torch.sigmoid(apart.gaussians["opacity_logits"]) * torch.exp(-0.5 * offset**2 / 0.2)
+        torch.testing.assert_close(opacities, expected)
+
+    def test_initial_temporal_variance_is_a_fifth_of_the_duration(self) -> None:
+        model = make_model()
+        torch.testing.assert_close(model.gaussians["log_time_scales"].exp() ** 2, torch.full((60,), 0.5 / 5))
+
+
+class TestInitialScales:
+    def test_is_the_root_mean_square_distance_to_three_neighbours(self) -> None:
+        positions = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [50, 0, 0]])
+        expected = math.sqrt((1 + 4 + 9) / 3)
+        assert nearest_neighbour_scales(positions)[0].item() == pytest.approx(expected)
+
+    @pytest.mark.parametrize("count", [0, 1, 2, 3])
+    def test_few_points_get_finite_scales(self, count: int) -> None:
+        scales = nearest_neighbour_scales(torch.rand(count, 3))
+        assert scales.shape == (count,)
+        assert torch.isfinite(scales).all()
+        assert (scales > 0).all()
+
+    def test_duplicated_points_get_a_floor(self) -> None:
+        assert (nearest_neighbour_scales(torch.ones(5, 3)) == 1e-7).all()
+
+
+class TestColour:
+    @pytest.mark.parametrize("degree", [0, 1, 2, 3])
+    def test_basis_is_orthonormal_over_the_sphere(self, degree: int) -> None:
+        z, weight = np.polynomial.legendre.leggauss(16)
+        phi = np.arange(32) * 2 * math.pi / 32
+        radius = np.sqrt(1 - z**2)
+        grid = np.stack([np.outer(radius, np.cos(phi)), np.outer(radius, np.sin(phi)), np.outer(z, np.ones(32))], -1)
+        values = sh.basis(torch.from_numpy(grid.reshape(-1, 3)), degree)
+        gram = (values * torch.from_numpy(np.repeat(weight, 32) * 2 * math.pi / 32)[:, None]).T @ values
+        torch.testing.assert_close(gram, torch.eye((degree + 1) ** 2, dtype=torch.float64))
+
+    def test_constant_colours_survive_the_coefficients(self) -> None:
+        rgb, directions = torch.rand(7, 3), torch.randn(7, 3)
+        for degree, time_degree in ((0, 0), (2, 0), (1, 2)):
+            coefficients = sh.coefficients_from_rgb(rgb, degree, time_degree)
+            assert coefficients.shape == (7, sh.channel_count(degree, time_degree), 3)
+            phase = torch.rand(7)
+            torch.testing.assert_close(sh.colors(coefficients, directions, phase, degree, time_degree), rgb)
+
+    def test_time_modulates_with_the_cosine_of_the_phase(self) -> None:
+        coefficients = torch.zeros(1, sh.channel_count(0, 1), 3)
+        coefficients[:, 1] = 0.4 / sh.C0
+        color = sh.colors(coefficients, torch.ones(1, 3), torch.tensor([1 / 6]), 0, 1)
+        torch.testing.assert_close(color, torch.full((1, 3), 0.5 + 0.4 * math.cos(math.pi / 3)))
+
+
+class TestPhotometricLoss:
+    def test_ssim_is_the_one_of_3d_gaussian_splatting(self) -> None:
+        rng = np.random.default_rng(0)
+        a = rng.random((24, 30, 3))
+        b = np.clip(a + 0.1 * rng.standard_normal(a.shape), 0, 1)
+        ours = ssim(torch.from_numpy(a), torch.from_numpy(b)).item()
+        assert ours == pytest.approx(float(ssim_3dgs(torch.from_numpy(a), torch.from_numpy(b))), abs=1e-9)
+
+    def test_equal_pictures_cost_nothing(self) -> None:
+        image = torch.rand(20, 20, 3, dtype=torch.float64)
+        assert photometric_loss(image, image).item() == pytest.approx(0, abs=1e-12)
+
+    def test_passes_gradcheck(self) -> None:
+        generator = torch.Generator().manual_seed(0)
+        image, target = torch.rand(2, 12, 13, 3, dtype=torch.float64, generator=generator)
+        assert torch.autograd.gradcheck(lambda x: photometric_loss(x, target), image.requires_grad_())
+
+
+class TestDensityControl:
+    def test_small_gaussians_are_cloned_and_large_ones_split_into_two(self) -> None:
+        model = make_model()
+        with torch.no_grad():
+            model.gaussians["log_scales"][:30] = math.log(1e-3)
+            model.gaussians["log_scales"][30:] = math.log(0.1)
+        model.gaussians.statistics["screen_gradient"][[0, 40]] = 1.0
+        model.gaussians.statistics["seen"].fill_(1)
+        before = parameters_of(model)
+        grow(model, DensifySettings(gradient=0.5, dense_fraction=0.01), torch.Generator().manual_seed(0))
+        after = parameters_of(model)
+        assert len(model) == 62, "one clone; one parent replaced by two children"
+        assert torch.equal(after["positions"][-3], before["positions"][0])
+        torch.testing.assert_close(after["log_scales"][-2:], before["log_scales"][[40, 40]] - math.log(1.6))
+        assert not (after["positions"] == before["positions"][40]).all(-1).any(), "the parent is gone"
+
+    def test_growth_stops_at_the_budget(self) -> None:
+        model = make_model()
+        model.gaussians.statistics["screen_gradient"].fill_(1)
+        model.gaussians.statistics["seen"].fill_(1)
+        grow(model, DensifySettings(gradient=0.5, budget=64), torch.Generator())
+        assert len(model) == 64
+
+    def test_transparent_and_huge_gaussians_are_pruned(self) -> None:
+        model = make_model()
+        with torch.no_grad():
+            model.gaussians["opacity_logits"][3] = -10
+            model.gaussians["log_scales"][5, 1] = 10
+        prune(model, DensifySettings())
+        assert len(model) == 58
+
+    def test_a_run_survives_losing_every_gaussian(self) -> None:
+        model = make_model()
+        model.select(torch.zeros(0, dtype=torch.int64))
+        render = model.render(make_views()[0])
+        assert (render.color == 0).all()
+        assert (render.alpha == 0).all()
+
+
+class TestGaussians:
+    def test_appended_rows_start_without_momentum(self) -> None:
+        gaussians = Gaussians({"x": torch.zeros(2, 3)}, {"x": 0.1})
+        gaussians["x"].sum().backward()
+        gaussians.optimizer.step()
+        gaussians.append({"x": torch.ones(1, 3)})
+        moments = gaussians.optimizer.state[gaussians["x"]]["exp_avg"]
+        assert (moments[:2] != 0).all()
+        assert (moments[2] == 0).all()
+
+    def test_overwriting_forgets_the_momentum(self) -> None:
+        gaussians = Gaussians({"x": torch.zeros(2, 3)}, {"x": 0.1})
+        gaussians["x"].sum().backward()
+        gaussians.optimizer.step()
+        gaussians.overwrite("x", torch.full((2, 3), 7.0))
+        assert gaussians["x"] not in gaussians.optimizer.state
+
+    def test_rows_and_rates_must_name_the_same_tensors(self) -> None:
+        with pytest.raises(ValueError, match="name different tensors"):
+            Gaussians({"x": torch.zeros(2, 3)}, {"y": 0.1})
+
+
+def test_training_lowers_the_loss_of_the_tiny_scene() -> None:
+    losses: list[float] = []
+    trainer = make_trainer(iterations=150)
+    trainer.run(on_step=lambda step, loss: losses.append(loss))
+    assert np.mean(losses[-6:]) < 0.5 * np.mean(losses[:6])
+    assert is_finite(trainer)
+
+
+def test_every_training_view_is_used_once_per_round() -> None:
+    trainer = make_trainer()
+    count = len(TinyFrames().views)
+    assert sorted(trainer._next_view() for _ in range(count)) == list(range(count))
+
+
+@pytest.mark.parametrize("settings", [{"couples_time": False}, {"sh_degree": 1, "sh_time_degree": 2}])
+@pytest.mark.parametrize("temporal", [True, False])
+def test_every_variant_trains_and_grows(settings: dict[str, object], temporal: bool) -> None:
+    points = torch.rand(3, 60, 3, generator=torch.Generator().manual_seed(0))
+    growth = {"start": 0.0, "stop": 1.0, "every": 7, "gradient": 1e-3, "dense_fraction": 0.1}
+    model = create(
+        points[0] + torch.tensor([-0.5, -0.5, 2.5]), points[1], points[2, :, 0] / 2, extent=2.0, duration=0.5,
+        temporal=temporal, settings=settings | {"densify": growth},
+    )  # fmt: skip
+    trainer = Trainer(model, TinyFrames(), TrainSettings(iterations=30))
+    trainer.run()
+    assert is_finite(trainer)
+    assert len(model) > 60
+
+
+def test_settings_arrive_through_the_entry_point() -> None:
+    model = create(
+        torch.rand(4, 3), torch.rand(4, 3), torch.zeros(4), extent=1.0, duration=1.0, temporal=True,
+        settings={"sh_degree": 1, "densify": {"every": 9}, "raster": {"near": 0.01}},
+    )  # fmt: skip
+    assert model.gaussians["harmonics"].shape == (4, 3, 3)
+    assert model.settings == Yang4DSettings(
+        sh_degree=1, densify=DensifySettings(every=9), raster=type(model.settings.raster)(near=0.01)
+    )
+
+
+def parameters_of(model) -> dict[str, torch.Tensor]:
+    return parameters(type("Holder", (), {"model": model})())

@@ -1,0 +1,307 @@
+"""The `d2` command as a person uses it: one run from capture to score, and one sentence for every mistake."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from d2_plugin.captures.export.folder import save_capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.commands.cli import main
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.store import PriorStore
+
+pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
+pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+
+CAMERAS = "train0,train1,train2"
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording small enough to train in seconds."""
+    path = tmp_path_factory.mktemp("recording") / "room"
+    return save_capture(synthetic_capture(cameras=3, held_out=1, frames=2, width=96, height=54), path)
+
+
+@pytest.fixture(scope="module")
+def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run with all hooks."""
+    output = tmp_path_factory.mktemp("runs") / "full"
+    assert train(capture, output) == 0
+    return output
+
+
+def train(capture: Path, output: Path, *more: str, cameras: str = CAMERAS) -> int:
+    fixed = ["--train-cameras", cameras, "--iterations", "40", "--output", str(output)]
+    return main(["train", str(capture), *fixed, *more])
+
+
+def refused(capsys: pytest.CaptureFixture[str], code: int) -> str:
+    """The one sentence on stderr of a refused command."""
+    message = capsys.readouterr().err.strip()
+    assert code == 2
+    assert message.startswith("d2: ")
+    assert len(message.splitlines()) == 1
+    assert "Traceback" not in message
+    return message
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def damaged_copy(capture: Path, tmp_path: Path) -> Path:
+    copy = tmp_path / "copy"
+    shutil.copytree(capture, copy)
+    return copy
+
+
+def test_a_run_leaves_scores_pictures_configuration_and_checkpoint(finished: Path) -> None:
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert set(metrics["test"]) >= {"psnr", "ssim1", "ssim2", "lpips", "depth_absrel"}
+    assert metrics["test"]["psnr"] > 10
+    assert 0 < metrics["test"]["depth_absrel"] < 1
+    assert metrics["test"]["lpips"] is None
+    assert metrics["train_cameras"] == CAMERAS.split(",")
+    assert metrics["test_cameras"] == ["test0"]
+    assert metrics["hooks"] == ["prior", "densify", "prune", "depth_loss"]
+    assert metrics["iterations"] == 40
+    assert metrics["gaussians"] > 100
+    assert set(metrics["seconds"]) == {"priors", "train", "eval"}
+    assert metrics["plan"]["temporal"]["use"] is True
+    assert metrics["mono_emulated"] is True
+    assert len(metrics["per_view"]) == 2
+    assert len(list((finished / "pictures").glob("test0_*.png"))) == 2
+    assert (finished / "d2.toml").is_file()
+    assert (finished / "checkpoint.pt").is_file()
+
+
+def test_a_cut_off_run_continues_to_the_same_score(capture: Path, finished: Path, tmp_path: Path) -> None:
+    import torch
+
+    from d2_plugin.runs.run import Run
+
+    first = Run.load(finished)
+    output = tmp_path / "again"
+    shutil.copytree(finished, output)
+    (output / "checkpoint.pt").unlink()
+    (output / "metrics.json").unlink()
+    run = Run(first.settings, output)
+    extent, sparse = run._points()
+    trainer = run._trainer(extent, sparse)
+    trainer.run(until=24)
+    run._save(trainer)
+    assert train(capture, output) == 0
+    ends = [torch.load(folder / "checkpoint.pt", weights_only=True)["model"] for folder in (finished, output)]
+    for name, value in ends[0]["parameters"].items():
+        assert torch.equal(value, ends[1]["parameters"][name]), name
+
+
+def test_evaluating_again_gives_the_same_scores(finished: Path) -> None:
+    before = json.loads((finished / "metrics.json").read_text())
+    assert main(["eval", str(finished), "--no-pictures"]) == 0
+    after = json.loads((finished / "metrics.json").read_text())
+    assert after["test"] == before["test"]
+    assert after["per_view"] == before["per_view"]
+
+
+def test_priors_are_built_in_parts_and_shown_on_a_sheet(
+    capture: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    build = ["priors", str(capture), "--train-cameras", CAMERAS, "--output", str(tmp_path)]
+    assert main([*build, "--shard", "2/2"]) == 0
+    assert not (tmp_path / "contact_sheet.png").exists()
+    assert main(build) == 0
+    assert "verified" in capsys.readouterr().out
+    assert (tmp_path / "contact_sheet.png").is_file()
+    whole, joined = PriorStore.open(finished / "priors"), PriorStore.open(tmp_path)
+    for camera in CAMERAS.split(","):
+        assert np.array_equal(whole.prior(camera, 1).depth, joined.prior(camera, 1).depth)
+
+
+def test_a_hook_that_changes_nothing_retires_and_the_scores_say_so(
+    capture: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "config.toml"
+    config.write_text("[d2]\nretire_after = 2\n[densify]\nmax_gaussians = 0\n")
+    hooks = ["--hooks", "densify", "--priors", str(finished / "priors"), "--config", str(config)]
+    assert train(capture, tmp_path / "idle", *hooks) == 0
+    assert "densify retired at step 4: it changed next to nothing" in capsys.readouterr().out
+    assert json.loads((tmp_path / "idle" / "metrics.json").read_text())["retired"] == {"densify": 4}
+
+
+def test_a_part_is_not_built_on_a_cluster(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    build = ["priors", str(capture), "--train-cameras", CAMERAS, "--output", str(tmp_path / "priors")]
+    assert "leave it out" in refused(capsys, main([*build, "--shard", "1/2", "--workers", "2"]))
+
+
+def test_compare_tabulates_what_was_measured(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", str(finished)]) == 0
+    header, _, row = capsys.readouterr().out.splitlines()
+    cells = dict(zip(header.split("|")[1:-1], row.split("|")[1:-1], strict=True))
+    cells = {key.strip(): value.strip() for key, value in cells.items()}
+    metrics = json.loads((finished / "metrics.json").read_text())
+    assert cells["run"] == "full"
+    assert cells["PSNR"] == f"{metrics['test']['psnr']:.2f}"
+    assert cells["LPIPS"] == "-"
+
+
+def test_doctor_names_compiler_device_and_extras(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert {line.split()[0] for line in lines} >= {"device", "compiler", "cache", "backbones", "onnxruntime", "cv2"}
+
+
+def test_plan_names_each_decision_with_its_measurement(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", str(capture), "--train-cameras", CAMERAS]) == 0
+    notes, lines = [], []
+    for line in capsys.readouterr().out.splitlines():
+        (notes if line.split()[0] == "note" else lines).append(line)
+    assert notes, "what is known about the recording is said"
+    assert [line.split()[1] for line in lines] == ["temporal", "stereo", "monocular", "verification"]
+    assert "% of a camera's pixels change" in lines[0]
+    assert "(emulated)" in lines[2]
+
+
+def test_one_instant_leaves_the_temporal_dimension_out(capture: Path, tmp_path: Path) -> None:
+    assert train(capture, tmp_path / "still", "--frames", "1:1", "--hooks", "none", "--export-ply") == 0
+    metrics = json.loads((tmp_path / "still" / "metrics.json").read_text())
+    assert metrics["plan"]["temporal"] == {"use": False, "reason": "one instant"}
+    assert [path.name for path in (tmp_path / "still" / "ply").iterdir()] == ["frame_00001.ply"]
+
+
+def test_the_temporal_dimension_can_be_left_out_by_the_user(capture: Path, tmp_path: Path) -> None:
+    config = tmp_path / "still.toml"
+    config.write_text("[plan]\ntemporal = false\n")
+    assert train(capture, tmp_path / "still", "--hooks", "none", "--config", str(config)) == 0
+    decision = json.loads((tmp_path / "still" / "metrics.json").read_text())["plan"]["temporal"]
+    assert decision["use"] is False
+    assert "overridden by the user (measured: motion" in decision["reason"]
+
+
+def test_one_training_camera_without_metric_depth_is_refused_or_trains_bare(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(capture, tmp_path / "bare", "--hooks", "none", cameras="train0") == 0
+    plan = json.loads((tmp_path / "bare" / "metrics.json").read_text())["plan"]
+    assert plan["stereo"] == {"use": False, "reason": "one training camera"}
+    assert plan["verification"]["use"] is False
+
+
+def test_all_cameras_may_train(capture: Path, tmp_path: Path) -> None:
+    assert train(capture, tmp_path / "all", "--hooks", "none", cameras=CAMERAS + ",test0") == 0
+    metrics = json.loads((tmp_path / "all" / "metrics.json").read_text())
+    assert metrics["test"] is None
+    assert metrics["test_cameras"] == []
+    assert metrics["train"]["psnr"] > 10
+
+
+class TestMistakes:
+    def test_an_output_folder_of_another_run_is_left_alone(
+        self, capture: Path, finished: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        before = contents(finished)
+        message = refused(capsys, train(capture, finished, "--seed", "5"))
+        assert "holds another run, made with other settings of seed" in message
+        assert contents(finished) == before
+
+    def test_a_folder_with_other_files_is_left_alone(
+        self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        (tmp_path / "notes.txt").write_text("mine")
+        assert "is not empty and holds no run" in refused(capsys, train(capture, tmp_path))
+        assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+    def test_unknown_hook(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        message = refused(capsys, train(capture, tmp_path / "x", "--hooks", "densify,depthloss"))
+        assert "unknown hook 'depthloss'" in message
+        assert "did you mean 'depth_loss'?" in message
+        assert not (tmp_path / "x").exists()
+
+    def test_unknown_backbone(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        message = refused(capsys, train(capture, tmp_path / "x", "--backbone", "yang"))
+        assert "unknown backbone 'yang'" in message
+        assert "did you mean 'yang4d'?" in message
+
+    def test_a_device_that_is_not_there(
+        self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        if torch.cuda.is_available():
+            pytest.skip("this machine has a CUDA device")
+        code = train(capture, tmp_path / "run", "--device", "cuda")
+        assert "leave out --device" in refused(capsys, code)
+        code = train(capture, tmp_path / "run", "--device", "cdua")
+        assert "cuda" in refused(capsys, code)
+
+    def test_no_training_camera(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "no training camera" in refused(capsys, train(capture, tmp_path / "x", cameras=","))
+
+    def test_unknown_training_camera(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        message = refused(capsys, train(capture, tmp_path / "x", cameras="train0,trian1"))
+        assert "unknown camera 'trian1'" in message
+        assert "did you mean 'train1'?" in message
+
+    def test_no_such_capture(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "no such capture" in refused(capsys, train(tmp_path / "nowhere", tmp_path / "x"))
+
+    def test_camera_missing_in_cameras_json(
+        self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        copy = damaged_copy(capture, tmp_path)
+        description = json.loads((copy / "cameras.json").read_text())
+        description["cameras"] = [c for c in description["cameras"] if c["name"] != "train1"]
+        (copy / "cameras.json").write_text(json.dumps(description))
+        assert "train1" in refused(capsys, train(copy, tmp_path / "x"))
+
+    def test_unreadable_frame(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        copy = damaged_copy(capture, tmp_path)
+        frame = copy / "images" / "train1" / "00001.png"
+        frame.write_bytes(frame.read_bytes()[:100])
+        assert "00001.png" in refused(capsys, train(copy, tmp_path / "x"))
+
+    def test_images_of_two_sizes(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        from d2_plugin.captures.pictures import write_png
+
+        copy = damaged_copy(capture, tmp_path)
+        write_png(copy / "images" / "train2" / "00001.png", np.zeros((20, 30, 3), np.uint8))
+        message = refused(capsys, train(copy, tmp_path / "x"))
+        assert "30x20" in message
+        assert "96x54" in message
+
+    def test_a_damaged_prior_is_named(
+        self, capture: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        priors = tmp_path / "priors"
+        shutil.copytree(finished / "priors" / "priors", priors / "priors")
+        shutil.copy(finished / "priors" / "store.json", priors)
+        array = priors / "priors" / "train1" / "00000.npy"
+        array.write_bytes(array.read_bytes()[:500])
+        with pytest.raises(D2Error, match="camera train1, frame 0 is damaged"):
+            PriorStore.open(priors)
+
+    def test_onnx_without_its_kind(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "--mono-kind" in refused(capsys, train(capture, tmp_path / "x", "--mono-onnx", "net.onnx"))
+
+    def test_wrong_setting_in_the_configuration(
+        self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        config = tmp_path / "d2.toml"
+        config.write_text("[prune]\ntau_pp = 0.5\n")
+        message = refused(capsys, train(capture, tmp_path / "x", "--config", str(config)))
+        assert "unknown setting of prune 'tau_pp'" in message
+        config.write_text("[plan]\nstereo = false\n")
+        message = refused(capsys, train(capture, tmp_path / "x", "--config", str(config)))
+        assert "unknown decision of plan 'stereo': have temporal" in message
+        config.write_text("[backbone]\nsh_degre = 1\n")
+        message = refused(capsys, train(capture, tmp_path / "y", "--hooks", "none", "--config", str(config)))
+        assert "did you mean 'sh_degree'?" in message
+        assert not (tmp_path / "y").exists()
+
+    def test_evaluating_what_is_no_run(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "holds no run" in refused(capsys, main(["eval", str(tmp_path)]))

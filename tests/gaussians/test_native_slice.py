@@ -1,0 +1,229 @@
+"""The slice in the kernel is the slice in torch: values, gradients, edges of the lanes, threads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_rotation4d import GOLDEN
+from tiny import make_model, make_views
+from torch import Tensor
+
+from d2_plugin import D2Error
+from d2_plugin.gaussians import native_slice as kernel
+from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL, native_slice
+from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, reference_slice
+
+AT, CONSTANTS = 0.5, (MARGINAL_CUT, LOG_SCALE_LIMIT)
+OUTPUTS = ("means", "covariances", "opacities")
+
+
+@pytest.fixture(autouse=True)
+def compiled() -> None:
+    if kernel.library() is None:
+        pytest.skip("there is no C++ compiler")
+
+
+@pytest.fixture(params=[True, False], ids=["temporal", "static"])
+def temporal(request: pytest.FixtureRequest) -> bool:
+    return request.param
+
+
+def random_rows(count: int, temporal: bool, seed: int = 0, time_scale: float = 0.2) -> dict[str, Tensor]:
+    """Raw parameters in float32; with `time_scale` 0.2 about two in three are drawn at AT."""
+    generator = torch.Generator().manual_seed(seed)
+    rows = {
+        name: torch.randn(*((count, width) if width > 1 else (count,)), generator=generator)
+        for name, width in (TEMPORAL if temporal else STATIC).items()
+    }
+    rows["log_scales"] = rows["log_scales"] * 0.7 - 2
+    if temporal:
+        rows["times"] = rows["times"] * 0.5 + AT
+        rows["log_time_scales"] = rows["log_time_scales"] * 0.3 + math.log(time_scale)
+    return rows
+
+
+def slice_with_gradients(slice_in, rows: Mapping[str, Tensor], dtype: torch.dtype, seed: int = 7, at: float = AT):
+    """Outputs, and gradients of a fixed random sum of them, of `slice_in` (native or torch) in `dtype`."""
+    raw = {name: value.to(dtype, copy=True).requires_grad_() for name, value in rows.items()}
+    *outputs, drawn = slice_in(raw, at, *CONSTANTS)
+    generator = torch.Generator().manual_seed(seed)
+    upstream = [torch.randn(output.shape, generator=generator).to(dtype) for output in outputs]
+    torch.autograd.backward(outputs, upstream)
+    return (*(o.detach() for o in outputs), drawn), {name: value.grad for name, value in raw.items()}
+
+
+def relative_error(value: Tensor, expected: Tensor) -> float:
+    """Relative L2 distance."""
+    difference = torch.linalg.vector_norm(value.double() - expected)
+    return float(difference / torch.linalg.vector_norm(expected).clamp(min=1e-300))
+
+
+@pytest.mark.parametrize("count", [1, 3, 15, 16, 17, 1024, 1040, 3001])
+def test_values_and_gradients_are_those_of_torch_in_float64(count: int, temporal: bool) -> None:
+    rows = random_rows(count, temporal)
+    native, native_gradients = slice_with_gradients(native_slice, rows, torch.float32)
+    exact, exact_gradients = slice_with_gradients(reference_slice, rows, torch.float64)
+    assert torch.equal(native[3], exact[3])
+    for name, value, expected in zip(OUTPUTS, native, exact):
+        assert value.is_contiguous()
+        assert relative_error(value, expected) < 1e-6, name
+    for name, expected in exact_gradients.items():
+        assert relative_error(native_gradients[name], expected) < 5e-6, name
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("time_scale", [0.02, 2.0])
+def test_short_and_long_lives_agree_with_torch_in_float64(seed: int, time_scale: float) -> None:
+    rows = random_rows(300, True, seed, time_scale)
+    native, native_gradients = slice_with_gradients(native_slice, rows, torch.float32)
+    exact, exact_gradients = slice_with_gradients(reference_slice, rows, torch.float64)
+    assert torch.equal(native[3], exact[3])
+    for name, value, expected in zip(OUTPUTS, native, exact):
+        assert relative_error(value, expected) < 2e-6, name
+    for name, expected in exact_gradients.items():
+        assert relative_error(native_gradients[name], expected) < 1e-5, name
+
+
+def test_where_float32_is_short_of_digits_the_kernel_loses_no_more_than_torch() -> None:
+    rows = random_rows(300, True, time_scale=200.0)  # velocities are ratios of numbers three orders apart
+    native, native_gradients = slice_with_gradients(native_slice, rows, torch.float32)
+    plain, plain_gradients = slice_with_gradients(reference_slice, rows, torch.float32)
+    exact, exact_gradients = slice_with_gradients(reference_slice, rows, torch.float64)
+    assert torch.equal(native[3], exact[3])
+    for name, value, other, expected in zip(OUTPUTS, native, plain, exact):
+        assert relative_error(value, expected) < 2e-6 + 1.5 * relative_error(other, expected), name
+    for name, expected in exact_gradients.items():
+        allowed = 2e-6 + 1.5 * relative_error(plain_gradients[name], expected)
+        assert relative_error(native_gradients[name], expected) < allowed, name
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 60), st.floats(-25, 25))
+def test_opacities_stay_below_one_and_everything_finite(seed: int, count: int, log_time_scale: float) -> None:
+    rows = random_rows(count, True, seed, math.exp(log_time_scale))
+    rows["opacity_logits"] *= 50
+    outputs, gradients = slice_with_gradients(native_slice, rows, torch.float32)
+    assert all(torch.isfinite(tensor).all() for tensor in (*outputs, *gradients.values()))
+    assert ((outputs[2] >= 0) & (outputs[2] <= 1)).all()
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_kernel_agrees_with_the_reference_implementation(name: str) -> None:
+    mean, mean_time, scales, left, right, instant, at, covariance, marginal, _, _ = GOLDEN[name]
+    rows = {
+        "positions": torch.tensor([mean], dtype=torch.float32),
+        "log_scales": torch.tensor([scales[:3]]).log(),
+        "left": torch.tensor([left], dtype=torch.float32),
+        "opacity_logits": torch.zeros(1),
+        "times": torch.tensor([mean_time]),
+        "log_time_scales": torch.tensor(scales[3:]).log(),
+        "right": torch.tensor([right], dtype=torch.float32),
+    }
+    means, covariances, opacities, drawn = native_slice(rows, instant, *CONSTANTS)
+    assert drawn.tolist() == [0]
+    torch.testing.assert_close(means[0], torch.tensor(at, dtype=torch.float32), atol=5e-7, rtol=1e-6)
+    torch.testing.assert_close(covariances[0], torch.tensor(covariance, dtype=torch.float32), atol=2e-8, rtol=1e-5)
+    torch.testing.assert_close(opacities[0], torch.tensor(0.5 * marginal), atol=0, rtol=1e-6)
+
+
+def test_a_gaussian_outside_its_temporal_support_is_left_out_with_zero_gradient() -> None:
+    rows = random_rows(500, True)
+    (_, _, opacities, drawn), gradients = slice_with_gradients(native_slice, rows, torch.float32)
+    assert 0 < len(drawn) < 500
+    assert (drawn.diff() > 0).all()
+    hidden = torch.ones(500, dtype=torch.bool).index_fill(0, drawn, False)
+    for name, gradient in gradients.items():
+        assert not gradient[hidden].any(), name
+        assert gradient[drawn].any(), name
+    assert (opacities > 0).all()
+
+
+@pytest.mark.parametrize("count", [0, 40])
+def test_nothing_drawn_gives_empty_splats_and_zero_gradients(count: int) -> None:
+    rows = random_rows(count, True)
+    outputs, gradients = slice_with_gradients(native_slice, rows, torch.float32, at=1e6)
+    assert [tuple(output.shape) for output in outputs] == [(0, 3), (0, 6), (0,), (0,)]
+    assert all(not gradient.any() and gradient.shape == rows[name].shape for name, gradient in gradients.items())
+
+
+def test_no_gaussians_without_time_are_no_splats() -> None:
+    outputs, _ = slice_with_gradients(native_slice, random_rows(0, False), torch.float32)
+    assert [len(output) for output in outputs] == [0, 0, 0, 0]
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("threads")
+def test_one_and_two_threads_give_the_same_bits(temporal: bool) -> None:
+    rows, results = random_rows(10_000, temporal), []
+    for count in (1, 2):
+        torch.set_num_threads(count)
+        outputs, gradients = slice_with_gradients(native_slice, rows, torch.float32)
+        results.append([*outputs, *gradients.values()])
+    assert all(torch.equal(one, two) for one, two in zip(*results))
+
+
+@pytest.mark.parametrize("spoilt", list(TEMPORAL))
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_nan_or_infinity_in_one_gaussian_leaves_the_others_untouched(spoilt: str, value: float) -> None:
+    rows = random_rows(200, True, time_scale=20.0)
+    clean, clean_gradients = slice_with_gradients(native_slice, rows, torch.float32)
+    rows[spoilt].view(200, -1)[7, 0] = value
+    # The same upstream gradient for each Gaussian, whether or not the spoilt one is still drawn.
+    raw = {name: tensor.clone().requires_grad_() for name, tensor in rows.items()}
+    *outputs, drawn = native_slice(raw, AT, *CONSTANTS)
+    kept, before = drawn != 7, clean[3] != 7
+    generator = torch.Generator().manual_seed(7)
+    upstream = [torch.randn(o.shape, generator=generator) for o in clean[:3]]
+    places = torch.searchsorted(clean[3], drawn)
+    torch.autograd.backward(outputs, [gradient[places] for gradient in upstream])
+    for output, expected in zip(outputs, clean):
+        assert torch.equal(output[kept], expected[before])
+    others = torch.arange(200) != 7
+    for name, tensor in raw.items():
+        assert torch.equal(tensor.grad[others], clean_gradients[name][others]), name
+
+
+def test_each_output_alone_has_its_gradient(temporal: bool) -> None:
+    rows = random_rows(40, temporal)
+    for output in range(3):
+        gradients = []
+        for slice_in, dtype in ((native_slice, torch.float32), (reference_slice, torch.float64)):
+            raw = {name: value.to(dtype, copy=True).requires_grad_() for name, value in rows.items()}
+            slice_in(raw, AT, *CONSTANTS)[output].square().sum().backward()
+            gradients.append({name: value.grad for name, value in raw.items()})
+        for name, expected in gradients[1].items():
+            found = gradients[0][name]
+            assert found is not None
+            if expected is None or not expected.any():
+                assert not found.any(), name
+            else:
+                assert relative_error(found, expected) < 5e-6, name
+
+
+def test_rows_of_another_number_of_gaussians_are_refused() -> None:
+    rows = random_rows(10, True)
+    rows["right"] = rows["right"][:9]
+    with pytest.raises(D2Error, match=r"right has shape \(9, 4\), expected 4 numbers for each of 10 Gaussians"):
+        native_slice(rows, AT, *CONSTANTS)
+
+
+def test_a_model_slices_in_torch_where_there_is_no_compiler(temporal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, view = make_model(temporal=temporal), make_views()[-1]
+    native = model.slice_at(view)
+    assert "_Slice" in type(native.covariances.grad_fn).__name__
+    monkeypatch.setattr(kernel, "library", lambda: None)
+    plain = model.slice_at(view)
+    assert "_Slice" not in type(plain.covariances.grad_fn).__name__
+    for one, other in zip(native, plain):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)

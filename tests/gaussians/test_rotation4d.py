@@ -1,0 +1,115 @@
+"""The slice of a 4D Gaussian at an instant, against golden vectors of the reference implementation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from d2_plugin.gaussians.rotation4d import (
+    condition_on_time,
+    covariances_from_factors,
+    normalized_quaternions,
+    rotation_matrices_3d,
+    rotation_matrices_4d,
+    temporal_marginal,
+    time_row,
+)
+
+# mean, mean time, scales, left, right, instant -> sliced mean, covariance, marginal, temporal variance, velocity
+GOLDEN = {
+    "A": (
+        (1, 2, 3), 0.5, (0.1, 0.2, 0.3, 0.4), (1, 0, 0, 0), (1, 0, 0, 0), 0.7,
+        (1, 2, 3), (0.01, 0, 0, 0.04, 0, 0.09), 0.8824969025845955, 0.16, (0, 0, 0),
+    ),
+    "B": (
+        (0, 0, 2), 0.0, (0.1, 0.2, 0.3, 0.5), (1, 0.2, -0.1, 0.05), (0.9, -0.1, 0.3, 0.2), 0.4,
+        (-0.07657938, -0.13313971, 2.09110397),
+        (0.01544891, 0.00192817, -0.01986139, 0.04780662, 0.0069878, 0.08927245),
+        0.6676256617997561, 0.19800625078134768, (-0.19144844, -0.33284928, 0.22775992),
+    ),
+    "C": (
+        (-1, 0.5, 4), 1.0, (0.05, 0.02, 0.04, 2**0.5), (2, 0.4, 0.2, -0.6), (0.5, 0.1, 0.05, 0.15), 2.5,
+        (-1.93595609, 0.68695754, 3.90645446),
+        (0.00307141, -0.00098906, 0.00024459, 0.00077273, -0.00013639, 0.0016432),
+        0.4525663865678813, 1.4189839335180057, None,
+    ),
+}  # fmt: skip
+
+
+def tensor(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def random_quaternions(seed: int, count: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return normalized_quaternions(torch.randn(4, count, generator=generator, dtype=torch.float64)).to(dtype)
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_slice_agrees_with_the_reference_implementation(name: str) -> None:
+    mean, mean_time, scales, left, right, instant, at, covariance, marginal, variance, velocity = GOLDEN[name]
+    left, right = normalized_quaternions(tensor(*left)[:, None]), normalized_quaternions(tensor(*right)[:, None])
+    factors = rotation_matrices_4d(left, right) * tensor(*scales)[:, None]
+    spatial, speed = condition_on_time(factors)
+    v_t = (time_row(left, right) * tensor(*scales)[:, None]).square().sum(0)
+    np.testing.assert_allclose(v_t[0], variance, rtol=1e-12)
+    np.testing.assert_allclose(tensor(*mean) + speed[:, 0] * (instant - mean_time), tensor(*at), atol=5e-9)
+    np.testing.assert_allclose(covariances_from_factors(spatial)[0], tensor(*covariance), atol=5e-9)
+    np.testing.assert_allclose(temporal_marginal(tensor(instant - mean_time), v_t)[0], marginal, rtol=1e-12)
+    if velocity is not None:
+        np.testing.assert_allclose(speed[:, 0], tensor(*velocity), atol=5e-9)
+
+
+def test_rotations_are_proper_and_time_row_is_their_last_row() -> None:
+    left, right = random_quaternions(0, 200), random_quaternions(1, 200)
+    rotation = rotation_matrices_4d(left, right)
+    matrices = rotation.movedim(-1, 0)
+    torch.testing.assert_close(matrices @ matrices.mT, torch.eye(4, dtype=torch.float64).expand_as(matrices))
+    torch.testing.assert_close(torch.linalg.det(matrices), torch.ones(200, dtype=torch.float64))
+    torch.testing.assert_close(time_row(left, right), rotation[3])
+
+
+def test_equal_quaternions_leave_time_alone_and_rotate_space_with_x_and_z_swapped() -> None:
+    q = random_quaternions(2, 50)
+    rotation = rotation_matrices_4d(q, q)
+    swap = torch.tensor([2, 1, 0])
+    torch.testing.assert_close(rotation[:3, :3], rotation_matrices_3d(q)[swap][:, swap])
+    torch.testing.assert_close(rotation[3], tensor(0, 0, 0, 1)[:, None].expand(4, 50))
+
+
+def test_factor_form_equals_the_schur_complement_in_float64() -> None:
+    scales = tensor(0.1, 0.2, 0.05, 0.5)[:, None]
+    factors = rotation_matrices_4d(random_quaternions(3, 100), random_quaternions(4, 100)) * scales
+    sigma = torch.einsum("ikn,jkn->nij", factors, factors)
+    u, v = sigma[:, :3, 3], sigma[:, 3, 3]
+    schur = sigma[:, :3, :3] - u[:, :, None] * u[:, None] / v[:, None, None]
+    spatial, velocity = condition_on_time(factors)
+    torch.testing.assert_close(torch.einsum("ikn,jkn->nij", spatial, spatial), schur)
+    torch.testing.assert_close(velocity.T, u / v[:, None])
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**31), st.sampled_from([1e-3, 1.0, 100.0]))
+def test_conditional_covariance_stays_positive_in_float32(seed: int, time_scale: float) -> None:
+    left, right = random_quaternions(seed, 64, torch.float32), random_quaternions(seed + 1, 64, torch.float32)
+    factors = rotation_matrices_4d(left, right) * torch.tensor([1e-2, 1e-2, 1e-3, time_scale])[:, None]
+    spatial, velocity = condition_on_time(factors)
+    matrices = spatial.double().movedim(-1, 0)
+    assert (torch.linalg.eigvalsh(matrices @ matrices.mT) > 0).all()
+    assert torch.isfinite(velocity).all()
+
+
+def test_slice_passes_gradcheck() -> None:
+    generator = torch.Generator().manual_seed(0)
+    left, right, scales = torch.randn(3, 4, 3, dtype=torch.float64, generator=generator)
+    left, right, scales = left.requires_grad_(), right.requires_grad_(), (scales.abs() + 0.1).requires_grad_()
+
+    def covariance_and_velocity(l, r, s):
+        rotation = rotation_matrices_4d(normalized_quaternions(l), normalized_quaternions(r))
+        spatial, velocity = condition_on_time(rotation * s)
+        return covariances_from_factors(spatial), velocity
+
+    assert torch.autograd.gradcheck(covariance_and_velocity, (left, right, scales))

@@ -1,0 +1,170 @@
+"""Alignment of a monocular map to geometric depth: the right domain, the right line, and reasons for refusing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.monocular.align import Alignment, AlignStatus, align, aligned_depth, not_aligned, rank_correlation
+from d2_plugin.priors.settings import AlignSettings
+from d2_plugin.study.bench.align_measure import align_problem
+
+SHAPE = (90, 120)
+
+
+def depths(seed: int = 0) -> np.ndarray:
+    """A slanted scene from 2 to 7 with some relief."""
+    rng = np.random.default_rng(seed)
+    ramp = np.linspace(2, 6, SHAPE[1])[None, :] + np.zeros((SHAPE[0], 1))
+    return ramp + rng.uniform(0, 1, SHAPE)
+
+
+def anchors(depth: np.ndarray, share: float = 0.3, noise: float = 0.002, seed: int = 1) -> np.ndarray:
+    """Geometric depth at a share of the pixels, 0 elsewhere."""
+    rng = np.random.default_rng(seed)
+    return np.where(rng.random(SHAPE) < share, depth * (1 + rng.normal(0, noise, SHAPE)), 0)
+
+
+def test_relative_maps_are_fitted_as_inverse_depth() -> None:
+    depth = depths()
+    mono = (1 / depth - 0.05) / 0.3  # what a relative network returns: 1/z = .3 m + .05
+    alignment = align(mono, anchors(depth), kind="relative", settings=AlignSettings())
+    assert alignment.status is AlignStatus.OK
+    assert (alignment.scale, alignment.shift) == pytest.approx((0.3, 0.05), rel=2e-3)
+    np.testing.assert_allclose(aligned_depth(mono, alignment, 100.0), depth, rtol=2e-3)
+
+
+def test_metric_maps_are_fitted_as_the_paper_writes_it() -> None:
+    depth = depths()
+    mono = (depth - 0.4) / 1.7
+    alignment = align(mono, anchors(depth), kind="metric", settings=AlignSettings(residual="absolute"))
+    assert alignment.accepted
+    assert (alignment.scale, alignment.shift) == pytest.approx((1.7, 0.4), rel=5e-3)
+    np.testing.assert_allclose(aligned_depth(mono, alignment, 100.0), depth, rtol=2e-3)
+
+
+def test_fitting_inverse_depth_as_depth_is_what_the_declared_kind_prevents() -> None:
+    depth = depths()
+    mono = (1 / depth - 0.05) / 0.3
+    alignment = align(mono, anchors(depth), kind="metric", settings=AlignSettings())
+    assert alignment.status is AlignStatus.WRONG_KIND
+    assert alignment.rank_correlation < -0.9
+    assert not aligned_depth(mono, alignment, 100.0).any()
+
+
+@pytest.mark.parametrize(("residual", "epsilon"), [("absolute", 0.01), ("relative", 0.02)])
+def test_either_residual_finds_the_scale_among_a_third_of_outliers(residual: str, epsilon: float) -> None:
+    depth = depths()
+    rng = np.random.default_rng(2)
+    geometric = anchors(depth, 0.9)
+    wrong = (geometric > 0) & (rng.random(SHAPE) < 0.33)
+    geometric[wrong] = rng.uniform(0.5, 12, int(wrong.sum()))
+    settings = AlignSettings(residual=residual, epsilon=epsilon)
+    alignment = align((depth - 0.5) / 2, geometric, kind="metric", settings=settings)
+    assert alignment.status is AlignStatus.OK
+    assert alignment.scale == pytest.approx(2, rel=0.03)
+
+
+def test_zeros_of_a_saturated_network_are_neither_fitted_nor_given_a_depth() -> None:
+    depth = depths()
+    mono = np.maximum((1 / depth - 0.2) / 0.3, 0)  # beyond a depth of 5 a ReLU returns zero
+    alignment = align(mono, anchors(depth), kind="relative", settings=AlignSettings())
+    assert (alignment.scale, alignment.shift) == pytest.approx((0.3, 0.2), rel=5e-3)
+    np.testing.assert_array_equal(aligned_depth(mono, alignment, 100.0) > 0, mono > 0)
+
+
+def test_subsampling_changes_the_aligned_depth_by_less_than_a_thousandth() -> None:
+    depth = np.tile(depths(), (4, 4))
+    rng = np.random.default_rng(3)
+    mono = (1 / depth - 0.05) / 0.3 * (1 + rng.normal(0, 0.02, depth.shape))
+    maps = [
+        aligned_depth(mono, align(mono, depth, kind="relative", settings=AlignSettings(max_anchors=n)), 100.0)
+        for n in (10**6, 20_000)
+    ]
+    assert np.abs(maps[1] / maps[0] - 1).max() < 1e-3
+
+
+def test_depth_that_is_not_positive_is_left_empty_and_never_clamped() -> None:
+    alignment = Alignment(AlignStatus.OK, "relative", scale=1.0, shift=-0.5)
+    mono = np.array([[0.2, 0.5, 0.501, 0.6, np.nan, np.inf]])
+    out = aligned_depth(mono, alignment, z_far=100.0)
+    np.testing.assert_allclose(out, [[0, 0, 0, 10, 0, 0]], rtol=1e-6)
+    assert out.dtype == np.float32
+    metric = Alignment(AlignStatus.OK, "metric", scale=2.0, shift=-1.0)
+    np.testing.assert_allclose(aligned_depth(np.array([[0.5, 0.4, 3, 60]]), metric, 100.0), [[0, 0, 5, 0]])
+
+
+def test_an_unaligned_map_is_used_as_it_is() -> None:
+    mono = np.array([[0.5, 0.25]])
+    np.testing.assert_allclose(aligned_depth(mono, not_aligned("relative"), 100.0), [[2, 4]])
+    np.testing.assert_allclose(aligned_depth(mono, not_aligned("metric"), 100.0), mono)
+
+
+def test_every_status_is_a_sentence_and_the_record_is_json() -> None:
+    for status in AlignStatus:
+        assert len(status.value) > 5
+    record = Alignment(AlignStatus.EMPTY, "metric").as_json()
+    assert record["status"] == "empty"
+    assert record["reason"] == AlignStatus.EMPTY.value
+    assert record["scale"] is None
+
+
+def test_the_rank_correlation_is_spearmans() -> None:
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=500), rng.normal(size=500)
+    stats = pytest.importorskip("scipy.stats")
+    assert rank_correlation(x, y) == pytest.approx(stats.spearmanr(x, y).statistic, abs=1e-12)
+    assert rank_correlation(x, np.exp(x)) == pytest.approx(1.0)
+    assert rank_correlation(np.round(x), np.round(y)) == pytest.approx(
+        stats.spearmanr(np.round(x), np.round(y)).statistic, abs=1e-12
+    )
+    assert rank_correlation(x, np.ones(500)) == 0
+
+
+def test_the_leverage_guard_saves_a_fit_that_every_convex_one_loses() -> None:
+    depth = depths()
+    mono = (depth - 0.5) / 2
+    geometric = depth.copy()
+    far = mono > np.quantile(mono, 0.6)
+    geometric[far] = np.random.default_rng(4).uniform(0.3, 0.6, int(far.sum()))
+    plain, guarded = (
+        align(mono, geometric, kind="metric", settings=AlignSettings(leverage_guard=guard, wrong_kind_correlation=-1.0))
+        for guard in (False, True)
+    )
+    assert plain.status is AlignStatus.BOUNDARY
+    assert guarded.status is AlignStatus.OK
+    assert guarded.scale == pytest.approx(2, rel=0.01)
+
+
+@pytest.mark.parametrize("wrong", [0.2, 0.4, 0.6])
+@pytest.mark.parametrize("kind", ["relative", "metric"])
+def test_with_the_leverage_guard_most_anchors_may_be_wrong(kind: str, wrong: float) -> None:
+    problem = align_problem(kind, 20_000, wrong)
+    found = align(
+        problem.mono[None], problem.geometric[None], kind=kind, settings=AlignSettings(leverage_guard=True)
+    )
+    assert found.accepted
+    assert found.gap <= 1e-9
+    assert np.median(problem.depth_error((found.scale, found.shift))) < 0.004
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_leverage_guard_finds_no_line_where_there_is_none(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    unrelated, depth = rng.uniform(0, 1, (2, 50, 80))
+    found = align(unrelated, 2 + 6 * depth, kind="metric", settings=AlignSettings(leverage_guard=True))
+    assert not found.accepted
+    assert found.t < AlignSettings().min_t
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"kind": "depth"}, "unknown monocular kind 'depth'"), ({"geometric": np.ones((3, 3))}, "resize the map")],
+)
+def test_mistakes_are_told_in_one_sentence(change: dict, message: str) -> None:
+    arguments = {"mono": np.ones(SHAPE), "geometric": np.ones(SHAPE), "kind": "relative", "settings": AlignSettings()}
+    with pytest.raises(D2Error, match=message):
+        align(**(arguments | change))
+    with pytest.raises(D2Error, match="did you mean 'absolute'"):
+        align(np.ones(SHAPE), np.ones(SHAPE), kind="metric", settings=AlignSettings(residual="absolut"))

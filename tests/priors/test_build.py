@@ -1,0 +1,360 @@
+"""Building priors: what is verified is right, nothing is computed twice, and a kill loses the frame in work."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_onnx
+
+from d2_plugin.captures.capture import Capture, Source
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.errors import D2Error
+from d2_plugin.priors import sources
+from d2_plugin.priors.build import NO_MAP, SCALE_UNKNOWN, PriorSettings, PriorSummary, build_priors
+from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.store import PriorStore
+from d2_plugin.protocol import Label
+
+pytest.importorskip("cv2")
+
+NAMES = ["train0", "train1", "train2"]
+SETTINGS = PriorSettings(stereo=StereoSettings(maker="sweep"))
+
+
+@dataclass
+class Recorder:
+    """A source that passes on what another one has, notes what was read, and may be told to lie."""
+
+    inner: Source
+    reads: set[tuple[str, str, int]]
+    flip_mono: tuple[tuple[str, int], ...] = ()
+    no_mono: tuple[tuple[str, int], ...] = ()
+    brighter: tuple[tuple[str, int], ...] = ()
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        self.reads.add(("image", camera, frame))
+        image = self.inner.image(camera, frame)
+        return np.minimum(image, 250) + 5 if (camera, frame) in self.brighter else image
+
+    def depth(self, camera: str, frame: int) -> np.ndarray | None:
+        self.reads.add(("depth", camera, frame))
+        return self.inner.depth(camera, frame)
+
+    def mono(self, camera: str, frame: int) -> np.ndarray | None:
+        if (camera, frame) in self.no_mono:
+            return None
+        mono = self.inner.mono(camera, frame)
+        return -mono if (camera, frame) in self.flip_mono else mono
+
+
+@pytest.fixture(scope="module")
+def plain() -> Capture:
+    return synthetic_capture(cameras=3, held_out=1, frames=2, width=160, height=90, arc_degrees=20)
+
+
+@pytest.fixture
+def capture(plain: Capture) -> Capture:
+    return replace(plain, source=Recorder(plain.source, set()))
+
+
+@pytest.fixture(scope="module")
+def built(plain: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PriorSummary]:
+    """A finished store that tests may read but not change."""
+    path = tmp_path_factory.mktemp("built") / "priors"
+    return path, build_priors(plain, NAMES, path, SETTINGS)
+
+
+def lying(capture: Capture, **lies: tuple) -> Capture:
+    return replace(capture, source=replace(capture.source, **lies))
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
+
+
+def no_stereo(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: object) -> None:
+        raise AssertionError("stereo was computed again")
+
+    monkeypatch.setattr(sources, "geometric_depth", refuse)
+
+
+def errors_of(capture: Capture, store: PriorStore, *labels: Label) -> np.ndarray:
+    """Relative errors at frame 0 of all pixels that carry one of the labels."""
+    found = []
+    for camera in NAMES:
+        truth, prior = capture.depth(camera, 0), store.prior(camera, 0)
+        mask = np.isin(prior.labels.numpy(), labels)
+        found.append(np.abs(prior.depth.numpy() - truth)[mask] / truth[mask])
+    return np.concatenate(found)
+
+
+def test_verified_pixels_are_right_and_mono_only_ones_roughly(plain: Capture, built: tuple) -> None:
+    store = PriorStore.open(built[0])
+    verified, mono = errors_of(plain, store, Label.VERIFIED), errors_of(plain, store, Label.MONO, Label.AGREED)
+    assert verified.size > 0.1 * 3 * 160 * 90
+    assert np.median(verified) < 0.006
+    assert (verified > 0.05).mean() < 0.01
+    assert np.median(mono) < 0.08
+
+
+def test_where_two_cameras_agree_monocular_depth_is_better_than_where_they_do_not(plain: Capture, built: tuple) -> None:
+    store = PriorStore.open(built[0])
+    agreed, alone = errors_of(plain, store, Label.AGREED), errors_of(plain, store, Label.MONO)
+    assert agreed.size > 0.02 * 3 * 160 * 90
+    assert np.median(agreed) < 0.5 * np.median(alone)
+
+
+def test_the_summary_tells_shares_per_camera(built: tuple) -> None:
+    path, summary = built
+    assert (summary.built, summary.kept, summary.refused) == (6, 0, [])
+    store = PriorStore.open(path)
+    for camera in NAMES:
+        expected = np.mean([(store.prior(camera, frame).labels.numpy() == Label.VERIFIED).mean() for frame in (0, 1)])
+        assert summary.shares[camera]["verified"] == pytest.approx(expected)
+        assert sum(summary.shares[camera].values()) == pytest.approx(1)
+    assert "6 priors built, 0 kept" in str(summary)
+    assert "train1" in str(summary)
+
+
+def test_the_record_tells_everything_that_decided(built: tuple) -> None:
+    record = PriorStore.open(built[0]).record("train0", 1)
+    assert record["alignment"]["status"] == "ok"
+    assert record["alignment"]["gap"] <= 1e-9
+    assert record["settings"]["stereo"]["maker"] == "sweep"
+    assert record["settings"]["tau_c"] == SETTINGS.tau_c
+    assert record["stereo"]["survivors"]["kept"] > 0
+    assert "emulated" in record["monocular"]
+    assert record["camera"]["size"] == [160, 90]
+    assert record["refused"] == ""
+
+
+def test_only_training_cameras_are_read_and_no_true_depth(capture: Capture, tmp_path: Path) -> None:
+    build_priors(capture, NAMES[:2], tmp_path, SETTINGS)
+    assert capture.source.reads == {("image", camera, frame) for camera in NAMES[:2] for frame in (0, 1)}
+
+
+def test_a_frame_is_matched_within_its_own_timestamp(
+    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matched = []
+    original = sources.geometric_depth
+
+    def watch(images: list, *rest: object) -> list:
+        matched.append(images)
+        return original(images, *rest)
+
+    monkeypatch.setattr(sources, "geometric_depth", watch)
+    build_priors(capture, NAMES[:2], tmp_path, SETTINGS)
+    for frame, images in zip(capture.frames, matched, strict=True):
+        for camera, image in zip(NAMES, images):
+            np.testing.assert_array_equal(image, capture.image(camera, frame))
+
+
+def test_a_second_build_computes_nothing_and_changes_nothing(
+    plain: Capture, built: tuple, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    no_stereo(monkeypatch)
+    before = contents(built[0])
+    summary = build_priors(plain, NAMES, built[0], SETTINGS)
+    assert (summary.built, summary.kept) == (0, 6)
+    assert summary.shares == built[1].shares
+    assert contents(built[0]) == before
+
+
+def test_other_fusion_settings_reuse_the_stereo_cache(
+    plain: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    strict = build_priors(plain, NAMES, tmp_path, SETTINGS)
+    no_stereo(monkeypatch)
+    loose = build_priors(plain, NAMES, tmp_path, replace(SETTINGS, tau_c=0.5))
+    assert loose.built == 6
+    assert loose.shares["train0"]["verified"] > strict.shares["train0"]["verified"]
+    assert loose.shares["train0"]["mono"] == strict.shares["train0"]["mono"]
+
+
+def test_a_changed_picture_rebuilds_its_timestamp_and_no_other(capture: Capture, tmp_path: Path) -> None:
+    build_priors(capture, NAMES, tmp_path, SETTINGS)
+    summary = build_priors(lying(capture, brighter=(("train1", 1),)), NAMES, tmp_path, SETTINGS)
+    assert (summary.built, summary.kept) == (3, 3)
+
+
+def test_a_damaged_prior_is_rebuilt_and_named(plain: Capture, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    build_priors(plain, NAMES, tmp_path, SETTINGS)
+    intact = contents(tmp_path)
+    file = tmp_path / "priors" / "train2" / "00001.npy"
+    file.write_bytes(file.read_bytes()[:-100])
+    cached = tmp_path / "cache" / "stereo" / "train0" / "00000.npy"
+    cached.write_bytes(b"garbage")
+    summary = build_priors(plain, NAMES, tmp_path, SETTINGS)
+    assert (summary.built, summary.kept) == (1, 5)
+    assert str(file) in caplog.text
+    assert contents(tmp_path / "priors") == {
+        name.removeprefix("priors/"): data for name, data in intact.items() if name.startswith("priors/")
+    }
+
+
+def test_a_kill_in_the_middle_loses_only_the_frame_in_work(plain: Capture, built: tuple, tmp_path: Path) -> None:
+    script = (
+        "from d2_plugin.captures.synthetic.room import synthetic_capture\n"
+        "from d2_plugin.priors.build import *\n"
+        "from d2_plugin.priors.settings import StereoSettings\n"
+        "import sys, time\n"
+        "capture = synthetic_capture(cameras=3, held_out=1, frames=2, width=160, height=90, arc_degrees=20)\n"
+        "def progress(done, total, note):\n"
+        "    print(done, flush=True)\n"
+        "    time.sleep(60 if done == 4 else 0)\n"
+        "settings = PriorSettings(stereo=StereoSettings(maker='sweep'))\n"
+        f"build_priors(capture, {NAMES}, sys.argv[1], settings, progress=progress)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    for line in process.stdout:
+        if int(line) == 4:
+            break
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    summary = build_priors(plain, NAMES, tmp_path, SETTINGS)
+    assert (summary.built, summary.kept) == (2, 4)
+    assert contents(tmp_path) == contents(built[0])
+
+
+def test_a_refused_view_is_empty_with_its_reason_and_the_others_are_not(capture: Capture, tmp_path: Path) -> None:
+    lies = lying(capture, flip_mono=(("train0", 1),), no_mono=(("train2", 0),))
+    summary = build_priors(lies, NAMES, tmp_path, SETTINGS)
+    assert summary.built == 6
+    assert {(camera, frame) for camera, frame, _ in summary.refused} == {("train0", 1), ("train2", 0)}
+    store = PriorStore.open(tmp_path)
+    assert not store.prior("train0", 1).support.any()
+    assert "declared kind" in store.record("train0", 1)["refused"]
+    assert store.record("train2", 0)["refused"] == NO_MAP
+    assert store.prior("train1", 1).verified.any()
+    assert "refused 1x (train0/1)" in str(summary)
+
+
+def test_progress_counts_pictures(plain: Capture, built: tuple) -> None:
+    seen: list[tuple[int, int]] = []
+    build_priors(plain, NAMES, built[0], SETTINGS, progress=lambda done, total, note: seen.append((done, total)))
+    assert seen == [(done, 6) for done in range(1, 7)]
+
+
+def test_without_monocular_depth_geometric_depth_stands_alone_and_that_is_said(plain: Capture, tmp_path: Path) -> None:
+    summary = build_priors(replace(plain, mono_kind=None), NAMES, tmp_path, SETTINGS)
+    assert "without a second source" in str(summary)
+    store = PriorStore.open(tmp_path)
+    assert store.record("train0", 0)["variant"] == "mvs"
+    assert set(np.unique(store.prior("train0", 0).labels)) == {Label.EMPTY, Label.VERIFIED}
+
+
+def test_one_camera_has_no_depth_from_a_relative_map(plain: Capture, tmp_path: Path) -> None:
+    summary = build_priors(plain, NAMES[:1], tmp_path, SETTINGS)
+    assert [reason for _, _, reason in summary.refused] == [SCALE_UNKNOWN] * 2
+    assert "one camera" in str(summary)
+
+
+def test_one_camera_has_mono_only_depth_from_a_metric_map(plain: Capture, tmp_path: Path) -> None:
+    class Metric(Recorder):
+        def mono(self, camera: str, frame: int) -> np.ndarray:
+            return self.inner.depth(camera, frame)
+
+    metric = replace(plain, source=Metric(plain.source, set()), mono_kind="metric")
+    build_priors(metric, NAMES[:1], tmp_path, SETTINGS)
+    prior = PriorStore.open(tmp_path).prior("train0", 0)
+    assert set(np.unique(prior.labels)) <= {Label.MONO, Label.EMPTY}
+    alone = prior.support.numpy()
+    assert alone.mean() > 0.8
+    np.testing.assert_allclose(prior.depth.numpy()[alone], plain.depth("train0", 0)[alone], rtol=1e-4)
+
+
+def test_no_source_at_all_is_an_error(plain: Capture, tmp_path: Path) -> None:
+    with pytest.raises(D2Error, match="has no depth source"):
+        build_priors(replace(plain, mono_kind=None), NAMES[:1], tmp_path / "p", SETTINGS)
+    assert not (tmp_path / "p").exists()
+
+
+@pytest.mark.parametrize("variant", ["mono", "mvs", "dual_unaligned", "dual_unverified"])
+def test_each_ablation_row_can_be_built(plain: Capture, built: tuple, tmp_path: Path, variant: str) -> None:
+    summary = build_priors(plain, NAMES, tmp_path, replace(SETTINGS, variant=variant))
+    shares, dual = summary.shares["train0"], built[1].shares["train0"]
+    if variant == "mono":
+        assert shares["verified"] > 0.95
+    elif variant == "mvs":
+        assert shares["verified"] == pytest.approx(dual["verified"] + dual["conflict"])
+        assert shares["mono"] == 0
+    elif variant == "dual_unaligned":
+        assert shares["conflict"] > 0.8 * (dual["verified"] + dual["conflict"])
+    else:
+        assert shares["conflict"] == 0
+        assert shares["verified"] == pytest.approx(dual["verified"] + dual["conflict"])
+
+
+def test_the_papers_plain_construction_is_a_preset_and_less_exact(plain: Capture, built: tuple, tmp_path: Path) -> None:
+    summary = build_priors(plain, NAMES, tmp_path, PriorSettings.paper(stereo=SETTINGS.stereo))
+    conflict, less = (np.mean([share["conflict"] for share in s.shares.values()]) for s in (summary, built[1]))
+    assert conflict > less
+    plain_error, corrected = (
+        np.median(errors_of(plain, PriorStore.open(path), Label.MONO, Label.AGREED)) for path in (tmp_path, built[0])
+    )
+    assert corrected < 0.9 * plain_error
+
+
+def test_a_network_is_asked_once_per_picture(plain: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("onnxruntime")
+    from d2_plugin.priors.monocular.network import MonocularModel
+
+    asked = []
+    original = MonocularModel.predict
+    monkeypatch.setattr(MonocularModel, "predict", lambda self, image: asked.append(1) or original(self, image))
+    network = tiny_onnx.mean_network(tmp_path / "net.onnx", 45, 80)
+    settings = replace(SETTINGS, mono_onnx=str(network), mono_kind="relative")
+    build_priors(plain, NAMES, tmp_path / "priors", settings)
+    assert len(asked) == 6
+    build_priors(plain, NAMES, tmp_path / "priors", replace(settings, tau_c=0.3))
+    assert len(asked) == 6
+    with pytest.raises(D2Error, match="mono_kind = relative"):
+        build_priors(plain, NAMES, tmp_path / "other", replace(settings, mono_kind=None))
+
+
+@pytest.mark.parametrize(
+    ("names", "change", "message"),
+    [
+        (["train0", "cam7"], {}, "unknown camera 'cam7'"),
+        ([], {}, "name at least one"),
+        (["train0", "train0"], {}, "named twice"),
+        (NAMES, {"variant": "duel"}, "did you mean 'dual'"),
+        (NAMES, {"mono_kind": "metric"}, "declared relative"),
+        (NAMES, {"depth_range": (9.0, 1.0)}, "swap or correct"),
+    ],
+)
+def test_mistakes_are_told_before_anything_is_written(
+    plain: Capture, tmp_path: Path, names: list[str], change: dict, message: str
+) -> None:
+    with pytest.raises(D2Error, match=message):
+        build_priors(plain, names, tmp_path / "p", replace(SETTINGS, **change))
+    assert not (tmp_path / "p" / "priors").exists()
+
+
+def test_settings_come_from_tables_and_unknown_names_are_refused() -> None:
+    settings = PriorSettings.from_dict(
+        {"tau_c": 0.2, "depth_range": [1, 9], "stereo": {"maker": "sweep"}, "align": {"local_scales": []}}
+    )
+    assert (settings.tau_c, settings.depth_range, settings.stereo.maker) == (0.2, (1, 9), "sweep")
+    assert settings.align.local_scales == ()
+    with pytest.raises(D2Error, match=r"unknown setting in \[stereo\] 'makers': .* did you mean 'maker'"):
+        PriorSettings.from_dict({"stereo": {"makers": "sweep"}})
+    with pytest.raises(D2Error, match="did you mean 'tau_c'"):
+        PriorSettings.from_dict({"tauc": 0.2})
+    with pytest.raises(D2Error, match=r"setting tau_c in \[priors\] must be float as 0.1, got 'small'"):
+        PriorSettings.from_dict({"tau_c": "small"})
+    with pytest.raises(D2Error, match="speckle_size .* must be int"):
+        PriorSettings.from_dict({"stereo": {"speckle_size": True}})
+    with pytest.raises(D2Error, match="stereo must be a table"):
+        PriorSettings.from_dict({"stereo": "sweep"})
+    assert PriorSettings.from_dict({"tau_c": 1}).tau_c == 1

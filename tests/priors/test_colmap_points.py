@@ -1,0 +1,189 @@
+"""Sparse points from known poses: accurate, in two views too, and never a crash."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from d2_plugin.captures import open_capture
+from d2_plugin.captures.calibration import pinhole, rigid
+from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.priors.colmap.matching import fundamental_matrix, sampson_distance
+from d2_plugin.priors.colmap.points import SparsePoints, triangulate, triangulate_frames
+
+pytest.importorskip("pycolmap")
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    return synthetic_capture(frames=4)
+
+
+def points_of(capture: Capture, names: list[str], frame: int = 0) -> SparsePoints:
+    images = [capture.image(name, frame) for name in names]
+    return triangulate(images, [capture.cameras[name] for name in names], frame)
+
+
+def depth_errors(capture: Capture, names: list[str], points: SparsePoints, frame: int = 0) -> np.ndarray:
+    """Relative depth error of each point in the camera that agrees best (the others may not see it)."""
+    errors = np.full(len(points), np.inf)
+    for name in names:
+        camera, depth = capture.cameras[name], capture.depth(name, frame)
+        in_camera = points.positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+        pixels = in_camera @ camera.K.T
+        column, row = np.floor(pixels[:, :2] / pixels[:, 2:]).astype(int).T
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        truth = depth[row[inside], column[inside]]
+        errors[inside] = np.minimum(errors[inside], np.abs(in_camera[inside, 2] / truth - 1))
+    return errors
+
+
+@pytest.mark.parametrize("names", [["train0", "train1", "train2", "train3"], ["train1", "train2"]])
+def test_points_lie_on_the_true_surfaces(capture: Capture, names: list[str]) -> None:
+    points = points_of(capture, names)
+    assert len(points) > 100
+    errors = depth_errors(capture, names, points)
+    assert np.median(errors) < 0.005
+    assert np.mean(errors < 0.05) > 0.9
+    assert points.errors.max() <= 2.0
+    assert points.track_lengths.min() >= 2
+    assert points.track_lengths.max() <= len(names)
+
+
+def test_points_carry_the_colour_of_their_surface(capture: Capture) -> None:
+    points = points_of(capture, ["train1", "train2"])
+    camera, image = capture.cameras["train1"], capture.image("train1", 0) / 255
+    in_camera = points.positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    pixels = in_camera @ camera.K.T
+    column, row = np.floor(pixels[:, :2] / pixels[:, 2:]).astype(int).T
+    seen = image[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)]
+    assert points.colors.min() >= 0
+    assert points.colors.max() <= 1
+    assert np.median(np.abs(points.colors - seen)) < 0.06
+
+
+def test_the_same_pictures_give_the_same_points(capture: Capture) -> None:
+    first, second = (points_of(capture, ["train0", "train1", "train2"]) for _ in range(2))
+    for name in ("positions", "colors", "errors", "track_lengths", "frames"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_points_of_several_frames_carry_their_frame(capture: Capture) -> None:
+    joined = triangulate_frames(capture, ["train1", "train2"], [0, 3])
+    assert set(joined.frames) == {0, 3}
+    single = points_of(capture, ["train1", "train2"], frame=3)
+    np.testing.assert_array_equal(joined.positions[joined.frames == 3], single.positions)
+
+
+def test_points_survive_a_file(capture: Capture, tmp_path: Path) -> None:
+    points = points_of(capture, ["train1", "train2"])
+    points.save(tmp_path / "points.cache")
+    again = SparsePoints.load(tmp_path / "points.cache")
+    for name in ("positions", "colors", "errors", "track_lengths", "frames"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(points, name))
+    whole = (tmp_path / "points.cache").read_bytes()
+    for damaged in (b"cut off", whole[:-200], whole[:300] + bytes(200) + whole[500:]):
+        (tmp_path / "points.cache").write_bytes(damaged)
+        with pytest.raises(D2Error, match=r"cannot read sparse points from .*points\.cache"):
+            SparsePoints.load(tmp_path / "points.cache")
+
+
+def test_hopeless_input_gives_no_points_and_no_abort(capture: Capture) -> None:
+    first, second = capture.cameras["train1"], capture.cameras["train2"]
+    image = capture.image("train1", 0)
+    black, noise = np.zeros_like(image), np.random.default_rng(0).integers(0, 256, image.shape, dtype=np.uint8)
+    for images, cameras in (
+        ([], []),
+        ([image], [first]),
+        ([image, image], [first, replace(first, name="twin")]),  # no baseline
+        ([black, black], [first, second]),
+        ([image, black], [first, second]),
+        ([black + 255, image], [first, second]),
+        ([noise, noise[::-1].copy()], [first, second]),
+        ([image[:1, :1], image[:1, 1:2]], [replace(c, width=1, height=1) for c in (first, second)]),
+        ([image[:9, :9], image[:9, :9]], [replace(c, width=9, height=9) for c in (first, second)]),
+    ):
+        points = triangulate(images, cameras)
+        assert len(points) == 0
+        assert points.positions.shape == points.colors.shape == (0, 3)
+
+
+def test_as_many_pictures_as_cameras_are_wanted(capture: Capture) -> None:
+    with pytest.raises(D2Error, match="1 pictures for 2 cameras"):
+        triangulate([capture.image("train0", 0)], [capture.cameras["train0"], capture.cameras["train1"]])
+
+
+def test_sampson_distance_is_the_pixel_distance_for_a_pure_sideways_move() -> None:
+    """Rectified cameras: epipolar lines are rows, and the first-order distance of a row offset d is d / sqrt(2)."""
+    first = Camera("a", 100, 80, pinhole(90, 90, 50, 40), np.eye(4))
+    second = Camera("b", 100, 80, pinhole(90, 90, 50, 40), rigid(np.eye(3), np.array([-0.3, 0, 0])))
+    fundamental = fundamental_matrix(first, second)
+    pixels = np.random.default_rng(0).uniform(0, 80, (20, 2))
+    moved = pixels - [7.0, 0.0]
+    np.testing.assert_allclose(sampson_distance(fundamental, pixels, moved), 0, atol=1e-9)
+    np.testing.assert_allclose(sampson_distance(fundamental, pixels, moved + [0, 3.0]), 3 / np.sqrt(2))
+
+
+def test_epipolar_geometry_holds_for_projected_points(capture: Capture) -> None:
+    first, second = capture.cameras["train0"], capture.cameras["test2"]
+    points = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 2], (50, 3))
+    pixels = []
+    for camera in (first, second):
+        projected = (points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]) @ camera.K.T
+        pixels.append(projected[:, :2] / projected[:, 2:])
+    assert sampson_distance(fundamental_matrix(first, second), *pixels).max() < 1e-9
+
+
+def test_a_missing_pycolmap_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(MissingExtra, match=r"pycolmap, which is not installed: run `pip install 'd2-4dgs\[stereo\]'`"):
+        triangulate([], [])
+
+
+@pytest.mark.parametrize(
+    "later", ["zlib.compress(bytes(10**5))", "np.savez_compressed(io.BytesIO(), a=np.zeros(10**4))"]
+)
+def test_compression_works_after_pycolmap_was_imported(later: str) -> None:
+    """pycolmap exports its own zlib; imported before the system's, it makes every later compression abort."""
+    imports = "from d2_plugin.priors.colmap import points; points.import_pycolmap('a test'); import io, zlib, numpy as np"
+    code = f"{imports}; {later}; print('alive')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout.strip()) == (0, "alive"), done.stderr
+
+
+def test_colmap_is_quiet(capture: Capture, capfd: pytest.CaptureFixture) -> None:
+    points_of(capture, ["train1", "train2"])
+    told = capfd.readouterr()
+    assert told.out == told.err == ""
+
+
+def test_real_pictures_of_studio_give_accurate_points(shared_data) -> None:
+    studio = open_capture(shared_data("studio"))
+    points = points_of(studio, ["00", "02", "05", "07"])
+    assert len(points) > 150
+    errors = depth_errors(studio, ["00", "02", "05", "07"], points)
+    assert np.median(errors) < 0.003
+    assert np.mean(errors < 0.01) > 0.85
+
+
+@pytest.mark.slow
+def test_points_of_sear_steak_agree_with_the_checked_ones(shared_data) -> None:
+    path = shared_data("n3dv_sear_steak_t0")
+    scene = open_capture(path)
+    points = points_of(scene, list(scene.cameras))
+    assert len(points) > 1000
+    checked = np.load(path / "sift_points.npz")["xyz"].astype(float)
+
+    def coinciding(positions: np.ndarray) -> float:
+        """Share of points with a checked one within 0.02 units: the same feature, in a scene 15 units deep."""
+        return np.mean([np.linalg.norm(checked - position, axis=1).min() < 0.02 for position in positions])
+
+    assert coinciding(points.positions) > 0.3  # the checked ones come from another SIFT: not every feature is shared
+    assert coinciding(points.positions + [0.1, 0, 0.1]) < 0.05

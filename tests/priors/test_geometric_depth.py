@@ -1,0 +1,192 @@
+"""Geometric depth: what the sweep finds, where the depth range comes from, and how makers are chosen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.stereo import geometric_depth as stereo
+from d2_plugin.priors.stereo.filter import GeometricDepth
+from d2_plugin.priors.stereo.geometric_depth import choose_maker, depth_bounds, enlarged, geometric_depth, gray
+from d2_plugin.priors.stereo.sweep import RunningMinimum
+from d2_plugin.study.bench.stereo_rigs import textured_rig
+
+pytest.importorskip("cv2")
+
+SWEEP = StereoSettings(maker="sweep")
+
+
+@pytest.fixture(scope="module")
+def pair() -> Capture:
+    """Two views 10 degrees apart: what the sweep is for."""
+    return synthetic_capture(cameras=2, held_out=0, frames=1, width=256, height=144, arc_degrees=10)
+
+
+def run(capture: Capture, bounds: tuple[float, float], settings: StereoSettings = SWEEP) -> list[GeometricDepth]:
+    names = list(capture.cameras)
+    images = [capture.image(name, 0) for name in names]
+    return geometric_depth(images, list(capture.cameras.values()), bounds, settings)
+
+
+def scores(results: list[GeometricDepth], capture: Capture) -> tuple[float, float, float]:
+    """Completeness, median relative error and share of errors above 5 % over all views."""
+    truths = [capture.depth(name, 0) for name in capture.cameras]
+    errors = [np.abs(r.depth - t)[r.valid] / t[r.valid] for r, t in zip(results, truths)]
+    found = np.concatenate(errors)
+    return float(np.mean([r.valid.mean() for r in results])), float(np.median(found)), float((found > 0.05).mean())
+
+
+def test_the_sweep_finds_a_good_part_of_a_narrow_pair(pair: Capture) -> None:
+    completeness, median, wrong = scores(run(pair, (2.0, 9.0)), pair)
+    assert completeness > 0.2
+    assert median < 0.006
+    assert wrong < 0.02
+
+
+def test_a_range_ten_times_too_wide_does_no_harm(pair: Capture) -> None:
+    narrow, wide = (scores(run(pair, bounds), pair) for bounds in ((2.0, 9.0), (0.2, 90.0)))
+    assert wide[0] > 0.8 * narrow[0]
+    assert wide[1] < 1.3 * narrow[1]
+
+
+def test_half_resolution_comes_back_at_full_size(pair: Capture) -> None:
+    results = run(pair, (2.0, 9.0), replace(SWEEP, max_pixels=128 * 72))
+    assert results[0].depth.shape == (144, 256)
+    completeness, median, wrong = scores(results, pair)
+    assert completeness > 0.05
+    assert median < 0.012
+    assert wrong < 0.03
+
+
+def test_enlarging_a_plane_is_exact_and_an_edge_is_left_out() -> None:
+    v, u = np.mgrid[:20, :30]
+    inverse = 0.2 + 0.001 * u + 0.002 * v
+    small = GeometricDepth((1 / inverse).astype(np.float32), np.zeros((20, 30)), np.ones((20, 30), np.uint8), {})
+    large = enlarged(small, 60, 40, tolerance=0.05)
+    v, u = (np.mgrid[:40, :60] + 0.5) / 2 - 0.5
+    inside = np.s_[2:-2, 2:-2]  # the outermost pixels extrapolate, and take the value at the rim
+    np.testing.assert_allclose(large.depth[inside], (1 / (0.2 + 0.001 * u + 0.002 * v))[inside], rtol=1e-5)
+    step = np.where(np.arange(30) < 15, 2.0, 4.0)[None].repeat(20, 0).astype(np.float32)
+    edge = enlarged(GeometricDepth(step, np.zeros((20, 30)), np.ones((20, 30), np.uint8), {}), 60, 40)
+    assert set(np.unique(edge.depth)) == {0, 2, 4}
+    assert not edge.depth[:, 29:31].any()
+    hole = step.copy()
+    hole[10, 5] = 0
+    assert not enlarged(GeometricDepth(hole, step, step, {}), 60, 40).depth[20:22, 10:12].any()
+
+
+def test_the_running_minimum_is_that_of_the_whole_volume_with_a_parabola() -> None:
+    rng = np.random.default_rng(0)
+    volume = rng.random((12, 5, 7)).astype(np.float32)
+    minimum = RunningMinimum((5, 7))
+    for cost in volume:
+        minimum.add(cost)
+    position, best = minimum.result()
+    np.testing.assert_array_equal(best, volume.min(axis=0))
+    index = volume.argmin(axis=0)
+    assert np.abs(position - index).max() <= 0.5
+    for row, column in np.ndindex(5, 7):
+        k = index[row, column]
+        if 0 < k < 11:
+            before, centre, after = volume[k - 1 : k + 2, row, column]
+            expected = np.clip(0.5 * (before - after) / (before - 2 * centre + after), -0.5, 0.5)
+            assert position[row, column] - k == pytest.approx(expected, abs=1e-4)
+        else:
+            assert position[row, column] == k
+
+
+def test_the_minimum_of_a_parabola_is_found_between_planes() -> None:
+    minimum = RunningMinimum((1, 1))
+    for plane in range(10):
+        minimum.add(np.full((1, 1), 0.1 * (plane - 4.3) ** 2, np.float32))
+    assert minimum.result()[0][0, 0] == pytest.approx(4.3, abs=1e-4)
+
+
+def test_the_depth_range_comes_from_points_then_the_data_set_then_the_baselines(pair: Capture) -> None:
+    cameras = list(pair.cameras.values())
+    rng = np.random.default_rng(0)
+    local = np.stack([rng.uniform(-0.3, 0.3, 500), rng.uniform(-0.2, 0.2, 500), np.linspace(3, 5, 500)], axis=1)
+    pose = cameras[0].T_camera_world
+    points = (local - pose[:3, 3]) @ pose[:3, :3]
+    measured = depth_bounds(cameras, points)
+    assert 3 * 0.7 < measured.near < 3 * 0.8
+    assert 5 * 1.2 < measured.far < 5 * 1.4
+    assert "triangulated" in measured.origin
+    declared = depth_bounds([replace(camera, near_far=(2.0, 10.0)) for camera in cameras])
+    assert declared[:2] == pytest.approx((1.6, 12.0))
+    wide = depth_bounds([replace(camera, near_far=None) for camera in cameras], points[:5])
+    truth = np.concatenate([pair.depth(name, 0).ravel() for name in pair.cameras])
+    assert wide.near < truth.min()
+    assert wide.far > truth.max()
+    assert "cameras alone" in wide.origin
+
+
+@pytest.mark.parametrize("views", [2, 3, 4])
+def test_the_range_from_triangulated_points_holds_what_two_views_see(views: int) -> None:
+    pytest.importorskip("pycolmap")
+    from d2_plugin.priors.colmap.points import triangulate
+
+    rig = textured_rig(views)
+    bounds = depth_bounds(rig.cameras, triangulate(rig.images, rig.cameras).positions)
+    truth = np.concatenate([depth[seen] for depth, seen in zip(rig.truths, rig.covisible)])
+    assert np.mean((truth < bounds.near) | (truth > bounds.far)) < 1e-3
+    assert bounds.far / bounds.near < 4 * truth.max() / truth.min()
+
+
+def test_cameras_that_look_at_each_other_across_a_room_have_a_range_that_holds_it() -> None:
+    """At wide angles disparity says nothing about the near end, but the frusta do."""
+    room = synthetic_capture(cameras=3, held_out=0, frames=1, width=160, height=90, arc_degrees=120)
+    cameras = [replace(camera, near_far=None) for camera in room.cameras.values()]
+    bounds = depth_bounds(cameras)
+    truth = np.concatenate([room.depth(name, 0).ravel() for name in room.cameras])
+    assert 0.05 * truth.min() < bounds.near < truth.min()
+    assert bounds.far > truth.max()
+
+
+def test_points_behind_or_beside_the_camera_do_not_count(pair: Capture) -> None:
+    cameras = list(pair.cameras.values())
+    backwards = -5 * cameras[0].T_camera_world[2, :3]
+    behind = cameras[0].centre + backwards + np.random.default_rng(0).normal(0, 0.1, (100, 3))
+    assert "triangulated" not in depth_bounds(cameras, behind).origin
+
+
+def test_auto_without_a_gpu_is_patchmatch_where_there_is_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    from d2_plugin import compiler
+    from d2_plugin.priors.colmap import mvs as colmap_mvs
+
+    monkeypatch.setattr(colmap_mvs, "why_not_usable", lambda: "there is no CUDA device")
+    monkeypatch.setattr(compiler, "find_compiler", lambda: ["c++"])
+    assert choose_maker("auto") == "patchmatch"
+
+    def none() -> list[str]:
+        raise compiler.NoCompiler("no C++ compiler found")
+
+    monkeypatch.setattr(compiler, "find_compiler", none)
+    assert choose_maker("auto") == "sweep"
+    with pytest.raises(D2Error, match="did you mean 'patchmatch'"):
+        choose_maker("patch-match")
+    with pytest.raises(D2Error, match="maker = sensor reads depth that lies beside a capture"):
+        choose_maker("sensor")
+
+
+def test_any_function_can_be_a_maker(pair: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    truths = [pair.depth(name, 0) for name in pair.cameras]
+
+    def oracle(grays: list, cameras: list[Camera], bounds: tuple, settings: StereoSettings, wanted: None) -> list:
+        return [(truth, np.zeros_like(truth)) for truth in truths]
+
+    monkeypatch.setitem(stereo.MAKERS, "oracle", oracle)
+    results = run(pair, (2.0, 9.0), StereoSettings(maker="oracle"))
+    assert scores(results, pair)[0] > 0.6
+    assert scores(results, pair)[1] == 0
+
+
+def test_grey_is_luma() -> None:
+    image = np.array([[[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]]], np.uint8)
+    np.testing.assert_array_equal(gray(image), [[76, 150, 29, 255]])

@@ -1,0 +1,135 @@
+"""Monocular networks: sizes, preprocessing, what comes out, and what is refused."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny_onnx
+import torch
+
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.priors.monocular.align import align, aligned_depth
+from d2_plugin.priors.monocular.network import IMAGENET_MEAN, IMAGENET_STD, MonocularModel, upsample
+from d2_plugin.priors.settings import AlignSettings
+
+pytest.importorskip("onnxruntime")
+pytest.importorskip("cv2")
+
+IMAGE = np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8)
+SMOOTH = np.repeat(np.linspace(0, 255, 160).astype(np.uint8)[None, :, None], 120, axis=0).repeat(3, axis=2)
+
+
+def test_a_network_of_fixed_size_gets_that_size_and_values_from_0_to_1(tmp_path: Path) -> None:
+    model = MonocularModel(tiny_onnx.mean_network(tmp_path / "net.onnx", 60, 80), "relative")
+    assert model.preprocessing == "unit"
+    tensor = model.prepare(IMAGE)
+    assert tensor.shape == (1, 3, 60, 80)
+    assert tensor.dtype == np.float32
+    expected = IMAGE.reshape(60, 2, 80, 2, 3).mean(axis=(1, 3)) / 255  # half the size is the mean of 2x2 pixels
+    np.testing.assert_allclose(tensor[0].transpose(1, 2, 0), expected, atol=1e-6)
+    np.testing.assert_allclose(model.predict(IMAGE), expected.mean(axis=-1), atol=1e-6)
+    assert model(IMAGE).shape == (120, 160)
+
+
+def test_a_network_of_free_size_gets_depth_anything_v2s_lower_bound(tmp_path: Path) -> None:
+    model = MonocularModel(tiny_onnx.mean_network(tmp_path / "net.onnx", "height", "width"), "relative")
+    assert model.preprocessing == "depth_anything_v2"
+    assert model.input_size(1014, 1352) == (518, 686)  # the example of reference/priors.md 4.1
+    assert model.input_size(640, 362) == (910, 518)
+    assert model.input_size(180, 320) == (518, 924)
+    tensor = model.prepare(SMOOTH)
+    assert tensor.shape == (1, 3, 518, 686)
+    restored = tensor[0].transpose(1, 2, 0) * IMAGENET_STD + IMAGENET_MEAN
+    assert restored.min() == pytest.approx(0, abs=0.01)
+    assert restored.max() == pytest.approx(1, abs=0.01)
+
+
+def test_a_fixed_size_in_patches_of_14_is_taken_for_depth_anything_v2(tmp_path: Path) -> None:
+    path = tiny_onnx.mean_network(tmp_path / "net.onnx", 28, 42)
+    assert MonocularModel(path, "metric").preprocessing == "depth_anything_v2"
+    assert MonocularModel(path, "metric", preprocessing="unit").preprocessing == "unit"
+
+
+def test_half_precision_networks_are_fed_half_precision(tmp_path: Path) -> None:
+    path = tiny_onnx.mean_network(tmp_path / "net.onnx", 30, 40, dtype=tiny_onnx.FLOAT16)
+    model = MonocularModel(path, "relative")
+    assert model.prepare(IMAGE).dtype == np.float16
+    assert model(IMAGE).dtype == np.float32
+
+
+def test_enlarging_aligns_the_corners_as_torch_does() -> None:
+    small = np.random.default_rng(0).random((7, 9)).astype(np.float32)
+    reference = torch.nn.functional.interpolate(
+        torch.from_numpy(small)[None, None], (50, 33), mode="bilinear", align_corners=True
+    )
+    np.testing.assert_allclose(upsample(small, 50, 33), reference[0, 0].numpy(), atol=1e-5)
+    np.testing.assert_array_equal(upsample(small, 7, 9), small)
+    np.testing.assert_array_equal(upsample(small[:1, :1], 4, 5), np.full((4, 5), small[0, 0]))
+
+
+def test_the_provider_and_preprocessing_that_were_taken_are_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO, logger="d2_plugin.priors.monocular.network"):
+        model = MonocularModel(tiny_onnx.mean_network(tmp_path / "net.onnx", 60, 80), "relative")
+    assert model.provider in caplog.text
+    assert "preprocessing unit" in caplog.text
+
+
+def test_the_fingerprint_changes_with_file_and_preprocessing(tmp_path: Path) -> None:
+    path = tiny_onnx.mean_network(tmp_path / "a.onnx", 28, 42)
+    other = tiny_onnx.mean_network(tmp_path / "b.onnx", 28, 56)
+    prints = {
+        MonocularModel(path, "relative").fingerprint(),
+        MonocularModel(path, "relative", preprocessing="unit").fingerprint(),
+        MonocularModel(other, "relative").fingerprint(),
+    }
+    assert len(prints) == 3
+    assert MonocularModel(path, "relative").fingerprint() in prints
+
+
+def test_what_is_no_monocular_network_is_refused(tmp_path: Path) -> None:
+    good = tiny_onnx.mean_network(tmp_path / "good.onnx", 60, 80)
+    with pytest.raises(D2Error, match="unknown monocular kind 'inverse'"):
+        MonocularModel(good, "inverse")
+    with pytest.raises(D2Error, match="unknown preprocessing 'imagenet'"):
+        MonocularModel(good, "relative", preprocessing="imagenet")
+    with pytest.raises(D2Error, match="no monocular network at"):
+        MonocularModel(tmp_path / "none.onnx", "relative")
+    (tmp_path / "text.onnx").write_text("this is no network")
+    with pytest.raises(D2Error, match="is not an ONNX network that onnxruntime can run"):
+        MonocularModel(tmp_path / "text.onnx", "relative")
+    four = tiny_onnx.mean_network(tmp_path / "four.onnx", 60, 80, channels=4)
+    with pytest.raises(D2Error, match=r"export a network whose input is \[1, 3, H, W\]"):
+        MonocularModel(four, "relative")
+    two = MonocularModel(tiny_onnx.mean_network(tmp_path / "two.onnx", 60, 80, outputs=2), "relative")
+    with pytest.raises(D2Error, match=r"returns \(1, 2, 60, 80\): expected one map"):
+        two.predict(IMAGE)
+
+
+def test_a_missing_onnxruntime_is_told_with_the_command_that_mends_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tiny_onnx.mean_network(tmp_path / "net.onnx", 60, 80)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'd2-4dgs\[mono\]'"):
+        MonocularModel(path, "relative")
+
+
+def test_a_real_network_sees_the_nearer_thing_as_nearer(shared_data: Callable[[str], Path]) -> None:
+    model = MonocularModel(shared_data("weights") / "mobile_pydnet.onnx", "relative")
+    assert (model.input.height, model.input.width, model.preprocessing) == (192, 640, "unit")
+    capture = synthetic_capture(cameras=1, frames=1, width=320, height=180)
+    depth = capture.depth("train0", 0)
+    alignment = align(model(capture.image("train0", 0)), depth, kind="relative", settings=AlignSettings())
+    assert alignment.accepted, alignment.status
+    assert alignment.rank_correlation > 0.4
+    aligned = aligned_depth(model(capture.image("train0", 0)), alignment, 30.0)
+    spread = np.median(np.abs(depth - np.median(depth)) / depth)
+    assert np.median(np.abs(aligned - depth) / depth) < 0.8 * spread  # better than one depth for all

@@ -1,0 +1,212 @@
+"""Static pixels once: what did not change is carried over, what changed is matched anew, and shards join exactly."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from d2_plugin.captures.capture import Capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.errors import D2Error
+from d2_plugin.priors import sources
+from d2_plugin.priors.build import PriorSettings, build_priors
+from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.stereo.geometric_depth import geometric_depth
+from d2_plugin.priors.stereo.reuse import MEMORY_DTYPE, MatchMemory, changed, covering_boxes
+from d2_plugin.priors.store import PriorStore
+from d2_plugin.protocol import Label
+
+pytest.importorskip("cv2")
+
+STEREO = StereoSettings(maker="sweep", reuse_block=3)
+SETTINGS = PriorSettings(stereo=STEREO)
+NAMES = ["train0", "train1"]
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    return synthetic_capture(cameras=2, held_out=0, frames=5, width=128, height=72, arc_degrees=10)
+
+
+@pytest.fixture(scope="module")
+def built(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("built") / "priors"
+    build_priors(capture, NAMES, path, SETTINGS)
+    return path
+
+
+def priors_of(path: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(path)): file.read_bytes() for file in sorted((path / "priors").rglob("*.*"))}
+
+
+def test_a_change_is_what_outlasts_noise_and_its_neighbourhood_changes_with_it() -> None:
+    rng = np.random.default_rng(0)
+    before = np.full((60, 80), 100, np.uint8)
+    noisy = np.clip(before + rng.normal(0, 2, before.shape), 0, 255).astype(np.uint8)
+    assert changed(noisy, before, STEREO).mean() < 0.02
+    moved = noisy.copy()
+    moved[30:34, 40:44] += 40
+    mask = changed(moved, before, STEREO)
+    assert mask[30 - STEREO.reuse_radius : 34 + STEREO.reuse_radius, 40 - STEREO.reuse_radius : 44].all()
+    assert not mask[:15].any()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.integers(0, 6), st.integers(0, 12))
+def test_boxes_cover_every_wanted_pixel_with_its_margin(seed: int, margin: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    mask = np.zeros((40, 50), bool)
+    mask[rng.integers(0, 40, count), rng.integers(0, 50, count)] = True
+    covered = np.zeros_like(mask)
+    for rows, columns in covering_boxes(mask, margin):
+        assert 0 <= rows.start < rows.stop <= 40
+        assert 0 <= columns.start < columns.stop <= 50
+        covered[rows, columns] = True
+    for row, column in np.argwhere(mask):
+        window = covered[max(row - margin, 0) : row + margin + 1, max(column - margin, 0) : column + margin + 1]
+        assert window.all()
+    assert covered.any() == mask.any()
+
+
+def test_the_memory_takes_in_what_was_matched_and_keeps_the_rest() -> None:
+    rng = np.random.default_rng(0)
+    grays = [rng.integers(0, 255, (6, 7)).astype(np.uint8)]
+    first = [(rng.random((6, 7)).astype(np.float32), rng.random((6, 7)).astype(np.float32))]
+    memory = MatchMemory()
+    assert memory.wanted(grays, STEREO) is None
+    memory.merge(grays, first, None)
+    assert memory.matched_share == 1
+    mask = rng.random((6, 7)) < 0.3
+    second = [(first[0][0] + 1, first[0][1] + 1)]
+    (depth, cost), *_ = memory.merge(grays, second, [mask])
+    np.testing.assert_array_equal(depth, np.where(mask, second[0][0], first[0][0]))
+    np.testing.assert_array_equal(cost, np.where(mask, second[0][1], first[0][1]))
+    assert memory.matched_share == pytest.approx(mask.mean())
+
+
+def test_a_saved_memory_comes_back_under_its_key_only_and_only_intact(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    memory = MatchMemory([rng.integers(0, 255, (5, 5)).astype(np.uint8).astype(MEMORY_DTYPE) for _ in range(2)])
+    memory.save(tmp_path, "key")
+    loaded = MatchMemory.load(tmp_path, "key", 2)
+    for view, expected in zip(loaded.views, memory.views, strict=True):
+        np.testing.assert_array_equal(view, expected)
+    assert MatchMemory.load(tmp_path, "other", 2) is None
+    assert MatchMemory.load(tmp_path, "key", 3) is None
+    (tmp_path / "1.npy").write_bytes(b"half a file")
+    assert MatchMemory.load(tmp_path, "key", 2) is None
+
+
+def test_a_scene_that_stands_still_is_matched_once() -> None:
+    still = synthetic_capture(cameras=2, held_out=0, frames=2, width=128, height=72, arc_degrees=10, moving=False)
+    memory, results = MatchMemory(), []
+    for frame in still.frames:
+        images = [still.image(name, frame) for name in NAMES]
+        results.append(geometric_depth(images, list(still.cameras.values()), (2, 9), STEREO, memory=memory))
+    assert memory.matched_share == 0
+    np.testing.assert_array_equal(results[0][0].depth, results[1][0].depth)
+
+
+def test_the_share_that_was_matched_is_recorded_and_small(built: Path) -> None:
+    store = PriorStore.open(built)
+    shares = [store.record("train0", frame)["stereo"]["matched_share"] for frame in range(5)]
+    assert shares[0] == shares[3] == 1  # blocks of three
+    assert max(shares[1], shares[2], shares[4]) < 0.4
+
+
+def test_carrying_over_does_not_change_what_is_verified_by_much(capture: Capture, built: Path, tmp_path: Path) -> None:
+    full = replace(SETTINGS, stereo=replace(STEREO, reuse_static=False))
+    build_priors(capture, NAMES, tmp_path, full)
+    results = {}
+    for path in (built, tmp_path):
+        store = PriorStore.open(path)
+        errors = []
+        for camera in NAMES:
+            for frame in (1, 2, 4):
+                truth, prior = capture.depth(camera, frame), store.prior(camera, frame)
+                mask = prior.labels.numpy() == Label.VERIFIED
+                errors.append((np.abs(prior.depth.numpy() - truth) / truth)[mask])
+        results[path] = np.concatenate(errors)
+    assert PriorStore.open(tmp_path).record("train0", 1)["stereo"]["matched_share"] == 1
+    carried, matched = results[built], results[tmp_path]
+    assert len(carried) > 0.9 * len(matched)
+    assert np.median(carried) < 1.1 * np.median(matched)
+
+
+def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(
+    capture: Capture, built: Path, tmp_path: Path
+) -> None:
+    class Stopped(Exception):
+        pass
+
+    def stop(done: int, total: int, note: str) -> None:
+        if done == 3:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        build_priors(capture, NAMES, tmp_path, SETTINGS, progress=stop)
+    build_priors(capture, NAMES, tmp_path, SETTINGS)
+    assert priors_of(tmp_path) == priors_of(built)
+
+
+def test_without_its_saved_memory_a_block_is_matched_again_to_the_same_store(
+    capture: Capture, built: Path, tmp_path: Path
+) -> None:
+    build_priors(capture, NAMES, tmp_path, SETTINGS)
+    memory = list((tmp_path / "cache" / "matches").rglob("*.npy"))
+    assert memory
+    for file in [*memory, *(tmp_path / "cache" / "stereo").rglob("*2.npy")]:
+        file.unlink()
+    (tmp_path / "priors" / "train1" / "00002.npy").unlink()
+    build_priors(capture, NAMES, tmp_path, SETTINGS)
+    assert priors_of(tmp_path) == priors_of(built)
+
+
+def test_shards_built_in_any_order_join_to_the_same_store(capture: Capture, built: Path, tmp_path: Path) -> None:
+    parts = [build_priors(capture, NAMES, tmp_path, SETTINGS, shard=(index, 2)) for index in (1, 0)]
+    assert [part.built for part in parts] == [4, 6]
+    assert priors_of(tmp_path) == priors_of(built)
+    assert (tmp_path / "store.json").read_bytes() == (built / "store.json").read_bytes()
+
+
+@pytest.mark.parametrize("shard", [(2, 2), (-1, 2), (0, 0)])
+def test_a_shard_that_does_not_exist_is_refused(capture: Capture, tmp_path: Path, shard: tuple[int, int]) -> None:
+    with pytest.raises(D2Error, match="does not exist"):
+        build_priors(capture, NAMES, tmp_path, SETTINGS, shard=shard)
+
+
+def test_the_sweep_matches_only_boxes_around_what_is_wanted(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    images, cameras = [capture.image(name, 0) for name in NAMES], list(capture.cameras.values())
+    grays = [image.mean(axis=-1).astype(np.uint8) for image in images]
+    from d2_plugin.priors.stereo.sweep import sweep
+
+    whole = sweep(grays, cameras, (2, 9), STEREO)
+    mask = np.zeros((72, 128), bool)
+    mask[20:40, 50:80] = True
+    part = sweep(grays, cameras, (2, 9), STEREO, [mask, np.zeros_like(mask)])
+    np.testing.assert_allclose(part[0][0][mask], whole[0][0][mask], rtol=1e-4)
+    assert (part[0][0] > 0).mean() < 0.3
+    assert not part[1][0].any()
+
+
+def test_a_source_is_asked_in_order_even_from_the_middle_of_a_block(capture: Capture, tmp_path: Path) -> None:
+    """The key of a frame covers the frames before it in its block."""
+
+    def source(frames: tuple[int, ...]) -> sources.GeometricSource:
+        return sources.GeometricSource(
+            list(capture.cameras.values()),
+            sources.DepthBounds(2, 9, "test"),
+            STEREO,
+            tmp_path,
+            frames,
+            lambda number: sources.Frame.read(capture, NAMES, number),
+        )
+
+    frame = sources.Frame.read(capture, NAMES, 2)
+    assert source((0, 1, 2)).key(frame) == source((0, 1, 2, 3, 4)).key(frame)
+    assert source((0, 1, 2)).key(frame) != source((1, 2)).key(frame)

@@ -1,0 +1,200 @@
+"""Evaluation: the right means, honest depth errors, pictures that can be looked at."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from d2_plugin.captures.capture import Capture
+from d2_plugin.captures.pictures import picture_size, read_picture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.captures.selection import select_cameras
+from d2_plugin.errors import D2Error
+from d2_plugin.runs import drawing, metrics
+from d2_plugin.runs.evaluation import RenderView, evaluate
+
+NAMES = ["test0", "test1"]
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    return select_cameras(synthetic_capture(cameras=3, frames=2, width=72, height=40), NAMES)
+
+
+def renderer(capture: Capture, offset: float = 0.0, depth_factor: float = 1.0, hole: int = 0) -> RenderView:
+    """Renders the truth plus an offset per colour; depth is scaled, and missing in the first `hole` columns."""
+
+    def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
+        color = torch.from_numpy(capture.image(camera, frame).astype(np.float32) / 255) + offset
+        depth = depth_factor * torch.from_numpy(capture.depth(camera, frame))
+        depth[:, :hole] = 0
+        return color, depth
+
+    return render
+
+
+def test_the_mean_over_views_is_the_mean_of_the_rows(capture: Capture) -> None:
+    def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
+        return renderer(capture, offset=0.02 * (1 + frame))(camera, frame)
+
+    result = evaluate(render, capture, NAMES, capture.frames)
+    assert [(row["camera"], row["frame"]) for row in result["per_view"]] == [(n, f) for n in NAMES for f in (0, 1)]
+    for name in ("psnr", "ssim1", "ssim2", "ssim_3dgs", "depth_absrel", "depth_delta1"):
+        assert result["test"][name] == pytest.approx(np.mean([row[name] for row in result["per_view"]]))
+    assert result["per_view"][0]["psnr"] > result["per_view"][1]["psnr"]
+    assert result["test"]["lpips"] is None
+    assert set(result["variants"]) == set(metrics.VARIANTS)
+    json.dumps(result)
+
+
+def test_every_frame_and_every_camera_has_its_mean(capture: Capture) -> None:
+    def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
+        return renderer(capture, offset=0.02 * (1 + frame) + 0.1 * (camera == "test1"))(camera, frame)
+
+    result = evaluate(render, capture, NAMES, iter(capture.frames))
+    assert [row["frame"] for row in result["per_frame"]] == [0, 1]
+    assert [row["camera"] for row in result["per_camera"]] == NAMES
+    for key, name in (("frame", "per_frame"), ("camera", "per_camera")):
+        for row in result[name]:
+            views = [view["psnr"] for view in result["per_view"] if view[key] == row[key]]
+            assert row["psnr"] == pytest.approx(np.mean(views))
+
+
+def test_flicker_is_the_error_of_change_and_belongs_to_one_camera(capture: Capture) -> None:
+    def blinking(camera: str, frame: int) -> tuple[Tensor, Tensor]:
+        return renderer(capture)(camera, frame)[0] * (0.5 if frame else 1.0), None
+
+    rows = evaluate(blinking, capture, NAMES, capture.frames)["per_view"]
+    assert [row["flicker"] is None for row in rows] == [True, False, True, False]
+    second = torch.from_numpy(capture.image("test1", 1).astype(np.float64) / 255)
+    assert rows[3]["flicker"] == pytest.approx((0.5 * second).mean().item(), abs=1e-6)
+    steady = evaluate(renderer(capture, offset=-0.0), capture, ["test0"], capture.frames)
+    assert steady["test"]["flicker"] == 0
+
+
+def test_both_lpips_networks_are_kept_apart(capture: Capture) -> None:
+    class Fixed:
+        def __init__(self, value: float, variant: str) -> None:
+            self.value, self.variant = value, variant
+
+        def __call__(self, image: Tensor, truth: Tensor) -> float:
+            return self.value
+
+    nets = {"lpips": Fixed(0.25, "on one"), "lpips_vgg": Fixed(0.5, "on another")}
+    result = evaluate(renderer(capture), capture, ["test0"], [0], **nets)
+    assert (result["test"]["lpips"], result["test"]["lpips_vgg"]) == (0.25, 0.5)
+    assert (result["variants"]["lpips"], result["variants"]["lpips_vgg"]) == ("on one", "on another")
+    alone = evaluate(renderer(capture), capture, ["test0"], [0], lpips=nets["lpips"])
+    assert alone["test"]["lpips_vgg"] is None
+    assert alone["variants"]["lpips_vgg"] == metrics.VARIANTS["lpips_vgg"]
+
+
+def test_scores_are_those_of_the_metric_functions(capture: Capture) -> None:
+    [row] = evaluate(renderer(capture, 0.05, 1.1), capture, ["test1"], [1])["per_view"]
+    color, depth = renderer(capture, 0.05, 1.1)("test1", 1)
+    truth = torch.from_numpy(capture.image("test1", 1).astype(np.float32) / 255)
+    assert row["psnr"] == metrics.psnr(color.clamp(0, 1), truth)
+    assert row["ssim1"] == metrics.ssim_range1(color.clamp(0, 1), truth)
+    assert row["depth_absrel"] == pytest.approx(0.1, abs=1e-5)
+    assert row["depth_delta1"] == 1
+    assert row["depth_absrel"] == metrics.depth_absrel(depth, torch.from_numpy(capture.depth("test1", 1)))
+
+
+def test_a_hole_in_the_rendered_depth_counts_as_wrong(capture: Capture) -> None:
+    [row] = evaluate(renderer(capture, hole=18), capture, ["test0"], [0])["per_view"]
+    assert row["depth_absrel"] == pytest.approx(18 / 72)
+    assert row["depth_delta1"] == pytest.approx(1 - 18 / 72)
+
+
+def test_without_truth_or_without_rendered_depth_there_is_no_depth_score(capture: Capture) -> None:
+    def color_only(camera: str, frame: int) -> tuple[Tensor, None]:
+        return renderer(capture)(camera, frame)[0] + 0.1, None
+
+    assert evaluate(color_only, capture, ["test0"], [0])["test"]["depth_absrel"] is None
+
+
+def test_colours_are_clamped_before_they_are_compared(capture: Capture) -> None:
+    def bright(camera: str, frame: int) -> tuple[Tensor, None]:
+        return torch.full((40, 72, 3), 7.0), None
+
+    def white(camera: str, frame: int) -> tuple[Tensor, None]:
+        return torch.ones(40, 72, 3), None
+
+    scores = [evaluate(render, capture, ["test0"], [0])["test"]["psnr"] for render in (bright, white)]
+    assert scores[0] == scores[1]
+
+
+def test_renders_that_cannot_be_compared_are_refused(capture: Capture) -> None:
+    def small(camera: str, frame: int) -> tuple[Tensor, None]:
+        return torch.ones(20, 36, 3), None
+
+    def diverged(camera: str, frame: int) -> tuple[Tensor, None]:
+        return torch.full((40, 72, 3), torch.nan), None
+
+    with pytest.raises(D2Error, match=r"render of camera test0 at frame 1 is \(20, 36, 3\), expected \(40, 72, 3\)"):
+        evaluate(small, capture, ["test0"], [1])
+    with pytest.raises(D2Error, match="not finite: the model has diverged"):
+        evaluate(diverged, capture, ["test0"], [1])
+    with pytest.raises(D2Error, match="nothing to evaluate"):
+        evaluate(small, capture, [], [1])
+
+
+def test_every_view_gets_one_picture_of_all_panels(capture: Capture, tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    evaluate(renderer(capture, 0.1), capture, NAMES, [0, 1], tmp_path / "a" / "b", progress=lambda *n: seen.append(n))
+    assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    names = [path.name for path in sorted((tmp_path / "a" / "b").iterdir())]
+    assert names == ["test0_00000.png", "test0_00001.png", "test1_00000.png", "test1_00001.png"]
+    # truth, render, depth, true depth, error
+    assert picture_size(tmp_path / "a" / "b" / names[0]) == (5 * 72 + 4 * drawing.GAP, 40 + 20)
+
+
+def test_the_panels_show_truth_render_and_error(capture: Capture, tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    evaluate(renderer(capture), capture, ["test0"], [0], tmp_path)
+    picture = read_picture(tmp_path / "test0_00000.png")
+    panels = [picture[20:, i * (72 + drawing.GAP) : i * (72 + drawing.GAP) + 72] for i in range(5)]
+    np.testing.assert_array_equal(panels[0], capture.image("test0", 0))
+    np.testing.assert_array_equal(panels[1], panels[0])
+    np.testing.assert_array_equal(panels[2], panels[3])  # the rendered depth is the true one here
+    assert len(np.unique(panels[2].reshape(-1, 3), axis=0)) > 30
+    assert (panels[4] == drawing.color_scale("inferno")[0]).all()  # no error: black
+
+
+def test_missing_depth_is_drawn_black(capture: Capture, tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    evaluate(renderer(capture, hole=10), capture, ["test0"], [0], tmp_path)
+    left = 2 * (72 + drawing.GAP)
+    depth = read_picture(tmp_path / "test0_00000.png")[20:, left : left + 72]
+    assert (depth[:, :10] == 0).all()
+    assert (depth[:, 10:].max(axis=-1) > 0).all()
+
+
+def test_letters_can_be_told_apart() -> None:
+    shapes = {drawing.text(chr(code)).tobytes() for code in range(32, 127)}
+    assert len(shapes) == 95
+    assert drawing.text("ab", 2).shape == (16, 24, 3)
+    np.testing.assert_array_equal(drawing.text("é"), drawing.text("?"))
+    bar = drawing.text("|")[..., 0] == drawing.INK
+    assert bar.any(axis=0).tolist() == [False, False, True, False, False, False]
+
+
+def test_colour_scales_run_from_dark_to_bright() -> None:
+    for name in ("viridis", "inferno"):
+        brightness = drawing.color_scale(name).astype(float) @ [0.299, 0.587, 0.114]
+        assert (np.diff(brightness) > -0.6).all()  # up to rounding
+        assert brightness[-1] - brightness[0] > 100
+    colors = drawing.color_scale("viridis")
+    ends = drawing.colorize(np.array([[-5.0, 1.0, 2.0, 99.0]]), 1.0, 2.0, colors)
+    np.testing.assert_array_equal(ends[0], colors[[0, 0, -1, -1]])
+
+
+def test_captions_of_large_pictures_are_larger() -> None:
+    small, large = (drawing.Panel("caption", np.zeros((30, width, 3), np.uint8)) for width in (240, 1352))
+    assert drawing.side_by_side([small]).shape == (30 + 20, 240, 3)
+    assert drawing.side_by_side([large, large]).shape == (30 + 80, 2 * 1352 + drawing.GAP, 3)

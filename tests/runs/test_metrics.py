@@ -1,0 +1,169 @@
+"""Metrics agree with the reference implementations they are named after."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from d2_plugin.errors import D2Error
+from d2_plugin.runs import metrics
+
+KEYS = {
+    "PSNR": metrics.psnr,
+    "SSIM1": metrics.ssim_range1,
+    "SSIM2": metrics.ssim_range2,
+    "SSIM_gauss": metrics.ssim_3dgs,
+}
+
+
+def noise_pair() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    a = rng.random((3, 48, 64)).astype(np.float32)
+    return a, np.clip(a + 0.1 * rng.standard_normal(a.shape).astype(np.float32), 0, 1)
+
+
+def sine_pair() -> tuple[np.ndarray, np.ndarray]:
+    y, x = np.mgrid[0:48, 0:64]
+    waves = [0.5 + 0.4 * np.sin(x / 7 + y / 11), 0.5 + 0.4 * np.cos(x / 5), 0.5 + 0.4 * np.sin(y / 6)]
+    a = np.stack(waves).astype(np.float32)
+    return a, np.roll(a, 1, axis=2)
+
+
+def tensors(pair: tuple[np.ndarray, np.ndarray]) -> list[torch.Tensor]:
+    """Channel-first arrays as [H, W, 3] tensors."""
+    return [torch.from_numpy(np.ascontiguousarray(array.transpose(1, 2, 0))) for array in pair]
+
+
+def scikit_image(a: torch.Tensor, b: torch.Tensor, data_range: float) -> float:
+    structural_similarity = pytest.importorskip("skimage.metrics").structural_similarity
+    return structural_similarity(a.double().numpy(), b.double().numpy(), data_range=data_range, channel_axis=2)
+
+
+@pytest.mark.parametrize("case", ["rng0", "sines_roll1", "motorcycle_blur2"])
+@pytest.mark.parametrize("key", list(KEYS))
+def test_metrics_agree_with_the_golden_values(shared_data, case: str, key: str) -> None:
+    golden = json.loads(shared_data("metrics_golden.json").read_text())["cases"]
+    if case == "motorcycle_blur2":
+        cv2 = pytest.importorskip("cv2")
+        [path] = (shared_data("middlebury") / "motorcycle" / "images" / "left").glob("*.png")
+        picture = cv2.imread(str(path))[..., ::-1]
+        blurred = cv2.GaussianBlur(picture, (0, 0), 2.0)
+        a, b = (torch.from_numpy(image.astype(np.float32) / 255) for image in (picture, blurred))
+    else:
+        a, b = tensors(noise_pair() if case == "rng0" else sine_pair())
+    assert KEYS[key](a, b) == pytest.approx(golden[case][key], abs=1e-6)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(7, 90), st.integers(7, 40), st.floats(0.0, 0.5), st.integers(0, 2**31))
+def test_ssim1_and_ssim2_are_scikit_images(height: int, width: int, noise: float, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    a = torch.rand(height, width, 3, generator=generator)
+    b = (a + noise * torch.randn(a.shape, generator=generator)).clamp(0, 1)
+    assert metrics.ssim_range1(a, b) == pytest.approx(scikit_image(a, b, 1.0), abs=1e-9)
+    assert metrics.ssim_range2(a, b) == pytest.approx(scikit_image(a, b, 2.0), abs=1e-9)
+
+
+def test_the_gaussian_ssim_is_the_convolution_of_3dgs() -> None:
+    """Written out with torch's convolution, as the codebases do it."""
+    a, b = (image.double().permute(2, 0, 1)[None] for image in tensors(sine_pair()))
+    taps = torch.exp(-((torch.arange(11, dtype=torch.float64) - 5) ** 2) / (2 * 1.5**2))
+    window = torch.outer(taps, taps).div(taps.sum() ** 2).expand(3, 1, 11, 11)
+
+    def blur(x: torch.Tensor) -> torch.Tensor:
+        return torch.nn.functional.conv2d(x, window, padding=5, groups=3)
+
+    mean_a, mean_b = blur(a), blur(b)
+    var_a, var_b, cov = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2, blur(a * b) - mean_a * mean_b
+    top = (2 * mean_a * mean_b + 1e-4) * (2 * cov + 9e-4)
+    expected = (top / ((mean_a**2 + mean_b**2 + 1e-4) * (var_a + var_b + 9e-4))).mean().item()
+    assert metrics.ssim_3dgs(*tensors(sine_pair())) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("metric", [metrics.ssim_range1, metrics.ssim_range2, metrics.ssim_3dgs])
+def test_equal_pictures_score_one_and_the_order_does_not_matter(metric: Callable[..., float]) -> None:
+    a, b = tensors(noise_pair())
+    assert metric(a, a) == pytest.approx(1, abs=1e-12)
+    assert metric(a, b) == pytest.approx(metric(b, a), abs=1e-12)
+    assert metric(a, b) < 1
+
+
+def test_range_two_is_the_milder_one() -> None:
+    for pair in (noise_pair(), sine_pair()):
+        a, b = tensors(pair)
+        assert metrics.ssim_range2(a, b) > metrics.ssim_range1(a, b)
+
+
+def test_the_strips_of_a_tall_picture_make_one_mean() -> None:
+    generator = torch.Generator().manual_seed(3)
+    a, b = torch.rand(2, 150, 20, 3, generator=generator)
+    assert metrics.ssim_range1(a, b) == pytest.approx(scikit_image(a, b, 1.0), abs=1e-9)
+
+
+def test_psnr_is_in_decibel_and_infinite_for_equal_pictures() -> None:
+    truth = torch.zeros(4, 5, 3)
+    assert metrics.psnr(truth + 0.1, truth) == pytest.approx(20, abs=1e-5)
+    assert metrics.psnr(truth, truth) == math.inf
+
+
+@pytest.mark.parametrize(("metric", "size"), [(metrics.ssim_range1, 7), (metrics.ssim_3dgs, 11)])
+def test_a_window_larger_than_the_picture_is_refused(metric: Callable[..., float], size: int) -> None:
+    assert math.isfinite(metric(torch.rand(size, size, 3), torch.rand(size, size, 3)))
+    small = torch.rand(size - 1, 40, 3)
+    with pytest.raises(D2Error, match=f"40x{size - 1} pixels is smaller than the {size}x{size} window"):
+        metric(small, small)
+
+
+def test_pictures_of_two_sizes_are_refused() -> None:
+    with pytest.raises(D2Error, match="cannot be compared"):
+        metrics.psnr(torch.rand(8, 8, 3), torch.rand(8, 9, 3))
+    with pytest.raises(D2Error, match="cannot be compared"):
+        metrics.psnr(torch.rand(3, 8, 8), torch.rand(3, 8, 8))
+    with pytest.raises(D2Error, match="differ: compare equal sizes"):
+        metrics.depth_absrel(torch.rand(8, 8), torch.rand(4, 4))
+
+
+def test_flicker_is_blind_to_constant_errors_and_to_true_motion() -> None:
+    before, after = torch.rand(2, 6, 8, 3, generator=torch.Generator().manual_seed(0))
+    assert metrics.flicker(after, after, before, before) == 0
+    assert metrics.flicker(after + 0.2, after, before + 0.2, before) == pytest.approx(0, abs=1e-7)
+    assert metrics.flicker(after + 0.1, after, before - 0.1, before) == pytest.approx(0.2, abs=1e-7)
+    assert metrics.psnr(after + 0.1, after) == pytest.approx(metrics.psnr(before - 0.1, before), abs=1e-4)
+
+
+def test_flicker_needs_two_frames_of_one_camera() -> None:
+    small, large = torch.rand(4, 4, 3), torch.rand(8, 4, 3)
+    with pytest.raises(D2Error, match="no two frames of one camera"):
+        metrics.flicker(small, small, large, large)
+
+
+def test_depth_errors_count_true_pixels_only() -> None:
+    truth = torch.tensor([[2.0, 4.0, 0.0, math.nan]])
+    depth = torch.tensor([[2.2, 3.0, 9.0, 9.0]])
+    assert metrics.depth_absrel(depth, truth) == pytest.approx((0.1 + 0.25) / 2)
+    assert metrics.depth_delta1(depth, truth) == 0.5
+    assert metrics.depth_absrel(depth, torch.zeros(1, 4)) is None
+    assert metrics.depth_delta1(depth, torch.zeros(1, 4)) is None
+
+
+@pytest.mark.parametrize("missing", [0.0, math.nan, math.inf, -1.0])
+def test_leaving_depth_out_never_flatters(missing: float) -> None:
+    truth = torch.full((1, 4), 2.0)
+    depth = torch.tensor([[2.0, 2.0, 2.0, missing]])
+    assert metrics.depth_absrel(depth, truth) == pytest.approx(0.25)
+    assert metrics.depth_delta1(depth, truth) == 0.75
+
+
+def test_every_metric_has_its_definition_in_words() -> None:
+    named = {"psnr", "ssim1", "ssim2", "ssim_3dgs", "lpips", "lpips_vgg", "flicker", "depth_absrel", "depth_delta1"}
+    assert named == set(metrics.VARIANTS)
+    assert "range 1" in metrics.VARIANTS["ssim1"]
+    assert "range 2" in metrics.VARIANTS["ssim2"]
+    assert len(set(metrics.VARIANTS.values())) == len(named)

@@ -1,0 +1,94 @@
+"""Tables of scores: every view, frame and camera, and LaTeX rows in the form of the paper's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.captures.selection import select_cameras
+from d2_plugin.errors import D2Error
+from d2_plugin.runs.evaluation import evaluate
+from d2_plugin.runs.tables import latex_table, metrics_table, read_metrics, view_tables, write_tables
+
+NAMES = ["test0", "test1"]
+
+
+@pytest.fixture(scope="module")
+def metrics() -> dict[str, Any]:
+    """Real scores of renders that get worse with time and flicker."""
+    capture = select_cameras(synthetic_capture(cameras=3, frames=3, width=40, height=30), NAMES)
+
+    def render(camera: str, frame: int) -> tuple[Tensor, None]:
+        color = torch.from_numpy(capture.image(camera, frame).astype(np.float32) / 255)
+        return color * (1 - 0.1 * (1 + frame)), None
+
+    scores = evaluate(render, capture, NAMES, capture.frames)
+    return scores | {"gaussians": 7, "seconds": {"priors": 1.0, "train": 2.0}, "backbone": "yang4d", "hooks": ["prune"]}
+
+
+def run(gaussians: int = 1, **test: float | None) -> dict[str, Any]:
+    return {"test": test, "gaussians": gaussians, "seconds": {"priors": 0.0, "train": 1.25}}
+
+
+def cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_the_tables_hold_every_view_every_frame_and_every_camera(metrics: dict[str, Any]) -> None:
+    text = view_tables(metrics)
+    sections = {part.splitlines()[0]: part.splitlines()[2:] for part in text.split("## ")[1:]}
+    assert list(sections) == ["Mean over test views", "Per camera", "Per frame", "Per view", "What is measured"]
+    assert [cells(line)[0] for line in sections["Per camera"][2:4]] == NAMES
+    assert [cells(line)[0] for line in sections["Per frame"][2:5]] == ["0", "1", "2"]
+    assert [cells(line)[:2] for line in sections["Per view"][2:8]] == [[n, str(f)] for n in NAMES for f in range(3)]
+    head = cells(sections["Per view"][0])
+    frame2 = cells(sections["Per frame"][4])
+    expected = np.mean([row["psnr"] for row in metrics["per_view"] if row["frame"] == 2])
+    assert float(frame2[1]) == pytest.approx(expected, abs=0.01)
+    assert "flicker" in head
+    assert "LPIPS vgg" not in head  # nothing measured it
+    assert "- flicker: mean |" in text
+    assert cells(sections["Per view"][2])[head.index("flicker")] == "-"  # a first frame has none before it
+
+
+def test_a_missing_score_is_a_dash_and_an_unmeasured_column_is_left_out() -> None:
+    table = metrics_table({"a": run(5, psnr=20.0, lpips=None), "b": run(6, psnr=21.5, flicker=0.02)})
+    head, _, first, second = (cells(line) for line in table.splitlines())
+    assert head[:5] == ["run", "PSNR", "SSIM1", "SSIM2", "LPIPS"]
+    assert "depth delta1" not in head
+    assert first[head.index("LPIPS")] == "-"
+    assert first[head.index("flicker")] == "-"
+    assert second[head.index("flicker")] == "0.0200"
+    assert second[-3:] == ["6", "0.0", "1.2"]
+    assert len({len(line) for line in table.splitlines()}) == 1
+
+
+def test_latex_rows_have_the_form_of_the_papers_tables() -> None:
+    runs = {
+        "backbone_alone": run(psnr=20.0, ssim1=0.7, ssim2=0.8, lpips=0.2),
+        "D²-4DGS": run(psnr=21.46683, ssim1=0.8011, ssim2=0.79, lpips=0.1968),
+        "unfinished": {"test": None},
+    }
+    lines = latex_table(runs).splitlines()
+    assert lines[0] == r"\begin{tabular}{lcccc}"
+    assert lines[2] == r"Method & PSNR$\uparrow$ & SSIM$_1\uparrow$ & SSIM$_2\uparrow$ & LPIPS$\downarrow$ \\"
+    assert lines[4] == r"backbone\_alone & 20.0000 & 0.7000 & \textbf{0.8000} & 0.2000 \\"
+    assert lines[5] == r"D$^2$-4DGS & \textbf{21.4668} & \textbf{0.8011} & 0.7900 & \textbf{0.1968} \\"
+    assert lines[6] == r"unfinished & -- & -- & -- & -- \\"
+    assert lines[-1] == r"\end{tabular}"
+    assert r"\textbf" not in latex_table({"alone": run(psnr=20.0)})
+
+
+def test_evaluation_leaves_both_tables_in_the_run_folder(metrics: dict[str, Any], tmp_path: Path) -> None:
+    write_tables(metrics, tmp_path)
+    assert (tmp_path / "metrics.md").read_text() == view_tables(metrics)
+    latex = (tmp_path / "metrics.tex").read_text()
+    assert f"yang4d prune & {metrics['test']['psnr']:.4f}" in latex
+    with pytest.raises(D2Error, match="has no metrics.json: finish `d2 train`"):
+        read_metrics(tmp_path)

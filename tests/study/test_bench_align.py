@@ -1,0 +1,107 @@
+"""`d2 bench align`: the peers solve what they claim to solve, errors are what they are called, results are written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from d2_plugin.errors import D2Error
+from d2_plugin.study.bench.align import bench_align, main, table
+from d2_plugin.study.bench.align_measure import (
+    TRUE_LINE,
+    AlignMethod,
+    align_problem,
+    measure,
+    methods,
+    optimum,
+    without_noise,
+)
+from d2_plugin.study.rows import read_rows
+
+SMALL = ["--anchors", "60", "300", "--outliers", "0", "0.4", "--seeds", "1", "--seconds", "0"]
+
+
+@pytest.mark.parametrize("kind", ["relative", "metric"])
+@pytest.mark.parametrize("method", methods(), ids=lambda method: f"{method.name}, {method.setting}")
+def test_every_method_finds_the_line_when_nothing_is_wrong(method: AlignMethod, kind: str) -> None:
+    problem = without_noise(align_problem(kind, 2000, 0.0))
+    line = method.fit(problem)
+    np.testing.assert_allclose(line, TRUE_LINE, rtol=2e-3, atol=2e-4)
+    assert problem.depth_error(line).max() < 5e-3
+
+
+def test_no_line_beats_the_optimum_that_gaps_are_measured_from() -> None:
+    problem = align_problem("relative", 1000, 0.3)
+    rng = np.random.default_rng(0)
+    for residual in ("relative", "absolute"):
+        best = optimum(problem, residual)
+        for method in methods():
+            assert problem.objective(method.fit(problem), residual) >= best * (1 - 1e-12)
+        for _ in range(200):
+            line = np.array(TRUE_LINE) * (1 + rng.normal(0, 0.05, 2))
+            assert problem.objective(tuple(line), residual) >= best
+
+
+def test_both_least_squares_are_one_and_a_general_solver_agrees_with_the_certified_one() -> None:
+    problem = align_problem("metric", 3000, 0.3)
+    fits = {(method.name, method.setting): method.fit(problem) for method in methods()}
+    np.testing.assert_allclose(
+        fits["least squares", "closed form"], fits["least squares", "torch.linalg.lstsq"], rtol=1e-9
+    )
+    if ("L-BFGS (scipy)", "its defaults") in fits:
+        certified = fits["certified", "relative, gap 1e-10"]
+        np.testing.assert_allclose(fits["L-BFGS (scipy)", "its defaults"], certified, rtol=1e-4)
+
+
+def test_a_tighter_gap_is_closer_to_the_optimum_and_is_kept() -> None:
+    problems = [align_problem("relative", 2000, 0.4, seed) for seed in range(3)]
+    settings = {method.setting: method for method in methods() if method.name == "certified"}
+    for residual in ("relative", "absolute"):
+        gaps = {
+            tolerance: measure(settings[f"{residual}, gap {tolerance:g}"], problems, 0).gap
+            for tolerance in (1e-2, 1e-6, 1e-10)
+        }
+        assert all(gap <= tolerance for tolerance, gap in gaps.items())
+        assert gaps[1e-10] <= gaps[1e-2]
+
+
+def test_least_squares_pays_for_wrong_anchors_and_the_certified_fit_little() -> None:
+    problems = [align_problem("metric", 5000, 0.2, seed) for seed in range(3)]
+    errors = {(m.name, m.setting): measure(m, problems, 0).depth_error for m in methods()}
+    assert errors["certified", "relative, gap 1e-10"] < 0.01 < 0.05 < errors["least squares", "closed form"]
+
+
+def test_a_line_that_gives_no_depth_is_wholly_wrong() -> None:
+    problem = align_problem("relative", 500, 0.0)
+    assert (problem.depth_error((-1.0, 0.0)) == 1).all()
+    assert problem.depth_error(TRUE_LINE).max() < 1e-12
+
+
+def test_bench_writes_rows_table_and_plot(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    assert main([*SMALL, "--methods", "certified", "RANSAC", "--output", str(tmp_path)]) == 0
+    rows = read_rows([tmp_path / "align.jsonl"])
+    assert len(rows) == 2 * 2 * 2 * 8
+    assert all(row["kind"] == "alignment" and row["error"] >= 0 and row["seconds"] > 0 for row in rows)
+    assert rows[0]["case"] == "relative map, 60 anchors, 0% wrong"
+    assert "| certified | relative, gap 1e-10 |" in (tmp_path / "align.md").read_text()
+    assert (tmp_path / "align.svg").stat().st_size > 1000
+
+
+def test_a_refusal_is_counted_and_no_error_is_made_up_for_it(tmp_path: Path) -> None:
+    rows = bench_align(
+        tmp_path, anchors=[20, 300], outliers=[0.0], kinds=["metric"], names=["align()"], seeds=1, budget=0
+    )
+    refused = [row for row in rows if row["failed"]]
+    assert {row["anchors"] for row in refused} == {20}
+    assert all("too few pixels" in row["failed"] and row["error"] is None for row in refused)
+    assert "(1 of 2 refused)" in table(rows)
+    assert json.loads((tmp_path / "align.jsonl").read_text().splitlines()[0])["failed"]
+
+
+def test_an_unknown_method_is_told(tmp_path: Path) -> None:
+    with pytest.raises(D2Error, match="unknown alignment method 'certifed'.*did you mean 'certified'"):
+        bench_align(tmp_path, names=["certifed"])

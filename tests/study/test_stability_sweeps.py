@@ -1,0 +1,101 @@
+"""`d2 stability`: what holds over the whole range of each parameter, and that a sweep can fail."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from d2_plugin.errors import D2Error
+from d2_plugin.study.rows import Row
+from d2_plugin.study.stability.gaussians import difference, largest, random_rotation, random_scene
+from d2_plugin.study.stability.sweep import PRECISIONS, all_sweeps, main, measure, run_sweeps, summary
+
+SWEEPS = {sweep.name: sweep for sweep in all_sweeps()}
+RANGES = {
+    "temporal variance": (1e-20, 1e20),
+    "anisotropy": (1, 1e9),
+    "depth": (1e-3, 1e6),
+    "outliers": (0, 0.6),
+    "epsilon": (1e-8, 0.1),
+    "opacity logit": (-50, 50),
+    "world offset": (1, 1e6),
+    "far plane": (1, 1e9),
+    "fast motion": (1, 1e12),
+}
+FLOAT32_ENDS = {"world offset": 100.0}
+"""Beyond this float32 cannot hold the scene, which the report shows as a gap."""
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[Row]:
+    return run_sweeps()
+
+
+@pytest.mark.parametrize("name", RANGES)
+def test_each_sweep_covers_its_range_in_both_precisions(name: str) -> None:
+    values = SWEEPS[name].values
+    assert (min(values), max(values)) == pytest.approx(RANGES[name], rel=1e-12)
+    assert set(SWEEPS[name].limits) == set(PRECISIONS)
+    assert SWEEPS[name].guard
+
+
+def test_nothing_fails_and_only_what_float32_cannot_hold_is_a_gap(rows: list[Row]) -> None:
+    assert [row for row in rows if row["verdict"] == "failure"] == []
+    for row in (row for row in rows if row["verdict"] == "gap"):
+        assert row["method"] == "float32"
+        assert row["value"] > FLOAT32_ENDS[row["case"]]
+
+
+def test_what_float32_cannot_hold_is_told_rather_than_clamped(rows: list[Row]) -> None:
+    far = [row for row in rows if (row["case"], row["method"], row["value"]) == ("world offset", "float32", 1e6)]
+    assert [row["verdict"] for row in far] == ["gap"]
+    assert "gap at 1e+06" in summary(rows)
+
+
+def test_a_point_that_is_refused_or_not_finite_is_a_failure_and_one_above_its_limit_a_gap() -> None:
+    def refuses(value: float, dtype: torch.dtype) -> float:
+        raise D2Error("no such thing")
+
+    sweep = SWEEPS["depth"]
+    assert measure(replace(sweep, measure=refuses), 1.0, "float64")["failed"] == "refused: no such thing"
+    for error, verdict in ((math.nan, "failure"), (math.inf, "failure"), (1.0, "gap"), (0.0, "ok")):
+        row = measure(replace(sweep, measure=lambda value, dtype, e=error: e), 1.0, "float64")
+        assert row["verdict"] == verdict
+        assert json.dumps(row, allow_nan=False)
+
+
+def test_a_nan_anywhere_is_not_lost_among_smaller_errors() -> None:
+    scene = random_scene()
+    image = scene.render(torch.float64)
+    for part in image._fields:
+        broken = image._replace(**{part: getattr(image, part) * torch.full((), math.nan, dtype=torch.float64)})
+        assert math.isnan(difference(broken, image))
+    assert math.isnan(largest(0.1, math.nan))
+    assert math.isnan(largest(math.nan, 0.1))
+
+
+def test_a_scene_that_is_another_one_is_seen_to_differ() -> None:
+    scene = random_scene()
+    image = scene.render(torch.float64)
+    assert difference(scene.turned(random_rotation(3)).render(torch.float64), image) < 1e-12
+    assert difference(scene._replace(means=scene.means + 1e-3).render(torch.float64), image) > 1e-4
+
+
+def test_the_command_appends_rows_and_prints_a_line_per_sweep(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    output = tmp_path / "runs.jsonl"
+    for _ in range(2):
+        assert main(["--sweeps", "epsilon", "--output", str(output)]) == 0
+    found = [json.loads(line) for line in output.read_text().splitlines()]
+    assert len(found) == 2 * 2 * len(SWEEPS["epsilon"].values)
+    assert found[0]["command"].startswith("d2 stability --sweeps epsilon")
+    assert "epsilon            float32   8/8 ok" in capsys.readouterr().out
+
+
+def test_an_unknown_sweep_is_told_with_the_nearest_one() -> None:
+    with pytest.raises(D2Error, match="unknown sweep 'epsilom'.*did you mean 'epsilon'"):
+        run_sweeps(["epsilom"])
