@@ -22,11 +22,24 @@ import textwrap
 import types
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from d2_plugin.errors import D2Error, unknown_name
 
-__all__ = ["Angle", "Count", "Declared", "NotNegative", "Positive", "Range", "Seed", "Settings", "Share", "Steps"]
+__all__ = [
+    "Angle",
+    "Count",
+    "Declared",
+    "NotNegative",
+    "Positional",
+    "Positive",
+    "Range",
+    "Seed",
+    "Settings",
+    "Share",
+    "Steps",
+]
 
 
 @dataclass(frozen=True)
@@ -52,6 +65,11 @@ class Range:
         low = "" if self.low is None else f"{'above' if self.open_low else 'at least'} {self.low:g}"
         high = "" if self.high is None else f"at most {self.high:g}"
         return " and ".join(part for part in (low, high) if part) or "finite"
+
+
+@dataclass(frozen=True)
+class Positional:
+    """Marks a setting that the command line takes by its place and not behind a flag: `Annotated[str, Positional()]`."""
 
 
 Count = Annotated[int, Range(0)]
@@ -83,6 +101,8 @@ class Declared(NamedTuple):
     default: Any
     """MISSING where a value must be given."""
     range: Range
+    positional: bool
+    """Whether the command line takes it by its place."""
     help: str
     """The docstring under the field, its lines joined."""
 
@@ -128,7 +148,8 @@ def declared(kind: Any) -> tuple[Declared, ...]:
     for entry in fields(kind):
         default = entry.default if entry.default_factory is MISSING else entry.default_factory()
         bare, limits = _annotation(hints[entry.name])
-        found.append(Declared(entry.name, bare, default, limits, helps.get(entry.name, "")))
+        by_place = any(isinstance(extra, Positional) for extra in get_args(hints[entry.name])[1:])
+        found.append(Declared(entry.name, bare, default, limits, by_place, helps.get(entry.name, "")))
     return tuple(found)
 
 
@@ -163,6 +184,8 @@ def _as_kind(kind: Any, limits: Range, value: Any, name: str) -> Any:
         return _as_tuple(get_args(kind), limits, value, name)
     if kind in (int, float):
         return _as_number(kind, limits, value, name)
+    if kind is Path and isinstance(value, str):
+        return Path(value)
     if isinstance(get_origin(kind) or kind, type) and isinstance(value, get_origin(kind) or kind):
         if isinstance(value, bool) and kind is not bool:
             raise _wrong(name, f"must be a {kind.__name__}", value)
