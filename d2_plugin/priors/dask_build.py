@@ -18,9 +18,10 @@ import numpy as np
 
 from d2_plugin.captures.capture import Capture
 from d2_plugin.errors import D2Error, missing_extra
-from d2_plugin.priors.build import PriorSummary, Progress, build_priors
+from d2_plugin.priors.build import Progress, build_priors
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.priors.sources import frame_blocks
+from d2_plugin.priors.stereo.match import frame_blocks
+from d2_plugin.priors.summary import PriorSummary
 
 PARTS_PER_WORKER = 4
 """Parts are handed out as workers become free: more of them even out frames that take longer, each loads the monocular

@@ -21,7 +21,7 @@ import numpy as np
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.files import Entry, read_json, write_entry
-from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.stereo.settings import StereoSettings
 
 SMOOTHING = 3  # side of the box over which a change is averaged, pixels: noise cancels, moving things do not
 MEMORY_DTYPE = np.dtype([("gray", "u1"), ("depth", "<f4"), ("cost", "<f4")])
@@ -96,7 +96,7 @@ def widened(mask: np.ndarray, radius: int) -> np.ndarray:
 def covering_boxes(mask: np.ndarray, margin: int) -> list[Box]:
     """Boxes that cover all pixels of `mask` with `margin` around them, merged where that saves work.
 
-    For makers that work on rectangles: two boxes become one when their union is no larger than both together.
+    For matchers that work on rectangles: two boxes become one when their union is no larger than both together.
     """
     cv2 = opencv("carrying static pixels over")
     height, width = mask.shape

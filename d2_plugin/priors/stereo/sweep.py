@@ -20,8 +20,8 @@ from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import missing_extra
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import ViewPair, check_depth_range, cropped_camera, inverse_depth_planes, view_pair
-from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.reuse import Box, covering_boxes
+from d2_plugin.priors.stereo.settings import StereoSettings
 
 WORST_COST = 2.0
 MIN_VARIANCE = 1e-5  # of grey values in 0..1 over one window: below it NCC correlates sensor noise
