@@ -42,7 +42,7 @@ def build_priors(
     """Build what is missing of the priors of `cameras` in the store at `output`.
 
     Geometric depth of a frame comes from these cameras at that timestamp and from no other. A view that must be refused
-    gets an empty prior and a reason; nothing is lost. A build that was killed goes on where it stopped.
+    gets an empty prior and a reason, and the others are built. A build that was killed goes on where it stopped.
 
     Args:
         capture: the recording.
@@ -126,7 +126,7 @@ class _Builder:
     def build(self, number: int) -> Iterator[tuple[str, dict[str, Any], bool]]:
         """(camera, record, whether it was built now) for every camera of one frame."""
         frame = self.read(number)
-        keys = {name: self._key(name, frame) for name in self.names}
+        keys = self._keys(frame)
         missing = [name for name in self.names if not self.store.is_current(name, number, keys[name])]
         priors = self.construction.priors(frame, missing) if missing else {}
         for name in self.names:
@@ -146,21 +146,22 @@ class _Builder:
             "image": frame.hashes[name],
         }
 
-    def _key(self, name: str, frame: Frame) -> str:
-        """Hash of everything that one prior depends on."""
-        settings, agrees = self.construction.settings, self.construction.agrees
-        maps = {} if self.mono is None else {camera: self.mono.key(camera, frame) for camera in self.names}
-        return hash_of(
+    def _keys(self, frame: Frame) -> dict[str, str]:
+        """Per camera, the hash of everything that its prior depends on."""
+        settings = self.construction.settings
+        geometric = None if self.source is None else self.source.key(frame)
+        maps = {} if self.mono is None else {name: self.mono.key(name, frame) for name in self.names}
+        common = (
             CONSTRUCTION_VERSION,
             settings.variant,
             settings.tau_c,
             settings.z_far_factor,
             settings.hanging_limit,
             asdict(settings.align),
-            None if self.source is None else self.source.key(frame),
-            maps.get(name),
-            [settings.agreement, *maps.values()] if agrees else None,
+            geometric,
+            [settings.agreement, *maps.values()] if self.construction.agrees else None,
         )
+        return {name: hash_of(*common, maps.get(name)) for name in self.names}
 
 
 def _chosen_bounds(settings: PriorSettings) -> DepthBounds | None:

@@ -132,19 +132,22 @@ class FilteredDepthOnDisk:
     ) -> None:
         self.found, self.cameras, self.bounds = found, list(cameras), bounds
         self.matcher, self.settings = found.name, replace(settings, reuse_static=False)
+        self._keys: dict[int, str] = {}
         self._last: tuple[int | None, list[np.ndarray]] = None, []
 
     def key(self, frame: Frame) -> str:
         """Hash of maps, pictures, cameras, range and settings."""
-        return hash_of(
-            FILTER_VERSION,
-            self.matcher,
-            asdict(self.settings),
-            None if self.bounds is None else list(self.bounds[:2]),
-            [describe_camera(camera) for camera in self.cameras],
-            [frame.hashes[camera.name] for camera in self.cameras],
-            [digest(depth) for depth in self._maps(frame.number)],
-        )
+        if frame.number not in self._keys:
+            self._keys[frame.number] = hash_of(
+                FILTER_VERSION,
+                self.matcher,
+                asdict(self.settings),
+                None if self.bounds is None else list(self.bounds[:2]),
+                [describe_camera(camera) for camera in self.cameras],
+                [frame.hashes[camera.name] for camera in self.cameras],
+                [digest(depth) for depth in self._maps(frame.number)],
+            )
+        return self._keys[frame.number]
 
     def depths(self, frame: Frame) -> list[GeometricDepth]:
         """D^g per camera at one frame."""

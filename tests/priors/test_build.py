@@ -170,6 +170,17 @@ def test_a_second_build_computes_nothing_and_changes_nothing(
     assert contents(built[0]) == before
 
 
+def test_a_build_that_is_up_to_date_reads_each_monocular_map_once(
+    capture: Capture, built: tuple, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cameras that must agree depend on each other's maps, which are hashed once per frame and not once per pair."""
+    read = []
+    original = Recorder.mono
+    monkeypatch.setattr(Recorder, "mono", lambda self, *view: read.append(view) or original(self, *view))
+    assert build_priors(capture, NAMES, built[0], SETTINGS).kept == 6
+    assert sorted(read) == [(camera, frame) for camera in NAMES for frame in (0, 1)]
+
+
 def test_other_fusion_settings_reuse_the_stereo_cache(
     plain: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,8 +4,8 @@ For each timestamp a workspace is written whose cameras are known (pictures, spa
 sources per view), COLMAP matches it in a process of its own, and its depth maps are checked before anyone believes
 them: without sources or memory COLMAP returns success and no output.
 
-COLMAP fills no cost map that it would write; what its own photometric and geometric filter leaves has a cost of 0, and
-the filter that all matchers share does the rest.
+COLMAP writes no cost map. What its own photometric and geometric filter leaves has a cost of 0, and the filter that
+all matchers share does the rest.
 """
 
 from __future__ import annotations

@@ -131,7 +131,8 @@ def aligned_depth(mono: np.ndarray, alignment: Alignment, z_far: float) -> np.nd
     """D-bar^m: aligned monocular depth float32 [H, W], 0 where it has none.
 
     A pixel whose aligned value is not a depth in (0, z_far] (an inverse depth that crosses zero, a saturated network)
-    is left empty, never clamped: a clamped one would propose Gaussians at the far plane. Refused: none at all.
+    is left empty, never clamped: a clamped one would propose Gaussians at the far plane. A refused alignment gives no
+    depth at all.
     """
     if not alignment.accepted:
         return np.zeros(mono.shape, np.float32)
