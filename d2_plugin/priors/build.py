@@ -1,12 +1,10 @@
-"""Building the priors of a capture: per frame stereo, per picture a monocular map, alignment, verification, fusion."""
+"""Building the priors of a capture: choose the sources, construct D* frame by frame, keep what is there already."""
 
 from __future__ import annotations
 
-import logging
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,90 +12,21 @@ import numpy as np
 
 from d2_plugin.captures.capture import Capture
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.priors.depth_on_disk import recorded_depth
-from d2_plugin.priors.fuse import VARIANTS, FusedPrior, empty_prior, fuse, hanging_pixels
-from d2_plugin.priors.geometry import check_depth_range
-from d2_plugin.priors.monocular.agree import with_agreement
-from d2_plugin.priors.monocular.align import Alignment, align, aligned_depth, not_aligned
-from d2_plugin.priors.monocular.correct import corrected_depth
-from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.priors.sources import (
-    Frame,
-    GeometricSource,
-    MonoSource,
-    StoredDepth,
-    describe_camera,
-    frame_blocks,
-    hash_of,
-    mono_source,
-)
-from d2_plugin.priors.stereo.geometric_depth import DepthBounds, depth_bounds
+from d2_plugin.priors.construct import CONSTRUCTION_VERSION, Construction
+from d2_plugin.priors.depth_on_disk import FilteredDepthOnDisk, find_depth_on_disk
+from d2_plugin.priors.frame import Frame, describe_camera, hash_of
+from d2_plugin.priors.monocular.maps import mono_source
+from d2_plugin.priors.settings import PriorSettings, Variant
+from d2_plugin.priors.stereo.cache import DepthCache, GeometricSource
+from d2_plugin.priors.stereo.depth_range import DepthBounds, depth_bounds
+from d2_plugin.priors.stereo.match import MatchedDepth, frame_blocks
 from d2_plugin.priors.store import PriorStore
+from d2_plugin.priors.summary import PriorSummary
 
 __all__ = ["PriorSettings", "PriorSummary", "build_priors"]
 
-FUSION_VERSION = 3  # raise it when alignment or fusion change what they return
-
-SHOWN = {"verified": "verified", "agreed": "agreed", "mono only": "mono", "conflict": "conflict", "empty": "empty"}
-"""Columns of the summary, and the share each shows."""
-
-NO_GEOMETRY = "no geometric depth survived the filter"
-NO_MAP = "there is no monocular map of this frame"
-SCALE_UNKNOWN = "one camera and a relative monocular map: its scale cannot be known"
-
 Progress = Callable[[int, int, str], None]
 """(pictures done, pictures in all, what was just done)."""
-
-logger = logging.getLogger(__name__)
-
-
-@dataclass
-class PriorSummary:
-    """What a build did: mean shares of the labels per camera, refused views and why, notes on what was left out."""
-
-    built: int = 0
-    kept: int = 0
-    shares: dict[str, dict[str, float]] = field(default_factory=dict)
-    refused: list[tuple[str, int, str]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    _counts: Counter[str] = field(default_factory=Counter)
-
-    def add(self, camera: str, frame: int, record: dict[str, Any], built: bool) -> None:
-        """Take one view's record into account."""
-        self.built, self.kept = self.built + built, self.kept + (not built)
-        count = self._counts[camera]
-        mean = self.shares.setdefault(camera, dict.fromkeys(record["shares"], 0.0))
-        for label, share in record["shares"].items():
-            mean[label] += (share - mean[label]) / (count + 1)
-        self._counts[camera] += 1
-        if record["refused"]:
-            self.refused.append((camera, frame, record["refused"]))
-
-    def add_part(self, part: PriorSummary) -> None:
-        """Take in the summary of another part of the same build; notes that both have are kept once."""
-        self.built, self.kept = self.built + part.built, self.kept + part.kept
-        for camera, share in part.shares.items():
-            mean = self.shares.setdefault(camera, dict.fromkeys(share, 0.0))
-            total = self._counts[camera] + part._counts[camera]
-            for label, value in share.items():
-                mean[label] += (value - mean[label]) * part._counts[camera] / total
-            self._counts[camera] = total
-        self.refused = sorted([*self.refused, *part.refused], key=lambda refusal: refusal[1])
-        self.notes += [note for note in part.notes if note not in self.notes]
-
-    def __str__(self) -> str:
-        lines = [
-            f"{self.built} priors built, {self.kept} kept",
-            f"{'camera':12}" + "  ".join(f"{name:>9}" for name in SHOWN),
-        ]
-        for camera, share in self.shares.items():
-            values = (share[label] for label in SHOWN.values())
-            lines.append(f"{camera:12}" + "  ".join(f"{value:9.1%}" for value in values))
-        reasons = Counter(reason for _, _, reason in self.refused)
-        for reason, count in reasons.most_common():
-            examples = [f"{camera}/{frame}" for camera, frame, why in self.refused if why == reason][:3]
-            lines.append(f"refused {count}x ({', '.join(examples)}{', ...' if count > 3 else ''}): {reason}")
-        return "\n".join([*lines, *self.notes])
 
 
 def build_priors(
@@ -113,7 +42,7 @@ def build_priors(
     """Build what is missing of the priors of `cameras` in the store at `output`.
 
     Geometric depth of a frame comes from these cameras at that timestamp and from no other. A view that must be refused
-    gets an empty prior and a reason; nothing is lost. A build that was killed goes on where it stopped.
+    gets an empty prior and a reason, and the others are built. A build that was killed goes on where it stopped.
 
     Args:
         capture: the recording.
@@ -132,48 +61,53 @@ def build_priors(
     builder = _Builder(capture, list(cameras), Path(output), settings, sparse_points)
     summary = PriorSummary(notes=builder.notes)
     total, done = len(frames) * len(builder.names), 0
-    for frame in frames:
-        for camera, record, built in builder.build(frame):
-            summary.add(camera, frame, record, built)
+    for number in frames:
+        for camera, record, built in builder.build(number):
+            summary.add(camera, number, record, built)
             done += 1
             if progress is not None:
-                progress(done, total, f"camera {camera}, frame {frame}: {record['shares']['verified']:.0%} verified")
+                progress(done, total, f"camera {camera}, frame {number}: {record['shares']['verified']:.0%} verified")
     return summary
 
 
 class _Builder:
-    """The sources, settings and store of one build."""
+    """The sources, the construction and the store of one build."""
 
     def __init__(
         self, capture: Capture, names: list[str], output: Path, settings: PriorSettings, points: np.ndarray | None
     ) -> None:
-        self.capture, self.names, self.notes = capture, names, []
-        _check(capture, names, settings)
-        self.cameras = [capture.cameras[name] for name in names]
-        self.mono = None if settings.variant == "mvs" else mono_source(capture, settings, output / "cache" / "mono")
-        recorded = recorded_depth(capture, names, settings.stereo)
+        _check(capture, names)
+        self.capture, self.names, self.settings = capture, names, settings
+        self.notes: list[str] = []
+        self.cameras = {name: capture.cameras[name] for name in names}
         self.bounds: DepthBounds | None = None
-        self.geometric: GeometricSource | None = None
-        if recorded is not None:
-            self.notes.append(f"geometric depth: {recorded.about}")
-            self.bounds = _chosen_bounds(settings)
-        elif len(names) > 1:
-            self.bounds = _chosen_bounds(settings) or _rounded(
-                depth_bounds(self.cameras, points, settings.stereo.max_angle)
-            )
-        if recorded is not None or len(names) > 1:
-            folder = output / "cache" / "stereo"
-            self.geometric = GeometricSource(
-                self.cameras, self.bounds, settings.stereo, folder, capture.frames, self.read, recorded
-            )
-        self.settings, self.variant = settings, self._variant(settings.variant)
+        cache = output / "cache"
+        self.mono = None if settings.variant == "mvs" else mono_source(capture, settings, cache / "mono")
+        self.source = self._geometric_source(points, cache / "matches")
+        geometric = None if self.source is None else DepthCache(self.source, cache / "stereo")
+        possible = replace(settings, variant=self._variant())
+        self.construction = Construction(self.cameras, self.mono, geometric, possible)
         self.store = PriorStore.create(output, names, capture.frames, {"capture": capture.name})
 
-    def _variant(self, wanted: str) -> str:
+    def _geometric_source(self, points: np.ndarray | None, matches: Path) -> GeometricSource | None:
+        """Depth on disk where there is any, else matching, or None with one camera alone; sets the depth range."""
+        stereo, cameras = self.settings.stereo, list(self.cameras.values())
+        found = find_depth_on_disk(self.capture, self.names, stereo)
+        if found is not None:
+            self.notes.append(f"geometric depth: {found.about}")
+            self.bounds = _chosen_bounds(self.settings)
+            return FilteredDepthOnDisk(found, cameras, self.bounds, stereo)
+        if len(cameras) == 1:
+            return None
+        self.bounds = _chosen_bounds(self.settings) or _rounded(depth_bounds(cameras, points, stereo.max_angle))
+        return MatchedDepth(cameras, self.bounds, stereo, matches, self.capture.frames, self.read)
+
+    def _variant(self) -> Variant:
         """The variant that the sources at hand allow; what is left out is noted."""
-        if self.geometric is not None and self.mono is not None:
+        wanted = self.settings.variant
+        if self.source is not None and self.mono is not None:
             return wanted
-        if self.geometric is not None:
+        if self.source is not None:
             if wanted != "mvs":
                 self.notes.append("no monocular depth: geometric depth counts as verified without a second source")
             return "mvs"
@@ -192,100 +126,47 @@ class _Builder:
     def build(self, number: int) -> Iterator[tuple[str, dict[str, Any], bool]]:
         """(camera, record, whether it was built now) for every camera of one frame."""
         frame = self.read(number)
-        keys = {name: self._key(name, frame) for name in self.names}
+        keys = self._keys(frame)
         missing = [name for name in self.names if not self.store.is_current(name, number, keys[name])]
-        priors = self._priors(frame, missing)
+        priors = self.construction.priors(frame, missing) if missing else {}
         for name in self.names:
             if name in missing:
-                prior, record = priors[name]
-                record |= {"shares": prior.shares(), "key": keys[name]}
-                self.store.write(name, number, prior, frame.images[name], record)
-            yield name, self.store.record(name, number), name in missing
+                record = {**self._described(name, frame), **priors[name].record(), "key": keys[name]}
+                self.store.write(name, number, priors[name].maps, record)
+            yield name, self.store.record(name, number) or {}, name in missing
 
-    def _priors(self, frame: Frame, missing: Sequence[str]) -> dict[str, tuple[FusedPrior, dict[str, Any]]]:
-        """D* and record of the `missing` cameras of one frame; cameras that must agree need each other's."""
-        if not missing:
-            return {}
-        geometric = self.geometric.depths(frame) if self.geometric is not None else {}
-        names = self.names if self._agrees else missing
-        made = {name: self._prior(name, frame, geometric.get(name)) for name in names}
-        if self._agrees:
-            fused = {name: prior for name, (prior, _) in made.items()}
-            agreed = with_agreement(
-                fused, dict(zip(self.names, self.cameras, strict=True)), self.settings.agreement, self.settings.tau_c
-            )
-            made = {name: (agreed[name], record) for name, (_, record) in made.items()}
-        return made
-
-    @property
-    def _agrees(self) -> bool:
-        return self.settings.agreement > 0 and self.variant == "dual" and len(self.names) > 1
-
-    def _key(self, name: str, frame: Frame) -> str:
-        return hash_of(
-            FUSION_VERSION,
-            self.variant,
-            self.settings.tau_c,
-            self.settings.z_far_factor,
-            self.settings.hanging_limit,
-            asdict(self.settings.align),
-            None if self.geometric is None else self.geometric.key(frame),
-            None if self.mono is None else self.mono.key(name, frame),
-            [self.settings.agreement, *(self.mono.key(other, frame) for other in self.names)] if self._agrees else None,
-        )
-
-    def _prior(self, name: str, frame: Frame, stereo: StoredDepth | None) -> tuple[FusedPrior, dict[str, Any]]:
-        shape = frame.images[name].shape[:2]
-        geometric = np.zeros(shape, np.float32) if stereo is None else stereo.depth
-        alignment, mono, refused = self._aligned(name, frame, geometric)
-        hanging = hanging_pixels(mono, self.settings.hanging_limit)
-        fused = fuse(mono, geometric, tau_c=self.settings.tau_c, variant=self.variant, hanging=hanging)
-        prior = empty_prior(shape) if refused else fused
-        record = {
-            "refused": refused,
-            "variant": self.variant,
-            "alignment": None if alignment is None else alignment.as_json(),
+    def _described(self, name: str, frame: Frame) -> dict[str, Any]:
+        """What is recorded about a view besides how its prior was constructed."""
+        return {
+            "variant": self.construction.settings.variant,
             "monocular": None if self.mono is None else self.mono.about,
-            "stereo": None if stereo is None else {k: v for k, v in stereo.record.items() if k != "checksum"},
             "bounds": None if self.bounds is None else list(self.bounds),
             "settings": asdict(self.settings),
-            "camera": describe_camera(self.capture.cameras[name]),
+            "camera": describe_camera(self.cameras[name]),
             "image": frame.hashes[name],
         }
-        return prior, record
 
-    def _aligned(self, name: str, frame: Frame, geometric: np.ndarray) -> tuple[Alignment | None, np.ndarray, str]:
-        """The alignment, aligned monocular depth [H, W], and why the view is refused (empty where it is not)."""
-        nothing = np.zeros_like(geometric)
-        if self.mono is None:
-            return None, nothing, "" if geometric.any() else NO_GEOMETRY
-        prediction = self.mono.map(name, frame)
-        if prediction is None:
-            return None, nothing, NO_MAP
-        if self.geometric is None and self.mono.kind == "relative":
-            return None, nothing, SCALE_UNKNOWN
-        alignment = self._fit(prediction, geometric, self.mono)
-        if not alignment.accepted:
-            return alignment, nothing, alignment.status.value
-        anchors = geometric[geometric > 0]
-        z_far = self.settings.z_far_factor * float(np.percentile(anchors, 99.5)) if anchors.size else np.inf
-        aligned = aligned_depth(prediction, alignment, z_far)
-        if self.variant != "dual_unaligned":
-            aligned = corrected_depth(aligned, geometric, self.settings.align)
-        return alignment, aligned, ""
-
-    def _fit(self, prediction: np.ndarray, geometric: np.ndarray, mono: MonoSource) -> Alignment:
-        """The alignment; a metric map is taken as it is where there is no geometric depth to fit it to."""
-        if self.geometric is None or self.variant == "dual_unaligned":
-            return not_aligned(mono.kind)
-        return align(prediction, geometric, kind=mono.kind, settings=self.settings.align)
+    def _keys(self, frame: Frame) -> dict[str, str]:
+        """Per camera, the hash of everything that its prior depends on."""
+        settings = self.construction.settings
+        geometric = None if self.source is None else self.source.key(frame)
+        maps = {} if self.mono is None else {name: self.mono.key(name, frame) for name in self.names}
+        common = (
+            CONSTRUCTION_VERSION,
+            settings.variant,
+            settings.tau_c,
+            settings.z_far_factor,
+            settings.hanging_limit,
+            asdict(settings.align),
+            geometric,
+            [settings.agreement, *maps.values()] if self.construction.agrees else None,
+        )
+        return {name: hash_of(*common, maps.get(name)) for name in self.names}
 
 
 def _chosen_bounds(settings: PriorSettings) -> DepthBounds | None:
     """The depth range of the settings, None where they leave it open."""
-    if settings.depth_range is None:
-        return None
-    return DepthBounds(*check_depth_range(settings.depth_range), "setting depth_range")
+    return None if settings.depth_range is None else DepthBounds(*settings.depth_range, "setting depth_range")
 
 
 def _rounded(bounds: DepthBounds) -> DepthBounds:
@@ -306,7 +187,7 @@ def _shard(frames: Sequence[int], settings: PriorSettings, shard: tuple[int, int
     return [number for block in frame_blocks(frames, settings.stereo)[index::count] for number in block]
 
 
-def _check(capture: Capture, names: list[str], settings: PriorSettings) -> None:
+def _check(capture: Capture, names: list[str]) -> None:
     if not names:
         raise D2Error("no camera was chosen for the priors: name at least one")
     for name in names:
@@ -314,5 +195,3 @@ def _check(capture: Capture, names: list[str], settings: PriorSettings) -> None:
             raise unknown_name("camera", name, capture.cameras)
     if len(set(names)) < len(names):
         raise D2Error(f"a camera is named twice in {', '.join(names)}: name each once")
-    if settings.variant not in VARIANTS:
-        raise unknown_name("prior variant", settings.variant, VARIANTS)

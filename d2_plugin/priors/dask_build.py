@@ -1,8 +1,8 @@
-"""Priors on a cluster: dask.distributed runs the parts that `build_priors(shard=...)` builds, on machines that share
-a file system.
+"""Priors built by dask.distributed: its workers run the parts that `build_priors(shard=...)` builds.
 
-Every worker writes finished frames into the one store, so nothing but the summary travels back. A worker that dies
-loses the frames it was at work on; its part is started again elsewhere, and what it had finished is found there.
+Workers are processes of this machine, or machines of a cluster that share a file system. Each writes finished frames
+into the one store, so nothing but the summary travels back. A worker that dies loses the frame it was building; its
+part is started again elsewhere and finds there what was finished.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ import numpy as np
 
 from d2_plugin.captures.capture import Capture
 from d2_plugin.errors import D2Error, missing_extra
-from d2_plugin.priors.build import PriorSummary, Progress, build_priors
+from d2_plugin.priors.build import Progress, build_priors
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.priors.sources import frame_blocks
+from d2_plugin.priors.stereo.match import frame_blocks
+from d2_plugin.priors.summary import PriorSummary
 
 PARTS_PER_WORKER = 4
-"""Parts are handed out as workers become free: more of them even out frames that take longer, each loads the monocular
-network once."""
+"""Parts are handed out as workers become free. More parts even out frames that take longer; each part loads the
+monocular network once."""
 
 logger = logging.getLogger(__name__)
 
@@ -88,7 +89,7 @@ def _part_count(capture: Capture, settings: PriorSettings, workers: int) -> int:
 
 
 def _joined(parts: list[Any], total: int, progress: Progress | None) -> PriorSummary:
-    """The summary of all parts, in the order in which they end; the first mistake ends all of them."""
+    """The summary of all parts, in the order in which they end; the first error ends all of them."""
     from distributed import KilledWorker, as_completed
 
     summary, done = PriorSummary(), 0

@@ -11,8 +11,9 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -20,10 +21,15 @@ from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import FrameFiles, numbered_files
 from d2_plugin.captures.pictures import shrink_depth
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.priors.colmap.workspace import WorkspaceDepth
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.frame import Frame, describe_camera, digest, hash_of
+from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filter import GeometricDepth, filter_depths, remove_speckles
 from d2_plugin.priors.stereo.geometric_depth import gray
+from d2_plugin.priors.stereo.settings import StereoSettings
+
+FILTER_VERSION = 1  # raise it when the filter changes what it returns, so that caches are not trusted
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """Metres per unit."""
@@ -38,10 +44,10 @@ SAME_SURFACE = 0.03
 """Neighbours of a sensor's depth agree within this share of it."""
 
 
-class RecordedDepth(Protocol):
-    """Where depth maps on disk come from; `maker` is their name in the settings."""
+class DepthOnDisk(Protocol):
+    """A folder of depth maps; `name` is what the setting `matcher` calls it."""
 
-    maker: str
+    name: ClassVar[str]
     about: str
 
     def depth(self, camera: Camera, frame: int) -> np.ndarray | None:
@@ -55,7 +61,7 @@ class SensorDepth:
         D2Error: depth.json is missing or does not say what a stored number means.
     """
 
-    maker = "sensor"
+    name: ClassVar[str] = "sensor"
 
     def __init__(self, folder: Path, cameras: Sequence[str]) -> None:
         self.scale = _scale(folder / "depth.json")
@@ -65,7 +71,7 @@ class SensorDepth:
         self.about = f"sensor depth of {', '.join(self.files) or 'no camera'} in {folder.name}/"
 
     def depth(self, camera: Camera, frame: int) -> np.ndarray | None:
-        """The map of one camera at one frame (see `RecordedDepth`)."""
+        """The map of one camera at one frame (see `DepthOnDisk`)."""
         path = self.files.get(camera.name, {}).get(frame)
         if path is None:
             return None
@@ -74,7 +80,7 @@ class SensorDepth:
         return _at_picture_size(np.where(known, stored * np.float32(self.scale), 0), camera, path)
 
 
-def recorded_depth(capture: Capture, cameras: Sequence[str], settings: StereoSettings) -> RecordedDepth | None:
+def find_depth_on_disk(capture: Capture, cameras: Sequence[str], settings: StereoSettings) -> DepthOnDisk | None:
     """The depth on disk that settings and capture name, or None where geometric depth is to be matched.
 
     Of its own accord (`auto`) no camera is left without depth: sensors are taken where every camera has one.
@@ -82,58 +88,95 @@ def recorded_depth(capture: Capture, cameras: Sequence[str], settings: StereoSet
     Raises:
         D2Error: the settings ask for depth on disk and there is none.
     """
-    from d2_plugin.priors.colmap.workspace import WorkspaceDepth
-
-    if settings.maker not in ("auto", SensorDepth.maker, WorkspaceDepth.maker):
+    if settings.matcher not in ("auto", SensorDepth.name, WorkspaceDepth.name):
         return None
-    if settings.maker == "auto" and capture.path is None:
+    if settings.matcher == "auto" and capture.path is None:
         return None
     root = (capture.path or Path()).absolute()
-    if settings.maker in ("auto", SensorDepth.maker):
+    if settings.matcher in ("auto", SensorDepth.name):
         folder = root / (settings.folder or "depth")
         sensor = SensorDepth(folder, cameras) if (folder / "depth.json").is_file() else None
-        if sensor is not None and (settings.maker == SensorDepth.maker or len(sensor.files) == len(cameras)):
+        if sensor is not None and (settings.matcher == SensorDepth.name or len(sensor.files) == len(cameras)):
             return sensor
-        if settings.maker == SensorDepth.maker:
-            raise D2Error(f"maker = sensor but {folder} has no depth.json: write it beside CAMERA/FRAME.png or .npy")
+        if settings.matcher == SensorDepth.name:
+            raise D2Error(f"matcher = sensor but {folder} has no depth.json: write it beside CAMERA/FRAME.png or .npy")
     calibrations = [capture.cameras[name] for name in cameras]
     found = WorkspaceDepth.find(root, settings, calibrations, capture.frames)
-    if found is None and settings.maker == WorkspaceDepth.maker:
+    if found is None and settings.matcher == WorkspaceDepth.name:
         where = settings.folder or "colmap/FRAME, colmap or dense"
         raise D2Error(
-            f"maker = workspace but {root} has no COLMAP workspace with stereo/depth_maps at {where}: say where it is "
-            "with stereo.folder"
+            f"matcher = workspace but {root} has no COLMAP workspace with stereo/depth_maps at {where}: say where "
+            "it is with stereo.folder"
         )
     return found
 
 
-def filter_recorded(
-    images: Sequence[np.ndarray],
-    cameras: Sequence[Camera],
-    maps: Sequence[np.ndarray],
-    maker: str,
-    settings: StereoSettings,
-) -> list[GeometricDepth]:
-    """D^g of one timestamp from maps on disk, float32 [H, W] per camera (0 = unknown).
+class FilteredDepthOnDisk:
+    """Filtered geometric depth from maps on disk; a `GeometricSource` of the cache.
 
-    COLMAP's maps go through the filter of all makers, with a cost of 0. A sensor measures where nothing can be matched,
-    often with one camera alone: its maps are asked for neighbours at their depth, not for texture and not for a second
-    view.
+    COLMAP's maps go through the filter of all matchers, with a cost of 0. A sensor measures where nothing can be
+    matched, often with one camera alone: its maps are asked for neighbours at their depth, not for texture and not for
+    a second view.
+
+    Args:
+        found: the maps.
+        cameras: whose maps are read.
+        bounds: what lies outside of them is dropped; nothing where None.
+        settings: of the filter.
     """
-    if maker == SensorDepth.maker:
-        return [_filter_sensor(depth, settings) for depth in maps]
-    grays = [gray(image) for image in images]
-    return filter_depths(grays, cameras, maps, [np.zeros(depth.shape, np.float32) for depth in maps], settings)
+
+    matched_share = 1.0  # nothing is carried over
+
+    def __init__(
+        self, found: DepthOnDisk, cameras: Sequence[Camera], bounds: DepthBounds | None, settings: StereoSettings
+    ) -> None:
+        self.found, self.cameras, self.bounds = found, list(cameras), bounds
+        self.matcher, self.settings = found.name, replace(settings, reuse_static=False)
+        self._keys: dict[int, str] = {}
+        self._last: tuple[int | None, list[np.ndarray]] = None, []
+
+    def key(self, frame: Frame) -> str:
+        """Hash of maps, pictures, cameras, range and settings."""
+        if frame.number not in self._keys:
+            self._keys[frame.number] = hash_of(
+                FILTER_VERSION,
+                self.matcher,
+                asdict(self.settings),
+                None if self.bounds is None else list(self.bounds[:2]),
+                [describe_camera(camera) for camera in self.cameras],
+                [frame.hashes[camera.name] for camera in self.cameras],
+                [digest(depth) for depth in self._maps(frame.number)],
+            )
+        return self._keys[frame.number]
+
+    def depths(self, frame: Frame) -> list[GeometricDepth]:
+        """D^g per camera at one frame."""
+        maps = self._maps(frame.number)
+        if self.matcher == SensorDepth.name:
+            return [filter_sensor(depth, self.settings) for depth in maps]
+        grays = [gray(frame.images[camera.name]) for camera in self.cameras]
+        costs = [np.zeros(depth.shape, np.float32) for depth in maps]
+        return filter_depths(grays, self.cameras, maps, costs, self.settings)
+
+    def _maps(self, number: int) -> list[np.ndarray]:
+        """The maps of one frame, float32 [H, W] per camera, 0 where unknown or out of range; the last are kept."""
+        if self._last[0] != number:
+            near, far = (0.0, np.inf) if self.bounds is None else self.bounds[:2]
+            read = [(camera, self.found.depth(camera, number)) for camera in self.cameras]
+            whole = [np.zeros((c.height, c.width), np.float32) if depth is None else depth for c, depth in read]
+            self._last = number, [np.where((d >= near) & (d <= far), d, np.float32(0)) for d in whole]
+        return self._last[1]
 
 
-def _filter_sensor(depth: np.ndarray, settings: StereoSettings) -> GeometricDepth:
+def filter_sensor(depth: np.ndarray, settings: StereoSettings) -> GeometricDepth:
+    """A sensor's map without the pixels that fly between two surfaces and without specks."""
     settled = np.where(flying_pixels(depth), 0, depth)
     final = remove_speckles(settled, settings.speckle_size, settings.relative_depth_max)
     survivors = {
         "pixels": depth.size,
-        "measured": np.count_nonzero(depth),
-        "settled": np.count_nonzero(settled),
-        "kept": np.count_nonzero(final),
+        "measured": int(np.count_nonzero(depth)),
+        "settled": int(np.count_nonzero(settled)),
+        "kept": int(np.count_nonzero(final)),
     }
     return GeometricDepth(final, np.zeros(depth.shape, np.float32), np.zeros(depth.shape, np.uint8), survivors)
 
@@ -141,9 +184,9 @@ def _filter_sensor(depth: np.ndarray, settings: StereoSettings) -> GeometricDept
 def flying_pixels(depth: np.ndarray) -> np.ndarray:
     """Pixels [H, W] bool of a sensor's map that lie between two surfaces: at an edge sensors mix both depths.
 
-    They are those whose 5x5 neighbours mostly lie elsewhere, by more than 3 %. Measured on a rendered room of 640x360
-    with 1 % of noise, depth mixed over 3 (5) pixels: of the depths off by more than 5 %, .1 (1.4) % stay, of those
-    within 3 %, 99.5 %. The coherence test of matched depth, made for less noise, would keep 45 %.
+    They are those whose 5x5 neighbours mostly lie elsewhere, by more than 3 %. The coherence test of matched depth is
+    made for less noise. Measured on a rendered room of 640x360 with 1 % of noise, depth mixed over 3 (5) pixels: of the
+    depths off by more than 5 %, .1 (1.4) % stay, of those within 3 %, 99.5 %, where the coherence test keeps 45 %.
     """
     height, width = depth.shape
     padded = np.pad(depth, NEIGHBOURS)

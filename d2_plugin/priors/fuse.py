@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.settings import Variant
 from d2_plugin.protocol import Label
 
-VARIANTS = ("dual", "mono", "mvs", "dual_unaligned", "dual_unverified")
-"""What D* is made of; the paper's full prior and the rows "Prior" of its ablation table.
-
-`dual`: aligned, verified, fused: the method.
-`mono`: aligned monocular depth alone. Geometric depth serves the alignment and is then left out; every pixel counts as
-verified, since the paper runs "identical densification, pruning, and RGB-D optimization" on each row.
-`mvs`: geometric depth alone, every pixel of it counts as verified; no monocular map is used at all.
-`dual_unaligned`: as `dual`, but with a = 1, b = 0. A relative map has no scale, so nearly all of it contradicts D^g.
-`dual_unverified`: aligned, but every geometric depth counts as verified, whatever the monocular map says.
-"""
+VARIANTS: tuple[Variant, ...] = get_args(Variant)
 
 NEVER = 1e3  # beyond any logarithm of a float32 depth: neutral in a minimum or, negated, in a maximum
 
 
 @dataclass(frozen=True, eq=False)
 class FusedPrior:
-    """D* [H, W] float32 (0 = empty) and `Label` [H, W] uint8, as numpy arrays."""
+    """All maps per pixel of D* of one view, as numpy arrays: what the construction fills and the store writes.
+
+    `depth` [H, W] float32 is planar z, 0 where empty; `labels` [H, W] uint8 holds `Label`; `colors` [H, W, 3] uint8 is
+    the picture that it was made for, None until the construction adds it.
+    """
 
     depth: np.ndarray
     labels: np.ndarray
+    colors: np.ndarray | None = None
 
     def shares(self) -> dict[str, float]:
         """Share of the pixels that carry each label."""
@@ -60,8 +58,8 @@ def hanging_pixels(mono: np.ndarray, limit: float) -> np.ndarray:
 
     Networks blur depth edges, and a point of the blur lies on neither surface: alone it would propose a floater. Such
     pixels are those around which, within 1 % of the picture's width, depth spans more than `limit` in relative terms.
-    Measured on studio: dropping the 11 % of mono-only pixels above .08 takes the share that is off by more than 10 %
-    from .092 to .043. A limit of 0 drops nothing, which is the paper.
+    A limit of 0 drops nothing, which is the paper. Measured on studio: dropping the 11 % of mono-only pixels above .08
+    takes the share that is off by more than 10 % from .092 to .043.
     """
     if limit <= 0:
         return np.zeros(mono.shape, bool)
@@ -80,7 +78,7 @@ def fuse(
     geometric: np.ndarray,
     *,
     tau_c: float,
-    variant: str = "dual",
+    variant: Variant = "dual",
     hanging: np.ndarray | None = None,
 ) -> FusedPrior:
     """D* and its labels from aligned monocular depth and filtered geometric depth.

@@ -6,7 +6,7 @@ the half pixel is taken off. For a reference pixel p = (u, v, 1) at inverse dept
 
     p' ~ A p + k q,     A = K_s R K_r^-1,  k = K_s t,     (R, t) maps reference to source camera,
 
-so a plane sweep or an inverse-depth plane costs one homography each (`reference/priors.md` section 2).
+so a plane sweep or an inverse-depth plane costs one homography each.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
@@ -80,7 +81,7 @@ def label_colors(labels: np.ndarray) -> np.ndarray:
     return palette[labels]
 
 
-def _row(cv2: object, image: np.ndarray, prior: DepthPrior, caption: str, width: int) -> np.ndarray:
+def _row(cv2: ModuleType, image: np.ndarray, prior: DepthPrior, caption: str, width: int) -> np.ndarray:
     size = (width, round(width * image.shape[0] / image.shape[1]))
     panels = [
         cv2.resize(image, size, interpolation=cv2.INTER_AREA),
@@ -93,7 +94,7 @@ def _row(cv2: object, image: np.ndarray, prior: DepthPrior, caption: str, width:
 
 
 def _caption(store: PriorStore, camera: str, frame: int) -> str:
-    record = store.record(camera, frame)
+    record = store.record(camera, frame) or {}
     if record["refused"]:
         return f"camera {camera}, frame {frame}: refused, {record['refused']}"
     shares = ", ".join(f"{name} {share:.0%}" for name, share in record["shares"].items())

@@ -27,8 +27,13 @@ from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import CameraRecord, DepthPrior, Label
 
 FORMAT = 2
+"""Of store.json and of the arrays; raise it when either changes."""
+
 PRIOR_DTYPE = np.dtype([("depth", "<u2"), ("label", "u1"), ("color", "u1", (3,))])
+"""The maps of a `FusedPrior` as they are stored, pixel by pixel."""
+
 CODES = 65534  # depth codes 1..65535; 0 is empty
+
 
 @dataclass(frozen=True)
 class DepthRange:
@@ -118,7 +123,8 @@ class PriorStore:
         described = read_json(path / "store.json")
         if described.get("format") != FORMAT:
             raise D2Error(
-                f"{path} has format {described.get('format')} but this version reads {FORMAT}: build the priors anew"
+                f"the prior store {path} has format {described.get('format')} but this version reads format {FORMAT}: "
+                "build the priors anew in another folder"
             )
         return cls(path, described["cameras"], described["frames"], described["about"])
 
@@ -153,23 +159,17 @@ class PriorStore:
         """Whether an intact prior built from exactly these inputs is there; a damaged one is named in the log."""
         return self.entries.find_current(camera, frame, key) is not None
 
-    def write(
-        self, camera: str, frame: int, prior: FusedPrior, image: np.ndarray, record: dict[str, Any]
-    ) -> None:
-        """Store one prior with the picture it was made for (RGB uint8 [H, W, 3]) and its record.
+    def write(self, camera: str, frame: int, prior: FusedPrior, record: dict[str, Any]) -> None:
+        """Store all maps of one prior and its record.
 
         Raises:
-            D2Error: a picture of another size, depth that is not finite or negative, or labels that contradict it.
+            D2Error: no colours or those of another size, depth that is not finite or negative, or labels that
+                contradict it.
         """
         _check(prior, f"the prior of camera {camera}, frame {frame}")
-        if image.shape != (*prior.depth.shape, 3):
-            raise D2Error(
-                f"the picture of camera {camera}, frame {frame} is {image.shape} but its prior {prior.depth.shape}: "
-                "build the prior at the picture's size"
-            )
         depth_range = DepthRange.of(prior.depth)
         codes = np.empty(prior.depth.shape, PRIOR_DTYPE)
-        codes["depth"], codes["label"], codes["color"] = depth_range.encode(prior.depth), prior.labels, image
+        codes["depth"], codes["label"], codes["color"] = depth_range.encode(prior.depth), prior.labels, prior.colors
         self.entries.write(camera, frame, codes, {**record, "depth_range": [depth_range.near, depth_range.far]})
 
     def _entry(self, camera: str, frame: int) -> Entry | None:
@@ -185,6 +185,9 @@ def _check(prior: FusedPrior, what: str) -> None:
     depth, labels = prior.depth, prior.labels
     if depth.ndim != 2 or depth.shape != labels.shape:
         raise D2Error(f"{what} has depth {depth.shape} and labels {labels.shape}: both must be [H, W] of one size")
+    if prior.colors is None or prior.colors.shape != (*depth.shape, 3):
+        found = "none" if prior.colors is None else str(prior.colors.shape)
+        raise D2Error(f"{what} is {depth.shape} and its colours {found}: build the prior at the picture's size")
     bad = ~np.isfinite(depth) | (depth < 0)
     if bad.any():
         raise D2Error(f"{what} has {int(bad.sum())} depths that are NaN, infinite or negative: use 0 for unknown depth")

@@ -29,9 +29,9 @@ def furnish(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for view in make_views():
         prior = TinyStore().prior(view.camera, view.frame)
         camera = {"K": view.K.tolist(), "T_camera_world": view.T_camera_world.tolist()}
-        fused = FusedPrior(prior.depth.numpy(), prior.labels.numpy())
         picture = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
-        store.write(view.camera, view.frame, fused, picture, {"camera": camera})
+        fused = FusedPrior(prior.depth.numpy(), prior.labels.numpy(), picture)
+        store.write(view.camera, view.frame, fused, {"camera": camera})
     (folder / "d2.toml").write_text(replace(HOOKS, prior="prior").to_toml())
     monkeypatch.chdir(folder)
     return folder

@@ -16,16 +16,17 @@ import tiny_onnx
 from d2_plugin.captures.capture import Capture, Source
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
-from d2_plugin.priors import sources
-from d2_plugin.priors.build import NO_MAP, SCALE_UNKNOWN, PriorSettings, PriorSummary, build_priors
+from d2_plugin.priors.build import PriorSettings, PriorSummary, build_priors
+from d2_plugin.priors.construct import NO_MAP, SCALE_UNKNOWN
 from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.stereo import match
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
 
 pytest.importorskip("cv2")
 
 NAMES = ["train0", "train1", "train2"]
-SETTINGS = PriorSettings(stereo=StereoSettings(maker="sweep"))
+SETTINGS = PriorSettings(stereo=StereoSettings(matcher="sweep"))
 
 
 @dataclass
@@ -83,7 +84,7 @@ def no_stereo(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: object) -> None:
         raise AssertionError("stereo was computed again")
 
-    monkeypatch.setattr(sources, "geometric_depth", refuse)
+    monkeypatch.setattr(match, "geometric_depth", refuse)
 
 
 def errors_of(capture: Capture, store: PriorStore, *labels: Label) -> np.ndarray:
@@ -128,7 +129,7 @@ def test_the_record_tells_everything_that_decided(built: tuple) -> None:
     record = PriorStore.open(built[0]).record("train0", 1)
     assert record["alignment"]["status"] == "ok"
     assert record["alignment"]["gap"] <= 1e-9
-    assert record["settings"]["stereo"]["maker"] == "sweep"
+    assert record["settings"]["stereo"]["matcher"] == "sweep"
     assert record["settings"]["tau_c"] == SETTINGS.tau_c
     assert record["stereo"]["survivors"]["kept"] > 0
     assert "emulated" in record["monocular"]
@@ -145,13 +146,13 @@ def test_a_frame_is_matched_within_its_own_timestamp(
     capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     matched = []
-    original = sources.geometric_depth
+    original = match.geometric_depth
 
     def watch(images: list, *rest: object) -> list:
         matched.append(images)
         return original(images, *rest)
 
-    monkeypatch.setattr(sources, "geometric_depth", watch)
+    monkeypatch.setattr(match, "geometric_depth", watch)
     build_priors(capture, NAMES[:2], tmp_path, SETTINGS)
     for frame, images in zip(capture.frames, matched, strict=True):
         for camera, image in zip(NAMES, images):
@@ -167,6 +168,17 @@ def test_a_second_build_computes_nothing_and_changes_nothing(
     assert (summary.built, summary.kept) == (0, 6)
     assert summary.shares == built[1].shares
     assert contents(built[0]) == before
+
+
+def test_a_build_that_is_up_to_date_reads_each_monocular_map_once(
+    capture: Capture, built: tuple, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cameras that must agree depend on each other's maps, which are hashed once per frame and not once per pair."""
+    read = []
+    original = Recorder.mono
+    monkeypatch.setattr(Recorder, "mono", lambda self, *view: read.append(view) or original(self, *view))
+    assert build_priors(capture, NAMES, built[0], SETTINGS).kept == 6
+    assert sorted(read) == [(camera, frame) for camera in NAMES for frame in (0, 1)]
 
 
 def test_other_fusion_settings_reuse_the_stereo_cache(
@@ -211,7 +223,7 @@ def test_a_kill_in_the_middle_loses_only_the_frame_in_work(plain: Capture, built
         "def progress(done, total, note):\n"
         "    print(done, flush=True)\n"
         "    time.sleep(60 if done == 4 else 0)\n"
-        "settings = PriorSettings(stereo=StereoSettings(maker='sweep'))\n"
+        "settings = PriorSettings(stereo=StereoSettings(matcher='sweep'))\n"
         f"build_priors(capture, {NAMES}, sys.argv[1], settings, progress=progress)"
     )
     process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True)
@@ -339,22 +351,3 @@ def test_mistakes_are_told_before_anything_is_written(
     with pytest.raises(D2Error, match=message):
         build_priors(plain, names, tmp_path / "p", replace(SETTINGS, **change))
     assert not (tmp_path / "p" / "priors").exists()
-
-
-def test_settings_come_from_tables_and_unknown_names_are_refused() -> None:
-    settings = PriorSettings.from_dict(
-        {"tau_c": 0.2, "depth_range": [1, 9], "stereo": {"maker": "sweep"}, "align": {"local_scales": []}}
-    )
-    assert (settings.tau_c, settings.depth_range, settings.stereo.maker) == (0.2, (1, 9), "sweep")
-    assert settings.align.local_scales == ()
-    with pytest.raises(D2Error, match=r"unknown setting in \[stereo\] 'makers': .* did you mean 'maker'"):
-        PriorSettings.from_dict({"stereo": {"makers": "sweep"}})
-    with pytest.raises(D2Error, match="did you mean 'tau_c'"):
-        PriorSettings.from_dict({"tauc": 0.2})
-    with pytest.raises(D2Error, match=r"setting tau_c in \[priors\] must be float as 0.1, got 'small'"):
-        PriorSettings.from_dict({"tau_c": "small"})
-    with pytest.raises(D2Error, match="speckle_size .* must be int"):
-        PriorSettings.from_dict({"stereo": {"speckle_size": True}})
-    with pytest.raises(D2Error, match="stereo must be a table"):
-        PriorSettings.from_dict({"stereo": "sweep"})
-    assert PriorSettings.from_dict({"tau_c": 1}).tau_c == 1

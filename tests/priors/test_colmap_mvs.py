@@ -25,13 +25,13 @@ from d2_plugin.priors.colmap.mvs import (
 )
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.filter import filter_depths
-from d2_plugin.priors.stereo.geometric_depth import MAKERS, choose_maker, gray
+from d2_plugin.priors.stereo.geometric_depth import MATCHERS, choose_matcher, gray
 from d2_plugin.study.bench.stereo_measure import score
 from d2_plugin.study.bench.stereo_rigs import Rig, textured_rig
 
 pytest.importorskip("cv2")
 
-SETTINGS = StereoSettings(maker="colmap")
+SETTINGS = StereoSettings(matcher="colmap")
 
 
 @pytest.fixture(scope="module")
@@ -213,8 +213,8 @@ def test_without_cuda_one_sentence_says_what_to_do(
     rig: Rig, grays: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(colmap_mvs, "why_not_usable", lambda: "the installed pycolmap was built without CUDA")
-    with pytest.raises(D2Error, match="built without CUDA: install pycolmap-cuda12 .* or set maker = patchmatch"):
-        MAKERS["colmap"](grays, rig.cameras, rig.depth_range, SETTINGS, None)
+    with pytest.raises(D2Error, match="built without CUDA: install pycolmap-cuda12 .* or set matcher = patchmatch"):
+        MATCHERS["colmap"](grays, rig.cameras, rig.depth_range, SETTINGS, None)
 
 
 def test_has_cuda_alone_does_not_make_colmap_usable(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -224,10 +224,10 @@ def test_has_cuda_alone_does_not_make_colmap_usable(monkeypatch: pytest.MonkeyPa
     assert why_not_usable() == "there is no CUDA device"
     monkeypatch.setattr(colmap_mvs, "_has_cuda_device", lambda: True)
     assert why_not_usable() == ""
-    assert choose_maker("auto") == "colmap"
+    assert choose_matcher("auto") == "colmap"
     monkeypatch.setattr(pycolmap, "has_cuda", False)
     assert "without CUDA" in why_not_usable()
-    assert choose_maker("auto") != "colmap"
+    assert choose_matcher("auto") != "colmap"
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     assert why_not_usable() == "pycolmap is not installed"
 

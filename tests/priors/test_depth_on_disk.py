@@ -13,12 +13,12 @@ from d2_plugin.captures.calibration import pinhole
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
-from d2_plugin.priors import sources
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.colmap.dense_arrays import write_dense_array
 from d2_plugin.priors.colmap.mvs import write_model
 from d2_plugin.priors.colmap.workspace import WorkspaceDepth, scale_of_world, seen_by
-from d2_plugin.priors.depth_on_disk import SensorDepth, filter_recorded, recorded_depth
+from d2_plugin.priors.depth_on_disk import FilteredDepthOnDisk, SensorDepth, find_depth_on_disk
+from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
@@ -27,7 +27,7 @@ cv2 = pytest.importorskip("cv2")
 
 NAMES = ["train0", "train1", "train2"]
 AUTO = StereoSettings()
-SENSOR = StereoSettings(maker="sensor")
+SENSOR = StereoSettings(matcher="sensor")
 
 
 @pytest.fixture(scope="module")
@@ -83,8 +83,8 @@ def write_maps(capture: Capture, place: str, frame: int, scale: float = 1.0, kin
 
 
 def workspace(capture: Capture, place: str = "") -> WorkspaceDepth:
-    settings = StereoSettings(maker="workspace", folder=place)
-    found = recorded_depth(capture, NAMES, settings)
+    settings = StereoSettings(matcher="workspace", folder=place)
+    found = find_depth_on_disk(capture, NAMES, settings)
     assert isinstance(found, WorkspaceDepth)
     return found
 
@@ -97,8 +97,8 @@ def test_sensor_depth_comes_in_world_units(
     capture: Capture, description: dict, step: float, suffix: str
 ) -> None:
     write_sensor(capture, description, step, suffix)
-    found = recorded_depth(capture, NAMES, SENSOR)
-    assert found.maker == "sensor"
+    found = find_depth_on_disk(capture, NAMES, SENSOR)
+    assert found.name == "sensor"
     depth = found.depth(capture.cameras["train1"], 1)
     np.testing.assert_allclose(depth, capture.depth("train1", 1), atol=0.51 * step if suffix == ".png" else 1e-6)
     assert found.depth(capture.cameras["train2"], 1) is None
@@ -146,13 +146,13 @@ def test_a_sensor_of_fewer_pixels_gives_each_picture_pixel_its_nearest(capture: 
 def test_what_a_stored_number_means_must_be_declared(capture: Capture, description: object, message: str) -> None:
     write_sensor(capture, description)
     with pytest.raises(D2Error, match=message):
-        recorded_depth(capture, NAMES, SENSOR)
+        find_depth_on_disk(capture, NAMES, SENSOR)
 
 
 def test_sensors_are_taken_unasked_only_where_every_camera_has_one(capture: Capture) -> None:
     write_sensor(capture, {"unit": "mm"})
-    assert recorded_depth(capture, NAMES, AUTO) is None
-    assert recorded_depth(capture, NAMES[:2], AUTO).maker == "sensor"
+    assert find_depth_on_disk(capture, NAMES, AUTO) is None
+    assert find_depth_on_disk(capture, NAMES[:2], AUTO).name == "sensor"
 
 
 def test_a_map_that_is_no_depth_is_named(capture: Capture) -> None:
@@ -179,8 +179,15 @@ def test_pixels_that_fly_between_two_surfaces_are_dropped_and_plain_walls_are_ke
     mixed = cv2.blur(truth, (3, 3))
     wrong, right = np.abs(mixed - truth) > 0.05 * truth, np.abs(mixed - truth) < 0.03 * truth
     measured = mixed * (1 + np.random.default_rng(0).normal(0, noise, truth.shape)).astype(np.float32)
-    blank = [np.full((180, 320, 3), 128, np.uint8)]
-    depth = filter_recorded(blank, [camera], [measured], "sensor", AUTO)[0].depth
+
+    class Measured:
+        name, about = "sensor", "a sensor"
+
+        def depth(self, camera: Camera, frame: int) -> np.ndarray:
+            return measured
+
+    blank = Frame(0, {camera.name: np.full((180, 320, 3), 128, np.uint8)}, {camera.name: ""})
+    depth = FilteredDepthOnDisk(Measured(), [camera], None, AUTO).depths(blank)[0].depth
     assert wrong.sum() > 300
     assert (depth[wrong] > 0).mean() < 0.02
     assert (depth[right] > 0).mean() > 0.95
@@ -197,7 +204,7 @@ def test_one_camera_with_a_depth_sensor_has_a_verified_prior(capture: Capture) -
     error = np.abs(prior.depth.numpy() - truth)[verified] / truth[verified]
     assert np.median(error) < 1e-3
     record = store.record("train0", 0)
-    assert record["stereo"]["maker"] == "sensor"
+    assert record["stereo"]["matcher"] == "sensor"
     assert record["bounds"] is None
 
 
@@ -207,8 +214,8 @@ def test_depth_on_disk_is_read_again_where_it_changed_and_only_there(
     folder, settings = write_sensor(capture, {"unit": "mm"}), PriorSettings(stereo=SENSOR)
     build_priors(capture, NAMES, capture.path / "priors", settings)
     filtered = []
-    original = sources.filter_recorded
-    monkeypatch.setattr(sources, "filter_recorded", lambda *a: filtered.append(1) or original(*a))
+    original = FilteredDepthOnDisk.depths
+    monkeypatch.setattr(FilteredDepthOnDisk, "depths", lambda *a: filtered.append(1) or original(*a))
     assert build_priors(capture, NAMES, capture.path / "priors", settings).built == 0
     assert cv2.imwrite(str(folder / "train0" / "00001.png"), np.full((90, 160), 3000, np.uint16))
     assert build_priors(capture, NAMES, capture.path / "priors", settings).built == 3
@@ -234,13 +241,13 @@ def test_a_workspace_in_another_unit_comes_back_in_ours(capture: Capture, scale:
 
 
 def test_a_workspace_is_found_where_it_usually_lies_or_where_the_settings_say(capture: Capture) -> None:
-    assert recorded_depth(capture, NAMES, AUTO) is None
+    assert find_depth_on_disk(capture, NAMES, AUTO) is None
     write_maps(capture, "elsewhere/f1", 1)
-    assert recorded_depth(capture, NAMES, AUTO) is None
+    assert find_depth_on_disk(capture, NAMES, AUTO) is None
     assert workspace(capture, "elsewhere/f{frame}").depth(capture.cameras["train0"], 1).any()
     write_maps(capture, "dense", 0)
-    assert recorded_depth(replace(capture, frames=(0,)), NAMES, AUTO).about.endswith("dense")
-    assert recorded_depth(capture, NAMES, StereoSettings(maker="patchmatch")) is None
+    assert find_depth_on_disk(replace(capture, frames=(0,)), NAMES, AUTO).about.endswith("dense")
+    assert find_depth_on_disk(capture, NAMES, StereoSettings(matcher="patchmatch")) is None
     with pytest.raises(D2Error, match="braces around other than frame"):
         workspace(capture, "elsewhere/{number}")
 
@@ -248,13 +255,13 @@ def test_a_workspace_is_found_where_it_usually_lies_or_where_the_settings_say(ca
 def test_a_workspace_of_one_instant_is_not_the_depth_of_all(capture: Capture) -> None:
     """Many captures keep the workspace that their initial points come from."""
     write_maps(capture, "colmap", 0)
-    assert recorded_depth(capture, NAMES, AUTO) is None
+    assert find_depth_on_disk(capture, NAMES, AUTO) is None
     with pytest.raises(D2Error, match="at frame 1: name pictures CAMERA/FRAME.png"):
         workspace(capture).depth(capture.cameras["train0"], 1)
     write_maps(capture, "colmap/00000", 0)
-    assert recorded_depth(capture, NAMES, AUTO) is None
+    assert find_depth_on_disk(capture, NAMES, AUTO) is None
     write_maps(capture, "colmap/00001", 1)
-    assert recorded_depth(capture, NAMES, AUTO).place == "colmap/{frame:05d}"
+    assert find_depth_on_disk(capture, NAMES, AUTO).place == "colmap/{frame:05d}"
 
 
 def test_pictures_of_all_frames_may_share_one_workspace(capture: Capture) -> None:
@@ -279,7 +286,7 @@ def test_maps_of_the_geometric_pass_come_first(still: Capture) -> None:
     folder = write_maps(still, "colmap", 0)
     write_dense_array(folder / "stereo" / "depth_maps" / "train0.png.photometric.bin", np.ones((90, 160)))
     depth = [
-        recorded_depth(still, NAMES, StereoSettings(colmap_geometric=wanted)).depth(still.cameras["train0"], 0)
+        find_depth_on_disk(still, NAMES, StereoSettings(colmap_geometric=wanted)).depth(still.cameras["train0"], 0)
         for wanted in (True, False)
     ]
     assert np.median(depth[0]) > 1.5
@@ -341,7 +348,7 @@ def test_a_workspace_of_other_pictures_says_how_to_name_them(still: Capture) -> 
 def test_a_workspace_that_saw_other_cameras_is_warned_of(still: Capture, caplog: pytest.LogCaptureFixture) -> None:
     """Held-out cameras must not reach training by way of somebody's depth maps."""
     write_maps(still, "colmap", 0)
-    source = recorded_depth(still, NAMES[:2], StereoSettings(maker="workspace"))
+    source = find_depth_on_disk(still, NAMES[:2], StereoSettings(matcher="workspace"))
     assert source.depth(still.cameras["train0"], 0).any()
     assert "saw train2.png as well" in caplog.text
 
@@ -370,9 +377,9 @@ def test_priors_from_a_workspace_pass_the_common_filter(capture: Capture) -> Non
 
 
 @pytest.mark.parametrize(
-    ("maker", "message"), [("sensor", "has no depth.json"), ("workspace", "say where it is with stereo.folder")]
+    ("matcher", "message"), [("sensor", "has no depth.json"), ("workspace", "say where it is with stereo.folder")]
 )
-def test_depth_that_is_asked_for_and_absent_is_told(capture: Capture, maker: str, message: str) -> None:
+def test_depth_that_is_asked_for_and_absent_is_told(capture: Capture, matcher: str, message: str) -> None:
     with pytest.raises(D2Error, match=message):
-        build_priors(capture, NAMES, capture.path / "p", PriorSettings(stereo=StereoSettings(maker=maker)))
+        build_priors(capture, NAMES, capture.path / "p", PriorSettings(stereo=StereoSettings(matcher=matcher)))
     assert not (capture.path / "p").exists()

@@ -1,4 +1,4 @@
-"""Geometric depth: what the sweep finds, where the depth range comes from, and how makers are chosen."""
+"""Geometric depth: what the sweep finds, where the depth range comes from, and how matchers are chosen."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo import geometric_depth as stereo
+from d2_plugin.priors.stereo.depth_range import depth_bounds
 from d2_plugin.priors.stereo.filter import GeometricDepth
-from d2_plugin.priors.stereo.geometric_depth import choose_maker, depth_bounds, enlarged, geometric_depth, gray
+from d2_plugin.priors.stereo.geometric_depth import choose_matcher, enlarged, geometric_depth, gray
 from d2_plugin.priors.stereo.sweep import RunningMinimum
 from d2_plugin.study.bench.stereo_rigs import textured_rig
 
 pytest.importorskip("cv2")
 
-SWEEP = StereoSettings(maker="sweep")
+SWEEP = StereoSettings(matcher="sweep")
 
 
 @pytest.fixture(scope="module")
@@ -162,27 +163,28 @@ def test_auto_without_a_gpu_is_patchmatch_where_there_is_a_compiler(monkeypatch:
 
     monkeypatch.setattr(colmap_mvs, "why_not_usable", lambda: "there is no CUDA device")
     monkeypatch.setattr(compiler, "find_compiler", lambda: ["c++"])
-    assert choose_maker("auto") == "patchmatch"
+    assert choose_matcher("auto") == "patchmatch"
 
     def none() -> list[str]:
         raise compiler.NoCompiler("no C++ compiler found")
 
     monkeypatch.setattr(compiler, "find_compiler", none)
-    assert choose_maker("auto") == "sweep"
+    assert choose_matcher("auto") == "sweep"
     with pytest.raises(D2Error, match="did you mean 'patchmatch'"):
-        choose_maker("patch-match")
-    with pytest.raises(D2Error, match="maker = sensor reads depth that lies beside a capture"):
-        choose_maker("sensor")
+        choose_matcher("patch-match")
+    with pytest.raises(D2Error, match="matcher = sensor reads depth that lies beside a capture"):
+        choose_matcher("sensor")
 
 
-def test_any_function_can_be_a_maker(pair: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_function_can_be_a_matcher(pair: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     truths = [pair.depth(name, 0) for name in pair.cameras]
 
     def oracle(grays: list, cameras: list[Camera], bounds: tuple, settings: StereoSettings, wanted: None) -> list:
         return [(truth, np.zeros_like(truth)) for truth in truths]
 
-    monkeypatch.setitem(stereo.MAKERS, "oracle", oracle)
-    results = run(pair, (2.0, 9.0), StereoSettings(maker="oracle"))
+    monkeypatch.setitem(stereo.MATCHERS, "oracle", oracle)
+    images, cameras = [pair.image(name, 0) for name in pair.cameras], list(pair.cameras.values())
+    results = geometric_depth(images, cameras, (2.0, 9.0), SWEEP, matcher="oracle")
     assert scores(results, pair)[0] > 0.6
     assert scores(results, pair)[1] == 0
 

@@ -40,7 +40,7 @@ def test_a_network_of_fixed_size_gets_that_size_and_values_from_0_to_1(tmp_path:
 def test_a_network_of_free_size_gets_depth_anything_v2s_lower_bound(tmp_path: Path) -> None:
     model = MonocularModel(tiny_onnx.mean_network(tmp_path / "net.onnx", "height", "width"), "relative")
     assert model.preprocessing == "depth_anything_v2"
-    assert model.input_size(1014, 1352) == (518, 686)  # the example of reference/priors.md 4.1
+    assert model.input_size(1014, 1352) == (518, 686)  # short side 518, both multiples of 14
     assert model.input_size(640, 362) == (910, 518)
     assert model.input_size(180, 320) == (518, 924)
     tensor = model.prepare(SMOOTH)

@@ -13,17 +13,19 @@ from hypothesis import strategies as st
 from d2_plugin.captures.capture import Capture
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
-from d2_plugin.priors import sources
 from d2_plugin.priors.build import PriorSettings, build_priors
+from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.geometric_depth import geometric_depth
+from d2_plugin.priors.stereo.match import MatchedDepth
 from d2_plugin.priors.stereo.reuse import MEMORY_DTYPE, MatchMemory, changed, covering_boxes
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
 
 pytest.importorskip("cv2")
 
-STEREO = StereoSettings(maker="sweep", reuse_block=3)
+STEREO = StereoSettings(matcher="sweep", reuse_block=3)
 SETTINGS = PriorSettings(stereo=STEREO)
 NAMES = ["train0", "train1"]
 
@@ -197,16 +199,16 @@ def test_the_sweep_matches_only_boxes_around_what_is_wanted(capture: Capture, mo
 def test_a_source_is_asked_in_order_even_from_the_middle_of_a_block(capture: Capture, tmp_path: Path) -> None:
     """The key of a frame covers the frames before it in its block."""
 
-    def source(frames: tuple[int, ...]) -> sources.GeometricSource:
-        return sources.GeometricSource(
+    def source(frames: tuple[int, ...]) -> MatchedDepth:
+        return MatchedDepth(
             list(capture.cameras.values()),
-            sources.DepthBounds(2, 9, "test"),
+            DepthBounds(2, 9, "test"),
             STEREO,
             tmp_path,
             frames,
-            lambda number: sources.Frame.read(capture, NAMES, number),
+            lambda number: Frame.read(capture, NAMES, number),
         )
 
-    frame = sources.Frame.read(capture, NAMES, 2)
+    frame = Frame.read(capture, NAMES, 2)
     assert source((0, 1, 2)).key(frame) == source((0, 1, 2, 3, 4)).key(frame)
     assert source((0, 1, 2)).key(frame) != source((1, 2)).key(frame)

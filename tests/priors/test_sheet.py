@@ -23,9 +23,10 @@ def test_the_sheet_shows_picture_depth_and_labels_of_every_view(tmp_path: Path) 
     for camera in capture.cameras:
         labels = np.full((36, 64), Label.MONO, np.uint8)
         labels[:, 32:] = Label.CONFLICT
-        prior = FusedPrior(np.where(labels == Label.MONO, capture.depth(camera, 0), 0), labels)
+        depth = np.where(labels == Label.MONO, capture.depth(camera, 0), 0)
+        prior = FusedPrior(depth, labels, capture.image(camera, 0))
         record = {"shares": prior.shares(), "refused": "", "monocular": "maps"}
-        store.write(camera, 0, prior, capture.image(camera, 0), record)
+        store.write(camera, 0, prior, record)
     sheet = cv2.imread(str(contact_sheet(store, capture, tmp_path / "out" / "sheet.png", width=64)))[..., ::-1]
     assert sheet.shape == (2 * (36 + 18), 3 * 64, 3)
     row = sheet[18 : 18 + 36]

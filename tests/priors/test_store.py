@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +25,14 @@ def some_prior(seed: int = 0) -> FusedPrior:
     rng = np.random.default_rng(seed)
     labels = rng.integers(0, 4, SHAPE).astype(np.uint8)
     supported = (labels == Label.MONO) | (labels == Label.VERIFIED)
-    return FusedPrior(np.where(supported, rng.uniform(1, 9, SHAPE), 0).astype(np.float32), labels)
+    return FusedPrior(np.where(supported, rng.uniform(1, 9, SHAPE), 0).astype(np.float32), labels, IMAGE)
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> PriorStore:
     made = PriorStore.create(tmp_path / "priors", ["a", "b"], [0, 3], {"capture": "test"})
     for camera in ("a", "b"):
-        made.write(camera, 0, some_prior(), IMAGE, {"key": "k", "shares": some_prior().shares()})
+        made.write(camera, 0, some_prior(), {"key": "k", "shares": some_prior().shares()})
     return made
 
 
@@ -80,7 +81,7 @@ def test_depth_that_is_no_depth_is_refused(store: PriorStore, bad: float) -> Non
     prior.depth[2, 3] = bad
     before = array_file(store).read_bytes()
     with pytest.raises(D2Error, match="camera a, frame 0 has 1 depths that are NaN, infinite or negative"):
-        store.write("a", 0, prior, IMAGE, {})
+        store.write("a", 0, prior, {})
     assert array_file(store).read_bytes() == before
 
 
@@ -88,12 +89,14 @@ def test_labels_that_contradict_depth_are_refused(store: PriorStore) -> None:
     prior = some_prior()
     prior.labels[prior.depth > 0] = Label.CONFLICT
     with pytest.raises(D2Error, match="contradict its depth"):
-        store.write("a", 0, prior, IMAGE, {})
+        store.write("a", 0, prior, {})
     prior.labels[0, 0] = 9
     with pytest.raises(D2Error, match="label 9"):
-        store.write("a", 0, prior, IMAGE, {})
+        store.write("a", 0, prior, {})
     with pytest.raises(D2Error, match="build the prior at the picture's size"):
-        store.write("a", 0, some_prior(), IMAGE[:5], {})
+        store.write("a", 0, replace(some_prior(), colors=IMAGE[:5]), {})
+    with pytest.raises(D2Error, match="its colours none"):
+        store.write("a", 0, replace(some_prior(), colors=None), {})
 
 
 def test_a_truncated_array_is_named_on_open(store: PriorStore) -> None:
@@ -134,7 +137,7 @@ def test_an_array_whose_record_was_not_written_yet_does_not_exist(store: PriorSt
 
 def test_an_array_replaced_without_its_record_is_not_trusted(store: PriorStore) -> None:
     record = array_file(store).with_suffix(".json").read_text()
-    store.write("a", 0, some_prior(5), IMAGE, {"key": "k2"})
+    store.write("a", 0, some_prior(5), {"key": "k2"})
     array_file(store).with_suffix(".json").write_text(record)  # as a kill between the two writes leaves it
     assert not store.is_current("a", 0, "k")
 

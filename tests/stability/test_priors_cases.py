@@ -1,6 +1,6 @@
 """COLMAP where it ends processes, numbered as in the list of cases that broke other codebases (cases 42 and 44).
 
-Cases 43 and 45 are in test_align_stability.py, the other makers of case 44 in test_stereo_stability.py.
+Cases 43 and 45 are in test_align_stability.py, the other matchers of case 44 in test_stereo_stability.py.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from d2_plugin.priors.stereo.geometric_depth import geometric_depth
 
 pytest.importorskip("cv2")
 
-COLMAP = StereoSettings(maker="colmap")
+COLMAP = StereoSettings(matcher="colmap")
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Stereo at the edge (reference/priors.md section 7, case 44): empty or refused, never a plausible map."""
+"""Stereo at the edge (case 44 of the inventory): empty or refused, never a plausible map."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.colmap.mvs import why_not_usable
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo.geometric_depth import depth_bounds, geometric_depth
+from d2_plugin.priors.stereo.depth_range import depth_bounds
+from d2_plugin.priors.stereo.geometric_depth import geometric_depth
 
 pytest.importorskip("cv2")
 
@@ -21,8 +22,8 @@ BOUNDS = (2.0, 9.0)
 
 
 @pytest.fixture(params=["sweep", "patchmatch", "colmap"])
-def maker(request: pytest.FixtureRequest) -> str:
-    """Every maker that this machine has."""
+def matcher(request: pytest.FixtureRequest) -> str:
+    """Every matcher that this machine has."""
     if request.param == "patchmatch":
         try:
             find_compiler()
@@ -39,58 +40,58 @@ def views() -> tuple[list[np.ndarray], list[Camera]]:
     return [capture.image(name, 0) for name in capture.cameras], list(capture.cameras.values())
 
 
-def valid_share(images: list[np.ndarray], cameras: list[Camera], maker: str) -> float:
-    results = geometric_depth(images, cameras, BOUNDS, StereoSettings(maker=maker))
+def valid_share(images: list[np.ndarray], cameras: list[Camera], matcher: str) -> float:
+    results = geometric_depth(images, cameras, BOUNDS, StereoSettings(matcher=matcher))
     for result in results:
         assert np.isfinite(result.depth).all()
     return max(float(result.valid.mean()) for result in results)
 
 
-def test_two_views_are_enough(views: tuple, maker: str) -> None:
+def test_two_views_are_enough(views: tuple, matcher: str) -> None:
     images, cameras = views
-    assert valid_share(images[:2], cameras[:2], maker) > 0.05
+    assert valid_share(images[:2], cameras[:2], matcher) > 0.05
 
 
-def test_a_frame_without_texture_has_no_depth(views: tuple, maker: str) -> None:
+def test_a_frame_without_texture_has_no_depth(views: tuple, matcher: str) -> None:
     images, cameras = views
-    assert valid_share([np.full_like(image, 128) for image in images], cameras, maker) == 0
+    assert valid_share([np.full_like(image, 128) for image in images], cameras, matcher) == 0
 
 
-def test_faint_noise_on_a_plain_wall_has_next_to_no_depth(views: tuple, maker: str) -> None:
+def test_faint_noise_on_a_plain_wall_has_next_to_no_depth(views: tuple, matcher: str) -> None:
     images, cameras = views
     rng = np.random.default_rng(0)
     noise = [np.clip(128 + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8) for image in images]
-    assert valid_share(noise, cameras, maker) < 0.01
+    assert valid_share(noise, cameras, matcher) < 0.01
 
 
-def test_identical_cameras_have_no_depth(views: tuple, maker: str) -> None:
+def test_identical_cameras_have_no_depth(views: tuple, matcher: str) -> None:
     images, cameras = views
-    assert valid_share([images[0]] * 3, [cameras[0]] * 3, maker) == 0
+    assert valid_share([images[0]] * 3, [cameras[0]] * 3, matcher) == 0
 
 
-def test_a_pure_rotation_has_no_depth(views: tuple, maker: str) -> None:
+def test_a_pure_rotation_has_no_depth(views: tuple, matcher: str) -> None:
     images, cameras = views
     turn = np.eye(4)
     turn[:2, :2] = [[0.999, -0.0447], [0.0447, 0.999]]
     turned = replace(cameras[0], name="turned", T_camera_world=turn @ cameras[0].T_camera_world)
-    assert valid_share([images[0], images[0]], [cameras[0], turned], maker) == 0
+    assert valid_share([images[0], images[0]], [cameras[0], turned], matcher) == 0
 
 
-def test_one_black_picture_neither_has_depth_nor_takes_it_from_the_others(views: tuple, maker: str) -> None:
+def test_one_black_picture_neither_has_depth_nor_takes_it_from_the_others(views: tuple, matcher: str) -> None:
     images, cameras = views
     results = geometric_depth(
-        [images[0], np.zeros_like(images[1]), images[2]], cameras, BOUNDS, StereoSettings(maker=maker)
+        [images[0], np.zeros_like(images[1]), images[2]], cameras, BOUNDS, StereoSettings(matcher=matcher)
     )
     assert not results[1].valid.any()
-    whole = geometric_depth(images[::2], cameras[::2], BOUNDS, StereoSettings(maker=maker))
+    whole = geometric_depth(images[::2], cameras[::2], BOUNDS, StereoSettings(matcher=matcher))
     assert results[0].valid.mean() > 0.5 * whole[0].valid.mean()
 
 
 @pytest.mark.parametrize("bounds", [(9.0, 2.0), (0.0, 2.0), (2.0, 2.0), (2.0, float("nan"))])
-def test_an_inverted_depth_range_is_refused(views: tuple, maker: str, bounds: tuple[float, float]) -> None:
+def test_an_inverted_depth_range_is_refused(views: tuple, matcher: str, bounds: tuple[float, float]) -> None:
     images, cameras = views
     with pytest.raises(D2Error, match="swap or correct"):
-        geometric_depth(images, cameras, bounds, StereoSettings(maker=maker))
+        geometric_depth(images, cameras, bounds, StereoSettings(matcher=matcher))
 
 
 def test_no_depth_range_follows_from_cameras_at_one_point(views: tuple) -> None:
@@ -99,14 +100,14 @@ def test_no_depth_range_follows_from_cameras_at_one_point(views: tuple) -> None:
         depth_bounds([first, replace(first, name="again")])
 
 
-def test_one_view_is_refused(views: tuple, maker: str) -> None:
+def test_one_view_is_refused(views: tuple, matcher: str) -> None:
     images, cameras = views
     with pytest.raises(D2Error, match="at least 2 cameras"):
-        geometric_depth(images[:1], cameras[:1], BOUNDS, StereoSettings(maker=maker))
+        geometric_depth(images[:1], cameras[:1], BOUNDS, StereoSettings(matcher=matcher))
 
 
-def test_views_that_do_not_overlap_have_no_depth(views: tuple, maker: str) -> None:
+def test_views_that_do_not_overlap_have_no_depth(views: tuple, matcher: str) -> None:
     images, cameras = views
     away = np.diag([-1.0, 1.0, -1.0, 1.0])
     turned = replace(cameras[1], T_camera_world=away @ cameras[1].T_camera_world)
-    assert valid_share(images[:2], [cameras[0], turned], maker) == 0
+    assert valid_share(images[:2], [cameras[0], turned], matcher) == 0

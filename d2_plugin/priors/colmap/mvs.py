@@ -1,11 +1,11 @@
-"""COLMAP's PatchMatch as a maker of geometric depth: the paper's own choice where there is a CUDA device.
+"""COLMAP's PatchMatch as a matcher of geometric depth: the paper's own choice where there is a CUDA device.
 
 For each timestamp a workspace is written whose cameras are known (pictures, sparse model without points, explicit
 sources per view), COLMAP matches it in a process of its own, and its depth maps are checked before anyone believes
-them: without sources or memory COLMAP returns success and no output (`reference/priors.md` section 1).
+them: without sources or memory COLMAP returns success and no output.
 
-COLMAP fills no cost map that it would write; what its own photometric and geometric filter leaves has a cost of 0, and
-the filter that all makers share does the rest.
+COLMAP writes no cost map. What its own photometric and geometric filter leaves has a cost of 0, and the filter that
+all matchers share does the rest.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ from d2_plugin.priors.colmap.mvs_process import OPTIONS
 from d2_plugin.priors.colmap.points import import_pycolmap
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import check_depth_range, check_views, index_intrinsics
-from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo.patchmatch import NO_MATCH, choose_sources
+from d2_plugin.priors.stereo.pyramid import NO_MATCH
+from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.priors.stereo.source_views import choose_sources
 
 CHILD = Path(__file__).with_name("mvs_process.py")
 CACHE_GIGABYTES = 8.0
@@ -78,7 +79,7 @@ def colmap_patch_match(
     *,
     run: Runner | None = None,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Depth and matching cost of every view from the others, as every maker returns them.
+    """Depth and matching cost of every view from the others, as every matcher returns them.
 
     Args:
         grays: uint8 [H, W] per camera, synchronized.
@@ -103,7 +104,7 @@ def colmap_patch_match(
         _refuse_without_cuda()
     sources = mutual_sources([choose_sources(i, cameras, (near, far), settings) for i in range(len(cameras))])
     if not any(sources):
-        return [_as_maker(np.zeros((camera.height, camera.width), np.float32)) for camera in cameras]
+        return [_with_cost(np.zeros((camera.height, camera.width), np.float32)) for camera in cameras]
     with tempfile.TemporaryDirectory(prefix="d2_colmap_") as folder:
         workspace = Path(folder)
         write_workspace(workspace, grays, cameras, sources, patch_match_options((near, far), settings))
@@ -113,15 +114,15 @@ def colmap_patch_match(
     maps = [np.where((depth >= near) & (depth <= far), depth, np.float32(0)) for depth in maps]
     if not any(depth.any() for depth in maps):
         logger.warning("COLMAP found no depth in any view: no texture, a wrong depth range, or a GPU it is too old for")
-    return [_as_maker(depth) for depth in maps]
+    return [_with_cost(depth) for depth in maps]
 
 
 def _refuse_without_cuda() -> None:
     reason = why_not_usable()
     if reason:
         raise D2Error(
-            f"maker = colmap needs pycolmap with CUDA and a CUDA device, but {reason}: install pycolmap-cuda12 in "
-            "place of pycolmap on a machine with a GPU, or set maker = patchmatch"
+            f"matcher = colmap needs pycolmap with CUDA and a CUDA device, but {reason}: install pycolmap-cuda12 in "
+            "place of pycolmap on a machine with a GPU, or set matcher = patchmatch"
         )
 
 
@@ -133,7 +134,7 @@ def mutual_sources(sources: Sequence[Sequence[int]]) -> list[list[int]]:
     return kept
 
 
-def _as_maker(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _with_cost(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return depth.astype(np.float32), np.where(depth > 0, 0, NO_MATCH).astype(np.float32)
 
 
@@ -220,7 +221,7 @@ def run_patch_match(workspace: Path, seconds: float, command: Sequence[str] | No
     if ended.returncode:
         raise D2Error(
             f"COLMAP's PatchMatch ended with {_ending(ended.returncode)} ({_last_words(ended.stderr)}): correct what "
-            "it says, or set maker = patchmatch"
+            "it says, or set matcher = patchmatch"
         )
 
 
@@ -256,7 +257,7 @@ def _checked_map(path: Path, camera: Camera) -> np.ndarray:
     if not path.is_file():
         raise D2Error(
             f"COLMAP's PatchMatch returned without an error but left no {path.name} for camera {camera.name}: it had "
-            "no sources or no memory for that view; lower max_pixels, or set maker = patchmatch"
+            "no sources or no memory for that view; lower max_pixels, or set matcher = patchmatch"
         )
     depth = read_dense_array(path)
     if depth.shape != (camera.height, camera.width):
@@ -267,7 +268,7 @@ def _checked_map(path: Path, camera: Camera) -> np.ndarray:
     if not np.isfinite(depth).all():
         raise D2Error(
             f"COLMAP's depth map of camera {camera.name} has {np.count_nonzero(~np.isfinite(depth))} values that are "
-            "not finite: update pycolmap and the GPU's driver, or set maker = patchmatch"
+            "not finite: update pycolmap and the GPU's driver, or set matcher = patchmatch"
         )
     return depth
 

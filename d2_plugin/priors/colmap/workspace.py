@@ -12,6 +12,7 @@ import logging
 import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
+from typing import ClassVar
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.readers.colmap_model import ColmapImage, ColmapModel, read_model
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.colmap.dense_arrays import read_dense_array
-from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.stereo.settings import StereoSettings
 
 PLACES = ("colmap/{frame:05d}", "colmap", "dense", "colmap/{frame:05d}/dense", "colmap/dense")
 """Where a workspace is looked for below a capture, in this order."""
@@ -46,7 +47,7 @@ class WorkspaceDepth:
             instant, as many captures have for their initial points, must not become the depth of all instants.
     """
 
-    maker = "workspace"
+    name: ClassVar[str] = "workspace"
 
     def __init__(
         self, root: Path, place: str, settings: StereoSettings, cameras: Sequence[Camera], frames: Sequence[int]
@@ -72,7 +73,7 @@ class WorkspaceDepth:
         """
         for place in [settings.folder] if settings.folder else PLACES:
             source = cls(root, place, settings, cameras, frames)
-            asked = settings.maker == cls.maker and any(source.has_maps(frame) for frame in frames)
+            asked = settings.matcher == cls.name and any(source.has_maps(frame) for frame in frames)
             if asked or all(source.serves(frame) for frame in (frames[0], frames[-1])):
                 return source
         return None
@@ -98,7 +99,7 @@ class WorkspaceDepth:
         folder = self._folder(frame)
         if not self.has_maps(frame):
             return None
-        self._read_model(folder)
+        model = self._read_model(folder)
         if folder != self._compared:
             self._compare_poses(folder, frame)
         image = self._image(camera.name, frame)
@@ -106,7 +107,7 @@ class WorkspaceDepth:
         if image is None or path is None:
             return None
         depth = read_dense_array(path)
-        return seen_by(camera, depth, self._intrinsics(image, depth.shape)) * np.float32(self._scale)
+        return seen_by(camera, depth, _intrinsics(model, image, depth.shape)) * np.float32(self._scale)
 
     def _folder(self, frame: int) -> Path:
         try:
@@ -114,14 +115,14 @@ class WorkspaceDepth:
         except (KeyError, IndexError, ValueError) as error:
             raise D2Error(f"stereo.folder {self.place} has braces around other than frame ({error}): mend it") from None
 
-    def _read_model(self, folder: Path) -> None:
-        """The cameras and pictures of a workspace, unless it is the one that was read last."""
-        if folder == self._read:
-            return
-        sparse = folder / "sparse"
-        self._model = read_model(sparse / "0" if (sparse / "0").is_dir() else sparse)
-        self._images, self._strangers = _by_camera_and_frame(self._model, [camera.name for camera in self.cameras])
-        self._read = folder
+    def _read_model(self, folder: Path) -> ColmapModel:
+        """The cameras and pictures of a workspace; the one that was read last is kept."""
+        if self._model is None or folder != self._read:
+            sparse = folder / "sparse"
+            self._model = read_model(sparse / "0" if (sparse / "0").is_dir() else sparse)
+            self._images, self._strangers = _by_camera_and_frame(self._model, [camera.name for camera in self.cameras])
+            self._read = folder
+        return self._model
 
     def _compare_poses(self, folder: Path, frame: int) -> None:
         """The scale of a workspace's world, once its cameras are known to be ours."""
@@ -130,7 +131,7 @@ class WorkspaceDepth:
         if not poses:
             raise D2Error(
                 f"the workspace {folder} has no picture of {', '.join(found)} at frame {frame}: name pictures "
-                "CAMERA/FRAME.png, or CAMERA.png where the folder is of one frame, or set maker = patchmatch"
+                "CAMERA/FRAME.png, or CAMERA.png where the folder is of one frame, or set matcher = patchmatch"
             )
         self._scale = scale_of_world([camera for camera in self.cameras if camera.name in poses], poses, folder)
         self._compared = folder
@@ -150,15 +151,16 @@ class WorkspaceDepth:
         paths = (folder / "stereo" / "depth_maps" / f"{name}.{kind}.bin" for kind in self.kinds)
         return next((path for path in paths if path.is_file()), None)
 
-    def _intrinsics(self, image: ColmapImage, shape: tuple[int, ...]) -> np.ndarray:
-        """K [3, 3] of a map, which COLMAP may have computed at less than the size of its picture."""
-        recorded = self._model.cameras[image.camera]
-        lens = recorded.lens(str(self._model.folder))
-        if lens.bends:
-            raise D2Error(
-                f"{self._model.folder} has pictures with lens distortion: give the output of `colmap image_undistorter`"
-            )
-        return np.diag([shape[1] / recorded.width, shape[0] / recorded.height, 1.0]) @ lens.K
+
+def _intrinsics(model: ColmapModel, image: ColmapImage, shape: tuple[int, ...]) -> np.ndarray:
+    """K [3, 3] of a map, which COLMAP may have computed at less than the size of its picture."""
+    recorded = model.cameras[image.camera]
+    lens = recorded.lens(str(model.folder))
+    if lens.bends:
+        raise D2Error(
+            f"{model.folder} has pictures with lens distortion: give the output of `colmap image_undistorter`"
+        )
+    return np.diag([shape[1] / recorded.width, shape[0] / recorded.height, 1.0]) @ lens.K
 
 
 def _by_camera_and_frame(
@@ -231,5 +233,5 @@ def scale_of_world(cameras: Sequence[Camera], poses: dict[str, np.ndarray], fold
 def _other_poses(folder: Path, difference: str) -> D2Error:
     return D2Error(
         f"the cameras of the workspace {folder} are not those of the capture ({difference}): compute it from the "
-        "capture's poses, or set maker = patchmatch"
+        "capture's poses, or set matcher = patchmatch"
     )

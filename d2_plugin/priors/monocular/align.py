@@ -1,8 +1,10 @@
 """Aligning a monocular map to geometric depth: one scale and one shift per frame and view, or a reason why not.
 
 The paper fits a D^m + b to D^g. A relative model (Depth Anything V2) however returns affine-invariant *inverse* depth,
-so its map is fitted to 1 / D^g; measured median error after alignment: .257 on the raw map against depth, .0085 in the
-right domain (`reference/priors.md` section 4.3). A metric model is fitted to D^g as the paper writes it.
+so its map is fitted to 1 / D^g. A metric model is fitted to D^g as the paper writes it.
+
+Measured: the median error of an aligned relative map is .257 where it was fitted to depth, .0085 where it was fitted to
+inverse depth.
 """
 
 from __future__ import annotations
@@ -10,17 +12,16 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 
 from d2_plugin.captures.capture import MonoKind
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.monocular.affine import AffineFit, fit_affine
-from d2_plugin.priors.settings import AlignSettings
+from d2_plugin.priors.monocular.settings import AlignSettings
 
-KINDS = ("relative", "metric")
-RESIDUALS = ("absolute", "relative")
+KINDS: tuple[MonoKind, ...] = get_args(MonoKind)
 RANKED = 4000  # anchors whose ranks are compared: its standard error is .016, and sorting stays below a millisecond
 
 
@@ -84,9 +85,9 @@ def align(mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: 
         settings: residual, smoothing and acceptance rules.
 
     Raises:
-        D2Error: maps of two sizes, or an unknown kind or residual.
+        D2Error: maps of two sizes, or an unknown kind.
     """
-    _check(mono, geometric, kind, settings)
+    _check(mono, geometric, kind)
     anchors = predicted(mono) & np.isfinite(geometric) & (geometric > 0)
     x_all, depth_all = mono[anchors].astype(np.float64), geometric[anchors].astype(np.float64)
     count = int(x_all.size)
@@ -130,7 +131,8 @@ def aligned_depth(mono: np.ndarray, alignment: Alignment, z_far: float) -> np.nd
     """D-bar^m: aligned monocular depth float32 [H, W], 0 where it has none.
 
     A pixel whose aligned value is not a depth in (0, z_far] (an inverse depth that crosses zero, a saturated network)
-    is left empty, never clamped: a clamped one would propose Gaussians at the far plane. Refused: none at all.
+    is left empty, never clamped: a clamped one would propose Gaussians at the far plane. A refused alignment gives no
+    depth at all.
     """
     if not alignment.accepted:
         return np.zeros(mono.shape, np.float32)
@@ -154,9 +156,9 @@ def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def _depth(mono: np.ndarray, scale: float, shift: float, kind: MonoKind, z_far: float) -> np.ndarray:
-    value = scale * np.where(predicted(mono), mono, np.nan) + shift
+    value: np.ndarray = scale * np.where(predicted(mono), mono, np.nan) + shift
     if kind == "relative":
-        near_enough = value > max(1 / z_far, np.finfo(np.float32).tiny)
+        near_enough = value > max(1 / z_far, float(np.finfo(np.float32).tiny))
         return np.where(near_enough, 1 / np.where(near_enough, value, 1), 0)
     return np.where((value > 0) & (value <= z_far), value, 0)
 
@@ -247,12 +249,10 @@ def _near_best_line(
     return _Selection(keep if keep.sum() >= 2 else np.ones(x.size, bool), float(keep.mean() - chance) / spread)
 
 
-def _check(mono: np.ndarray, geometric: np.ndarray, kind: str, settings: AlignSettings) -> None:
+def _check(mono: np.ndarray, geometric: np.ndarray, kind: str) -> None:
     if mono.shape != geometric.shape:
         raise D2Error(
             f"the monocular map is {mono.shape} but geometric depth is {geometric.shape}: resize the map first"
         )
     if kind not in KINDS:
         raise unknown_name("monocular kind", kind, KINDS)
-    if settings.residual not in RESIDUALS:
-        raise unknown_name("alignment residual", settings.residual, RESIDUALS)

@@ -5,20 +5,25 @@ few per cent. The logarithm of D^g / D-bar^m at the anchors shows that bend. It 
 coarse to fine, each correcting what the coarser ones left, and fades to none where no anchor is near. An anchor that
 disagrees with the many around it is outvoted there, so verification by the corrected map is sharper, not weaker.
 
-Measured on studio (emulated maps, 4 training views, 5 frames): median error of mono-only pixels .0425 before, .027
-after; verified pixels 31.6 % before, 33.8 % after, of which off by more than 5 % .46 % before, .42 % after. On
-n3dv_sear_steak_t0 with mobile_pydnet, at held-out squares of 64 pixels: median deviation from stereo .06 to .09 before,
-.013 to .015 after.
+Measured:
+
+| capture | quantity | before | after |
+|---|---|---|---|
+| studio (emulated maps, 4 training views, 5 frames) | median error of mono-only pixels | .0425 | .027 |
+| | verified pixels | 31.6 % | 33.8 % |
+| | of them off by more than 5 % | .46 % | .42 % |
+| n3dv_sear_steak_t0 (mobile_pydnet, held-out squares) | deviation from stereo | .06 to .09 | .013 to .015 |
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import ModuleType
 
 import numpy as np
 
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.settings import AlignSettings
+from d2_plugin.priors.monocular.settings import AlignSettings
 
 GRID = 80  # cells across the picture: twice as many change the median error by less than .0002 and take 8 times longer
 OUTLIER = 0.03  # of log depth: an anchor this far from the average of its window has 0.7 of its weight
@@ -57,7 +62,7 @@ def _smooth_field(bend: np.ndarray, known: np.ndarray, scales: Sequence[float], 
     return cv2.resize(field, size, interpolation=cv2.INTER_LINEAR)[: bend.shape[0], : bend.shape[1]]
 
 
-def _robust_average(cv2: object, values: np.ndarray, share: np.ndarray, sigma: float, prior: float) -> np.ndarray:
+def _robust_average(cv2: ModuleType, values: np.ndarray, share: np.ndarray, sigma: float, prior: float) -> np.ndarray:
     """Gaussian average weighted by how much of a cell is known, then by agreement with that average."""
 
     def blur(cells: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import hashlib
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -18,8 +18,9 @@ from d2_plugin.captures.capture import MonoKind
 from d2_plugin.errors import D2Error, missing_extra, unknown_name
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.monocular.align import KINDS
+from d2_plugin.priors.settings import Preprocessing
 
-PREPROCESSINGS = ("auto", "depth_anything_v2", "unit")
+PREPROCESSINGS: tuple[Preprocessing, ...] = get_args(Preprocessing)
 PATCH = 14  # side of a ViT patch: Depth Anything V2 takes sizes that are multiples of it
 SHORT_SIDE = 518  # Depth Anything V2's lower bound of the shorter side, pixels
 IMAGENET_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
@@ -70,7 +71,9 @@ class MonocularModel:
         MissingExtra: onnxruntime is not installed.
     """
 
-    def __init__(self, path: Path | str, kind: MonoKind, preprocessing: str = "auto", threads: int = 1) -> None:
+    def __init__(
+        self, path: Path | str, kind: MonoKind, preprocessing: Preprocessing = "auto", threads: int = 1
+    ) -> None:
         self.path, self.kind = Path(path), kind
         if kind not in KINDS:
             raise unknown_name("monocular kind", str(kind), KINDS)

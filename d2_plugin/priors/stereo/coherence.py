@@ -1,9 +1,11 @@
 """Surface coherence: does a depth lie on the same surface as the depths around it?
 
 A wrong match is seldom wrong in the same way as its neighbours, while a right one shares a tangent plane with them.
-The test needs nothing but the depth map, so it judges every maker alike. Measured on PatchMatch maps of the studio
-capture, among pixels that another view confirms: off by more than 5 % are 2.6 % of those with a coherence above .55
-and 30 % of the others. Grey-value texture, at the threshold that keeps as many pixels, separates 8 % from 12 %.
+The test needs nothing but the depth map, so it judges every matcher alike.
+
+Measured on PatchMatch maps of the studio capture, among pixels that another view confirms: off by more than 5 % are
+2.6 % of those with a coherence above .55 and 30 % of the others. Grey-value texture, at the threshold that keeps as
+many pixels, separates 8 % from 12 %.
 """
 
 from __future__ import annotations

@@ -6,7 +6,8 @@ edges of the picture. The minimum over planes is refined by a parabola. Planes s
 the result insensitive to the range; only the running minimum and its two neighbours are kept in memory.
 
 Fronto-parallel planes see little of a wide rig. Measured on studio (16 to 33 degrees between neighbours): completeness
-.10, where a compiled PatchMatch finds .41; with the mean of the best two sources instead of the best one a third less.
+is .10, where a compiled PatchMatch finds .41. With the mean of the best two sources instead of the best one it is a
+third less.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import missing_extra
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import ViewPair, check_depth_range, cropped_camera, inverse_depth_planes, view_pair
-from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.reuse import Box, covering_boxes
+from d2_plugin.priors.stereo.settings import StereoSettings
 
 WORST_COST = 2.0
 MIN_VARIANCE = 1e-5  # of grey values in 0..1 over one window: below it NCC correlates sensor noise

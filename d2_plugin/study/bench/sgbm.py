@@ -15,7 +15,8 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import index_intrinsics, relative_pose, viewing_rays
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo.patchmatch import NO_MATCH, choose_sources
+from d2_plugin.priors.stereo.pyramid import NO_MATCH
+from d2_plugin.priors.stereo.source_views import choose_sources
 
 BLOCK = 5  # side of the matched block, pixels; smoothness as OpenCV's documentation advises for one channel
 SUBPIXEL = 16  # OpenCV's disparities are fixed point

@@ -14,7 +14,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors.colmap.mvs import why_not_usable
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.filter import GeometricDepth, filter_depths
-from d2_plugin.priors.stereo.geometric_depth import MAKERS, Maker, gray
+from d2_plugin.priors.stereo.geometric_depth import MATCHERS, Matcher, gray
 
 from .sgbm import sgbm
 from .stereo_rigs import Rig
@@ -26,7 +26,7 @@ class Method:
 
     name: str
     setting: str
-    make: Maker
+    make: Matcher
     settings: StereoSettings
 
 
@@ -52,9 +52,9 @@ def methods() -> list[Method]:
     }
     colmap = {} if why_not_usable() else {"default": {}, "photometric pass alone": {"colmap_geometric": False}}
     return [
-        *(Method("patchmatch", name, MAKERS["patchmatch"], replace(default, **kw)) for name, kw in patchmatch.items()),
-        *(Method("sweep", name, MAKERS["sweep"], replace(default, **kw)) for name, kw in sweep.items()),
-        *(Method("colmap", name, MAKERS["colmap"], replace(default, **kw)) for name, kw in colmap.items()),
+        *(Method("patchmatch", name, MATCHERS["patchmatch"], replace(default, **k)) for name, k in patchmatch.items()),
+        *(Method("sweep", name, MATCHERS["sweep"], replace(default, **kw)) for name, kw in sweep.items()),
+        *(Method("colmap", name, MATCHERS["colmap"], replace(default, **kw)) for name, kw in colmap.items()),
         Method("sgbm", "default", sgbm, default),
     ]
 

@@ -1,0 +1,131 @@
+"""D* of the views of one instant from its two sources: align, correct, verify, fuse, let cameras agree.
+
+A map per pixel that comes to D* is a field of `FusedPrior`: it is made in `_view` here and written by the store.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.captures.capture import Camera, MonoKind
+from d2_plugin.priors.frame import Frame
+from d2_plugin.priors.fuse import FusedPrior, empty_prior, fuse, hanging_pixels
+from d2_plugin.priors.monocular.agree import with_agreement
+from d2_plugin.priors.monocular.align import Alignment, align, aligned_depth, not_aligned
+from d2_plugin.priors.monocular.correct import corrected_depth
+from d2_plugin.priors.monocular.maps import MonoSource
+from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.priors.stereo.cache import DepthCache, StoredDepth
+
+CONSTRUCTION_VERSION = 3  # raise it when alignment or fusion change what they return
+
+NO_GEOMETRY = "no geometric depth survived the filter"
+NO_MAP = "there is no monocular map of this frame"
+SCALE_UNKNOWN = "one camera and a relative monocular map: its scale cannot be known"
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPrior:
+    """D* of one view and what is known about it."""
+
+    maps: FusedPrior
+    refused: str
+    """Why the view has no depth; empty where it has."""
+    alignment: Alignment | None
+    stereo: dict[str, Any] | None
+    """What the cache of geometric depth recorded."""
+
+    def record(self) -> dict[str, Any]:
+        """What of it goes into the JSON beside the stored maps."""
+        return {
+            "refused": self.refused,
+            "alignment": None if self.alignment is None else self.alignment.as_json(),
+            "stereo": self.stereo,
+            "shares": self.maps.shares(),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedMap:
+    """D-bar^m of one view, float32 [H, W] (0 = none), how it was aligned, and why the view is refused if it is."""
+
+    depth: np.ndarray
+    alignment: Alignment | None = None
+    refused: str = ""
+
+
+class Construction:
+    """Turns the two depths of a frame into D*.
+
+    Args:
+        cameras: the training cameras, by name.
+        mono: the monocular maps, None where there are none.
+        geometric: geometric depth, None where there is none.
+        settings: of the construction; `variant` is one that the sources allow.
+    """
+
+    def __init__(
+        self,
+        cameras: Mapping[str, Camera],
+        mono: MonoSource | None,
+        geometric: DepthCache | None,
+        settings: PriorSettings,
+    ) -> None:
+        self.cameras, self.mono, self.geometric, self.settings = cameras, mono, geometric, settings
+        self.agrees = settings.agreement > 0 and settings.variant == "dual" and len(cameras) > 1
+
+    def priors(self, frame: Frame, wanted: Sequence[str]) -> dict[str, ViewPrior]:
+        """D* of the wanted cameras of one frame; cameras that must agree need each other's, and all come back."""
+        geometric = {} if self.geometric is None else self.geometric.depths(frame)
+        names = self.cameras if self.agrees else wanted
+        views = {name: self._view(name, frame, geometric.get(name)) for name in names}
+        if not self.agrees:
+            return views
+        maps = {name: view.maps for name, view in views.items()}
+        agreed = with_agreement(maps, self.cameras, self.settings.agreement, self.settings.tau_c)
+        return {name: replace(view, maps=agreed[name]) for name, view in views.items()}
+
+    def _view(self, name: str, frame: Frame, stereo: StoredDepth | None) -> ViewPrior:
+        """D* of one camera, before it is compared with the others."""
+        image = frame.images[name]
+        geometric = np.zeros(image.shape[:2], np.float32) if stereo is None else stereo.depth
+        mono = self._aligned(name, frame, geometric)
+        if mono.refused:
+            maps = empty_prior(geometric.shape)
+        else:
+            hanging = hanging_pixels(mono.depth, self.settings.hanging_limit)
+            maps = fuse(
+                mono.depth, geometric, tau_c=self.settings.tau_c, variant=self.settings.variant, hanging=hanging
+            )
+        recorded = None if stereo is None else {k: v for k, v in stereo.record.items() if k != "checksum"}
+        return ViewPrior(replace(maps, colors=image), mono.refused, mono.alignment, recorded)
+
+    def _aligned(self, name: str, frame: Frame, geometric: np.ndarray) -> AlignedMap:
+        """The monocular map in world units, where there is one and its scale can be known."""
+        nothing = np.zeros_like(geometric)
+        if self.mono is None:
+            return AlignedMap(nothing, refused="" if geometric.any() else NO_GEOMETRY)
+        prediction = self.mono.map(name, frame)
+        if prediction is None:
+            return AlignedMap(nothing, refused=NO_MAP)
+        if self.geometric is None and self.mono.kind == "relative":
+            return AlignedMap(nothing, refused=SCALE_UNKNOWN)
+        alignment = self._fit(prediction, geometric, self.mono.kind)
+        if not alignment.accepted:
+            return AlignedMap(nothing, alignment, alignment.status.value)
+        anchors = geometric[geometric > 0]
+        z_far = self.settings.z_far_factor * float(np.percentile(anchors, 99.5)) if anchors.size else np.inf
+        depth = aligned_depth(prediction, alignment, z_far)
+        if self.settings.variant != "dual_unaligned":
+            depth = corrected_depth(depth, geometric, self.settings.align)
+        return AlignedMap(depth, alignment)
+
+    def _fit(self, prediction: np.ndarray, geometric: np.ndarray, kind: MonoKind) -> Alignment:
+        """The alignment; a metric map is taken as it is where there is no geometric depth to fit it to."""
+        if self.geometric is None or self.settings.variant == "dual_unaligned":
+            return not_aligned(kind)
+        return align(prediction, geometric, kind=kind, settings=self.settings.align)

@@ -1,0 +1,98 @@
+"""Where monocular maps come from: a network, whose predictions are cached, or maps that lie beside the pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from d2_plugin.captures.capture import Capture, MonoKind
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.files import EntryFolder
+from d2_plugin.priors.frame import Frame, digest, hash_of
+from d2_plugin.priors.monocular.network import MonocularModel, upsample
+from d2_plugin.priors.settings import PriorSettings
+
+MONO_VERSION = 1  # raise it when prediction changes what it returns, so that caches are not trusted
+
+
+class MonoSource(Protocol):
+    """Where monocular maps come from."""
+
+    kind: MonoKind
+    about: str
+
+    def key(self, camera: str, frame: Frame) -> str:
+        """Hash of everything the map depends on."""
+
+    def map(self, camera: str, frame: Frame) -> np.ndarray | None:
+        """The map float32 [H, W] at the picture's size, or None where there is none."""
+
+
+class MapsOnDisk:
+    """Monocular maps that lie beside the pictures of a capture; `kind` says what they are."""
+
+    def __init__(self, capture: Capture, kind: MonoKind) -> None:
+        self.capture, self.kind = capture, kind
+        self.about = f"{kind} maps on disk" + (" (emulated)" if capture.mono_emulated else "")
+
+    def key(self, camera: str, frame: Frame) -> str:
+        """Hash of the map itself."""
+        stored = self.capture.mono(camera, frame.number)
+        return "none" if stored is None else digest(stored)
+
+    def map(self, camera: str, frame: Frame) -> np.ndarray | None:
+        """The stored map, enlarged to the picture."""
+        stored = self.capture.mono(camera, frame.number)
+        return None if stored is None else upsample(stored, *frame.images[camera].shape[:2])
+
+
+class MapsFromNetwork:
+    """Predictions of an ONNX network, cached at the network's output size."""
+
+    def __init__(self, model: MonocularModel, cache: Path) -> None:
+        self.model, self.kind, self.entries = model, model.kind, EntryFolder(cache)
+        self.about = f"{model.kind} maps of {model.path.name} on {model.provider}, preprocessing {model.preprocessing}"
+        self._fingerprint = model.fingerprint()
+
+    def key(self, camera: str, frame: Frame) -> str:
+        """Hash of network and picture."""
+        return hash_of(MONO_VERSION, self._fingerprint, frame.hashes[camera])
+
+    def map(self, camera: str, frame: Frame) -> np.ndarray:
+        """The prediction, computed once."""
+        key = self.key(camera, frame)
+        entry = self.entries.find_current(camera, frame.number, key)
+        if entry is None:
+            prediction = self.model.predict(frame.images[camera])
+            self.entries.write(camera, frame.number, prediction, {"key": key, "about": self.about})
+        else:
+            prediction = entry.array()
+        return upsample(prediction, *frame.images[camera].shape[:2])
+
+
+def mono_source(capture: Capture, settings: PriorSettings, cache: Path) -> MonoSource | None:
+    """The monocular source that settings and capture name, or None where there is none.
+
+    Raises:
+        D2Error: a network without a declared kind, or a declared kind that contradicts the capture's.
+    """
+    if settings.mono_onnx:
+        if settings.mono_kind is None:
+            raise D2Error(
+                f"what {settings.mono_onnx} predicts is not declared: say mono_kind = relative (inverse depth, as most "
+                "Depth Anything V2 models) or metric"
+            )
+        model = MonocularModel(
+            settings.mono_onnx, settings.mono_kind, settings.mono_preprocessing, settings.mono_threads
+        )
+        return MapsFromNetwork(model, cache)
+    if capture.mono_kind is None:
+        return None
+    if settings.mono_kind not in (None, capture.mono_kind):
+        raise D2Error(
+            f"mono_kind = {settings.mono_kind} but the maps of {capture.name} are declared {capture.mono_kind}: "
+            "leave mono_kind out, or correct cameras.json"
+        )
+    return MapsOnDisk(capture, capture.mono_kind)
