@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from d2_plugin.captures import Capture, open_capture, select_cameras, select_frames
 from d2_plugin.captures.calibration import pinhole
-from d2_plugin.captures.export.colmap import quaternion
 from d2_plugin.captures.export.export import export_capture
 from d2_plugin.captures.export.n3dv import sorted_names
 from d2_plugin.captures.export.ply import PointCloud
-from d2_plugin.captures.readers.colmap_model import read_model, read_points, rotation_of_quaternion
+from d2_plugin.captures.readers.colmap_model import read_model, read_points
+from d2_plugin.captures.rotations import quaternion_of_rotation, rotation_of_quaternion
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.export_capture import main
 from d2_plugin.errors import D2Error
@@ -154,7 +154,7 @@ def test_initial_points_are_those_given(original: Capture, tmp_path: Path) -> No
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3))
 def test_quaternions_lose_nothing_at_any_angle(components: list[float]) -> None:
     rotation = rotation_of_quaternion(np.array(components))
-    np.testing.assert_allclose(rotation_of_quaternion(quaternion(rotation)), rotation, atol=1e-12)
+    np.testing.assert_allclose(rotation_of_quaternion(quaternion_of_rotation(rotation)), rotation, atol=1e-12)
 
 
 @pytest.mark.parametrize("layout", ["n3dv", "multipleview"])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from d2_plugin.captures import open_capture
-from d2_plugin.captures.export.colmap import quaternion
 from d2_plugin.captures.pictures import write_png
+from d2_plugin.captures.rotations import quaternion_of_rotation
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 
@@ -97,7 +97,7 @@ def test_a_capture_written_in_the_layout_reads_back(tmp_path: Path) -> None:
     lines = []
     for number, camera in enumerate(original.cameras.values()):
         K, T = camera.K, camera.T_camera_world
-        numbers = [K[0, 0], K[0, 2], K[1, 2], K[1, 1] / K[0, 0], 0.0, *quaternion(T[:3, :3]), *T[:3, 3]]
+        numbers = [K[0, 0], K[0, 2], K[1, 2], K[1, 1] / K[0, 0], 0.0, *quaternion_of_rotation(T[:3, :3]), *T[:3, 3]]
         lines.append(" ".join(f"{value:.17g}" for value in numbers))
         for frame in original.frames:
             write_png(tmp_path / f"scene_undist_{frame:05d}_{number:02d}.png", original.image(camera.name, frame))

@@ -18,6 +18,7 @@ from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import FrameFiles, common_frames, numbered_files
 from d2_plugin.captures.lens import Lens, opencv_lens
 from d2_plugin.captures.pictures import opencv, picture_size
+from d2_plugin.captures.rotations import rotation_of_vector
 from d2_plugin.errors import D2Error, unknown_name
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
@@ -148,15 +149,6 @@ def _pose(name: str, extrinsics: OpencvYaml) -> np.ndarray:
     if rotation is None:
         raise D2Error(f"{where} has neither R_{name} nor Rot_{name}: add the rotation of camera {name}")
     return rigid(_shaped(rotation, (3, 3), f"Rot_{name}", where), translation)
-
-
-def rotation_of_vector(vector: np.ndarray) -> np.ndarray:
-    """Rotation [3, 3] about `vector` [3] by its length in radians (Rodrigues)."""
-    angle = np.linalg.norm(vector)
-    x, y, z = vector
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    # sin(a) / a and (1 - cos(a)) / a^2, finite at a = 0; np.sinc(x) is sin(pi x) / (pi x).
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * (cross @ cross)
 
 
 def _shaped(matrix: np.ndarray | None, shape: tuple[int, ...], key: str, where: str) -> np.ndarray:

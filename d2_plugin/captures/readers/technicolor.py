@@ -23,7 +23,7 @@ from d2_plugin.captures.files import FrameFiles, cameras_with_pictures, common_f
 from d2_plugin.captures.lens import Lens
 from d2_plugin.captures.naming import Shot, by_camera
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES, picture_size
-from d2_plugin.captures.readers.colmap_model import rotation_of_quaternion
+from d2_plugin.captures.rotations import rotation_of_quaternion
 from d2_plugin.errors import D2Error
 
 PARAMETERS = "cameras_parameters.txt"
@@ -93,17 +93,18 @@ def _rows(path: Path) -> dict[str, np.ndarray]:
 def _pictures(path: Path) -> tuple[dict[str, FrameFiles], str]:
     """Files by camera and frame, and the scene's name in lower case."""
     folder = path / "images" if (path / "images").is_dir() else path
-    found, scenes = {}, set()
+    shots: dict[str, Shot] = {}
+    files: dict[str, Path] = {}
+    scenes: set[str] = set()
     for file in sorted(folder.iterdir()):
         match = _NAME.match(file.stem) if file.suffix.lower() in PICTURE_SUFFIXES else None
         if match:
-            found[file.name] = (Shot(f"{int(match['camera']):02d}", int(match["frame"])), file)
+            shots[file.name], files[file.name] = Shot(f"{int(match['camera']):02d}", int(match["frame"])), file
             scenes.add(match["scene"].lower())
-    if not found:
+    if not files:
         raise D2Error(f"no pictures in {folder}: expected names like Birthday_undist_00151_00.png")
     if len(scenes) > 1:
         raise D2Error(f"{folder} holds pictures of several scenes ({', '.join(sorted(scenes))}): give one folder each")
-    shots, files = ({name: pair[place] for name, pair in found.items()} for place in (0, 1))
     return by_camera(shots, files), scenes.pop()
 
 
