@@ -105,6 +105,50 @@ def test_rows_and_cameras_must_agree_in_number(tmp_path: Path) -> None:
         open_capture(tmp_path)
 
 
+def n3dv_scene(folder: Path, rows: int, cameras: tuple[int, ...]) -> Path:
+    """Rows whose camera stands at x = row number, and one frame of each camera."""
+    table = np.stack([ROW] * rows)
+    table[:, 3] = np.arange(rows)
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "poses_bounds.npy", table)
+    for camera in cameras:
+        (folder / f"cam{camera:02d}").mkdir()
+        write_png(folder / f"cam{camera:02d}" / "0000.png", np.zeros((6, 8, 3), np.uint8))
+    return folder
+
+
+def test_a_camera_without_pictures_is_left_out_only_when_asked(tmp_path: Path) -> None:
+    path = n3dv_scene(tmp_path / "scene", 3, (0, 5, 9))
+    (path / "cam05" / "0000.png").unlink()
+    with pytest.raises(D2Error, match=r"camera cam05 of .*poses_bounds\.npy has no picture"):
+        open_capture(path)
+    capture = open_capture(path, intersect=True)
+    assert {name: camera.centre[0] for name, camera in capture.cameras.items()} == pytest.approx(
+        {"cam00": 0, "cam09": 2},
+        abs=1e-6,  # each keeps its own row
+    )
+    assert "left out, pictures missing: cam05" in capture.notes
+    with pytest.raises(D2Error, match="camera cam05 .* has no picture"):
+        open_capture(path, intersect=True, cameras=["cam05"])
+
+
+def test_of_the_whole_rig_a_few_cameras_are_enough_when_asked(tmp_path: Path) -> None:
+    path = n3dv_scene(tmp_path / "scene", 21, (0, 13, 20))
+    with pytest.raises(D2Error, match="21 rows for 3 cameras"):
+        open_capture(path)
+    capture = open_capture(path, intersect=True)
+    assert {name: camera.centre[0] for name, camera in capture.cameras.items()} == pytest.approx(
+        {"cam00": 0, "cam13": 13, "cam20": 20}, abs=1e-6
+    )
+    assert any("18 of 21 cameras are not there" in note for note in capture.notes)
+
+
+def test_rows_that_no_camera_can_be_told_for_are_refused_even_when_asked(tmp_path: Path) -> None:
+    path = n3dv_scene(tmp_path / "scene", 18, (0, 13, 17))  # a scene that lacks cameras: row 13 may be cam15's
+    with pytest.raises(D2Error, match="18 rows for 3 cameras"):
+        open_capture(path, intersect=True)
+
+
 def test_the_unsynchronised_camera_of_coffee_martini_is_named(tmp_path: Path) -> None:
     scene = tmp_path / "coffee_martini"
     for name in ("cam00", "cam13"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +60,17 @@ def test_the_principal_point_is_not_the_centre_and_fy_is_scaled(tmp_path: Path) 
     assert camera.near_far == (1.75, 10.0)
     half = open_capture(tmp_path / "Birthday", downscale=2).cameras["01"]
     np.testing.assert_allclose(half.K[:2, 2], [8.625, 3.25])
+
+
+def test_pictures_of_a_camera_without_calibration_are_left_out_only_when_asked(tmp_path: Path) -> None:
+    path = rig(tmp_path / "Train", scene="Train")
+    shutil.copy(next(path.glob("*_00.png")), path / "Train_undist_00151_07.png")
+    with pytest.raises(D2Error, match=r"camera 07 has pictures but is not in .*cameras_parameters\.txt, which has 00"):
+        open_capture(path)
+    capture = open_capture(path, intersect=True)
+    assert "07" not in capture.cameras
+    assert "left out, calibration missing: 07" in capture.notes
+    assert list(open_capture(path, cameras=["01"]).cameras) == ["01"]
 
 
 def test_the_distorted_release_is_undistorted_on_load(tmp_path: Path) -> None:

@@ -66,11 +66,16 @@ class OpencvYaml:
         return float(node.real()) if node.isReal() or node.isInt() else None
 
 
-def open_enerf(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = True) -> Capture:
+def is_enerf(path: Path) -> bool:
+    """Whether `path` looks like the layout of EasyMocap and EasyVolcap."""
+    return (path / INTRINSICS).is_file()
+
+
+def open_enerf(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Capture:
     """Read the layout of EasyMocap and EasyVolcap; of the pictures only headers are opened.
 
-    The published files name cameras of which only some have a pose or pictures: the others are always left out, with
-    a note. A camera that is asked for by name must have all three.
+    The published files name cameras of which only some have a pose or pictures: the others are left out with a note,
+    whatever `intersect` says. A camera that is asked for by name must have all three.
     """
     intrinsics, extrinsics = OpencvYaml(path / INTRINSICS), OpencvYaml(path / EXTRINSICS)
     folders = {folder.name: folder for folder in sorted((path / "images").glob("*")) if folder.is_dir()}
