@@ -20,7 +20,7 @@ from d2_plugin.priors.geometry import check_depth_range
 from d2_plugin.priors.monocular.agree import with_agreement
 from d2_plugin.priors.monocular.align import Alignment, align, aligned_depth, not_aligned
 from d2_plugin.priors.monocular.correct import corrected_depth
-from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.priors.settings import NO_MATCHER, PriorSettings
 from d2_plugin.priors.sources import (
     Frame,
     GeometricSource,
@@ -43,7 +43,7 @@ SHOWN = {"verified": "verified", "agreed": "agreed", "mono only": "mono", "confl
 
 NO_GEOMETRY = "no geometric depth survived the filter"
 NO_MAP = "there is no monocular map of this frame"
-SCALE_UNKNOWN = "one camera and a relative monocular map: its scale cannot be known"
+SCALE_UNKNOWN = "a relative monocular map without geometric depth: its scale cannot be known"
 
 Progress = Callable[[int, int, str], None]
 """(pictures done, pictures in all, what was just done)."""
@@ -152,16 +152,17 @@ class _Builder:
         self.cameras = [capture.cameras[name] for name in names]
         self.mono = None if settings.variant == "mvs" else mono_source(capture, settings, output / "cache" / "mono")
         recorded = recorded_depth(capture, names, settings.stereo)
+        matched = len(names) > 1 and settings.stereo.maker != NO_MATCHER
         self.bounds: DepthBounds | None = None
         self.geometric: GeometricSource | None = None
         if recorded is not None:
             self.notes.append(f"geometric depth: {recorded.about}")
             self.bounds = _chosen_bounds(settings)
-        elif len(names) > 1:
+        elif matched:
             self.bounds = _chosen_bounds(settings) or _rounded(
                 depth_bounds(self.cameras, points, settings.stereo.max_angle)
             )
-        if recorded is not None or len(names) > 1:
+        if recorded is not None or matched:
             folder = output / "cache" / "stereo"
             self.geometric = GeometricSource(
                 self.cameras, self.bounds, settings.stereo, folder, capture.frames, self.read, recorded
@@ -179,11 +180,18 @@ class _Builder:
             return "mvs"
         if self.mono is None:
             raise D2Error(
-                f"{self.capture.name} with one camera has no depth source: give a metric monocular network, or a "
-                "second camera"
+                f"{self.capture.name} has no depth source ({self._lacking}): give a metric monocular network, or "
+                "cameras that see the same"
             )
-        self.notes.append("one camera: no geometric depth, so nothing is verified and nothing can prune or supervise")
+        self.notes.append(
+            f"{self._lacking}: no geometric depth, so nothing is verified and nothing can prune or supervise"
+        )
         return wanted
+
+    @property
+    def _lacking(self) -> str:
+        """Why there is no geometric depth."""
+        return "one camera" if len(self.names) == 1 else "nothing matched"
 
     def read(self, number: int) -> Frame:
         """The pictures of one frame."""
@@ -219,7 +227,8 @@ class _Builder:
 
     @property
     def _agrees(self) -> bool:
-        return self.settings.agreement > 0 and self.variant == "dual" and len(self.names) > 1
+        several = self.geometric is not None and len(self.names) > 1
+        return self.settings.agreement > 0 and self.variant == "dual" and several
 
     def _key(self, name: str, frame: Frame) -> str:
         return hash_of(

@@ -9,6 +9,9 @@ from typing import Any
 from d2_plugin.captures.capture import MonoKind
 from d2_plugin.errors import D2Error, unknown_name
 
+NO_MATCHER = "none"
+"""What `StereoSettings.maker` says where nothing is matched."""
+
 
 @dataclass(frozen=True)
 class StereoSettings:
@@ -16,8 +19,9 @@ class StereoSettings:
 
     maker: str = "auto"
     """Matchers: `patchmatch` (compiled), `sweep` (OpenCV), `colmap` (needs CUDA). Depth that lies on disk: `workspace`
-    (COLMAP's), `sensor`. `auto` takes the first there is of sensor (of every camera), workspace, colmap, patchmatch,
-    sweep. Measured on eight rigs of 2 to 4 views: F of patchmatch is above the sweep's on each, narrow pairs too."""
+    (COLMAP's), `sensor`. `none` matches nothing and reads nothing. `auto` takes the first there is of sensor (of every
+    camera), workspace, colmap, patchmatch, sweep. Measured on eight rigs of 2 to 4 views: F of patchmatch is above the
+    sweep's on each, narrow pairs too."""
     folder: str = ""
     """Where the depth on disk lies, relative to the capture; `{frame}` (as in `mvs/{frame:05d}`) stands for the frame
     number. Where empty: `depth` for `sensor`, `colmap/FRAME`, `colmap` or `dense` for `workspace`."""
