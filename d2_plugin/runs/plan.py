@@ -43,7 +43,7 @@ class ScenePlan:
     """The decisions for one capture and its training cameras."""
 
     measured: tuple[Decision, ...]
-    """Taken by measurement: temporal, sensor, stereo."""
+    """Taken by measurement: temporal, sensor (where one lies beside the pictures), stereo."""
     mono_source: str | None = None
     """Where monocular depth comes from, or None where there is none."""
     mono_kind: MonoKind | None = None
@@ -54,8 +54,8 @@ class ScenePlan:
         return (*self.measured, *self._following())
 
     def uses(self, name: str) -> bool:
-        """Whether the named part is used."""
-        return next(d.use for d in self.decisions if d.name == name)
+        """Whether the named part is used; a part that there is no question of is not."""
+        return any(d.use for d in self.decisions if d.name == name)
 
     @property
     def geometric(self) -> bool:
@@ -141,23 +141,21 @@ def _temporal(capture: Capture, cameras: Sequence[str]) -> Decision:
 
 def _geometric(
     capture: Capture, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None
-) -> tuple[Decision, Decision]:
+) -> tuple[Decision, ...]:
     """Sensor and stereo: depth that lies on disk is taken before anything is matched."""
     recorded = recorded_depth(capture, cameras, settings.stereo)
-    if recorded is None:
-        return Decision("sensor", False, _no_sensor(capture, settings)), _stereo(capture, cameras, settings, points)
-    if recorded.maker == SensorDepth.maker:
+    if recorded is not None and recorded.maker == SensorDepth.maker:
         reason = "a sensor measured the depth: nothing is matched"
         instead = 'the sensor is taken first: choose a matcher, such as stereo.maker = "patchmatch" in [priors]'
         return Decision("sensor", True, recorded.about), Decision("stereo", False, reason, instead)
-    return Decision("sensor", False, _no_sensor(capture, settings)), Decision("stereo", True, recorded.about)
-
-
-def _no_sensor(capture: Capture, settings: PriorSettings) -> str:
+    if recorded is not None:
+        return (Decision("stereo", True, recorded.about),)
+    stereo = _stereo(capture, cameras, settings, points)
     folder = settings.stereo.folder or "depth"
     if capture.path is None or not (capture.path / folder / "depth.json").is_file():
-        return f"no {folder}/depth.json beside the pictures"
-    return f"{folder}/ does not serve every training camera, or the settings choose another source"
+        return (stereo,)
+    reason = f"{folder}/ does not serve every training camera, or the settings name another source"
+    return Decision("sensor", False, reason), stereo
 
 
 def _stereo(capture: Capture, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None) -> Decision:
