@@ -1,7 +1,7 @@
 """Which camera and which frame a picture shows, told from its name, for data sets that list pictures one by one.
 
-Three habits are understood: CAMERA/FRAME.png, CAMERA_FRAME.png, and one picture per camera. Leading folders `images`
-and `.` mean nothing, and so does a folder `images` inside a camera's.
+Three habits are understood: CAMERA/FRAME.png, CAMERA_FRAME.png, and one picture per camera. Folders called `images` or
+`.` say nothing about the camera, wherever they stand.
 """
 
 from __future__ import annotations

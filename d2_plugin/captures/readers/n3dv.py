@@ -30,10 +30,10 @@ N3DV_FPS = 30.0
 """Frame rate of the data set, where no video says it."""
 
 UNSYNCHRONISED = {"coffee_martini": ("cam13",)}
-"""Cameras of the data set whose video runs beside the others' time (MixVoxels and K-Planes leave them out)."""
+"""Cameras whose video is not synchronised with the others. MixVoxels and K-Planes leave them out, too."""
 
 RIG_SIZE = 21
-"""Cameras of the data set's rig, cam00 to cam20; scenes with fewer rows lack cameras that their rows do not name."""
+"""Cameras of the rig, cam00 to cam20. Scenes with fewer rows lack cameras, and their rows do not say which."""
 
 _NUMBERED_NAME = re.compile(r"cam(\d+)$")
 _EXTRACTED_NAME = re.compile(r"(?P<camera>.+)_\d+$")

@@ -35,8 +35,8 @@ TECHNICOLOR_FPS = 30.0
 DAMAGED = {
     "birthday": {("09", 12): 13, ("09", 173): 172, ("02", 255): 254},
 }
-"""Pictures of the data set that cannot be decoded, by scene, camera and frame, and the frame that stands in for each
-(as public loaders of it do)."""
+"""Pictures of the data set that cannot be decoded, by scene, camera and frame, and the frame that stands in for each.
+Public loaders of the data set do the same."""
 
 NEAR_FAR = {
     "painter": (1.75, 10.0),
