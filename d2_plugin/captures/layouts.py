@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from d2_plugin.captures import selection
 from d2_plugin.captures.capture import Capture
 from d2_plugin.captures.readers.colmap import is_colmap, open_colmap
 from d2_plugin.captures.readers.enerf import is_enerf, open_enerf
@@ -15,6 +14,8 @@ from d2_plugin.captures.readers.folder import CALIBRATION, is_folder, open_folde
 from d2_plugin.captures.readers.n3dv import is_n3dv, open_n3dv
 from d2_plugin.captures.readers.technicolor import is_technicolor, open_technicolor
 from d2_plugin.captures.readers.transforms_json import is_transforms, open_transforms
+from d2_plugin.captures.selection import downscale as downscaled
+from d2_plugin.captures.selection import select_frames
 from d2_plugin.errors import D2Error, unknown_name
 
 Reader = Callable[[Path, tuple[str, ...] | None, bool], Capture]
@@ -72,8 +73,8 @@ def open_capture(
         raise D2Error(f"camera names '{', '.join(names)}' are empty or repeated: name each camera once")
     capture = replace(LAYOUTS[layout].open(folder, names, intersect), layout=layout)
     if frames is not None:
-        capture = selection.select_frames(capture, frames)
-    return selection.downscale(capture, downscale)
+        capture = select_frames(capture, frames)
+    return downscaled(capture, downscale)
 
 
 def _recognised(folder: Path) -> str:
