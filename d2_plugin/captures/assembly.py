@@ -27,8 +27,8 @@ from d2_plugin.errors import D2Error
 
 log = logging.getLogger(__name__)
 
-BLACK_TOLD = 1e-3
-"""Larger shares of an undistorted picture that were not recorded are told."""
+BLACK_NOTED = 1e-3
+"""A note says how much of an undistorted picture is black where it is more than this share."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,10 @@ def _lens_notes(bent: Mapping[str, Lens], cameras: Mapping[str, Camera]) -> tupl
         return ()
     shares = {name: black_share(lens, cameras[name]) for name, lens in bent.items()}
     worst = max(shares, key=lambda name: shares[name])
-    black = f", up to {shares[worst]:.1%} of a picture ({worst}) is black by it" if shares[worst] > BLACK_TOLD else ""
-    return (f"distortion of {', '.join(bent)} is undone when a picture is read{black}",)
+    note = f"lens distortion of {', '.join(bent)} is undone when a picture is read"
+    if shares[worst] > BLACK_NOTED:
+        note += f"; where nothing was recorded a picture is black: up to {shares[worst]:.1%} ({worst})"
+    return (note,)
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -122,25 +124,49 @@ def _maps(folder: Path, names: list[str], suffix: str) -> dict[str, FrameFiles]:
 def _mono_description(path: Path) -> tuple[MonoKind, bool, tuple[str, ...]]:
     """(kind, emulated, notes) of the maps in mono/."""
     declared = path / "mono" / "mono.json"
-    if not declared.exists():
-        return "relative", *_emulated_by_source(path)
-    content = read_json(declared)
-    kind, emulated = content.get("kind", "relative"), content.get("emulated", False)
+    content = read_json(declared) if declared.exists() else {}
+    kind = content.get("kind", "relative")
+    if "emulated" not in content:
+        emulated, notes = _emulated_by_text(path)
+    else:
+        emulated, notes = content["emulated"], ("monocular maps are emulated, not predicted",)
     if kind not in get_args(MonoKind) or not isinstance(emulated, bool):
         raise D2Error(
             f"{declared} says kind {kind!r} and emulated {emulated!r}: "
             "expected 'relative' or 'metric', and true or false"
         )
-    return kind, emulated, ("monocular maps are emulated, not predicted",) if emulated else ()
+    return kind, emulated, notes if emulated else ()
 
 
-def _emulated_by_source(path: Path) -> tuple[bool, tuple[str, ...]]:
-    """Captures without mono.json that own up to emulated maps in their SOURCE.txt must not pass for predictions."""
+def _emulated_by_text(path: Path) -> tuple[bool, tuple[str, ...]]:
+    """Whether SOURCE.txt, or `mono` in cameras.json, says in words that the maps are emulated; and the note.
+
+    Such maps must not pass for predictions because mono.json is missing.
+    """
+    for file, said in (("SOURCE.txt", _words_of_source(path)), ("cameras.json", _words_of_calibration(path))):
+        if any(_EMULATED.search(words) for words in said):
+            return True, (f"monocular maps are emulated, not predicted ({file} says so)",)
+    return False, ()
+
+
+_EMULATED = re.compile(r"(?<!\bnot )\bemulated\b", re.IGNORECASE)
+
+
+def _words_of_source(path: Path) -> list[str]:
+    """What follows the word `mono` in each line of SOURCE.txt."""
     source = path / "SOURCE.txt"
-    text = source.read_text(errors="replace") if source.exists() else ""
-    if re.search(r"\bmono\b[^\n]*\bEMULATED\b", text, re.IGNORECASE) is None:
-        return False, ()
-    return True, ("monocular maps are emulated, not predicted (SOURCE.txt says so)",)
+    text = source.read_text(errors="replace") if source.is_file() else ""
+    return re.findall(r"\bmono\b(.*)", text, re.IGNORECASE)
+
+
+def _words_of_calibration(path: Path) -> list[str]:
+    """`mono` in cameras.json, where there is such a file; another program's file of that name says nothing."""
+    try:
+        content = json.loads((path / "cameras.json").read_text())
+    except (OSError, ValueError):
+        return []
+    said = content.get("mono") if isinstance(content, dict) else None
+    return [said] if isinstance(said, str) else []
 
 
 def _load_array(path: Path, key: str | None) -> np.ndarray:

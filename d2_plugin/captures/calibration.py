@@ -7,6 +7,9 @@ import numpy as np
 from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import D2Error
 
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From OpenGL's camera axes (y up, z backward) to OpenCV's (y down, z forward), and back."""
+
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R R^T - I that still counts as rounding in a text file."""
 

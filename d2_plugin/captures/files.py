@@ -54,9 +54,16 @@ def cameras_with_pictures(
 ) -> tuple[list[str], tuple[str, ...]]:
     """(cameras to read, notes) of those that `where` describes; those that are `asked` for, or all.
 
-    Cameras without pictures are refused by name, or left out with a note where `intersect` and nothing was asked for.
+    Where nothing was asked for, cameras without pictures and pictures of cameras that `where` does not describe are
+    refused by name, or left out with a note where `intersect`. A camera that is asked for must have both.
     """
     known = list(calibrated)
+    unknown = [name for name in pictured if name not in known] if asked is None else []
+    if unknown and not intersect:
+        raise D2Error(
+            f"camera {', '.join(unknown)} has pictures but is not in {where}, which has {', '.join(known)}: add its "
+            "calibration or choose the cameras to read"
+        )
     names = known if asked is None else list(asked)
     for name in names:
         if name not in known:
@@ -66,5 +73,6 @@ def cameras_with_pictures(
         raise D2Error(
             f"camera {', '.join(missing)} of {where} has no picture: add its pictures or choose the cameras to read"
         )
-    notes = (f"left out, pictures missing: {', '.join(missing)}",) if missing else ()
+    left_out = {"pictures": missing, "calibration": unknown}
+    notes = tuple(f"left out, {what} missing: {', '.join(cameras)}" for what, cameras in left_out.items() if cameras)
     return [name for name in names if name in pictured], notes

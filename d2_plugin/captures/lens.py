@@ -25,10 +25,10 @@ KEPT_MAPS = 8
 """Cameras whose resampling map stays in memory (6 bytes per pixel each)."""
 
 COVERAGE_STEP = 8
-"""Every this many pixels one is looked at to tell how much of a picture is black."""
+"""Steps in pixels, across and down, at which it is measured how much of a picture is black."""
 
 NEVER = 1e-12
-"""A fold at 1 / a^2 below this lies a million times as far out as the focal length: nowhere."""
+"""A fold counts as none where 1 / a^2 is below this: it lies a million focal lengths away from the centre."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Which camera and which frame a picture shows, told from its name, for data sets that list pictures one by one.
 
-Three habits are understood: CAMERA/FRAME.png, CAMERA_FRAME.png, and one picture per camera. Leading folders `images`
-and `.` mean nothing, and so does a folder `images` inside a camera's.
+Three habits are understood: CAMERA/FRAME.png, CAMERA_FRAME.png, and one picture per camera. Folders called `images` or
+`.` say nothing about the camera, wherever they stand.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ def arrange(names: Iterable[str], still: Callable[[list[str]], bool]) -> tuple[d
     as in a still scene photographed by one moving camera, every picture is a camera of its own at frame 0 and the
     reading is None.
     """
-    names = list(names)
+    names = list(dict.fromkeys(names))
     for reading in (in_folders, by_prefix):
-        shots = {name: reading(name) for name in names}
-        if all(shots.values()) and all(still(group) for group in _by_camera_name(shots)):
+        shots = {name: shot for name in names if (shot := reading(name)) is not None}
+        if len(shots) == len(names) and all(still(group) for group in _by_camera_name(shots)):
             return shots, reading
     return one_instant(names), None
 

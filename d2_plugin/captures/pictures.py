@@ -18,12 +18,16 @@ _PNG_RGBA = 6  # colour type in the header's byte 25
 _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0..15 without DHT, JPG, DAC
 
 
-def opencv(purpose: str) -> ModuleType:
-    """The module cv2, or the error that says how to install it for `purpose`."""
+def opencv(purpose: str, extra: str = "image") -> ModuleType:
+    """The module cv2; `purpose` completes the sentence "<purpose> needs OpenCV".
+
+    Raises:
+        MissingExtra: where it is not installed; the sentence names `extra`, the extra of this package that brings it.
+    """
     try:
         import cv2
     except ImportError:
-        raise missing_extra("OpenCV", "image", purpose) from None
+        raise missing_extra("OpenCV", extra, purpose) from None
     return cv2
 
 

@@ -1,8 +1,8 @@
 """Which cameras to train on with two, three or four views, and which frames are compared, by data set.
 
 The paper's own camera lists are in a supplement that is not public, and no public code holds lists for two or three
-views. Those here are this project's, but for N3DV's four views, which are 4C4D's. Each data set has one order: more
-views are fewer views and one camera more, so that scores over the number of views compare like with like.
+views. N3DV's four views are those of 4C4D; the other lists are this project's choice. Each data set has one order:
+three views are the two views and one camera more, so scores over the number of views compare like with like.
 
     preset:4          four views of the data set that the capture is recognised as
     preset:n3dv:4     four views by the order of N3DV, whatever the capture is

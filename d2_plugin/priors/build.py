@@ -20,6 +20,7 @@ from d2_plugin.priors.settings import PriorSettings, Variant
 from d2_plugin.priors.stereo.cache import DepthCache, GeometricSource
 from d2_plugin.priors.stereo.depth_range import DepthBounds, depth_bounds
 from d2_plugin.priors.stereo.match import MatchedDepth, frame_blocks
+from d2_plugin.priors.stereo.settings import NO_MATCHER
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.priors.summary import PriorSummary
 
@@ -90,14 +91,14 @@ class _Builder:
         self.store = PriorStore.create(output, names, capture.frames, {"capture": capture.name})
 
     def _geometric_source(self, points: np.ndarray | None, matches: Path) -> GeometricSource | None:
-        """Depth on disk where there is any, else matching, or None with one camera alone; sets the depth range."""
+        """Depth on disk where there is any, else matching, or None where nothing is matched; sets the depth range."""
         stereo, cameras = self.settings.stereo, list(self.cameras.values())
         found = find_depth_on_disk(self.capture, self.names, stereo)
         if found is not None:
             self.notes.append(f"geometric depth: {found.about}")
             self.bounds = _chosen_bounds(self.settings)
             return FilteredDepthOnDisk(found, cameras, self.bounds, stereo)
-        if len(cameras) == 1:
+        if len(cameras) == 1 or stereo.matcher == NO_MATCHER:
             return None
         self.bounds = _chosen_bounds(self.settings) or _rounded(depth_bounds(cameras, points, stereo.max_angle))
         return MatchedDepth(cameras, self.bounds, stereo, matches, self.capture.frames, self.read)
@@ -113,11 +114,18 @@ class _Builder:
             return "mvs"
         if self.mono is None:
             raise D2Error(
-                f"{self.capture.name} with one camera has no depth source: give a metric monocular network, or a "
-                "second camera"
+                f"{self.capture.name} has no depth source ({self._lacking}): give a metric monocular network, or "
+                "cameras that see the same"
             )
-        self.notes.append("one camera: no geometric depth, so nothing is verified and nothing can prune or supervise")
+        self.notes.append(
+            f"{self._lacking}: no geometric depth, so nothing is verified and nothing can prune or supervise"
+        )
         return wanted
+
+    @property
+    def _lacking(self) -> str:
+        """Why there is no geometric depth."""
+        return "one camera" if len(self.names) == 1 else "nothing matched"
 
     def read(self, number: int) -> Frame:
         """The pictures of one frame."""

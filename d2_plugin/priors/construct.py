@@ -25,7 +25,7 @@ CONSTRUCTION_VERSION = 3  # raise it when alignment or fusion change what they r
 
 NO_GEOMETRY = "no geometric depth survived the filter"
 NO_MAP = "there is no monocular map of this frame"
-SCALE_UNKNOWN = "one camera and a relative monocular map: its scale cannot be known"
+SCALE_UNKNOWN = "a relative monocular map without geometric depth: its scale cannot be known"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,8 @@ class Construction:
         settings: PriorSettings,
     ) -> None:
         self.cameras, self.mono, self.geometric, self.settings = cameras, mono, geometric, settings
-        self.agrees = settings.agreement > 0 and settings.variant == "dual" and len(cameras) > 1
+        several = geometric is not None and len(cameras) > 1
+        self.agrees = settings.agreement > 0 and settings.variant == "dual" and several
 
     def priors(self, frame: Frame, wanted: Sequence[str]) -> dict[str, ViewPrior]:
         """D* of the wanted cameras of one frame; cameras that must agree need each other's, and all come back."""

@@ -4,17 +4,9 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from d2_plugin.errors import missing_extra
+from d2_plugin.captures.pictures import opencv as cv2_for
 
 
 def opencv(purpose: str) -> ModuleType:
-    """The `cv2` module; `purpose` completes the sentence "<purpose> needs OpenCV".
-
-    Raises:
-        MissingExtra: where it is not installed.
-    """
-    try:
-        import cv2
-    except ImportError:
-        raise missing_extra("OpenCV", "stereo", purpose) from None
-    return cv2
+    """The `cv2` module for `purpose` (see `pictures.opencv`), as the extra `stereo` brings it."""
+    return cv2_for(purpose, extra="stereo")

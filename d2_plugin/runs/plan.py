@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from d2_plugin.captures import Capture
+from d2_plugin.captures import Capture, MonoKind
+from d2_plugin.captures.readers.colmap_model import find_model, read_points
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.depth_on_disk import SensorDepth, find_depth_on_disk
+from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.priors.stereo.settings import NO_MATCHER
+from d2_plugin.runs.overlap import Overlap, measure_overlap, measure_texture
 
 CHANGED = 12 / 255
 """A pixel has changed when any channel differs by more than this (three times the noise of 8-bit compressed video)."""
 
 MOVING_SHARE = 1e-3
 """A camera sees motion when more than this share of its pixels has changed."""
+
+MIN_OVERLAP = 0.02
+"""Cameras overlap when at least one of them shares more than this part of its picture with another."""
+
+MIN_TEXTURE = 0.02
+"""Pictures have texture when at least one camera finds it in more than this part of them."""
 
 
 @dataclass(frozen=True)
@@ -23,36 +35,99 @@ class Decision:
     name: str
     use: bool
     reason: str
+    impossible: str = ""
+    """Why the other way cannot be taken; empty where it can."""
 
 
 @dataclass(frozen=True)
 class ScenePlan:
     """The decisions for one capture and its training cameras."""
 
-    decisions: tuple[Decision, ...]
+    measured: tuple[Decision, ...]
+    """Taken by measurement: temporal, sensor (where one lies beside the pictures), stereo."""
+    mono_source: str | None = None
+    """Where monocular depth comes from, or None where there is none."""
+    mono_kind: MonoKind | None = None
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        """All decisions: those measured, and those that follow from them."""
+        return (*self.measured, *self._following())
 
     def uses(self, name: str) -> bool:
-        """Whether the named part is used."""
-        return next(d.use for d in self.decisions if d.name == name)
+        """Whether the named part is used; a part that there is no question of is not."""
+        return any(d.use for d in self.decisions if d.name == name)
+
+    @property
+    def geometric(self) -> bool:
+        """Whether there is geometric depth, matched or measured."""
+        return any(d.use for d in self.measured if d.name in ("sensor", "stereo"))
 
     def as_dict(self) -> dict[str, dict[str, object]]:
         """For metrics.json."""
         return {d.name: {"use": d.use, "reason": d.reason} for d in self.decisions}
 
     def override(self, **choices: bool | None) -> ScenePlan:
-        """The same plan with some decisions taken by the user; None leaves a decision alone."""
-        return ScenePlan(tuple(_overridden(d, choices.get(d.name)) for d in self.decisions))
+        """The same plan with some of the measured decisions taken by the user; None leaves a decision alone.
+
+        Raises:
+            D2Error: what is asked for cannot be, such as stereo with one camera.
+        """
+        return replace(self, measured=tuple(_overridden(d, choices.get(d.name)) for d in self.measured))
+
+    def obeyed_by(self, settings: PriorSettings) -> PriorSettings:
+        """The settings of the prior builder that do what the plan says: without stereo nothing is matched."""
+        if self.geometric:
+            return settings
+        return replace(settings, stereo=replace(settings.stereo, matcher=NO_MATCHER))
+
+    def _following(self) -> tuple[Decision, Decision]:
+        mono = Decision("monocular", self.mono_source is not None, self.mono_source or "no maps on disk and no network")
+        if mono.use and self.mono_kind == "relative" and not self.geometric:
+            mono = replace(mono, use=False, reason=f"{mono.reason}: no geometric depth tells their scale")
+        both = self.geometric and mono.use
+        reason = "two depth sources check each other" if both else "there is one depth source at most"
+        return mono, Decision("verification", both, reason)
 
 
-def plan_scene(capture: Capture, cameras: Sequence[str], mono_source: str | None) -> ScenePlan:
-    """Decide for `capture` trained with `cameras`; `mono_source` says where monocular depth comes from, if anywhere."""
-    stereo = _stereo(capture, cameras)
-    mono = Decision("monocular", mono_source is not None, mono_source or "no maps on disk and no ONNX model given")
-    both = stereo.use and mono.use
-    verification = Decision(
-        "verification", both, "two depth sources check each other" if both else "there is one depth source at most"
-    )
-    return ScenePlan((_temporal(capture, cameras), stereo, mono, verification))
+def plan_scene(
+    capture: Capture,
+    cameras: Sequence[str],
+    mono_source: str | None,
+    settings: PriorSettings | None = None,
+    points: np.ndarray | None = None,
+) -> ScenePlan:
+    """Decide for `capture` trained with `cameras`.
+
+    Args:
+        capture: the recording.
+        cameras: names of the training cameras.
+        mono_source: says where monocular depth comes from; None where there is none.
+        settings: of the prior builder; its stereo's angles and texture decide what can be matched.
+        points: surface points [P, 3], world; those of the capture's own COLMAP model where None.
+    """
+    settings = settings or PriorSettings()
+    kind = settings.mono_kind if settings.mono_onnx else capture.mono_kind
+    decisions = (_temporal(capture, cameras), *_geometric(capture, cameras, settings, points))
+    return ScenePlan(decisions, mono_source, kind)
+
+
+def plan_text(capture: Capture, train_cameras: Sequence[str], plan: ScenePlan) -> str:
+    """What a capture is and what is decided for it, one line each: what `d2 plan` prints."""
+    sizes = sorted({(camera.width, camera.height) for camera in capture.cameras.values()})
+    first, last = capture.frames[0], capture.frames[-1]
+    about = {
+        "layout": capture.layout,
+        "cameras": f"{len(capture.cameras)} ({' '.join(capture.cameras)}); training on {' '.join(train_cameras)}",
+        "frames": f"{len(capture.frames)} ({first} to {last}) at {capture.fps:g} per second"
+        if len(capture.frames) > 1
+        else f"1 ({first})",
+        "pictures": ", ".join(f"{width}x{height}" for width, height in sizes) + " pixels",
+    }
+    lines = [f"{name:>9}  {said}" for name, said in about.items()]
+    lines += [f"{'note':>9}  {note}" for note in capture.notes]
+    lines += [f"{'use' if d.use else 'leave out':>9}  {d.name:12} {d.reason}" for d in plan.decisions]
+    return "\n".join(lines)
 
 
 def _temporal(capture: Capture, cameras: Sequence[str]) -> Decision:
@@ -65,13 +140,54 @@ def _temporal(capture: Capture, cameras: Sequence[str]) -> Decision:
     )
 
 
-def _stereo(capture: Capture, cameras: Sequence[str]) -> Decision:
+def _geometric(
+    capture: Capture, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None
+) -> tuple[Decision, ...]:
+    """Sensor and stereo: depth that lies on disk is taken before anything is matched."""
+    found = find_depth_on_disk(capture, cameras, settings.stereo)
+    if found is not None and found.name == SensorDepth.name:
+        reason = "a sensor measured the depth: nothing is matched"
+        instead = 'the sensor is taken first: choose a matcher, such as stereo.matcher = "patchmatch" in [priors]'
+        return Decision("sensor", True, found.about), Decision("stereo", False, reason, instead)
+    if found is not None:
+        return (Decision("stereo", True, found.about),)
+    stereo = _stereo(capture, cameras, settings, points)
+    folder = settings.stereo.folder or "depth"
+    if capture.path is None or not (capture.path / folder / "depth.json").is_file():
+        return (stereo,)
+    reason = f"{folder}/ does not serve every training camera, or the settings name another source"
+    return Decision("sensor", False, reason), stereo
+
+
+def _stereo(capture: Capture, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None) -> Decision:
     if len(cameras) < 2:
-        return Decision("stereo", False, "one training camera")
-    centres = np.stack([capture.cameras[name].centre for name in cameras])
-    if np.ptp(centres, axis=0).max() == 0:
-        return Decision("stereo", False, "all training cameras stand at one point")
-    return Decision("stereo", True, f"{len(cameras)} training cameras")
+        return Decision("stereo", False, "one training camera", "it takes a second training camera")
+    if settings.stereo.matcher == NO_MATCHER:
+        return Decision("stereo", False, "the settings of the priors say so", "the settings of the priors rule it out")
+    calibrations = [capture.cameras[name] for name in cameras]
+    if np.ptp(np.stack([camera.centre for camera in calibrations]), axis=0).max() == 0:
+        return Decision("stereo", False, "all training cameras stand at one point", "it takes cameras that stand apart")
+    points = _own_points(capture) if points is None else points
+    seen = measure_overlap(calibrations, settings.stereo, depth_range=settings.depth_range, points=points)
+    texture = measure_texture(capture, cameras, settings.stereo)
+    overlap, textured = max(seen.shares) > MIN_OVERLAP, max(texture) > MIN_TEXTURE
+    lacking = "" if overlap and textured else f"no {'texture' if overlap else 'overlap'}: "
+    figures = f"{len(cameras)} training cameras, {_in_words(seen)}, {np.mean(texture):.0%} textured"
+    return Decision("stereo", overlap and textured, lacking + figures)
+
+
+def _in_words(seen: Overlap) -> str:
+    share = f"{np.mean(seen.shares):.0%} of each picture seen by another"
+    angles = sorted({round(angle) for angle in seen.angles})
+    apart = f", {angles[0]} to {angles[-1]} degrees apart" if len(angles) > 1 else ""
+    apart = f", {angles[0]} degrees apart" if len(angles) == 1 else apart
+    return f"{share}{apart}" if seen.depth_known else f"at most {share} (depths unknown){apart}"
+
+
+def _own_points(capture: Capture) -> np.ndarray | None:
+    """The sparse points of a capture that is a COLMAP model, [P, 3], or None."""
+    model = find_model(capture.path) if capture.layout == "colmap" and capture.path is not None else None
+    return None if model is None else read_points(model).positions
 
 
 def changed_share(capture: Capture, camera: str, samples: int = 5) -> float:
@@ -88,4 +204,7 @@ def changed_share(capture: Capture, camera: str, samples: int = 5) -> float:
 def _overridden(decision: Decision, choice: bool | None) -> Decision:
     if choice is None or choice == decision.use:
         return decision
-    return Decision(decision.name, choice, f"overridden by the user (measured: {decision.reason})")
+    if decision.impossible:
+        choice_said = str(choice).lower()
+        raise D2Error(f"[plan] {decision.name} = {choice_said}, but {decision.reason}: {decision.impossible}")
+    return replace(decision, use=choice, reason=f"overridden by the user (measured: {decision.reason})")

@@ -20,9 +20,9 @@ from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.provenance import circumstances
-from d2_plugin.runs.start import Extent, TrainingFrames, initial_points, make_view, scene_extent, triangulated_points
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config, prior_settings
+from d2_plugin.runs.start import Extent, TrainingFrames, initial_points, make_view, scene_extent, triangulated_points
 
 RENDERED_ALPHA = 0.5
 """A rendered depth is reported where the accumulated alpha exceeds this."""
@@ -236,7 +236,7 @@ def build_priors_for(
     (`scheduler` or `workers`) hands the frames to dask.distributed instead.
     """
     with progress_bar("priors", len(scene.capture.frames) * len(scene.train_cameras)) as bar:
-        what = (scene.capture, scene.train_cameras, folder, prior_settings(settings))
+        what = (scene.capture, scene.train_cameras, folder, scene.plan.obeyed_by(prior_settings(settings)))
         how = {"sparse_points": points, "progress": lambda done, total, note="": bar.update(done, note)}
         if cluster is not None:
             from d2_plugin.priors.dask_build import build_priors_on_cluster

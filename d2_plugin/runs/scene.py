@@ -8,7 +8,7 @@ from pathlib import Path
 from d2_plugin.captures import Capture, open_capture
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.runs.plan import ScenePlan, plan_scene
-from d2_plugin.runs.settings import RunSettings
+from d2_plugin.runs.settings import RunSettings, prior_settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class Scene:
         """Open the capture that `settings` name, split its cameras, and measure what it needs."""
         capture = open_capture(settings.capture, frames=settings.frames, downscale=settings.downscale)
         train, test = _split(capture, settings)
-        plan = plan_scene(capture, train, _mono_source(capture, settings))
+        plan = plan_scene(capture, train, _mono_source(capture, settings), prior_settings(settings))
         return cls(capture, train, test, plan.override(**settings.overrides.get("plan", {})))
 
 

@@ -17,8 +17,8 @@ from d2_plugin.priors.settings import PriorSettings
 HOOK_NAMES = ("prior", "densify", "prune", "depth_loss")
 TABLES = ("backbone", "d2", "densify", "prune", "depth_loss", "priors", "plan")
 """What a configuration file may hold."""
-OVERRIDABLE = ("temporal",)
-"""Decisions of the plan that `[plan]` may take; the others follow from the cameras and depth sources that are given."""
+OVERRIDABLE = ("temporal", "stereo")
+"""Decisions of the plan that `[plan]` may take; the others follow from them and from the depth sources."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from stand_in_captures import five_cameras
 
 from d2_plugin.captures import open_capture
 from d2_plugin.captures.capture import Capture
@@ -69,14 +70,14 @@ def test_the_unsynchronised_camera_is_neither_trained_on_nor_scored() -> None:
     assert any("cam13 missing or unsynchronised: the next in order" in note for note in split.notes)
 
 
-def test_a_real_capture_of_five_cameras_has_a_preset(shared_data) -> None:
-    capture = open_capture(shared_data("n3dv_sear_steak_t0"))  # read as a folder, an N3DV scene by its names
+def test_a_capture_of_five_cameras_has_a_preset(tmp_path: Path) -> None:
+    capture = open_capture(five_cameras(tmp_path / "scene"))  # read as a folder, an N3DV scene by its names
     split = camera_preset(capture, "preset:4")
     assert (split.train, split.test) == (("cam03", "cam05", "cam08", "cam14"), ("cam00",))
     assert any("cam01, cam13, cam10, cam20 missing" in note for note in split.notes)
 
 
-def test_a_data_set_can_be_named(shared_data) -> None:
+def test_a_data_set_can_be_named() -> None:
     capture = capture_of("folder", NAMES["technicolor"])
     assert camera_preset(capture, "preset:technicolor:2").train == ("00", "15")
     with pytest.raises(D2Error, match="none of the data sets with presets .*preset:n3dv:4"):
@@ -99,8 +100,8 @@ def test_too_few_known_cameras_are_refused() -> None:
         camera_preset(capture_of("n3dv", ("cam00", "cam01", "cam02")), "preset:3")
 
 
-def test_a_run_is_given_names_in_place_of_a_preset(shared_data) -> None:
-    path = shared_data("n3dv_sear_steak_t0")
+def test_a_run_is_given_names_in_place_of_a_preset(tmp_path: Path) -> None:
+    path = five_cameras(tmp_path / "scene")
     train, test, notes = resolve_cameras(path, ("preset:2",))
     assert (train, test) == (("cam03", "cam14"), ("cam00", "cam05", "cam08"))
     assert notes

@@ -9,7 +9,7 @@ import pytest
 
 from d2_plugin.captures import open_capture
 from d2_plugin.captures.pictures import write_png
-from d2_plugin.captures.readers.enerf import rotation_of_vector
+from d2_plugin.captures.rotations import rotation_of_vector
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 

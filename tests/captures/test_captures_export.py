@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from stand_in_captures import smooth_capture
 
 from d2_plugin.captures import Capture, open_capture, select_cameras, select_frames
 from d2_plugin.captures.calibration import pinhole
-from d2_plugin.captures.export.colmap import quaternion
 from d2_plugin.captures.export.export import export_capture
+from d2_plugin.captures.export.folder import save_capture
 from d2_plugin.captures.export.n3dv import sorted_names
 from d2_plugin.captures.export.ply import PointCloud
-from d2_plugin.captures.readers.colmap_model import read_model, read_points, rotation_of_quaternion
+from d2_plugin.captures.readers.colmap_model import read_model, read_points
+from d2_plugin.captures.rotations import quaternion_of_rotation, rotation_of_quaternion
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.export_capture import main
 from d2_plugin.errors import D2Error
@@ -68,12 +70,13 @@ def test_uneven_cameras_read_back_the_same(uneven: Capture, layout: str, tmp_pat
 
 
 @pytest.mark.parametrize("layout", ["transforms", "n3dv", "colmap"])
-def test_studio_reads_back_the_same(shared_data, layout: str, tmp_path: Path) -> None:
-    studio = select_cameras(select_frames(open_capture(shared_data("studio")), (0, 5)), ("01", "00", "02"))
-    folder = export_capture(studio, layout, tmp_path / layout, test_cameras=("01",), cloud=CLOUD)
+def test_cameras_named_by_digits_in_any_order_read_back_the_same(layout: str, tmp_path: Path) -> None:
+    whole = smooth_capture(("00", "01", "02", "03"), frames=6, width=32, height=24)
+    chosen = select_cameras(select_frames(whole, (0, 5)), ("01", "00", "02"))
+    folder = export_capture(chosen, layout, tmp_path / layout, test_cameras=("01",), cloud=CLOUD)
     back, names = open_capture(folder), names_of(folder)
-    assert_same_cameras(back, studio, names)
-    np.testing.assert_array_equal(back.image(names["02"], 5), studio.image("02", 5))
+    assert_same_cameras(back, chosen, names)
+    np.testing.assert_array_equal(back.image(names["02"], 5), chosen.image("02", 5))
 
 
 def test_a_centred_camera_is_told_by_its_angle_alone(original: Capture, tmp_path: Path) -> None:
@@ -154,7 +157,7 @@ def test_initial_points_are_those_given(original: Capture, tmp_path: Path) -> No
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 1e-3))
 def test_quaternions_lose_nothing_at_any_angle(components: list[float]) -> None:
     rotation = rotation_of_quaternion(np.array(components))
-    np.testing.assert_allclose(rotation_of_quaternion(quaternion(rotation)), rotation, atol=1e-12)
+    np.testing.assert_allclose(rotation_of_quaternion(quaternion_of_rotation(rotation)), rotation, atol=1e-12)
 
 
 @pytest.mark.parametrize("layout", ["n3dv", "multipleview"])
@@ -176,8 +179,9 @@ def test_mistakes_are_one_sentence(original: Capture, tmp_path: Path) -> None:
         export_capture(original, "colmap", tmp_path / "full")
 
 
-def test_the_command_writes_points_and_says_where(shared_data, tmp_path: Path, capsys) -> None:
-    command = f"{shared_data('studio')} --format transforms --output {tmp_path / 'scene'} --train-cameras 00,02"
+def test_the_command_writes_points_and_says_where(tmp_path: Path, capsys) -> None:
+    source = save_capture(smooth_capture(("00", "01", "02", "03"), frames=3), tmp_path / "source")
+    command = f"{source} --format transforms --output {tmp_path / 'scene'} --train-cameras 00,02"
     main([*command.split(), "--test-cameras", "01", "--frames", "0:1", "--downscale", "4", "--points", "50"])
     assert f"in {tmp_path / 'scene'} (transforms)" in capsys.readouterr().out
     content = json.loads((tmp_path / "scene" / "export.json").read_text())

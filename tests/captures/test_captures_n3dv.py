@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stand_in_captures import smooth_capture, write_videos
 
 from d2_plugin.captures import open_capture
+from d2_plugin.captures.export.folder import save_capture
 from d2_plugin.captures.pictures import write_png
 from d2_plugin.captures.readers.n3dv import camera_from_row
 from d2_plugin.captures.video import SKIP_LIMIT, VideoSource
@@ -20,6 +22,12 @@ ROW = np.array(
      -.1008565, -.0343765, -.9943069, -.2155790, 1462.0671309, 8.5598926, 19.8132412]
 )  # fmt: skip
 """The real row of camera cam00 of sear_steak."""
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A video of 20 frames."""
+    return write_videos(smooth_capture(("00",)), tmp_path_factory.mktemp("videos")) / "cam00.mp4"
 
 
 def test_a_real_row_becomes_the_opencv_camera_it_describes() -> None:
@@ -105,6 +113,50 @@ def test_rows_and_cameras_must_agree_in_number(tmp_path: Path) -> None:
         open_capture(tmp_path)
 
 
+def n3dv_scene(folder: Path, rows: int, cameras: tuple[int, ...]) -> Path:
+    """Rows whose camera stands at x = row number, and one frame of each camera."""
+    table = np.stack([ROW] * rows)
+    table[:, 3] = np.arange(rows)
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "poses_bounds.npy", table)
+    for camera in cameras:
+        (folder / f"cam{camera:02d}").mkdir()
+        write_png(folder / f"cam{camera:02d}" / "0000.png", np.zeros((6, 8, 3), np.uint8))
+    return folder
+
+
+def test_a_camera_without_pictures_is_left_out_only_when_asked(tmp_path: Path) -> None:
+    path = n3dv_scene(tmp_path / "scene", 3, (0, 5, 9))
+    (path / "cam05" / "0000.png").unlink()
+    with pytest.raises(D2Error, match=r"camera cam05 of .*poses_bounds\.npy has no picture"):
+        open_capture(path)
+    capture = open_capture(path, intersect=True)
+    assert {name: camera.centre[0] for name, camera in capture.cameras.items()} == pytest.approx(
+        {"cam00": 0, "cam09": 2},
+        abs=1e-6,  # each keeps its own row
+    )
+    assert "left out, pictures missing: cam05" in capture.notes
+    with pytest.raises(D2Error, match="camera cam05 .* has no picture"):
+        open_capture(path, intersect=True, cameras=["cam05"])
+
+
+def test_of_the_whole_rig_a_few_cameras_are_enough_when_asked(tmp_path: Path) -> None:
+    path = n3dv_scene(tmp_path / "scene", 21, (0, 13, 20))
+    with pytest.raises(D2Error, match="21 rows for 3 cameras"):
+        open_capture(path)
+    capture = open_capture(path, intersect=True)
+    assert {name: camera.centre[0] for name, camera in capture.cameras.items()} == pytest.approx(
+        {"cam00": 0, "cam13": 13, "cam20": 20}, abs=1e-6
+    )
+    assert any("18 of 21 cameras are not there" in note for note in capture.notes)
+
+
+def test_rows_that_no_camera_can_be_told_for_are_refused_even_when_asked(tmp_path: Path) -> None:
+    path = n3dv_scene(tmp_path / "scene", 18, (0, 13, 17))  # a scene that lacks cameras: row 13 may be cam15's
+    with pytest.raises(D2Error, match="18 rows for 3 cameras"):
+        open_capture(path, intersect=True)
+
+
 def test_the_unsynchronised_camera_of_coffee_martini_is_named(tmp_path: Path) -> None:
     scene = tmp_path / "coffee_martini"
     for name in ("cam00", "cam13"):
@@ -121,9 +173,10 @@ def test_a_file_that_is_no_video_is_refused(tmp_path: Path, capfd: pytest.Captur
         open_capture(tmp_path)
 
 
-def test_studio_has_the_same_cameras_in_both_layouts(shared_data) -> None:
-    folder = open_capture(shared_data("studio"))
-    videos = open_capture(shared_data("studio"), layout="n3dv")
+def test_a_capture_has_the_same_cameras_in_both_layouts(tmp_path: Path) -> None:
+    path = write_videos(recorded := smooth_capture(("00", "05")), save_capture(recorded, tmp_path / "scene"))
+    folder = open_capture(path)
+    videos = open_capture(path, layout="n3dv")
     assert list(videos.cameras) == [f"cam{name}" for name in folder.cameras]
     assert (videos.frames, videos.fps) == (folder.frames, folder.fps)
     for ours, theirs in zip(folder.cameras.values(), videos.cameras.values()):
@@ -139,17 +192,16 @@ def test_studio_has_the_same_cameras_in_both_layouts(shared_data) -> None:
         assert int(np.argmin(others)) == frame
 
 
-def test_videos_give_the_same_frame_in_any_order(shared_data) -> None:
-    path = shared_data("studio") / "cam00.mp4"
-    in_order = VideoSource({"a": path})
+def test_videos_give_the_same_frame_in_any_order(video: Path) -> None:
+    in_order = VideoSource({"a": video})
     expected = [in_order.image("a", frame) for frame in range(20)]
-    jumping = VideoSource({"a": path})
+    jumping = VideoSource({"a": video})
     for frame in (7, 3, 19, 0, 12, 12, 5, 6, 17):
         np.testing.assert_array_equal(jumping.image("a", frame), expected[frame])
 
 
-def test_reading_in_order_never_seeks(shared_data, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = VideoSource({"a": shared_data("studio") / "cam00.mp4"})
+def test_reading_in_order_never_seeks(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = VideoSource({"a": video})
     source.image("a", 0)
 
     class NoSeek:
@@ -168,18 +220,18 @@ def test_reading_in_order_never_seeks(shared_data, monkeypatch: pytest.MonkeyPat
         source.image("a", frame)
 
 
-def test_a_video_source_travels_to_another_process(shared_data) -> None:
-    source = VideoSource({"a": shared_data("studio") / "cam00.mp4"})
+def test_a_video_source_travels_to_another_process(video: Path) -> None:
+    source = VideoSource({"a": video})
     first = source.image("a", 4)
     again = pickle.loads(pickle.dumps(source))
     np.testing.assert_array_equal(again.image("a", 4), first)
 
 
-def test_a_frame_behind_the_end_of_a_video_is_refused(shared_data) -> None:
-    source = VideoSource({"a": shared_data("studio") / "cam00.mp4"})
+def test_a_frame_behind_the_end_of_a_video_is_refused(video: Path) -> None:
+    source = VideoSource({"a": video})
     with pytest.raises(D2Error, match=r"frame 400 of .*cam00\.mp4 cannot be decoded"):
         source.image("a", 400)
-    assert source.image("a", 2).shape == (180, 320, 3)
+    assert source.image("a", 2).shape == (64, 96, 3)
 
 
 def test_the_real_n3dv_rows_agree_with_its_folder_layout(shared_data) -> None:

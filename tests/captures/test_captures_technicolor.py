@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from d2_plugin.captures import open_capture
-from d2_plugin.captures.export.colmap import quaternion
 from d2_plugin.captures.pictures import write_png
+from d2_plugin.captures.rotations import quaternion_of_rotation
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 
@@ -61,6 +62,17 @@ def test_the_principal_point_is_not_the_centre_and_fy_is_scaled(tmp_path: Path) 
     np.testing.assert_allclose(half.K[:2, 2], [8.625, 3.25])
 
 
+def test_pictures_of_a_camera_without_calibration_are_left_out_only_when_asked(tmp_path: Path) -> None:
+    path = rig(tmp_path / "Train", scene="Train")
+    shutil.copy(next(path.glob("*_00.png")), path / "Train_undist_00151_07.png")
+    with pytest.raises(D2Error, match=r"camera 07 has pictures but is not in .*cameras_parameters\.txt, which has 00"):
+        open_capture(path)
+    capture = open_capture(path, intersect=True)
+    assert "07" not in capture.cameras
+    assert "left out, calibration missing: 07" in capture.notes
+    assert list(open_capture(path, cameras=["01"]).cameras) == ["01"]
+
+
 def test_the_distorted_release_is_undistorted_on_load(tmp_path: Path) -> None:
     pytest.importorskip("cv2")
     path = rig(tmp_path / "Train", scene="Train", tag="", line=f"{INTRINSICS} 0.4 0.05 {POSE}")
@@ -97,7 +109,7 @@ def test_a_capture_written_in_the_layout_reads_back(tmp_path: Path) -> None:
     lines = []
     for number, camera in enumerate(original.cameras.values()):
         K, T = camera.K, camera.T_camera_world
-        numbers = [K[0, 0], K[0, 2], K[1, 2], K[1, 1] / K[0, 0], 0.0, *quaternion(T[:3, :3]), *T[:3, 3]]
+        numbers = [K[0, 0], K[0, 2], K[1, 2], K[1, 1] / K[0, 0], 0.0, *quaternion_of_rotation(T[:3, :3]), *T[:3, 3]]
         lines.append(" ".join(f"{value:.17g}" for value in numbers))
         for frame in original.frames:
             write_png(tmp_path / f"scene_undist_{frame:05d}_{number:02d}.png", original.image(camera.name, frame))

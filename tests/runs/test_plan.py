@@ -2,11 +2,32 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
 import pytest
 
-from d2_plugin.captures import open_capture, select_frames
+from d2_plugin.captures import Camera, Capture, open_capture, select_frames
+from d2_plugin.captures.calibration import pinhole, rigid
+from d2_plugin.captures.export.export import export_capture
+from d2_plugin.captures.export.folder import save_capture
+from d2_plugin.captures.export.ply import PointCloud
+from d2_plugin.captures.rotations import rotation_of_vector
 from d2_plugin.captures.synthetic.room import synthetic_capture
-from d2_plugin.runs.plan import changed_share, plan_scene
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.settings import PriorSettings, StereoSettings
+from d2_plugin.priors.stereo import match
+from d2_plugin.priors.stereo.settings import NO_MATCHER
+from d2_plugin.priors.store import PriorStore
+from d2_plugin.protocol import Label
+from d2_plugin.runs.overlap import measure_overlap, measure_texture
+from d2_plugin.runs.plan import changed_share, plan_scene, plan_text
+from d2_plugin.runs.run import build_priors_for
+from d2_plugin.runs.scene import Scene
+from d2_plugin.runs.settings import RunSettings
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +71,203 @@ def test_a_user_may_decide_otherwise_and_the_plan_says_so(moving) -> None:
     assert "overridden by the user (measured: motion" in plan.as_dict()["temporal"]["reason"]
 
 
+def test_stereo_left_out_by_the_user_leaves_out_what_follows_from_it(moving) -> None:
+    plan = plan_scene(moving, ["train0", "train1"], "relative maps").override(stereo=False)
+    assert [plan.uses(name) for name in ("stereo", "verification", "monocular")] == [False] * 3
+    assert "no geometric depth tells their scale" in plan.as_dict()["monocular"]["reason"]
+    metric = plan_scene(replace(moving, mono_kind="metric"), ["train0", "train1"], "metric maps").override(stereo=False)
+    assert [metric.uses(name) for name in ("stereo", "verification", "monocular")] == [False, False, True]
+
+
+def test_what_cannot_be_is_not_overridden(moving) -> None:
+    with pytest.raises(D2Error, match=r"\[plan\] stereo = true, but one training camera: it takes a second"):
+        plan_scene(moving, ["train0"], None).override(stereo=True)
+    twice = replace(moving, cameras=dict.fromkeys(("train0", "train1"), moving.cameras["train0"]))
+    with pytest.raises(D2Error, match="all training cameras stand at one point: it takes cameras that stand apart"):
+        plan_scene(twice, ["train0", "train1"], None).override(stereo=True)
+
+
+def camera(name: str, x: float = 0.0, turn: float = 0.0, near_far: tuple[float, float] | None = None) -> Camera:
+    """At (x, 0, 0), turned to the right by `turn` degrees; 100 pixels wide, 53 degrees."""
+    rotation = rotation_of_vector(np.array([0, -np.deg2rad(turn), 0]))
+    T = rigid(rotation, -rotation @ [x, 0, 0])
+    return Camera(name, 100, 80, pinhole(100, 100, 50, 40), T, near_far)
+
+
+AT_TWO = (1.999, 2.001)
+
+
+def test_overlap_is_the_share_of_the_picture_that_another_camera_sees() -> None:
+    pair = [camera("a", near_far=AT_TWO), camera("b", 0.5, near_far=AT_TWO)]  # a shift by 25 of 100 pixels
+    found = measure_overlap(pair, StereoSettings())
+    assert found.depth_known
+    assert found.shares == pytest.approx((0.75, 0.75))
+    assert found.angles == pytest.approx((13.5, 13.5), abs=0.5)  # 14 in the middle, less towards the sides
+    assert measure_overlap(pair, StereoSettings(), depth_range=(0.999, 1.001)).shares == pytest.approx((0.5, 0.5))
+
+
+def test_angles_that_cannot_be_matched_are_no_overlap() -> None:
+    across = [camera("a", -2, 45, (2.8, 2.9)), camera("b", 2, -45, (2.8, 2.9))]  # both look at (0, 0, 2)
+    assert max(measure_overlap(across, StereoSettings()).shares) == 0
+    assert min(measure_overlap(across, StereoSettings(max_angle=120.0)).shares) > 0.3
+    still = [camera("a", near_far=AT_TWO), camera("b", 1e-3, near_far=AT_TWO)]
+    assert max(measure_overlap(still, StereoSettings()).shares) == 0
+
+
+def test_points_tell_the_depths_where_no_range_is_declared() -> None:
+    pair = [camera("a"), camera("b", 0.5)]
+    points = np.random.default_rng(0).uniform((-0.5, -0.5, 1.99), (1, 0.5, 2.01), (200, 3))
+    found = measure_overlap(pair, StereoSettings(), points=points)
+    assert found.depth_known
+    assert found.shares == pytest.approx((0.75, 0.75))
+    assert not measure_overlap(pair, StereoSettings(), points=points[:5]).depth_known
+
+
+def test_unknown_depths_give_the_most_that_could_be_seen() -> None:
+    found = measure_overlap([camera("a", 0, 10), camera("b", 0.5, -10)], StereoSettings())
+    assert not found.depth_known
+    assert min(found.shares) > 0.9  # from some depth on, each pixel lies in the other picture
+    assert found.angles == pytest.approx((20, 20))
+    apart = measure_overlap([camera("a", 0, -90), camera("b", 0.5, 90)], StereoSettings())
+    assert apart.shares == (0, 0)
+    assert apart.angles == ()
+
+
+def rig(capture: Capture, *cameras: Camera) -> Capture:
+    """The capture with other cameras for train0 and train1; its pictures stay."""
+    sized = [replace(c, width=96, height=54, K=pinhole(96, 96, 48, 27)) for c in cameras]
+    return replace(capture, cameras={name: replace(c, name=name) for name, c in zip(("train0", "train1"), sized)})
+
+
+def test_cameras_that_share_nothing_have_no_stereo_and_the_reason_says_how_little(moving) -> None:
+    apart = rig(moving, camera("a", 0, -90), camera("b", 0.5, 90))
+    plan = plan_scene(apart, ["train0", "train1"], "relative maps")
+    assert not plan.uses("stereo")
+    assert plan.as_dict()["stereo"]["reason"].startswith("no overlap: 2 training cameras, at most 0% of each picture")
+    assert not plan.uses("verification")
+    assert plan.override(stereo=True).uses("verification")
+
+
+class Plain:
+    """Pictures of one colour."""
+
+    def __init__(self, inner) -> None:
+        self.inner = inner
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        return np.full_like(self.inner.image(camera, frame), 90)
+
+    def __getattr__(self, name: str):
+        return getattr(self.inner, name)
+
+
+def test_pictures_without_texture_have_no_stereo_and_the_reason_says_so(moving) -> None:
+    plain = replace(moving, source=Plain(moving.source))
+    assert measure_texture(plain, ["train0"], StereoSettings()) == (0,)
+    plan = plan_scene(plain, ["train0", "train1"], "maps")
+    assert not plan.uses("stereo")
+    assert plan.as_dict()["stereo"]["reason"].startswith("no texture: 2 training cameras")
+    assert plan.as_dict()["stereo"]["reason"].endswith("0% textured")
+
+
+def test_the_reason_for_stereo_has_the_figures(moving) -> None:
+    cameras = (camera("a", near_far=AT_TWO), camera("b", 0.5, near_far=AT_TWO))
+    reason = plan_scene(rig(moving, *cameras), ["train0", "train1"], "maps").as_dict()["stereo"]["reason"]
+    texture = np.mean(measure_texture(moving, ["train0", "train1"], StereoSettings()))
+    expected = f"2 training cameras, 75% of each picture seen by another, 13 degrees apart, {texture:.0%} textured"
+    assert reason == expected.replace("13 degrees", f"{reason.split(', ')[2].split(' ')[0]} degrees")
+    assert texture > 0.5
+
+
+def test_a_colmap_model_brings_the_points_that_tell_the_depths(moving, tmp_path: Path) -> None:
+    undeclared = {name: replace(c, near_far=None) for name, c in moving.cameras.items()}
+    still = replace(select_frames(moving, [0]), cameras=undeclared)
+    depth, first = still.depth("train0", 0), still.cameras["train0"]
+    rows, columns = (values.ravel()[::37] for values in np.mgrid[:54, :96])
+    rays = np.stack([columns + 0.5, rows + 0.5, np.ones(rows.size)], -1) @ np.linalg.inv(first.K).T
+    points = (rays * depth[rows, columns, None] - first.T_camera_world[:3, 3]) @ first.T_camera_world[:3, :3]
+    cloud = PointCloud(points, np.full(points.shape, 0.5))
+    model = open_capture(export_capture(still, "colmap", tmp_path / "model", cloud=cloud))
+    names = ["train0", "train1"]
+    assert "depths unknown" not in plan_scene(model, names, None).as_dict()["stereo"]["reason"]
+    assert "depths unknown" in plan_scene(still, names, None).as_dict()["stereo"]["reason"]
+
+
+def with_sensor(capture: Capture, folder: Path, *cameras: str) -> Capture:
+    """The capture on disk, with depth of a sensor beside the pictures of `cameras`."""
+    path = save_capture(capture, folder / "scene")
+    shutil.rmtree(path / "depth")
+    for name in cameras:
+        (path / "depth" / name).mkdir(parents=True)
+        for frame in capture.frames:
+            np.save(path / "depth" / name / f"{frame:05d}.npy", capture.depth(name, frame))
+    (path / "depth" / "depth.json").write_text('{"unit": "m"}')
+    return open_capture(path)
+
+
+def test_a_sensor_is_the_geometric_source_of_one_camera(moving, tmp_path: Path) -> None:
+    plan = plan_scene(with_sensor(moving, tmp_path, "train0"), ["train0"], "relative maps")
+    assert plan.as_dict()["sensor"] == {"use": True, "reason": "sensor depth of train0 in depth/"}
+    assert [plan.uses(name) for name in ("stereo", "monocular", "verification")] == [False, True, True]
+    assert plan.obeyed_by(PriorSettings()) == PriorSettings()
+    with pytest.raises(D2Error, match=r"the sensor is taken first: choose a matcher"):
+        plan.override(stereo=True)
+
+
+def test_a_sensor_beside_one_of_two_cameras_leaves_stereo(moving, tmp_path: Path) -> None:
+    capture = with_sensor(moving, tmp_path, "train0")
+    plan = plan_scene(capture, ["train0", "train1"], None)
+    assert [plan.uses(name) for name in ("sensor", "stereo")] == [False, True]
+    assert "does not serve every training camera" in plan.as_dict()["sensor"]["reason"]
+    settings = PriorSettings(stereo=StereoSettings(matcher="sweep"))
+    assert plan_scene(capture, ["train0", "train1"], None, settings).uses("stereo")
+
+
+def test_no_stereo_reaches_the_priors(moving, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is matched, and monocular depth stands alone where its scale is known."""
+    apart = replace(select_frames(moving, [0, 1]), mono_kind="metric")
+    path = save_capture(rig(apart, camera("a", 0, -90), camera("b", 0.5, 90)), tmp_path / "scene")
+    for name in ("train0", "train1"):
+        for frame in (0, 1):
+            np.save(path / "mono" / name / f"{frame:05d}.npy", moving.depth(name, frame))
+    monkeypatch.setattr(match, "geometric_depth", lambda *_: pytest.fail("something was matched"))
+    settings = RunSettings(str(path), ("train0", "train1"))
+    scene = Scene.open(settings)
+    assert [scene.plan.uses(name) for name in ("stereo", "monocular", "verification")] == [False, True, False]
+    summary = build_priors_for(settings, scene, np.zeros((0, 3)), tmp_path / "priors")
+    assert any("nothing matched" in note for note in summary.notes)
+    prior = PriorStore.open(tmp_path / "priors").prior("train0", 0)
+    assert set(np.unique(prior.labels)) <= {Label.MONO, Label.EMPTY}
+    assert prior.support.numpy().mean() > 0.8
+
+
+def test_stereo_changes_no_setting_of_the_priors(moving) -> None:
+    plan = plan_scene(moving, ["train0", "train1"], "maps")
+    settings = PriorSettings(tau_c=0.2)
+    assert plan.obeyed_by(settings) is settings
+    assert plan.override(stereo=False).obeyed_by(settings).stereo == StereoSettings(matcher=NO_MATCHER)
+
+
+def test_the_text_of_a_plan_says_what_the_capture_is(moving, tmp_path: Path) -> None:
+    capture = open_capture(save_capture(moving, tmp_path / "scene"))
+    train = ["train0", "train1"]
+    lines = plan_text(capture, train, plan_scene(capture, train, "maps")).splitlines()
+    assert lines[:4] == [
+        "   layout  folder",
+        "  cameras  5 (train0 train1 train2 test0 test1); training on train0 train1",
+        "   frames  4 (0 to 3) at 12 per second",
+        " pictures  96x54 pixels",
+    ]
+    assert lines[4] == "     note  monocular maps are emulated, not predicted"
+    assert lines[5].startswith("      use  temporal     motion: up to")
+    assert json.dumps(plan_scene(capture, train, "maps").as_dict())
+
+
+def test_a_capture_of_one_instant_on_disk_has_no_temporal_dimension(moving, tmp_path: Path) -> None:
+    path = save_capture(select_frames(moving, [2]), tmp_path / "scene")
+    assert not plan_scene(open_capture(path), ["train0", "train1"], None).uses("temporal")
+
+
 def test_the_real_one_instant_capture_has_no_temporal_dimension(shared_data) -> None:
     capture = open_capture(shared_data("n3dv_sear_steak_t0"))
     assert not plan_scene(capture, ["cam03", "cam05"], None).uses("temporal")
@@ -58,3 +276,19 @@ def test_the_real_one_instant_capture_has_no_temporal_dimension(shared_data) -> 
 def test_the_real_moving_capture_has_one(shared_data) -> None:
     capture = open_capture(shared_data("pose2sim_single"), frames=[0, 20, 40])
     assert plan_scene(capture, ["cam01", "cam02"], None).uses("temporal")
+
+
+@pytest.mark.parametrize(
+    ("name", "cameras"),
+    [
+        ("studio", "00 02 05 07"),
+        ("plaza", "00 02 05 07"),
+        ("plaza", "02 05"),
+        ("n3dv_sear_steak_t0", "cam03 cam05 cam08 cam14"),
+        ("pose2sim_single", "cam01 cam02 cam03 cam04"),
+    ],
+)
+def test_the_real_captures_keep_stereo(shared_data, name: str, cameras: str) -> None:
+    plan = plan_scene(open_capture(shared_data(name)), cameras.split(), None)
+    assert plan.uses("stereo")
+    assert "textured" in plan.as_dict()["stereo"]["reason"]

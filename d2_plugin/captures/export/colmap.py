@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.export.export import Export, Names, refuse_off_centre
+from d2_plugin.captures.export.base import Export, Written, refuse_off_centre
 from d2_plugin.captures.export.n3dv import depth_bounds, llff_row
 from d2_plugin.captures.export.ply import PointCloud, color_bytes, write_point_cloud
 from d2_plugin.captures.pictures import opencv
+from d2_plugin.captures.rotations import quaternion_of_rotation
 from d2_plugin.errors import D2Error
 
 PINHOLE = 1
@@ -30,7 +31,7 @@ class _Picture(NamedTuple):
     camera: Camera
 
 
-def write_colmap(export: Export) -> Names:
+def write_colmap(export: Export) -> Written:
     """sparse/0/{cameras,images,points3D}.bin and images/CAMERA_FRAME.png; names are kept.
 
     COLMAP's models know no time, so the first frame alone is registered: a trainer of still scenes sees one instant,
@@ -46,10 +47,10 @@ def write_colmap(export: Export) -> Names:
     _write_model(export.folder / "sparse" / "0", pictures, export.cloud)
     if export.cloud is not None:
         write_point_cloud(export.folder / "sparse" / "0" / "points3D.ply", export.cloud)
-    return {name: name for name in capture.cameras}
+    return export.written()
 
 
-def write_multipleview(export: Export) -> Names:
+def write_multipleview(export: Export) -> Written:
     """4DGaussians' layout of own recordings: sparse_/, camNN/frame_NNNNN.jpg, points3D_multipleview.ply and
     poses_bounds_multipleview.npy.
 
@@ -71,7 +72,7 @@ def write_multipleview(export: Export) -> Names:
     rows = [llff_row(camera, depth_bounds(camera, export.cloud)) for camera in kept.values()]
     np.save(export.folder / "poses_bounds_multipleview.npy", np.stack(rows))
     write_point_cloud(export.folder / "points3D_multipleview.ply", export.cloud)
-    return names
+    return export.written(names, {frame: index + 1 for index, frame in enumerate(export.capture.frames)})
 
 
 def _write_model(folder: Path, pictures: list[_Picture], cloud: PointCloud | None) -> None:
@@ -93,7 +94,7 @@ def _camera_record(number: int, camera: Camera) -> bytes:
 
 def _image_record(identity: int, picture: _Picture) -> bytes:
     pose = picture.camera.T_camera_world
-    head = struct.pack("<I7dI", identity, *quaternion(pose[:3, :3]), *pose[:3, 3], picture.number)
+    head = struct.pack("<I7dI", identity, *quaternion_of_rotation(pose[:3, :3]), *pose[:3, 3], picture.number)
     return head + picture.name.encode() + b"\0" + struct.pack("<Q", 0)
 
 
@@ -104,22 +105,6 @@ def _point_records(cloud: PointCloud | None) -> bytes:
     rows = zip(np.asarray(cloud.positions, float).tolist(), colors)
     records = [struct.pack("<Q3d3BdQ", index + 1, *xyz, *rgb, 0.0, 0) for index, (xyz, rgb) in enumerate(rows)]
     return struct.pack("<Q", len(records)) + b"".join(records)
-
-
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion [4], w first and not negative, of the rotation nearest to `rotation` [3, 3].
-
-    It is the leading eigenvector of a symmetric matrix (Bar-Itzhack 2000), which loses no digits at any angle.
-    """
-    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)
-    symmetric = [
-        [a + e + i, h - f, c - g, d - b],
-        [h - f, a - e - i, b + d, c + g],
-        [c - g, b + d, e - a - i, f + h],
-        [d - b, c + g, f + h, i - a - e],
-    ]
-    found = np.linalg.eigh(np.array(symmetric))[1][:, -1]
-    return found if found[0] >= 0 else -found
 
 
 def _write_jpeg(path: Path, picture: np.ndarray) -> None:

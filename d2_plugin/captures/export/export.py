@@ -12,43 +12,29 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.captures.capture import Capture
+from d2_plugin.captures.export.base import Export, Written, empty_folder, refuse_skew
+from d2_plugin.captures.export.colmap import write_colmap, write_multipleview
+from d2_plugin.captures.export.n3dv import write_n3dv
 from d2_plugin.captures.export.ply import PointCloud
-from d2_plugin.captures.pictures import write_png
+from d2_plugin.captures.export.transforms_json import write_transforms
 from d2_plugin.errors import D2Error, unknown_name
 
 EXPORT_FILE = "export.json"
 """Written last: a folder without it is half an export."""
 
+Writer = Callable[[Export], Written]
 
-@dataclass(frozen=True)
-class Export:
-    """What a layout is written from: a capture, which of its cameras are held out, and where Gaussians start."""
-
-    capture: Capture
-    test_cameras: tuple[str, ...]
-    cloud: PointCloud | None
-    folder: Path
-
-    @property
-    def train_cameras(self) -> tuple[str, ...]:
-        """The cameras that are not held out, in the capture's order."""
-        return tuple(name for name in self.capture.cameras if name not in self.test_cameras)
-
-    def write_pictures(self, place: Callable[[str, int], Path]) -> None:
-        """Every frame of every camera as a lossless PNG at `place(camera, frame)`."""
-        for camera in self.capture.cameras:
-            for frame in self.capture.frames:
-                target = place(camera, frame)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                write_png(target, self.capture.image(camera, frame))
-
-
-Names = dict[str, str]
-"""Camera of the source -> camera of the export."""
+WRITERS: dict[str, Writer] = {
+    "transforms": write_transforms,
+    "n3dv": write_n3dv,
+    "multipleview": write_multipleview,
+    "colmap": write_colmap,
+}
+"""By the name of the layout. A new layout is one module beside this one and one row here."""
 
 
 def export_capture(
@@ -59,7 +45,7 @@ def export_capture(
     test_cameras: Sequence[str] = (),
     cloud: PointCloud | None = None,
 ) -> Path:
-    """Write `capture` under `path` in the layout `transforms`, `n3dv`, `multipleview` or `colmap`; returns the path.
+    """Write `capture` under `path` in one of the layouts of `WRITERS`; returns the path.
 
     Args:
         capture: cameras and frames to write; restrict it with `select_cameras`, `select_frames` and `downscale`.
@@ -71,39 +57,27 @@ def export_capture(
     Raises:
         D2Error: what the layout cannot hold (principal points, several focal lengths, skew), by camera.
     """
-    from d2_plugin.captures.export.colmap import write_colmap, write_multipleview
-    from d2_plugin.captures.export.n3dv import write_n3dv
-    from d2_plugin.captures.export.transforms_json import write_transforms
-
-    writers: dict[str, Callable[[Export], Names]] = {
-        "transforms": write_transforms,
-        "n3dv": write_n3dv,
-        "multipleview": write_multipleview,
-        "colmap": write_colmap,
-    }
-    if layout not in writers:
-        raise unknown_name("layout", layout, writers)
-    folder = _empty(Path(path))
-    export = Export(_without_skew(capture), _known(capture, test_cameras), cloud, folder)
-    names = writers[layout](export)
-    frames = {frame: number for number, frame in enumerate(capture.frames, 1)} if layout == "multipleview" else None
-    description = {"source": capture.name, "layout": layout, "cameras": names}
-    description["frames"] = frames or {frame: frame for frame in capture.frames}
-    description |= {"fps": capture.fps, "test_cameras": [names[name] for name in export.test_cameras if name in names]}
-    (folder / EXPORT_FILE).write_text(json.dumps(description, indent=1) + "\n")
+    if layout not in WRITERS:
+        raise unknown_name("layout", layout, WRITERS)
+    held_out = _known(capture, test_cameras)
+    for camera in capture.cameras.values():
+        refuse_skew(camera)
+    folder = empty_folder(path)
+    written = WRITERS[layout](Export(capture, held_out, cloud, folder))
+    described = json.dumps(_description(capture, layout, written, held_out), indent=1)
+    (folder / EXPORT_FILE).write_text(described + "\n")
     return folder
 
 
-def refuse_off_centre(camera: Camera, layout: str) -> None:
-    """Raise `D2Error` for a camera that one focal length and a centred principal point do not describe."""
-    fx, fy, cx, cy = (float(camera.K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    slack = 1e-6 * camera.width
-    if abs(fx - fy) > slack or abs(cx - camera.width / 2) > slack or abs(cy - camera.height / 2) > slack:
-        raise D2Error(
-            f"camera {camera.name} has fx {fx:g}, fy {fy:g} and principal point ({cx:g}, {cy:g}) but layout {layout} "
-            f"holds one focal length and the centre ({camera.width / 2:g}, {camera.height / 2:g}) only: "
-            "choose the layout transforms"
-        )
+def _description(capture: Capture, layout: str, written: Written, held_out: tuple[str, ...]) -> dict[str, Any]:
+    return {
+        "source": capture.name,
+        "layout": layout,
+        "cameras": written.cameras,
+        "frames": written.frames,
+        "fps": capture.fps,
+        "test_cameras": [written.cameras[name] for name in held_out if name in written.cameras],
+    }
 
 
 def _known(capture: Capture, test_cameras: Sequence[str]) -> tuple[str, ...]:
@@ -113,19 +87,3 @@ def _known(capture: Capture, test_cameras: Sequence[str]) -> tuple[str, ...]:
     if set(test_cameras) >= set(capture.cameras):
         raise D2Error(f"all cameras of {capture.name} are held out: leave at least one to train on")
     return tuple(test_cameras)
-
-
-def _without_skew(capture: Capture) -> Capture:
-    for camera in capture.cameras.values():
-        if camera.K[0, 1] != 0:
-            raise D2Error(
-                f"camera {camera.name} has skew {camera.K[0, 1]:g}, which no layout holds: undistort it first"
-            )
-    return capture
-
-
-def _empty(folder: Path) -> Path:
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise D2Error(f"{folder} already exists and is not empty: choose another folder, nothing was written")
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder

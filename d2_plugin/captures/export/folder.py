@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.captures.export.base import empty_folder, refuse_skew
 from d2_plugin.captures.pictures import write_png
-from d2_plugin.errors import D2Error
 
 
 def save_capture(capture: Capture, path: Path | str) -> Path:
@@ -18,10 +18,7 @@ def save_capture(capture: Capture, path: Path | str) -> Path:
 
     Pictures are lossless PNG; maps are float32. Raises `D2Error` where `path` already holds something.
     """
-    folder = Path(path)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise D2Error(f"{folder} already exists and is not empty: choose another folder, nothing was written")
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = empty_folder(path)
     description = json.dumps(_description(capture), indent=1)
     for camera in capture.cameras:
         for frame in capture.frames:
@@ -60,8 +57,7 @@ def _description(capture: Capture) -> dict[str, Any]:
 
 
 def _camera_entry(camera: Camera) -> dict[str, Any]:
-    if camera.K[0, 1] != 0:
-        raise D2Error(f"camera {camera.name} has skew {camera.K[0, 1]:g}, which the folder layout cannot hold")
+    refuse_skew(camera)
     fx, fy, cx, cy = (float(camera.K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
     rotation, translation = camera.T_camera_world[:3, :3].tolist(), camera.T_camera_world[:3, 3].tolist()
     size = {"width": camera.width, "height": camera.height}

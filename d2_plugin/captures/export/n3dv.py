@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.export.export import Export, Names, refuse_off_centre
+from d2_plugin.captures.export.base import Export, Names, Written, refuse_off_centre
 from d2_plugin.captures.export.ply import PointCloud, write_point_cloud
 from d2_plugin.errors import D2Error
 
@@ -23,7 +23,7 @@ READ_FRAMES = 24
 """Frames of each camera that Deformable-3D-Gaussians reads (scene/__init__.py), whatever there is."""
 
 
-def write_n3dv(export: Export) -> Names:
+def write_n3dv(export: Export) -> Written:
     """poses_bounds.npy, CAMERA/images/CAMERA_FRAME.png, frames/ with a link to each, and points3D.ply.
 
     A camera keeps its name where all begin with `cam` and the held-out one comes first in sorted order; a name of
@@ -47,7 +47,7 @@ def write_n3dv(export: Export) -> Names:
     np.save(export.folder / "poses_bounds.npy", np.stack([rows[name] for name in sorted(rows)]))
     if export.cloud is not None:
         write_point_cloud(export.folder / "points3D.ply", export.cloud)
-    return names
+    return export.written(names)
 
 
 def sorted_names(cameras: list[str], held_out: int) -> Names:

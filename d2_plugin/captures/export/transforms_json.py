@@ -8,15 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from d2_plugin.captures.calibration import OPENGL_TO_OPENCV
 from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.export.export import Export, Names
+from d2_plugin.captures.export.base import Export, Written
 from d2_plugin.captures.export.ply import write_point_cloud
 
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From OpenCV's camera axes (y down, z forward) to OpenGL's (y up, z back)."""
 
-
-def write_transforms(export: Export) -> Names:
+def write_transforms(export: Export) -> Written:
     """transforms_train.json, transforms_test.json, images/CAMERA_FRAME.png and points3d.ply; names are kept.
 
     `time` is in seconds since the first frame; `transform_matrix` maps an OpenGL camera to the world.
@@ -28,7 +26,7 @@ def write_transforms(export: Export) -> Names:
         (export.folder / f"transforms_{split}.json").write_text(json.dumps(content, indent=1) + "\n")
     if export.cloud is not None:
         write_point_cloud(export.folder / "points3d.ply", export.cloud)
-    return {name: name for name in export.capture.cameras}
+    return export.written()
 
 
 def _stem(camera: str, frame: int) -> str:
@@ -45,7 +43,7 @@ def _transforms(export: Export, cameras: tuple[str, ...]) -> dict[str, Any]:
         {
             "file_path": _stem(camera.name, frame),
             "time": capture.seconds(frame),
-            "transform_matrix": (np.linalg.inv(camera.T_camera_world) @ OPENGL).tolist(),
+            "transform_matrix": (np.linalg.inv(camera.T_camera_world) @ OPENGL_TO_OPENCV).tolist(),
             **({} if alike else _intrinsics(camera)),
         }
         for camera in described

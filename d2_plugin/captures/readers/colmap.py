@@ -31,6 +31,11 @@ SAME_POSE = 0.02
 adjustment moves every picture by itself."""
 
 
+def is_colmap(path: Path) -> bool:
+    """Whether a COLMAP model lies in `path` or where COLMAP puts one below it."""
+    return find_model(path) is not None
+
+
 def open_colmap(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Capture:
     """Read the COLMAP layout; of the pictures only headers are opened.
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from d2_plugin.captures.calibration import pinhole, rigid
 from d2_plugin.captures.lens import Lens
+from d2_plugin.captures.rotations import rotation_of_quaternion
 from d2_plugin.errors import D2Error
 
 MODELS = (
@@ -45,7 +46,7 @@ class ColmapCamera(NamedTuple):
             case ("SIMPLE_RADIAL", 4) | ("RADIAL", 5):
                 return Lens(pinhole(p[0], p[0], p[1], p[2]), p[3:])
             case "OPENCV", 8:
-                return Lens(pinhole(*p[:4]), p[4:6], p[6:8])
+                return Lens(pinhole(*p[:4]), p[4:6], (p[6], p[7]))
             case "OPENCV_FISHEYE", 8:
                 return Lens(pinhole(*p[:4]), p[4:], fisheye=True)
             case ("SIMPLE_RADIAL_FISHEYE", 4) | ("RADIAL_FISHEYE", 5):
@@ -211,18 +212,3 @@ def _content(lines: list[str]) -> Iterator[str]:
 def _transform(pose: list[float]) -> np.ndarray:
     """T [4, 4] of qw qx qy qz tx ty tz."""
     return rigid(rotation_of_quaternion(np.array(pose[:4])), np.array(pose[4:7]))
-
-
-def rotation_of_quaternion(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation [3, 3] of a quaternion [4], w first, of any length but zero."""
-    length = np.linalg.norm(quaternion)
-    if not length > 0:
-        raise ValueError("a quaternion has length zero")
-    w, x, y, z = quaternion / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -18,6 +18,7 @@ from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import FrameFiles, common_frames, numbered_files
 from d2_plugin.captures.lens import Lens, opencv_lens
 from d2_plugin.captures.pictures import opencv, picture_size
+from d2_plugin.captures.rotations import rotation_of_vector
 from d2_plugin.errors import D2Error, unknown_name
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
@@ -65,11 +66,16 @@ class OpencvYaml:
         return float(node.real()) if node.isReal() or node.isInt() else None
 
 
-def open_enerf(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = True) -> Capture:
+def is_enerf(path: Path) -> bool:
+    """Whether `path` looks like the layout of EasyMocap and EasyVolcap."""
+    return (path / INTRINSICS).is_file()
+
+
+def open_enerf(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Capture:
     """Read the layout of EasyMocap and EasyVolcap; of the pictures only headers are opened.
 
-    The published files name cameras of which only some have a pose or pictures: the others are always left out, with
-    a note. A camera that is asked for by name must have all three.
+    The published files name cameras of which only some have a pose or pictures: the others are left out with a note,
+    whatever `intersect` says. A camera that is asked for by name must have all three.
     """
     intrinsics, extrinsics = OpencvYaml(path / INTRINSICS), OpencvYaml(path / EXTRINSICS)
     folders = {folder.name: folder for folder in sorted((path / "images").glob("*")) if folder.is_dir()}
@@ -148,15 +154,6 @@ def _pose(name: str, extrinsics: OpencvYaml) -> np.ndarray:
     if rotation is None:
         raise D2Error(f"{where} has neither R_{name} nor Rot_{name}: add the rotation of camera {name}")
     return rigid(_shaped(rotation, (3, 3), f"Rot_{name}", where), translation)
-
-
-def rotation_of_vector(vector: np.ndarray) -> np.ndarray:
-    """Rotation [3, 3] about `vector` [3] by its length in radians (Rodrigues)."""
-    angle = np.linalg.norm(vector)
-    x, y, z = vector
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    # sin(a) / a and (1 - cos(a)) / a^2, finite at a = 0; np.sinc(x) is sin(pi x) / (pi x).
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * (cross @ cross)
 
 
 def _shaped(matrix: np.ndarray | None, shape: tuple[int, ...], key: str, where: str) -> np.ndarray:

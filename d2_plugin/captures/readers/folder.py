@@ -21,8 +21,15 @@ from d2_plugin.captures.files import common_frames, numbered_files
 from d2_plugin.captures.pictures import picture_size
 from d2_plugin.errors import D2Error, unknown_name
 
+CALIBRATION = "cameras.json"
+
 DEFAULT_FPS = 30.0
 """Frame rate taken, and noted, where cameras.json names none."""
+
+
+def is_folder(path: Path) -> bool:
+    """Whether `path` looks like the folder layout."""
+    return (path / CALIBRATION).is_file() and (path / "images").is_dir()
 
 
 def open_folder(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Capture:
@@ -31,8 +38,8 @@ def open_folder(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
     `cameras` restricts everything, checks included, to the named ones; `intersect` leaves out, with a note, cameras
     that have pictures without calibration or calibration without pictures, which are otherwise refused by name.
     """
-    description = read_json(path / "cameras.json")
-    calibrated = _calibrations(description, path / "cameras.json")
+    description = read_json(path / CALIBRATION)
+    calibrated = _calibrations(description, path / CALIBRATION)
     pictured = {folder.name: folder for folder in sorted((path / "images").iterdir()) if folder.is_dir()}
     names, notes = _agreed(list(calibrated), list(pictured), cameras, intersect, path)
     images = {name: numbered_files(pictured[name]) for name in names}
@@ -87,7 +94,7 @@ def _agreed(
     no_pictures = [name for name in wanted if name not in pictured]
     both = [name for name in wanted if name in calibrated and name in pictured]
     if both and intersect and (no_calibration or no_pictures):
-        return both, (f"left out, calibration or pictures missing: {', '.join({*no_calibration, *no_pictures})}",)
+        return both, (f"left out, calibration or pictures missing: {', '.join([*no_calibration, *no_pictures])}",)
     if no_calibration:
         raise D2Error(
             f"camera {', '.join(no_calibration)} is not in {path / 'cameras.json'}, which has {', '.join(calibrated)}: "

@@ -17,41 +17,69 @@ import numpy as np
 from d2_plugin.captures.assembly import assembled
 from d2_plugin.captures.calibration import checked_camera, pinhole, rigid
 from d2_plugin.captures.capture import Camera, Capture
-from d2_plugin.captures.files import FrameFiles, collect, common_frames, numbered_files
+from d2_plugin.captures.files import FrameFiles, cameras_with_pictures, collect, common_frames, numbered_files
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES, picture_size
 from d2_plugin.captures.video import VideoSource, video_header
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error
 
 log = logging.getLogger(__name__)
+
+POSES = "poses_bounds.npy"
 
 N3DV_FPS = 30.0
 """Frame rate of the data set, where no video says it."""
 
 UNSYNCHRONISED = {"coffee_martini": ("cam13",)}
-"""Cameras of the data set whose video runs beside the others' time (MixVoxels and K-Planes leave them out)."""
+"""Cameras whose video is not synchronised with the others. MixVoxels and K-Planes leave them out, too."""
 
+RIG_SIZE = 21
+"""Cameras of the rig, cam00 to cam20. Scenes with fewer rows lack cameras, and their rows do not say which."""
+
+_NUMBERED_NAME = re.compile(r"cam(\d+)$")
 _EXTRACTED_NAME = re.compile(r"(?P<camera>.+)_\d+$")
 
 
-def open_n3dv(path: Path, cameras: tuple[str, ...] | None = None) -> Capture:
-    """Read the N3DV layout; frames are decoded when asked for, only headers are opened here."""
-    rows = _rows(path / "poses_bounds.npy")
+def is_n3dv(path: Path) -> bool:
+    """Whether `path` looks like the N3DV layout."""
+    return (path / POSES).is_file()
+
+
+def open_n3dv(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Capture:
+    """Read the N3DV layout; frames are decoded when asked for, only headers are opened here.
+
+    A camera whose video or folder is empty is refused by name, and so are rows without a camera. Where `intersect`
+    both are left out with a note: an empty camera keeps its row, and of the whole rig (`RIG_SIZE` rows) the number in
+    a camera's name says which row is its own. Otherwise nothing tells whose the rows are.
+    """
     videos = {video.stem: video for video in sorted(path.glob("cam*.mp4"))}
     extracted = {} if videos else _extracted(path)
-    present = list(videos or extracted)
-    if not present:
-        raise D2Error(f"{path} has poses_bounds.npy but no cam*.mp4 and no extracted frames: add the videos")
-    if len(present) != len(rows):
-        raise D2Error(
-            f"{path / 'poses_bounds.npy'} has {len(rows)} rows for {len(present)} cameras ({', '.join(present)}): "
-            "rows belong to the cameras in sorted order, so add or remove what does not match"
-        )
-    names = present if cameras is None else list(cameras)
-    for name in names:
-        if name not in present:
-            raise unknown_name("camera", name, present)
-    by_name = dict(zip(present, rows))
-    return _from_videos(path, by_name, videos, names) if videos else _from_pictures(path, by_name, extracted, names)
+    listed = list(videos or extracted)
+    if not listed:
+        raise D2Error(f"{path} has {POSES} but no cam*.mp4 and no extracted frames: add the videos")
+    rows, notes = _assigned(_rows(path / POSES), listed, intersect, path / POSES)
+    pictured = {name for name in listed if (videos[name].stat().st_size if videos else extracted[name])}
+    names, missing = cameras_with_pictures(rows, pictured, cameras, intersect, path / POSES)
+    notes = (*notes, *missing)
+    if videos:
+        return _from_videos(path, rows, videos, names, notes)
+    return _from_pictures(path, rows, extracted, names, notes)
+
+
+def _assigned(
+    rows: np.ndarray, listed: list[str], intersect: bool, where: Path
+) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """(row of each camera, notes); rows belong to the cameras in sorted order, or to their numbers in a whole rig."""
+    if len(rows) == len(listed):
+        return dict(zip(listed, rows)), ()
+    numbers = {name: int(match[1]) for name in listed if (match := _NUMBERED_NAME.match(name))}
+    if intersect and len(rows) == RIG_SIZE and len(numbers) == len(listed) and max(numbers.values()) < RIG_SIZE:
+        absent = len(rows) - len(listed)
+        note = f"{absent} of {RIG_SIZE} cameras are not there and left out: rows are taken by the cameras' numbers"
+        return {name: rows[number] for name, number in numbers.items()}, (note,)
+    raise D2Error(
+        f"{where} has {len(rows)} rows for {len(listed)} cameras ({', '.join(listed)}): "
+        "rows belong to the cameras in sorted order, so add or remove what does not match"
+    )
 
 
 def camera_from_row(row: np.ndarray, name: str, size: tuple[int, int] | None, where: str) -> Camera:
@@ -90,10 +118,12 @@ def _rows(path: Path) -> np.ndarray:
     return rows.astype(np.float64)
 
 
-def _from_videos(path: Path, rows: dict[str, np.ndarray], videos: dict[str, Path], names: list[str]) -> Capture:
+def _from_videos(
+    path: Path, rows: dict[str, np.ndarray], videos: dict[str, Path], names: list[str], notes: tuple[str, ...]
+) -> Capture:
     found = {name: video_header(videos[name]) for name in names}
-    frames, notes = common_frames({name: range(header.frames) for name, header in found.items()}, path)
-    where = str(path / "poses_bounds.npy")
+    frames, frame_notes = common_frames({name: range(header.frames) for name, header in found.items()}, path)
+    where = str(path / POSES)
     return Capture(
         name=path.resolve().name,
         cameras={name: camera_from_row(rows[name], name, found[name].size, where) for name in names},
@@ -101,18 +131,18 @@ def _from_videos(path: Path, rows: dict[str, np.ndarray], videos: dict[str, Path
         fps=found[names[0]].fps or N3DV_FPS,
         source=VideoSource({name: videos[name] for name in names}),
         path=path,
-        notes=(*notes, *_known_flaws(path, names)),
+        notes=(*notes, *frame_notes, *_known_flaws(path, names)),
     )
 
 
 def _from_pictures(
-    path: Path, rows: dict[str, np.ndarray], extracted: dict[str, FrameFiles], names: list[str]
+    path: Path, rows: dict[str, np.ndarray], extracted: dict[str, FrameFiles], names: list[str], notes: tuple[str, ...]
 ) -> Capture:
     files = {name: extracted[name] for name in names}
-    frames, notes = common_frames(files, path)
-    where = str(path / "poses_bounds.npy")
+    frames, frame_notes = common_frames(files, path)
+    where = str(path / POSES)
     cameras = {name: camera_from_row(rows[name], name, picture_size(files[name][frames[0]]), where) for name in names}
-    return assembled(path, cameras, files, frames, N3DV_FPS, (*notes, *_known_flaws(path, names)))
+    return assembled(path, cameras, files, frames, N3DV_FPS, (*notes, *frame_notes, *_known_flaws(path, names)))
 
 
 def _known_flaws(path: Path, names: list[str]) -> tuple[str, ...]:
@@ -124,14 +154,20 @@ def _known_flaws(path: Path, names: list[str]) -> tuple[str, ...]:
 
 
 def _extracted(path: Path) -> dict[str, FrameFiles]:
-    """Frames extracted as camXX/images/*, camXX/*, images/camXX/* or images/camXX_0000.*, cameras sorted."""
+    """Frames extracted as camXX/images/*, camXX/*, images/camXX/* or images/camXX_0000.*, cameras sorted.
+
+    A camera whose folder is empty has no frames.
+    """
+    partly: dict[str, FrameFiles] = {}
     for pattern in ("cam*/images", "cam*", "images/*"):
         folders = [folder for folder in sorted(path.glob(pattern)) if folder.is_dir()]
         cameras = [folder.parent.name if folder.name == "images" else folder.name for folder in folders]
         found = {camera: numbered_files(folder) for camera, folder in zip(cameras, folders)}
         if found and all(found.values()):
             return found
-    return dict(_by_prefix(path / "images"))
+        if not partly and any(found.values()):
+            partly = found
+    return partly or dict(_by_prefix(path / "images"))
 
 
 def _by_prefix(folder: Path) -> Iterator[tuple[str, FrameFiles]]:

@@ -23,7 +23,7 @@ from d2_plugin.captures.files import FrameFiles, cameras_with_pictures, common_f
 from d2_plugin.captures.lens import Lens
 from d2_plugin.captures.naming import Shot, by_camera
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES, picture_size
-from d2_plugin.captures.readers.colmap_model import rotation_of_quaternion
+from d2_plugin.captures.rotations import rotation_of_quaternion
 from d2_plugin.errors import D2Error
 
 PARAMETERS = "cameras_parameters.txt"
@@ -35,8 +35,8 @@ TECHNICOLOR_FPS = 30.0
 DAMAGED = {
     "birthday": {("09", 12): 13, ("09", 173): 172, ("02", 255): 254},
 }
-"""Pictures of the data set that cannot be decoded, by scene, camera and frame, and the frame that stands in for each
-(as public loaders of it do)."""
+"""Pictures of the data set that cannot be decoded, by scene, camera and frame, and the frame that stands in for each.
+Public loaders of the data set do the same."""
 
 NEAR_FAR = {
     "painter": (1.75, 10.0),
@@ -48,6 +48,11 @@ NEAR_FAR = {
 """Depth bounds by scene, metres, as HyperReel chose them."""
 
 _NAME = re.compile(r"(?P<scene>[^_]*)_.*?(?P<frame>\d+)_(?P<camera>\d+)$")
+
+
+def is_technicolor(path: Path) -> bool:
+    """Whether `path` looks like the Technicolor layout."""
+    return (path / PARAMETERS).is_file()
 
 
 def open_technicolor(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Capture:
@@ -93,17 +98,18 @@ def _rows(path: Path) -> dict[str, np.ndarray]:
 def _pictures(path: Path) -> tuple[dict[str, FrameFiles], str]:
     """Files by camera and frame, and the scene's name in lower case."""
     folder = path / "images" if (path / "images").is_dir() else path
-    found, scenes = {}, set()
+    shots: dict[str, Shot] = {}
+    files: dict[str, Path] = {}
+    scenes: set[str] = set()
     for file in sorted(folder.iterdir()):
         match = _NAME.match(file.stem) if file.suffix.lower() in PICTURE_SUFFIXES else None
         if match:
-            found[file.name] = (Shot(f"{int(match['camera']):02d}", int(match["frame"])), file)
+            shots[file.name], files[file.name] = Shot(f"{int(match['camera']):02d}", int(match["frame"])), file
             scenes.add(match["scene"].lower())
-    if not found:
+    if not files:
         raise D2Error(f"no pictures in {folder}: expected names like Birthday_undist_00151_00.png")
     if len(scenes) > 1:
         raise D2Error(f"{folder} holds pictures of several scenes ({', '.join(sorted(scenes))}): give one folder each")
-    shots, files = ({name: pair[place] for name, pair in found.items()} for place in (0, 1))
     return by_camera(shots, files), scenes.pop()
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.captures.assembly import assembled, read_json
-from d2_plugin.captures.calibration import checked_camera, pinhole, resized
+from d2_plugin.captures.calibration import OPENGL_TO_OPENCV, checked_camera, pinhole, resized
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import common_frames
 from d2_plugin.captures.lens import Lens, opencv_lens
@@ -36,8 +36,6 @@ SAME_POSE = 1e-5
 TIME_DIGITS = 12
 """Decimals of a time that count: splits are written by programs that divide in another order."""
 
-OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-
 
 @dataclass(frozen=True, eq=False)
 class _Entry:
@@ -49,6 +47,11 @@ class _Entry:
     time: float | None
     intrinsics: Mapping[str, Any]
     listed_in: Path
+
+
+def is_transforms(path: Path) -> bool:
+    """Whether `path` holds a transforms.json or one of its parts."""
+    return any((path / name).is_file() for name in FILES)
 
 
 def open_transforms(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Capture:
@@ -133,13 +136,13 @@ def _present(entries: dict[str, _Entry], intersect: bool) -> tuple[dict[str, _En
 
 def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], float]:
     """Camera and frame of every picture, and frames per unit of time."""
-    declared = next(iter(entries.values())).intrinsics.get("fps")
+    declared = _rate(next(iter(entries.values())).intrinsics.get("fps"))
     shots, _ = arrange(entries, lambda group: _still([entries[name] for name in group]))
-    times = {name: entry.time for name, entry in entries.items()}
+    times = {name: entry.time for name, entry in entries.items() if entry.time is not None}
     instants = set(times.values())
-    if len(instants) == 1:
-        return shots, declared if _is_rate(declared) else STATIC_FPS
-    if None in instants:
+    if not instants or (len(instants) == 1 and len(times) == len(entries)):
+        return shots, declared or STATIC_FPS
+    if len(times) < len(entries):
         raise D2Error(f"some pictures listed in {path} have a time and others have none: give all of them one")
     if all(shot.frame == 0 for shot in shots.values()):
         raise D2Error(
@@ -147,11 +150,12 @@ def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], flo
             "have no number in their names: expected cameras that stand still, and names like CAMERA_FRAME.png"
         )
     shots, rate = _timed(shots, times)
-    return shots, declared if _is_rate(declared) and math.isclose(declared, rate, rel_tol=1e-6) else rate
+    return shots, declared if declared and math.isclose(declared, rate, rel_tol=1e-6) else rate
 
 
-def _is_rate(value: Any) -> bool:
-    return isinstance(value, int | float) and 0 < value < math.inf
+def _rate(value: Any) -> float | None:
+    """The frame rate that a file declares, or None where it declares nothing usable."""
+    return value if isinstance(value, int | float) and 0 < value < math.inf else None
 
 
 def _timed(shots: dict[str, Shot], times: dict[str, float]) -> tuple[dict[str, Shot], float]:

@@ -61,7 +61,8 @@ class Scene:
 def render_color(scene: Scene, camera: Camera, seconds: float) -> np.ndarray:
     """RGB uint8 [H, W, 3], the mean of four rays per pixel."""
     offsets = ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
-    total = sum(_shaded(scene, camera, seconds, offset, light) for offset, light in zip(offsets, scene.lights))
+    shaded = [_shaded(scene, camera, seconds, offset, light) for offset, light in zip(offsets, scene.lights)]
+    total = np.sum(shaded, axis=0)
     mean = total.reshape(3, camera.height, camera.width).transpose(1, 2, 0) / len(offsets)
     return np.ascontiguousarray(np.clip(np.rint(mean * 255), 0, 255).astype(np.uint8))
 

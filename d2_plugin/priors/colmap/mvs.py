@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.export.colmap import quaternion
+from d2_plugin.captures.rotations import quaternion_of_rotation
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.colmap.dense_arrays import read_dense_array
 from d2_plugin.priors.colmap.mvs_process import OPTIONS
@@ -189,7 +189,7 @@ def write_model(folder: Path, cameras: Sequence[Camera]) -> None:
         K = index_intrinsics(camera)
         numbers = " ".join(repr(float(value)) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
         lenses.append(f"{index + 1} PINHOLE {camera.width} {camera.height} {numbers}\n")
-        pose = (*quaternion(camera.T_camera_world[:3, :3]), *camera.T_camera_world[:3, 3])
+        pose = (*quaternion_of_rotation(camera.T_camera_world[:3, :3]), *camera.T_camera_world[:3, 3])
         pictures.append(f"{index + 1} {' '.join(repr(float(v)) for v in pose)} {index + 1} {_picture(index)}\n\n")
     (folder / "cameras.txt").write_text("".join(lenses))
     (folder / "images.txt").write_text("".join(pictures))

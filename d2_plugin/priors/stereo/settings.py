@@ -9,8 +9,11 @@ from typing import Annotated, Any, Literal
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Angle, Count, NotNegative, Positive, Range, Seed, Settings, Share
 
-MatcherName = Literal["auto", "sensor", "workspace", "colmap", "patchmatch", "sweep"]
+MatcherName = Literal["auto", "none", "sensor", "workspace", "colmap", "patchmatch", "sweep"]
 """What matches views, or where depth that nobody has to match lies on disk."""
+
+NO_MATCHER: MatcherName = "none"
+"""Nothing is matched and no depth on disk is read: for cameras that share nothing."""
 
 Pixels = Annotated[int, Range(0, unit="pixels")]
 Side = Annotated[int, Range(1, unit="pixels")]
@@ -22,8 +25,9 @@ class StereoSettings(Settings):
 
     matcher: MatcherName = "auto"
     """Matchers: `patchmatch` (compiled), `sweep` (OpenCV), `colmap` (needs CUDA). Depth that lies on disk: `sensor`,
-    `workspace` (COLMAP's). `auto` takes the first there is of sensor (of every camera), workspace, colmap, patchmatch,
-    sweep. Measured on eight rigs of 2 to 4 views: F of patchmatch is above the sweep's on each, narrow pairs too."""
+    `workspace` (COLMAP's). `none` matches nothing and reads nothing. `auto` takes the first of sensor (of every
+    camera), workspace, colmap, patchmatch and sweep that there is. Measured on eight rigs of 2 to 4 views: F of
+    patchmatch is above the sweep's on each, narrow pairs too."""
     folder: str = ""
     """Where the depth on disk lies, relative to the capture; `{frame}` (as in `mvs/{frame:05d}`) stands for the frame
     number. Where empty: `depth` for `sensor`, `colmap/FRAME`, `colmap` or `dense` for `workspace`."""

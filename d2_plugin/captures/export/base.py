@@ -1,0 +1,80 @@
+"""What every writer of a layout starts from and hands back, and the checks that several of them share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.captures.export.ply import PointCloud
+from d2_plugin.captures.pictures import write_png
+from d2_plugin.errors import D2Error
+
+Names = dict[str, str]
+"""Camera of the source -> camera of the export."""
+
+
+class Written(NamedTuple):
+    """What the cameras and frames of the source are called in the export; those that were not written are absent."""
+
+    cameras: Names
+    frames: dict[int, int]
+
+
+@dataclass(frozen=True)
+class Export:
+    """What a layout is written from: a capture, which of its cameras are held out, and where Gaussians start."""
+
+    capture: Capture
+    test_cameras: tuple[str, ...]
+    cloud: PointCloud | None
+    folder: Path
+
+    @property
+    def train_cameras(self) -> tuple[str, ...]:
+        """The cameras that are not held out, in the capture's order."""
+        return tuple(name for name in self.capture.cameras if name not in self.test_cameras)
+
+    def write_pictures(self, place: Callable[[str, int], Path]) -> None:
+        """Every frame of every camera as a lossless PNG at `place(camera, frame)`."""
+        for camera in self.capture.cameras:
+            for frame in self.capture.frames:
+                target = place(camera, frame)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                write_png(target, self.capture.image(camera, frame))
+
+    def written(self, cameras: Mapping[str, str] | None = None, frames: Mapping[int, int] | None = None) -> Written:
+        """What a writer returns; names that are not given were kept."""
+        return Written(
+            {name: name for name in self.capture.cameras} if cameras is None else dict(cameras),
+            {frame: frame for frame in self.capture.frames} if frames is None else dict(frames),
+        )
+
+
+def refuse_off_centre(camera: Camera, layout: str) -> None:
+    """Raise `D2Error` for a camera that one focal length and a centred principal point do not describe."""
+    fx, fy, cx, cy = (float(camera.K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    slack = 1e-6 * camera.width
+    if abs(fx - fy) > slack or abs(cx - camera.width / 2) > slack or abs(cy - camera.height / 2) > slack:
+        raise D2Error(
+            f"camera {camera.name} has fx {fx:g}, fy {fy:g} and principal point ({cx:g}, {cy:g}) but layout {layout} "
+            f"holds one focal length and the centre ({camera.width / 2:g}, {camera.height / 2:g}) only: "
+            "choose the layout transforms"
+        )
+
+
+def refuse_skew(camera: Camera) -> None:
+    """Raise `D2Error` for a camera whose pixel axes are not perpendicular: no layout can say so."""
+    if camera.K[0, 1] != 0:
+        raise D2Error(f"camera {camera.name} has skew {camera.K[0, 1]:g}, which no layout holds: undistort it first")
+
+
+def empty_folder(path: Path | str) -> Path:
+    """The folder at `path`, made where it is missing; one that holds something is refused."""
+    folder = Path(path)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise D2Error(f"{folder} already exists and is not empty: choose another folder, nothing was written")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

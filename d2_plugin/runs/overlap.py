@@ -1,0 +1,150 @@
+"""What stereo has to work with: how much of a picture other cameras see, at which angle, and how much has texture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from d2_plugin.captures import Camera, Capture
+from d2_plugin.captures.pictures import shrink_picture
+from d2_plugin.priors.geometry import relative_pose, scaled_camera, view_pair, viewing_rays
+from d2_plugin.priors.stereo.filter import texture_mask
+from d2_plugin.priors.stereo.geometric_depth import gray
+from d2_plugin.priors.stereo.settings import StereoSettings
+
+GRID = (16, 12)
+"""Pixels across and down at which a picture is asked who else sees it."""
+
+KNOWN_DEPTHS = 9
+"""Depths of each of those pixels where the depth of the scene is known."""
+
+ANY_DEPTHS = 60
+"""Depths of each of those pixels where it is not, over `ANY_RANGE`."""
+
+ANY_RANGE = (0.05, 1000.0)
+"""Depths tried where nothing is known about the scene, in distances between the two cameras that are farthest apart."""
+
+ENOUGH_POINTS = 10
+"""Sparse points that a camera must see to tell the depths of its picture."""
+
+TEXTURE_PIXELS = 320 * 180
+"""Texture is measured in pictures that were made smaller until they have at most this many pixels."""
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """What the cameras of a rig see of each other's pictures."""
+
+    shares: tuple[float, ...]
+    """Of each camera's picture, the part that some other camera sees at an angle that can be matched, 0..1."""
+    angles: tuple[float, ...]
+    """Of each camera that shares anything, the angle to the one it shares most with, degrees."""
+    depth_known: bool
+    """Whether the depth of the scene is known. Where not, `shares` holds what could be seen if every pixel lay at the
+    best possible depth, and `angles` are those between the optical axes."""
+
+
+def measure_overlap(
+    cameras: Sequence[Camera],
+    settings: StereoSettings,
+    *,
+    depth_range: tuple[float, float] | None = None,
+    points: np.ndarray | None = None,
+) -> Overlap:
+    """Who sees what of whose picture; occlusion is not known and left out of account.
+
+    Args:
+        cameras: the cameras that would be matched, at least two that stand apart.
+        settings: `min_angle` and `max_angle` bound the angles, in degrees, at which two cameras can be matched.
+        depth_range: near and far of the scene, world units; without it what the cameras declare, if any do.
+        points: surface points [P, 3], world; they tell the depths better than any range.
+    """
+    depths = [_depths(camera, cameras, depth_range, points) for camera in cameras]
+    known = all(values is not None for values in depths)
+    anywhere = _any_depths(cameras)
+    shares, angles = [], []
+    for index, (camera, values) in enumerate(zip(cameras, depths, strict=True)):
+        others = [other for place, other in enumerate(cameras) if place != index]
+        shared = [_shared(camera, other, anywhere if values is None else values, settings) for other in others]
+        # [D, pixels] of each other camera; where no depth is known, whether there is one at which it sees the pixel.
+        seen = [alike if known else np.any(alike, axis=0, keepdims=True) for alike, _ in shared]
+        shares.append(float(np.mean(np.any(np.stack(seen), axis=0))))
+        if shares[-1] > 0:
+            best = int(np.argmax([alike.mean() for alike in seen]))
+            alike, angle = shared[best]
+            angles.append(float(np.median(angle[alike])) if known else _between_axes(camera, others[best]))
+    return Overlap(tuple(shares), tuple(angles), known)
+
+
+def measure_texture(capture: Capture, cameras: Sequence[str], settings: StereoSettings) -> tuple[float, ...]:
+    """Share of each camera's pictures with enough texture to match, by the test of the stereo filter, 0..1.
+
+    The first and the last frame are looked at, made smaller: a window then covers more of the scene, so the share is
+    rather too high than too low.
+    """
+    frames = sorted({capture.frames[0], capture.frames[-1]})
+    return tuple(float(np.mean([_textured(capture.image(name, f), settings) for f in frames])) for name in cameras)
+
+
+def _textured(picture: np.ndarray, settings: StereoSettings) -> float:
+    height, width = picture.shape[:2]
+    factor = math.ceil(math.sqrt(height * width / TEXTURE_PIXELS))
+    small = shrink_picture(picture, factor) if factor > 1 else picture
+    return float(texture_mask(gray(small), settings).mean())
+
+
+def _depths(
+    camera: Camera,
+    cameras: Sequence[Camera],
+    depth_range: tuple[float, float] | None,
+    points: np.ndarray | None,
+) -> np.ndarray | None:
+    """Depths [D] at which the things in a camera's picture lie, or None where nothing tells them."""
+    if depth_range is None and points is not None:
+        visible = _visible_depths(camera, points)
+        if visible.size >= ENOUGH_POINTS:
+            return np.quantile(visible, np.linspace(0.05, 0.95, KNOWN_DEPTHS))
+    declared = [other.near_far for other in (camera, *cameras) if other.near_far is not None]
+    if depth_range is None and not declared:
+        return None
+    near, far = depth_range or declared[0]
+    return 1 / np.linspace(1 / near, 1 / far, KNOWN_DEPTHS)
+
+
+def _visible_depths(camera: Camera, points: np.ndarray) -> np.ndarray:
+    local = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    local = local[local[:, 2] > 0]
+    pixels = local @ camera.K.T
+    inside = (pixels[:, :2] >= 0) & (pixels[:, :2] < pixels[:, 2:] * (camera.width, camera.height))
+    return local[inside.all(axis=1), 2]
+
+
+def _any_depths(cameras: Sequence[Camera]) -> np.ndarray:
+    centres = np.stack([camera.centre for camera in cameras])
+    apart = float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
+    return apart * np.geomspace(*ANY_RANGE, ANY_DEPTHS)
+
+
+def _shared(
+    reference: Camera, source: Camera, depths: np.ndarray, settings: StereoSettings
+) -> tuple[np.ndarray, np.ndarray]:
+    """(whether `source` sees it at an angle that can be matched, that angle in degrees), both [D, pixels]."""
+    grid = scaled_camera(reference, *GRID)
+    pair = view_pair(grid, source)
+    u, v = np.meshgrid(np.arange(float(GRID[0])), np.arange(float(GRID[1])))
+    at = pair.project(u.reshape(1, -1), v.reshape(1, -1), depths[:, None])
+    inside = (at.z > 0) & (at.x > -0.5) & (at.y > -0.5) & (at.x < source.width - 0.5) & (at.y < source.height - 0.5)
+    points = viewing_rays(grid, np.float64).reshape(1, -1, 3) * depths[:, None, None]
+    away = points - pair.direction
+    # atan2 of (|a x b|, a.b) keeps its digits at small angles, where arccos has few.
+    sine = np.linalg.norm(np.cross(points, away), axis=-1)
+    angle = np.rad2deg(np.arctan2(sine, (points * away).sum(axis=-1)))
+    return inside & (angle > settings.min_angle) & (angle < settings.max_angle), angle
+
+
+def _between_axes(one: Camera, other: Camera) -> float:
+    """Angle between the directions in which two cameras look, degrees."""
+    return float(np.rad2deg(np.arccos(np.clip(relative_pose(one, other)[2, 2], -1, 1))))
