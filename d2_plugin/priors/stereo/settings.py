@@ -10,7 +10,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.settings import Angle, Count, NotNegative, Positive, Range, Seed, Settings, Share
 
 MatcherName = Literal["auto", "none", "sensor", "workspace", "colmap", "patchmatch", "sweep"]
-"""What matches views, or where depth that nobody has to match lies on disk."""
+"""What matches views, or what kind of depth on disk is taken in place of matching."""
 
 NO_MATCHER: MatcherName = "none"
 """Nothing is matched and no depth on disk is read: for cameras that share nothing."""
