@@ -45,8 +45,8 @@ def modules(checkout: Path) -> None:
     for group, name in names:
         registry.load(group, name)
     assert len(names) > 2, f"only {names} are registered"
-    loaded = {name: getattr(module, "__file__", None) for name, module in sys.modules.items()}
-    astray = {name: file for name, file in loaded.items() if file and checkout in Path(file).resolve().parents}
+    files = {name: getattr(module, "__file__", None) for name, module in sys.modules.items() if "d2_plugin" in name}
+    astray = {name: file for name, file in files.items() if file and checkout in Path(file).resolve().parents}
     assert not astray, f"loaded from the checkout: {astray}"
     say(f"{len(names)} backbones and adapters load from {Path(d2_plugin.__file__).parent}")
 
