@@ -134,7 +134,8 @@ def unpackaged(root: Path, setup: configparser.ConfigParser) -> list[str]:
             matches = set(listed.get(package, root / "nowhere").glob(pattern))
             wrong += [] if matches else [f"package_data's {package} = {pattern} matches no file"]
             covered |= matches
-    beside = {path for top in tops for path in top.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
+    every = (path for top in tops for path in top.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc"))
+    beside = {path for path in every if not any(part.startswith(".") for part in path.relative_to(root).parts)}
     return wrong + [f"{path} is in no package_data" for path in sorted(beside - covered)]
 
 

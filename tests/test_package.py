@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import tomllib
+import zipfile
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -46,6 +47,14 @@ def calls(function: str) -> Iterator[tuple[str, ast.Call]]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] == function:
                 yield f"{path.relative_to(ROOT)}, line {node.lineno}", node
+
+
+def tables(name: str) -> Iterator[dict]:
+    """Every dictionary of that name that a module of the plugin holds, read from its text."""
+    for path in sorted((ROOT / "d2_plugin").rglob("*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name:
+                yield ast.literal_eval(node.value)
 
 
 def test_importing_the_package_loads_nothing_heavy() -> None:
@@ -90,6 +99,37 @@ def test_every_extra_in_text_exists(setup: configparser.ConfigParser) -> None:
     assert extras_in("pip install -e '.[all,tset]' d2-4dgs[mono]") == {"all", "tset", "mono"}
 
 
+def test_every_package_that_doctor_names_is_in_the_extra_that_it_names(setup: configparser.ConfigParser) -> None:
+    distributions = {"cv2": "opencv-contrib-python-headless"}
+    (optional,) = tables("OPTIONAL")
+    for module, (extra, *_) in optional.items():
+        assert distributions.get(module, module) in setup["options.extras_require"][extra], f"{module} not in {extra}"
+
+
 def test_every_extra_of_a_user_is_in_all(setup: configparser.ConfigParser) -> None:
     together = extras_in(setup["options.extras_require"]["all"])
     assert together == set(setup["options.extras_require"]) - {"all", "test", "cuda"}
+
+
+def test_the_tables_that_contributing_names_are_there() -> None:
+    named = re.findall(r"`(\w+)` in `([\w/]+\.py)`", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"))
+    assert len(named) > 3
+    missing = [
+        f"{name} in {file}"
+        for name, file in named
+        if not (ROOT / file).exists() or name not in (ROOT / file).read_text()
+    ]
+    assert not missing
+
+
+def test_wheels_that_differ_are_told_apart(tmp_path: Path) -> None:
+    files = {"one": {"a.py": "1", "b.h": "2"}, "two": {"a.py": "1", "b.h": "3", "c.h": ""}}
+    for folder, contents in files.items():
+        (tmp_path / folder).mkdir()
+        with zipfile.ZipFile(tmp_path / folder / "x.whl", "w") as archive:
+            for name, text in contents.items():
+                archive.writestr(name, text)
+    command = [sys.executable, ROOT / ".ci" / "compare_archives.py", tmp_path / "one"]
+    differ = subprocess.run([*command, tmp_path / "two"], capture_output=True, text=True)
+    assert (differ.returncode, differ.stderr.split("\n")[:2]) == (1, ["only in two: c.h", "differs: b.h"])
+    assert subprocess.run([*command, tmp_path / "one"]).returncode == 0
