@@ -77,7 +77,7 @@ class TestCharbonnier:
         torch.testing.assert_close(charbonnier(r, 0.1), torch.sqrt(r**2 + 0.01) - 0.1)
 
     def test_equals_kornia_rescaled(self) -> None:
-        kornia = pytest.importorskip("kornia", reason="kornia is in the `image` extra")
+        kornia = pytest.importorskip("kornia", reason="kornia is in the `test` extra")
         r = torch.linspace(-3, 3, 31, dtype=torch.float64)
         expected = 0.1 * kornia.losses.charbonnier_loss(r / 0.1, torch.zeros_like(r))
         torch.testing.assert_close(charbonnier(r, 0.1), expected)
@@ -211,7 +211,7 @@ class TestDensification:
         torch.testing.assert_close(image[:, :2] / image[:, 2:] - 0.5, pixels.double())
 
     def test_back_projection_agrees_with_kornia_shifted_by_half_a_pixel(self) -> None:
-        depth_module = pytest.importorskip("kornia.geometry.depth", reason="kornia is in the `image` extra")
+        depth_module = pytest.importorskip("kornia.geometry.depth", reason="kornia is in the `test` extra")
         view = a_view()
         depth = torch.rand(view.height, view.width, dtype=torch.float64) + 1
         rows, columns = torch.meshgrid(torch.arange(view.height), torch.arange(view.width), indexing="ij")

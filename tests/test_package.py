@@ -1,0 +1,135 @@
+"""What the package says of itself is true: one version everywhere, extras that exist, an import that loads little."""
+
+from __future__ import annotations
+
+import ast
+import configparser
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+import yaml
+
+import d2_plugin
+from d2_plugin.errors import missing_extra
+
+ROOT = Path(__file__).resolve().parents[1]
+CODE = ("d2_plugin", "backbones", "adapters")
+
+
+@pytest.fixture(scope="module")
+def setup() -> configparser.ConfigParser:
+    parser = configparser.ConfigParser(delimiters=("=",), interpolation=None)
+    parser.optionxform = str
+    parser.read(ROOT / "setup.cfg")
+    return parser
+
+
+@pytest.fixture(scope="module")
+def citation() -> dict:
+    return yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+
+
+def extras_in(text: str) -> set[str]:
+    """Extras of this package that a text names, in `d2-4dgs[one,two]` or `.[one,two]`."""
+    return {name.strip() for group in re.findall(r"(?:d2-4dgs|\.)\[([a-z, ]+)\]", text) for name in group.split(",")}
+
+
+def calls(function: str) -> Iterator[tuple[str, ast.Call]]:
+    """Every call of `function` in the code, with its place."""
+    for path in sorted(path for folder in CODE for path in (ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] == function:
+                yield f"{path.relative_to(ROOT)}, line {node.lineno}", node
+
+
+def tables(name: str) -> Iterator[dict]:
+    """Every dictionary of that name that a module of the plugin holds, read from its text."""
+    for path in sorted((ROOT / "d2_plugin").rglob("*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name:
+                yield ast.literal_eval(node.value)
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    script = "import sys, d2_plugin; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout.split()
+    assert "d2_plugin" in loaded
+    assert not {"torch", "numpy", "cv2", "onnxruntime", "pycolmap", "kornia", "rich", "matplotlib"} & set(loaded)
+
+
+def test_one_version_everywhere(setup: configparser.ConfigParser, citation: dict) -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text()).get("project", {})
+    assert "version" not in project, "pyproject.toml has a version of its own"
+    assert setup["metadata"]["version"] == "attr: d2_plugin.__version__"
+    assert version("d2-4dgs") == d2_plugin.__version__
+    assert citation["version"] == d2_plugin.__version__
+    released = re.findall(r"^## \[(\d[^\]]*)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert released[0] == d2_plugin.__version__
+
+
+def test_the_citation_names_the_paper(setup: configparser.ConfigParser, citation: dict) -> None:
+    assert {"cff-version", "message", "title", "authors", "preferred-citation"} <= citation.keys()
+    paper = citation["preferred-citation"]
+    assert {"type", "title", "authors"} <= paper.keys()
+    assert paper["title"] == "D²-4DGS: Dual-Depth Guided Sparse-Camera 4D Gaussian Splatting"
+    assert citation["license"] == setup["metadata"]["license_expression"]
+
+
+def test_every_extra_in_an_error_exists(setup: configparser.ConfigParser) -> None:
+    known = set(setup["options.extras_require"])
+    named = {place: ast.literal_eval(call.args[1]) for place, call in calls("missing_extra")}
+    assert len(named) > 3
+    assert not {place: extra for place, extra in named.items() if extra not in known}
+    assert extras_in(str(missing_extra("OpenCV", "image", "reading pictures"))) == {"image"}
+
+
+def test_every_extra_in_text_exists(setup: configparser.ConfigParser) -> None:
+    known = set(setup["options.extras_require"])
+    files = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "setup.cfg", ROOT / ".ci" / "run"]
+    files += [path for folder in CODE for path in (ROOT / folder).rglob("*.py")] + list((ROOT / "docs").rglob("*.md"))
+    named = {path.name: extras_in(path.read_text(encoding="utf-8")) - known for path in files}
+    assert not {name: extras for name, extras in named.items() if extras}
+    assert extras_in("pip install -e '.[all,tset]' d2-4dgs[mono]") == {"all", "tset", "mono"}
+
+
+def test_every_package_that_doctor_names_is_in_the_extra_that_it_names(setup: configparser.ConfigParser) -> None:
+    distributions = {"cv2": "opencv-contrib-python-headless"}
+    (optional,) = tables("OPTIONAL")
+    for module, (extra, *_) in optional.items():
+        assert distributions.get(module, module) in setup["options.extras_require"][extra], f"{module} not in {extra}"
+
+
+def test_every_extra_of_a_user_is_in_all(setup: configparser.ConfigParser) -> None:
+    together = extras_in(setup["options.extras_require"]["all"])
+    assert together == set(setup["options.extras_require"]) - {"all", "test", "cuda"}
+
+
+def test_the_tables_that_contributing_names_are_there() -> None:
+    named = re.findall(r"`(\w+)` in `([\w/]+\.py)`", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"))
+    assert len(named) > 3
+    missing = [
+        f"{name} in {file}"
+        for name, file in named
+        if not (ROOT / file).exists() or name not in (ROOT / file).read_text()
+    ]
+    assert not missing
+
+
+def test_wheels_that_differ_are_told_apart(tmp_path: Path) -> None:
+    files = {"one": {"a.py": "1", "b.h": "2"}, "two": {"a.py": "1", "b.h": "3", "c.h": ""}}
+    for folder, contents in files.items():
+        (tmp_path / folder).mkdir()
+        with zipfile.ZipFile(tmp_path / folder / "x.whl", "w") as archive:
+            for name, text in contents.items():
+                archive.writestr(name, text)
+    command = [sys.executable, ROOT / ".ci" / "compare_archives.py", tmp_path / "one"]
+    differ = subprocess.run([*command, tmp_path / "two"], capture_output=True, text=True)
+    assert (differ.returncode, differ.stderr.split("\n")[:2]) == (1, ["only in two: c.h", "differs: b.h"])
+    assert subprocess.run([*command, tmp_path / "one"]).returncode == 0
