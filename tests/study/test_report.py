@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 
 from d2_plugin.captures.pictures import write_png
 from d2_plugin.errors import D2Error
-from d2_plugin.study.bench.work_precision import Table, means, pareto_front, work_precision
-from d2_plugin.study.report.page import Picture, markdown_table
+from d2_plugin.runs.markup import Table, markdown
+from d2_plugin.study.report.page import Picture
 from d2_plugin.study.report.report import BUILDERS, collect, main, make_report
 from d2_plugin.study.report.svg import Axis, Plot, Point, Series, bars, figure, number
+from d2_plugin.study.report.work_precision import means, pareto_front, work_precision
 from d2_plugin.study.rows import KINDS, Row, append_rows, make_row, read_rows
 from d2_plugin.study.training_rows import training_rows
 
@@ -284,5 +285,5 @@ def test_stacked_bars_are_as_long_as_their_sums() -> None:
 
 
 def test_a_table_in_markdown_keeps_its_bars_and_stresses_the_best() -> None:
-    text = markdown_table(Table(("a", "b"), (("1|2", "3"),), frozenset({(0, 1)})))
+    text = markdown(Table(("a", "b"), (("1|2", "3"),), frozenset({(0, 1)})))
     assert text.splitlines()[-1] == "| 1\\|2 | **3** |"

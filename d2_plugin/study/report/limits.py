@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from d2_plugin.study.bench.raster import exponent
-from d2_plugin.study.bench.work_precision import SMALLEST, Table, colors_of, shown
+from d2_plugin.runs.markup import Table
+from d2_plugin.study.growth import power
 from d2_plugin.study.rows import Row
 
 from .sections import Section, cases_of, distinct, sources_of
 from .svg import Axis, Plot, Point, Series, figure, number
+from .work_precision import SMALLEST, colors_of, growth, shown
 
 
 def stability(rows: Sequence[Row]) -> Section:
@@ -118,21 +119,16 @@ def _rounded(value: float) -> str:
 
 def scaling(rows: Sequence[Row]) -> Section:
     """How time and memory grow with the number of frames."""
-    lengths, colors = distinct(rows, "frames"), colors_of(rows)
-    x = Axis.around("frames", lengths, log=True)
-    plots, cells = [], []
+    lengths, plots, cells = distinct(rows, "frames"), [], []
     for name, label in (("seconds", "seconds"), ("peak_mb", "peak MB")):
-        series = []
-        for method, color in colors.items():
-            places = {row["frames"]: row[name] for row in rows if row["method"] == method and row.get(name)}
-            line = tuple(places.items())
-            points = tuple(Point(*place, f"{method}, {place[0]} frames: {place[1]:.4g} {label}") for place in line)
-            series.append(Series(method, points, line, color))
-            power = exponent(line) if len(line) > 1 else None
-            grows = "-" if power is None else f"frames^{round(power, 2) + 0.0:.2f}"
-            cells.append((method, label, *(shown(places.get(length)) for length in lengths), grows))
-        values = [y for each in series for _, y in each.line]
-        plots.append(Plot(label, x, Axis.around(label, values, log=True), tuple(series)))
+        lines = {
+            part: [(row["frames"], row[name]) for row in rows if row["method"] == part and row.get(name)]
+            for part in colors_of(rows)
+        }
+        plots.append(growth(label, "frames", label, lines))
+        for part, line in lines.items():
+            measured = [shown(dict(line).get(length)) for length in lengths]
+            cells.append((part, label, *measured, power(line, "frames") or "-"))
     header = ("part", "of", *(f"{length:g} frames" for length in lengths), "grows as")
     return Section(
         "scaling",

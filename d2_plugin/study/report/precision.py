@@ -5,20 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import inf
 
-from d2_plugin.study.bench.work_precision import (
-    SMALLEST,
-    Mean,
-    Table,
-    colors_of,
-    means,
-    means_table,
-    shown,
-    work_precision,
-)
+from d2_plugin.runs.markup import Table
 from d2_plugin.study.rows import Row
 
 from .sections import Section, cases_of, distinct, sources_of
 from .svg import Axis, Plot, Point, Series, figure, number
+from .work_precision import SMALLEST, Mean, colors_of, means, means_table, shown, work_precision
 
 ALIGNED_ANCHORS = 20_000
 """Number of anchors that is plotted, or the nearest one that was measured."""

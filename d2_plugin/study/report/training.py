@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from statistics import mean, stdev
 
+from d2_plugin.runs.markup import Table
 from d2_plugin.study.ablation.paper_tables import SOURCE, paper_rows
-from d2_plugin.study.bench.work_precision import Table, colors_of, pareto_front
 from d2_plugin.study.rows import Row
 
 from .sections import Section, cases_of, sources_of
 from .svg import Axis, Plot, Point, Series, bars, figure
+from .work_precision import colors_of, pareto_front
 
 SCORES = (
     ("PSNR", "psnr", 2),
