@@ -88,11 +88,14 @@ def align_problem(kind: MonoKind, anchors: int, outliers: float, seed: int = 0) 
     return AlignProblem(kind, mono, geometric, clean, truth)
 
 
-def weights_and_epsilon(target: np.ndarray, residual: str) -> tuple[np.ndarray, float]:
-    """What `align` makes of its default settings: the weights of the residuals and the smoothing."""
+def weights_and_epsilon(
+    target: np.ndarray, residual: str, settings: AlignSettings | None = None
+) -> tuple[np.ndarray, float]:
+    """What `align` makes of its settings (the default ones): the weights of the residuals and the smoothing."""
+    epsilon = (settings or AlignSettings()).epsilon
     if residual == "relative":
-        return 1 / target, AlignSettings().epsilon
-    return np.ones_like(target), 0.01 * float(np.median(target))
+        return 1 / target, epsilon
+    return np.ones_like(target), epsilon * float(np.median(target))
 
 
 @dataclass(frozen=True)
