@@ -26,9 +26,14 @@ class Margin:
 
     @property
     def verdict(self) -> str:
-        """`holds` or `fails` beyond two standard errors, `undecided` within; `no verdict` from too few seeds."""
+        """`holds` or `fails` beyond two standard errors, `undecided` within; `no verdict` from too few seeds.
+
+        `no difference` where every seed gave exactly the same.
+        """
         if self.error is None or self.seeds < LEAST_SEEDS:
             return f"{_COUNTS[self.seeds]}: no verdict"
+        if self.value == self.error == 0:
+            return "no difference"
         if abs(self.value) <= 2 * self.error:
             return "undecided"
         return "holds" if self.value > 0 else "fails"

@@ -100,7 +100,9 @@ def test_bench_writes_rows_table_and_plot(tmp_path: Path) -> None:
     assert all(row["kind"] == "alignment" and row["error"] >= 0 and row["seconds"] > 0 for row in rows)
     assert rows[0]["case"] == "relative map, 60 anchors, 0% wrong"
     assert "| certified | relative, gap 1e-10 |" in (tmp_path / "align.md").read_text()
-    assert rows[0]["command"].startswith("d2 bench align --anchors 60 300 --outliers 0.0 0.4 --methods certified RANSAC")
+    assert rows[0]["command"].startswith(
+        "d2 bench align --anchors 60 300 --outliers 0.0 0.4 --methods certified RANSAC"
+    )
     plot = ET.fromstring((tmp_path / "align.svg").read_text())
     marks = [element for element in plot.iter() if len(element) and element[0].text and "ms per fit" in element[0].text]
     assert len(marks) == 8 + 8 + 2 * 2  # gap and depth error of 8 settings, and the time of 2 methods at 2 sizes

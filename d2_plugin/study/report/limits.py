@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from d2_plugin.runs.markup import Table
 from d2_plugin.study.growth import power
 from d2_plugin.study.rows import Row
+from d2_plugin.study.verdict import Margin
 
 from .sections import Section, cases_of, distinct, sources_of
 from .svg import Axis, Plot, Point, Series, figure, number
@@ -86,14 +88,15 @@ def _sweep_cells(case: str, method: str, rows: Sequence[Row]) -> tuple[str, ...]
 
 def plan(rows: Sequence[Row]) -> Section:
     """What is left out: its saving and its cost on the capture, measured with and without."""
-    header = ("capture", "decision", "by the plan", "s", "peak MB", "Gaussians", "cost of leaving it out")
+    header = ("capture", "decision", "by the plan", "s", "peak MB", "Gaussians", "cost of leaving it out", "verdict")
     decisions = dict.fromkeys((row["case"], row["method"]) for row in rows)
     cells = tuple(_decision([row for row in rows if (row["case"], row["method"]) == key]) for key in decisions)
     return Section(
         "plan",
         "Scene plan: what is left out",
         "Each decision of the plan, taken both ways on the capture itself: time, memory and Gaussians with the part → "
-        "without it, and what leaving it out costs (negative: it gains).",
+        "without it, and what leaving it out costs (negative: it gains), as mean ± deviation over the seeds. The "
+        "verdict needs at least three seeds and a cost beyond two standard errors.",
         tables=(("Decisions", Table(header, cells)),),
         sources=sources_of(rows),
     )
@@ -105,7 +108,20 @@ def _decision(rows: Sequence[Row]) -> tuple[str, ...]:
     both = ("-" if rows[0].get(n) is None else " → ".join(_rounded(row[n]) for row in rows) for n in names)
     first, last = rows[0], rows[-1]
     cost = first["failed"] or ("-" if last["cost"] is None else f"{last['cost']:+.3f}{_spread(last)} {last['unit']}")
-    return (first["case"], first["method"], first["planned"], *both, cost)
+    return (first["case"], first["method"], first["planned"], *both, cost, _plan_verdict(last))
+
+
+def _plan_verdict(row: Row) -> str:
+    """What the cost of leaving a part out says; its differences were taken seed by seed."""
+    if row["failed"] or row["cost"] is None:
+        return "-"
+    seeds = row.get("seeds")
+    if seeds is None:
+        return "built once: no verdict"
+    deviation = row.get("cost_deviation")
+    error = None if deviation is None else deviation / math.sqrt(len(seeds))
+    verdict = Margin(row["cost"], error, len(seeds)).verdict
+    return {"holds": "costs", "fails": "gains"}.get(verdict, verdict)
 
 
 def _spread(row: Row) -> str:

@@ -92,7 +92,7 @@ def raster(rows: Sequence[Row]) -> Section:
     swept = [row for row in rows if "thresholds" in row]
     plain = [row for row in rows if "thresholds" not in row]
     header = ("method", "scene", "forward ms", "forward + backward ms", "survey ms", "peak MB", "colour p99.9")
-    figures = {"raster": figure([_raster_plot(plain)], "Rasterizer error against time")}
+    figures = {"raster": figure([raster_plot(plain)], "Rasterizer error against time")}
     details: tuple[tuple[str, Table], ...] = ()
     if swept:
         error, time = "colour error, p99.9", "forward + backward, ms"
@@ -114,7 +114,7 @@ def raster(rows: Sequence[Row]) -> Section:
     )
 
 
-def _raster_plot(rows: Sequence[Row]) -> Plot:
+def raster_plot(rows: Sequence[Row]) -> Plot:
     """One mark per scene and size; scenes are not compared, so none is faded."""
     drawn = [row for row in rows if row["error"] and row["seconds"]]
     points = {name: tuple(_raster_point(row) for row in drawn if row["method"] == name) for name in colors_of(drawn)}
