@@ -7,6 +7,7 @@ Whether it costs anything is a verdict over at least three seeds, see `verdict`.
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -86,7 +87,7 @@ def _command(settings: PlanVerification) -> str:
 
 def _range(frames: Sequence[int]) -> str:
     """Frames as first:last:step where they are evenly spaced, each one otherwise."""
-    steps = {later - earlier for earlier, later in zip(frames, frames[1:])}
+    steps = {later - earlier for earlier, later in itertools.pairwise(frames)}
     if len(steps) != 1:
         return ",".join(map(str, frames))
     (step,) = steps

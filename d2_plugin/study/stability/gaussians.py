@@ -14,7 +14,7 @@ from torch import Tensor
 from d2_plugin import registry
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 
-from .sweep import Sweep, decades
+from .definition import Sweep, decades
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 54.0
 THRESHOLDS = RasterSettings(alpha_min=1e-12, transmittance_min=1e-12)
