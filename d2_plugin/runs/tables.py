@@ -26,10 +26,15 @@ class Column:
     larger_is_better: bool
     always: bool = True
     """Otherwise the column is left out of a table in which nothing has it."""
+    unit: str = ""
+
+    def text(self, value: float | None) -> str:
+        """The value in its digits, `-` where it was not measured."""
+        return "-" if value is None else format(value, self.form)
 
 
 COLUMNS = (
-    Column("PSNR", r"PSNR$\uparrow$", "psnr", ".2f", True),
+    Column("PSNR", r"PSNR$\uparrow$", "psnr", ".2f", True, unit="dB"),
     Column("SSIM1", r"SSIM$_1\uparrow$", "ssim1", ".4f", True),
     Column("SSIM2", r"SSIM$_2\uparrow$", "ssim2", ".4f", True),
     Column("LPIPS", r"LPIPS$\downarrow$", "lpips", ".4f", False),
@@ -42,6 +47,9 @@ COLUMNS = (
 
 PAPER_COLUMNS = tuple(column for column in COLUMNS if column.key in ("psnr", "ssim1", "ssim2", "lpips"))
 """The columns of the paper's tables, which print four digits."""
+
+STUDY_COLUMNS = tuple(c for c in COLUMNS if c.key in ("psnr", "ssim1", "ssim2", "lpips", "depth_absrel"))
+"""The columns by which variants are compared: no single one of them says which is better."""
 
 
 def metrics_table(runs: Mapping[str, Metrics]) -> str:
@@ -118,11 +126,7 @@ def _section(title: str, rows: Sequence[Mapping[str, Any]], keys: Sequence[str])
 
 
 def _cells(scores: Mapping[str, Any], columns: Sequence[Column]) -> list[str]:
-    return [_cell(scores.get(column.key), column.form) for column in columns]
-
-
-def _cell(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
+    return [column.text(scores.get(column.key)) for column in columns]
 
 
 def _best(column: Column, scored: Sequence[Mapping[str, Any]]) -> float | None:
