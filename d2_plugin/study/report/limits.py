@@ -10,8 +10,9 @@ from d2_plugin.study.growth import power
 from d2_plugin.study.rows import Row
 from d2_plugin.study.verdict import Margin
 
+from .plots import Axis, Plot, Point, Series, number
 from .sections import Section, cases_of, distinct, sources_of
-from .svg import Axis, Plot, Point, Series, figure, number
+from .svg import figure
 from .work_precision import SMALLEST, colors_of, growth, shown
 
 

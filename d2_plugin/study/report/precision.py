@@ -8,8 +8,9 @@ from math import inf
 from d2_plugin.runs.markup import Table
 from d2_plugin.study.rows import Row
 
+from .plots import Axis, Plot, Point, Series, number
 from .sections import Section, cases_of, distinct, sources_of
-from .svg import Axis, Plot, Point, Series, figure, number
+from .svg import figure
 from .work_precision import SMALLEST, Mean, colors_of, means, means_table, shown, work_precision
 
 ALIGNED_ANCHORS = 20_000

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from d2_plugin.runs.markup import Table
 from d2_plugin.study.rows import Row
 
-from .svg import Axis, Plot, Point, Series, number
+from .plots import Axis, Plot, Point, Series, number
 
 SMALLEST = 1e-16
 """Errors below this are drawn here: they are rounding, and a logarithm needs a floor."""
