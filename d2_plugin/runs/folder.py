@@ -23,7 +23,8 @@ def read_settings(folder: Path) -> RunSettings:
     if not path.is_file():
         raise D2Error(f"{folder} holds no run: expected run.json; give the --output folder of `d2 train`")
     table: dict[str, Any] = json.loads(path.read_text())
-    return RunSettings(**{key: tuple(value) if isinstance(value, list) else value for key, value in table.items()})
+    tuples: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
+    return RunSettings(**tuples)
 
 
 def claim(folder: Path, settings: RunSettings) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from d2_plugin.priors.build import PriorSummary, build_priors
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings, prior_settings
@@ -21,19 +23,25 @@ def build_priors_for(
     *,
     shard: tuple[int, int] | None = None,
     cluster: Mapping[str, Any] | None = None,
-) -> Any:
+) -> PriorSummary:
     """Build what is missing of the depth prior in `folder`; `points` [P, 3] bound the depths that are searched.
 
     `shard` (index from 0, count) builds one part of it, which any scheduler may run beside the others; `cluster`
     (`scheduler` or `workers`) hands the frames to dask.distributed instead.
     """
     with progress_bar("priors", len(scene.capture.frames) * len(scene.train_cameras)) as bar:
-        what = (scene.capture, scene.train_cameras, folder, prior_settings(settings))
-        how = {"sparse_points": points, "progress": lambda done, total, note="": bar.update(done, note)}
-        if cluster is not None:
-            from d2_plugin.priors.dask_build import build_priors_on_cluster
 
-            return build_priors_on_cluster(*what, **how, **cluster)
-        from d2_plugin.priors.build import build_priors
+        def report(done: int, total: int, note: str = "") -> None:
+            bar.update(done, note)
 
-        return build_priors(*what, **how, shard=shard)
+        if cluster is None:
+            build = partial(build_priors, shard=shard)
+        else:
+            from d2_plugin.priors.dask_build import build_priors_on_cluster  # needs an extra
+
+            build = partial(build_priors_on_cluster, **cluster)
+        return build(
+            *(scene.capture, scene.train_cameras, folder, prior_settings(settings)),
+            sparse_points=points,
+            progress=report,
+        )

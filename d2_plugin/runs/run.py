@@ -167,7 +167,7 @@ class Run:
 
     def _trainer(self, triangulated: TimedPoints, attach: bool = True) -> Any:
         """A new trainer of the backbone, with hooks where the run has some and `attach` allows it."""
-        backbone = registry.load(registry.BACKBONES, self.settings.backbone)
+        backbone: Any = registry.load(registry.BACKBONES, self.settings.backbone)
         capture, cameras = self.scene.capture, self.scene.train_cameras
         extent = scene_extent(capture, cameras, triangulated.positions)
         start = initial_points(capture, cameras, triangulated, extent, self.settings.seed)
@@ -190,7 +190,7 @@ class Run:
         return trainer
 
     def _attach(self, model: object) -> D2Hooks:
-        adapter = registry.load(registry.ADAPTERS, self.settings.backbone)
+        adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
         config = hook_config(self.settings, self.priors)
         (self.folder / "d2.toml").write_text(config.to_toml())
         return D2Hooks.from_config(config, backbone=adapter(model))

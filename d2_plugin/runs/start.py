@@ -121,7 +121,7 @@ def scene_extent(capture: Capture, cameras: Sequence[str], points: np.ndarray) -
     if len(depths) >= 10:
         low, middle, high = np.percentile(depths, [1, 50, 99])
         return Extent(0.75 * float(low), 1.25 * float(high), 0.5 * float(middle))
-    bounds = [capture.cameras[name].near_far for name in cameras if capture.cameras[name].near_far]
+    bounds = [near_far for name in cameras if (near_far := capture.cameras[name].near_far) is not None]
     if bounds:
         near, far = min(b[0] for b in bounds), max(b[1] for b in bounds)
         return Extent(0.8 * near, 1.2 * far, 0.5 * float(np.sqrt(near * far)))

@@ -19,7 +19,8 @@ def command_line(command: str, settings: Settings, comma: bool = False, **writte
         written: flags whose text is not simply that of the value.
     """
     words = ["d2", *command.split()]
-    for setting in declared(type(settings)):
+    kind: Any = type(settings)
+    for setting in declared(kind):
         value = getattr(settings, setting.name)
         if value == setting.default:
             continue

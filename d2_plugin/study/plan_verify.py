@@ -253,7 +253,8 @@ def _build(settings: RunSettings, folder: Path) -> dict[str, Any]:
     build_priors_for(settings, scene, points, folder)
     seconds = time.perf_counter() - start
     store, views = PriorStore.open(folder), [(c, f) for c in scene.train_cameras for f in scene.capture.frames]
-    shares = [store.record(camera, frame)["shares"]["verified"] for camera, frame in views]
+    records = [store.record(camera, frame) for camera, frame in views]
+    shares = [record["shares"]["verified"] for record in records if record is not None]
     errors = [error for view in views for error in _errors(scene, store.prior(*view), *view)]
     median = float(np.median(np.concatenate(errors))) if errors else None
     return {"score": mean(shares), "seconds": seconds, "median_error": median}

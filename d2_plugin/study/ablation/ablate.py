@@ -77,7 +77,7 @@ def _share(work: Sequence[Job]) -> None:
     """Triangulate once, and build each prior once, so that runs side by side never build the same thing twice."""
     from d2_plugin.runs.run import Run
 
-    first: dict[str, Run] = {}
+    built: set[str | None] = set()
     points: Path | None = None
     for job in work:
         run = Run(job.settings, job.folder)
@@ -86,9 +86,9 @@ def _share(work: Sequence[Job]) -> None:
             points = run.folder / "points.npz"
         elif not (run.folder / "points.npz").is_file():
             shutil.copyfile(points, run.folder / "points.npz")
-        if run.uses_prior and job.settings.priors not in first:
+        if run.uses_prior and job.settings.priors not in built:
             run.prepare()
-            first[job.settings.priors] = run
+            built.add(job.settings.priors)
             measured = _prior_seconds_file(job.settings)
             if not measured.exists():  # a build that was cut off and continues would time its second part alone
                 measured.write_text(json.dumps(run.seconds["priors"]))

@@ -18,7 +18,7 @@ from d2_plugin.study.command_line import command_line
 from d2_plugin.study.growth import power
 from d2_plugin.study.report.precision import raster_plot
 from d2_plugin.study.report.svg import figure
-from d2_plugin.study.report.work_precision import growth
+from d2_plugin.study.report.work_precision import colors_of, growth
 from d2_plugin.study.rows import Row, append_rows, make_row
 
 from .raster_measure import (
@@ -250,5 +250,6 @@ def _milliseconds(row: Row) -> float:
 
 def plot(rows: Sequence[Row]) -> str:
     """SVG: error against time where errors were measured, and time against the number of Gaussians."""
-    panels = (raster_plot(rows), growth("Growth", "Gaussians", "forward+backward, ms", _by_gaussians(rows)))
+    lines, colors = _by_gaussians(rows), colors_of(rows)
+    panels = (raster_plot(rows), growth("Growth", "Gaussians", "forward+backward, ms", lines, len(colors)))
     return figure(panels, "Rasterizer: error against time, and time against Gaussians", columns=2, size=(480, 340))

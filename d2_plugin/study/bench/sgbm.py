@@ -6,7 +6,7 @@ It knows rectified pairs only, so every view is rectified with the source that P
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -78,7 +78,7 @@ def _pair_depth(
     return _unrectified(cv2, np.where(np.isfinite(depth) & (depth > 0), depth, 0), pair, camera)
 
 
-def _rectify(cv2: object, gray: np.ndarray, other: np.ndarray, camera: Camera, source: Camera) -> Rectified:
+def _rectify(cv2: Any, gray: np.ndarray, other: np.ndarray, camera: Camera, source: Camera) -> Rectified:
     T = relative_pose(camera, source)
     size, none = (camera.width, camera.height), np.zeros(5)
     K, K_source = index_intrinsics(camera), index_intrinsics(source)
@@ -96,7 +96,7 @@ def _rectify(cv2: object, gray: np.ndarray, other: np.ndarray, camera: Camera, s
     return Rectified(R1, P1[:, :3], float(P2[0, 3]), float(P1[0, 2] - P2[0, 2]), left, right)
 
 
-def _unrectified(cv2: object, depth: np.ndarray, pair: Rectified, camera: Camera) -> np.ndarray:
+def _unrectified(cv2: Any, depth: np.ndarray, pair: Rectified, camera: Camera) -> np.ndarray:
     """Planar depth [H, W] of the original view from that of the rectified one, which is turned against it."""
     rays = viewing_rays(camera, np.float64) @ pair.rotation.T
     at = rays @ pair.K.T / rays[..., 2:]

@@ -123,10 +123,12 @@ def _point(mark: Drawn, unit: float, on_front: bool, error_label: str, seconds_l
     return Point(mark.seconds * unit, max(mark.error, SMALLEST), note, label, faded=not on_front)
 
 
-def growth(title: str, size: str, cost: str, lines: Mapping[str, Sequence[tuple[float, float]]]) -> Plot:
+def growth(
+    title: str, size: str, cost: str, lines: Mapping[str, Sequence[tuple[float, float]]], first_color: int = 0
+) -> Plot:
     """How a cost grows with a size: one line of (size, cost) per name, both axes logarithmic."""
     series = []
-    for color, (name, line) in enumerate(lines.items()):
+    for color, (name, line) in enumerate(lines.items(), start=first_color):
         points = tuple(Point(*place, f"{name}, {place[0]:g} {size}: {place[1]:.4g} {cost}") for place in line)
         series.append(Series(name, points, tuple(line), color))
     values = [place for line in lines.values() for place in line]
