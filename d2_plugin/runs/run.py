@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,6 @@ from d2_plugin import registry
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
-from d2_plugin.runs.folder import claim, read_settings, write_json
 from d2_plugin.runs.prior import build_priors_for
 from d2_plugin.runs.provenance import circumstances
 from d2_plugin.runs.scene import Scene
@@ -43,7 +44,7 @@ class Run:
     def __init__(self, settings: RunSettings, folder: Path) -> None:
         self.settings, self.folder = check(settings), folder
         self.scene = Scene.open(self.settings)
-        claim(folder, self.settings)
+        _claim(folder, self.settings)
         self.seconds = {"priors": 0.0, "train": 0.0, "eval": 0.0}
         self.retired: dict[str, int] = {}
         """Hooks that stopped because they changed next to nothing, and at which step."""
@@ -51,7 +52,14 @@ class Run:
     @classmethod
     def load(cls, folder: Path) -> Run:
         """The run that lies in `folder`."""
-        return cls(read_settings(folder), folder)
+        path = folder / "run.json"
+        if not path.is_file():
+            raise D2Error(f"{folder} holds no run: expected run.json; give the --output folder of `d2 train`")
+        table = json.loads(path.read_text())
+        tuples: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in table.items()
+        }
+        return cls(RunSettings(**tuples), folder)
 
     @property
     def uses_prior(self) -> bool:
@@ -92,7 +100,7 @@ class Run:
         with self._timed("eval"):
             scores = self._scores(trainer.model, self.folder / "pictures" if pictures else None)
         metrics = scores | self._about(trainer)
-        write_json(self.folder / "metrics.json", metrics)
+        _write_json(self.folder / "metrics.json", metrics)
         write_tables(metrics, self.folder)
         return metrics
 
@@ -231,3 +239,29 @@ class Run:
             yield
         finally:
             self.seconds[name] += time.monotonic() - start
+
+
+def _claim(folder: Path, settings: RunSettings) -> None:
+    """Take the folder, or find this very run in it; anything else is refused and nothing is written."""
+    identity = json.loads(json.dumps(asdict(settings)))
+    path = folder / "run.json"
+    if path.is_file():
+        found = json.loads(path.read_text())
+        changed = sorted(k for k in identity.keys() | found.keys() if identity.get(k) != found.get(k))
+        if changed:
+            raise D2Error(
+                f"{folder} holds another run, made with other settings of {', '.join(changed)}: "
+                "give another --output, or remove that folder"
+            )
+        return
+    if folder.is_dir() and any(folder.iterdir()):
+        raise D2Error(f"{folder} is not empty and holds no run of ours: give another --output")
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_json(path, identity)
+
+
+def _write_json(path: Path, table: Mapping[str, Any]) -> None:
+    """Write a table; who reads the file meanwhile finds the old one or the new one, whole."""
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(json.dumps(table, indent=1))
+    os.replace(temporary, path)
