@@ -20,7 +20,7 @@ from d2_plugin.runs.lpips import Lpips
 RenderView = Callable[[str, int], tuple[Tensor, Tensor | None]]
 """(camera name, frame) -> (RGB [H, W, 3] in 0..1, planar depth [H, W] or None).
 
-The depth is 0 where the model has too little opacity to say one. Such a pixel counts as wrong wherever there is true
+The depth is 0 where the model has too little opacity to have one. Such a pixel counts as wrong wherever there is true
 depth (see `metrics.depth_absrel`), so leaving depth out never improves a score.
 """
 

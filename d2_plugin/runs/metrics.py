@@ -27,7 +27,7 @@ K1, K2 = 0.01, 0.03
 """SSIM's stabilising constants, times the data range."""
 
 STRIP_ROWS = 32
-"""Rows of the picture whose similarity is computed at a time."""
+"""How many rows of the picture are compared at a time."""
 
 VARIANTS = {
     "psnr": "20 log10(1 / sqrt(MSE)) per image in dB, then the mean over images",

@@ -26,7 +26,7 @@ def build_priors_for(
 ) -> PriorSummary:
     """Build what is missing of the depth prior in `folder`; `points` [P, 3] bound the depths that are searched.
 
-    `shard` (index from 0, count) builds one part of it, which any scheduler may run beside the others; `cluster`
+    `shard` (index from 0, count) builds one part, so that any scheduler can run the parts beside each other. `cluster`
     (`scheduler` or `workers`) hands the frames to dask.distributed instead.
     """
     with progress_bar("priors", len(scene.capture.frames) * len(scene.train_cameras)) as bar:

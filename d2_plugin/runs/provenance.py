@@ -43,7 +43,7 @@ def cpu_name() -> str:
 
 @functools.cache
 def commit() -> str | None:
-    """The commit of a checkout (with + where files differ from it) when first asked, None for an installed package."""
+    """The commit of the checkout when first asked, with + where files differ; None for an installed package."""
     try:
         found, changed = _git("rev-parse", "--short", "HEAD"), _git("status", "--porcelain", "--", "..")
     except (OSError, subprocess.CalledProcessError):

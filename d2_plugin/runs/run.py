@@ -35,7 +35,7 @@ RENDERED_ALPHA = 0.5
 """A rendered depth is reported where the accumulated alpha exceeds this."""
 
 CHECKPOINTS = 10
-"""Times in a run that it is saved; a run that was cut off continues from the last one, bitwise."""
+"""How often a run is saved. One that was cut off continues from its last checkpoint, bitwise."""
 
 
 class Run:
@@ -67,7 +67,7 @@ class Run:
         return any(name in self.settings.hooks for name in HOOK_NAMES[1:])
 
     def prepare(self, priors: bool = True) -> TimedPoints:
-        """Triangulate the sparse points and build the depth prior where they are missing; the points."""
+        """Triangulate the sparse points and build the depth prior where they are missing; returns the points."""
         with self._timed("priors"):
             points = self._points()
             if priors and self.uses_prior:

@@ -173,7 +173,7 @@ def _random_points(capture: Capture, camera: str, extent: Extent, count: int, rn
 def triangulated_points(capture: Capture, cameras: Sequence[str], instants: int = 5) -> TimedPoints:
     """Points triangulated with the known poses at up to `instants` frames spread over the recording.
 
-    None for a single camera, or where pycolmap is not installed, which is said in a warning.
+    There are none for a single camera, or where pycolmap is not installed; the latter is said in a warning.
     """
     chosen = np.unique(np.linspace(0, len(capture.frames) - 1, instants).round().astype(int))
     try:

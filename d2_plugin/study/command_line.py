@@ -1,4 +1,4 @@
-"""The command that a row is the result of, as its settings tell it."""
+"""The command that made a row, written from its settings."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ class Margin:
     error: float | None
     """Standard error of the difference; None where one of them has a single seed."""
     seeds: int
-    """Of the variant that has fewer."""
+    """Number of seeds; that of the variant with fewer."""
 
     @property
     def verdict(self) -> str:
@@ -55,10 +55,3 @@ def margin(ours: Sequence[float], theirs: Sequence[float], larger_is_better: boo
     if seeds > 1:
         error = math.sqrt(variance(ours) / len(ours) + variance(theirs) / len(theirs))
     return Margin(sign * (mean(ours) - mean(theirs)), error, seeds)
-
-
-def margin_of_pairs(differences: Sequence[float]) -> Margin:
-    """The mean of differences that were taken seed by seed, with its standard error s / sqrt(n)."""
-    seeds = len(differences)
-    error = math.sqrt(variance(differences) / seeds) if seeds > 1 else None
-    return Margin(mean(differences), error, seeds)

@@ -1,4 +1,4 @@
-"""Stiff and extreme alignments: certified, or refused for the right reason (reference/priors.md sections 5 and 7)."""
+"""Stiff and extreme alignments: certified, or refused for the right reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stereo at the edge (reference/priors.md section 7, case 44): empty or refused, never a plausible map."""
+"""Stereo at the edge (case 44): empty or refused, never a plausible map."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ EXPLANATION = (
 
 @dataclass(frozen=True)
 class Claim:
-    """That one variant is better than another in one metric, and the margin by which it is here."""
+    """The claim that one variant is better than another in one metric, and the margin that was measured."""
 
     other: str
     column: Column

@@ -1,4 +1,4 @@
-"""The tables of an ablation: mean ± deviation over the seeds, and what the paper's order of the rows comes to here."""
+"""The tables of an ablation: mean ± deviation over the seeds, and whether the paper's order of the rows holds here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Error against run time."""
+"""Benchmarks: error against run time of one part each."""
 
 from __future__ import annotations
 

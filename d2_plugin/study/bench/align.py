@@ -45,7 +45,7 @@ class AlignBench(Settings):
     seconds: NotNegative = 0.03
     """Time for which each fit is repeated, seconds."""
     threads: Annotated[int, Range(1)] | None = None
-    """CPU threads of torch; as many as torch chooses where none is given. The fits themselves use one."""
+    """CPU threads of torch; torch's own choice where left out. The fits themselves use one."""
     output: Path = Path("bench-align")
     """Folder of the results."""
 

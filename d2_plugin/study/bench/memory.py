@@ -15,7 +15,7 @@ _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 class Measured(NamedTuple):
-    """What the work returned, and the memory it took beyond what was there before, MB; NaN where Linux is not."""
+    """What the work returned, and the memory it took beyond what was there before, MB; NaN outside Linux."""
 
     result: Any
     peak_mb: float

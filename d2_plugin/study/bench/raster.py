@@ -50,15 +50,15 @@ class RasterBench(Settings):
     sizes: tuple[str, ...] = ("320x180", "640x360", "1280x720")
     """Image sizes as WIDTHxHEIGHT in pixels."""
     garden: Path | None = None
-    """gsplat's test_garden.npz; adds the scene garden."""
+    """Path of gsplat's test_garden.npz, which adds the scene garden."""
     device: str = "cpu"
     """Where it is drawn: cpu or cuda."""
     seconds: NotNegative = 3.0
     """About how long each pass is repeated, seconds."""
     threads: Annotated[int, Range(1)] | None = None
-    """CPU threads; as many as torch chooses where none is given."""
+    """CPU threads; torch's own choice where left out."""
     error_limit: Count = 60_000
-    """Most Gaussians for which the error is measured. The truth in float64 takes minutes beyond."""
+    """Most Gaussians for which the error is measured; with more of them the truth in float64 takes minutes."""
     no_memory: bool = False
     """Leave out peak memory, which takes a new process for every row on the CPU."""
     output: Path = Path("bench-raster")

@@ -23,7 +23,7 @@ THRESHOLD_DEVIATION = 1e-5
 """Color or alpha that deviates more than this from float64 in a pixel does so because of a threshold."""
 
 REFERENCE_LIMIT = 12_000
-"""Most Gaussians for which the torch path is timed as a peer; it takes seconds per call beyond."""
+"""Most Gaussians for which the torch path is timed as a peer; with more of them it takes seconds per call."""
 
 
 NEARLY_NO_THRESHOLDS = RasterSettings(alpha_min=1e-7, transmittance_min=1e-9)
@@ -84,7 +84,7 @@ def _gsplat(splats: Splats, colors: Tensor, scene: Scene) -> Render:
 
 
 def implementations(device: torch.device, gaussians: int) -> dict[str, RenderScene]:
-    """What is compared on `device`: this package, the torch path where it is bearable, gsplat where it is installed."""
+    """What is compared on `device`: this package, the torch path up to `REFERENCE_LIMIT`, gsplat where installed."""
     found: dict[str, RenderScene] = {"d2": _d2}
     if gaussians <= REFERENCE_LIMIT:
         found["torch reference"] = _reference

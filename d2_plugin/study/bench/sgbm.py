@@ -1,4 +1,4 @@
-"""OpenCV's semi-global matching as an outsider: what geometric depth is compared with, never used for priors.
+"""OpenCV's semi-global matching, which geometric depth is compared with. It is never used for priors.
 
 It knows rectified pairs only, so every view is rectified with the source that PatchMatch would match first.
 """
@@ -35,7 +35,7 @@ class Rectified(NamedTuple):
 def sgbm(
     grays: Sequence[np.ndarray], cameras: Sequence[Camera], depth_range: tuple[float, float], settings: StereoSettings
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Depth and cost (0 where there is a depth) of every view, as makers of geometric depth return them.
+    """Depth and cost (0 where there is a depth) of every view, as matchers of this package return them.
 
     Raises:
         D2Error: a pair is not beside each other, or its disparities span more than the picture.
@@ -86,7 +86,7 @@ def _rectify(cv2: Any, gray: np.ndarray, other: np.ndarray, camera: Camera, sour
     R1, R2, P1, P2, *_ = cv2.stereoRectify(K, none, K_source, none, size, R, t, flags=0, alpha=-1)
     if abs(P2[1, 3]) > abs(P2[0, 3]):
         raise D2Error(
-            f"cameras {camera.name} and {source.name} stand above each other, which this outsider cannot match"
+            f"cameras {camera.name} and {source.name} stand above each other, which semi-global matching cannot match"
         )
     maps = [
         cv2.initUndistortRectifyMap(intrinsics, none, rotation, projection[:, :3], size, cv2.CV_32FC1)

@@ -1,4 +1,4 @@
-"""`d2 bench stereo`: error against run time of geometric depth, every maker and setting behind the same filter."""
+"""`d2 bench stereo`: error against run time of geometric depth, every matcher and setting behind the same filter."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class StereoBench(Settings):
     """Settings of `d2 bench stereo`."""
 
     rigs: tuple[str, ...] = ()
-    """Rendered ones (synthetic2, synthetic3, synthetic4) and those in --data (studio, art, laundry, motorcycle, teddy).
-    Where none is named: the rendered ones, and the others where --data is given."""
+    """Rendered: synthetic2, synthetic3, synthetic4. From --data: studio, art, laundry, motorcycle, teddy. All that are
+    there where none is named."""
     data: Path | None = None
     """Folder with the captures studio/ and middlebury/."""
     makers: tuple[str, ...] = ()
-    """Which matchers of patchmatch, sweep, sgbm and colmap (which needs CUDA); all that run here if none is named."""
+    """Matchers, of patchmatch, sweep, sgbm and colmap (which needs CUDA); all that run here if none is named."""
     defaults_only: bool = False
     """Leave out what is varied about a matcher."""
     width: Annotated[int, Range(32, unit="pixels")] = 320

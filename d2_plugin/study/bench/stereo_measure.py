@@ -44,7 +44,7 @@ VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Method:
-    """A maker with one setting."""
+    """A matcher with one setting."""
 
     name: str
     setting: str
@@ -53,7 +53,7 @@ class Method:
 
 
 def methods() -> list[Method]:
-    """Every maker that runs here and what is varied about it; the first row of each is its default."""
+    """Every matcher that runs here and what is varied about it; the first row of each is its default."""
     default = StereoSettings()
     rows = [
         Method(name, setting, MAKERS[name], replace(default, **changes))

@@ -24,7 +24,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Series:
-    """Marks of one colour and shape; `line` joins some points, `hollow` marks are figures of somebody else."""
+    """Marks of one colour and shape; `line` joins some points, `hollow` marks are figures from elsewhere."""
 
     name: str
     points: tuple[Point, ...]
@@ -42,7 +42,7 @@ class Axis:
     high: float
     log: bool = False
     names: tuple[str, ...] = ()
-    """With names the axis is a list of them, at 0, 1, ..."""
+    """An axis with names lists them, at 0, 1, ..."""
 
     @classmethod
     def listing(cls, label: str, names: Sequence[str]) -> Axis:

@@ -55,7 +55,7 @@ def scores_table(what: str, groups: Sequence[Group]) -> Table:
 
 
 def best_of_cases(groups: Sequence[Group], column: Column) -> list[int]:
-    """Places of the groups with the best mean of one metric, one for each capture on which there are two or more."""
+    """Index of the group with the best mean of one metric, for each capture that has two groups or more."""
     found = []
     for case in dict.fromkeys(group.case for group in groups):
         values = {

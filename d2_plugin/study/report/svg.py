@@ -21,7 +21,7 @@ MARGIN_LEFT, MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 76, 18, 34, 46
 LETTER = 6.4
 """Mean width of a letter at 12 px, px."""
 LABELLED = 320
-"""Plots narrower than this leave the labels of marks to their tooltips, px."""
+"""In plots narrower than this marks have tooltips but no labels, px."""
 NAMED_ROW = 24
 """Height of one name on an axis that lists names, px."""
 
@@ -85,7 +85,7 @@ def text(x: float, y: float, words: str, classes: str = "ink", anchor: str = "st
 
 
 Entry = tuple[str, Callable[[float, float], str]]
-"""A name of the legend, and what draws its sign around a place."""
+"""A name in the legend, and what draws its sign at a place (x, y)."""
 
 
 def _entries(plots: Sequence[Plot]) -> list[Entry]:

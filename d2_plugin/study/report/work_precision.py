@@ -69,7 +69,7 @@ def _geometric(values: Sequence[float]) -> float | None:
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the points that no other one beats in both coordinates (lower is better), by the first one."""
+    """Indices of the points that no other one beats in both coordinates (lower is better), in order of the first."""
     front, best = [], math.inf
     for index in sorted(range(len(points)), key=lambda i: points[i]):
         if points[index][1] < best:

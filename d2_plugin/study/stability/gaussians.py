@@ -1,6 +1,6 @@
 """Sweeps over Gaussians: their lives and motion in the 4D backbone, and their images in the rasterizer.
 
-Truths are closed forms, or the same image by another road: a scene in other units, turned, or moved is the same scene.
+The truth is a closed form, or an image that must be the same: that of the scene in other units, turned or moved.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def depth(unit: float, dtype: torch.dtype) -> float:
 
 
 def world_offset(offset: float, dtype: torch.dtype) -> float:
-    """A scene that lies `offset` away from the origin of its world, camera and all, against the scene at home."""
+    """A scene and its camera, both moved `offset` away from the origin, against the same at the origin."""
     direction = torch.tensor([2.0, -1.0, 2.0], dtype=torch.float64) / 3
     scene = random_scene()
     return difference(scene.moved(offset * direction).render(dtype), scene.render(torch.float64))
