@@ -309,7 +309,7 @@ def _command_line() -> str:
 def _priors(options: argparse.Namespace) -> None:
     from d2_plugin.priors.sheet import contact_sheet
     from d2_plugin.priors.store import PriorStore
-    from d2_plugin.runs.run import build_priors_for
+    from d2_plugin.runs.prior import build_priors_for
     from d2_plugin.runs.scene import Scene
     from d2_plugin.runs.settings import check
     from d2_plugin.runs.start import triangulated_points
@@ -318,7 +318,7 @@ def _priors(options: argparse.Namespace) -> None:
     scene = Scene.open(settings)
     _print_notes(scene.capture.notes)
     _print_plan(scene.plan)
-    points = triangulated_points(scene.capture, scene.train_cameras)["positions"]
+    points = triangulated_points(scene.capture, scene.train_cameras).positions
     print(build_priors_for(settings, scene, points, options.output, shard=options.shard, cluster=_cluster(options)))
     if options.shard is None:
         sheet = options.output / "contact_sheet.png"

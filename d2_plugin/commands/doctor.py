@@ -19,7 +19,6 @@ OPTIONAL = {
     "cv2": ("image", "pictures, videos, the OpenCV stereo sweep"),
     "kornia": ("image", "image operations that tests compare with"),
     "rich": ("cli", "progress bars"),
-    "matplotlib": ("report", "plots of `d2 bench`"),
     "distributed": ("cluster", "priors built by several processes or machines"),
 }
 

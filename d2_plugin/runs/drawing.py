@@ -45,7 +45,7 @@ class Panel(NamedTuple):
 
 
 def colorize(values: np.ndarray, low: float, high: float, colors: np.ndarray) -> np.ndarray:
-    """Colours uint8 [H, W, 3] of `values` [H, W] on a scale from `low` to `high`; its end colours outside."""
+    """Colours uint8 [H, W, 3] of `values` [H, W] on a scale from `low` to `high`, clipped at its ends."""
     place = np.clip((values - low) / max(high - low, 1e-12), 0, 1) * (len(colors) - 1)
     return colors[np.rint(place).astype(np.int64)]
 

@@ -20,7 +20,7 @@ from d2_plugin.runs.lpips import Lpips
 RenderView = Callable[[str, int], tuple[Tensor, Tensor | None]]
 """(camera name, frame) -> (RGB [H, W, 3] in 0..1, planar depth [H, W] or None).
 
-The depth is 0 where the model has too little opacity to say one. Such a pixel counts as wrong wherever there is true
+The depth is 0 where the model has too little opacity to have one. Such a pixel counts as wrong wherever there is true
 depth (see `metrics.depth_absrel`), so leaving depth out never improves a score.
 """
 
@@ -99,15 +99,17 @@ def evaluate(
 def _scores(
     color: Tensor, depth: Tensor | None, truth: Tensor, true_depth: np.ndarray | None
 ) -> dict[str, float | None]:
-    comparable = depth is not None and true_depth is not None
-    z = torch.from_numpy(true_depth) if comparable else None
+    absrel, delta1 = None, None
+    if depth is not None and true_depth is not None:
+        z = torch.from_numpy(true_depth)
+        absrel, delta1 = metrics.depth_absrel(depth, z), metrics.depth_delta1(depth, z)
     return {
         "psnr": metrics.psnr(color, truth),
         "ssim1": metrics.ssim_range1(color, truth),
         "ssim2": metrics.ssim_range2(color, truth),
         "ssim_3dgs": metrics.ssim_3dgs(color, truth),
-        "depth_absrel": metrics.depth_absrel(depth, z) if comparable else None,
-        "depth_delta1": metrics.depth_delta1(depth, z) if comparable else None,
+        "depth_absrel": absrel,
+        "depth_delta1": delta1,
     }
 
 
@@ -115,7 +117,8 @@ def _checked(
     rendered: tuple[Tensor, Tensor | None], shape: torch.Size, camera: str, frame: int
 ) -> tuple[Tensor, Tensor | None]:
     """Colour in 0..1 and depth on the CPU, float32."""
-    color, depth = (None if part is None else part.detach().cpu().float() for part in rendered)
+    color = rendered[0].detach().cpu().float()
+    depth = None if rendered[1] is None else rendered[1].detach().cpu().float()
     where = f"the render of camera {camera} at frame {frame}"
     if color.shape != shape or (depth is not None and depth.shape != shape[:2]):
         sizes = f"{tuple(color.shape)}" + ("" if depth is None else f" and depth {tuple(depth.shape)}")
@@ -150,8 +153,8 @@ def _panels(
         Panel(f"truth  {row['camera']}  frame {row['frame']}", _bytes(truth)),
         Panel(f"rendered  {row['psnr']:.2f} dB", _bytes(color)),
     ]
-    shown = {"depth": None if depth is None else depth.numpy(), "true depth": true_depth}
-    shown = {title: array for title, array in shown.items() if array is not None}
+    maps = {"depth": None if depth is None else depth.numpy(), "true depth": true_depth}
+    shown = {title: array for title, array in maps.items() if array is not None}
     if shown:
         low, high = _depth_range(list(shown.values())[-1])  # the true one's where there is one
         panels += [_depth_panel(title, array, low, high, row["depth_absrel"]) for title, array in shown.items()]

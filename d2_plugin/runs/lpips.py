@@ -29,7 +29,19 @@ SCALE = (0.458, 0.448, 0.450)
 SMALLEST = 64
 """Least width and height in pixels: below it the deepest features have no pixel left."""
 
-_VGG16 = (64, 64, "pool", 128, 128, "pool", *(256,) * 3, "pool", *(512,) * 3, "pool", *(512,) * 3)
+_VGG16: tuple[int | str, ...] = (
+    64,
+    64,
+    "pool",
+    128,
+    128,
+    "pool",
+    *(256,) * 3,
+    "pool",
+    *(512,) * 3,
+    "pool",
+    *(512,) * 3,
+)
 _TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}  # layers (ReLUs) whose output is compared
 _FILES = {"alex": ("alexnet*.pth", "alex.pth"), "vgg": ("vgg16-*.pth", "vgg.pth")}
 
@@ -86,11 +98,13 @@ def find_lpips(net: str = "alex", folder: Path | None = None) -> Lpips | None:
     if net not in _FILES:
         raise unknown_name("LPIPS network", net, _FILES)
     places = [folder] if folder is not None else list(_usual_places())
-    found = [next((file for place in places for file in sorted(place.glob(name))), None) for name in _FILES[net]]
-    if None in found:
+    features, linear = (
+        next((file for place in places for file in sorted(place.glob(name))), None) for name in _FILES[net]
+    )
+    if features is None or linear is None:
         log.info("LPIPS is not available: no %s and %s in %s", *_FILES[net], ", ".join(map(str, places)))
         return None
-    return Lpips(net, *found)
+    return Lpips(net, features, linear)
 
 
 def _usual_places() -> Iterator[Path]:
@@ -123,7 +137,7 @@ def _vgg16() -> nn.Sequential:
     layers: list[nn.Module] = []
     width = 3
     for step in _VGG16:
-        if step == "pool":
+        if isinstance(step, str):
             layers.append(nn.MaxPool2d(2, 2))
         else:
             layers += [nn.Conv2d(width, step, 3, padding=1), nn.ReLU()]

@@ -27,7 +27,7 @@ K1, K2 = 0.01, 0.03
 """SSIM's stabilising constants, times the data range."""
 
 STRIP_ROWS = 32
-"""Rows of the picture whose similarity is computed at a time."""
+"""How many rows of the picture are compared at a time."""
 
 VARIANTS = {
     "psnr": "20 log10(1 / sqrt(MSE)) per image in dB, then the mean over images",
@@ -44,8 +44,8 @@ VARIANTS = {
 
 def psnr(image: Tensor, truth: Tensor) -> float:
     """Peak signal to noise ratio in dB, 20 log10(1 / sqrt(MSE)); infinite for equal pictures."""
-    image, truth = _pair(image, truth)
-    error = float(np.square(image - truth).mean())
+    first, second = _pair(image, truth)
+    error = float(np.square(first - second).mean())
     return -10 * math.log10(error) if error > 0 else math.inf
 
 
@@ -61,20 +61,20 @@ def ssim_range2(image: Tensor, truth: Tensor) -> float:
 
 def ssim_uniform(image: Tensor, truth: Tensor, data_range: float) -> float:
     """Structural similarity with a uniform 7x7 window and sample covariance, mean over windows inside the picture."""
-    image, truth = _pair(image, truth, UNIFORM_WINDOW)
+    first, second = _pair(image, truth, UNIFORM_WINDOW)
     count = UNIFORM_WINDOW**2
     taps = [1 / UNIFORM_WINDOW] * UNIFORM_WINDOW
-    return _ssim(image, truth, taps, data_range, unbias=count / (count - 1))
+    return _ssim(first, second, taps, data_range, unbias=count / (count - 1))
 
 
 def ssim_3dgs(image: Tensor, truth: Tensor) -> float:
     """Structural similarity as 3DGS codebases compute it: Gaussian 11x11 window over a zero-padded picture."""
-    image, truth = _pair(image, truth, GAUSSIAN_WINDOW)
+    pair = _pair(image, truth, GAUSSIAN_WINDOW)
     reach = GAUSSIAN_WINDOW // 2
     weights = [math.exp(-0.5 * (offset / GAUSSIAN_SIGMA) ** 2) for offset in range(-reach, reach + 1)]
     taps = [weight / sum(weights) for weight in weights]
-    padded = [np.pad(picture, ((0, 0), (reach, reach), (reach, reach))) for picture in (image, truth)]
-    return _ssim(*padded, taps, data_range=1.0, unbias=1.0)
+    first, second = (np.pad(picture, ((0, 0), (reach, reach), (reach, reach))) for picture in pair)
+    return _ssim(first, second, taps, data_range=1.0, unbias=1.0)
 
 
 def flicker(image: Tensor, truth: Tensor, image_before: Tensor, truth_before: Tensor) -> float:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import platform
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -24,7 +26,7 @@ def circumstances(device: torch.device | str = "cpu") -> dict[str, str | int | N
     }
 
 
-def provenance(row: dict) -> str:
+def provenance(row: Mapping[str, Any]) -> str:
     """One sentence for a caption, from a row that has what `circumstances` gives and the `command`."""
     where = f"{row['device']}, {row['threads']} threads, torch {row['torch']}"
     return f"{where}, commit {row['commit'] or row['version']}, `{row['command']}`."
@@ -41,11 +43,13 @@ def cpu_name() -> str:
 
 @functools.cache
 def commit() -> str | None:
-    """The commit of a checkout (with + where files differ from it) when first asked, None for an installed package."""
+    """The commit of the checkout when first asked, with + where files differ; None for an installed package."""
     try:
-        options = {"cwd": Path(__file__).parent, "capture_output": True, "text": True, "check": True}
-        found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], **options).stdout.strip()
-        changed = subprocess.run(["git", "status", "--porcelain", "--", ".."], **options).stdout
+        found, changed = _git("rev-parse", "--short", "HEAD"), _git("status", "--porcelain", "--", "..")
     except (OSError, subprocess.CalledProcessError):
         return None
-    return found + ("+" if changed else "")
+    return found.strip() + ("+" if changed else "")
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=Path(__file__).parent, capture_output=True, text=True, check=True).stdout

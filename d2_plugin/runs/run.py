@@ -11,7 +11,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,16 +18,24 @@ from d2_plugin import registry
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
+from d2_plugin.runs.prior import build_priors_for
 from d2_plugin.runs.provenance import circumstances
 from d2_plugin.runs.scene import Scene
-from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config, prior_settings
-from d2_plugin.runs.start import Extent, TrainingFrames, initial_points, make_view, scene_extent, triangulated_points
+from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config
+from d2_plugin.runs.start import (
+    TimedPoints,
+    TrainingFrames,
+    initial_points,
+    make_view,
+    scene_extent,
+    triangulated_points,
+)
 
 RENDERED_ALPHA = 0.5
 """A rendered depth is reported where the accumulated alpha exceeds this."""
 
 CHECKPOINTS = 10
-"""Times in a run that it is saved; a run that was cut off continues from the last one, bitwise."""
+"""How often a run is saved. One that was cut off continues from its last checkpoint, bitwise."""
 
 
 class Run:
@@ -49,7 +56,9 @@ class Run:
         if not path.is_file():
             raise D2Error(f"{folder} holds no run: expected run.json; give the --output folder of `d2 train`")
         table = json.loads(path.read_text())
-        tuples = {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
+        tuples: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in table.items()
+        }
         return cls(RunSettings(**tuples), folder)
 
     @property
@@ -57,18 +66,17 @@ class Run:
         """Whether any hook of this run needs the depth prior."""
         return any(name in self.settings.hooks for name in HOOK_NAMES[1:])
 
-    def prepare(self, priors: bool = True) -> tuple[Extent, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Triangulate the sparse points and build the depth prior where they are missing; the extent and the points."""
+    def prepare(self, priors: bool = True) -> TimedPoints:
+        """Triangulate the sparse points and build the depth prior where they are missing; returns the points."""
         with self._timed("priors"):
-            extent, sparse = self._points()
+            points = self._points()
             if priors and self.uses_prior:
-                build_priors_for(self.settings, self.scene, sparse[0], self.priors)
-        return extent, sparse
+                build_priors_for(self.settings, self.scene, points.positions, self.priors)
+        return points
 
     def train(self) -> None:
         """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one."""
-        extent, sparse = self.prepare()
-        trainer = self._trainer(extent, sparse)
+        trainer = self._trainer(self.prepare())
         self._restore(trainer)
         iterations = self.settings.iterations
         chunk = max(iterations // CHECKPOINTS, 1)
@@ -86,27 +94,42 @@ class Run:
         Writes metrics.json (per view, per frame, per camera, mean), the same as tables in metrics.md and metrics.tex,
         and pictures/.
         """
-        from d2_plugin.runs.evaluation import evaluate
-        from d2_plugin.runs.lpips import find_lpips
         from d2_plugin.runs.tables import write_tables
 
-        trainer, scene = self._trained(), self.scene
+        trainer = self._trained()
+        with self._timed("eval"):
+            scores = self._scores(trainer.model, self.folder / "pictures" if pictures else None)
+        metrics = scores | self._about(trainer)
+        _write_json(self.folder / "metrics.json", metrics)
+        write_tables(metrics, self.folder)
+        return metrics
+
+    def _scores(self, model: Any, pictures: Path | None) -> dict[str, Any]:
+        """What `evaluate` finds; under `train` instead of `test` where no camera was held out."""
+        from d2_plugin.runs.evaluation import evaluate
+        from d2_plugin.runs.lpips import find_lpips
+
+        scene = self.scene
         cameras = scene.test_cameras or scene.train_cameras
-        total = len(cameras) * len(scene.capture.frames)
-        with progress_bar("evaluate", total) as bar, self._timed("eval"):
+        with progress_bar("evaluate", len(cameras) * len(scene.capture.frames)) as bar:
             scores = evaluate(
-                self._renderer(trainer.model),
+                self._renderer(model),
                 scene.capture,
                 cameras,
                 scene.capture.frames,
-                self.folder / "pictures" if pictures else None,
+                pictures,
                 lpips=find_lpips("alex"),
                 lpips_vgg=find_lpips("vgg"),
                 progress=lambda done, _: bar.update(done),
             )
-        if not scene.test_cameras:
-            scores = {"test": None, "train": scores.pop("test")} | scores
-        metrics = scores | {
+        if scene.test_cameras:
+            return scores
+        return {"test": None, "train": scores.pop("test")} | scores
+
+    def _about(self, trainer: Any) -> dict[str, Any]:
+        """What metrics.json says beside the scores: the run, its cost, and the machine."""
+        scene = self.scene
+        return {
             "gaussians": len(trainer.model),
             "iterations": trainer.step,
             "seconds": {name: round(value, 3) for name, value in self.seconds.items()},
@@ -121,9 +144,6 @@ class Run:
             "notes": list(scene.capture.notes),
             "made": circumstances(),
         }
-        _write_json(self.folder / "metrics.json", metrics)
-        write_tables(metrics, self.folder)
-        return metrics
 
     def export_ply(self) -> list[Path]:
         """One 3DGS PLY per frame under ply/: the Gaussians of that instant, temporal opacity folded in."""
@@ -146,39 +166,39 @@ class Run:
         """Folder of the depth prior."""
         return Path(self.settings.priors) if self.settings.priors else self.folder / "priors"
 
-    def _points(self) -> tuple[Extent, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Extent of the scene and its triangulated points (positions, colors, frames), kept in points.npz."""
+    def _points(self) -> TimedPoints:
+        """The triangulated points, kept in points.npz."""
         path = self.folder / "points.npz"
         if not path.is_file():
-            _write_npz(path, **triangulated_points(self.scene.capture, self.scene.train_cameras))
-        with np.load(path) as stored:
-            sparse = (stored["positions"], stored["colors"], stored["frames"])
-        return scene_extent(self.scene.capture, self.scene.train_cameras, sparse[0]), sparse
+            triangulated_points(self.scene.capture, self.scene.train_cameras).save(path)
+        return TimedPoints.load(path)
 
-    def _trainer(self, extent: Extent, sparse: tuple, attach: bool = True) -> Any:
-        backbone = registry.load(registry.BACKBONES, self.settings.backbone)
-        points = initial_points(self.scene.capture, self.scene.train_cameras, sparse, extent, self.settings.seed)
-        frames = self.scene.capture.frames
+    def _trainer(self, triangulated: TimedPoints, attach: bool = True) -> Any:
+        """A new trainer of the backbone, with hooks where the run has some and `attach` allows it."""
+        backbone: Any = registry.load(registry.BACKBONES, self.settings.backbone)
+        capture, cameras = self.scene.capture, self.scene.train_cameras
+        extent = scene_extent(capture, cameras, triangulated.positions)
+        start = initial_points(capture, cameras, triangulated, extent, self.settings.seed)
         model = backbone.create(
-            *(values.to(self.settings.device) for values in (points.positions, points.colors, points.times)),
+            *start.tensors(self.settings.device),
             extent=extent.radius,
-            duration=self.scene.capture.seconds(frames[-1]),
+            duration=capture.seconds(capture.frames[-1]),
             temporal=self.scene.plan.uses("temporal"),
             settings=self.settings.overrides.get("backbone", {}),
         )
         training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
-        pictures = TrainingFrames(self.scene.capture, self.scene.train_cameras, self.settings.device)
+        pictures = TrainingFrames(capture, cameras, self.settings.device)
         return backbone.Trainer(model, pictures, training, self._attach if attach and self.uses_prior else None)
 
     def _trained(self) -> Any:
         """The trainer at the last checkpoint, without hooks."""
-        trainer = self._trainer(*self._points(), attach=False)
+        trainer = self._trainer(self._points(), attach=False)
         if not self._restore(trainer):
             raise D2Error(f"{self.folder} holds no checkpoint yet: run `d2 train` to its end first")
         return trainer
 
     def _attach(self, model: object) -> D2Hooks:
-        adapter = registry.load(registry.ADAPTERS, self.settings.backbone)
+        adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
         config = hook_config(self.settings, self.priors)
         (self.folder / "d2.toml").write_text(config.to_toml())
         return D2Hooks.from_config(config, backbone=adapter(model))
@@ -221,32 +241,6 @@ class Run:
             self.seconds[name] += time.monotonic() - start
 
 
-def build_priors_for(
-    settings: RunSettings,
-    scene: Scene,
-    points: np.ndarray,
-    folder: Path,
-    *,
-    shard: tuple[int, int] | None = None,
-    cluster: Mapping[str, Any] | None = None,
-) -> Any:
-    """Build what is missing of the depth prior in `folder`; `points` [P, 3] bound the depths that are searched.
-
-    `shard` (index from 0, count) builds one part of it, which any scheduler may run beside the others; `cluster`
-    (`scheduler` or `workers`) hands the frames to dask.distributed instead.
-    """
-    with progress_bar("priors", len(scene.capture.frames) * len(scene.train_cameras)) as bar:
-        what = (scene.capture, scene.train_cameras, folder, scene.plan.obeyed_by(prior_settings(settings)))
-        how = {"sparse_points": points, "progress": lambda done, total, note="": bar.update(done, note)}
-        if cluster is not None:
-            from d2_plugin.priors.dask_build import build_priors_on_cluster
-
-            return build_priors_on_cluster(*what, **how, **cluster)
-        from d2_plugin.priors.build import build_priors
-
-        return build_priors(*what, **how, shard=shard)
-
-
 def _claim(folder: Path, settings: RunSettings) -> None:
     """Take the folder, or find this very run in it; anything else is refused and nothing is written."""
     identity = json.loads(json.dumps(asdict(settings)))
@@ -267,12 +261,7 @@ def _claim(folder: Path, settings: RunSettings) -> None:
 
 
 def _write_json(path: Path, table: Mapping[str, Any]) -> None:
+    """Write a table; who reads the file meanwhile finds the old one or the new one, whole."""
     temporary = path.with_suffix(".tmp")
     temporary.write_text(json.dumps(table, indent=1))
-    os.replace(temporary, path)
-
-
-def _write_npz(path: Path, **arrays: np.ndarray) -> None:
-    temporary = path.with_suffix(".tmp.npz")
-    np.savez(temporary, **arrays)
     os.replace(temporary, path)

@@ -2,23 +2,74 @@
 
 from __future__ import annotations
 
+import os
 import warnings
+import zipfile
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from d2_plugin.captures import Camera, Capture
-from d2_plugin.errors import MissingExtra
-from d2_plugin.priors.colmap.points import SparsePoints, triangulate_frames
+from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.priors.colmap.points import triangulate_frames
 from d2_plugin.protocol import View
 
 MIN_POINTS = 1000
-"""Fewer triangulated points than this are filled up with random ones (studio, backbone alone, 600 steps: 24.5 dB with
-1214 triangulated points, 22.2 with 3786 random ones added)."""
+"""Fewer triangulated points than this are filled up with random ones.
+
+Measured on studio, backbone alone, 600 steps: 24.5 dB with 1214 triangulated points, 22.2 dB with 3786 random ones
+added to them.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class TimedPoints:
+    """Coloured points, each at an instant: those that were triangulated, and those that Gaussians start from."""
+
+    positions: np.ndarray  # [N, 3] float64, world
+    colors: np.ndarray  # [N, 3] in 0..1
+    times: np.ndarray  # [N] seconds since the first frame
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @classmethod
+    def joined(cls, parts: Sequence[TimedPoints]) -> TimedPoints:
+        """The points of all parts, in their order."""
+        together = [(part.positions, part.colors, part.times) for part in parts]
+        return cls(*(np.concatenate(values) for values in zip(*together, strict=True)))
+
+    def save(self, path: Path) -> None:
+        """Write an .npz with one array per attribute; a file that is there is replaced at once."""
+        temporary = path.with_suffix(".tmp.npz")
+        np.savez(temporary, positions=self.positions, colors=self.colors, times=self.times)
+        os.replace(temporary, path)
+
+    @classmethod
+    def load(cls, path: Path) -> TimedPoints:
+        """Read what `save` wrote.
+
+        Raises:
+            D2Error: the file is damaged or that of another version.
+        """
+        try:
+            with np.load(path) as stored:
+                return cls(stored["positions"], stored["colors"], stored["times"])
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as failure:
+            raise D2Error(
+                f"cannot read points from {path} ({failure}): delete the file, it will be made again"
+            ) from None
+
+    def tensors(self, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor, Tensor]:
+        """Positions, colours and times in float32."""
+        parts = (self.positions, self.colors, self.times)
+        positions, colors, times = (torch.tensor(part, dtype=torch.float32, device=device) for part in parts)
+        return positions, colors, times
 
 
 def make_view(capture: Capture, camera: str, frame: int, device: torch.device | str = "cpu") -> View:
@@ -70,7 +121,7 @@ def scene_extent(capture: Capture, cameras: Sequence[str], points: np.ndarray) -
     if len(depths) >= 10:
         low, middle, high = np.percentile(depths, [1, 50, 99])
         return Extent(0.75 * float(low), 1.25 * float(high), 0.5 * float(middle))
-    bounds = [capture.cameras[name].near_far for name in cameras if capture.cameras[name].near_far]
+    bounds = [near_far for name in cameras if (near_far := capture.cameras[name].near_far) is not None]
     if bounds:
         near, far = min(b[0] for b in bounds), max(b[1] for b in bounds)
         return Extent(0.8 * near, 1.2 * far, 0.5 * float(np.sqrt(near * far)))
@@ -84,44 +135,30 @@ def _depths(camera: Camera, points: np.ndarray) -> np.ndarray:
     return z[z > 0]
 
 
-@dataclass(frozen=True)
-class InitialPoints:
-    """Where Gaussians start: positions [N, 3] world, colors [N, 3] in 0..1, times [N] seconds."""
-
-    positions: Tensor
-    colors: Tensor
-    times: Tensor
-
-
 def initial_points(
     capture: Capture,
     cameras: Sequence[str],
-    sparse: tuple[np.ndarray, np.ndarray, np.ndarray],
+    triangulated: TimedPoints,
     extent: Extent,
     seed: int = 0,
     minimum: int = MIN_POINTS,
-) -> InitialPoints:
-    """Triangulated points `sparse` (positions, colors, frames), filled up to `minimum` with random ones.
+) -> TimedPoints:
+    """Where Gaussians start: the triangulated points, filled up to `minimum` with random ones.
 
     A random point lies on the ray of a random pixel of a random training picture, at a depth drawn uniformly in
     inverse depth between near and far, and takes the pixel's colour.
     """
-    positions, colors, frames = sparse
-    times = np.array([capture.seconds(int(frame)) for frame in frames])
-    missing = max(minimum - len(positions), 0)
+    missing = max(minimum - len(triangulated), 0)
     rng = np.random.default_rng(seed)
     fill = [_random_points(capture, camera, extent, n, rng) for camera, n in _shares(cameras, missing)]
-    parts = zip((positions, colors, times), *fill, strict=True)
-    return InitialPoints(*(torch.tensor(np.concatenate(part), dtype=torch.float32) for part in parts))
+    return TimedPoints.joined([triangulated, *fill])
 
 
 def _shares(cameras: Sequence[str], count: int) -> list[tuple[str, int]]:
     return [(camera, len(range(i, count, len(cameras)))) for i, camera in enumerate(cameras)]
 
 
-def _random_points(
-    capture: Capture, camera: str, extent: Extent, count: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _random_points(capture: Capture, camera: str, extent: Extent, count: int, rng: np.random.Generator) -> TimedPoints:
     calibration, frame = capture.cameras[camera], capture.frames[int(rng.integers(len(capture.frames)))]
     columns, rows = rng.integers(calibration.width, size=count), rng.integers(calibration.height, size=count)
     depth = 1 / rng.uniform(1 / extent.far, 1 / extent.near, count)
@@ -130,19 +167,19 @@ def _random_points(
     rotation, translation = calibration.T_camera_world[:3, :3], calibration.T_camera_world[:3, 3]
     colors = capture.image(camera, frame)[rows, columns] / 255
     times = rng.uniform(0, max(capture.seconds(capture.frames[-1]), 1e-9), count)
-    return (in_camera - translation) @ rotation, colors, times
+    return TimedPoints((in_camera - translation) @ rotation, colors, times)
 
 
-def triangulated_points(capture: Capture, cameras: Sequence[str], instants: int = 5) -> dict[str, np.ndarray]:
+def triangulated_points(capture: Capture, cameras: Sequence[str], instants: int = 5) -> TimedPoints:
     """Points triangulated with the known poses at up to `instants` frames spread over the recording.
 
-    Returns positions [P, 3], colors [P, 3] in 0..1 and frames [P]; none for a single camera, or where pycolmap is not
-    installed, which is said in a warning.
+    There are none for a single camera, or where pycolmap is not installed; the latter is said in a warning.
     """
     chosen = np.unique(np.linspace(0, len(capture.frames) - 1, instants).round().astype(int))
     try:
-        points = triangulate_frames(capture, cameras, [capture.frames[i] for i in chosen])
+        found = triangulate_frames(capture, cameras, [capture.frames[i] for i in chosen])
     except MissingExtra as error:
         warnings.warn(f"{error}; Gaussians start from random points instead", stacklevel=2)
-        points = SparsePoints.empty()
-    return {"positions": points.positions, "colors": points.colors, "frames": points.frames}
+        return TimedPoints(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0))
+    times = np.array([capture.seconds(int(frame)) for frame in found.frames], dtype=float)
+    return TimedPoints(found.positions, found.colors, times)

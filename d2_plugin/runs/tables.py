@@ -1,4 +1,4 @@
-"""Tables of metrics, as Markdown for people and as LaTeX rows in the form of the paper's tables."""
+"""Tables of metrics, as Markdown for people and as LaTeX in the form of the paper's tables."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin.errors import D2Error
+from d2_plugin.runs.markup import Table, escaped, latex, markdown
 
 Metrics = Mapping[str, Any]
 
@@ -25,10 +26,15 @@ class Column:
     larger_is_better: bool
     always: bool = True
     """Otherwise the column is left out of a table in which nothing has it."""
+    unit: str = ""
+
+    def text(self, value: float | None) -> str:
+        """The value in its digits, `-` where it was not measured."""
+        return "-" if value is None else format(value, self.form)
 
 
 COLUMNS = (
-    Column("PSNR", r"PSNR$\uparrow$", "psnr", ".2f", True),
+    Column("PSNR", r"PSNR$\uparrow$", "psnr", ".2f", True, unit="dB"),
     Column("SSIM1", r"SSIM$_1\uparrow$", "ssim1", ".4f", True),
     Column("SSIM2", r"SSIM$_2\uparrow$", "ssim2", ".4f", True),
     Column("LPIPS", r"LPIPS$\downarrow$", "lpips", ".4f", False),
@@ -42,17 +48,21 @@ COLUMNS = (
 PAPER_COLUMNS = tuple(column for column in COLUMNS if column.key in ("psnr", "ssim1", "ssim2", "lpips"))
 """The columns of the paper's tables, which print four digits."""
 
+STUDY_COLUMNS = tuple(c for c in COLUMNS if c.key in ("psnr", "ssim1", "ssim2", "lpips", "depth_absrel"))
+"""The columns by which variants are compared: no single one of them says which is better."""
+
 
 def metrics_table(runs: Mapping[str, Metrics]) -> str:
     """A Markdown table with one row per run of `metrics.json` contents; what was not measured shows as `-`."""
-    scored = {name: metrics.get("test") or {} for name, metrics in runs.items()}
+    scored = _scored(runs)
     columns = _columns(list(scored.values()))
-    lines = [["run", *(column.title for column in columns), "Gaussians", "priors s", "train s"]]
+    header = ("run", *(column.title for column in columns), "Gaussians", "priors s", "train s")
+    rows = []
     for name, metrics in runs.items():
         seconds = metrics["seconds"]
-        cells = [_cell(scored[name].get(column.key), column.form) for column in columns]
-        lines.append([name, *cells, str(metrics["gaussians"]), f"{seconds['priors']:.1f}", f"{seconds['train']:.1f}"])
-    return _markdown(lines)
+        costs = (str(metrics["gaussians"]), f"{seconds['priors']:.1f}", f"{seconds['train']:.1f}")
+        rows.append((name, *_cells(scored[name], columns), *costs))
+    return markdown(Table(header, tuple(rows)), padded=True)
 
 
 def latex_table(runs: Mapping[str, Metrics], columns: Sequence[Column] = PAPER_COLUMNS) -> str:
@@ -60,15 +70,21 @@ def latex_table(runs: Mapping[str, Metrics], columns: Sequence[Column] = PAPER_C
 
     What was not measured shows as `--`.
     """
-    scored = {name: metrics.get("test") or {} for name, metrics in runs.items()}
+    scored = _scored(runs)
+    header = ("Method", *(column.latex for column in columns))
+    rows = tuple((escaped(name), *(_latex_cell(scores.get(c.key)) for c in columns)) for name, scores in scored.items())
     best = {column.key: _best(column, list(scored.values())) for column in columns}
-    head = " & ".join(["Method", *(column.latex for column in columns)])
-    rows = [
-        " & ".join([_escaped(name), *(_latex_cell(scores.get(c.key), best[c.key]) for c in columns)])
-        for name, scores in scored.items()
-    ]
-    lines = [rf"\begin{{tabular}}{{l{'c' * len(columns)}}}", r"\toprule", head + r" \\", r"\midrule"]
-    return "\n".join([*lines, *(row + r" \\" for row in rows), r"\bottomrule", r"\end{tabular}"])
+    stressed = frozenset(
+        (row, place)
+        for row, scores in enumerate(scored.values())
+        for place, column in enumerate(columns, start=1)
+        if scores.get(column.key) is not None and scores[column.key] == best[column.key]
+    )
+    return latex(Table(header, rows, stressed))
+
+
+def _scored(runs: Mapping[str, Metrics]) -> dict[str, Mapping[str, Any]]:
+    return {name: metrics.get("test") or {} for name, metrics in runs.items()}
 
 
 def view_tables(metrics: Metrics) -> str:
@@ -104,22 +120,13 @@ def _columns(scored: Sequence[Mapping[str, Any]]) -> list[Column]:
 
 def _section(title: str, rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> str:
     columns = _columns(rows)
-    lines = [[*keys, *(column.title for column in columns)]]
-    for row in rows:
-        cells = [_cell(row.get(column.key), column.form) for column in columns]
-        lines.append([*(str(row[key]) for key in keys), *cells])
-    return f"## {title}\n\n{_markdown(lines)}"
+    header = (*keys, *(column.title for column in columns))
+    lines = tuple((*(str(row[key]) for key in keys), *_cells(row, columns)) for row in rows)
+    return f"## {title}\n\n{markdown(Table(header, lines), padded=True)}"
 
 
-def _markdown(lines: Sequence[Sequence[str]]) -> str:
-    """A table whose first line is its head."""
-    rows = [lines[0], ["---"] * len(lines[0]), *lines[1:]]
-    widths = [max(len(row[place]) for row in rows) for place in range(len(lines[0]))]
-    return "\n".join("| " + " | ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) + " |" for row in rows)
-
-
-def _cell(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
+def _cells(scores: Mapping[str, Any], columns: Sequence[Column]) -> list[str]:
+    return [column.text(scores.get(column.key)) for column in columns]
 
 
 def _best(column: Column, scored: Sequence[Mapping[str, Any]]) -> float | None:
@@ -130,15 +137,7 @@ def _best(column: Column, scored: Sequence[Mapping[str, Any]]) -> float | None:
     return max(known) if column.larger_is_better else min(known)
 
 
-def _latex_cell(value: float | None, best: float | None) -> str:
+def _latex_cell(value: float | None) -> str:
     if value is None:
         return "--"
-    text = f"{value:.4f}" if math.isfinite(value) else r"$\infty$"
-    return rf"\textbf{{{text}}}" if value == best else text
-
-
-def _escaped(text: str) -> str:
-    """A run's name, which LaTeX prints as it is."""
-    for symbol in "&%$#_{}":
-        text = text.replace(symbol, "\\" + symbol)
-    return text.replace("²", "$^2$")
+    return f"{value:.4f}" if math.isfinite(value) else r"$\infty$"

@@ -1,1 +1,1 @@
-"""Metrics, evaluation, ablations and reports."""
+"""Everything that compares: benchmarks, ablations, stability sweeps, both ways of a plan, and the report of it all."""

@@ -2,33 +2,96 @@
 
 Time and memory are those of the work that the decision is about (training, or building priors), each measured in a
 process of its own. The cost is what leaving the part out loses: held-out dB, or verified pixels; negative is a gain.
+Whether it costs anything is a verdict over at least three seeds, see `verdict`.
 """
 
 from __future__ import annotations
 
-import argparse
-import shlex
-import sys
+import itertools
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, stdev
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from d2_plugin.captures.presets import resolve_cameras
+from d2_plugin.runs.markup import markdown
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check
+from d2_plugin.settings import Positional, Range, Seed, Settings
 from d2_plugin.study.bench.memory import Measured, in_fresh_process
+from d2_plugin.study.command_line import command_line
 from d2_plugin.study.report.limits import plan as plan_section
-from d2_plugin.study.report.page import markdown_table
+from d2_plugin.study.verdict import LEAST_SEEDS
 
 from .rows import Row, append_rows, make_row
 
 USED, LEFT_OUT = "used", "left out"
+
+
+@dataclass(frozen=True)
+class PlanVerification(Settings):
+    """Settings of `d2 plan CAPTURE --verify`."""
+
+    capture: Annotated[str, Positional()]
+    """Folder of the recording."""
+    train_cameras: tuple[str, ...]
+    """Names of the cameras that train; or preset:2, preset:3, preset:4 for a known data set."""
+    frames: tuple[int, ...] | None = None
+    """Which frames; all of the recording where none is named."""
+    downscale: Annotated[int, Range(1)] = 1
+    """Make pictures this many times smaller."""
+    mono_onnx: str | None = None
+    """Monocular depth network as an ONNX file."""
+    mono_kind: Literal["relative", "metric"] | None = None
+    """What the network predicts: inverse depth up to scale and shift (relative) or depth (metric)."""
+    iterations: Annotated[int, Range(1, unit="steps")] = 300
+    """Optimizer steps of each training."""
+    prior_frames: Annotated[int, Range(1)] = 6
+    """Number of frames over which priors are built, from the first one."""
+    seeds: tuple[Seed, ...] = (0, 1, 2)
+    """Seeds of the trainings. A verdict needs at least three."""
+    output: Path = Path("runs.jsonl")
+    """File that the rows are added to."""
+
+
+def run(settings: PlanVerification) -> str:
+    """Take each decision both ways and add the rows; the table, and where the rows lie."""
+    train, test, notes = resolve_cameras(settings.capture, settings.train_cameras, None)
+    base = RunSettings(
+        settings.capture,
+        train,
+        test_cameras=test,
+        frames=settings.frames,
+        downscale=settings.downscale,
+        mono_onnx=settings.mono_onnx,
+        mono_kind=settings.mono_kind,
+    )
+    rows = verify(base, settings.iterations, settings.prior_frames, settings.seeds, _command(settings))
+    append_rows(settings.output, rows)
+    told = [*(f"note: {note}" for note in notes), table(rows)]
+    if len(settings.seeds) < LEAST_SEEDS:
+        told.append(f"{len(settings.seeds)} seeds are too few for a verdict: give at least {LEAST_SEEDS} with --seeds")
+    return "\n".join([*told, f"rows are in {settings.output}; `d2 report {settings.output}` shows them"])
+
+
+def _command(settings: PlanVerification) -> str:
+    frames = settings.frames
+    written = {} if frames is None else {"frames": _range(frames)}
+    return command_line("plan --verify", settings, comma=True, **written)
+
+
+def _range(frames: Sequence[int]) -> str:
+    """Frames as first:last:step where they are evenly spaced, each one otherwise."""
+    steps = {later - earlier for earlier, later in itertools.pairwise(frames)}
+    if len(steps) != 1:
+        return ",".join(map(str, frames))
+    (step,) = steps
+    return f"{frames[0]}:{frames[-1]}" + (f":{step}" if step != 1 else "")
 
 
 @dataclass(frozen=True)
@@ -56,7 +119,7 @@ def verify(
         settings: capture, cameras and monocular source, as for a run.
         iterations: optimizer steps of each training, on all frames.
         prior_frames: frames over which priors are built, from the first one.
-        seeds: of the trainings; a single one tells nothing about differences below a few tenths of a dB.
+        seeds: of the trainings; a verdict needs three.
         command: how this was started.
 
     Raises:
@@ -149,7 +212,8 @@ def _runs(question: Question, way: str, folder: Path, seeds: Sequence[int]) -> l
         return [in_fresh_process(_build, settings, place)]
     if settings.hooks:
         settings = replace(settings, priors=str(folder / "priors"))
-        in_fresh_process(_prepare, settings, place / "prepared")  # building the prior is in nobody's memory
+        # The prior is built in a process of its own, so that its memory does not count as that of a training.
+        in_fresh_process(_prepare, settings, place / "prepared")
     return [in_fresh_process(_train, replace(settings, seed=seed), place / str(seed)) for seed in seeds]
 
 
@@ -180,16 +244,17 @@ def _train(settings: RunSettings, folder: Path) -> dict[str, Any]:
 def _build(settings: RunSettings, folder: Path) -> dict[str, Any]:
     """Build the priors; the score is the verified share, with the median error of those pixels where truth is known."""
     from d2_plugin.priors.store import PriorStore
-    from d2_plugin.runs.run import build_priors_for
+    from d2_plugin.runs.prior import build_priors_for
     from d2_plugin.runs.start import triangulated_points
 
     scene = Scene.open(settings)
-    points = triangulated_points(scene.capture, scene.train_cameras)["positions"]
+    points = triangulated_points(scene.capture, scene.train_cameras).positions
     start = time.perf_counter()
     build_priors_for(settings, scene, points, folder)
     seconds = time.perf_counter() - start
     store, views = PriorStore.open(folder), [(c, f) for c in scene.train_cameras for f in scene.capture.frames]
-    shares = [store.record(camera, frame)["shares"]["verified"] for camera, frame in views]
+    records = [store.record(camera, frame) for camera, frame in views]
+    shares = [record["shares"]["verified"] for record in records if record is not None]
     errors = [error for view in views for error in _errors(scene, store.prior(*view), *view)]
     median = float(np.median(np.concatenate(errors))) if errors else None
     return {"score": mean(shares), "seconds": seconds, "median_error": median}
@@ -206,48 +271,4 @@ def _errors(scene: Scene, prior: Any, camera: str, frame: int) -> list[np.ndarra
 
 def table(rows: Sequence[Row]) -> str:
     """The rows as Markdown."""
-    return markdown_table(plan_section(rows).tables[0][1])
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
-
-
-def _seeds(text: str) -> tuple[int, ...]:
-    return tuple(int(number) for number in _names(text))
-
-
-def _frames(text: str) -> tuple[int, ...]:
-    first, last, *step = (int(part) for part in text.split(":"))  # argparse names the option when this raises
-    return tuple(range(first, last + 1, *step))
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point of `d2 plan CAPTURE --verify`."""
-    parser = argparse.ArgumentParser(prog="d2 plan --verify", description=__doc__)
-    parser.add_argument("capture", help="folder of the recording")
-    parser.add_argument("--train-cameras", required=True, type=_names, help="names joined by commas, or preset:4")
-    parser.add_argument("--frames", type=_frames, default=None, help="first:last or first:last:step; default all")
-    parser.add_argument("--downscale", type=int, default=1, help="pictures this many times smaller (integer); 1")
-    parser.add_argument("--mono-onnx", default=None, help="monocular depth network as an ONNX file")
-    parser.add_argument("--mono-kind", choices=("relative", "metric"), default=None, help="inverse depth or depth")
-    parser.add_argument("--iterations", type=int, default=300, help="optimizer steps of each training; 300")
-    parser.add_argument("--prior-frames", type=int, default=6, help="frames over which priors are built; 6")
-    parser.add_argument("--seeds", type=_seeds, default=(0, 1, 2), help="of the trainings, joined by commas; 0,1,2")
-    parser.add_argument("--output", type=Path, default=Path("runs.jsonl"), help="rows are added to it; runs.jsonl")
-    options = parser.parse_args(arguments)
-    train, test, _ = resolve_cameras(options.capture, options.train_cameras, None)
-    settings = RunSettings(
-        options.capture,
-        train,
-        test_cameras=test,
-        frames=options.frames,
-        downscale=options.downscale,
-        mono_onnx=options.mono_onnx,
-        mono_kind=options.mono_kind,
-    )
-    command = shlex.join(["d2", "plan", "--verify", *(arguments or ())])
-    rows = verify(settings, options.iterations, options.prior_frames, options.seeds, command)
-    append_rows(options.output, rows)
-    sys.stdout.write(f"{table(rows)}\nrows are in {options.output}\n")
-    return 0
+    return markdown(plan_section(rows).tables[0][1])

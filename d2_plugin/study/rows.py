@@ -66,7 +66,7 @@ def make_row(
         raise unknown_name("kind of row", kind, KINDS)
     if error is not None and not math.isfinite(error):
         error, failed = None, failed or f"the error is {error}"
-    row = {"kind": kind, "case": case, "method": method, "setting": setting}
+    row: Row = {"kind": kind, "case": case, "method": method, "setting": setting}
     row |= {"error": error, "seconds": seconds, "failed": failed}
     return row | details | circumstances(device) | {"command": command}
 

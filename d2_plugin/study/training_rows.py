@@ -12,14 +12,13 @@ from typing import Any
 from d2_plugin.captures.pictures import opencv, read_picture, shrink_picture
 from d2_plugin.errors import MissingExtra
 from d2_plugin.runs.provenance import circumstances
+from d2_plugin.runs.settings import HOOK_NAMES
 from d2_plugin.runs.tables import read_metrics
 
 from .rows import Row, make_row
 
 PICTURE_WIDTH = 1600
 """Pictures in the report are made at most this wide by averaging whole blocks, pixels."""
-
-HOOKS = ("prior", "densify", "prune", "depth_loss")
 
 
 def training_rows(folders: Sequence[Path]) -> list[Row]:
@@ -65,7 +64,7 @@ def command_of(metrics: dict[str, Any], settings: dict[str, Any], output: str) -
     hooks = metrics["hooks"]
     words = ["d2", "train", metrics["capture"], "--train-cameras", ",".join(metrics["train_cameras"])]
     words += ["--backbone", metrics["backbone"], "--iterations", str(metrics["iterations"])]
-    words += ["--hooks", "all" if set(hooks) == set(HOOKS) else ",".join(hooks) or "none"]
+    words += ["--hooks", "all" if set(hooks) == set(HOOK_NAMES) else ",".join(hooks) or "none"]
     words += ["--seed", str(settings.get("seed", 0))]
     for name in ("downscale", "mono_kind"):
         if settings.get(name) not in (None, 1):
@@ -89,7 +88,7 @@ def method_of(metrics: dict[str, Any]) -> str:
     hooks = [name for name in metrics["hooks"] if name != "prior"]
     if not hooks:
         return metrics["backbone"]
-    return f"{metrics['backbone']} + " + ("D2" if set(HOOKS[1:]) <= set(hooks) else ", ".join(hooks))
+    return f"{metrics['backbone']} + " + ("D2" if set(HOOK_NAMES[1:]) <= set(hooks) else ", ".join(hooks))
 
 
 def picture_of(folder: Path) -> tuple[str, str] | None:

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from d2_plugin.captures.synthetic.room import synthetic_capture
-from d2_plugin.runs.start import TrainingFrames, initial_points, make_view, scene_extent
+from d2_plugin.errors import D2Error
+from d2_plugin.runs.start import TimedPoints, TrainingFrames, initial_points, make_view, scene_extent
 
 CAMERAS = ("train0", "train1")
 
@@ -67,27 +68,39 @@ def test_extent_falls_back_to_declared_bounds_and_then_to_the_rig(capture) -> No
 
 def test_too_few_points_are_filled_up_inside_the_views(capture) -> None:
     points = surface_points(capture, 50)
-    sparse = (points, np.full((50, 3), 0.5), np.zeros(50, dtype=np.int64))
+    sparse = TimedPoints(points, np.full((50, 3), 0.5), np.zeros(50))
     extent = scene_extent(capture, CAMERAS, points)
     start = initial_points(capture, CAMERAS, sparse, extent, minimum=400)
-    assert start.positions.shape == (400, 3)
-    assert torch.equal(start.positions[:50], torch.tensor(points, dtype=torch.float32))
+    positions, _, _ = start.tensors()
+    assert positions.shape == (400, 3)
+    assert torch.equal(positions[:50], torch.tensor(points, dtype=torch.float32))
     assert (start.colors >= 0).all()
     assert (start.colors <= 1).all()
     assert (start.times <= 0.2).all()
     for name, rows in (("train0", slice(50, 225)), ("train1", slice(225, 400))):
         view = make_view(capture, name, 0)
-        camera = start.positions[rows] @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
+        camera = positions[rows] @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
         image = camera @ view.K.T
         assert ((camera[:, 2] > 0.99 * extent.near) & (camera[:, 2] < 1.01 * extent.far)).all()
         assert ((image[:, 0] / image[:, 2] > -0.01) & (image[:, 0] / image[:, 2] < 96.01)).all()
 
 
 def test_the_same_seed_gives_the_same_start(capture) -> None:
-    sparse = (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, dtype=np.int64))
-    extent = scene_extent(capture, CAMERAS, sparse[0])
-    first, second = (initial_points(capture, CAMERAS, sparse, extent, seed=4, minimum=100) for _ in range(2))
-    assert torch.equal(first.positions, second.positions)
-    assert not torch.equal(
-        first.positions, initial_points(capture, CAMERAS, sparse, extent, seed=5, minimum=100).positions
-    )
+    sparse = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    extent = scene_extent(capture, CAMERAS, sparse.positions)
+    first, second, third = (initial_points(capture, CAMERAS, sparse, extent, seed, 100) for seed in (4, 4, 5))
+    for one, same, other in zip(first.tensors(), second.tensors(), third.tensors(), strict=True):
+        assert torch.equal(one, same)
+        assert not torch.equal(one, other)
+
+
+def test_points_come_back_from_their_file_and_a_damaged_one_is_told(capture, tmp_path) -> None:
+    points = TimedPoints(surface_points(capture, 20), np.full((20, 3), 0.25), np.linspace(0, 0.2, 20))
+    points.save(tmp_path / "points.npz")
+    again = TimedPoints.load(tmp_path / "points.npz")
+    for name in ("positions", "colors", "times"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(points, name))
+    assert [path.name for path in tmp_path.iterdir()] == ["points.npz"]
+    (tmp_path / "points.npz").write_bytes(b"PK")
+    with pytest.raises(D2Error, match="delete the file"):
+        TimedPoints.load(tmp_path / "points.npz")

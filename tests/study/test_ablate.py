@@ -13,7 +13,10 @@ from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import VARIANTS
 from d2_plugin.runs.settings import RunSettings, check, hook_config, prior_settings
-from d2_plugin.study.ablation import ablate
+from d2_plugin.runs.tables import STUDY_COLUMNS
+from d2_plugin.study.ablation import tables
+from d2_plugin.study.ablation.claims import Claim, claims
+from d2_plugin.study.ablation.job import Job
 from d2_plugin.study.ablation.presets import PRESETS, TABLES, rows_named
 
 
@@ -62,7 +65,7 @@ class TestPresets:
         assert mine["prune"]["lambda_e"] == 0.4
 
 
-def results(**psnr: list[float]) -> dict[ablate.Job, dict]:
+def results(**psnr: list[float]) -> dict[Job, dict]:
     """Metrics of made-up runs, one per seed."""
 
     def metrics(value: float) -> dict:
@@ -73,50 +76,69 @@ def results(**psnr: list[float]) -> dict[ablate.Job, dict]:
         }
 
     return {
-        ablate.Job(name, "yang4d", seed, settings_of(name), Path()): metrics(value)
+        Job(name, "yang4d", seed, settings_of(name), Path()): metrics(value)
         for name, values in psnr.items()
         for seed, value in enumerate(values)
     }
 
 
+def order(**psnr: list[float]) -> dict[str, Claim]:
+    """What is claimed about PSNR, by the title of the other row."""
+    scores, others = tables.scores_of(results(**psnr), "yang4d"), [PRESETS[name].title for name in tables.OTHERS]
+    return {claim.other: claim for claim in claims(scores, PRESETS["full"].title, others, STUDY_COLUMNS[0])}
+
+
 class TestTables:
     def test_a_cell_is_mean_and_sample_deviation(self) -> None:
-        text = ablate.table(results(full=[28.0, 30.0]), "yang4d", ["full"])
+        text = tables.table(results(full=[28.0, 30.0]), "yang4d", ["full"])
         assert "| D²-4DGS | 29.00 ± 1.41 |" in text
         assert "| - |" in text  # LPIPS was not measured
 
     def test_latex_has_a_row_per_variant(self) -> None:
-        text = ablate.table(
-            results(full=[28.0, 30.0], backbone=[25.0, 26.0]), "yang4d", ["backbone", "full"], latex=True
+        text = tables.table(
+            results(full=[28.0, 30.0], backbone=[25.0, 26.0]), "yang4d", ["backbone", "full"], as_latex=True
         )
         assert text.count(r"\pm") == 2 * 6
         assert r"D$^2$-4DGS & $29.00 \pm 1.41$" in text
 
     def test_an_order_that_fails_is_said_with_its_margin(self) -> None:
-        found = {
-            c.sentence: c for c in ablate.claims(results(full=[28.0], backbone=[25.0], no_pruning=[28.5]), "yang4d")
-        }
-        assert found["D²-4DGS is above Backbone"].margin == pytest.approx(3)
-        assert str(found["D²-4DGS is above w/o Pruning"]).startswith("- fails")
+        found = order(full=[28.0, 28.1, 27.9], backbone=[25.0, 25.1, 24.9], no_pruning=[28.5, 28.6, 28.4])
+        assert found["Backbone"].margin.value == pytest.approx(3)
+        assert str(found["w/o Pruning"]) == "fails (-0.50 ± 0.08 dB)"
         assert len(found) == 2  # nothing is claimed about rows that were not run
 
     def test_an_order_within_the_spread_of_the_seeds_is_undecided(self) -> None:
-        found = ablate.claims(
-            results(full=[28.0, 29.0, 30.0], backbone=[25.0, 25.1], no_pruning=[29.3, 29.5]), "yang4d"
-        )
-        assert [claim.verdict for claim in found] == ["holds", "undecided"]
-        assert found[1].error == pytest.approx((1 / 3 + 0.02 / 2) ** 0.5)
+        found = order(full=[28.0, 29.0, 30.0], backbone=[25.0, 25.05, 25.1], no_pruning=[29.3, 29.5, 29.4])
+        assert [claim.margin.verdict for claim in found.values()] == ["holds", "undecided"]
+        assert found["w/o Pruning"].margin.error == pytest.approx((1 / 3 + 0.01 / 3) ** 0.5)
+
+    def test_fewer_than_three_seeds_give_no_verdict_however_large_the_margin(self) -> None:
+        alone = order(full=[28.001], backbone=[28.0])
+        assert str(alone["Backbone"]) == "one seed: no verdict (+0.00 dB)"
+        pair = order(full=[40.0, 40.1], backbone=[20.0, 20.1, 20.2])
+        assert pair["Backbone"].margin.verdict == "two seeds: no verdict"
+        made = tables.report(results(full=[28.001], backbone=[28.0]), rows_named(["full", "backbone"]))
+        assert "holds" not in made.replace(tables.EXPLANATION, "")
+
+    def test_each_metric_has_a_verdict_of_its_own(self) -> None:
+        runs = results(full=[28.0, 28.1, 27.9], mvs_only=[25.0, 25.1, 24.9])
+        for job, metrics in runs.items():
+            metrics["test"]["ssim1"] = (0.8 if job.preset == "full" else 0.9) + 0.001 * job.seed
+            metrics["test"]["depth_absrel"] = (0.03 if job.preset == "full" else 0.05) + 0.001 * job.seed
+        [row] = tables.order_table(runs, "yang4d").rows
+        assert [cell.split()[0] for cell in row[1:]] == ["holds", "fails", "no", "holds"]
+        assert tables.order_table(runs, "yang4d").header[1:] == ("PSNR", "SSIM1", "SSIM2", "depth AbsRel")
 
     def test_the_papers_own_figures_stand_beside_labelled(self) -> None:
         made = results(**{name: [28.0] for name in TABLES["pruning"]})
-        text = ablate.report(made, rows_named(["pruning"]))
+        text = tables.report(made, rows_named(["pruning"]))
         assert "○ paper's PSNR" in text
         assert "| 22.21 |" in text
         assert "not measured here" in text
 
     def test_statistics_leave_out_what_was_not_measured(self) -> None:
-        assert ablate.statistics([None, 2.0, None]) == (2.0, 0.0)
-        assert ablate.statistics([None]) is None
+        assert tables.statistics([None, 2.0, None]) == (2.0, 0.0)
+        assert tables.statistics([None]) is None
 
 
 def test_the_command_trains_shares_priors_and_repeats_nothing(

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from d2_plugin.errors import D2Error
-from d2_plugin.study.bench.align import bench_align, main, table
+from d2_plugin.priors.settings import AlignSettings
+from d2_plugin.study.bench.align import AlignBench, bench_align, run, table
 from d2_plugin.study.bench.align_measure import (
     TRUE_LINE,
     AlignMethod,
@@ -17,11 +19,12 @@ from d2_plugin.study.bench.align_measure import (
     measure,
     methods,
     optimum,
+    weights_and_epsilon,
     without_noise,
 )
 from d2_plugin.study.rows import read_rows
 
-SMALL = ["--anchors", "60", "300", "--outliers", "0", "0.4", "--seeds", "1", "--seconds", "0"]
+SMALL = {"anchors": (60, 300), "outliers": (0.0, 0.4), "seeds": 1, "seconds": 0.0}
 
 
 @pytest.mark.parametrize("kind", ["relative", "metric"])
@@ -68,6 +71,14 @@ def test_a_tighter_gap_is_closer_to_the_optimum_and_is_kept() -> None:
         assert gaps[1e-10] <= gaps[1e-2]
 
 
+def test_the_absolute_residual_is_smoothed_as_the_default_settings_say() -> None:
+    target = np.array([1.0, 2.0, 4.0])
+    for epsilon in (None, 0.05):
+        settings = AlignSettings() if epsilon is None else AlignSettings(epsilon=epsilon)
+        assert weights_and_epsilon(target, "absolute", settings)[1] == pytest.approx(settings.epsilon * 2.0)
+        assert weights_and_epsilon(target, "relative", settings)[1] == settings.epsilon
+
+
 def test_least_squares_pays_for_wrong_anchors_and_the_certified_fit_little() -> None:
     problems = [align_problem("metric", 5000, 0.2, seed) for seed in range(3)]
     errors = {(m.name, m.setting): measure(m, problems, 0).depth_error for m in methods()}
@@ -81,14 +92,20 @@ def test_a_line_that_gives_no_depth_is_wholly_wrong() -> None:
 
 
 def test_bench_writes_rows_table_and_plot(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    assert main([*SMALL, "--methods", "certified", "RANSAC", "--output", str(tmp_path)]) == 0
+    told = run(AlignBench(**SMALL, methods=("certified", "RANSAC"), output=tmp_path))
+    assert (tmp_path / "align.md").read_text() in told
+    assert told.endswith(f"are in {tmp_path}")
     rows = read_rows([tmp_path / "align.jsonl"])
     assert len(rows) == 2 * 2 * 2 * 8
     assert all(row["kind"] == "alignment" and row["error"] >= 0 and row["seconds"] > 0 for row in rows)
     assert rows[0]["case"] == "relative map, 60 anchors, 0% wrong"
     assert "| certified | relative, gap 1e-10 |" in (tmp_path / "align.md").read_text()
-    assert (tmp_path / "align.svg").stat().st_size > 1000
+    assert rows[0]["command"].startswith(
+        "d2 bench align --anchors 60 300 --outliers 0.0 0.4 --methods certified RANSAC"
+    )
+    plot = ET.fromstring((tmp_path / "align.svg").read_text())
+    marks = [element for element in plot.iter() if len(element) and element[0].text and "ms per fit" in element[0].text]
+    assert len(marks) == 8 + 8 + 2 * 2  # gap and depth error of 8 settings, and the time of 2 methods at 2 sizes
 
 
 def test_a_refusal_is_counted_and_no_error_is_made_up_for_it(tmp_path: Path) -> None:

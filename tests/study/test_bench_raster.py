@@ -11,9 +11,10 @@ import torch
 
 from d2_plugin.errors import D2Error
 from d2_plugin.rasterizer import RasterSettings, reference
-from d2_plugin.study.bench.raster import bench_raster, exponent, main, parse_size
+from d2_plugin.study.bench.raster import RasterBench, bench_raster, parse_size, run
 from d2_plugin.study.bench.raster_measure import THRESHOLDS, Case, peak_memory, threshold_errors
 from d2_plugin.study.bench.raster_scenes import load_scene
+from d2_plugin.study.growth import exponent
 
 
 def test_synthetic_gaussians_have_the_radius_and_the_frustum_they_are_described_with():
@@ -63,9 +64,9 @@ def test_scaling_exponent_is_the_slope_in_logarithms():
 
 
 def test_bench_writes_rows_table_and_plot(tmp_path):
-    pytest.importorskip("matplotlib")
-    sizes = ["--sizes", "24x16", "--seconds", "0", "--no-memory", "--output", str(tmp_path)]
-    assert main(["--scenes", "synth:30", "synth:60", *sizes]) == 0
+    told = run(
+        RasterBench(scenes=("synth:30", "synth:60"), sizes=("24x16",), seconds=0, no_memory=True, output=tmp_path)
+    )
     every = [json.loads(line) for line in (tmp_path / "raster.jsonl").read_text().splitlines()]
     rows = [row for row in every if "thresholds" not in row]
     assert [(row["method"], row["gaussians"]) for row in rows] == [
@@ -79,11 +80,16 @@ def test_bench_writes_rows_table_and_plot(tmp_path):
         assert 0 < row["passes"]["forward+backward"]["min_ms"] <= row["passes"]["forward+backward"]["median_ms"]
         assert 0 < row["errors"]["color"]["max"] < 1e-3
         assert 0 < row["errors"]["grad covariances"]["relative_l2"] < 1e-3
-        assert row["command"].startswith("d2 bench raster --scenes")
+        assert row["command"] == (
+            "d2 bench raster --scenes synth:30 synth:60 --sizes 24x16 --seconds 0.0 --no-memory "
+            f"--output {tmp_path.name}"
+        )
         assert not math.isnan(row["passes"]["forward"]["cpu_ms"])
     table = (tmp_path / "raster.md").read_text()
     assert "| d2 | synth:60 | 24x16 |" in table
     assert "N^" in table
+    assert table in told
+    assert told.endswith(f"are in {tmp_path}")
     assert (tmp_path / "raster.svg").stat().st_size > 1000
 
 

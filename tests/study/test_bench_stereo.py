@@ -13,7 +13,7 @@ from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.filter import filter_depths
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.study.bench.sgbm import sgbm
-from d2_plugin.study.bench.stereo import bench_stereo, main, table
+from d2_plugin.study.bench.stereo import StereoBench, bench_stereo, run, table
 from d2_plugin.study.bench.stereo_measure import Method, measure, methods, score
 from d2_plugin.study.bench.stereo_rigs import Rig, load_rigs, textured_rig
 
@@ -82,10 +82,13 @@ def test_a_method_that_fails_on_a_rig_says_why_and_counts_as_nothing(rig: Rig) -
 
 
 def test_bench_writes_rows_table_and_plot(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("matplotlib")
     monkeypatch.setattr("d2_plugin.study.bench.stereo._set_threads", lambda count: None)
-    options = ["--rigs", "synthetic2", "--width", "96", "--makers", "sweep", "sgbm", "--defaults-only"]
-    assert main([*options, "--output", str(tmp_path)]) == 0
+    settings = StereoBench(
+        rigs=("synthetic2",), width=96, makers=("sweep", "sgbm"), defaults_only=True, output=tmp_path
+    )
+    told = run(settings)
+    assert "| sweep | default |" in told, "what a command made is printed"
+    assert told.endswith(f"are in {tmp_path}")
     rows = [json.loads(line) for line in (tmp_path / "stereo.jsonl").read_text().splitlines()]
     assert [(row["method"], row["rig"], row["width"]) for row in rows] == [
         ("sweep", "synthetic2", 96),

@@ -67,7 +67,7 @@ def test_published_rows_are_labelled_as_the_papers() -> None:
     assert all(line.startswith(f"| {MARK}") and "(paper)" in line for line in lines[2:6])
     assert "not measured here" in lines[-1]
     assert "22.2082" in text
-    latex = paper_table(paper_rows("pruning"), latex=True)
+    latex = paper_table(paper_rows("pruning"), as_latex=True)
     assert r"actor5\_6" in latex
     assert latex.count(r"\\") == 5
     assert latex.isascii()

@@ -18,7 +18,7 @@ from d2_plugin.study import plan_verify
 from d2_plugin.study.bench import memory
 from d2_plugin.study.bench import scaling as bench_scaling
 from d2_plugin.study.bench.memory import Measured, in_fresh_process
-from d2_plugin.study.plan_verify import LEFT_OUT, USED, questions, table, verify
+from d2_plugin.study.plan_verify import LEFT_OUT, USED, PlanVerification, questions, table, verify
 from d2_plugin.study.rows import Row, make_row
 
 LINUX = pytest.mark.skipif(not memory._RESET.exists(), reason="peak memory is measured on Linux")
@@ -88,7 +88,37 @@ def test_verification_measures_both_ways_and_the_cost_of_leaving_out(room: Path,
     assert len(by["temporal dimension", USED]["details"]) == 2
     text = table(rows)
     assert "| temporal dimension | used: motion" in text
-    assert "dB held out |" in text
+    assert "dB held out | two seeds: no verdict |" in text
+
+
+def plan_rows(*costs: float) -> list[Row]:
+    """A decision that was taken both ways, with the cost of leaving the part out for each seed."""
+    spread = float(np.std(costs, ddof=1)) if len(costs) > 1 else None
+    about = {"planned": "used: motion", "unit": "dB held out", "seconds": 1.0, "seeds": list(range(len(costs)))}
+    used = make_row("plan", "room", "temporal", USED, error=0.0, cost=0.0, cost_deviation=0.0, **about)
+    mean = float(np.mean(costs))
+    return [used, make_row("plan", "room", "temporal", LEFT_OUT, error=mean, cost=mean, cost_deviation=spread, **about)]
+
+
+@pytest.mark.parametrize(
+    ("costs", "verdict"),
+    [
+        ((0.001,), "one seed: no verdict"),
+        ((2.0, 2.1), "two seeds: no verdict"),
+        ((2.0, 2.1, 1.9), "costs"),
+        ((-2.0, -2.1, -1.9), "gains"),
+        ((1.0, -0.9, 0.3), "undecided"),
+        ((0.0, 0.0, 0.0), "no difference"),
+    ],
+)
+def test_a_decision_has_a_verdict_from_three_seeds_on(costs: tuple[float, ...], verdict: str) -> None:
+    assert table(plan_rows(*costs)).splitlines()[-1].endswith(f"| {verdict} |")
+
+
+def test_the_recorded_command_is_the_one_that_makes_the_rows() -> None:
+    settings = PlanVerification("/data/room", ("a", "b"), (0, 2, 4), mono_kind="metric", output=Path("/tmp/rows.jsonl"))
+    words = "d2 plan --verify room --train-cameras a,b --frames 0:4:2 --mono-kind metric --output rows.jsonl"
+    assert plan_verify._command(settings) == words
 
 
 def test_scaling_rows_tell_time_and_memory_per_length(here: None, tmp_path: Path) -> None:
@@ -99,6 +129,17 @@ def test_scaling_rows_tell_time_and_memory_per_length(here: None, tmp_path: Path
     ]
     assert all(row["seconds"] > 0 and row["kind"] == "scaling" for row in rows)
     assert json.dumps(rows, allow_nan=False)
+
+
+def test_the_command_adds_its_rows_and_tells_how_costs_grow(here: None, tmp_path: Path) -> None:
+    settings = bench_scaling.ScalingBench(frames=(1, 2), width=96, iterations=2, output=tmp_path / "runs.jsonl")
+    told = bench_scaling.run(settings)
+    assert len(told.splitlines()) == 2 * 2 + 1
+    assert "grows as frames^" in told
+    rows = [json.loads(line) for line in (tmp_path / "runs.jsonl").read_text().splitlines()]
+    assert {row["command"] for row in rows} == {
+        "d2 bench scaling --frames 1 2 --width 96 --iterations 2 --output runs.jsonl"
+    }
 
 
 def test_growth_is_the_exponent_of_the_number_of_frames() -> None:
@@ -129,9 +170,10 @@ def test_memory_is_that_of_the_work_not_of_what_was_there_before() -> None:
 @LINUX
 def test_the_whole_verification_in_processes_of_its_own(room: Path, tmp_path: Path) -> None:
     output = tmp_path / "runs.jsonl"
-    options = ["--train-cameras", "train0,train1", "--iterations", "20", "--prior-frames", "2", "--frames", "0:2"]
-    options += ["--seeds", "5"]
-    assert plan_verify.main([str(room), *options, "--output", str(output)]) == 0
+    settings = PlanVerification(
+        str(room), ("train0", "train1"), (0, 1, 2), iterations=20, prior_frames=2, seeds=(5,), output=output
+    )
+    assert "one seed: no verdict" in plan_verify.run(settings)
     rows = [json.loads(line) for line in output.read_text().splitlines()]
     assert len(rows) == 7
     assert all(row["peak_mb"] > 0 for row in rows if not row["failed"])

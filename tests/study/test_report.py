@@ -14,10 +14,12 @@ from hypothesis import strategies as st
 
 from d2_plugin.captures.pictures import write_png
 from d2_plugin.errors import D2Error
-from d2_plugin.study.bench.work_precision import Table, means, pareto_front, work_precision
-from d2_plugin.study.report.page import Picture, markdown_table
-from d2_plugin.study.report.report import BUILDERS, collect, main, make_report
-from d2_plugin.study.report.svg import Axis, Plot, Point, Series, bars, figure, number
+from d2_plugin.runs.markup import Table, markdown
+from d2_plugin.study.report.page import Picture
+from d2_plugin.study.report.plots import Axis, Plot, Point, Series, number
+from d2_plugin.study.report.report import BUILDERS, ReportSettings, collect, make_report, run
+from d2_plugin.study.report.svg import bars, figure
+from d2_plugin.study.report.work_precision import means, pareto_front, work_precision
 from d2_plugin.study.rows import KINDS, Row, append_rows, make_row, read_rows
 from d2_plugin.study.training_rows import training_rows
 
@@ -27,7 +29,9 @@ RUNS = Path(__file__).parents[1] / "data" / "runs.jsonl"
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
-    assert main([str(RUNS), "--output", str(folder)]) == 0
+    told = run(ReportSettings((RUNS,), folder))
+    assert str(folder / "report.html") in told
+    assert told.startswith(f"{len(read_rows([RUNS]))} rows")
     return folder
 
 
@@ -120,6 +124,44 @@ def test_the_top_of_the_page_tells_what_the_sections_found(report: Path) -> None
     rows = [row for row in read_rows([RUNS]) if row["kind"] == "stability"]
     assert f"{sum(row['verdict'] == 'ok' for row in rows)} of {len(rows)} points ok" in top
     assert "world offset in float32" in top
+
+
+def ablated(method: str, seed: int, **scores: float) -> Row:
+    """A run of an ablation as a row."""
+    about = {"seconds": 1.0, "prior_seconds": 0.0, "gaussians": 1, "iterations": 5, "scores": scores}
+    return make_row("ablation", "room, 4 cameras", method, f"seed {seed}", error=0.1, **about)
+
+
+def test_a_gain_without_its_backbone_is_not_drawn_and_the_page_says_so(tmp_path: Path) -> None:
+    rows = [ablated(name, 0, psnr=psnr) for name, psnr in (("yang4d full", 28.0), ("yang4d no_pruning", 27.0))]
+    _, text, *plots = make_report(rows, tmp_path / "alone")
+    assert "No gain is drawn for yang4d on room, 4 cameras: the backbone alone was not run there." in text.read_text()
+    assert not any("dB</title>" in plot.read_text() for plot in plots)
+    rows += [ablated("yang4d backbone", 0, psnr=25.0), ablated("deform full", 0, psnr=21.0)]
+    _, text, plot = make_report(rows, tmp_path / "with")
+    assert "No gain is drawn for deform on room, 4 cameras" in text.read_text()
+    assert "yang4d full, seed 0: +3.00 dB" in plot.read_text()
+    assert "deform full" not in plot.read_text()
+
+
+def test_which_variant_is_best_is_said_metric_by_metric(tmp_path: Path) -> None:
+    better, best = {"psnr": 28.0, "ssim1": 0.80, "lpips": 0.3}, {"psnr": 27.0, "ssim1": 0.85, "lpips": 0.2}
+    worst = {"psnr": 20.0, "ssim1": 0.5, "lpips": 0.5}
+    rows = [ablated("yang4d full", seed, **better) for seed in range(3)]
+    rows += [ablated("yang4d mvs_only", seed, **best) for seed in range(2)]
+    rows += [ablated("yang4d backbone", seed, **worst) for seed in range(3)]
+    text = make_report(rows, tmp_path)[1].read_text()
+    top, _, _ = text.partition("\n## ")
+    assert "room, 4 cameras: best mean PSNR: yang4d full; SSIM1, LPIPS: yang4d mvs_only" in top
+    found = {line.split(" | ")[1]: line.split(" | ")[2:] for line in text.splitlines() if line.count("(") == 3}
+    assert [cell.split(" (")[0] for cell in found["yang4d backbone"]] == ["holds"] * 3
+    assert [cell.split(" (")[0] for cell in found["yang4d mvs_only"]] == ["two seeds: no verdict"] * 3
+    assert found["yang4d mvs_only"][2].startswith("two seeds: no verdict (-0.1")
+
+
+def test_a_headline_of_too_few_seeds_has_no_verdict(report: Path) -> None:
+    top, _, _ = (report / "report.md").read_text().partition("\n## ")
+    assert re.search(r"yang4d \+ D2 PSNR [\d.]+ dB in [\d.]+ min \(2 seeds: no verdict\)", top)
 
 
 def test_nothing_to_report_is_told(tmp_path: Path) -> None:
@@ -277,6 +319,19 @@ def test_marks_lie_inside_the_picture_and_carry_their_numbers() -> None:
     assert {c[0].text for c in circles} == {"the first", "the <second>"}
 
 
+def test_a_list_of_names_is_as_high_as_it_is_long_and_a_bare_line_is_a_line_in_the_legend() -> None:
+    def height(count: int) -> float:
+        names = [str(i) for i in range(count)]
+        marks = Series("here", tuple(Point(0.0, i) for i in range(count)))
+        limit = Series("limit", (), ((0.0, 0.0), (0.0, 1.0)), color=1, hollow=True)
+        drawn = figure([Plot("gains", Axis("dB", -1, 1), Axis.listing("", names), (marks, limit))], "gains")
+        assert drawn.count("stroke-dasharray") == 2, "in the plot and in the legend"
+        assert "s1 hollow" not in drawn
+        return float(ET.fromstring(drawn).attrib["height"])
+
+    assert height(12) - height(2) == pytest.approx(10 * 24)
+
+
 def test_stacked_bars_are_as_long_as_their_sums() -> None:
     root = ET.fromstring(bars([("a", (1.0, 3.0)), ("b", (2.0, 0.0))], ("prior", "training"), "min", "time"))
     long = [float(e.attrib["width"]) for e in root.iter() if e.tag.endswith("rect") and e.attrib.get("rx")]
@@ -284,5 +339,5 @@ def test_stacked_bars_are_as_long_as_their_sums() -> None:
 
 
 def test_a_table_in_markdown_keeps_its_bars_and_stresses_the_best() -> None:
-    text = markdown_table(Table(("a", "b"), (("1|2", "3"),), frozenset({(0, 1)})))
+    text = markdown(Table(("a", "b"), (("1|2", "3"),), frozenset({(0, 1)})))
     assert text.splitlines()[-1] == "| 1\\|2 | **3** |"

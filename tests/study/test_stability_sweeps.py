@@ -13,9 +13,8 @@ import torch
 from d2_plugin.errors import D2Error
 from d2_plugin.study.rows import Row
 from d2_plugin.study.stability.gaussians import difference, largest, random_rotation, random_scene
-from d2_plugin.study.stability.sweep import PRECISIONS, all_sweeps, main, measure, run_sweeps, summary
+from d2_plugin.study.stability.sweep import PRECISIONS, SWEEPS, StabilitySettings, measure, run, run_sweeps, summary
 
-SWEEPS = {sweep.name: sweep for sweep in all_sweeps()}
 RANGES = {
     "temporal variance": (1e-20, 1e20),
     "anisotropy": (1, 1e9),
@@ -86,14 +85,15 @@ def test_a_scene_that_is_another_one_is_seen_to_differ() -> None:
     assert difference(scene._replace(means=scene.means + 1e-3).render(torch.float64), image) > 1e-4
 
 
-def test_the_command_appends_rows_and_prints_a_line_per_sweep(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_command_appends_rows_and_prints_a_line_per_sweep(tmp_path: Path) -> None:
     output = tmp_path / "runs.jsonl"
-    for _ in range(2):
-        assert main(["--sweeps", "epsilon", "--output", str(output)]) == 0
+    first, told = (run(StabilitySettings(("epsilon",), output)) for _ in range(2))
+    assert first == told
     found = [json.loads(line) for line in output.read_text().splitlines()]
     assert len(found) == 2 * 2 * len(SWEEPS["epsilon"].values)
     assert found[0]["command"].startswith("d2 stability --sweeps epsilon")
-    assert "epsilon            float32   8/8 ok" in capsys.readouterr().out
+    assert "epsilon            float32   8/8 ok" in told
+    assert str(output) in told
 
 
 def test_an_unknown_sweep_is_told_with_the_nearest_one() -> None:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from d2_plugin.errors import unknown_name
+from d2_plugin.runs.markup import Table, escaped, latex, markdown
 
 SOURCE = "D²-4DGS paper, as published, not measured here"
 MARK = "○"
@@ -86,24 +87,21 @@ def paper_rows(
     ]
 
 
-def paper_table(rows: Sequence[PaperRow], latex: bool = False) -> str:
+def paper_table(rows: Sequence[PaperRow], as_latex: bool = False) -> str:
     """Markdown or LaTeX of published rows, each labelled as the paper's; four digits as there."""
-    titles = ["method", "data set", "views", "PSNR", "SSIM1", "SSIM2", "LPIPS"]
-    lines = [
-        [
+    header = ("method", "data set", "views", "PSNR", "SSIM1", "SSIM2", "LPIPS")
+    cells = [
+        (
             f"{MARK} {row.label}",
             row.dataset + (f", {row.scene}" if row.scene else ""),
             str(row.views),
             *(f"{score:.4f}" for score in row.scores.values()),
-        ]
+        )
         for row in rows
     ]
-    if not latex:
-        table = [titles, ["---"] * len(titles), *lines]
-        return "\n".join("| " + " | ".join(line) + " |" for line in table) + f"\n\n{MARK} {SOURCE}."
-    body = [" & ".join(line).replace("_", r"\_") + r" \\" for line in (titles, *lines)]
-    text = "\n".join([r"\begin{tabular}{llccccc}", r"\toprule", body[0], r"\midrule", *body[1:], r"\bottomrule"])
-    return text.replace(MARK, r"$\circ$").replace("²", "$^2$") + "\n" + r"\end{tabular}"
+    if as_latex:
+        return latex(Table(header, tuple(tuple(map(escaped, line)) for line in cells)), columns="llccccc")
+    return f"{markdown(Table(header, tuple(cells)))}\n\n{MARK} {SOURCE}."
 
 
 _MAIN = """

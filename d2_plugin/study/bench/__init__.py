@@ -1,1 +1,23 @@
-"""Error against run time of each part."""
+"""Benchmarks: error against run time of one part each."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Benchmark(NamedTuple):
+    """One benchmark of `d2 bench`: its module holds the settings class and `run(settings) -> str`."""
+
+    module: str
+    settings: str
+    """Name of the settings class in that module."""
+    help: str
+
+
+BENCHMARKS = {
+    "align": Benchmark("d2_plugin.study.bench.align", "AlignBench", "the fit of monocular to geometric depth"),
+    "raster": Benchmark("d2_plugin.study.bench.raster", "RasterBench", "the rasterizer: time, memory, precision"),
+    "scaling": Benchmark("d2_plugin.study.bench.scaling", "ScalingBench", "priors and training over more frames"),
+    "stereo": Benchmark("d2_plugin.study.bench.stereo", "StereoBench", "geometric depth: matchers and settings"),
+}
+"""Every benchmark by name; none is imported before it is asked for."""

@@ -2,31 +2,52 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 import math
-import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, median
-from typing import Any, NamedTuple, get_args
+from typing import Annotated, Any, NamedTuple, get_args
 
 import torch
 
 from d2_plugin.captures.capture import MonoKind
-from d2_plugin.errors import D2Error, MissingExtra, missing_extra, unknown_name
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.provenance import provenance
-from d2_plugin.study.rows import append_rows, make_row
+from d2_plugin.settings import NotNegative, Range, Settings, Share
+from d2_plugin.study.command_line import command_line
+from d2_plugin.study.report.svg import figure
+from d2_plugin.study.report.work_precision import colors_of, growth, work_precision
+from d2_plugin.study.rows import Row, append_rows, make_row
 
-from .align_measure import AlignMethod, align_problem, measure, methods
+from .align_measure import AlignMethod, AlignProblem, align_problem, measure, methods
 
 logger = logging.getLogger(__name__)
 
-ANCHORS = (100, 1_000, 20_000, 100_000)
-OUTLIERS = (0.0, 0.2, 0.4, 0.6)
-SEEDS = 3
-DRAWN_GAP = 1e-13
-"""Smallest objective gap of the plot; what is closer to the optimum is drawn here."""
+PLOTTED_ANCHORS = 10_000
+"""Number of anchors that is plotted, or the nearest one that was measured."""
+
+
+@dataclass(frozen=True)
+class AlignBench(Settings):
+    """Settings of `d2 bench align`."""
+
+    anchors: tuple[Annotated[int, Range(1)], ...] = (100, 1_000, 20_000, 100_000)
+    """Numbers of anchors."""
+    outliers: tuple[Share, ...] = (0.0, 0.2, 0.4, 0.6)
+    """Shares of the anchors that are wrong."""
+    methods: tuple[str, ...] = ()
+    """Names of methods as the table shows them; all where none is named."""
+    seeds: Annotated[int, Range(1)] = 3
+    """Problems per case; figures are medians over them."""
+    seconds: NotNegative = 0.03
+    """Time for which each fit is repeated, seconds."""
+    threads: Annotated[int, Range(1)] | None = None
+    """CPU threads of torch; torch's own choice where left out. The fits themselves use one."""
+    output: Path = Path("bench-align")
+    """Folder of the results."""
 
 
 class AlignCase(NamedTuple):
@@ -40,18 +61,34 @@ class AlignCase(NamedTuple):
         return f"{self.domain} map, {self.anchors} anchors, {self.outliers:.0%} wrong"
 
 
+def run(settings: AlignBench) -> str:
+    """Measure; the table, and where rows, table and plot lie."""
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    rows = bench_align(
+        settings.output,
+        anchors=settings.anchors,
+        outliers=settings.outliers,
+        names=settings.methods,
+        seeds=settings.seeds,
+        budget=settings.seconds,
+        command=command_line("bench align", settings),
+    )
+    return f"{table(rows)}\nalign.jsonl (rows), align.md (this table) and align.svg (plot) are in {settings.output}"
+
+
 def bench_align(
     output: Path,
     *,
-    anchors: Sequence[int] = ANCHORS,
-    outliers: Sequence[float] = OUTLIERS,
+    anchors: Sequence[int] = AlignBench.anchors,
+    outliers: Sequence[float] = AlignBench.outliers,
     kinds: Sequence[MonoKind] = get_args(MonoKind),
     names: Sequence[str] = (),
-    seeds: int = SEEDS,
-    budget: float = 0.03,
+    seeds: int = AlignBench.seeds,
+    budget: float = AlignBench.seconds,
     command: str = "",
-) -> list[dict[str, Any]]:
-    """Measure and write `align.jsonl`, `align.md` and, where matplotlib is installed, `align.svg` into `output`.
+) -> list[Row]:
+    """Measure and write `align.jsonl`, `align.md` and `align.svg` into `output`.
 
     Args:
         output: folder, created where absent; its three files are replaced.
@@ -69,7 +106,7 @@ def bench_align(
     chosen = _chosen(names)
     output.mkdir(parents=True, exist_ok=True)
     (output / "align.jsonl").unlink(missing_ok=True)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     for case in (AlignCase(*values) for values in _product(kinds, anchors, outliers)):
         problems = [align_problem(*case, seed=seed) for seed in range(seeds)]
         found = [_row(method, case, problems, budget, command) for method in chosen]
@@ -77,10 +114,7 @@ def bench_align(
         rows += found
         logger.info("%s is measured", case)
     (output / "align.md").write_text(table(rows))
-    try:
-        plot(rows, output / "align.svg")
-    except MissingExtra as error:
-        logger.warning("no plot: %s", error)
+    (output / "align.svg").write_text(plot(rows))
     return rows
 
 
@@ -99,7 +133,7 @@ def _chosen(names: Sequence[str]) -> list[AlignMethod]:
     return [method for method in every if not names or method.name in names]
 
 
-def _row(method: AlignMethod, case: AlignCase, problems: list, budget: float, command: str) -> dict[str, Any]:
+def _row(method: AlignMethod, case: AlignCase, problems: list[AlignProblem], budget: float, command: str) -> Row:
     found: dict[str, Any] = {"error": None, "seconds": None, "depth_error": None}
     failed = None
     try:
@@ -113,7 +147,7 @@ def _row(method: AlignMethod, case: AlignCase, problems: list, budget: float, co
     )
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
+def table(rows: Sequence[Row]) -> str:
     """Markdown: per method and setting the depth error by share of wrong anchors, and the time by their number."""
     shares = sorted({row["outliers"] for row in rows})
     counts = sorted({row["anchors"] for row in rows})
@@ -123,36 +157,39 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         "objective that the method minimises or would be compared in. Time: median wall time of one fit. "
         f"{provenance(rows[0])}"
     )
-    parts = [caption, ""]
+    header = ("method", "setting", *(f"{share:.0%} wrong" for share in shares), "worst gap")
+    header += tuple(f"{count} anchors, ms" for count in counts)
+    parts = [caption]
     for kind in dict.fromkeys(row["domain"] for row in rows):
         mine = [row for row in rows if row["domain"] == kind]
-        header = ["method", "setting", *(f"{share:.0%} wrong" for share in shares), "worst gap"]
-        header += [f"{count} anchors, ms" for count in counts]
-        parts += [f"{kind.capitalize()} map", "", _line(header), _line(["---"] * len(header))]
-        parts += [_line(_cells(key, group, shares, counts)) for key, group in _grouped(mine)]
-        parts.append("")
-    return "\n".join(parts)
+        lines = tuple(_cells(key, group, shares, counts) for key, group in _by_setting(mine).items())
+        parts += [f"{kind.capitalize()} map", markdown(Table(header, lines))]
+    return "\n\n".join(parts) + "\n"
 
 
-def _grouped(rows: Sequence[dict[str, Any]]) -> list[tuple[tuple[str, str], list[dict[str, Any]]]]:
+def _by_setting(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
     keys = dict.fromkeys((row["method"], row["setting"]) for row in rows)
-    return [(key, [row for row in rows if (row["method"], row["setting"]) == key]) for key in keys]
+    return {key: [row for row in rows if (row["method"], row["setting"]) == key] for key in keys}
 
 
 def _cells(
-    key: tuple[str, str], group: Sequence[dict[str, Any]], shares: Sequence[float], counts: Sequence[int]
-) -> list[str]:
+    key: tuple[str, str], group: Sequence[Row], shares: Sequence[float], counts: Sequence[int]
+) -> tuple[str, ...]:
     """One line of the table; cases that the method refused are counted apart."""
-    cells = [_depth_error([row for row in group if row["outliers"] == share]) for share in shares]
+    errors = [_depth_error([row for row in group if row["outliers"] == share]) for share in shares]
     worked = [row for row in group if not row["failed"]]
-    cells.append(f"{max(row['error'] for row in worked):.0e}" if worked else "-")
-    for count in counts:
-        times = [1000 * row["seconds"] for row in worked if row["anchors"] == count]
-        cells.append(f"{median(times):.2f}" if times else "-")
-    return [*key, *cells]
+    gap = f"{max(row['error'] for row in worked):.0e}" if worked else "-"
+    times = [_milliseconds(worked, count) for count in counts]
+    return (*key, *errors, gap, *("-" if time is None else f"{time:.2f}" for time in times))
 
 
-def _depth_error(rows: Sequence[dict[str, Any]]) -> str:
+def _milliseconds(rows: Sequence[Row], anchors: int) -> float | None:
+    """Median time of a fit of so many anchors, None where there was none."""
+    times = [1000 * row["seconds"] for row in rows if row["anchors"] == anchors]
+    return median(times) if times else None
+
+
+def _depth_error(rows: Sequence[Row]) -> str:
     """Mean over the cases that the method took on, and how many it refused."""
     errors = [row["depth_error"] for row in rows if not row["failed"]]
     refused = len(rows) - len(errors)
@@ -160,84 +197,33 @@ def _depth_error(rows: Sequence[dict[str, Any]]) -> str:
     return f"{told} ({refused} of {len(rows)} refused)" if refused else told
 
 
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+def plot(rows: Sequence[Row]) -> str:
+    """SVG: objective gap and depth error against time, and time against the number of anchors; lower left is better.
 
-
-def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Objective gap and depth error against time, and time against the number of anchors; lower left is better.
-
-    The first two panels show the number of anchors nearest to 10,000, one mark per setting: the gap's worst case and
-    the depth error with the largest share of wrong anchors, both over the domains.
-
-    Raises:
-        MissingExtra: matplotlib is not installed.
+    The first two plots show the number of anchors nearest to `PLOTTED_ANCHORS`; the depth error is that with the
+    largest share of wrong anchors. Means are geometric, over the kinds of map and, for the gap, over the shares.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise missing_extra("matplotlib", "report", "the plot") from None
-    worked = [row for row in rows if not row["failed"]]
-    anchors = min({row["anchors"] for row in rows}, key=lambda count: abs(math.log(count / 10_000)))
+    anchors = min({row["anchors"] for row in rows}, key=lambda count: abs(math.log(count / PLOTTED_ANCHORS)))
     worst = max(row["outliers"] for row in rows)
-    figure = Figure(figsize=(14, 4.8), layout="constrained")
-    gap, depth, scaling = figure.subplots(1, 3)
-    for name in dict.fromkeys(row["method"] for row in worked):
-        mine = [row for row in worked if row["method"] == name]
-        _scatter(gap, name, [row for row in mine if row["anchors"] == anchors], "error", max)
-        hard = [row for row in mine if row["anchors"] == anchors and row["outliers"] == worst]
-        _scatter(depth, name, hard, "depth_error", mean)
-        last = [group for _, group in _grouped(mine)][-1]
-        counts = sorted({row["anchors"] for row in last})
-        times = [median(1000 * row["seconds"] for row in last if row["anchors"] == count) for count in counts]
-        scaling.plot(counts, times, marker="o", label=f"{name}, {last[0]['setting']}")
-    gap.set(xlabel=f"ms per fit of {anchors} anchors", ylabel="worst objective gap F / F* - 1")
-    depth.set(xlabel=f"ms per fit of {anchors} anchors", ylabel=f"median depth error, {worst:.0%} of the anchors wrong")
-    scaling.set(xlabel="anchors", ylabel="ms per fit")
-    for panel in (gap, depth, scaling):
-        panel.set(xscale="log", yscale="log")
-        panel.grid(True, which="both", alpha=0.3)
-        if panel.get_legend_handles_labels()[0]:
-            panel.legend(fontsize=6)
-    figure.supxlabel(provenance(rows[0]), fontsize=6, wrap=True)
-    figure.savefig(path, metadata={"Date": None})
-
-
-def _scatter(panel: Any, name: str, rows: Sequence[dict[str, Any]], value: str, unite: Any) -> None:
-    """One mark per setting of one method, with the setting beside it."""
-    groups = _grouped(rows)
-    if not groups:
-        return
-    times = [median(1000 * row["seconds"] for row in group) for _, group in groups]
-    values = [max(unite(row[value] for row in group), DRAWN_GAP) for _, group in groups]
-    panel.scatter(times, values, label=name)
-    for ((_, setting), _), x, y in zip(groups, times, values):
-        panel.annotate(setting, (x, y), fontsize=5, xytext=(3, 3), textcoords="offset points")
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of `d2 bench align`."""
-    parser = argparse.ArgumentParser(prog="d2 bench align", description=__doc__)
-    parser.add_argument("--output", type=Path, default=Path("bench-align"), help="folder of the results")
-    parser.add_argument("--anchors", nargs="+", type=int, default=ANCHORS, metavar="N", help="numbers of anchors")
-    parser.add_argument(
-        "--outliers", nargs="+", type=float, default=OUTLIERS, metavar="SHARE", help="shares of wrong anchors, 0..1"
+    mine, colors = [row for row in rows if row["anchors"] == anchors], colors_of(rows)
+    hard = [{**row, "error": row["depth_error"]} for row in mine if row["outliers"] == worst]
+    panels = (
+        work_precision(mine, f"{anchors} anchors", "F / F* - 1", "ms per fit", 1e3, colors),
+        work_precision(hard, f"{anchors} anchors, {worst:.0%} wrong", "depth error", "ms per fit", 1e3, colors),
+        growth("Slowest setting of each method", "anchors", "ms per fit", _times(rows, colors)),
     )
-    parser.add_argument("--methods", nargs="+", default=(), metavar="METHOD", help="names in the table; default all")
-    parser.add_argument("--seeds", type=int, default=SEEDS, help="problems per case; figures are medians over them")
-    parser.add_argument("--seconds", type=float, default=0.03, help="for which each fit is repeated")
-    parser.add_argument("--threads", type=int, help="CPU threads of torch; default: torch's. The fits use one")
-    options = parser.parse_args(argv)
-    if options.threads:
-        torch.set_num_threads(options.threads)
-    bench_align(
-        options.output,
-        anchors=options.anchors,
-        outliers=options.outliers,
-        names=options.methods,
-        seeds=options.seeds,
-        budget=options.seconds,
-        command=shlex.join(["d2", "bench", "align", *(argv if argv is not None else ())]),
-    )
-    logger.info("results are in %s", options.output)
-    return 0
+    return figure(panels, "Alignment: gap, depth error and time of the fits", columns=3, size=(380, 320))
+
+
+def _times(rows: Sequence[Row], names: Iterable[str]) -> Mapping[str, list[tuple[float, float]]]:
+    """Median milliseconds over the number of anchors, of the setting of each method that takes longest."""
+    counts = sorted({row["anchors"] for row in rows})
+    lines = {}
+    for name in names:
+        worked = [row for row in rows if row["method"] == name and not row["failed"]]
+        found = [
+            [(count, time) for count in counts if (time := _milliseconds(group, count)) is not None]
+            for group in _by_setting(worked).values()
+        ]
+        lines[name] = max(found, key=lambda line: line[-1][1], default=[])
+    return lines

@@ -78,7 +78,7 @@ class AlignProblem:
 def align_problem(kind: MonoKind, anchors: int, outliers: float, seed: int = 0) -> AlignProblem:
     """`anchors` of them, of which the share `outliers` has the geometric depth of another place in the room."""
     rng = np.random.default_rng([seed, anchors, round(100 * outliers)])
-    truth, elsewhere = np.exp(rng.uniform(*np.log(ROOM), (2, anchors)))
+    truth, elsewhere = np.exp(rng.uniform(float(np.log(ROOM[0])), float(np.log(ROOM[1])), (2, anchors)))
     target = 1 / truth if kind == "relative" else truth
     clean = (target - TRUE_LINE[1]) / TRUE_LINE[0]
     mono = (target * (1 + rng.normal(0, MONO_NOISE, anchors)) - TRUE_LINE[1]) / TRUE_LINE[0]
@@ -88,11 +88,14 @@ def align_problem(kind: MonoKind, anchors: int, outliers: float, seed: int = 0) 
     return AlignProblem(kind, mono, geometric, clean, truth)
 
 
-def weights_and_epsilon(target: np.ndarray, residual: str) -> tuple[np.ndarray, float]:
-    """What `align` makes of its default settings: the weights of the residuals and the smoothing."""
+def weights_and_epsilon(
+    target: np.ndarray, residual: str, settings: AlignSettings | None = None
+) -> tuple[np.ndarray, float]:
+    """What `align` makes of its settings (the default ones): the weights of the residuals and the smoothing."""
+    epsilon = (settings or AlignSettings()).epsilon
     if residual == "relative":
-        return 1 / target, AlignSettings().epsilon
-    return np.ones_like(target), 0.01 * float(np.median(target))
+        return 1 / target, epsilon
+    return np.ones_like(target), epsilon * float(np.median(target))
 
 
 @dataclass(frozen=True)
@@ -137,9 +140,9 @@ def _certified(residual: str, tolerance: float) -> Callable[[AlignProblem], Line
     return fit
 
 
-def _as_used(problem: AlignProblem, **changes: bool) -> Line:
+def _as_used(problem: AlignProblem, leverage_guard: bool = AlignSettings.leverage_guard) -> Line:
     """Everything that building a prior does: selection, subsampling, fit, certificate, acceptance."""
-    settings = AlignSettings(**changes)
+    settings = AlignSettings(leverage_guard=leverage_guard)
     found = align(problem.mono[None], problem.geometric[None], kind=problem.kind, settings=settings)
     if not found.accepted:
         raise D2Error(found.status.value)

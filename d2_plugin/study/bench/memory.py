@@ -15,7 +15,7 @@ _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 class Measured(NamedTuple):
-    """What the work returned, and the memory it took beyond what was there before, MB; NaN where Linux is not."""
+    """What the work returned, and the memory it took beyond what was there before, MB; NaN outside Linux."""
 
     result: Any
     peak_mb: float
@@ -47,4 +47,5 @@ def _measured(work: Callable[..., Any], arguments: tuple, threads: int) -> Measu
 
 
 def _status_mb(key: str) -> float:
-    return int(re.search(rf"{key}:\s+(\d+) kB", _STATUS.read_text()).group(1)) * 1024 / 1e6
+    found = re.search(rf"{key}:\s+(\d+) kB", _STATUS.read_text())
+    return float("nan") if found is None else int(found.group(1)) * 1024 / 1e6

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
-import math
-import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, TypeVar
 
 import torch
 
-from d2_plugin.errors import D2Error, MissingExtra, missing_extra
+from d2_plugin.errors import D2Error
+from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.provenance import provenance
-from d2_plugin.study.rows import append_rows, make_row
+from d2_plugin.settings import Count, NotNegative, Range, Settings
+from d2_plugin.study.command_line import command_line
+from d2_plugin.study.growth import power
+from d2_plugin.study.report.precision import raster_plot
+from d2_plugin.study.report.svg import figure
+from d2_plugin.study.report.work_precision import colors_of, growth
+from d2_plugin.study.rows import Row, append_rows, make_row
 
 from .raster_measure import (
     THRESHOLDS,
@@ -31,24 +36,66 @@ from .raster_measure import (
 
 logger = logging.getLogger(__name__)
 
-SCENES = ("synth:10000", "synth:50000", "synth:200000")
-SIZES = ("320x180", "640x360", "1280x720")
+Key = TypeVar("Key")
+
 PASSES = ("forward", "forward+backward", "survey")
+
+
+@dataclass(frozen=True)
+class RasterBench(Settings):
+    """Settings of `d2 bench raster`."""
+
+    scenes: tuple[str, ...] = ("synth:10000", "synth:50000", "synth:200000")
+    """What is drawn: synth:N for N synthetic Gaussians, or garden."""
+    sizes: tuple[str, ...] = ("320x180", "640x360", "1280x720")
+    """Image sizes as WIDTHxHEIGHT in pixels."""
+    garden: Path | None = None
+    """Path of gsplat's test_garden.npz, which adds the scene garden."""
+    device: str = "cpu"
+    """Where it is drawn: cpu or cuda."""
+    seconds: NotNegative = 3.0
+    """About how long each pass is repeated, seconds."""
+    threads: Annotated[int, Range(1)] | None = None
+    """CPU threads; torch's own choice where left out."""
+    error_limit: Count = 60_000
+    """Most Gaussians for which the error is measured; with more of them the truth in float64 takes minutes."""
+    no_memory: bool = False
+    """Leave out peak memory, which takes a new process for every row on the CPU."""
+    output: Path = Path("bench-raster")
+    """Folder of the results."""
+
+
+def run(settings: RasterBench) -> str:
+    """Measure; the table, and where rows, table and plot lie."""
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+    rows = bench_raster(
+        settings.output,
+        scenes=settings.scenes,
+        sizes=settings.sizes,
+        garden=settings.garden,
+        device=settings.device,
+        seconds=settings.seconds,
+        error_limit=settings.error_limit,
+        memory=not settings.no_memory,
+        command=command_line("bench raster", settings),
+    )
+    return f"{table(rows)}\nraster.jsonl (rows), raster.md (this table) and raster.svg (plot) are in {settings.output}"
 
 
 def bench_raster(
     output: Path,
     *,
-    scenes: Sequence[str] = SCENES,
-    sizes: Sequence[str] = SIZES,
+    scenes: Sequence[str] = RasterBench.scenes,
+    sizes: Sequence[str] = RasterBench.sizes,
     garden: Path | None = None,
     device: str = "cpu",
-    seconds: float = 3.0,
-    error_limit: int = 60_000,
+    seconds: float = RasterBench.seconds,
+    error_limit: int = RasterBench.error_limit,
     memory: bool = True,
     command: str = "",
-) -> list[dict[str, Any]]:
-    """Measure and write `raster.jsonl`, `raster.md` and, where matplotlib is installed, `raster.svg` into `output`.
+) -> list[Row]:
+    """Measure and write `raster.jsonl`, `raster.md` and `raster.svg` into `output`.
 
     Args:
         output: folder, created where absent; its three files are replaced.
@@ -78,10 +125,7 @@ def bench_raster(
             append_rows(output / "raster.jsonl", found)
         rows += measured
     (output / "raster.md").write_text(table(rows))
-    try:
-        plot(rows, output / "raster.svg")
-    except MissingExtra as error:
-        logger.warning("no plot: %s", error)
+    (output / "raster.svg").write_text(plot(rows))
     return rows
 
 
@@ -95,7 +139,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 def _measure(
     case: Case, device: torch.device, seconds: float, error_limit: int, memory: bool, command: str
-) -> list[dict[str, Any]]:
+) -> list[Row]:
     scene = case.load()
     gaussians = len(scene.means)
     truth = exact(scene) if gaussians <= error_limit else None
@@ -124,7 +168,7 @@ def _measure(
     return rows
 
 
-def _measure_thresholds(case: Case, device: torch.device, seconds: float, command: str) -> list[dict[str, Any]]:
+def _measure_thresholds(case: Case, device: torch.device, seconds: float, command: str) -> list[Row]:
     """What the thresholds of splatting cost in error and save in time, one row each, for `d2 report`."""
     scene, where = case.load(), f"{case.scene} at {case.width}x{case.height}"
     works = {name: passes_of(with_thresholds(name), scene, device)["forward+backward"] for name in THRESHOLDS}
@@ -143,28 +187,16 @@ def _measure_thresholds(case: Case, device: torch.device, seconds: float, comman
     ]
 
 
-def exponent(points: Sequence[tuple[float, float]]) -> float | None:
-    """Slope p of time ~ size^p by least squares in logarithms, None with fewer than two sizes."""
-    if len({size for size, _ in points}) < 2:
-        return None
-    logs = [(math.log(size), math.log(value)) for size, value in points]
-    mean_x, mean_y = (sum(values) / len(logs) for values in zip(*logs))
-    spread = sum((x - mean_x) ** 2 for x, _ in logs)
-    return sum((x - mean_x) * (y - mean_y) for x, y in logs) / spread
-
-
-def table(rows: Sequence[dict[str, Any]]) -> str:
+def table(rows: Sequence[Row]) -> str:
     """Markdown: times, memory and errors per case, then how time grows with Gaussians and with pixels."""
-    lines = [_caption(rows), ""]
-    header = ["implementation", "scene", "size", *(f"{kind} ms" for kind in PASSES), "CPU ms", "peak MB"]
-    header += ["color p99.9", "color max", "pixels apart", "worst gradient"]
-    lines += [_line(header), _line(["---"] * len(header))]
-    lines += [_line(_cells(row)) for row in rows]
-    lines += ["", *_scaling(rows), ""]
-    return "\n".join(lines)
+    header = ("implementation", "scene", "size", *(f"{kind} ms" for kind in PASSES), "CPU ms", "peak MB")
+    header += ("color p99.9", "color max", "pixels apart", "worst gradient")
+    parts = [_caption(rows), markdown(Table(header, tuple(map(_cells, rows))))]
+    grown = [f"- {name}: {law}" for name, law in _growth(rows)]
+    return "\n\n".join([*parts, "Forward+backward grows as:", "\n".join(grown)]) + "\n"
 
 
-def _caption(rows: Sequence[dict[str, Any]]) -> str:
+def _caption(rows: Sequence[Row]) -> str:
     return (
         "Median wall time and half the interquartile range in ms; CPU ms is the CPU time of one forward+backward over "
         "all threads; peak MB is what one forward+backward takes beyond its inputs. Error against float64: absolute "
@@ -173,111 +205,51 @@ def _caption(rows: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def _cells(row: dict[str, Any]) -> list[str]:
+def _cells(row: Row) -> tuple[str, ...]:
     def milliseconds(kind: str) -> str:
         found = row["passes"].get(kind)
         return f"{found['median_ms']:.2f} ± {found['iqr_ms'] / 2:.2f}" if found else "-"
 
-    cells = [row["method"], row["scene"], f"{row['width']}x{row['height']}", *map(milliseconds, PASSES)]
-    cells += [f"{row['passes']['forward+backward']['cpu_ms']:.2f}"]
-    cells += ["-" if row["peak_mb"] is None else f"{row['peak_mb']:.0f}"]
-    error = row["errors"]
-    if not error:
-        return [*cells, *["-"] * 4]
-    worst = max(value["relative_l2"] for name, value in error.items() if name.startswith("grad"))
-    color = error["color"]
-    return [*cells, f"{color['p99.9']:.1e}", f"{color['max']:.1e}", f"{error['pixels']['apart']:.1e}", f"{worst:.1e}"]
+    cpu = f"{row['passes']['forward+backward']['cpu_ms']:.2f}"
+    peak = "-" if row["peak_mb"] is None else f"{row['peak_mb']:.0f}"
+    size = f"{row['width']}x{row['height']}"
+    return (row["method"], row["scene"], size, *map(milliseconds, PASSES), cpu, peak, *_error_cells(row["errors"]))
 
 
-def _scaling(rows: Sequence[dict[str, Any]]) -> list[str]:
-    lines = ["Forward+backward grows as:", ""]
-    for name, mine in _grouped(rows, lambda row: row["method"]):
-        synthetic = [row for row in mine if row["scene"] != "garden"]
-        for size, group in _grouped(synthetic, lambda row: f"{row['width']}x{row['height']}"):
-            if (power := exponent([(row["gaussians"], _milliseconds(row)) for row in group])) is not None:
-                lines.append(f"- {name} at {size}: N^{power:.2f}")
-        for scene, group in _grouped(mine, lambda row: row["scene"]):
-            if (power := exponent([(row["width"] * row["height"], _milliseconds(row)) for row in group])) is not None:
-                lines.append(f"- {name}, {scene}: pixels^{power:.2f}")
-    return lines
+def _error_cells(errors: Mapping[str, Mapping[str, float]] | None) -> tuple[str, ...]:
+    if not errors:
+        return ("-",) * 4
+    worst = max(value["relative_l2"] for name, value in errors.items() if name.startswith("grad"))
+    color = errors["color"]
+    return tuple(f"{value:.1e}" for value in (color["p99.9"], color["max"], errors["pixels"]["apart"], worst))
 
 
-def _grouped(
-    rows: Sequence[dict[str, Any]], key: Callable[[dict[str, Any]], str]
-) -> list[tuple[str, list[dict[str, Any]]]]:
+def _growth(rows: Sequence[Row]) -> list[tuple[str, str]]:
+    """What grows, and as which power of the number of Gaussians or of pixels."""
+    laws = [(name, power(line, "N")) for name, line in _by_gaussians(rows).items()]
+    for (name, scene), group in _grouped(rows, lambda row: (row["method"], row["scene"])):
+        line = [(row["width"] * row["height"], _milliseconds(row)) for row in group]
+        laws.append((f"{name}, {scene}", power(line, "pixels")))
+    return [(name, law) for name, law in laws if law is not None]
+
+
+def _by_gaussians(rows: Sequence[Row]) -> Mapping[str, list[tuple[float, float]]]:
+    """Milliseconds over the number of synthetic Gaussians, per implementation and image size."""
+    synthetic = [row for row in rows if row["scene"] != "garden"]
+    groups = _grouped(synthetic, lambda row: f"{row['method']} at {row['width']}x{row['height']}")
+    return {name: sorted((row["gaussians"], _milliseconds(row)) for row in group) for name, group in groups}
+
+
+def _grouped(rows: Sequence[Row], key: Callable[[Row], Key]) -> list[tuple[Key, list[Row]]]:
     return [(value, [row for row in rows if key(row) == value]) for value in dict.fromkeys(map(key, rows))]
 
 
-def _milliseconds(row: dict[str, Any]) -> float:
+def _milliseconds(row: Row) -> float:
     return row["passes"]["forward+backward"]["median_ms"]
 
 
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
-
-
-def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Error against time, and time against the number of Gaussians.
-
-    Raises:
-        MissingExtra: matplotlib is not installed.
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise missing_extra("matplotlib", "report", "the plot") from None
-    figure = Figure(figsize=(11, 4.8), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for name, mine in _grouped(rows, lambda row: row["method"]):
-        known = [row for row in mine if row["errors"]]
-        errors = [max(row["errors"]["color"]["p99.9"], 1e-9) for row in known]
-        if known:
-            left.scatter([_milliseconds(row) for row in known], errors, label=name)
-        synthetic = [row for row in mine if row["scene"] != "garden"]
-        for size, group in _grouped(synthetic, lambda row: f"{row['width']}x{row['height']}"):
-            points = sorted((row["gaussians"], _milliseconds(row)) for row in group)
-            right.plot(*zip(*points), marker="o", label=f"{name}, {size}")
-    if not any(row["errors"] for row in rows):
-        left.text(0.5, 0.5, "error not measured", ha="center", transform=left.transAxes)
-    labels = (("forward+backward, ms", "color error against float64, p99.9"), ("Gaussians", "forward+backward, ms"))
-    for axes, (x, y) in zip((left, right), labels):
-        axes.set(xlabel=x, ylabel=y)
-        if axes.get_legend_handles_labels()[0]:
-            axes.set(xscale="log", yscale="log")
-            axes.grid(True, which="both", alpha=0.3)
-            axes.legend(fontsize=7)
-    figure.supxlabel(provenance(rows[0]), fontsize=6, wrap=True)
-    figure.savefig(path, metadata={"Date": None})
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of `d2 bench raster`."""
-    parser = argparse.ArgumentParser(prog="d2 bench raster", description=__doc__)
-    parser.add_argument("--output", type=Path, default=Path("bench-raster"), help="folder of the results")
-    parser.add_argument("--scenes", nargs="+", default=SCENES, metavar="SCENE", help="synth:N (N Gaussians), garden")
-    parser.add_argument("--sizes", nargs="+", default=SIZES, metavar="WxH", help="image sizes in pixels")
-    parser.add_argument("--garden", type=Path, help="gsplat's test_garden.npz; adds the scene 'garden'")
-    parser.add_argument("--device", default="cpu", help="cpu or cuda")
-    parser.add_argument("--seconds", type=float, default=3.0, help="about how long each pass is repeated, seconds")
-    parser.add_argument("--threads", type=int, help="CPU threads; default: torch's")
-    parser.add_argument(
-        "--error-limit", type=int, default=60_000, help="most Gaussians for which the error is measured (slow beyond)"
-    )
-    parser.add_argument("--no-memory", action="store_true", help="do not measure peak memory (a new process per row)")
-    options = parser.parse_args(argv)
-    if options.threads:
-        torch.set_num_threads(options.threads)
-    command = shlex.join(["d2", "bench", "raster", *(argv if argv is not None else ())])
-    bench_raster(
-        options.output,
-        scenes=options.scenes,
-        sizes=options.sizes,
-        garden=options.garden,
-        device=options.device,
-        seconds=options.seconds,
-        error_limit=options.error_limit,
-        memory=not options.no_memory,
-        command=command,
-    )
-    logger.info("results are in %s", options.output)
-    return 0
+def plot(rows: Sequence[Row]) -> str:
+    """SVG: error against time where errors were measured, and time against the number of Gaussians."""
+    lines, colors = _by_gaussians(rows), colors_of(rows)
+    panels = (raster_plot(rows), growth("Growth", "Gaussians", "forward+backward, ms", lines, len(colors)))
+    return figure(panels, "Rasterizer: error against time, and time against Gaussians", columns=2, size=(480, 340))

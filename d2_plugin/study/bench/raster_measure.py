@@ -23,7 +23,7 @@ THRESHOLD_DEVIATION = 1e-5
 """Color or alpha that deviates more than this from float64 in a pixel does so because of a threshold."""
 
 REFERENCE_LIMIT = 12_000
-"""Most Gaussians for which the torch path is timed as a peer; it takes seconds per call beyond."""
+"""Most Gaussians for which the torch path is timed as a peer; with more of them it takes seconds per call."""
 
 
 NEARLY_NO_THRESHOLDS = RasterSettings(alpha_min=1e-7, transmittance_min=1e-9)
@@ -84,7 +84,7 @@ def _gsplat(splats: Splats, colors: Tensor, scene: Scene) -> Render:
 
 
 def implementations(device: torch.device, gaussians: int) -> dict[str, RenderScene]:
-    """What is compared on `device`: this package, the torch path where it is bearable, gsplat where it is installed."""
+    """What is compared on `device`: this package, the torch path up to `REFERENCE_LIMIT`, gsplat where installed."""
     found: dict[str, RenderScene] = {"d2": _d2}
     if gaussians <= REFERENCE_LIMIT:
         found["torch reference"] = _reference
@@ -99,11 +99,18 @@ def leaves_of(scene: Scene, device: torch.device, dtype: torch.dtype) -> list[Te
     return [part.to(device, dtype).requires_grad_() for part in parts]
 
 
+def splats_of(leaves: Sequence[Tensor]) -> Splats:
+    """The Gaussians of `leaves_of`, without their colors."""
+    means, covariances, opacities, _ = leaves
+    return Splats(means, covariances, opacities, torch.arange(len(means), device=means.device))
+
+
 def upstream(scene: Scene, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Fixed random gradients of color, depth sum and alpha."""
     g = torch.Generator().manual_seed(0)
     size = (scene.view.height, scene.view.width)
-    return tuple(torch.randn(shape, generator=g).to(like) for shape in ((*size, 3), size, size))
+    color, depth, alpha = (torch.randn(shape, generator=g).to(like) for shape in ((*size, 3), size, size))
+    return color, depth, alpha
 
 
 def prior_of(scene: Scene, device: torch.device) -> DepthPrior:
@@ -117,8 +124,8 @@ def prior_of(scene: Scene, device: torch.device) -> DepthPrior:
 def passes_of(render: RenderScene, scene: Scene, device: torch.device) -> dict[str, Callable[[], object]]:
     """What is timed: forward, forward and backward (gradients of everything for all three outputs), survey."""
     leaves = leaves_of(scene, device, torch.float32)
-    splats = Splats(*leaves[:3], torch.arange(len(scene.means), device=device))
-    fixed = Splats(*(part.detach() for part in splats))
+    splats = splats_of(leaves)
+    fixed = splats_of([leaf.detach() for leaf in leaves])
     weights, prior = upstream(scene, leaves[0]), prior_of(scene, device)
 
     def forward() -> object:
@@ -141,7 +148,8 @@ def timed(works: Mapping[str, Callable[[], object]], device: torch.device, secon
     """
     for work in works.values():
         _finish(work(), device)
-    wall, cpu = ({name: [] for name in works} for _ in range(2))
+    wall: dict[str, list[float]] = {name: [] for name in works}
+    cpu: dict[str, list[float]] = {name: [] for name in works}
     end, rounds = time.perf_counter() + seconds * len(works), 0
     while rounds < 3 or (time.perf_counter() < end and rounds < 200):
         for name, work in works.items():
@@ -179,7 +187,7 @@ class Truth(NamedTuple):
 def exact(scene: Scene) -> Truth:
     """Image of the reference in float64."""
     leaves = leaves_of(scene, torch.device("cpu"), torch.float64)
-    splats = Splats(*leaves[:3], torch.arange(len(scene.means)))
+    splats = splats_of(leaves)
     return Truth(reference.rasterize(splats, leaves[3], scene.view, SETTINGS), leaves)
 
 
@@ -192,7 +200,7 @@ def error_of(render: RenderScene, scene: Scene, device: torch.device, truth: Tru
     out the pixels whose color or alpha deviates by more than `THRESHOLD_DEVIATION`, whose share is in `apart`.
     """
     leaves = leaves_of(scene, device, torch.float32)
-    found = render(Splats(*leaves[:3], torch.arange(len(scene.means), device=device)), leaves[3], scene)
+    found = render(splats_of(leaves), leaves[3], scene)
     deviations = [(part.detach().cpu().double() - true.detach()).abs() for part, true in zip(found, truth.render)]
     apart = (deviations[0].amax(-1) > THRESHOLD_DEVIATION) | (deviations[2] > THRESHOLD_DEVIATION)
     kept = (~apart[..., None], ~apart, ~apart)
@@ -215,7 +223,8 @@ def error_of(render: RenderScene, scene: Scene, device: torch.device, truth: Tru
 def threshold_errors(scene: Scene, device: torch.device) -> dict[str, float]:
     """For each of `THRESHOLDS` the 99.9th percentile of the colour's deviation from an image that has nearly none."""
     exact_splats = scene.to(torch.float64).splats()
-    splats, colors = Splats(*(part.to(device) for part in scene.splats())), scene.colors.to(device)
+    leaves = leaves_of(scene, device, torch.float32)
+    splats, colors = splats_of(leaves), leaves[3]
     with torch.no_grad():
         truth = reference.rasterize(exact_splats, scene.colors.double(), scene.view, NEARLY_NO_THRESHOLDS).color
         found = {name: rasterize(splats, colors, scene.view, kind).color for name, kind in THRESHOLDS.items()}

@@ -48,7 +48,8 @@ class Scene(NamedTuple):
 
     def to(self, dtype: torch.dtype) -> Scene:
         """The same scene in another floating type."""
-        return Scene(*(part.to(dtype) for part in self[:5]), self.view)
+        means, quaternions, scales, opacities, colors = (part.to(dtype) for part in self[:5])
+        return Scene(means, quaternions, scales, opacities, colors, self.view)
 
 
 def load_scene(name: str, width: int, height: int, garden: Path | None = None) -> Scene:
@@ -147,5 +148,7 @@ def _scene(
     colors: np.ndarray,
     view: View,
 ) -> Scene:
-    parts = (means, quaternions, scales, opacities, colors)
-    return Scene(*(torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in parts), view)
+    def tensor(values: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+
+    return Scene(tensor(means), tensor(quaternions), tensor(scales), tensor(opacities), tensor(colors), view)

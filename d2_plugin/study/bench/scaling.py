@@ -6,29 +6,51 @@ in processes of their own. Training keeps decoded pictures up to a bound (1 GiB)
 
 from __future__ import annotations
 
-import argparse
-import shlex
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from d2_plugin.captures.export.folder import save_capture
 from d2_plugin.captures.synthetic.room import split, synthetic_capture
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
+from d2_plugin.settings import Range, Settings
+from d2_plugin.study.command_line import command_line
+from d2_plugin.study.growth import exponent, power
 from d2_plugin.study.rows import Row, append_rows, make_row
 
 from .memory import in_fresh_process
-from .raster import exponent
 
-FRAMES = (5, 20, 80)
+PARTS, MEASURES = ("priors", "training"), ("seconds", "peak_mb")
+
+
+@dataclass(frozen=True)
+class ScalingBench(Settings):
+    """Settings of `d2 bench scaling`."""
+
+    frames: tuple[Annotated[int, Range(1)], ...] = (5, 20, 80)
+    """Lengths of the recording, frames."""
+    width: Annotated[int, Range(32, unit="pixels")] = 160
+    """Width of the pictures, which are 16:9, pixels."""
+    iterations: Annotated[int, Range(1, unit="steps")] = 150
+    """Optimizer steps of each training."""
+    output: Path = Path("runs.jsonl")
+    """File that the rows are added to."""
+
+
+def run(settings: ScalingBench) -> str:
+    """Measure and add the rows; how each cost grows, and where the rows lie."""
+    command = command_line("bench scaling", settings)
+    rows = bench_scaling(settings.frames, settings.width, settings.iterations, command)
+    append_rows(settings.output, rows)
+    return f"{summary(rows)}\nrows are in {settings.output}; `d2 report {settings.output}` shows them"
 
 
 def bench_scaling(
-    frames: Sequence[int] = FRAMES, width: int = 160, iterations: int = 150, command: str = ""
+    frames: Sequence[int] = ScalingBench.frames, width: int = 160, iterations: int = 150, command: str = ""
 ) -> list[Row]:
     """Two rows per number of frames: building priors (time and memory), and training with all hooks.
 
@@ -65,26 +87,22 @@ def _training(settings: RunSettings, folder: Path) -> dict[str, Any]:
     return {"seconds": run.seconds["train"]}
 
 
+def summary(rows: Sequence[Row]) -> str:
+    """One line per part and cost: its value for each length, and the power of the number of frames it grows as."""
+    lines = []
+    for part in PARTS:
+        for measure in MEASURES:
+            places = _places(rows, part, measure)
+            law = power(places, "frames")
+            found = ", ".join(f"{frames:g}: {value:.1f}" for frames, value in places)
+            lines.append(f"{part:9} {measure:8} {found}" + (f"  grows as {law}" if law else ""))
+    return "\n".join(lines)
+
+
 def growth(rows: Sequence[Row], part: str, measure: str) -> float | None:
     """Exponent p of `measure` ("seconds", "peak_mb") ~ frames^p; None with fewer than two lengths."""
-    return exponent([(row["frames"], row[measure]) for row in rows if row["method"] == part and row[measure]])
+    return exponent(_places(rows, part, measure))
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point of `d2 bench scaling`."""
-    parser = argparse.ArgumentParser(prog="d2 bench scaling", description=__doc__)
-    parser.add_argument("--output", type=Path, default=Path("runs.jsonl"), help="rows are added to it; runs.jsonl")
-    parser.add_argument("--frames", nargs="+", type=int, default=FRAMES, help="lengths of the recording; 5 20 80")
-    parser.add_argument("--width", type=int, default=160, help="of the pictures, 16:9, pixels; 160")
-    parser.add_argument("--iterations", type=int, default=150, help="optimizer steps of each training; 150")
-    options = parser.parse_args(arguments)
-    command = shlex.join(["d2", "bench", "scaling", *(arguments or ())])
-    rows = bench_scaling(options.frames, options.width, options.iterations, command)
-    append_rows(options.output, rows)
-    for part in ("priors", "training"):
-        for measure in ("seconds", "peak_mb"):
-            found = [f"{row['frames']}: {row[measure]:.1f}" for row in rows if row["method"] == part]
-            power = growth(rows, part, measure)
-            text = "" if power is None else f"  grows as frames^{power:.2f}"
-            sys.stdout.write(f"{part:9} {measure:8} {', '.join(found)}{text}\n")
-    return 0
+def _places(rows: Sequence[Row], part: str, measure: str) -> list[tuple[float, float]]:
+    return [(row["frames"], row[measure]) for row in rows if row["method"] == part and row[measure]]

@@ -1,4 +1,4 @@
-"""OpenCV's semi-global matching as an outsider: what geometric depth is compared with, never used for priors.
+"""OpenCV's semi-global matching, which geometric depth is compared with. It is never used for priors.
 
 It knows rectified pairs only, so every view is rectified with the source that PatchMatch would match first.
 """
@@ -6,7 +6,7 @@ It knows rectified pairs only, so every view is rectified with the source that P
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,7 +36,7 @@ class Rectified(NamedTuple):
 def sgbm(
     grays: Sequence[np.ndarray], cameras: Sequence[Camera], depth_range: tuple[float, float], settings: StereoSettings
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Depth and cost (0 where there is a depth) of every view, as makers of geometric depth return them.
+    """Depth and cost (0 where there is a depth) of every view, as matchers of this package return them.
 
     Raises:
         D2Error: a pair is not beside each other, or its disparities span more than the picture.
@@ -79,7 +79,7 @@ def _pair_depth(
     return _unrectified(cv2, np.where(np.isfinite(depth) & (depth > 0), depth, 0), pair, camera)
 
 
-def _rectify(cv2: object, gray: np.ndarray, other: np.ndarray, camera: Camera, source: Camera) -> Rectified:
+def _rectify(cv2: Any, gray: np.ndarray, other: np.ndarray, camera: Camera, source: Camera) -> Rectified:
     T = relative_pose(camera, source)
     size, none = (camera.width, camera.height), np.zeros(5)
     K, K_source = index_intrinsics(camera), index_intrinsics(source)
@@ -87,7 +87,7 @@ def _rectify(cv2: object, gray: np.ndarray, other: np.ndarray, camera: Camera, s
     R1, R2, P1, P2, *_ = cv2.stereoRectify(K, none, K_source, none, size, R, t, flags=0, alpha=-1)
     if abs(P2[1, 3]) > abs(P2[0, 3]):
         raise D2Error(
-            f"cameras {camera.name} and {source.name} stand above each other, which this outsider cannot match"
+            f"cameras {camera.name} and {source.name} stand above each other, which semi-global matching cannot match"
         )
     maps = [
         cv2.initUndistortRectifyMap(intrinsics, none, rotation, projection[:, :3], size, cv2.CV_32FC1)
@@ -97,7 +97,7 @@ def _rectify(cv2: object, gray: np.ndarray, other: np.ndarray, camera: Camera, s
     return Rectified(R1, P1[:, :3], float(P2[0, 3]), float(P1[0, 2] - P2[0, 2]), left, right)
 
 
-def _unrectified(cv2: object, depth: np.ndarray, pair: Rectified, camera: Camera) -> np.ndarray:
+def _unrectified(cv2: Any, depth: np.ndarray, pair: Rectified, camera: Camera) -> np.ndarray:
     """Planar depth [H, W] of the original view from that of the rectified one, which is turned against it."""
     rays = viewing_rays(camera, np.float64) @ pair.rotation.T
     at = rays @ pair.K.T / rays[..., 2:]

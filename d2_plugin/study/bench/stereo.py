@@ -1,19 +1,23 @@
-"""`d2 bench stereo`: error against run time of geometric depth, every maker and setting behind the same filter."""
+"""`d2 bench stereo`: error against run time of geometric depth, every matcher and setting behind the same filter."""
 
 from __future__ import annotations
 
-import argparse
 import logging
-import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 
-from d2_plugin.errors import MissingExtra, missing_extra, unknown_name
+from d2_plugin.errors import unknown_name
+from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.provenance import provenance
-from d2_plugin.study.rows import append_rows, make_row
+from d2_plugin.settings import Range, Settings
+from d2_plugin.study.command_line import command_line
+from d2_plugin.study.report.svg import figure
+from d2_plugin.study.report.work_precision import work_precision
+from d2_plugin.study.rows import Row, append_rows, make_row
 
 from .stereo_measure import Method, measure, methods
 from .stereo_rigs import ARCS, MIDDLEBURY, load_rigs
@@ -22,6 +26,50 @@ logger = logging.getLogger(__name__)
 
 RENDERED = tuple(f"synthetic{views}" for views in ARCS)
 FROM_DISK = ("studio", *MIDDLEBURY)
+DRAWN_SHARE = 1e-4
+"""Smallest share of wrong depths in the plot, whose axis is logarithmic."""
+
+
+@dataclass(frozen=True)
+class StereoBench(Settings):
+    """Settings of `d2 bench stereo`."""
+
+    rigs: tuple[str, ...] = ()
+    """Rendered: synthetic2, synthetic3, synthetic4. From --data: studio, art, laundry, motorcycle, teddy. All that are
+    there where none is named."""
+    data: Path | None = None
+    """Folder with the captures studio/ and middlebury/."""
+    makers: tuple[str, ...] = ()
+    """Matchers, of patchmatch, sweep, sgbm and colmap (which needs CUDA); all that run here if none is named."""
+    defaults_only: bool = False
+    """Leave out what is varied about a matcher."""
+    width: Annotated[int, Range(32, unit="pixels")] = 320
+    """Width of rendered pictures, which are 16:9, pixels."""
+    widen: Annotated[float, Range(1)] = 1.0
+    """Make the depth range too wide by this factor at both ends."""
+    repeats: Annotated[int, Range(1)] = 1
+    """Matchings per row; times are medians, CPU seconds."""
+    threads: Annotated[int, Range(1)] = 1
+    """CPU threads."""
+    output: Path = Path("bench-stereo")
+    """Folder of the results."""
+
+
+def run(settings: StereoBench) -> str:
+    """Measure; the table, and where rows, table and plot lie."""
+    _set_threads(settings.threads)
+    rows = bench_stereo(
+        settings.output,
+        rigs=settings.rigs or (*RENDERED, *(FROM_DISK if settings.data else ())),
+        makers=settings.makers,
+        defaults_only=settings.defaults_only,
+        data=settings.data,
+        width=settings.width,
+        widen=settings.widen,
+        repeats=settings.repeats,
+        command=command_line("bench stereo", settings),
+    )
+    return f"{table(rows)}\nstereo.jsonl (rows), stereo.md (this table) and stereo.svg (plot) are in {settings.output}"
 
 
 def bench_stereo(
@@ -35,14 +83,14 @@ def bench_stereo(
     widen: float = 1.0,
     repeats: int = 1,
     command: str = "",
-) -> list[dict[str, Any]]:
-    """Measure and write `stereo.jsonl`, `stereo.md` and, where matplotlib is installed, `stereo.svg` into `output`.
+) -> list[Row]:
+    """Measure and write `stereo.jsonl`, `stereo.md` and `stereo.svg` into `output`.
 
     Args:
         output: folder, created where absent; its three files are replaced.
         rigs: names of `load_rigs`.
         makers: `patchmatch`, `sweep`, `sgbm`, and `colmap` where it runs; all where empty.
-        defaults_only: leave out what is varied about a maker.
+        defaults_only: leave out what is varied about a matcher.
         data: folder with the captures `studio` and `middlebury`.
         width: of rendered pictures, pixels.
         widen: how many times too wide the depth range is at both ends.
@@ -55,7 +103,7 @@ def bench_stereo(
     chosen = _chosen(makers, defaults_only)
     loaded = [load_rigs(name, data, width) for name in rigs]
     output.mkdir(parents=True, exist_ok=True)
-    rows = []
+    rows: list[Row] = []
     (output / "stereo.jsonl").unlink(missing_ok=True)
     for group in loaded:
         for method in chosen:
@@ -64,14 +112,11 @@ def bench_stereo(
             append_rows(output / "stereo.jsonl", rows[-1:])
             logger.info("%s (%s) on %s is measured", method.name, method.setting, row["rig"])
     (output / "stereo.md").write_text(table(rows))
-    try:
-        plot(rows, output / "stereo.svg")
-    except MissingExtra as error:
-        logger.warning("no plot: %s", error)
+    (output / "stereo.svg").write_text(plot(rows))
     return rows
 
 
-def _row(found: dict[str, Any], **more: Any) -> dict[str, Any]:
+def _row(found: dict[str, Any], **more: Any) -> Row:
     """What `measure` found, as a row of the study: error 1 - F, seconds of CPU time per view."""
     case = f"{found['rig']} at {found['width']}x{found['height']}"
     error, seconds = (None, None) if found["failed"] else (1 - found["f1"], found["cpu"])
@@ -86,7 +131,7 @@ def _chosen(makers: Sequence[str], defaults_only: bool) -> list[Method]:
     known = dict.fromkeys(method.name for method in every)
     for name in makers:
         if name not in known:
-            raise unknown_name("stereo maker", name, known)
+            raise unknown_name("stereo matcher", name, known)
     return [
         method
         for method in every
@@ -94,29 +139,28 @@ def _chosen(makers: Sequence[str], defaults_only: bool) -> list[Method]:
     ]
 
 
-def table(rows: Sequence[dict[str, Any]]) -> str:
+def table(rows: Sequence[Row]) -> str:
     """Markdown: the mean over rigs per method and setting, then every rig."""
-    captions = [
+    caption = (
         "Completeness: share of the pixels that another view sees which have a depth after the filter. F: harmonic "
         "mean of the share of depths within 1 % of the truth and the share of co-visible pixels with such a depth. "
-        f"Time is of matching alone, per view. {provenance(rows[0])}",
-        "",
-    ]
-    header = ["maker", "setting", "completeness", "F at 1 %", "median error", "off > 5 %", "CPU s", "CPU µs/pixel"]
-    lines = ["Mean over rigs", "", _line(header), _line(["---"] * len(header))]
-    groups = {(row["method"], row["setting"]): [] for row in rows}
+        f"Time is of matching alone, per view. {provenance(rows[0])}"
+    )
+    header = ("matcher", "setting", "completeness", "F at 1 %", "median error", "off > 5 %", "CPU s", "CPU µs/pixel")
+    groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
-        groups[row["method"], row["setting"]].append(row)
-    lines += [_line([*key, *_numbers(_mean(group))]) for key, group in groups.items()]
-    header = ["rig", "views", "size", *header]
-    lines += ["", "Every rig", "", _line(header), _line(["---"] * len(header))]
-    for row in rows:
-        size = f"{row['width']}x{row['height']}"
-        lines.append(_line([row["rig"], str(row["views"]), size, row["method"], row["setting"], *_numbers(row)]))
-    return "\n".join([*captions, *lines, ""])
+        groups.setdefault((row["method"], row["setting"]), []).append(row)
+    over_rigs = Table(header, tuple((*key, *_numbers(_mean(group))) for key, group in groups.items()))
+    each = Table(("rig", "views", "size", *header), tuple(map(_cells, rows)))
+    return "\n\n".join([caption, "Mean over rigs", markdown(over_rigs), "Every rig", markdown(each)]) + "\n"
 
 
-def _mean(group: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _cells(row: Row) -> tuple[str, ...]:
+    size = f"{row['width']}x{row['height']}"
+    return (row["rig"], str(row["views"]), size, row["method"], row["setting"], *_numbers(row))
+
+
+def _mean(group: Sequence[Row]) -> dict[str, Any]:
     """Means over rigs; a rig on which the method failed counts with completeness and F of 0 and says so."""
     worked = [row for row in group if not row["failed"]]
     mean: dict[str, Any] = {"failed": None if worked else "all"}
@@ -128,7 +172,7 @@ def _mean(group: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return mean
 
 
-def _numbers(row: dict[str, Any]) -> list[str]:
+def _numbers(row: Row) -> list[str]:
     if row["failed"]:
         return ["failed", *["-"] * 5]
     forms = {"completeness": "{:.3f}", "f1": "{:.3f}", "median": "{:.5f}", "wrong": "{:.2%}", "cpu": "{:.2f}"}
@@ -136,79 +180,26 @@ def _numbers(row: dict[str, Any]) -> list[str]:
     return ["-" if row[name] is None else form.format(row[name]) for name, form in forms.items()]
 
 
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+def plot(rows: Sequence[Row]) -> str:
+    """SVG: 1 - F, 1 - completeness and the share of wrong depths against CPU time per view; lower left is better.
 
-
-def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """1 - F, 1 - completeness and the share of wrong depths against CPU time, means over rigs; lower left is better.
-
-    Raises:
-        MissingExtra: matplotlib is not installed.
+    Means over the rigs are geometric; a share of 0 is drawn as 0.01 %.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise missing_extra("matplotlib", "report", "the plot") from None
-    figure = Figure(figsize=(13, 4.5), layout="constrained")
-    panels = figure.subplots(1, 3)
-    groups: dict[str, dict[str, list[dict[str, Any]]]] = {}
-    for row in rows:
-        groups.setdefault(row["method"], {}).setdefault(row["setting"], []).append(row)
-    for name, settings in groups.items():
-        points = [(setting, _mean(group)) for setting, group in settings.items()]
-        points = [(setting, mean) for setting, mean in points if not mean["failed"] and mean["wrong"] is not None]
-        times = [mean["microseconds_per_pixel"] for _, mean in points]
-        errors = [[1 - mean["f1"], 1 - mean["completeness"], mean["wrong"]] for _, mean in points]
-        for panel, values in zip(panels, zip(*errors)):
-            panel.scatter(times, values, label=name)
-            for (setting, _), x, y in zip(points, times, values):
-                panel.annotate(setting, (x, y), fontsize=6, xytext=(3, 3), textcoords="offset points")
-    for panel, title in zip(panels, ("1 - F at 1 %", "1 - completeness", "share off by more than 5 %")):
-        panel.set(xlabel="CPU microseconds per pixel and view", ylabel=title, xscale="log")
-        panel.margins(x=0.3)  # settings are written to the right of their marks
-        panel.set_ylim(bottom=0)
-        panel.grid(True, which="both", alpha=0.3)
-        if panel.get_legend_handles_labels()[0]:
-            panel.legend(fontsize=7)
-    figure.supxlabel(provenance(rows[0]), fontsize=6, wrap=True)
-    figure.savefig(path, metadata={"Date": None})
+    errors = {
+        "1 - F at 1 %": lambda row: row["error"],
+        "1 - completeness": lambda row: max(1 - row["completeness"], DRAWN_SHARE),
+        "share off by more than 5 %": lambda row: None if row["wrong"] is None else max(row["wrong"], DRAWN_SHARE),
+    }
+    panels = [
+        work_precision([_with_error(row, error) for row in rows], title, title, "CPU seconds per view")
+        for title, error in errors.items()
+    ]
+    return figure(panels, "Stereo: errors against CPU time", columns=3, size=(380, 340))
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of `d2 bench stereo`."""
-    parser = argparse.ArgumentParser(prog="d2 bench stereo", description=__doc__)
-    parser.add_argument("--output", type=Path, default=Path("bench-stereo"), help="folder of the results")
-    parser.add_argument(
-        "--rigs",
-        nargs="+",
-        metavar="RIG",
-        help=f"{', '.join(RENDERED)} (rendered), {', '.join(FROM_DISK)} (in --data); default: all there are",
-    )
-    parser.add_argument("--data", type=Path, help="folder with the captures studio/ and middlebury/")
-    parser.add_argument(
-        "--makers", nargs="+", default=(), metavar="MAKER", help="patchmatch, sweep, sgbm, colmap (CUDA); default all"
-    )
-    parser.add_argument("--defaults-only", action="store_true", help="leave out what is varied about a maker")
-    parser.add_argument("--width", type=int, default=320, help="width of rendered pictures (16:9), pixels; default 320")
-    parser.add_argument("--widen", type=float, default=1.0, help="depth range too wide by this factor at both ends")
-    parser.add_argument("--repeats", type=int, default=1, help="matchings per row; times are medians, CPU seconds")
-    parser.add_argument("--threads", type=int, default=1, help="CPU threads; default 1")
-    options = parser.parse_args(argv)
-    _set_threads(options.threads)
-    bench_stereo(
-        options.output,
-        rigs=options.rigs or (*RENDERED, *(FROM_DISK if options.data else ())),
-        makers=options.makers,
-        defaults_only=options.defaults_only,
-        data=options.data,
-        width=options.width,
-        widen=options.widen,
-        repeats=options.repeats,
-        command=shlex.join(["d2", "bench", "stereo", *(argv if argv is not None else ())]),
-    )
-    logger.info("results are in %s", options.output)
-    return 0
+def _with_error(row: Row, error: Callable[[Row], float | None]) -> Row:
+    """The row with another of its figures as its error."""
+    return row if row["failed"] else {**row, "error": error(row)}
 
 
 def _set_threads(count: int) -> None:

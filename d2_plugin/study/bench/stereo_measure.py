@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,21 +19,8 @@ from d2_plugin.priors.stereo.geometric_depth import MATCHERS, Matcher, gray
 from .sgbm import sgbm
 from .stereo_rigs import Rig
 
-
-@dataclass(frozen=True)
-class Method:
-    """A maker with one setting."""
-
-    name: str
-    setting: str
-    make: Matcher
-    settings: StereoSettings
-
-
-def methods() -> list[Method]:
-    """Every maker that runs here and what is varied about it; the first row of each is its default."""
-    default = StereoSettings()
-    patchmatch = {
+VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
+    "patchmatch": {
         "default": {},
         "dense: 1 geometric round": {"patchmatch_geometric_rounds": 1},
         "2 sweeps at full size": {"patchmatch_rounds": (4, 2, 2, 2)},
@@ -44,19 +31,37 @@ def methods() -> list[Method]:
         "fewer sweeps": {"patchmatch_rounds": (2, 1, 1, 1)},
         "half size only": {"patchmatch_rounds": (4, 2, 1, 0)},
         "no consensus": {"patchmatch_consensus_passes": 0},
-    }
-    sweep = {
+    },
+    "sweep": {
         "default": {},
         "planes half a pixel apart": {"sweep_step": 0.5},
         "planes 2 pixels apart": {"sweep_step": 2},
-    }
-    colmap = {} if why_not_usable() else {"default": {}, "photometric pass alone": {"colmap_geometric": False}}
-    return [
-        *(Method("patchmatch", name, MATCHERS["patchmatch"], replace(default, **k)) for name, k in patchmatch.items()),
-        *(Method("sweep", name, MATCHERS["sweep"], replace(default, **kw)) for name, kw in sweep.items()),
-        *(Method("colmap", name, MATCHERS["colmap"], replace(default, **kw)) for name, kw in colmap.items()),
-        Method("sgbm", "default", sgbm, default),
+    },
+    "colmap": {"default": {}, "photometric pass alone": {"colmap_geometric": False}},
+}
+"""What is varied about each matcher of this package: its settings that are not the default."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A matcher with one setting."""
+
+    name: str
+    setting: str
+    make: Matcher
+    settings: StereoSettings
+
+
+def methods() -> list[Method]:
+    """Every matcher that runs here and what is varied about it; the first row of each is its default."""
+    default = StereoSettings()
+    rows = [
+        Method(name, setting, MATCHERS[name], replace(default, **changes))
+        for name, variants in VARIANTS.items()
+        if name != "colmap" or not why_not_usable()
+        for setting, changes in variants.items()
     ]
+    return [*rows, Method("sgbm", "default", sgbm, default)]
 
 
 class Run(NamedTuple):
@@ -82,7 +87,8 @@ def run(method: Method, rig: Rig, depth_range: tuple[float, float], repeats: int
         cpu.append(time.process_time() - start[0])
         wall.append(time.perf_counter() - start[1])
     start_filter = time.process_time()
-    filtered = filter_depths(grays, rig.cameras, *map(list, zip(*raw)), method.settings)
+    depths, costs = zip(*raw, strict=True)
+    filtered = filter_depths(grays, rig.cameras, depths, costs, method.settings)
     views = len(rig.cameras)
     return Run(filtered, median(cpu) / views, median(wall) / views, (time.process_time() - start_filter) / views)
 
@@ -118,12 +124,17 @@ def score(depths: Iterable[np.ndarray], truths: Iterable[np.ndarray | None], cov
     return Score(found / pixels, f1, float(np.median(every)), precision, float(np.mean(every > 0.05)), pixels)
 
 
-def measure(method: Method, rigs: Sequence[Rig], widen: float = 1.0, repeats: int = 1) -> dict[str, float | str | None]:
+def measure(method: Method, rigs: Sequence[Rig], widen: float = 1.0, repeats: int = 1) -> dict[str, Any]:
     """One row: scores and times of a method over the rigs of one name, or `failed` with the method's own words.
 
     `widen` divides the near and multiplies the far end of the depth range.
     """
-    row = {"method": method.name, "setting": method.setting, "rig": rigs[0].name, "views": len(rigs[0].cameras)}
+    row: dict[str, Any] = {
+        "method": method.name,
+        "setting": method.setting,
+        "rig": rigs[0].name,
+        "views": len(rigs[0].cameras),
+    }
     row |= {"width": rigs[0].cameras[0].width, "height": rigs[0].cameras[0].height, "failed": None}
     try:
         runs = [run(method, rig, _widened(rig.depth_range, widen), repeats) for rig in rigs]

@@ -1,7 +1,7 @@
 """Rigs with true depth on which geometric depth is measured: rendered ones, and captures from disk.
 
-The rendered rooms are textured on most surfaces, with sensor noise of 1 % and exposures that differ by up to 5 %, as
-`reference/priors.md` section 3 describes them. Depth ranges come from the truth, a quarter wider on both sides.
+The rendered rooms are textured on most surfaces, with sensor noise of 1 % and exposures that differ by up to 5 %. Depth
+ranges come from the truth, a quarter wider on both sides.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def textured_rig(views: int, width: int = 320, height: int = 180, seed: int = 0,
     for camera in cameras:
         clean = render_color(scene, camera, 0.0) * rng.uniform(0.95, 1.05)
         images.append(np.clip(np.rint(clean + rng.normal(0, 255 * noise, clean.shape)), 0, 255).astype(np.uint8))
-    truths = [render_depth(scene, camera, 0.0) for camera in cameras]
+    truths: list[np.ndarray | None] = [render_depth(scene, camera, 0.0) for camera in cameras]
     return Rig(f"synthetic{views}", images, cameras, truths)
 
 

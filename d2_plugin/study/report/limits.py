@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
-from d2_plugin.study.bench.raster import exponent
-from d2_plugin.study.bench.work_precision import SMALLEST, Table, colors_of, shown
+from d2_plugin.runs.markup import Table
+from d2_plugin.study.growth import power
 from d2_plugin.study.rows import Row
+from d2_plugin.study.verdict import Margin
 
+from .plots import Axis, Plot, Point, Series, number
 from .sections import Section, cases_of, distinct, sources_of
-from .svg import Axis, Plot, Point, Series, figure, number
+from .svg import figure
+from .work_precision import SMALLEST, colors_of, growth, shown
 
 
 def stability(rows: Sequence[Row]) -> Section:
@@ -85,14 +89,15 @@ def _sweep_cells(case: str, method: str, rows: Sequence[Row]) -> tuple[str, ...]
 
 def plan(rows: Sequence[Row]) -> Section:
     """What is left out: its saving and its cost on the capture, measured with and without."""
-    header = ("capture", "decision", "by the plan", "s", "peak MB", "Gaussians", "cost of leaving it out")
+    header = ("capture", "decision", "by the plan", "s", "peak MB", "Gaussians", "cost of leaving it out", "verdict")
     decisions = dict.fromkeys((row["case"], row["method"]) for row in rows)
     cells = tuple(_decision([row for row in rows if (row["case"], row["method"]) == key]) for key in decisions)
     return Section(
         "plan",
         "Scene plan: what is left out",
         "Each decision of the plan, taken both ways on the capture itself: time, memory and Gaussians with the part → "
-        "without it, and what leaving it out costs (negative: it gains).",
+        "without it, and what leaving it out costs (negative: it gains), as mean ± deviation over the seeds. The "
+        "verdict needs at least three seeds and a cost beyond two standard errors.",
         tables=(("Decisions", Table(header, cells)),),
         sources=sources_of(rows),
     )
@@ -104,7 +109,20 @@ def _decision(rows: Sequence[Row]) -> tuple[str, ...]:
     both = ("-" if rows[0].get(n) is None else " → ".join(_rounded(row[n]) for row in rows) for n in names)
     first, last = rows[0], rows[-1]
     cost = first["failed"] or ("-" if last["cost"] is None else f"{last['cost']:+.3f}{_spread(last)} {last['unit']}")
-    return (first["case"], first["method"], first["planned"], *both, cost)
+    return (first["case"], first["method"], first["planned"], *both, cost, _plan_verdict(last))
+
+
+def _plan_verdict(row: Row) -> str:
+    """What the cost of leaving a part out says; its differences were taken seed by seed."""
+    if row["failed"] or row["cost"] is None:
+        return "-"
+    seeds = row.get("seeds")
+    if seeds is None:
+        return "built once: no verdict"
+    deviation = row.get("cost_deviation")
+    error = None if deviation is None else deviation / math.sqrt(len(seeds))
+    verdict = Margin(row["cost"], error, len(seeds)).verdict
+    return {"holds": "costs", "fails": "gains"}.get(verdict, verdict)
 
 
 def _spread(row: Row) -> str:
@@ -118,21 +136,16 @@ def _rounded(value: float) -> str:
 
 def scaling(rows: Sequence[Row]) -> Section:
     """How time and memory grow with the number of frames."""
-    lengths, colors = distinct(rows, "frames"), colors_of(rows)
-    x = Axis.around("frames", lengths, log=True)
-    plots, cells = [], []
+    lengths, plots, cells = distinct(rows, "frames"), [], []
     for name, label in (("seconds", "seconds"), ("peak_mb", "peak MB")):
-        series = []
-        for method, color in colors.items():
-            places = {row["frames"]: row[name] for row in rows if row["method"] == method and row.get(name)}
-            line = tuple(places.items())
-            points = tuple(Point(*place, f"{method}, {place[0]} frames: {place[1]:.4g} {label}") for place in line)
-            series.append(Series(method, points, line, color))
-            power = exponent(line) if len(line) > 1 else None
-            grows = "-" if power is None else f"frames^{round(power, 2) + 0.0:.2f}"
-            cells.append((method, label, *(shown(places.get(length)) for length in lengths), grows))
-        values = [y for each in series for _, y in each.line]
-        plots.append(Plot(label, x, Axis.around(label, values, log=True), tuple(series)))
+        lines = {
+            part: [(row["frames"], row[name]) for row in rows if row["method"] == part and row.get(name)]
+            for part in colors_of(rows)
+        }
+        plots.append(growth(label, "frames", label, lines))
+        for part, line in lines.items():
+            measured = [shown(dict(line).get(length)) for length in lengths]
+            cells.append((part, label, *measured, power(line, "frames") or "-"))
     header = ("part", "of", *(f"{length:g} frames" for length in lengths), "grows as")
     return Section(
         "scaling",

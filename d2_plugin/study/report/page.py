@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from html import escape
 from typing import NamedTuple
 
-from d2_plugin.study.bench.work_precision import Table
+from d2_plugin.runs import markup
+from d2_plugin.runs.markup import Table
 
 from .sections import Section
 from .svg import style
@@ -155,16 +156,6 @@ def markdown(sections: Sequence[Section], lead: str) -> str:
         parts += [f"## {section.title}", section.text]
         parts += [f"![{section.title}]({name}.svg)" for name in section.figures]
         for title, table in section.tables:
-            parts += [f"**{title}**", markdown_table(table)]
+            parts += [f"**{title}**", markup.markdown(table)]
         parts += list(section.sources)
     return "\n\n".join(parts) + "\n"
-
-
-def markdown_table(table: Table) -> str:
-    """The table as Markdown; what stands out is bold."""
-    rows = [
-        [f"**{cell}**" if (index, i) in table.best else cell.replace("|", "\\|") for i, cell in enumerate(row)]
-        for index, row in enumerate(table.rows)
-    ]
-    lines = [list(table.header), ["---"] * len(table.header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

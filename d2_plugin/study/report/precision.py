@@ -5,20 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from math import inf
 
-from d2_plugin.study.bench.work_precision import (
-    SMALLEST,
-    Mean,
-    Table,
-    colors_of,
-    means,
-    means_table,
-    shown,
-    work_precision,
-)
+from d2_plugin.runs.markup import Table
 from d2_plugin.study.rows import Row
 
+from .plots import Axis, Plot, Point, Series, number
 from .sections import Section, cases_of, distinct, sources_of
-from .svg import Axis, Plot, Point, Series, figure, number
+from .svg import figure
+from .work_precision import SMALLEST, Mean, colors_of, means, means_table, shown, work_precision
 
 ALIGNED_ANCHORS = 20_000
 """Number of anchors that is plotted, or the nearest one that was measured."""
@@ -100,7 +93,7 @@ def raster(rows: Sequence[Row]) -> Section:
     swept = [row for row in rows if "thresholds" in row]
     plain = [row for row in rows if "thresholds" not in row]
     header = ("method", "scene", "forward ms", "forward + backward ms", "survey ms", "peak MB", "colour p99.9")
-    figures = {"raster": figure([_raster_plot(plain)], "Rasterizer error against time")}
+    figures = {"raster": figure([raster_plot(plain)], "Rasterizer error against time")}
     details: tuple[tuple[str, Table], ...] = ()
     if swept:
         error, time = "colour error, p99.9", "forward + backward, ms"
@@ -122,7 +115,7 @@ def raster(rows: Sequence[Row]) -> Section:
     )
 
 
-def _raster_plot(rows: Sequence[Row]) -> Plot:
+def raster_plot(rows: Sequence[Row]) -> Plot:
     """One mark per scene and size; scenes are not compared, so none is faded."""
     drawn = [row for row in rows if row["error"] and row["seconds"]]
     points = {name: tuple(_raster_point(row) for row in drawn if row["method"] == name) for name in colors_of(drawn)}

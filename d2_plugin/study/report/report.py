@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.tables import read_metrics
-from d2_plugin.study.rows import KINDS, Row, read_rows
+from d2_plugin.settings import Positional, Settings
+from d2_plugin.study.rows import Row, read_rows
 from d2_plugin.study.training_rows import method_of, picture_of, training_rows
 
+from .ablation import ablation
 from .limits import plan, scaling, stability
 from .page import Picture, html, markdown
 from .precision import alignment, raster, stereo
 from .sections import Section
-from .training import ablation, training
+from .training import training
 
 BUILDERS: dict[str, Callable[[Sequence[Row]], Section]] = {
     build.__name__: build for build in (training, ablation, alignment, stereo, raster, stability, plan, scaling)
@@ -27,6 +29,25 @@ LEAD = (
     "Every figure here was measured by a command of this package and is shown with the machine, the commit and the "
     "command that made it. Errors are on the vertical axis, run time on the horizontal one."
 )
+
+
+@dataclass(frozen=True)
+class ReportSettings(Settings):
+    """Settings of `d2 report`."""
+
+    sources: Annotated[tuple[Path, ...], Positional()]
+    """Files of rows (runs.jsonl) and output folders of `d2 train`, in any number."""
+    output: Path = Path("report")
+    """Folder of the report."""
+    no_pictures: bool = False
+    """Leave the pictures of the runs out of the page."""
+
+
+def run(settings: ReportSettings) -> str:
+    """Make the report; how many rows it holds, and which files it is."""
+    rows, pictures = collect(settings.sources)
+    page, markdown_file, *plots = make_report(rows, settings.output, () if settings.no_pictures else pictures)
+    return f"{len(rows)} rows; open {page}, or read {markdown_file} with its {len(plots)} plots"
 
 
 def make_report(rows: Sequence[Row], output: Path, pictures: Sequence[Picture] = ()) -> list[Path]:
@@ -85,22 +106,3 @@ def _runs(folder: Path) -> list[Path]:
 def _picture(folder: Path, capture: str, method: str) -> Picture | None:
     found = picture_of(folder)
     return None if found is None else Picture(f"{capture}, {method}: {found[0]} of run {folder.name}", found[1])
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point of `d2 report`."""
-    parser = argparse.ArgumentParser(prog="d2 report", description=__doc__)
-    parser.add_argument(
-        "sources",
-        nargs="+",
-        type=Path,
-        metavar="RUNS",
-        help=f"files of rows (runs.jsonl; kinds {', '.join(KINDS)}) and output folders of d2 train, in any number",
-    )
-    parser.add_argument("--output", type=Path, default=Path("report"), help="folder of the report; default: report")
-    parser.add_argument("--no-pictures", action="store_true", help="leave the pictures of the runs out of the page")
-    options = parser.parse_args(arguments)
-    rows, pictures = collect(options.sources)
-    written = make_report(rows, options.output, () if options.no_pictures else pictures)
-    sys.stdout.write(f"{len(rows)} rows; open {written[0]}\n")
-    return 0

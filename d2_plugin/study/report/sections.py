@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from d2_plugin.runs.markup import Table
 from d2_plugin.runs.provenance import provenance
-from d2_plugin.study.bench.work_precision import Table
 from d2_plugin.study.rows import Row
 
 

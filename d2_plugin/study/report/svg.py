@@ -1,29 +1,29 @@
-"""Plots as small SVG files, drawn here: crisp at any size, readable by a diff, light and dark, no plotting library.
+"""Plots as SVG, the only plot engine of this package.
 
-Text stays text, every mark carries its numbers as a tooltip, series differ by shape as well as by colour, and colours
-follow the reader's light or dark setting.
+It stays in place of a plotting library because the report needs what matplotlib's SVG does not give: text stays text,
+every mark carries its numbers as a tooltip, colours follow the reader's light or dark setting through one style sheet
+that a page states once, and a file of a few kilobytes changes in a diff where a number changed. Series differ by shape
+as well as by colour.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from html import escape
-from typing import NamedTuple
+
+from .plots import Plot, Series
 
 LIGHT = ("#2a78d6", "#eb6834", "#149a69", "#b07c00", "#d0589a", "#4a3aa7", "#e34948", "#008300")
 DARK = ("#5598e7", "#e0713f", "#2db584", "#d09a1d", "#d55181", "#9085e9", "#e66767", "#4aa84a")
 SHAPES = ("circle", "square", "diamond", "triangle", "cross", "wedge")
-SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 MARGIN_LEFT, MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 76, 18, 34, 46
 LETTER = 6.4
 """Mean width of a letter at 12 px, px."""
 LABELLED = 320
-"""Plots narrower than this leave the labels of marks to their tooltips, px."""
-EDGE = 0.06
-"""Room between the outermost marks and the frame, as a share of the axis."""
+"""In plots narrower than this marks have tooltips but no labels, px."""
+NAMED_ROW = 24
+"""Height of one name on an axis that lists names, px."""
 
 
 def style() -> str:
@@ -45,118 +45,28 @@ def style() -> str:
     return f"{fixed}{light}@media(prefers-color-scheme:dark){{{dark}}}{late}"
 
 
-class Point(NamedTuple):
-    """One mark: its place, what the tooltip says, and a label beside it where there is room."""
-
-    x: float
-    y: float
-    note: str = ""
-    label: str = ""
-    faded: bool = False
-
-
-@dataclass(frozen=True)
-class Series:
-    """Marks of one colour and shape; `line` joins some points, `hollow` marks are figures of somebody else."""
-
-    name: str
-    points: tuple[Point, ...]
-    line: tuple[tuple[float, float], ...] = ()
-    color: int = 0
-    hollow: bool = False
-
-
-@dataclass(frozen=True)
-class Axis:
-    """A range of values with a label that names the unit."""
-
-    label: str
-    low: float
-    high: float
-    log: bool = False
-    names: tuple[str, ...] = ()
-    """With names the axis is a list of them, at 0, 1, ..."""
-
-    @classmethod
-    def listing(cls, label: str, names: Sequence[str]) -> Axis:
-        """An axis of names, the first one at the top."""
-        return cls(label, len(names) - 0.4, -0.6, names=tuple(names))
-
-    @classmethod
-    def around(cls, label: str, values: Iterable[float], log: bool = False) -> Axis:
-        """The range of `values` with some room at both ends; a decade around a single one."""
-        known = [value for value in values if math.isfinite(value) and (value > 0 or not log)] or [1.0]
-        low, high = (math.log10(min(known)), math.log10(max(known))) if log else (min(known), max(known))
-        if high - low < 1e-9 * max(abs(high), 1e-12) or (log and high - low < 0.3):
-            room = 0.5 if log else max(0.1 * abs(high), 1e-6)
-        else:
-            room = EDGE * (high - low)
-        ends = (low - room, high + room)
-        return cls(label, *((10 ** ends[0], 10 ** ends[1]) if log else ends), log)
-
-    def place(self, value: float) -> float:
-        """0 at `low`, 1 at `high`."""
-        if self.log:
-            return math.log(max(value, 1e-300) / self.low) / math.log(self.high / self.low)
-        return (value - self.low) / (self.high - self.low)
-
-    def ticks(self, most: int = 7) -> list[tuple[float, str]]:
-        """Round values within the range, with their text."""
-        if self.names:
-            return list(enumerate(self.names))
-        values = self._decades(most) if self.log else self._steps(most)
-        return [(value, number(value)) for value in values if self.low <= value <= self.high]
-
-    def _decades(self, most: int) -> list[float]:
-        first, last = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
-        if last - first >= 2:
-            return [10.0**power for power in range(first, last + 1, math.ceil((last - first + 1) / most))]
-        factors = (1, 2, 5) if self.high / self.low > 3 else (1, 1.5, 2, 3, 4, 5, 6, 7, 8, 9)
-        return [factor * 10.0**power for power in range(first - 1, last + 1) for factor in factors]
-
-    def _steps(self, most: int) -> list[float]:
-        raw = (self.high - self.low) / most
-        unit = 10 ** math.floor(math.log10(raw))
-        step = next(factor * unit for factor in (1, 2, 5, 10) if factor * unit >= raw)
-        return [step * i for i in range(math.ceil(self.low / step), math.floor(self.high / step) + 1)]
-
-
-@dataclass(frozen=True)
-class Plot:
-    """Axes with series in them."""
-
-    title: str
-    x: Axis
-    y: Axis
-    series: tuple[Series, ...]
-
-
-def number(value: float) -> str:
-    """A short text: plain where that is short, powers of ten otherwise."""
-    if value == 0 or 1e-3 <= abs(value) < 1e5:
-        return f"{value:.6g}"
-    power = math.floor(math.log10(abs(value)) + 1e-9)
-    mantissa = value / 10.0**power
-    front = "" if abs(mantissa - 1) < 1e-6 else f"{mantissa:.3g}·"
-    return f"{front}10{str(power).translate(SUPERSCRIPTS)}"
-
-
 def figure(plots: Sequence[Plot], description: str, columns: int = 1, size: tuple[int, int] = (720, 380)) -> str:
     """All plots on a grid under one legend, as one SVG; `description` is what a screen reader says.
 
-    `size` is that of one plot, px. Plots without a mark are left out.
+    `size` is that of one plot, px; one that lists names takes its height from them. Plots without a mark are left out.
     """
     plots = [plot for plot in plots if any(series.points for series in plot.series)]
     if not plots:
         return document(text(size[0] / 2, 40, "nothing was measured", "soft", "middle"), size[0], 70, description)
     columns = min(columns, len(plots))
-    names = dict.fromkeys((s.name, s.color, s.hollow) for plot in plots for s in plot.series if s.name)
-    legend, top = _legend(list(names), columns * size[0])
-    cells = [
-        _plot(plot, (index % columns) * size[0], top + (index // columns) * size[1], size)
-        for index, plot in enumerate(plots)
-    ]
-    return document(legend + "".join(cells), columns * size[0], top + -(-len(plots) // columns) * size[1], description)
+    legend, top = _legend(_entries(plots), columns * size[0])
+    parts = [legend]
+    for first in range(0, len(plots), columns):
+        row = plots[first : first + columns]
+        height = max(_height(plot, size[1]) for plot in row)
+        parts += [_plot(plot, place * size[0], top, (size[0], height)) for place, plot in enumerate(row)]
+        top += height
+    return document("".join(parts), columns * size[0], top, description)
+
+
+def _height(plot: Plot, height: int) -> int:
+    """A plot that lists names is as high as it has names."""
+    return MARGIN_TOP + MARGIN_BOTTOM + NAMED_ROW * len(plot.y.names) if plot.y.names else height
 
 
 def document(body: str, width: float, height: float, description: str) -> str:
@@ -174,18 +84,44 @@ def text(x: float, y: float, words: str, classes: str = "ink", anchor: str = "st
     return f'<text class="{classes}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{turned}>{escape(words)}</text>'
 
 
-def _legend(entries: Sequence[tuple[str, int, bool]], width: float) -> tuple[str, float]:
+Entry = tuple[str, Callable[[float, float], str]]
+"""A name in the legend, and what draws its sign at a place (x, y)."""
+
+
+def _entries(plots: Sequence[Plot]) -> list[Entry]:
+    """Each series of the plots once: a dashed line where it has no marks, its mark otherwise."""
+    known: dict[tuple[str, int, bool], Series] = {}
+    for series in (series for plot in plots for series in plot.series if series.name):
+        known.setdefault((series.name, series.color, series.hollow), series)
+    return [(series.name, _sign(series)) for series in known.values()]
+
+
+def _sign(series: Series) -> Callable[[float, float], str]:
+    if series.points or not series.line:
+        return lambda x, y: _mark(x, y, series.color, series.hollow)
+    return lambda x, y: f'<path class="{_color(series.color)} front" d="M{x - 7:.1f} {y:.1f}h16"{_dashes(series)}/>'
+
+
+def _legend(entries: Sequence[Entry], width: float) -> tuple[str, float]:
     """The legend in as many rows as it needs, and its height; none for a single series."""
     if len(entries) < 2:
         return "", 6
     parts, x, y = [], 16.0, 18.0
-    for name, color, hollow in entries:
+    for name, draw in entries:
         wide = 36 + 1.1 * LETTER * len(name)
         if x + wide > width - 10 and x > 16:
             x, y = 16.0, y + 20
-        parts += [_mark(x + 6, y - 4, color, hollow), text(x + 18, y, name)]
+        parts += [draw(x + 6, y - 4), text(x + 18, y, name)]
         x += wide
     return "".join(parts), y + 10
+
+
+def _color(index: int) -> str:
+    return f"s{index % len(LIGHT)}"
+
+
+def _dashes(series: Series) -> str:
+    return ' stroke-dasharray="5 4"' if series.hollow else ""
 
 
 def _plot(plot: Plot, left: float, top: float, size: tuple[int, int]) -> str:
@@ -206,8 +142,7 @@ def _plot(plot: Plot, left: float, top: float, size: tuple[int, int]) -> str:
     for series in plot.series:
         if len(series.line) > 1:
             path = "L".join("{:.1f} {:.1f}".format(*at(*point)) for point in series.line)
-            dashes = ' stroke-dasharray="5 4"' if series.hollow else ""
-            parts.append(f'<path class="s{series.color % len(LIGHT)} front" d="M{path}"{dashes}/>')
+            parts.append(f'<path class="{_color(series.color)} front" d="M{path}"{_dashes(series)}/>')
         parts += [_mark(*at(p.x, p.y), series.color, series.hollow, p.note, p.faded) for p in series.points]
     for series in plot.series if size[0] >= LABELLED else ():
         parts += [_label(*at(p.x, p.y), p.label, taken, x1) for p in series.points if p.label]
@@ -217,7 +152,7 @@ def _plot(plot: Plot, left: float, top: float, size: tuple[int, int]) -> str:
 def _mark(x: float, y: float, color: int, hollow: bool, note: str = "", faded: bool = False) -> str:
     """A mark of about 9 px, the shape that goes with its colour, with a tooltip."""
     r, shape = 4.5, SHAPES[color % len(SHAPES)]
-    classes = f"s{color % len(LIGHT)} {'hollow' if hollow else 'edge'}{' faded' if faded else ''}"
+    classes = f"{_color(color)} {'hollow' if hollow else 'edge'}{' faded' if faded else ''}"
     tip = f"<title>{escape(note)}</title>" if note else ""
     if shape == "circle":
         return f'<circle class="{classes}" cx="{x:.1f}" cy="{y:.1f}" r="{r}">{tip}</circle>'
@@ -247,7 +182,7 @@ def bars(
     rows: Sequence[tuple[str, Sequence[float]]], parts: Sequence[str], unit: str, description: str, width: int = 720
 ) -> str:
     """Stacked horizontal bars: one row per label, one segment per part, the sum at the end."""
-    legend, top = _legend([(name, index, False) for index, name in enumerate(parts)], width)
+    legend, top = _legend([(name, _swatch(index)) for index, name in enumerate(parts)], width)
     left = 24 + LETTER * max(len(label) for label, _ in rows)
     most = max(max(sum(values) for _, values in rows), 1e-12)
     scale = (width - left - 90) / most
@@ -259,7 +194,12 @@ def bars(
             long = max(value * scale - 2, 0.5)  # a gap of two pixels keeps neighbours apart
             tip = f"<title>{escape(f'{label}, {parts[part]}: {value:.4g} {unit}')}</title>"
             box = f'x="{x:.1f}" y="{y:.1f}" width="{long:.1f}" height="20" rx="2"'
-            body.append(f'<rect class="s{part % len(LIGHT)} edge" {box}>{tip}</rect>')
+            body.append(f'<rect class="{_color(part)} edge" {box}>{tip}</rect>')
             x += value * scale
         body.append(text(x + 6, y + 15, f"{sum(values):.3g} {unit}", "soft"))
     return document(legend + "".join(body), width, top + 18 + 30 * len(rows), description)
+
+
+def _swatch(color: int) -> Callable[[float, float], str]:
+    """A piece of a bar, for the legend."""
+    return lambda x, y: f'<rect class="{_color(color)} edge" x="{x - 6:.1f}" y="{y - 5:.1f}" width="12" height="10"/>'

@@ -1,12 +1,12 @@
 """Sweeps over Gaussians: their lives and motion in the 4D backbone, and their images in the rasterizer.
 
-Truths are closed forms, or the same image by another road: a scene in other units, turned, or moved is the same scene.
+The truth is a closed form, or an image that must be the same: that of the scene in other units, turned or moved.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torch import Tensor
 from d2_plugin import registry
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 
-from .sweep import Sweep, decades
+from .definition import Sweep, decades
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 54.0
 THRESHOLDS = RasterSettings(alpha_min=1e-12, transmittance_min=1e-12)
@@ -35,8 +35,8 @@ class Scene(NamedTuple):
         full = self.factors @ self.factors.mT
         upper = torch.triu_indices(3, 3)
         packed = full[:, upper[0], upper[1]]
-        parts = (part.to(dtype) for part in (self.means, packed, self.opacities))
-        splats = Splats(*parts, torch.arange(len(self.means)))
+        means, covariances, opacities = (part.to(dtype) for part in (self.means, packed, self.opacities))
+        splats = Splats(means, covariances, opacities, torch.arange(len(self.means)))
         settings = RasterSettings(near, alpha_min=THRESHOLDS.alpha_min, transmittance_min=THRESHOLDS.transmittance_min)
         return rasterize(splats, self.colors.to(dtype), camera(self.pose), settings)
 
@@ -109,7 +109,7 @@ def depth(unit: float, dtype: torch.dtype) -> float:
 
 
 def world_offset(offset: float, dtype: torch.dtype) -> float:
-    """A scene that lies `offset` away from the origin of its world, camera and all, against the scene at home."""
+    """A scene and its camera, both moved `offset` away from the origin, against the same at the origin."""
     direction = torch.tensor([2.0, -1.0, 2.0], dtype=torch.float64) / 3
     scene = random_scene()
     return difference(scene.moved(offset * direction).render(dtype), scene.render(torch.float64))
@@ -138,9 +138,8 @@ def far_plane(far: float, dtype: torch.dtype) -> float:
     means = torch.cat([torch.zeros(3, 2, dtype=torch.float64), depths[:, None]], 1)
     means[:, :2] = 0.5 * depths[:, None] / FOCAL
     packed = (depths[:, None] * 0.5) ** 2 * torch.tensor([1.0, 0, 0, 1, 0, 1], dtype=torch.float64)
-    parts = (part.to(dtype) for part in (means, packed, torch.full((3,), 0.5)))
     view = camera(torch.eye(4, dtype=torch.float64))
-    splats = Splats(*parts, torch.arange(3))
+    splats = Splats(means.to(dtype), packed.to(dtype), torch.full((3,), 0.5, dtype=dtype), torch.arange(3))
     render = rasterize(splats, torch.eye(3, dtype=dtype), view, RasterSettings(near=0.005))
     row, column = HEIGHT // 2, WIDTH // 2
     expected = torch.tensor([0.25, 0.5, 0.125], dtype=dtype)
@@ -149,9 +148,9 @@ def far_plane(far: float, dtype: torch.dtype) -> float:
     return largest(colors, abs(render.depth_sum[row, column].item() / distance - 1))
 
 
-def one_gaussian(dtype: torch.dtype, **rows: list[float]) -> object:
+def one_gaussian(dtype: torch.dtype, **rows: list[float]) -> Any:
     """A model of the 4D backbone with a single Gaussian whose raw parameters are given by name."""
-    backbone = registry.load(registry.BACKBONES, "yang4d")
+    backbone: Any = registry.load(registry.BACKBONES, "yang4d")
     zeros = torch.zeros(1, 3, dtype=dtype)
     model = backbone.create(zeros, zeros, zeros[:, 0], extent=1.0, duration=1.0, temporal=True)
     with torch.no_grad():

@@ -13,7 +13,7 @@ from d2_plugin.priors.monocular.affine import fit_affine
 from d2_plugin.priors.monocular.align import AlignStatus, align
 from d2_plugin.priors.settings import AlignSettings
 
-from .sweep import Sweep, decades
+from .definition import Sweep, decades
 
 SCALE, SHIFT = 2.0, 0.5
 ANCHORS = 20_000

@@ -6,11 +6,8 @@ something is not finite or is refused. Nothing is clamped in silence: each sweep
 
 from __future__ import annotations
 
-import argparse
-import shlex
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,42 +15,35 @@ import torch
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.progress import progress_bar
+from d2_plugin.settings import Settings
+from d2_plugin.study.command_line import command_line
 from d2_plugin.study.rows import Row, append_rows, make_row
+
+from .definition import Sweep
+from .gaussians import gaussian_sweeps
+from .priors import prior_sweeps
 
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 
-Measure = Callable[[float, torch.dtype], float]
-"""The error at one value of the parameter, computed in that precision; not finite where the result is not."""
+SWEEPS: dict[str, Sweep] = {sweep.name: sweep for sweep in (*gaussian_sweeps(), *prior_sweeps())}
+"""Every sweep of the study by name, Gaussians first, then priors."""
 
 
 @dataclass(frozen=True)
-class Sweep:
-    """One parameter and how far it is driven."""
+class StabilitySettings(Settings):
+    """Settings of `d2 stability`."""
 
-    name: str
-    parameter: str
-    """What is swept, with its unit."""
-    values: tuple[float, ...]
-    error: str
-    """What the error is."""
-    limits: dict[str, float]
-    """Largest error that counts as ok, per precision; a precision without one is not measured."""
-    guard: str
-    """What keeps this finite, or that nothing does."""
-    measure: Measure
+    sweeps: tuple[str, ...] = ()
+    """Names of sweeps; all where none is named. An unknown name is answered by the list."""
+    output: Path = Path("runs.jsonl")
+    """File that the rows are added to."""
 
 
-def decades(first: int, last: int, step: int = 1) -> tuple[float, ...]:
-    """Powers of ten from 10^first to 10^last."""
-    return tuple(10.0**power for power in range(first, last + 1, step))
-
-
-def all_sweeps() -> list[Sweep]:
-    """Every sweep of the study, Gaussians first, then priors."""
-    from .gaussians import gaussian_sweeps
-    from .priors import prior_sweeps
-
-    return [*gaussian_sweeps(), *prior_sweeps()]
+def run(settings: StabilitySettings) -> str:
+    """Sweep and add the rows; a line per sweep, and where the rows lie."""
+    rows = run_sweeps(settings.sweeps, command_line("stability", settings))
+    append_rows(settings.output, rows)
+    return f"{summary(rows)}\nrows are in {settings.output}; `d2 report {settings.output}` shows them"
 
 
 def measure(sweep: Sweep, value: float, precision: str, command: str = "") -> Row:
@@ -87,15 +77,13 @@ def run_sweeps(names: Sequence[str] = (), command: str = "") -> list[Row]:
     Raises:
         D2Error: there is no such sweep.
     """
-    sweeps = all_sweeps()
-    known = [sweep.name for sweep in sweeps]
     for name in names:
-        if name not in known:
-            raise unknown_name("sweep", name, known)
+        if name not in SWEEPS:
+            raise unknown_name("sweep", name, SWEEPS)
     points = [
         (sweep, value, precision)
-        for sweep in sweeps
-        if not names or sweep.name in names
+        for name, sweep in SWEEPS.items()
+        if not names or name in names
         for precision in sweep.limits
         for value in sweep.values
     ]
@@ -118,17 +106,3 @@ def summary(rows: Sequence[Row]) -> str:
         ok = f"{len(mine) - len(lost):2}/{len(mine)} ok, worst {worst:.1e}"
         lines.append(f"{case:18} {method}  {ok}  {shown}".rstrip())
     return "\n".join(lines)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point of `d2 stability`."""
-    parser = argparse.ArgumentParser(prog="d2 stability", description=__doc__)
-    parser.add_argument("--output", type=Path, default=Path("runs.jsonl"), help="rows are added to it; runs.jsonl")
-    parser.add_argument(
-        "--sweeps", nargs="+", default=(), metavar="NAME", help="; ".join(sweep.name for sweep in all_sweeps())
-    )
-    options = parser.parse_args(arguments)
-    rows = run_sweeps(options.sweeps, shlex.join(["d2", "stability", *(arguments or ())]))
-    append_rows(options.output, rows)
-    sys.stdout.write(f"{summary(rows)}\nrows are in {options.output}; `d2 report {options.output}` shows them\n")
-    return 0

@@ -11,19 +11,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from d2_plugin.study.report.svg import Axis, Plot, Point, Series, number
+from d2_plugin.runs.markup import Table
 from d2_plugin.study.rows import Row
+
+from .plots import Axis, Plot, Point, Series, number
 
 SMALLEST = 1e-16
 """Errors below this are drawn here: they are rounding, and a logarithm needs a floor."""
-
-
-class Table(NamedTuple):
-    """A table of texts; `best` are the cells (row, column) that stand out."""
-
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    best: frozenset[tuple[int, int]] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -38,10 +32,18 @@ class Mean:
     cases: int
     failures: int
 
-    @property
-    def drawn(self) -> bool:
-        """Whether error and time are both known."""
-        return self.error is not None and bool(self.seconds)
+
+class Drawn(NamedTuple):
+    """A mean whose error and time are both known."""
+
+    mean: Mean
+    seconds: float
+    error: float
+
+
+def drawn(found: Sequence[Mean]) -> list[Drawn]:
+    """Those of the means that have a place in a plot."""
+    return [Drawn(mean, mean.seconds, mean.error) for mean in found if mean.error is not None and mean.seconds]
 
 
 def means(rows: Sequence[Row]) -> list[Mean]:
@@ -67,7 +69,7 @@ def _geometric(values: Sequence[float]) -> float | None:
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the points that no other one beats in both coordinates (lower is better), by the first one."""
+    """Indices of the points that no other one beats in both coordinates (lower is better), in order of the first."""
     front, best = [], math.inf
     for index in sorted(range(len(points)), key=lambda i: points[i]):
         if points[index][1] < best:
@@ -93,36 +95,52 @@ def work_precision(
 
     A setting that failed on some case is faded and never on the front: a mean over the easy cases is no result.
     """
-    drawn = [mean for mean in means(rows) if mean.drawn]
-    whole = [mean for mean in drawn if not mean.failures]
-    front = {whole[i] for i in pareto_front([(mean.seconds, mean.error) for mean in whole])}
+    marks = drawn(means(rows))
+    front = {mark.mean for mark in _front(marks)}
     series = []
     for name, color in (colors or colors_of(rows)).items():
-        mine = [mean for mean in drawn if mean.method == name]
-        points = tuple(_point(mean, unit, mean in front, error_label, seconds_label) for mean in mine)
-        settled = [mean for mean in mine if not mean.failures]
-        steps = [settled[i] for i in pareto_front([(mean.seconds, mean.error) for mean in settled])]
-        line = tuple((mean.seconds * unit, max(mean.error, SMALLEST)) for mean in steps)
+        mine = [mark for mark in marks if mark.mean.method == name]
+        points = tuple(_point(mark, unit, mark.mean in front, error_label, seconds_label) for mark in mine)
+        line = tuple((mark.seconds * unit, max(mark.error, SMALLEST)) for mark in _front(mine))
         series.append(Series(name, points, line, color))
-    x = Axis.around(seconds_label, [mean.seconds * unit for mean in drawn], log=True)
-    y = Axis.around(error_label, [max(mean.error, SMALLEST) for mean in drawn], log=True)
+    x = Axis.around(seconds_label, [mark.seconds * unit for mark in marks], log=True)
+    y = Axis.around(error_label, [max(mark.error, SMALLEST) for mark in marks], log=True)
     return Plot(title, x, y, tuple(series))
 
 
-def _point(mean: Mean, unit: float, on_front: bool, error_label: str, seconds_label: str) -> Point:
-    measured = f"{error_label} {shown(mean.error)}, {seconds_label} {shown(mean.seconds * unit)}"
+def _front(marks: Sequence[Drawn]) -> list[Drawn]:
+    """What nothing beats in both among the settings that worked on every case, by time."""
+    whole = [mark for mark in marks if not mark.mean.failures]
+    return [whole[i] for i in pareto_front([(mark.seconds, mark.error) for mark in whole])]
+
+
+def _point(mark: Drawn, unit: float, on_front: bool, error_label: str, seconds_label: str) -> Point:
+    mean = mark.mean
+    measured = f"{error_label} {shown(mark.error)}, {seconds_label} {shown(mark.seconds * unit)}"
     note = f"{mean.method}, {mean.setting}: {measured}"
     note += f"; failed on {mean.failures} of {mean.cases}" if mean.failures else ""
     label = mean.setting if on_front and mean.setting != "default" else ""
-    return Point(mean.seconds * unit, max(mean.error, SMALLEST), note, label, faded=not on_front)
+    return Point(mark.seconds * unit, max(mark.error, SMALLEST), note, label, faded=not on_front)
+
+
+def growth(
+    title: str, size: str, cost: str, lines: Mapping[str, Sequence[tuple[float, float]]], first_color: int = 0
+) -> Plot:
+    """How a cost grows with a size: one line of (size, cost) per name, both axes logarithmic."""
+    series = []
+    for color, (name, line) in enumerate(lines.items(), start=first_color):
+        points = tuple(Point(*place, f"{name}, {place[0]:g} {size}: {place[1]:.4g} {cost}") for place in line)
+        series.append(Series(name, points, tuple(line), color))
+    values = [place for line in lines.values() for place in line]
+    x, y = Axis.around(size, [x for x, _ in values], log=True), Axis.around(cost, [y for _, y in values], log=True)
+    return Plot(title, x, y, tuple(series))
 
 
 def means_table(rows: Sequence[Row], error_name: str, seconds_name: str, unit: float = 1) -> Table:
     """Method, setting, error (geometric mean and worst case), time, failures; settings on the front stand out."""
     header = ("method", "setting", error_name, "worst case", seconds_name, "cases", "failed")
     found = means(rows)
-    whole = [i for i, mean in enumerate(found) if mean.drawn and not mean.failures]
-    front = pareto_front([(found[i].seconds, found[i].error) for i in whole])
+    front = {mark.mean for mark in _front(drawn(found))}
     cells = tuple(
         (
             *(mean.method, mean.setting, shown(mean.error), shown(mean.worst)),
@@ -130,7 +148,8 @@ def means_table(rows: Sequence[Row], error_name: str, seconds_name: str, unit: f
         )
         for mean in found
     )
-    return Table(header, cells, frozenset((whole[i], column) for i in front for column in (2, 4)))
+    best = frozenset((row, column) for row, mean in enumerate(found) if mean in front for column in (2, 4))
+    return Table(header, cells, best)
 
 
 def shown(value: float | None) -> str:

@@ -1,0 +1,47 @@
+"""The depth prior of a run: what its settings and its scene make of the prior builder's arguments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.priors.build import PriorSummary, build_priors
+from d2_plugin.progress import progress_bar
+from d2_plugin.runs.scene import Scene
+from d2_plugin.runs.settings import RunSettings, prior_settings
+
+
+def build_priors_for(
+    settings: RunSettings,
+    scene: Scene,
+    points: np.ndarray,
+    folder: Path,
+    *,
+    shard: tuple[int, int] | None = None,
+    cluster: Mapping[str, Any] | None = None,
+) -> PriorSummary:
+    """Build what is missing of the depth prior in `folder`; `points` [P, 3] bound the depths that are searched.
+
+    `shard` (index from 0, count) builds one part, so that any scheduler can run the parts beside each other. `cluster`
+    (`scheduler` or `workers`) hands the frames to dask.distributed instead.
+    """
+    with progress_bar("priors", len(scene.capture.frames) * len(scene.train_cameras)) as bar:
+
+        def report(done: int, total: int, note: str = "") -> None:
+            bar.update(done, note)
+
+        if cluster is None:
+            build = partial(build_priors, shard=shard)
+        else:
+            from d2_plugin.priors.dask_build import build_priors_on_cluster  # needs an extra
+
+            build = partial(build_priors_on_cluster, **cluster)
+        return build(
+            *(scene.capture, scene.train_cameras, folder, scene.plan.obeyed_by(prior_settings(settings))),
+            sparse_points=points,
+            progress=report,
+        )

@@ -1,0 +1,98 @@
+"""The tables of an ablation: mean ± deviation over the seeds, and whether the paper's order of the rows holds here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import mean, stdev
+
+from d2_plugin.runs.markup import Table, latex, markdown
+from d2_plugin.runs.tables import STUDY_COLUMNS
+
+from .claims import EXPLANATION, Scores, claims_table
+from .job import Job, Metrics
+from .paper_tables import MARK, SOURCE, paper_rows
+from .paper_tables import TABLES as PAPER_TABLES
+from .presets import PRESETS, TABLES, Preset
+
+OTHERS = (*TABLES["ablation"][:8], "opacity_only", "depth_only")
+"""Rows that the paper puts below the full method."""
+
+
+def statistics(values: Sequence[float | None]) -> tuple[float, float] | None:
+    """Mean and sample deviation (0 for a single value); None where nothing was measured."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    return mean(known), stdev(known) if len(known) > 1 else 0.0
+
+
+def table(
+    results: Mapping[Job, Metrics],
+    backbone: str,
+    rows: Sequence[str],
+    as_latex: bool = False,
+    published: Mapping[str, float] | None = None,
+) -> str:
+    """One table, Markdown or LaTeX: mean ± deviation over seeds per preset; what was not measured shows as `-`.
+
+    `published` holds the paper's PSNR by preset: it stands in a column of its own, labelled as the paper's.
+    """
+    header = ["variant", *(column.title for column in STUDY_COLUMNS), "Gaussians", "train s"]
+    lines = [[PRESETS[name].title, *_cells(_of(results, backbone, name), as_latex)] for name in rows]
+    if published:
+        header.append(f"{MARK} paper's PSNR")
+        lines = [[*line, f"{published[name]:.2f}" if name in published else "-"] for line, name in zip(lines, rows)]
+    made = Table(tuple(header), tuple(map(tuple, lines)))
+    return latex(made) if as_latex else markdown(made)
+
+
+def _of(results: Mapping[Job, Metrics], backbone: str, preset: str) -> list[Metrics]:
+    return [metrics for job, metrics in results.items() if (job.backbone, job.preset) == (backbone, preset)]
+
+
+def _cells(runs: Sequence[Metrics], as_latex: bool) -> list[str]:
+    scores = [run["test"] or {} for run in runs]
+    found = [(statistics([score.get(column.key) for score in scores]), column.form) for column in STUDY_COLUMNS]
+    found.append((statistics([run["gaussians"] for run in runs]), ".0f"))
+    found.append((statistics([run["seconds"]["train"] for run in runs]), ".1f"))
+    return [_cell(value, form, as_latex) for value, form in found]
+
+
+def _cell(value: tuple[float, float] | None, form: str, as_latex: bool) -> str:
+    if value is None:
+        return "-"
+    middle, spread = (format(number, form) for number in value)
+    return f"${middle} \\pm {spread}$" if as_latex else f"{middle} ± {spread}"
+
+
+def scores_of(results: Mapping[Job, Metrics], backbone: str) -> Scores:
+    """The held-out scores of one backbone's runs, by the titles of their presets."""
+    return {
+        preset.title: [run["test"] for run in _of(results, backbone, name) if run["test"]]
+        for name, preset in PRESETS.items()
+    }
+
+
+def order_table(results: Mapping[Job, Metrics], backbone: str) -> Table:
+    """What the paper's two tables say about the full method, tested on these runs; only rows that were run."""
+    full, others = PRESETS["full"].title, [PRESETS[name].title for name in OTHERS]
+    return claims_table(scores_of(results, backbone), full, others, f"{full} is better than")
+
+
+def report(results: Mapping[Job, Metrics], presets: Sequence[Preset], as_latex: bool = False) -> str:
+    """All tables whose rows were run, and the paper's order of the rows, for each backbone."""
+    names = {preset.name for preset in presets}
+    parts = []
+    for backbone in dict.fromkeys(job.backbone for job in results):
+        parts.append(f"% {backbone}" if as_latex else f"## {backbone}")
+        complete = [title for title, rows in TABLES.items() if title != "main" and set(rows) <= names]
+        for title in complete:
+            published = {row.preset: row.psnr for row in paper_rows(title) if row.preset}
+            parts.append(table(results, backbone, TABLES[title], as_latex, published))
+            parts.append(f"{'% ' if as_latex else ''}{MARK} {SOURCE} ({PAPER_TABLES[title]}).")
+        if not complete:
+            parts.append(table(results, backbone, [preset.name for preset in presets], as_latex))
+        order = order_table(results, backbone)
+        if order.rows and not as_latex:
+            parts += [EXPLANATION, markdown(order)]
+    return "\n\n".join(part for part in parts if part) + "\n"

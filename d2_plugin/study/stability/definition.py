@@ -1,0 +1,33 @@
+"""What a sweep is: one parameter, how far it is driven, what is measured, and what guards it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+
+Measure = Callable[[float, torch.dtype], float]
+"""The error at one value of the parameter, computed in that precision; not finite where the result is not."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One parameter and how far it is driven."""
+
+    name: str
+    parameter: str
+    """What is swept, with its unit."""
+    values: tuple[float, ...]
+    error: str
+    """What the error is."""
+    limits: dict[str, float]
+    """Largest error that counts as ok, per precision; a precision without one is not measured."""
+    guard: str
+    """What keeps this finite, or that nothing does."""
+    measure: Measure
+
+
+def decades(first: int, last: int, step: int = 1) -> tuple[float, ...]:
+    """Powers of ten from 10^first to 10^last."""
+    return tuple(10.0**power for power in range(first, last + 1, step))

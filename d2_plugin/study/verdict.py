@@ -1,0 +1,57 @@
+"""When a difference between runs means something: at least three seeds, and more than two standard errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import mean, variance
+
+LEAST_SEEDS = 3
+"""Two seeds agree by chance in far too many experiments, and one has no spread at all."""
+
+_COUNTS = {0: "no seed", 1: "one seed", 2: "two seeds"}
+
+
+@dataclass(frozen=True)
+class Margin:
+    """By how much one variant is better than another, over the seeds."""
+
+    value: float
+    """Difference of the means; positive where the first one is better."""
+    error: float | None
+    """Standard error of the difference; None where one of them has a single seed."""
+    seeds: int
+    """Number of seeds; that of the variant with fewer."""
+
+    @property
+    def verdict(self) -> str:
+        """`holds` or `fails` beyond two standard errors, `undecided` within; `no verdict` from too few seeds.
+
+        `no difference` where every seed gave exactly the same.
+        """
+        if self.error is None or self.seeds < LEAST_SEEDS:
+            return f"{_COUNTS[self.seeds]}: no verdict"
+        if self.value == self.error == 0:
+            return "no difference"
+        if abs(self.value) <= 2 * self.error:
+            return "undecided"
+        return "holds" if self.value > 0 else "fails"
+
+    def text(self, digits: int = 2, unit: str = "") -> str:
+        """The margin with its standard error, such as `+0.93 ± 0.34 dB`."""
+        error = "" if self.error is None else f" ± {self.error:.{digits}f}"
+        return f"{self.value:+.{digits}f}{error}" + (f" {unit}" if unit else "")
+
+
+def margin(ours: Sequence[float], theirs: Sequence[float], larger_is_better: bool = True) -> Margin:
+    """By how much `ours` are better than `theirs`, which are runs of their own: their variances add up.
+
+    The standard error is sqrt(s1^2 / n1 + s2^2 / n2) with the sample variances s^2.
+    """
+    sign = 1 if larger_is_better else -1
+    seeds = min(len(ours), len(theirs))
+    error = None
+    if seeds > 1:
+        error = math.sqrt(variance(ours) / len(ours) + variance(theirs) / len(theirs))
+    return Margin(sign * (mean(ours) - mean(theirs)), error, seeds)
