@@ -111,7 +111,7 @@ def _is_choice(kind: Any) -> bool:
 
 def _as_choice(kind: Any, value: Any, name: str) -> Any:
     choices = get_args(kind)
-    if any(value == choice and type(value) is type(choice) for choice in choices):
+    if any(type(value) is type(choice) and value == choice for choice in choices):
         return value
     if isinstance(value, str) and all(isinstance(choice, str) for choice in choices):
         raise unknown_name(name, value, choices)
