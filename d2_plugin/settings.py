@@ -43,6 +43,7 @@ from d2_plugin.values import (
 
 __all__ = [
     "FORMAT",
+    "NONE",
     "Angle",
     "AtLeastOne",
     "Count",
@@ -65,6 +66,9 @@ __all__ = [
 
 FORMAT = 1
 """Version of the settings in files (d2.toml, run.json); it rises when a name gets another meaning."""
+
+NONE = "none"
+"""How files and the command line, which have no word for it, write that an optional setting has no value."""
 
 
 class Declared(NamedTuple):
@@ -157,7 +161,10 @@ def table_of(kind: Any) -> type[Settings] | None:
 
 
 def _from_plain(setting: Declared, value: Any, where: str) -> Any:
-    """A table becomes the Settings that are declared there; anything else is checked as it is."""
+    """A table becomes the Settings that are declared there, "none" nothing; anything else is checked as it is."""
+    options = get_args(setting.kind)
+    if isinstance(value, str) and value == NONE and type(None) in options and str not in options:
+        return None
     kind = table_of(setting.kind)
     if kind is None or isinstance(value, kind) or (value is None and kind is not setting.kind):
         return checked(setting.kind, setting.range, value, where)

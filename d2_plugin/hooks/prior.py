@@ -23,8 +23,8 @@ class Store(Protocol):
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
 
 
-class VerifiedPixels(NamedTuple):
-    """Omega^v of one view: where D* is verified, and D* there."""
+class TrustedPixels(NamedTuple):
+    """What may supervise one view: where D* is trusted (see `DepthPrior.trusted`), and D* there."""
 
     index: Tensor  # [K] int64, row * width + column
     depth: Tensor  # [K] float32
@@ -37,7 +37,7 @@ class PriorLoader:
         self.store, self.keep_bytes = store, keep_bytes
         self._kept: OrderedDict[tuple[str, int], DepthPrior | None] = OrderedDict()
         self._cameras = CameraCheck()
-        self._pixels: dict[tuple[str, int], VerifiedPixels] = {}
+        self._pixels: dict[tuple[str, int], TrustedPixels] = {}
 
     def __call__(self, view: View) -> DepthPrior | None:
         """D* of the view, or None where the store has none; refuses one made for another size, K or pose."""
@@ -55,14 +55,14 @@ class PriorLoader:
             self._pixels.pop(dropped, None)
         return prior
 
-    def verified(self, view: View) -> VerifiedPixels | None:
-        """The verified pixels of the view, or None where there is not one."""
+    def trusted(self, view: View) -> TrustedPixels | None:
+        """The trusted pixels of the view, or None where there is not one."""
         key, prior = (view.camera, view.frame), self(view)
         if prior is None:
             return None
         if key not in self._pixels:
             index = torch.nonzero(prior.trusted.flatten()).squeeze(1)
-            self._pixels[key] = VerifiedPixels(index, prior.depth.flatten()[index])
+            self._pixels[key] = TrustedPixels(index, prior.depth.flatten()[index])
         pixels = self._pixels[key]
         return pixels if len(pixels.index) else None
 
@@ -86,7 +86,7 @@ def _with_depth(prior: DepthPrior) -> DepthPrior:
 
 
 def _bytes(prior: DepthPrior | None) -> int:
-    """Of a prior on the device, and of as many verified pixels as it may have."""
+    """Of a prior on the device, and of as many trusted pixels as it may have."""
     if prior is None:
         return 0
     return sum(t.numel() * t.element_size() for t in prior if t is not None) + 12 * prior.depth.numel()

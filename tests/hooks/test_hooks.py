@@ -17,7 +17,7 @@ from d2_plugin.hooks.densify import (
     under_reconstructed,
 )
 from d2_plugin.hooks.depth_loss import charbonnier, depth_loss, pixel_depth_loss
-from d2_plugin.hooks.prior import VerifiedPixels
+from d2_plugin.hooks.prior import TrustedPixels
 from d2_plugin.hooks.prune import depth_inconsistency, opacity_contribution, pruning_score
 from d2_plugin.hooks.rendered_depth import relative_discrepancy, rendered_depth
 from d2_plugin.protocol import View
@@ -145,7 +145,7 @@ class TestPixelDepthLoss:
     @settings(max_examples=50, deadline=None)
     def test_equals_the_composed_formula_with_its_gradient(self, seed: int) -> None:
         depth_sum, alpha, prior, verified = self.maps(seed)
-        pixels = VerifiedPixels(torch.nonzero(verified.flatten()).squeeze(1), prior[verified])
+        pixels = TrustedPixels(torch.nonzero(verified.flatten()).squeeze(1), prior[verified])
         gradients = []
         for fast in (False, True):
             z, a = depth_sum.clone().requires_grad_(), alpha.clone().requires_grad_()
@@ -162,13 +162,13 @@ class TestPixelDepthLoss:
     def test_gradcheck(self) -> None:
         depth_sum, alpha, prior, verified = self.maps(1)
         alpha = torch.where((alpha - 0.5).abs() < 0.01, 0.6, alpha)  # away from the step at tau_v
-        pixels = VerifiedPixels(torch.nonzero(verified.flatten()).squeeze(1), prior[verified])
+        pixels = TrustedPixels(torch.nonzero(verified.flatten()).squeeze(1), prior[verified])
         inputs = (depth_sum.requires_grad_(), alpha.requires_grad_())
         assert torch.autograd.gradcheck(lambda z, a: pixel_depth_loss(z, a, pixels, 0.5, 0.01), inputs)
 
     def test_is_finite_where_nothing_is_rendered(self) -> None:
         z, a = torch.zeros(2, 3, requires_grad=True), torch.zeros(2, 3, requires_grad=True)
-        loss = pixel_depth_loss(z, a, VerifiedPixels(torch.tensor([0, 4]), torch.tensor([1e-3, 1e6])), 0.5, 0.01)
+        loss = pixel_depth_loss(z, a, TrustedPixels(torch.tensor([0, 4]), torch.tensor([1e-3, 1e6])), 0.5, 0.01)
         loss.backward()
         assert loss == 0
         assert not z.grad.any()
