@@ -6,12 +6,14 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
 from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
+from d2_plugin.settings import NotNegative, Positive, Range, Settings
 
 from .densify import DensifySettings, densify
 from .gaussians import Gaussians
@@ -21,28 +23,32 @@ STATISTICS = ("screen_gradient", "seen")
 
 
 @dataclass(frozen=True)
-class SplatSettings:
-    """Gaussians and their optimizer; learning rates are per step, positions' relative to the scene's extent."""
+class SplatSettings(Settings):
+    """Gaussians and their optimizer; learning rates are per step, those of positions relative to the extent."""
 
     temporal: bool = True
     """False leaves time out: these are ordinary 3D Gaussians."""
-    sh_degree: int = 0
-    """Degree of the view-dependent colour, 0..3."""
-    position_rate: float = 3e-4
-    """Learning rate of positions times the extent of the scene, at the first step (studio, native 4D Gaussians alone,
-    held-out PSNR after 1210 steps: 25.3 dB; 24.9 at 1e-4)."""
-    position_rate_final: float = 3e-6
+    sh_degree: Annotated[int, Range(0, 3)] = 0
+    """Degree of the view-dependent colour."""
+    position_rate: Positive = 3e-4
+    """Learning rate of positions at the first step, times the extent of the scene.
+    Studio, native 4D Gaussians alone, held-out PSNR after 1210 steps: 25.3 dB at 3e-4, 24.9 at 1e-4."""
+    position_rate_final: Positive = 3e-6
     """The same at the last step; exponential in between."""
-    scale_rate: float = 1e-2
-    """Of log-scales (as above: 24.6 dB at 5e-3, 24.9 at 2e-2)."""
-    rotation_rate: float = 2e-3
-    opacity_rate: float = 5e-2
-    """Of opacity logits (as above: 24.5 dB at 2e-2)."""
-    color_rate: float = 1e-2
-    """Of the constant term; higher harmonics learn at a twentieth of it."""
-    initial_opacity: float = 0.1
+    scale_rate: NotNegative = 1e-2
+    """Learning rate of log-scales. As above: 24.6 dB at 5e-3, 25.3 at 1e-2, 24.9 at 2e-2."""
+    rotation_rate: NotNegative = 2e-3
+    """Learning rate of quaternions."""
+    opacity_rate: NotNegative = 5e-2
+    """Learning rate of opacity logits. As above: 24.5 dB at 2e-2, 25.3 at 5e-2."""
+    color_rate: NotNegative = 1e-2
+    """Learning rate of the constant colour; higher harmonics learn at a twentieth of it."""
+    initial_opacity: Annotated[float, Range(0, 1, open_low=True)] = 0.1
+    """Opacity of the Gaussians at the start."""
     raster: RasterSettings = field(default_factory=RasterSettings)
+    """Constants of the rasterizer."""
     densify: DensifySettings = field(default_factory=DensifySettings)
+    """The backbone's own density control."""
 
 
 class SplatModel(ABC):

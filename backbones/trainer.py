@@ -14,6 +14,7 @@ from torch import Tensor
 
 from d2_plugin.gaussians.photometric import photometric_loss
 from d2_plugin.rasterizer import Render, View
+from d2_plugin.settings import Seed, Settings, Share, Steps
 
 
 class Model(Protocol):
@@ -37,13 +38,14 @@ class Frames(Protocol):
 
 
 @dataclass(frozen=True)
-class TrainSettings:
+class TrainSettings(Settings):
     """How long and on what loss to train."""
 
-    iterations: int = 3000
-    ssim_weight: float = 0.2
-    """Share of D-SSIM in the photometric loss."""
-    seed: int = 0
+    iterations: Steps = 3000
+    """Steps to train."""
+    ssim_weight: Share = 0.2
+    """Share of D-SSIM in the photometric loss; the rest is L1."""
+    seed: Seed = 0
     """Of the order of views and of split samples; the global random state is never used."""
 
 

@@ -286,8 +286,8 @@ def test_settings_arrive_through_the_entry_point() -> None:
 @pytest.mark.parametrize(
     ("table", "sentence"),
     [
-        ({"field": "hexplan"}, "unknown deformation field 'hexplan': have hexplane, mlp; did you mean 'hexplane'"),
-        ({"mlp": {"widht": 3}}, "unknown setting of mlp 'widht'.*did you mean 'width'"),
+        ({"field": "hexplan"}, "unknown backbone.field 'hexplan': have hexplane, mlp; did you mean 'hexplane'"),
+        ({"mlp": {"widht": 3}}, "unknown setting of backbone.mlp 'widht'.*did you mean 'width'"),
         ({"mlp": 3}, "backbone.mlp must be a table of settings, got 3"),
         ({"temporal": False}, "unknown setting of backbone 'temporal'"),
     ],
