@@ -21,10 +21,8 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
 from d2_plugin.gaussians.slicing import unit_quaternions
+from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
-
-SH_C0 = 0.28209479177387814
-"""Y_0 of the spherical harmonics."""
 
 ROWS = "d2_rows"
 """The column in the strategy's state: the number of each row plus one, since gsplat marks what is new with zeros."""

@@ -11,14 +11,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny import ALL_HOOKS, TinyStore, make_model, make_trainer, make_views, parameters, same
+from tiny import ALL_HOOKS, BACKBONES, TinyStore, make_adapter, make_model, make_trainer, make_views, parameters, same
 
 from d2_plugin import D2Config, D2Error, D2Hooks
 from d2_plugin.adapters.yang4d import Yang4DAdapter
 from d2_plugin.backbones import trainer as trainer_module
 from d2_plugin.config import DensifyConfig, PruneConfig, for_iterations
 from d2_plugin.hooks.views import ViewSampler
-from d2_plugin.protocol import Backbone, Points
+from d2_plugin.protocol import Backbone, Points, Splats, View
+from d2_plugin.rasterizer import rasterize
 
 
 def only(*hooks: str) -> D2Config:
@@ -79,6 +80,48 @@ def test_depth_loss_of_the_trainers_own_render_equals_a_second_render() -> None:
     reused = d2.loss(1, view)
     assert adapter.rendered_depth(view) is None, "the render must be handed out once"
     torch.testing.assert_close(d2.loss(2, view), reused)
+
+
+def renders_of_ours(monkeypatch: pytest.MonkeyPatch) -> list[View]:
+    """The views that D2 renders itself from now on."""
+    views: list[View] = []
+
+    def counting(splats: Splats, colors: torch.Tensor, view: View, *rest: object) -> object:
+        views.append(view)
+        return rasterize(splats, colors, view, *rest)
+
+    monkeypatch.setattr("d2_plugin.hooks.depth_loss.rasterize", counting)
+    return views
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_every_view_of_a_batch_uses_the_trainers_own_render(backbone: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, views = make_model(backbone=backbone), make_views()[:3]
+    d2 = D2Hooks(only("depth_loss"), make_adapter(model), TinyStore())
+    ours = renders_of_ours(monkeypatch)
+    expected = d2.loss(1, views)
+    assert len(ours) == 3, "the count does not count"
+    ours.clear()
+    for view in reversed(views):
+        model.render(view)
+    torch.testing.assert_close(d2.loss(2, views), expected)
+    assert ours == []
+    for view in views:
+        model.render(view)
+        torch.testing.assert_close(d2.loss(3, view), d2.loss(3, view))  # the second one renders
+    assert ours == views
+
+
+def test_renders_of_an_earlier_step_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, view = make_model(), make_views()[0]
+    adapter = make_adapter(model)
+    model.render(view).color.sum().backward()
+    model.optimize(1, 10)
+    assert adapter.rendered_depth(view) is None
+    model.render(view)
+    with torch.no_grad():
+        model.render(view)
+    assert adapter.rendered_depth(view) is None, "the trainer's last render of this view has no gradients"
 
 
 def test_insertion_keeps_the_densification_evidence_of_the_backbone() -> None:

@@ -113,8 +113,8 @@ class Session:
             training = torch.is_grad_enabled() and package["render"].requires_grad
             if self.hooks is None or model is not self.objects.model or not training:
                 return package
-            if "stage" in named:
-                self.hooks.backbone.stage = named["stage"]
+            if self.recipe.heard is not None:
+                self.recipe.heard(self.hooks.backbone, named)
             return self._with_loss(camera, package)
 
         return rendering

@@ -206,9 +206,9 @@ class TestDeformations:
     def test_before_the_warm_up_nothing_is_deformed(self) -> None:
         model, deform, _ = deformable3d.make()
         adapter = Deformable3DAdapter(model, deform, warm_up=30)
-        adapter.active(29)
+        adapter.begin_step(29)
         assert torch.equal(adapter.slice_at(make_views()[0]).means, model._xyz)
-        adapter.active(30)
+        adapter.begin_step(30)
         assert not torch.equal(adapter.slice_at(make_views()[0]).means, model._xyz)
 
     def test_the_length_of_a_quaternion_scales_the_covariance(self) -> None:
@@ -284,6 +284,28 @@ class TestProbe:
         torch.testing.assert_close(reused, d2.loss(2, camera))
         reused.backward()
         assert model._xyz.grad.any()
+
+    def test_a_batch_of_renders_is_found_view_by_view(
+        self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        model, scene = fudan_model()
+        adapter, cameras = FudanAdapter(model, scene), scene.train_cameras[1.0][:2]
+        d2 = D2Hooks(DEPTH_ALONE, adapter, TinyStore())
+        expected = d2.loss(1, list(cameras))
+        caplog.clear()
+        batch = [adapter.rendered(camera, fudan.render(camera, model, [0, 0, 0])) for camera in cameras]
+        monkeypatch.setattr("d2_plugin.hooks.depth_loss.rasterize", None)  # D2 need not render
+        with caplog.at_level(logging.INFO, logger="d2_plugin.adapters.inria"):
+            torch.testing.assert_close(d2.loss(2, batch), expected)
+        assert "no render of the trainer" not in caplog.text
+
+    def test_a_render_of_an_earlier_step_is_not_used(self) -> None:
+        model, scene = fudan_model()
+        adapter, camera = FudanAdapter(model, scene), scene.train_cameras[1.0][0]
+        adapter.begin_step(1)
+        view = adapter.view(adapter.rendered(camera, fudan.render(camera, model, [0, 0, 0])))
+        adapter.begin_step(2)
+        assert adapter.rendered_depth(view) is None
 
     @pytest.mark.parametrize(
         ("mend", "sentence"),

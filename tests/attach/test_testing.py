@@ -12,7 +12,7 @@ from tiny import BACKBONES, make_adapter, make_model, make_views
 
 from d2_plugin.adapters.watched import WatchedModel
 from d2_plugin.backbones.densify import grow
-from d2_plugin.protocol import RasterSettings, Splats
+from d2_plugin.protocol import RasterSettings, Render, Splats, View
 from d2_plugin.testing import CHECKS, ContractError, Example, check_backbone
 
 
@@ -188,7 +188,15 @@ def normalised_depth(adapter: WatchedModel) -> None:
 
 
 def any_camera(adapter: WatchedModel) -> None:
-    adapter.rendered_depth = lambda view: adapter._rendered and adapter._rendered[1:]
+    kept: list[tuple[torch.Tensor, torch.Tensor]] = []
+    rendered = adapter.rendered
+
+    def remember(view: View, render: Render) -> None:
+        rendered(view, render)
+        kept[:] = [(render.depth_sum, render.alpha)]
+
+    adapter.rendered = remember
+    adapter.rendered_depth = lambda view: kept.pop() if kept else None
 
 
 def refuses(adapter: WatchedModel) -> None:
