@@ -19,6 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from d2_plugin.errors import D2Error
 from d2_plugin.settings import AtLeastOne, Count, NotNegative, Settings
 
 SPLITS = (3, 4, 3)
@@ -77,6 +78,11 @@ class HexPlaneSettings(Settings):
     """Weight of the squared second differences along time. Official name: time_smoothness_weight."""
     still: NotNegative = 1e-4
     """Weight of |1 - plane| of the planes with time: a plane of ones changes nothing. Official name: l1_time_planes."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.resolutions:
+            raise D2Error("setting resolutions has no level: give at least one number of nodes")
 
 
 class Box(NamedTuple):

@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from d2_plugin.settings import NotNegative, Range, Settings, Share
+from d2_plugin.settings import Range, Settings, Share
 
 
 class Label(IntEnum):
@@ -119,10 +119,10 @@ class CameraRecord(NamedTuple):
 class RasterSettings(Settings):
     """Constants of splatting; the defaults are those of the Inria rasterizer, which most backbones were tuned with."""
 
-    near: NotNegative = 0.2
-    """Gaussians with a view depth z <= near are not drawn; world units."""
-    blur: NotNegative = 0.3
-    """Added to both diagonal entries of the projected covariance; pixels squared."""
+    near: Annotated[float, Range(0, unit="world units")] = 0.2
+    """Gaussians with a view depth z <= near are not drawn."""
+    blur: Annotated[float, Range(0, unit="pixels squared")] = 0.3
+    """Added to both diagonal entries of the projected covariance."""
     alpha_max: Annotated[float, Range(0, 1, open_low=True)] = 0.99
     """Upper clamp of alpha; no gradient flows through a clamped alpha."""
     alpha_min: Share = 1 / 255
