@@ -54,7 +54,8 @@ def intrinsics(camera: Any, width: int, height: int) -> Tensor:
             )
         focal, centre = half / torch.tensor([math.tan(angle / 2) for angle in angles], dtype=torch.float64), half
     K = torch.eye(3, dtype=torch.float64)
-    K[0, 0], K[1, 1], K[0, 2], K[1, 2] = *focal, *centre
+    K[0, 0], K[1, 1] = focal
+    K[:2, 2] = centre
     return K
 
 

@@ -105,7 +105,7 @@ class Deform(SplatModel):
 
     def offsets(self, positions: Tensor, time: float) -> Offsets | None:
         """What the field adds at canonical `positions` [K, 3]; None where nothing is deformed (warm-up, no time)."""
-        if not self.deforms or not len(positions):
+        if self.field is None or not self.deforms or not len(positions):
             return None
         return self.field(positions, time / self.duration)
 
@@ -115,7 +115,7 @@ class Deform(SplatModel):
 
     def regularization(self) -> Tensor | float:
         """What keeps the field smooth."""
-        return self.field.regularization() if self.deforms else 0.0
+        return self.field.regularization() if self.field is not None and self.deforms else 0.0
 
     def optimize(self, step: int, iterations: int) -> None:
         """One step of both optimizers, gradients cleared; learning rates and noise for the next step set."""
@@ -130,9 +130,9 @@ class Deform(SplatModel):
         strength = max(1 - 2 * step / max(iterations, 1), 0.0) * self.settings.time_noise * self.duration
         self._noise = strength * torch.randn((), generator=self._generator).item()
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         """Gaussians and field with their optimizers, and the noise: enough for a bitwise continuation."""
-        state: dict[str, object] = {"gaussians": super().state_dict()}
+        state: dict[str, Any] = {"gaussians": super().state_dict()}
         if self.field is not None:
             state |= {
                 "field": {name: value.clone() for name, value in self.field.state_dict().items()},
@@ -143,7 +143,7 @@ class Deform(SplatModel):
             }
         return state
 
-    def load_state_dict(self, state: Mapping[str, object]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`."""
         super().load_state_dict(state["gaussians"])
         if self.field is not None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -124,7 +124,7 @@ class Field(nn.Module, ABC):
         """The last layer [N, 10] for places [N, 3] in units of the box, -1..1 inside."""
 
     @abstractmethod
-    def parameter_groups(self) -> list[dict[str, object]]:
+    def parameter_groups(self) -> list[dict[str, Any]]:
         """Groups for an optimizer: params, lr, name."""
 
     def regularization(self) -> Tensor | float:
@@ -158,7 +158,7 @@ class MlpField(Field):
             state = F.relu(state + enters[1] if i == self.skip else state)
         return self.heads(state)
 
-    def parameter_groups(self) -> list[dict[str, object]]:
+    def parameter_groups(self) -> list[dict[str, Any]]:
         """One group: the network."""
         return [{"params": list(self.parameters()), "lr": self.settings.rate, "name": "network"}]
 
@@ -182,7 +182,7 @@ class HexPlaneField(Field):
         levels = [self._level(space, time, inside, fraction) for space, time in zip(self.space, self.time)]
         return self.heads(F.relu(self.features(torch.cat(levels).T)))
 
-    def parameter_groups(self) -> list[dict[str, object]]:
+    def parameter_groups(self) -> list[dict[str, Any]]:
         """Two groups: planes and network."""
         planes = [*self.space, *self.time]
         network = [*self.features.parameters(), *self.heads.parameters()]

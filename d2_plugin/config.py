@@ -96,7 +96,7 @@ def for_iterations(hooks: Iterable[str], iterations: int, **settings: Any) -> D2
 
     The schedule of a hook is that of its settings, see `HookConfig.for_iterations`.
     """
-    chosen = {}
+    chosen: dict[str, Any] = {}
     for name in hooks:
         if name not in HOOKS:
             raise unknown_name("hook", name, ["prior", *HOOKS])

@@ -119,11 +119,11 @@ class CameraRecord(NamedTuple):
 class RasterSettings(Settings):
     """Constants of splatting; the defaults are those of the Inria rasterizer, which most backbones were tuned with."""
 
-    near: Annotated[float, Range(0, unit="world units")] = 0.2
+    near: Annotated[float, Range(0, unit="world units", open_low=True)] = 0.2
     """Gaussians with a view depth z <= near are not drawn."""
     blur: Annotated[float, Range(0, unit="pixels squared")] = 0.3
     """Added to both diagonal entries of the projected covariance."""
-    alpha_max: Annotated[float, Range(0, 1, open_low=True)] = 0.99
+    alpha_max: Annotated[float, Range(0, 1, open_low=True, open_high=True)] = 0.99
     """Upper clamp of alpha; no gradient flows through a clamped alpha."""
     alpha_min: Share = 1 / 255
     """Contributions with a smaller alpha are skipped."""

@@ -21,6 +21,8 @@ class Range:
     unit: str = ""
     open_low: bool = False
     """The lower bound itself is refused."""
+    open_high: bool = False
+    """The upper bound itself is refused."""
     infinite: bool = False
     """Infinity is a value."""
 
@@ -29,11 +31,11 @@ class Range:
         if isinstance(value, float) and (math.isnan(value) or (math.isinf(value) and not self.infinite)):
             return False
         above = self.low is None or value > self.low or (value == self.low and not self.open_low)
-        return above and (self.high is None or value <= self.high)
+        return above and (self.high is None or value < self.high or (value == self.high and not self.open_high))
 
     def __str__(self) -> str:
         low = "" if self.low is None else f"{'above' if self.open_low else 'at least'} {self.low:g}"
-        high = "" if self.high is None else f"at most {self.high:g}"
+        high = "" if self.high is None else f"{'below' if self.open_high else 'at most'} {self.high:g}"
         return " and ".join(part for part in (low, high) if part) or "finite"
 
 

@@ -1,4 +1,4 @@
-"""Every setting of hooks, backbones, rasterizer and runs is refused in one sentence when it cannot be; files keep them."""
+"""Every setting of hooks, backbones, rasterizer and runs: what cannot be is refused in one sentence, files keep all."""
 
 from __future__ import annotations
 
@@ -123,7 +123,8 @@ def test_schedules_fit_the_length_of_a_run(iterations: int) -> None:
         ({"initial_opacity": 0}, r"backbone\.initial_opacity must be above 0 and at most 1, got 0"),
         ({"sh_degree": 4}, r"backbone\.sh_degree must be at least 0 and at most 3, got 4"),
         ({"densify": {"every": 0}}, r"backbone\.densify\.every must be at least 1 steps, got 0"),
-        ({"raster": {"near": -1}}, r"backbone\.raster\.near must be at least 0 world units, got -1"),
+        ({"raster": {"near": -1}}, r"backbone\.raster\.near must be above 0 world units, got -1"),
+        ({"raster": {"alpha_max": 1}}, r"backbone\.raster\.alpha_max must be above 0 and below 1, got 1"),
         ({"mlp": {"width": 0}}, r"backbone\.mlp\.width must be at least 1, got 0"),
         ({"hexplane": {"resolutions": [8, 0]}}, r"backbone\.hexplane\.resolutions\[1\] must be at least 1, got 0"),
         ({"hexplane": {"resolutions": []}}, r"resolutions has no level: give at least one"),

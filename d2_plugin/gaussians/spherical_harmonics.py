@@ -10,6 +10,8 @@ import math
 import torch
 from torch import Tensor
 
+from d2_plugin.errors import D2Error
+
 SH_C0 = 0.28209479177387814
 """Y_0, the constant harmonic: a colour c in 0..1 is stored as the coefficient (c - 0.5) / Y_0."""
 
@@ -60,7 +62,9 @@ def colors(coefficients: Tensor, directions: Tensor, phase: Tensor | None, degre
     else:
         values = basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     if time_degree:
-        waves = torch.stack([torch.cos(2 * math.pi * n * phase) for n in range(time_degree + 1)], -1)
+        if phase is None:
+            raise D2Error(f"colours with {time_degree} cosines in time need the phase of each Gaussian: pass it")
+        waves = torch.stack([torch.cos(phase * (2 * math.pi * n)) for n in range(time_degree + 1)], -1)
         values = (waves[:, :, None] * values[:, None]).flatten(1)
     return torch.relu((values[..., None] * coefficients).sum(1) + 0.5)
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -23,11 +24,14 @@ class Store(Protocol):
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
 
 
-class TrustedPixels(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class TrustedPixels:
     """What may supervise one view: where D* is trusted (see `DepthPrior.trusted`), and D* there."""
 
-    index: Tensor  # [K] int64, row * width + column
-    depth: Tensor  # [K] float32
+    index: Tensor
+    """[K] int64, row * width + column."""
+    depth: Tensor
+    """[K] float32, world units."""
 
 
 class PriorLoader:
@@ -48,7 +52,7 @@ class PriorLoader:
         prior = self.store.prior(*key)
         if prior is not None:
             self._check(view, prior)
-            prior = _with_depth(DepthPrior(*(None if t is None else t.to(view.K.device) for t in prior)))
+            prior = _with_depth(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior))
         self._kept[key] = prior
         while len(self._kept) > 1 and sum(map(_bytes, self._kept.values())) > self.keep_bytes:
             dropped, _ = self._kept.popitem(last=False)

@@ -19,9 +19,9 @@ from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.provenance import circumstances
-from d2_plugin.runs.start import Extent, TrainingFrames, initial_points, make_view, scene_extent, triangulated_points
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config, prior_settings
+from d2_plugin.runs.start import Extent, TrainingFrames, initial_points, make_view, scene_extent, triangulated_points
 
 RENDERED_ALPHA = 0.5
 """A rendered depth is reported where the accumulated alpha exceeds this."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,10 +18,10 @@ from d2_plugin.hooks.densify import (
     under_reconstructed,
 )
 from d2_plugin.hooks.depth_loss import charbonnier, depth_loss, pixel_depth_loss
-from d2_plugin.hooks.prior import TrustedPixels
+from d2_plugin.hooks.prior import PriorLoader, TrustedPixels
 from d2_plugin.hooks.prune import depth_inconsistency, opacity_contribution, pruning_score
 from d2_plugin.hooks.rendered_depth import relative_discrepancy, rendered_depth
-from d2_plugin.protocol import View
+from d2_plugin.protocol import DepthPrior, Label, View
 
 
 def tensor(*values: float) -> torch.Tensor:
@@ -94,8 +95,19 @@ class TestCharbonnier:
             assert r.grad.item() == 0
 
 
+@pytest.mark.parametrize("label", list(Label))
+def test_trusted_are_verified_and_agreed_pixels_and_no_others(label: Label) -> None:
+    prior = DepthPrior(torch.ones(2, 2), torch.full((2, 2), int(label), dtype=torch.uint8))
+    assert prior.verified.all() == (label == Label.VERIFIED)
+    assert prior.trusted.all() == (label in (Label.VERIFIED, Label.AGREED))
+    assert prior.support.all() == (label in (Label.VERIFIED, Label.AGREED, Label.MONO))
+    view = View("a", 0, 0.0, torch.eye(4), torch.eye(3), 2, 2)
+    pixels = PriorLoader(SimpleNamespace(prior=lambda camera, frame: prior)).trusted(view)
+    assert (pixels is not None) == prior.trusted.all()
+
+
 class TestDepthLoss:
-    def test_counts_only_pixels_that_are_verified_and_validly_rendered(self) -> None:
+    def test_counts_only_pixels_that_are_trusted_and_validly_rendered(self) -> None:
         depth, prior = tensor(2.0, 2.0, 2.0), tensor(1.0, 4.0, 8.0)
         valid, verified = torch.tensor([True, True, False]), torch.tensor([True, False, True])
         expected = charbonnier(tensor(1.0), 0.01).squeeze()
