@@ -169,8 +169,8 @@ class Backbone(Protocol):
     ``rendered_depth(view) -> (depth_sum, alpha) | None``
         where the trainer has rendered this view in the present step and its own output has both with gradients: saves a
         second render. The views of a batch are told apart by camera and frame.
-    ``begin_step(step)``
-        is told which training step it is, before anything else is asked in it.
+    ``begin_step(step) -> None``
+        called with the number of the training step before anything else is asked in it.
     ``active(step) -> bool``
         False while the hooks must wait (stages, warm-up); a question, which changes nothing.
     """
