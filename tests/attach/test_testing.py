@@ -199,6 +199,32 @@ def any_camera(adapter: WatchedModel) -> None:
     adapter.rendered_depth = lambda view: kept.pop() if kept else None
 
 
+def last_only(adapter: WatchedModel) -> None:
+    rendered = adapter.rendered
+
+    def remember(view: View, render: Render) -> None:
+        adapter._renders.forget()
+        rendered(view, render)
+
+    adapter.rendered = remember
+
+
+def swaps_a_batch(adapter: WatchedModel) -> None:
+    """Hands out the renders of a batch in the wrong order."""
+    rendered_depth, put = adapter.rendered_depth, adapter._renders.put
+    views: list[View] = []
+
+    def remember(view: View, render: object) -> None:
+        views.append(view)
+        put(view, render)
+
+    def wrong(view: View) -> object:
+        others = [other for other in views[-2:] if other is not view]
+        return rendered_depth(view if view not in views or not others else others[0])
+
+    adapter._renders.put, adapter.rendered_depth = remember, wrong
+
+
 def refuses(adapter: WatchedModel) -> None:
     def fail(points: object) -> int:
         raise RuntimeError("no room")
@@ -248,6 +274,8 @@ def mirrored(view: object) -> torch.Tensor:
         (draws, "the global random state changes"),
         (normalised_depth, "depth_sum is not the slice's"),
         (any_camera, "render of one camera for another"),
+        (last_only, "rendered_depth knows the last render alone"),
+        (swaps_a_batch, "the render of one camera of a batch for another"),
         (refuses, "insert: the backbone raised RuntimeError: no room"),
     ],
 )
