@@ -43,7 +43,7 @@ class DeformSettings(SplatSettings):
     field_decay: Positive = 0.1
     """Learning rates of the field at the last step, as a share of the first; exponential in between."""
     seed: Seed = 0
-    """Of the field's start and of the noise on time; the global random state is never used."""
+    """Seed of the field's start and of the noise on time; the global random state is never used."""
     mlp: MlpSettings = dataclasses.field(default_factory=MlpSettings)
     """The network of a field of kind "mlp"."""
     hexplane: HexPlaneSettings = dataclasses.field(default_factory=HexPlaneSettings)

@@ -55,7 +55,7 @@ class TrainSettings(Settings):
     ssim_weight: Share = 0.2
     """Share of D-SSIM in the photometric loss; the rest is L1."""
     seed: Seed = 0
-    """Of the order of views and of split samples; the global random state is never used."""
+    """Seed of the order of views and of split samples; the global random state is never used."""
 
 
 class Trainer:

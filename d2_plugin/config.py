@@ -48,7 +48,7 @@ class D2Config(_HookTables):
     retire_below: Share = 1e-3
     """Share of the Gaussians; an evaluation that changes fewer has changed next to nothing."""
     seed: Seed = 0
-    """Of D2's own random generator."""
+    """Seed of D2's own random generator."""
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], where: str = "") -> D2Config:

@@ -38,6 +38,7 @@ from d2_plugin.values import (
     Steps,
     bare_and_range,
     checked,
+    options_of,
     shown,
 )
 
@@ -94,7 +95,10 @@ class Settings:
     """Base of all settings; a subclass is a frozen dataclass."""
 
     def __post_init__(self) -> None:
-        """Check each value against its declaration; whole numbers become floats and lists tuples where declared so."""
+        """Check each value against its declaration; whole numbers become floats and lists tuples where declared so.
+
+        A subclass that checks several settings against each other does so after this.
+        """
         for setting in declared(type(self)):
             name = f"{type(self).__name__}.{setting.name}"
             value = checked(setting.kind, setting.range, getattr(self, setting.name), name)
@@ -154,7 +158,7 @@ def of_this_format(table: Mapping[str, Any], place: str) -> dict[str, Any]:
 
 def table_of(kind: Any) -> type[Settings] | None:
     """The Settings that a declared kind is, or may be; None where it is a plain value."""
-    for option in (kind, *get_args(kind)):
+    for option in options_of(kind):
         if isinstance(option, type) and is_dataclass(option) and issubclass(option, Settings):
             return option
     return None
@@ -162,7 +166,7 @@ def table_of(kind: Any) -> type[Settings] | None:
 
 def _from_plain(setting: Declared, value: Any, where: str) -> Any:
     """A table becomes the Settings that are declared there, "none" nothing; anything else is checked as it is."""
-    options = get_args(setting.kind)
+    options = options_of(setting.kind)
     if isinstance(value, str) and value == NONE and type(None) in options and str not in options:
         return None
     kind = table_of(setting.kind)

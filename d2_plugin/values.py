@@ -53,7 +53,7 @@ Every = Annotated[int, Range(1, unit="steps")]
 AtLeastOne = Annotated[int, Range(1)]
 """A whole number, 1 or more."""
 Seed = Annotated[int, Range(0, 2**63 - 1)]
-"""Of a random generator."""
+"""Seed of a random generator."""
 Positive = Annotated[float, Range(0, open_low=True)]
 """A number above 0."""
 NotNegative = Annotated[float, Range(0)]
@@ -61,11 +61,16 @@ NotNegative = Annotated[float, Range(0)]
 Share = Annotated[float, Range(0, 1)]
 """A part of a whole, 0..1."""
 Angle = Annotated[float, Range(0, 180, unit="degrees")]
-"""An angle."""
+"""An angle, 0 to 180 degrees."""
 
 
 class OutOfRange(D2Error):
     """A value of the right type that lies outside its declared range."""
+
+
+def options_of(kind: Any) -> tuple[Any, ...]:
+    """The kinds of which a value may be: the members of a union, else the kind itself."""
+    return get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
 
 
 def checked(kind: Any, limits: Range, value: Any, name: str) -> Any:
@@ -73,7 +78,7 @@ def checked(kind: Any, limits: Range, value: Any, name: str) -> Any:
 
     `kind` and `limits` are what `Declared.kind` and `Declared.range` hold.
     """
-    options = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+    options = options_of(kind)
     if value is None and type(None) in options:
         return None
     options = tuple(option for option in options if option is not type(None))

@@ -47,7 +47,7 @@ class RunSettings(Settings):
     hooks: tuple[str, ...] = HOOK_NAMES
     """Parts of the method that are used."""
     seed: Seed = 0
-    """Of everything that is drawn at random."""
+    """Seed of everything that is drawn at random."""
     downscale: AtLeastOne = 1
     """Pictures are this many times smaller than recorded, along each side."""
     frames: tuple[Count, ...] | None = None
