@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ from d2_plugin.protocol import View
 from .keys import PriorKey
 
 
-def inria_view(camera: object, key: PriorKey, time: float, like: Tensor) -> View:
+def inria_view(camera: Any, key: PriorKey, time: float, like: Tensor) -> View:
     """The view of a camera object, on the device of `like`; `time` is in the trainer's unit."""
     width, height = int(camera.image_width), int(camera.image_height)
     pose = camera.world_view_transform.detach().T
@@ -34,7 +35,7 @@ def inria_view(camera: object, key: PriorKey, time: float, like: Tensor) -> View
     )
 
 
-def intrinsics(camera: object, width: int, height: int) -> Tensor:
+def intrinsics(camera: Any, width: int, height: int) -> Tensor:
     """K [3, 3] float64 in pixels, with pixel centres at i + 0.5, as the trainer's rasterizer has it.
 
     From the projection P (clip = P camera, w = z): f_x = P_00 W / 2 and c_x = (P_02 + 1) W / 2, rows alike.
@@ -53,11 +54,12 @@ def intrinsics(camera: object, width: int, height: int) -> Tensor:
             )
         focal, centre = half / torch.tensor([math.tan(angle / 2) for angle in angles], dtype=torch.float64), half
     K = torch.eye(3, dtype=torch.float64)
-    K[0, 0], K[1, 1], K[0, 2], K[1, 2] = *focal, *centre
+    K[0, 0], K[1, 1] = focal
+    K[:2, 2] = centre
     return K
 
 
-def correct_fields_of_view(cameras: Iterable[object]) -> int:
+def correct_fields_of_view(cameras: Iterable[Any]) -> int:
     """Give cameras whose FoVx is -1 the fields of view that their focal lengths mean; returns how many there were.
 
     fudan's reader leaves -1 where transforms.json has fl_x (dataset_readers.py:276), and its rasterizer then takes

@@ -1,11 +1,13 @@
 """ingra14m/Deformable-3D-Gaussians (CVPR 2024): canonical 3D Gaussians moved by an MLP, `DeformModel`.
 
-    d2 = D2Hooks.from_config("d2.toml", Deformable3DAdapter(gaussians, deform, warm_up=opt.warm_up))  # train.py:41
-    loss = loss + d2.loss(iteration, viewpoint_cam)                                                   # before :109
-    d2.step(iteration)                                                                                # after :163
+d2 = D2Hooks.from_config("d2.toml", Deformable3DAdapter(gaussians, deform, warm_up=opt.warm_up))  # train.py:41
+loss = loss + d2.loss(iteration, viewpoint_cam)                                                   # before :109
+d2.step(iteration)                                                                                # after :163
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,8 +39,8 @@ class Deformable3DAdapter(InriaAdapter):
 
     def __init__(
         self,
-        gaussians: object,
-        deform: object,
+        gaussians: Any,
+        deform: Any,
         *,
         warm_up: int = 3000,
         is_6dof: bool | None = None,
@@ -49,12 +51,11 @@ class Deformable3DAdapter(InriaAdapter):
         self.deform, self.warm_up = deform, warm_up
         self.is_6dof = bool(getattr(deform.deform, "is_6dof", False)) if is_6dof is None else is_6dof
         self.inversion: Inversion | None = None
-        self._step = 0
 
-    def active(self, step: int) -> bool:
-        """Always; D2Hooks asks this first, which tells the present step and thereby whether the field is used yet."""
-        self._step = step
-        return True
+    @property
+    def deforms(self) -> bool:
+        """Whether the field is used in the present step, which `begin_step` was told."""
+        return self._step >= self.warm_up
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable in the model's and in the field's parameters."""
@@ -62,7 +63,7 @@ class Deformable3DAdapter(InriaAdapter):
         rows = torch.arange(len(self), device=model._xyz.device)
         opacities = torch.sigmoid(model._opacity.squeeze(-1))
         means, scales, rotations = model._xyz, model._scaling.exp(), torch.nn.functional.normalize(model._rotation)
-        if self._step >= self.warm_up:
+        if self.deforms:
             motion, rotation, scaling = self._field(model._xyz.detach(), view.time)
             means, scales, rotations = self._moved(means, motion), scales + scaling, rotations + rotation
         factors = rotation_matrices_3d(rotations.T) * scales.T
@@ -76,13 +77,13 @@ class Deformable3DAdapter(InriaAdapter):
             return positions + motion
         return torch.einsum("nij,nj->ni", motion[:, :3, :3], positions) + motion[:, :3, 3]
 
-    def _time(self, camera: object) -> float:
+    def _time(self, camera: Any) -> float:
         """`fid`, a tensor of one number."""
         return float(camera.fid)
 
     def _append(self, points: Points) -> None:
         """Canonical Gaussians that the field moves onto the points at the points' times; they exist at all times."""
-        if self._step >= self.warm_up:
+        if self.deforms:
             self.inversion = invert_at_times(points, self._deformed, self.gaussians._xyz.detach())
             points = points._replace(positions=self.inversion.positions)
         self.gaussians.densification_postfix(*self._raw_rows(points))

@@ -54,7 +54,7 @@ class Ex4DGSAdapter(InriaAdapter):
 
     def __init__(
         self,
-        gaussians: object,
+        gaussians: Any,
         *,
         near: float = 0.2,
         far: float = 1e10,
@@ -113,7 +113,7 @@ class Ex4DGSAdapter(InriaAdapter):
         rows = self._raw_rows(points)
         self.gaussians.densification_postfix_onlystatic(*rows, torch.zeros_like(rows.xyz))
 
-    def _default_key(self, camera: object) -> PriorKey:
+    def _default_key(self, camera: Any) -> PriorKey:
         """Camera by `image_name`, frame by `timestamp`, which counts frames."""
         return PriorKey(PurePosixPath(str(camera.image_name)).stem, self.first_frame + round(self._time(camera)))
 

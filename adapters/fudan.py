@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -52,8 +53,8 @@ class FudanAdapter(InriaAdapter):
 
     def __init__(
         self,
-        gaussians: object,
-        scene: object | None = None,
+        gaussians: Any,
+        scene: Any = None,
         *,
         correct_fov: bool = True,
         settings: RasterSettings | None = None,
@@ -71,7 +72,7 @@ class FudanAdapter(InriaAdapter):
             if count:
                 log.warning("%d cameras had a field of view of -1: set from their focal lengths (issue 64)", count)
 
-    def view(self, camera: object) -> View:
+    def view(self, camera: Any) -> View:
         """See `InriaAdapter.view`; a camera whose field of view is still -1 is named once."""
         if getattr(camera, "FoVx", 0) == -1 and not self._warned:
             log.warning(
@@ -143,6 +144,6 @@ class FudanAdapter(InriaAdapter):
         model.densification_postfix(*rows, times, scales, right)
 
 
-def _prefilter(model: object) -> float:
+def _prefilter(model: Any) -> float:
     """Variance added to every temporal extent; 0 where it is off (negative) or unknown (older snapshots, 4C4D)."""
     return max(getattr(model, "prefilter_var", 0.0), 0.0)

@@ -13,6 +13,7 @@ so a column of row numbers in there tells afterwards what became of each row.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -21,10 +22,8 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
 from d2_plugin.gaussians.slicing import unit_quaternions
+from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
-
-SH_C0 = 0.28209479177387814
-"""Y_0 of the spherical harmonics."""
 
 ROWS = "d2_rows"
 """The column in the strategy's state: the number of each row plus one, since gsplat marks what is new with zeros."""
@@ -109,7 +108,7 @@ class GsplatAdapter:
         index = torch.arange(self._count + count, device=points.positions.device)
         index[self._count :] = -1
         for name in self.parameters:
-            self._replace(name, lambda old, new=rows[name]: torch.cat([old, new.to(old)]), new_moments=rows[name])
+            self._replace(name, partial(_appended, rows[name]), new_moments=rows[name])
         self._change_state(lambda old: torch.cat([old, old.new_zeros(count, *old.shape[1:])]), index)
         return count
 
@@ -163,8 +162,10 @@ class GsplatAdapter:
         for key, value in moments.items():
             if key == "step" or not isinstance(value, Tensor) or value.shape[:1] != old.shape[:1]:
                 continue
-            padded = new_moments is not None
-            moments[key] = torch.cat([value, torch.zeros_like(new_moments).to(value)]) if padded else change(value)
+            if new_moments is None:
+                moments[key] = change(value)
+            else:
+                moments[key] = torch.cat([value, torch.zeros_like(new_moments).to(value)])
         if moments:
             optimizer.state[new] = moments
         for group in optimizer.param_groups:
@@ -172,9 +173,10 @@ class GsplatAdapter:
         self.parameters[name] = new
 
     def _change_state(self, change: Callable[[Tensor], Tensor], index: Tensor) -> None:
-        for key, value in (self.state or {}).items():
+        state = {} if self.state is None else self.state
+        for key, value in state.items():
             if isinstance(value, Tensor) and key not in NO_ROWS and value.shape[:1] == (self._known,):
-                self.state[key] = change(value)
+                state[key] = change(value)
         self._renumber()
         self._tell(index)
 
@@ -211,11 +213,13 @@ class GsplatAdapter:
             listener(index)
 
 
-def gsplat_view(
-    camera: str, frame: int, time: float, camtoworld: Tensor, K: Tensor, width: int, height: int
-) -> View:
+def gsplat_view(camera: str, frame: int, time: float, camtoworld: Tensor, K: Tensor, width: int, height: int) -> View:
     """The view of one camera of gsplat's data sets: camtoworld [4, 4] or [1, 4, 4] in OpenCV axes, K likewise."""
     return View(camera, frame, time, torch.linalg.inv(camtoworld.reshape(4, 4)), K.reshape(3, 3), width, height)
+
+
+def _appended(new: Tensor, old: Tensor) -> Tensor:
+    return torch.cat([old, new.to(old)])
 
 
 def _first_occurrences(rows: Tensor) -> Tensor:

@@ -10,6 +10,8 @@ adapter of the fine stage takes the place of the coarse one's. Iterations count 
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -47,20 +49,25 @@ class Hust4DAdapter(InriaAdapter):
 
     def __init__(
         self,
-        gaussians: object,
-        scene: object | None,
+        gaussians: Any,
+        scene: Any,
         stage: str,
         *,
         active_stages: tuple[str, ...] = ("fine",),
         settings: RasterSettings | None = None,
         key: KeyOf | None = None,
     ) -> None:
-        if stage not in STAGES:
-            raise D2Error(f"stage must be one of {', '.join(STAGES)}, got '{stage}': pass scene_reconstruction's own")
         super().__init__(gaussians, settings, key)
-        self.stage, self.active_stages = stage, active_stages
+        self.enter_stage(stage)
+        self.active_stages = active_stages
         self.inversion: Inversion | None = None
         self._dataset = getattr(getattr(scene, "train_camera", None), "dataset", None)
+
+    def enter_stage(self, stage: str) -> None:
+        """From now on the model is drawn as in this stage."""
+        if stage not in STAGES:
+            raise D2Error(f"stage must be one of {', '.join(STAGES)}, got '{stage}': pass scene_reconstruction's own")
+        self.stage = stage
 
     def active(self, step: int) -> bool:
         """Whether hooks run in this stage."""
@@ -88,11 +95,11 @@ class Hust4DAdapter(InriaAdapter):
         constant, rest = self.gaussians._features_dc, self.gaussians._features_rest
         return constant.shape[1] + rest.shape[1], 3
 
-    def _time(self, camera: object) -> float:
+    def _time(self, camera: Any) -> float:
         """In 0..1 of the clip, unlike `timestamp` elsewhere."""
         return float(camera.time)
 
-    def _default_key(self, camera: object) -> PriorKey:
+    def _default_key(self, camera: Any) -> PriorKey:
         if self._dataset is None:
             return key_from_picture(str(camera.image_name))
         paths = getattr(self._dataset, "image_paths", None)

@@ -19,17 +19,16 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
 from d2_plugin.rasterizer import rasterize
 
 from .cameras import inria_view
 from .keys import KeyOf, PriorKey, key_from_picture
 from .probe import Probe, probe_package
+from .renders import Renders
 
 log = logging.getLogger(__name__)
-
-SH_C0 = 0.28209479177387814
-"""Y_0 of the spherical harmonics: an RGB value c is stored as (c - 0.5) / Y_0."""
 
 Report = Callable[[], Tensor]
 """The index of a change, once it is done."""
@@ -50,7 +49,7 @@ class RawRows(NamedTuple):
 class RenderedCamera:
     """A camera together with what the trainer has just rendered for it; no tuple, which would be read as a batch."""
 
-    camera: object
+    camera: Any
     package: Mapping[str, Any]
 
 
@@ -67,20 +66,21 @@ class InriaAdapter(ABC):
     evidence: ClassVar[dict[str, float]] = {"xyz_gradient_accum": 0.0, "denom": 0.0, "max_radii2D": 0.0}
     """What an insertion would erase, though it is about the Gaussians that were there, and the value of a new row."""
 
-    def __init__(self, gaussians: object, settings: RasterSettings | None = None, key: KeyOf | None = None) -> None:
+    def __init__(self, gaussians: Any, settings: RasterSettings | None = None, key: KeyOf | None = None) -> None:
         self.gaussians, self.settings = gaussians, settings or RasterSettings()
         self.probe: Probe | None = None
         self._key = key
         self._listeners: list[ResizeListener] = []
-        self._rendered: tuple[View, Mapping[str, Any]] | None = None
-        self._overridden: dict[str, object] = {}
+        self._renders: Renders[Mapping[str, Any]] = Renders()
+        self._step = 0
+        self._overridden: dict[str, Any] = {}
         self._said: set[str] = set()
         self._attach()
 
     def __len__(self) -> int:
         return len(self.gaussians._xyz)
 
-    def view(self, camera: object) -> View:
+    def view(self, camera: Any) -> View:
         """The view of a camera object, of a `RenderedCamera` (see `rendered`), or a `View` as it is."""
         package = None
         if isinstance(camera, RenderedCamera):
@@ -94,8 +94,14 @@ class InriaAdapter(ABC):
             )
         view = inria_view(camera, self._key_of(camera), self._time(camera), self.gaussians._xyz)
         if package is not None:
-            self._rendered = (view, package)
+            self._renders.put(view, package)
         return view
+
+    def begin_step(self, step: int) -> None:
+        """Learn which training step it is; what was rendered in an earlier one is of no more use."""
+        if step != self._step:
+            self._renders.forget()
+        self._step = step
 
     @abstractmethod
     def slice_at(self, view: View) -> Splats:
@@ -123,7 +129,7 @@ class InriaAdapter(ABC):
         """Register a listener for every structural change, the backbone's own densification included."""
         self._listeners.append(listener)
 
-    def rendered(self, camera: object, package: Mapping[str, Any]) -> RenderedCamera:
+    def rendered(self, camera: Any, package: Mapping[str, Any]) -> RenderedCamera:
         """Pass this to `D2Hooks.loss` instead of the camera where the trainer's `package` may save a second render.
 
         Only a render with depth, alpha and gradients to both is used; the first one is probed, and the log says so.
@@ -131,12 +137,12 @@ class InriaAdapter(ABC):
         return RenderedCamera(camera, package)
 
     def rendered_depth(self, view: View) -> tuple[Tensor, Tensor] | None:
-        """Depth sum and alpha [H, W] of the package that came with this view, or None; hands it out once."""
-        rendered, self._rendered = self._rendered, None
-        if rendered is None or rendered[0] is not view:
+        """Depth sum and alpha [H, W] of the package that came with this view in the present step, or None; hands it out
+        once."""
+        package = self._renders.take(view)
+        if package is None:
             self._say_once("no render of the trainer was passed along: D2 renders depth with its own rasterizer")
             return None
-        package = rendered[1]
         if self.probe is None or not self.probe.final:
             self.probe = self._probed(view, package)
         if not self.probe.usable:
@@ -162,14 +168,14 @@ class InriaAdapter(ABC):
     def _append(self, points: Points) -> None:
         """Append the raw rows of finite points."""
 
-    def _time(self, camera: object) -> float:
+    def _time(self, camera: Any) -> float:
         """The instant of a camera in the backbone's unit."""
         return float(camera.timestamp)
 
-    def _key_of(self, camera: object) -> PriorKey:
+    def _key_of(self, camera: Any) -> PriorKey:
         return self._key(camera) if self._key is not None else self._default_key(camera)
 
-    def _default_key(self, camera: object) -> PriorKey:
+    def _default_key(self, camera: Any) -> PriorKey:
         return key_from_picture(str(getattr(camera, "image_path", None) or camera.image_name))
 
     def _attach(self) -> None:

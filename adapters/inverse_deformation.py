@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -99,7 +100,7 @@ def invert_at_times(
         chosen = torch.nonzero(points.times == time).squeeze(-1)
         moved = deformed(present, time)
         found = invert_deformation(
-            lambda x, time=time: deformed(x, time),
+            partial(_at, deformed, time),
             points.positions[chosen],
             moved,
             moved - present,
@@ -107,3 +108,7 @@ def invert_at_times(
         )
         positions[chosen], accepted[chosen], residuals[chosen] = found
     return Inversion(positions, accepted, residuals)
+
+
+def _at(deformed: Callable[[Tensor, float], Tensor], time: float, positions: Tensor) -> Tensor:
+    return deformed(positions, time)

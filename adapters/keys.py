@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from pathlib import PurePosixPath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ class PriorKey(NamedTuple):
     frame: int
 
 
-KeyOf = Callable[[object], PriorKey]
+KeyOf = Callable[[Any], PriorKey]
 """From a trainer's camera object to the key of its prior; every adapter takes one as `key`."""
 
 _PREFIXED = re.compile(r"(?P<camera>.+)_(?P<frame>\d+)$")
@@ -55,7 +55,7 @@ def key_from_picture(name: str) -> PriorKey:
     )
 
 
-def one_picture_each(camera: object) -> PriorKey:
+def one_picture_each(camera: Any) -> PriorKey:
     """The key of a recording by one moving camera, where every picture is a camera of its own at frame 0."""
     return PriorKey(PurePosixPath(str(camera.image_name)).stem, 0)
 
@@ -82,12 +82,12 @@ class KeysByPose:
     frame of a camera object, for instance from its time. A camera that stands nowhere near a known one is refused.
     """
 
-    def __init__(self, cameras: Mapping[str, Tensor], frame: Callable[[object], int], tolerance: float = 1e-3) -> None:
+    def __init__(self, cameras: Mapping[str, Tensor], frame: Callable[[Any], int], tolerance: float = 1e-3) -> None:
         self.names = list(cameras)
         self.poses = torch.stack([torch.as_tensor(pose).double().cpu() for pose in cameras.values()])
         self.frame, self.tolerance = frame, tolerance
 
-    def __call__(self, camera: object) -> PriorKey:
+    def __call__(self, camera: Any) -> PriorKey:
         """The key of a camera object of the Inria family."""
         pose = camera.world_view_transform.detach().T.double().cpu()
         distances = (self.poses - pose).abs().flatten(1).amax(1)

@@ -1,7 +1,8 @@
 """Whether a trainer's own render may stand in for ours: it needs depth and alpha, both with gradients, and our meaning.
 
 Depth is the sum of w z in most rasterizers, but divided by alpha in Ex4DGS, the median in SpacetimeGaussians, and
-without a gradient in the main branch of depth-diff-gaussian-rasterization. None says which: so one render is compared.
+without a gradient in the main branch of depth-diff-gaussian-rasterization. No package says which of these it holds, so
+one render is compared with our own.
 """
 
 from __future__ import annotations

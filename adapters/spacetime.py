@@ -10,6 +10,7 @@ Line 2 runs once per view; gradients are averaged over the batch afterwards (`se
 from __future__ import annotations
 
 from pathlib import PurePosixPath
+from typing import Any
 
 import torch
 
@@ -41,7 +42,7 @@ class SpacetimeAdapter(InriaAdapter):
 
     def __init__(
         self,
-        gaussians: object,
+        gaussians: Any,
         duration: int,
         *,
         first_frame: int = 0,
@@ -69,7 +70,7 @@ class SpacetimeAdapter(InriaAdapter):
         distance = (time - model._trbf_center[rows, 0]) / model._trbf_scale[rows, 0].exp()
         return torch.sigmoid(model._opacity[rows, 0]) * torch.exp(-distance * distance)
 
-    def _default_key(self, camera: object) -> PriorKey:
+    def _default_key(self, camera: Any) -> PriorKey:
         """Camera by `image_name`, frame by time: one name stands for all instants."""
         frame = frame_of_time(self._time(camera), self.duration, self.first_frame)
         return PriorKey(PurePosixPath(str(camera.image_name)).stem, frame)

@@ -1,4 +1,4 @@
-"""What the adapters of the bundled backbones share: they watch one model's choke points and remember its render."""
+"""What the adapters of the bundled backbones share: they hear of one model's changes and remember its renders."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from typing import Generic, TypeVar
 import torch
 from torch import Tensor
 
-from d2_plugin.backbones.model import SplatModel
+from d2_plugin.backbones.model import Observer, SplatModel
 from d2_plugin.protocol import RasterSettings, Render, ResizeListener, Splats, View
+
+from .renders import Renders
 
 Model = TypeVar("Model", bound=SplatModel)
 
 
-class WatchedModel(Generic[Model]):
-    """Wraps one model: its two structural functions report every change, its renders are remembered.
+class WatchedModel(Observer, Generic[Model]):
+    """One model and what it tells its observers: every change of its Gaussians, and every render.
 
     An adapter of a bundled backbone adds `insert`; everything else of the contract is here.
     """
@@ -22,8 +24,8 @@ class WatchedModel(Generic[Model]):
     def __init__(self, model: Model) -> None:
         self.model = model
         self._listeners: list[ResizeListener] = []
-        self._rendered: tuple[View, Tensor, Tensor] | None = None
-        self._watch(model)
+        self._renders: Renders[tuple[Tensor, Tensor]] = Renders()
+        model.observers.append(self)
 
     @property
     def settings(self) -> RasterSettings:
@@ -50,31 +52,22 @@ class WatchedModel(Generic[Model]):
         self._listeners.append(listener)
 
     def rendered_depth(self, view: View) -> tuple[Tensor, Tensor] | None:
-        """Depth sum and alpha of the render the trainer has just made of this view, or None; hands it out once."""
-        rendered, self._rendered = self._rendered, None
-        if rendered is None or rendered[0] is not view:
-            return None
-        return rendered[1:]
+        """Depth sum and alpha of the trainer's render of this view in the present step, or None; hands it out once."""
+        return self._renders.take(view)
 
-    def _watch(self, model: Model) -> None:
-        """Override the choke points on the instance: internal calls go through `self.`, so all are seen."""
-        append, select, render = model.append, model.select, model.render
+    def resized(self, index: Tensor) -> None:
+        """The model's Gaussians changed, by its own densification or through this adapter."""
+        self._tell(index)
 
-        def watched_append(rows: dict[str, Tensor]) -> None:
-            before = torch.arange(len(model), device=model.gaussians.device)
-            append(rows)
-            self._tell(torch.cat([before, before.new_full((len(model) - len(before),), -1)]))
+    def rendered(self, view: View, render: Render) -> None:
+        """Remember what the model has rendered; without gradients it only ends what was remembered of the view."""
+        self._renders.take(view)
+        if render.alpha.requires_grad:
+            self._renders.put(view, (render.depth_sum, render.alpha))
 
-        def watched_select(index: Tensor) -> None:
-            select(index)
-            self._tell(index)
-
-        def watched_render(view: View, background: Tensor | None = None) -> Render:
-            output = render(view, background)
-            self._rendered = (view, output.depth_sum, output.alpha) if output.alpha.requires_grad else None
-            return output
-
-        model.append, model.select, model.render = watched_append, watched_select, watched_render
+    def optimized(self) -> None:
+        """The parameters changed: what was rendered with the old ones is of no more use."""
+        self._renders.forget()
 
     def _tell(self, index: Tensor) -> None:
         for listener in self._listeners:

@@ -10,42 +10,44 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d
 from d2_plugin.gaussians.slicing import slice_gaussians, unit_quaternions
 from d2_plugin.rasterizer import Splats, View
+from d2_plugin.settings import NotNegative, Positive, Seed, Share
 
 from .deform_fields import Box, Field, HexPlaneField, HexPlaneSettings, MlpField, MlpSettings, Offsets
 from .model import SplatModel, SplatSettings, decayed_rate, shared_rates
-from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, settings_of
+from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, refuse_temporal
 from .trainer import Trainer, TrainSettings
 
 __all__ = ["Deform", "DeformSettings", "TrainSettings", "Trainer", "create", "initial_rows", "settings_from"]
 
-FIELDS = ("mlp", "hexplane")
-
 
 @dataclass(frozen=True)
 class DeformSettings(SplatSettings):
-    """Model and optimizers of the backbone; fractions are of the run's iterations."""
+    """Model and optimizers of the backbone."""
 
-    field: str = "mlp"
-    """"mlp" or "hexplane"."""
-    warm_up: float = 0.075
-    """Fraction of the run without deformation: the canonical Gaussians settle first (official: 3000 of 40000)."""
-    time_noise: float = 5e-3
-    """Standard deviation of the noise on a training step's time, as a fraction of the duration, at the first step; it
-    falls to zero at half of the run (official: a tenth of the frame interval, real scenes)."""
-    field_decay: float = 0.1
-    """Learning rates of the field at the last step, as a fraction of the first; exponential in between."""
-    seed: int = 0
-    """Of the field's start and of the noise on time; the global random state is never used."""
+    field: Literal["mlp", "hexplane"] = "mlp"
+    """Kind of the deformation field."""
+    warm_up: Share = 0.075
+    """Share of the run without deformation: the canonical Gaussians settle first. Official: 3000 of 40000 steps."""
+    time_noise: NotNegative = 5e-3
+    """Standard deviation of the noise on a training step's time at the first step, as a share of the duration; it falls
+    to zero at half of the run. Official: a tenth of the frame interval, in real scenes."""
+    field_decay: Positive = 0.1
+    """Learning rates of the field at the last step, as a share of the first; exponential in between."""
+    seed: Seed = 0
+    """Seed of the field's start and of the noise on time; the global random state is never used."""
     mlp: MlpSettings = dataclasses.field(default_factory=MlpSettings)
+    """The network of a field of kind "mlp"."""
     hexplane: HexPlaneSettings = dataclasses.field(default_factory=HexPlaneSettings)
+    """The planes of a field of kind "hexplane"."""
 
 
 class Deform(SplatModel):
@@ -82,7 +84,7 @@ class Deform(SplatModel):
         return cls(rows, settings, extent, duration, Box.around(positions, extent))
 
     def slice_at(self, view: View) -> Splats:
-        """The 3D Gaussians at `view.time`, differentiable; before or after the scene they rest where they were or are.
+        """The 3D Gaussians at `view.time`, differentiable; a time outside the scene shows its first or last instant.
 
         With gradients enabled the time is that of the present training step, noise included.
 
@@ -103,7 +105,7 @@ class Deform(SplatModel):
 
     def offsets(self, positions: Tensor, time: float) -> Offsets | None:
         """What the field adds at canonical `positions` [K, 3]; None where nothing is deformed (warm-up, no time)."""
-        if not self.deforms or not len(positions):
+        if self.field is None or not self.deforms or not len(positions):
             return None
         return self.field(positions, time / self.duration)
 
@@ -113,7 +115,7 @@ class Deform(SplatModel):
 
     def regularization(self) -> Tensor | float:
         """What keeps the field smooth."""
-        return self.field.regularization() if self.deforms else 0.0
+        return self.field.regularization() if self.field is not None and self.deforms else 0.0
 
     def optimize(self, step: int, iterations: int) -> None:
         """One step of both optimizers, gradients cleared; learning rates and noise for the next step set."""
@@ -128,9 +130,9 @@ class Deform(SplatModel):
         strength = max(1 - 2 * step / max(iterations, 1), 0.0) * self.settings.time_noise * self.duration
         self._noise = strength * torch.randn((), generator=self._generator).item()
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         """Gaussians and field with their optimizers, and the noise: enough for a bitwise continuation."""
-        state: dict[str, object] = {"gaussians": super().state_dict()}
+        state: dict[str, Any] = {"gaussians": super().state_dict()}
         if self.field is not None:
             state |= {
                 "field": {name: value.clone() for name, value in self.field.state_dict().items()},
@@ -141,7 +143,7 @@ class Deform(SplatModel):
             }
         return state
 
-    def load_state_dict(self, state: Mapping[str, object]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`."""
         super().load_state_dict(state["gaussians"])
         if self.field is not None:
@@ -166,16 +168,14 @@ def initial_rows(
     return rows | {"rotations": identity_quaternions(len(positions), positions)}
 
 
-def settings_from(table: Mapping[str, object], temporal: bool = True) -> DeformSettings:
+def settings_from(table: Mapping[str, Any], temporal: bool = True) -> DeformSettings:
     """`DeformSettings` from a plain table with tables "mlp", "hexplane", "densify" and "raster" inside.
 
     Raises:
-        D2Error: a name is unknown.
+        D2Error: an unknown name; a value of the wrong type or out of range.
     """
-    settings = settings_of(DeformSettings, table, temporal)
-    if settings.field not in FIELDS:
-        raise unknown_name("deformation field", settings.field, FIELDS)
-    return settings
+    chosen = DeformSettings.from_dict(refuse_temporal(table), "backbone")
+    return dataclasses.replace(chosen, temporal=temporal)
 
 
 def create(
@@ -186,7 +186,7 @@ def create(
     extent: float,
     duration: float,
     temporal: bool,
-    settings: Mapping[str, object] | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> Deform:
     """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults.
 

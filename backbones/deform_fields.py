@@ -13,11 +13,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from d2_plugin.errors import D2Error
+from d2_plugin.settings import AtLeastOne, Count, NotNegative, Settings
 
 SPLITS = (3, 4, 3)
 """Columns of the last layer: offsets of position, quaternion and log-scales."""
@@ -35,44 +38,51 @@ class Offsets(NamedTuple):
 
 
 @dataclass(frozen=True)
-class MlpSettings:
+class MlpSettings(Settings):
     """Network of `MlpField`."""
 
-    width: int = 64
-    """Neurons of a hidden layer (official: 256, on a GPU)."""
-    depth: int = 4
-    """Hidden layers, with a skip connection to the middle one (official: 8)."""
-    position_octaves: int = 6
-    """Frequencies of the encoding of positions (official: 10)."""
-    time_octaves: int = 6
-    """Frequencies of the encoding of time (official: 10, or 6 for synthetic scenes)."""
-    rate: float = 2e-4
-    """Learning rate of the network at the first step (official: 8e-4; studio, four views, backbone alone, 2000 steps,
-    held-out PSNR of seeds 0 and 1: 24.5, 24.6 dB at 2e-4; of seed 0: 23.5 at 5e-4)."""
+    width: AtLeastOne = 64
+    """Neurons of a hidden layer. Official: 256, on a GPU."""
+    depth: AtLeastOne = 4
+    """Hidden layers, with a skip connection to the middle one. Official: 8."""
+    position_octaves: Count = 6
+    """Frequencies of the encoding of positions. Official: 10."""
+    time_octaves: Count = 6
+    """Frequencies of the encoding of time. Official: 10, or 6 for synthetic scenes."""
+    rate: NotNegative = 2e-4
+    """Learning rate of the network at the first step. Official: 8e-4.
+    Studio, four views, backbone alone, 2000 steps, held-out PSNR: 24.5, 24.6 dB at 2e-4 (seeds 0, 1), 23.5 at 5e-4
+    (seed 0)."""
 
 
 @dataclass(frozen=True)
-class HexPlaneSettings:
+class HexPlaneSettings(Settings):
     """Planes and network of `HexPlaneField`."""
 
-    features: int = 16
+    features: AtLeastOne = 16
     """Channels of each plane."""
-    resolutions: tuple[int, ...] = (16, 32)
-    """Nodes of the planes along each axis of space, one number per level (official: 64 and 128)."""
-    instants: int = 10
-    """Nodes of the planes along time (official: half the number of frames)."""
-    width: int = 64
+    resolutions: tuple[AtLeastOne, ...] = (16, 32)
+    """Nodes of the planes along each axis of space, one number per level. Official: 64 and 128."""
+    instants: AtLeastOne = 10
+    """Nodes of the planes along time. Official: half the number of frames."""
+    width: AtLeastOne = 64
     """Neurons of the hidden layer."""
-    plane_rate: float = 1e-2
+    plane_rate: NotNegative = 1e-2
     """Learning rate of the planes at the first step."""
-    network_rate: float = 3e-4
-    """Learning rate of the network at the first step (as above: 25.8, 25.0 dB at 3e-4; of seed 0: 25.3 at 1e-3)."""
-    smooth_space: float = 2e-4
-    """Weight of the squared second differences of planes in space (official name: plane_tv_weight)."""
-    smooth_time: float = 1e-3
-    """Weight of the squared second differences along time (time_smoothness_weight)."""
-    still: float = 1e-4
-    """Weight of |1 - plane| of the planes with time: a plane of ones changes nothing (l1_time_planes)."""
+    network_rate: NotNegative = 3e-4
+    """Learning rate of the network at the first step.
+    Studio, as for `MlpSettings.rate`: 25.8, 25.0 dB at 3e-4 (seeds 0, 1), 25.3 at 1e-3 (seed 0)."""
+    smooth_space: NotNegative = 2e-4
+    """Weight of the squared second differences of planes in space. Official name: plane_tv_weight."""
+    smooth_time: NotNegative = 1e-3
+    """Weight of the squared second differences along time. Official name: time_smoothness_weight."""
+    still: NotNegative = 1e-4
+    """Weight of |1 - plane| of the planes with time: a plane of ones changes nothing. Official name: l1_time_planes."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.resolutions:
+            raise D2Error("setting resolutions has no level: give at least one number of nodes")
 
 
 class Box(NamedTuple):
@@ -114,7 +124,7 @@ class Field(nn.Module, ABC):
         """The last layer [N, 10] for places [N, 3] in units of the box, -1..1 inside."""
 
     @abstractmethod
-    def parameter_groups(self) -> list[dict[str, object]]:
+    def parameter_groups(self) -> list[dict[str, Any]]:
         """Groups for an optimizer: params, lr, name."""
 
     def regularization(self) -> Tensor | float:
@@ -148,7 +158,7 @@ class MlpField(Field):
             state = F.relu(state + enters[1] if i == self.skip else state)
         return self.heads(state)
 
-    def parameter_groups(self) -> list[dict[str, object]]:
+    def parameter_groups(self) -> list[dict[str, Any]]:
         """One group: the network."""
         return [{"params": list(self.parameters()), "lr": self.settings.rate, "name": "network"}]
 
@@ -172,7 +182,7 @@ class HexPlaneField(Field):
         levels = [self._level(space, time, inside, fraction) for space, time in zip(self.space, self.time)]
         return self.heads(F.relu(self.features(torch.cat(levels).T)))
 
-    def parameter_groups(self) -> list[dict[str, object]]:
+    def parameter_groups(self) -> list[dict[str, Any]]:
         """Two groups: planes and network."""
         planes = [*self.space, *self.time]
         network = [*self.features.parameters(), *self.heads.parameters()]

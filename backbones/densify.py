@@ -9,6 +9,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from d2_plugin.settings import Count, Every, NotNegative, Positive, Settings, Share, Steps
+
 from .gaussians import Gaussians
 
 
@@ -25,30 +27,31 @@ class Growable(Protocol):
 
 
 @dataclass(frozen=True)
-class DensifySettings:
-    """When the backbone clones, splits, prunes and resets; fractions are of the run's iterations."""
+class DensifySettings(Settings):
+    """When the backbone clones, splits, prunes and resets."""
 
     enabled: bool = True
-    start: float = 0.05
-    """Fraction of the run before the first edit."""
-    stop: float = 0.6
-    """Fraction of the run after the last edit."""
-    every: int = 100
+    """Whether the backbone changes the number of its Gaussians at all."""
+    start: Share = 0.05
+    """Share of the run before the first edit."""
+    stop: Share = 0.6
+    """Share of the run after which there are no more edits."""
+    every: Every = 100
     """Steps between edits."""
-    gradient: float = 1e-3
-    """Mean screen-space gradient (in units of half the image) above which a Gaussian is cloned or split. Studio, four
-    views, backbone alone, 2000 steps, seeds 0 1 2, held-out PSNR: 25.4, 24.9, 26.1 dB at 1e-3 (4,300 Gaussians), 26.4,
-    24.3, 23.9 at 5e-4 (10,700); the official 2e-4 with few views only overfits."""
-    dense_fraction: float = 0.01
+    gradient: NotNegative = 1e-3
+    """Mean screen-space gradient (in units of half the image) above which a Gaussian is cloned or split.
+    Studio, four views, backbone alone, 2000 steps, seeds 0 1 2, held-out PSNR: 25.4, 24.9, 26.1 dB at 1e-3 (4,300
+    Gaussians); 26.4, 24.3, 23.9 dB at 5e-4 (10,700). The official 2e-4 only overfits where there are few views."""
+    dense_fraction: Positive = 0.01
     """Gaussians larger than this fraction of the extent are split, smaller ones cloned."""
-    opacity: float = 0.005
+    opacity: Share = 0.005
     """Gaussians below this opacity are pruned."""
-    scale_fraction: float = 0.5
+    scale_fraction: Positive = 0.5
     """Gaussians larger than this fraction of the extent are pruned."""
-    reset_every: int = 0
-    """Steps between opacity resets to 0.01; 0 never resets (official: every 3000 of 30000 steps; in runs of some
-    thousand steps a reset costs 1 dB on studio)."""
-    budget: int = 100_000
+    reset_every: Steps = 0
+    """Steps between opacity resets to 0.01; 0 never resets.
+    Official: every 3000 of 30000 steps. In runs of some thousand steps a reset costs 1 dB on studio."""
+    budget: Count = 100_000
     """No growth beyond this number of Gaussians."""
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -58,7 +59,7 @@ class Gaussians:
         """Set one named tensor and forget its moments (an opacity reset, for instance)."""
         self._replace(name, lambda old: values.to(old), keep_moments=False)
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         """Everything that an exact continuation needs."""
         return {
             "parameters": {name: value.detach().clone() for name, value in self.parameters.items()},
@@ -66,7 +67,7 @@ class Gaussians:
             "optimizer": self.optimizer.state_dict(),
         }
 
-    def load_state_dict(self, state: Mapping[str, object]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`, whatever the present number of Gaussians."""
         for name, value in state["parameters"].items():
             self._replace(name, lambda old, new=value: new.to(old), keep_moments=False)
@@ -74,7 +75,9 @@ class Gaussians:
         self.optimizer.load_state_dict(state["optimizer"])
 
     @torch.no_grad()
-    def _replace(self, name: str, change, zeros: Tensor | None = None, keep_moments: bool = True) -> None:
+    def _replace(
+        self, name: str, change: Callable[..., Tensor], zeros: Tensor | None = None, keep_moments: bool = True
+    ) -> None:
         """Swap one Parameter for a changed one, its Adam moments changed alike (`zeros`: rows appended with none)."""
         old = self.parameters[name]
         new = nn.Parameter(change(old.detach()).contiguous())

@@ -6,12 +6,15 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
+from d2_plugin.errors import D2Error
 from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
+from d2_plugin.settings import NotNegative, Positive, Range, Settings
 
 from .densify import DensifySettings, densify
 from .gaussians import Gaussians
@@ -21,28 +24,45 @@ STATISTICS = ("screen_gradient", "seen")
 
 
 @dataclass(frozen=True)
-class SplatSettings:
-    """Gaussians and their optimizer; learning rates are per step, positions' relative to the scene's extent."""
+class SplatSettings(Settings):
+    """Gaussians and their optimizer; learning rates are per step, those of positions relative to the extent."""
 
     temporal: bool = True
     """False leaves time out: these are ordinary 3D Gaussians."""
-    sh_degree: int = 0
-    """Degree of the view-dependent colour, 0..3."""
-    position_rate: float = 3e-4
-    """Learning rate of positions times the extent of the scene, at the first step (studio, native 4D Gaussians alone,
-    held-out PSNR after 1210 steps: 25.3 dB; 24.9 at 1e-4)."""
-    position_rate_final: float = 3e-6
+    sh_degree: Annotated[int, Range(0, 3)] = 0
+    """Degree of the view-dependent colour."""
+    position_rate: Positive = 3e-4
+    """Learning rate of positions at the first step, times the extent of the scene.
+    Studio, native 4D Gaussians alone, held-out PSNR after 1210 steps: 25.3 dB at 3e-4, 24.9 at 1e-4."""
+    position_rate_final: Positive = 3e-6
     """The same at the last step; exponential in between."""
-    scale_rate: float = 1e-2
-    """Of log-scales (as above: 24.6 dB at 5e-3, 24.9 at 2e-2)."""
-    rotation_rate: float = 2e-3
-    opacity_rate: float = 5e-2
-    """Of opacity logits (as above: 24.5 dB at 2e-2)."""
-    color_rate: float = 1e-2
-    """Of the constant term; higher harmonics learn at a twentieth of it."""
-    initial_opacity: float = 0.1
+    scale_rate: NotNegative = 1e-2
+    """Learning rate of log-scales. As above: 24.6 dB at 5e-3, 25.3 at 1e-2, 24.9 at 2e-2."""
+    rotation_rate: NotNegative = 2e-3
+    """Learning rate of quaternions."""
+    opacity_rate: NotNegative = 5e-2
+    """Learning rate of opacity logits. As above: 24.5 dB at 2e-2, 25.3 at 5e-2."""
+    color_rate: NotNegative = 1e-2
+    """Learning rate of the constant colour; higher harmonics learn at a twentieth of it."""
+    initial_opacity: Annotated[float, Range(0, 1, open_low=True)] = 0.1
+    """Opacity of the Gaussians at the start."""
     raster: RasterSettings = field(default_factory=RasterSettings)
+    """Constants of the rasterizer."""
     densify: DensifySettings = field(default_factory=DensifySettings)
+    """The backbone's own density control."""
+
+
+class Observer:
+    """What somebody may want to hear of a model: an entry of `SplatModel.observers`; here nothing is done with it."""
+
+    def resized(self, index: Tensor) -> None:
+        """The Gaussians changed: row r was row index[r] before, -1 for a new one."""
+
+    def rendered(self, view: View, render: Render) -> None:
+        """The model has rendered a view."""
+
+    def optimized(self) -> None:
+        """The parameters have changed their values."""
 
 
 class SplatModel(ABC):
@@ -58,6 +78,7 @@ class SplatModel(ABC):
         self.settings, self.extent = settings, extent
         self.gaussians = Gaussians(rows, {name: learning_rates[name] for name in rows})
         self.gaussians.statistics = {name: rows["positions"].new_zeros(len(rows["positions"])) for name in STATISTICS}
+        self.observers: list[Observer] = []
         self.screen_offsets: Tensor | None = None
         self._drawn: Tensor | None = None
 
@@ -92,9 +113,12 @@ class SplatModel(ABC):
         colors = self.colors(view, splats)
         self._drawn = splats.rows
         self.screen_offsets = splats.means.new_zeros(len(splats.means), 2, requires_grad=torch.is_grad_enabled())
-        return rasterize(
+        render = rasterize(
             splats, colors, view, self.settings.raster, background=background, screen_offsets=self.screen_offsets
         )
+        for observer in self.observers:
+            observer.rendered(view, render)
+        return render
 
     def regularization(self) -> Tensor | float:
         """A term of the training loss that concerns no picture; 0.0 where there is none."""
@@ -103,6 +127,8 @@ class SplatModel(ABC):
     @torch.no_grad()
     def accumulate(self, view: View) -> None:
         """After backward: add the last render's screen-space gradient, in units of half the image, per Gaussian."""
+        if self.screen_offsets is None or self.screen_offsets.grad is None or self._drawn is None:
+            raise D2Error("there is no screen-space gradient yet: render a view and go backward before accumulate")
         gradient = self.screen_offsets.grad
         half = gradient.new_tensor([view.width / 2, view.height / 2])
         length = (gradient * half).norm(dim=-1)
@@ -117,6 +143,8 @@ class SplatModel(ABC):
         s = self.settings
         rate = decayed_rate(s.position_rate, s.position_rate_final, step, iterations)
         self.gaussians.set_learning_rate("positions", rate * self.extent)
+        for observer in self.observers:
+            observer.optimized()
 
     def densify(self, step: int, iterations: int, generator: torch.Generator) -> None:
         """The backbone's own clone, split, prune and opacity reset where `settings.densify` schedules them."""
@@ -124,17 +152,26 @@ class SplatModel(ABC):
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Add Gaussians (raw rows by name, [K, ...]) at the end. All growth goes through here."""
+        before = len(self)
         self.gaussians.append(rows)
+        index = torch.arange(len(self), device=self.gaussians.device)
+        index[before:] = -1
+        self._tell(index)
 
     def select(self, index: Tensor) -> None:
         """Keep the rows `index`. All shrinking and reordering goes through here."""
         self.gaussians.select(index)
+        self._tell(index)
 
-    def state_dict(self) -> dict[str, object]:
+    def _tell(self, index: Tensor) -> None:
+        for observer in self.observers:
+            observer.resized(index)
+
+    def state_dict(self) -> dict[str, Any]:
         """Parameters, statistics and optimizer: enough for a bitwise continuation."""
         return self.gaussians.state_dict()
 
-    def load_state_dict(self, state: Mapping[str, object]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`."""
         self.gaussians.load_state_dict(state)
 

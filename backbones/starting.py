@@ -1,20 +1,15 @@
-"""What a backbone starts from: coloured points as isotropic Gaussians, and its settings from a plain table."""
+"""What a backbone starts from: coloured points as isotropic Gaussians."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
-from typing import TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error
 from d2_plugin.gaussians import spherical_harmonics as sh
-
-from .model import SplatSettings
-
-Settings = TypeVar("Settings", bound=SplatSettings)
 
 
 def isotropic_rows(
@@ -53,25 +48,8 @@ def nearest_neighbour_scales(positions: Tensor, neighbours: int = 3) -> Tensor:
     return torch.cat(chunks)[:, 1:].square().mean(-1).sqrt().clamp(min=1e-7)
 
 
-def settings_of(kind: type[Settings], table: Mapping[str, object], temporal: bool) -> Settings:
-    """Settings of a backbone from a plain table, with a table inside for each setting that is a dataclass itself.
-
-    Raises:
-        D2Error: a name is unknown, or a table is none.
-    """
-    chosen = dict(table)
-    for name, part in ((entry.name, entry.default_factory) for entry in fields(kind)):
-        if is_dataclass(part):
-            chosen[name] = part(**_known(name, part, chosen.get(name, {})))
-    return kind(temporal=temporal, **_known("backbone", kind, chosen, {"temporal"}))
-
-
-def _known(name: str, kind: type, values: object, taken: set[str] = frozenset()) -> Mapping[str, object]:
-    """`values`, if they are a table of settings that `kind` has."""
-    if not isinstance(values, Mapping):
-        raise D2Error(f"backbone.{name} must be a table of settings, got {values!r}: write [backbone.{name}] above it")
-    known = {entry.name for entry in fields(kind)} - taken
-    for key in values:
-        if key not in known:
-            raise unknown_name(f"setting of {name}", key, known)
-    return values
+def refuse_temporal(table: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The table of a backbone as it is, unless it decides whether there is time: that is the plan's to say."""
+    if "temporal" in table:
+        raise D2Error("unknown setting of backbone 'temporal': whether there is time is decided by `[plan] temporal`")
+    return table

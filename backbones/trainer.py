@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from d2_plugin.gaussians.photometric import photometric_loss
 from d2_plugin.rasterizer import Render, View
+from d2_plugin.settings import Seed, Settings, Share, Steps
 
 
 class Model(Protocol):
@@ -24,8 +25,17 @@ class Model(Protocol):
     def accumulate(self, view: View) -> None: ...
     def optimize(self, step: int, iterations: int) -> None: ...
     def densify(self, step: int, iterations: int, generator: torch.Generator) -> None: ...
-    def state_dict(self) -> dict[str, object]: ...
-    def load_state_dict(self, state: Mapping[str, object]) -> None: ...
+    def state_dict(self) -> dict[str, Any]: ...
+    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
+
+
+class Hooks(Protocol):
+    """What the loop needs of D2."""
+
+    def loss(self, step: int, views: Sequence[View]) -> Tensor | float: ...
+    def step(self, step: int) -> Any: ...
+    def state_dict(self) -> dict[str, Any]: ...
+    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
 
 
 class Frames(Protocol):
@@ -37,14 +47,15 @@ class Frames(Protocol):
 
 
 @dataclass(frozen=True)
-class TrainSettings:
+class TrainSettings(Settings):
     """How long and on what loss to train."""
 
-    iterations: int = 3000
-    ssim_weight: float = 0.2
-    """Share of D-SSIM in the photometric loss."""
-    seed: int = 0
-    """Of the order of views and of split samples; the global random state is never used."""
+    iterations: Steps = 3000
+    """Steps to train."""
+    ssim_weight: Share = 0.2
+    """Share of D-SSIM in the photometric loss; the rest is L1."""
+    seed: Seed = 0
+    """Seed of the order of views and of split samples; the global random state is never used."""
 
 
 class Trainer:
@@ -55,7 +66,7 @@ class Trainer:
         model: Model,
         frames: Frames,
         settings: TrainSettings,
-        attach: Callable[[Model], object] | None = None,
+        attach: Callable[[Any], Hooks] | None = None,
     ) -> None:
         self.model, self.frames, self.settings = model, frames, settings
         self.step = 0
@@ -85,7 +96,7 @@ class Trainer:
             if on_step:
                 on_step(self.step, logged)
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         """Model, sampler and D2: a run resumed from here is bitwise the uninterrupted one."""
         return {
             "step": self.step,
@@ -95,7 +106,7 @@ class Trainer:
             "d2": self.d2.state_dict() if self.d2 is not None else None,
         }
 
-    def load_state_dict(self, state: Mapping[str, object]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`."""
         self.step = state["step"]
         self.model.load_state_dict(state["model"])

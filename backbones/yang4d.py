@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,9 +19,10 @@ from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, rotation_matrices_4d
 from d2_plugin.gaussians.slicing import slice_gaussians, unit_quaternions
 from d2_plugin.rasterizer import Splats, View
+from d2_plugin.settings import Count, NotNegative
 
 from .model import SplatModel, SplatSettings, shared_rates
-from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, settings_of
+from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, refuse_temporal
 from .trainer import Trainer, TrainSettings
 
 __all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "initial_rows", "settings_from"]
@@ -30,9 +32,9 @@ __all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "in
 class Yang4DSettings(SplatSettings):
     """Model and optimizer of the backbone."""
 
-    sh_time_degree: int = 0
-    """Number of cosines in time that modulate the colour (0: constant in time, as without time)."""
-    time_rate: float = 1.6e-3
+    sh_time_degree: Count = 0
+    """Number of cosines in time that modulate the colour; 0: constant in time."""
+    time_rate: NotNegative = 1.6e-3
     """Learning rate of mean times, relative to the duration."""
     couples_time: bool = True
     """False keeps time apart from space: one quaternion instead of two, and every Gaussian stands still while it lives
@@ -123,9 +125,13 @@ def _time_degree(settings: Yang4DSettings) -> int:
     return settings.sh_time_degree if settings.temporal else 0
 
 
-def settings_from(table: Mapping[str, object], temporal: bool = True) -> Yang4DSettings:
-    """`Yang4DSettings` from a plain table with tables "densify" and "raster" inside; a D2Error for unknown names."""
-    return settings_of(Yang4DSettings, table, temporal)
+def settings_from(table: Mapping[str, Any], temporal: bool = True) -> Yang4DSettings:
+    """`Yang4DSettings` from a plain table with tables "densify" and "raster" inside.
+
+    Raises:
+        D2Error: an unknown name; a value of the wrong type or out of range.
+    """
+    return replace(Yang4DSettings.from_dict(refuse_temporal(table), "backbone"), temporal=temporal)
 
 
 def create(
@@ -136,7 +142,7 @@ def create(
     extent: float,
     duration: float,
     temporal: bool,
-    settings: Mapping[str, object] | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> Yang4D:
     """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults."""
     return Yang4D.from_points(positions, colors, times, settings_from(settings or {}, temporal), extent, duration)

@@ -10,29 +10,28 @@ from __future__ import annotations
 import logging
 import warnings
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from d2_plugin.config import HOOKS, D2Config
+from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
-from d2_plugin.hooks import Context, Densify, DepthLoss, Hook, PriorLoader, Prune
+from d2_plugin.hooks import Context, Hook, PriorLoader
+from d2_plugin.hooks.prior import Store
+from d2_plugin.hooks.table import HOOKS
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Backbone, Edit, Points
 from d2_plugin.registry import ADAPTERS, load
 
 _log = logging.getLogger(__name__)
 
-STRUCTURE = ("densify", "prune")
-"""Hooks that edit Gaussians; each of their evaluations surveys several views."""
 
-_CLASSES: dict[str, Callable[[Any], Hook]] = {"densify": Densify, "prune": Prune, "depth_loss": DepthLoss}
-
-
-class Trace(NamedTuple):
+@dataclass(frozen=True)
+class Trace:
     """One thing a hook did: `action` is "loss", "insert", "remove" or "retire"; `count` is the number of Gaussians."""
 
     step: int
@@ -56,10 +55,10 @@ class D2Hooks:
     the global random state is never touched.
     """
 
-    def __init__(self, config: D2Config, backbone: Backbone, store: object | None = None) -> None:
+    def __init__(self, config: D2Config, backbone: Backbone, store: Store | None = None) -> None:
         """`store` is anything with `prior(camera, frame) -> DepthPrior | None`; by default the folder config.prior."""
         self.config, self.backbone = config, backbone
-        self.hooks: dict[str, Hook] = {name: _CLASSES[name](getattr(config, name)) for name in config.hooks}
+        self.hooks: dict[str, Hook] = {name: HOOKS[name].hook(getattr(config, name)) for name in config.hooks}
         self.trace: deque[Trace] = deque(maxlen=1000)
         self.generator = torch.Generator().manual_seed(config.seed)
         self._sampler = ViewSampler()
@@ -74,7 +73,7 @@ class D2Hooks:
 
     @classmethod
     def from_config(
-        cls, config: str | Path | Mapping[str, Any] | D2Config, backbone: Backbone, store: object | None = None
+        cls, config: str | Path | Mapping[str, Any] | D2Config, backbone: Backbone, store: Store | None = None
     ) -> D2Hooks:
         """From a TOML file, a mapping or a D2Config."""
         if isinstance(config, (str, Path)):
@@ -100,7 +99,7 @@ class D2Hooks:
         """
         if not self.hooks:
             return 0.0
-        self._check_count()
+        self._begin(step)
         batch = views if isinstance(views, (list, tuple)) else [views]
         converted = [self.backbone.view(camera) for camera in batch]
         self._sampler.add(converted)
@@ -118,7 +117,7 @@ class D2Hooks:
         """Insert and remove what the hooks ask for, in one edit; call after the optimizer's step and zero_grad."""
         if not self.hooks:
             return Report(gaussians=len(self.backbone))
-        self._check_count()
+        self._begin(step)
         context = self._context(step, ())
         proposals = [(name, hook.edit(context)) for name, hook in self._due(step)]
         edits = [(name, edit) for name, edit in proposals if edit is not None]
@@ -153,6 +152,13 @@ class D2Hooks:
         self._idle, self.retired = dict(state["idle"]), dict(state["retired"])
         self._count = len(self.backbone)
 
+    def _begin(self, step: int) -> None:
+        """Tell the backbone which step this is, where it wants to know, and notice what nobody reported."""
+        begin = getattr(self.backbone, "begin_step", None)
+        if begin is not None:
+            begin(step)
+        self._check_count()
+
     def _due(self, step: int) -> list[tuple[str, Hook]]:
         active = getattr(self.backbone, "active", None)
         if active is not None and not active(step):
@@ -168,7 +174,7 @@ class D2Hooks:
     def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
         """Leave out a structure hook whose last evaluations changed next to nothing: its surveys cost time."""
         config, hook = self.config, self.hooks[name]
-        if not config.retire_after or name not in STRUCTURE or not context.evaluation:
+        if not config.retire_after or not HOOKS[name].edits_structure or not context.evaluation:
             return
         changed = edit is not None and edit.changes >= max(config.retire_below * len(self.backbone), 1)
         self._idle[name] = 0 if changed else self._idle[name] + 1
@@ -216,7 +222,7 @@ class D2Hooks:
         self._count = len(self.backbone)
 
 
-def _open_store(path: str | None) -> object:
+def _open_store(path: str | None) -> Store:
     if path is None:
         raise D2Error(f"{', '.join(HOOKS)} need a depth prior: set `prior` to the folder that `d2 priors` wrote")
     from d2_plugin.priors.store import PriorStore

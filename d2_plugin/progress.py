@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Any, Protocol
 
 
 class Bar(Protocol):
@@ -33,7 +33,7 @@ class _Lines:
 
 
 class _Rich:
-    def __init__(self, progress: object, task: object) -> None:
+    def __init__(self, progress: Any, task: Any) -> None:
         self._progress, self._task = progress, task
 
     def update(self, done: int, note: str = "") -> None:

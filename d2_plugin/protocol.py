@@ -10,9 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
+
+from d2_plugin.settings import Range, Settings, Share
 
 
 class Label(IntEnum):
@@ -95,7 +97,9 @@ class DepthPrior(NamedTuple):
 
     @property
     def trusted(self) -> Tensor:
-        """Pixels that may prune and supervise, bool [H, W]: Omega^v, and what two cameras agree on."""
+        """Pixels that may prune and supervise, bool [H, W]: Omega^v, and what the maps of two cameras agree on.
+
+        Where the paper sums over Omega^v, the hooks sum over these."""
         return self.verified | (self.labels == Label.AGREED)
 
     @property
@@ -112,20 +116,20 @@ class CameraRecord(NamedTuple):
 
 
 @dataclass(frozen=True)
-class RasterSettings:
+class RasterSettings(Settings):
     """Constants of splatting; the defaults are those of the Inria rasterizer, which most backbones were tuned with."""
 
-    near: float = 0.2
-    """Gaussians with a view depth z <= near are not drawn; world units."""
-    blur: float = 0.3
-    """Added to both diagonal entries of the projected covariance; pixels squared."""
-    alpha_max: float = 0.99
+    near: Annotated[float, Range(0, unit="world units", open_low=True)] = 0.2
+    """Gaussians with a view depth z <= near are not drawn."""
+    blur: Annotated[float, Range(0, unit="pixels squared")] = 0.3
+    """Added to both diagonal entries of the projected covariance."""
+    alpha_max: Annotated[float, Range(0, 1, open_low=True, open_high=True)] = 0.99
     """Upper clamp of alpha; no gradient flows through a clamped alpha."""
-    alpha_min: float = 1 / 255
+    alpha_min: Share = 1 / 255
     """Contributions with a smaller alpha are skipped."""
-    transmittance_min: float = 1e-4
+    transmittance_min: Share = 1e-4
     """A pixel is finished before the Gaussian that would bring its transmittance to this value or below."""
-    fov_clamp: float = 1.3
+    fov_clamp: Annotated[float, Range(0, open_low=True, infinite=True)] = 1.3
     """x/z and y/z are clamped to this multiple of tan(fov/2) in the projection's Jacobian."""
 
 
@@ -140,13 +144,14 @@ class Render(NamedTuple):
 class Survey(NamedTuple):
     """Compositing weights of one view, gathered per Gaussian (M rows of the surveyed `Splats`) and per pixel.
 
-    Per Gaussian, with w its weight at a pixel (paper: w_{k,q}), z its view depth, D* the prior:
+    Per Gaussian, with w its weight at a pixel (paper: w_{k,q}), z its view depth, D* the prior, and trusted pixels as
+    in `DepthPrior.trusted`:
     """
 
-    weight: Tensor  # [M] sum of w over verified pixels
-    error: Tensor  # [M] sum of w |z - D*| / (D* + eps) over verified pixels
+    weight: Tensor  # [M] sum of w over trusted pixels
+    error: Tensor  # [M] sum of w |z - D*| / (D* + eps) over trusted pixels
     max_weight: Tensor  # [M] maximum of w over all pixels; 0 where it contributes nowhere
-    hits: Tensor  # [M] int32, number of verified pixels it contributes to
+    hits: Tensor  # [M] int32, number of trusted pixels it contributes to
     depth_sum: Tensor  # [H, W]
     alpha: Tensor  # [H, W]
 
@@ -159,9 +164,15 @@ ResizeListener = Callable[[Tensor], None]
 class Backbone(Protocol):
     """What the hooks need from a 4D Gaussian model; structural, so nothing has to be inherited.
 
-    Optional members: ``rendered_depth(view) -> (depth_sum, alpha) | None`` when the trainer has just rendered this view
-    and its own output has both with gradients (saves a second render), and ``active(step) -> bool`` when the hooks must
-    wait (stages, warm-up).
+    Optional members:
+
+    ``rendered_depth(view) -> (depth_sum, alpha) | None``
+        where the trainer has rendered this view in the present step and its own output has both with gradients: saves a
+        second render. The views of a batch are told apart by camera and frame.
+    ``begin_step(step) -> None``
+        called with the number of the training step before anything else is asked in it.
+    ``active(step) -> bool``
+        False while the hooks must wait (stages, warm-up); a question, which changes nothing.
     """
 
     settings: RasterSettings
@@ -169,7 +180,7 @@ class Backbone(Protocol):
     def __len__(self) -> int:
         """N, the number of Gaussians."""
 
-    def view(self, camera: object) -> View:
+    def view(self, camera: Any) -> View:
         """The trainer's own camera object as a `View`."""
 
     def slice_at(self, view: View) -> Splats:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.metadata import EntryPoint, entry_points
+from typing import Any
 
 from d2_plugin.errors import unknown_name
 
@@ -18,7 +19,7 @@ def names(group: str) -> list[str]:
     return sorted(_points(group))
 
 
-def load(group: str, name: str) -> object:
+def load(group: str, name: str) -> Any:
     """The registered object of that name; an unknown one is refused with the names that there are."""
     points = _points(group)
     if name not in points:

@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import copy
 import inspect
+import random
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from tiny import ALL_HOOKS, TinyStore, make_model, make_trainer, make_views, parameters, same
+from tiny import ALL_HOOKS, BACKBONES, TinyStore, make_adapter, make_model, make_trainer, make_views, parameters, same
 
 from d2_plugin import D2Config, D2Error, D2Hooks
 from d2_plugin.adapters.yang4d import Yang4DAdapter
 from d2_plugin.backbones import trainer as trainer_module
+from d2_plugin.backbones.trainer import Trainer
 from d2_plugin.config import DensifyConfig, PruneConfig, for_iterations
+from d2_plugin.hooks.densify import sample_pixels
 from d2_plugin.hooks.views import ViewSampler
-from d2_plugin.protocol import Backbone, Points
+from d2_plugin.protocol import Backbone, Points, Splats, View
+from d2_plugin.rasterizer import rasterize
 
 
 def only(*hooks: str) -> D2Config:
@@ -36,12 +42,39 @@ def some_points(count: int) -> Points:
 
 
 def test_adapter_satisfies_the_protocol() -> None:
-    assert isinstance(Yang4DAdapter(make_model()), Backbone)
+    adapter = Yang4DAdapter(make_model())
+    assert isinstance(adapter, Backbone)
+    members = ("settings", "__len__", "view", "slice_at", "insert", "remove", "on_resize")
+    for missing in members:
+        partial = type("Partial", (), {name: getattr(type(adapter), name) for name in members if name != missing})
+        assert not isinstance(partial(), Backbone), missing
 
 
-def test_a_trainer_changes_by_three_lines() -> None:
-    marked = [line for line in inspect.getsource(trainer_module.Trainer).splitlines() if "# D2, line" in line]
-    assert [line.split("# D2, line ")[1][0] for line in marked] == ["1", "2", "3"]
+def trainer_without(*numbers: int) -> type[Trainer]:
+    """The bundled trainer with some of the three lines that attach D2 taken out of its source."""
+    lines = inspect.getsource(Trainer).splitlines()
+    for number in numbers:
+        (index,) = (i for i, line in enumerate(lines) if f"# D2, line {number}" in line)
+        guarded = lines[index - 1].strip() == "if d2 is not None:"
+        del lines[index - 1 if guarded else index : index + 1]
+    space = dict(vars(trainer_module))
+    exec("\n".join(lines), space)
+    space["Trainer"].d2 = None
+    return space["Trainer"]
+
+
+def test_a_trainer_changes_by_three_lines_and_each_does_its_part() -> None:
+    assert inspect.getsource(Trainer).count("# D2, line") == 3
+    bare, without = make_trainer(), make_trainer(ALL_HOOKS, kind=trainer_without(1, 2, 3))
+    bare.run()
+    without.run()
+    assert same(parameters(bare), parameters(without)), "a fourth line attaches D2"
+    done = {}
+    for missing in (None, 2, 3):
+        trainer = make_trainer(ALL_HOOKS, kind=trainer_without(missing) if missing else Trainer)
+        trainer.run()
+        done[missing] = {entry.action for entry in trainer.d2.trace}
+    assert done == {None: {"loss", "insert", "remove"}, 2: set(), 3: {"loss"}}  # line 2 shows the views to survey
 
 
 def test_a_resume_without_the_state_of_d2_differs() -> None:
@@ -64,21 +97,85 @@ def test_each_hook_alone_leaves_only_its_own_trace(hook: str) -> None:
     assert {entry.hook for entry in trainer.d2.trace} == {hook}
 
 
-def test_hooks_never_touch_the_global_random_state() -> None:
-    before = torch.get_rng_state()
-    make_trainer(ALL_HOOKS).run()
-    assert torch.equal(before, torch.get_rng_state())
+def random_states() -> list[object]:
+    """Of the three global generators that a trainer may draw from."""
+    return [torch.get_rng_state().tolist(), np.random.get_state()[1].tolist(), random.getstate()]
 
 
-def test_depth_loss_of_the_trainers_own_render_equals_a_second_render() -> None:
+def test_hooks_never_touch_the_global_random_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, trainer = random_states(), make_trainer(ALL_HOOKS)
+    trainer.run()
+    assert {entry.action for entry in trainer.d2.trace} == {"loss", "insert", "remove"}, "the hooks did nothing"
+    assert random_states() == before
+    for draw in (lambda: torch.rand(1), lambda: np.random.rand(), random.random):
+
+        def drawing(*arguments: object, draw: Callable[[], object] = draw) -> object:
+            draw()
+            return sample_pixels(*arguments)
+
+        monkeypatch.setattr("d2_plugin.hooks.densify.sample_pixels", drawing)
+        make_trainer(ALL_HOOKS, iterations=6).run()
+        assert random_states() != before, "a hook that draws is not noticed"
+        before = random_states()
+
+
+def test_depth_loss_of_the_trainers_own_render_equals_a_second_render(monkeypatch: pytest.MonkeyPatch) -> None:
     model = make_model()
     adapter = Yang4DAdapter(model)
     view = make_views()[0]
     d2 = D2Hooks(only("depth_loss"), adapter, TinyStore())
+    ours = renders_of_ours(monkeypatch)
     model.render(view)
     reused = d2.loss(1, view)
+    assert ours == [], "the trainer's render was not used"
     assert adapter.rendered_depth(view) is None, "the render must be handed out once"
     torch.testing.assert_close(d2.loss(2, view), reused)
+    assert ours == [view]
+    gradients = [torch.autograd.grad(loss, model.gaussians["positions"])[0] for loss in (reused, d2.loss(3, view))]
+    torch.testing.assert_close(*gradients)
+    assert gradients[0].any()
+
+
+def renders_of_ours(monkeypatch: pytest.MonkeyPatch) -> list[View]:
+    """The views that D2 renders itself from now on."""
+    views: list[View] = []
+
+    def counting(splats: Splats, colors: torch.Tensor, view: View, *rest: object) -> object:
+        views.append(view)
+        return rasterize(splats, colors, view, *rest)
+
+    monkeypatch.setattr("d2_plugin.hooks.depth_loss.rasterize", counting)
+    return views
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_every_view_of_a_batch_uses_the_trainers_own_render(backbone: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, views = make_model(backbone=backbone), make_views()[:3]
+    d2 = D2Hooks(only("depth_loss"), make_adapter(model), TinyStore())
+    ours = renders_of_ours(monkeypatch)
+    expected = d2.loss(1, views)
+    assert len(ours) == 3, "the count does not count"
+    ours.clear()
+    for view in reversed(views):
+        model.render(view)
+    torch.testing.assert_close(d2.loss(2, views), expected)
+    assert ours == []
+    for view in views:
+        model.render(view)
+        torch.testing.assert_close(d2.loss(3, view), d2.loss(3, view))  # the second one renders
+    assert ours == views
+
+
+def test_renders_of_an_earlier_step_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, view = make_model(), make_views()[0]
+    adapter = make_adapter(model)
+    model.render(view).color.sum().backward()
+    model.optimize(1, 10)
+    assert adapter.rendered_depth(view) is None
+    model.render(view)
+    with torch.no_grad():
+        model.render(view)
+    assert adapter.rendered_depth(view) is None, "the trainer's last render of this view has no gradients"
 
 
 def test_insertion_keeps_the_densification_evidence_of_the_backbone() -> None:

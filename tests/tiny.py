@@ -93,14 +93,16 @@ ALL_HOOKS = D2Config(
 )
 
 
-def make_trainer(config: D2Config | None = None, iterations: int = 30, **model: object) -> Trainer:
+def make_trainer(
+    config: D2Config | None = None, iterations: int = 30, kind: type[Trainer] = Trainer, **model: object
+) -> Trainer:
     """A trainer of the tiny scene, with D2 attached where a configuration is given."""
 
     def attach(model: SplatModel) -> D2Hooks:
         return D2Hooks.from_config(config, backbone=make_adapter(model), store=TinyStore())
 
     settings = TrainSettings(iterations=iterations, seed=3)
-    return Trainer(make_model(**model), TinyFrames(), settings, attach if config is not None else None)
+    return kind(make_model(**model), TinyFrames(), settings, attach if config is not None else None)
 
 
 def parameters(trainer: Trainer) -> dict[str, Tensor]:

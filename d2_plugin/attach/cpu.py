@@ -37,9 +37,9 @@ class _Event:
 def run_on_cpu() -> None:
     """Make `cuda` mean `cpu` in this process, from here on; cannot be undone."""
     log.warning("there is no GPU: in this process device 'cuda' means 'cpu', and times of CUDA events are 0")
-    torch.Tensor.cuda = lambda self, *_, **__: self
-    torch.nn.Module.cuda = lambda self, *_, **__: self
-    torch.cuda.Event = _Event
+    torch.Tensor.cuda = lambda self, *_, **__: self  # type: ignore[method-assign]
+    torch.nn.Module.cuda = lambda self, *_, **__: self  # type: ignore[method-assign]
+    torch.cuda.Event = _Event  # type: ignore[misc, assignment]
     for name in _NOTHING:
         setattr(torch.cuda, name, lambda *_, **__: None)
     for name in _ZERO:

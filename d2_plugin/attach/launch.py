@@ -55,7 +55,7 @@ def launch(options: argparse.Namespace, command: Sequence[str]) -> Session | Non
         config = D2Config.from_toml(options.d2)
         session = Session(found, config, _store(config, options.exported))
         session.wrap()
-    os.execv = _refuse_restart
+    os.execv = _refuse_restart  # type: ignore[assignment]
     runpy.run_path(str(script), run_name="__main__")
     return session
 

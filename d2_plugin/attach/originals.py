@@ -50,6 +50,8 @@ def _failure(original: Original, folder: Path) -> str | None:
 def _import_file(name: str, path: Path) -> None:
     """Import one file under its full name without its package, whose other imports may fail for other reasons."""
     spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path} is no module that Python can load")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     spec.loader.exec_module(module)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,6 +49,8 @@ class Recipe:
     originals: tuple[Original, ...]
     model: tuple[str, str] = ("scene.gaussian_model", "GaussianModel")
     renderer: tuple[str, str] = ("gaussian_renderer", "render")
+    heard: Callable[[Any, Mapping[str, Any]], None] | None = None
+    """What the adapter learns from the named arguments of each render, where they say something."""
     seen: dict[str, tuple[str, str]] = field(default_factory=lambda: {"scene": ("scene", "Scene")})
     """Classes whose latest instance is remembered, by its field of `Objects`."""
 
@@ -62,7 +64,12 @@ def _deformable3d(adapter: Adapter, objects: Objects) -> Backbone:
 
 
 def _hust4d(adapter: Adapter, objects: Objects) -> Backbone:
-    return adapter(objects.model, objects.scene, "coarse")  # corrected by each render, which knows the stage
+    return adapter(objects.model, objects.scene, "coarse")  # each render says the stage, see `_hear_stage`
+
+
+def _hear_stage(adapter: Any, named: Mapping[str, Any]) -> None:
+    if "stage" in named:
+        adapter.enter_stage(named["stage"])
 
 
 RECIPES = {
@@ -97,6 +104,7 @@ RECIPES = {
         "hust4d",
         _hust4d,
         (Original("diff_gaussian_rasterization", "d2_plugin.compat.depth"), _KNN),
+        heard=_hear_stage,
     ),
 }
 
@@ -110,4 +118,4 @@ def recipe(name: str) -> Recipe:
 
 def adapter_of(found: Recipe) -> Adapter:
     """The adapter of a recipe, by entry point."""
-    return registry.load(registry.ADAPTERS, found.adapter)  # type: ignore[return-value]
+    return registry.load(registry.ADAPTERS, found.adapter)

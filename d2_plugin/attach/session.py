@@ -13,6 +13,7 @@ from torch import Tensor
 
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
+from d2_plugin.hooks.prior import Store
 from d2_plugin.plugin import D2Hooks
 
 from .recipes import Objects, Recipe, adapter_of
@@ -47,7 +48,7 @@ class Session:
     number of pictures that the step before drew, and left out of the very first step, when nobody knows it yet.
     """
 
-    def __init__(self, recipe: Recipe, config: D2Config, store: object | None = None) -> None:
+    def __init__(self, recipe: Recipe, config: D2Config, store: Store | None = None) -> None:
         self.recipe, self.config, self.store = recipe, config, store
         self.objects = Objects()
         self.hooks: D2Hooks | None = None
@@ -74,7 +75,7 @@ class Session:
         return f"{hooks}: {self.inserted} inserted, {self.removed} removed, {len(self.hooks.backbone)} Gaussians"
 
     def _remember(self, kind: type, name: str) -> None:
-        original = kind.__init__
+        original = kind.__init__  # type: ignore[misc]
 
         @wraps(original)
         def remembering(instance: Any, *arguments: Any, **named: Any) -> None:
@@ -82,7 +83,7 @@ class Session:
             setattr(self.objects, name, instance)
             original(instance, *arguments, **named)
 
-        kind.__init__ = remembering
+        kind.__init__ = remembering  # type: ignore[misc]  # a foreign class, overridden for all its instances
 
     def _attaching(self, training_setup: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(training_setup)
@@ -113,19 +114,19 @@ class Session:
             training = torch.is_grad_enabled() and package["render"].requires_grad
             if self.hooks is None or model is not self.objects.model or not training:
                 return package
-            if "stage" in named:
-                self.hooks.backbone.stage = named["stage"]
-            return self._with_loss(camera, package)
+            if self.recipe.heard is not None:
+                self.recipe.heard(self.hooks.backbone, named)
+            return self._with_loss(self.hooks, camera, package)
 
         return rendering
 
-    def _with_loss(self, camera: Any, package: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _with_loss(self, hooks: D2Hooks, camera: Any, package: Mapping[str, Any]) -> Mapping[str, Any]:
         if not self._told:
             self._iteration, self._told = self._iteration + 1, True
         self._drawn += 1
-        rendered = getattr(self.hooks.backbone, "rendered", None)
+        rendered = getattr(hooks.backbone, "rendered", None)
         view = rendered(camera, package) if rendered is not None else camera
-        term = self.hooks.loss(self._iteration, [view])
+        term = hooks.loss(self._iteration, [view])
         if self._batch and isinstance(term, Tensor) and term.requires_grad:
             return {**package, "render": AddGradient.apply(package["render"], term, 1 / self._batch)}
         return package
@@ -146,9 +147,11 @@ class Session:
                 stepped[0] = False
                 self._after_step()
 
-        optimizer.step, optimizer.zero_grad = stepping, zeroing
+        optimizer.step, optimizer.zero_grad = stepping, zeroing  # type: ignore[method-assign]
 
     def _after_step(self) -> None:
+        if self.hooks is None:
+            return
         report = self.hooks.step(self._iteration)
         self._told, self._drawn, self._batch = False, 0, self._drawn
         self.inserted, self.removed = self.inserted + report.inserted, self.removed + report.removed

@@ -12,7 +12,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_4d, time_row
 from d2_plugin.protocol import Splats
 
-from .inria import colors_of, covariances_of, draw, exactly_one, harmonics, in_front, shape_given
+from .inria import colors_of, covariances_of, draw, exactly_one, given, harmonics, in_front, shape_given
 
 MARGINAL_MIN = 0.05
 """Gaussians whose temporal factor is not above this are skipped (forward.cu, computeCov3D_conditional)."""
@@ -79,17 +79,22 @@ class GaussianRasterizer(nn.Module):
             rows = torch.arange(len(means3D), device=means3D.device)
             splats = Splats(means3D, cov3D_precomp, opacities.squeeze(-1), rows)
         else:
-            shape = (scales, scales_t, rotations, rotations_r)
+            shape = (given(scales, "scales"), scales_t, given(rotations, "rotations"), rotations_r)
             splats = self._slice(means3D, opacities.squeeze(-1), ts, shape, prefilter_var)
         if colors_precomp is None:
             # From the unsliced centre, as the CUDA source does.
-            colors = self._colors(shs, means3D, ts, splats.rows)
+            colors = self._colors(given(shs, "shs"), means3D, ts, splats.rows)
         else:
             colors = colors_precomp[splats.rows]
         return self._outputs(splats, colors, flow_2d, means2D, len(means3D))
 
     def _slice(
-        self, means: Tensor, opacities: Tensor, ts: Tensor | None, shape: tuple[Tensor | None, ...], prefilter: float
+        self,
+        means: Tensor,
+        opacities: Tensor,
+        ts: Tensor | None,
+        shape: tuple[Tensor, Tensor | None, Tensor, Tensor | None],
+        prefilter: float,
     ) -> Splats:
         """The Gaussians that live at the settings' timestamp."""
         settings = self.raster_settings
@@ -101,13 +106,12 @@ class GaussianRasterizer(nn.Module):
             raise D2Error("4D Gaussians need ts and scales_t, and rotations_r with rot_4d: pass all of them")
         offset = settings.timestamp - ts.squeeze(-1)
         if not settings.rot_4d:
-            variance = settings.scale_modifier * scales_t.squeeze(
-                -1
-            )  # the original takes scale_t for the variance here
+            # The original takes scale_t for the variance here.
+            variance = settings.scale_modifier * scales_t.squeeze(-1)
             rows, marginal = _alive(offset, variance, prefilter)
             covariances = covariances_of(scales[rows], rotations[rows], settings.scale_modifier)
             return Splats(means[rows], covariances, opacities[rows] * marginal, rows)
-        left, right = rotations.T, rotations_r.T
+        left, right = rotations.T, given(rotations_r, "rotations_r").T
         deviations = settings.scale_modifier * torch.cat([scales, scales_t], -1).T
         variance = (time_row(left, right) * deviations).square().sum(0)
         rows, marginal = _alive(offset, variance, prefilter)
@@ -126,7 +130,7 @@ class GaussianRasterizer(nn.Module):
         if settings.gaussian_dim == 3 or settings.force_sh_3d or degree < 3 or not settings.sh_degree_t:
             return colors_of(shs[rows], degree, means[rows], centre)
         values = harmonics(means[rows], centre, degree)
-        phase = 2 * math.pi * (ts.squeeze(-1)[rows] - settings.timestamp) / settings.time_duration
+        phase = 2 * math.pi * (given(ts, "ts").squeeze(-1)[rows] - settings.timestamp) / settings.time_duration
         waves = torch.stack([torch.cos(n * phase) for n in range(settings.sh_degree_t + 1)], -1)
         products = (waves[:, :, None] * values[:, None]).flatten(1)
         return torch.relu((products[..., None] * shs[rows][:, : products.shape[1]]).sum(1) + 0.5)
@@ -136,7 +140,7 @@ class GaussianRasterizer(nn.Module):
     ) -> tuple[Tensor, ...]:
         settings, background = self.raster_settings, self.raster_settings.bg
         flowing = flow_2d is not None and (flow_2d.requires_grad or bool(flow_2d.any()))
-        if flowing:
+        if flowing and flow_2d is not None:
             colors = torch.cat([colors, flow_2d[splats.rows]], -1)
             background = torch.cat([background, background.new_zeros(2)])
         drawn = draw(settings, splats, colors, background, means2D, count)

@@ -155,8 +155,15 @@ def in_front(positions: Tensor, viewmatrix: Tensor) -> Tensor:
 def exactly_one(what: str, first: object | None, second: object | None) -> None:
     """Raise `D2Error` unless one of two alternatives is given; `what` names them."""
     if (first is None) == (second is None):
-        given = "neither" if first is None else "both"
-        raise D2Error(f"the rasterizer takes either {what}, got {given}: give exactly one")
+        got = "neither" if first is None else "both"
+        raise D2Error(f"the rasterizer takes either {what}, got {got}: give exactly one")
+
+
+def given(value: Tensor | None, name: str) -> Tensor:
+    """The tensor, or a `D2Error` that asks for it."""
+    if value is None:
+        raise D2Error(f"the rasterizer needs {name} for these Gaussians, got None: pass it")
+    return value
 
 
 def shape_given(scales: Tensor | None, rotations: Tensor | None, cov3D_precomp: Tensor | None) -> None:

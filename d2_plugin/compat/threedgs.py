@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Splats
 
-from .inria import Drawn, colors_of, covariances_of, draw, exactly_one, in_front, shape_given
+from .inria import Drawn, colors_of, covariances_of, draw, exactly_one, given, in_front, shape_given
 
 
 class GaussianRasterizationSettings(NamedTuple):
@@ -77,9 +77,10 @@ class GaussianRasterizer(nn.Module):
         exactly_one("shs or colors_precomp", shs, colors_precomp)
         shape_given(scales, rotations, cov3D_precomp)
         if cov3D_precomp is None:
-            cov3D_precomp = covariances_of(scales, rotations, settings.scale_modifier)
+            shape = given(scales, "scales"), given(rotations, "rotations")
+            cov3D_precomp = covariances_of(*shape, settings.scale_modifier)
         if colors_precomp is None:
-            colors_precomp = colors_of(shs, settings.sh_degree, means3D, settings.campos)
+            colors_precomp = colors_of(given(shs, "shs"), settings.sh_degree, means3D, settings.campos)
         rows = torch.arange(len(means3D), device=means3D.device)
         splats = Splats(means3D, cov3D_precomp, opacities.squeeze(-1), rows)
         return draw(settings, splats, colors_precomp, settings.bg, means2D, len(rows), absolute)

@@ -19,12 +19,12 @@ from torch.autograd.function import once_differentiable
 
 from d2_plugin.compiler import NoCompiler, load_library
 from d2_plugin.errors import D2Error
-from d2_plugin.rasterizer import native
 
 from .rotation4d import SMALL_NORM
 
 KERNELS = Path(__file__).parent / "kernels"
-SHARED_HEADERS = (native.KERNELS / "simd.h", native.KERNELS / "parallel.h")
+_RASTERIZER = Path(__file__).parents[1] / "rasterizer" / "kernels"  # no import: only its headers are shared
+SHARED_HEADERS = (_RASTERIZER / "simd.h", _RASTERIZER / "parallel.h")
 FLAGS = ("-ffp-contract=fast",)
 
 STATIC = {"positions": 3, "log_scales": 3, "left": 4, "opacity_logits": 1}
@@ -70,6 +70,14 @@ def library() -> ctypes.CDLL | None:
     return kernel
 
 
+def _kernel() -> ctypes.CDLL:
+    """The kernel, where `can_slice` has found that there is one."""
+    found = library()
+    if found is None:
+        raise NoCompiler("the slice in C++ needs a compiler: take `reference_slice`, which `can_slice` leads to")
+    return found
+
+
 def can_slice(raw: Mapping[str, Tensor]) -> bool:
     """Whether these parameters are the kernel's: float32 on the CPU, where there is a compiler."""
     fit = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in raw.values())
@@ -112,7 +120,7 @@ class _Slice(torch.autograd.Function):
         count = call.drawn
         outputs = raw[0].new_empty(count, 3), raw[0].new_empty(count, 6), raw[0].new_empty(count)
         call.point(means=outputs[0], covariances=outputs[1], opacities=outputs[2])
-        library().d2_slice_forward(call)
+        _kernel().d2_slice_forward(call)
         ctx.constants = (time, cut, limit)
         ctx.save_for_backward(rows, *raw)
         ctx.set_materialize_grads(False)
@@ -131,7 +139,7 @@ class _Slice(torch.autograd.Function):
         call.point(grad_means=incoming[0], grad_covariances=incoming[1], grad_opacities=incoming[2])
         gradients = [torch.empty_like(tensor) for tensor in raw]
         call.point(**{f"grad_{name}": gradient for name, gradient in zip(TEMPORAL, gradients)})
-        library().d2_slice_backward(call)
+        _kernel().d2_slice_backward(call)
         return None, None, None, *gradients
 
 
@@ -150,5 +158,5 @@ def _rows(call: _Call) -> Tensor:
         return torch.arange(call.count)
     rows = torch.empty(call.count, dtype=torch.int64)
     call.point(rows=rows)
-    call.drawn = library().d2_slice_rows(call)
+    call.drawn = _kernel().d2_slice_rows(call)
     return rows[: call.drawn]

@@ -47,6 +47,14 @@ def library() -> ctypes.CDLL | None:
     return kernel
 
 
+def _kernel() -> ctypes.CDLL:
+    """The kernel, where `can_compare` has found that there is one."""
+    found = library()
+    if found is None:
+        raise NoCompiler("the loss in C++ needs a compiler: take `reference_photometric_loss`")
+    return found
+
+
 def can_compare(image: Tensor, target: Tensor) -> bool:
     """Whether these pictures are the kernel's: float32 on the CPU, a fixed target, and there is a compiler."""
     fit = all(part.dtype == torch.float32 and part.device.type == "cpu" for part in (image, target))
@@ -75,7 +83,7 @@ class _Photometric(torch.autograd.Function):
         call.image, call.target = image.data_ptr(), target.data_ptr()
         call.gradient = None if gradient is None else gradient.data_ptr()
         call.differences, call.similarities = sums[0].data_ptr(), sums[1].data_ptr()
-        loss = library().d2_photometric(call)
+        loss = _kernel().d2_photometric(call)
         ctx.save_for_backward(gradient)
         return image.new_tensor(loss)
 

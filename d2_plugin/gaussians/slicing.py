@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from d2_plugin.rasterizer import Splats
+from d2_plugin.protocol import Splats
 
 from .native_slice import can_slice, native_slice
 from .rotation4d import (
@@ -42,7 +42,14 @@ def reference_slice(
         rows = torch.arange(len(raw["positions"]), device=factors.device)
         return raw["positions"], covariances_from_factors(factors), torch.sigmoid(raw["opacity_logits"]), rows
     log_scales = torch.cat([raw["log_scales"], raw["log_time_scales"][:, None]], 1)
-    parts = (raw["positions"], log_scales, raw["left"], raw["right"], raw["opacity_logits"], raw["times"])
+    parts: tuple[Tensor, ...] = (
+        raw["positions"],
+        log_scales,
+        raw["left"],
+        raw["right"],
+        raw["opacity_logits"],
+        raw["times"],
+    )
     # A Gaussian outside its temporal support is never projected; without a gradient, none of it is 0 * inf.
     with torch.no_grad():
         axes = unit_quaternions(raw["left"]), unit_quaternions(raw["right"])

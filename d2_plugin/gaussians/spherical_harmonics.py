@@ -10,13 +10,16 @@ import math
 import torch
 from torch import Tensor
 
-C0 = 0.28209479177387814
+from d2_plugin.errors import D2Error
+
+SH_C0 = 0.28209479177387814
+"""Y_0, the constant harmonic: a colour c in 0..1 is stored as the coefficient (c - 0.5) / Y_0."""
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
     """Real spherical harmonics Y_k [M, (degree + 1)^2] of unit directions [M, 3]; degree 0..3, Inria's signs."""
     x, y, z = directions.unbind(-1)
-    values = [torch.full_like(x, C0)]
+    values = [torch.full_like(x, SH_C0)]
     if degree >= 1:
         values += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if degree >= 2:
@@ -53,13 +56,15 @@ def colors(coefficients: Tensor, directions: Tensor, phase: Tensor | None, degre
     (t - mu_t) / duration, None when time_degree is 0.
     """
     if degree == 0 and not time_degree:
-        return torch.relu(C0 * coefficients[:, 0] + 0.5)
+        return torch.relu(SH_C0 * coefficients[:, 0] + 0.5)
     if degree == 0:
-        values = coefficients.new_full((len(coefficients), 1), C0)
+        values = coefficients.new_full((len(coefficients), 1), SH_C0)
     else:
         values = basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     if time_degree:
-        waves = torch.stack([torch.cos(2 * math.pi * n * phase) for n in range(time_degree + 1)], -1)
+        if phase is None:
+            raise D2Error(f"colours with {time_degree} cosines in time need the phase of each Gaussian: pass it")
+        waves = torch.stack([torch.cos(phase * (2 * math.pi * n)) for n in range(time_degree + 1)], -1)
         values = (waves[:, :, None] * values[:, None]).flatten(1)
     return torch.relu((values[..., None] * coefficients).sum(1) + 0.5)
 
@@ -67,5 +72,5 @@ def colors(coefficients: Tensor, directions: Tensor, phase: Tensor | None, degre
 def coefficients_from_rgb(rgb: Tensor, degree: int, time_degree: int) -> Tensor:
     """Coefficients [N, channel_count, 3] of constant colours rgb [N, 3]."""
     coefficients = rgb.new_zeros(len(rgb), channel_count(degree, time_degree), 3)
-    coefficients[:, 0] = (rgb - 0.5) / C0
+    coefficients[:, 0] = (rgb - 0.5) / SH_C0
     return coefficients

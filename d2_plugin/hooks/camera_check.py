@@ -49,10 +49,11 @@ class CameraCheck:
             if not torch.allclose(pose, built, atol=1e-3):
                 log.info("the trainer's world is not that of the prior: taken as moved by what %s shows", view.camera)
             return
+        first, first_pose, first_built = self._first
         known = depth[depth > 0]
         if known.numel():
             slack = POSITION_TOLERANCE * float(known.median())
-            self._check_pose(view, _relative(pose, self._first[1]), _relative(built, self._first[2]), slack)
+            self._check_pose(view, first, _relative(pose, first_pose), _relative(built, first_built), slack)
 
     def _check_intrinsics(self, view: View, built: Tensor) -> None:
         K, size = view.K.detach().double().cpu(), torch.tensor([view.width, view.height], dtype=torch.float64)
@@ -69,9 +70,8 @@ class CameraCheck:
                 f"{_text(centre[1])} but the view has {_text(centre[0])}: build the prior with the trainer's cameras"
             )
 
-    def _check_pose(self, view: View, here: Tensor, built: Tensor, slack: float) -> None:
+    def _check_pose(self, view: View, first: View, here: Tensor, built: Tensor, slack: float) -> None:
         """Compare poses [4, 4] relative to the first view's; `slack` is a distance."""
-        first = self._first[0]
         angle = _angle(here[:3, :3] @ built[:3, :3].T)
         centres = _centre(here), _centre(built)
         if angle > ANGLE_TOLERANCE or float((centres[0] - centres[1]).norm()) > slack:

@@ -3,15 +3,57 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Annotated, Self
 
 import torch
 from torch import Tensor
 
-from d2_plugin.config import DensifyConfig
 from d2_plugin.protocol import Edit, Label, Points, Splats, View
+from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
 
-from .hook import Context, Hook, Surveyed, Window
+from .hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
 from .rendered_depth import relative_discrepancy, rendered_depth
+
+
+@dataclass(frozen=True)
+class DensifyConfig(HookConfig):
+    """Depth-guided insertion of Gaussians."""
+
+    start: Steps = 1
+    """First step at which it may run."""
+    stop: Steps | None = 1500
+    """First step at which it no longer runs; refinement continues after it."""
+    every: Every = 100
+    """Steps between evaluations."""
+    tau_v: Share = 0.5
+    """A rendered depth is valid where the accumulated alpha exceeds this."""
+    tau_u: Positive = 0.1
+    """Relative depth error above which a verified pixel counts as under-reconstructed."""
+    tau_u_mono: Annotated[float, Range(0, infinite=True)] = 0.2
+    """The same for every other pixel that has a depth: aligned monocular depth is itself off by some per cent."""
+    budget_per_view: Count = 60
+    """Samples drawn per evaluated view. A larger budget buys quality with time.
+    Studio, all 20 frames, 2000 steps, three seeds: 28.9 dB at 60, with training 1.13 to 1.17 times as long as the bare
+    trainer's. 30.3 dB at 500 with 8 views per evaluation and the loss at every step, 1.4 times as long as that.
+    1500 is too many (1210 steps: 28.2 dB, against 29.3 at 500)."""
+    max_gaussians: Count = 1_000_000
+    """No insertion beyond this number of Gaussians."""
+    scale: Positive = 1.0
+    """Standard deviation of a new Gaussian in units of the distance between samples.
+    Studio: 29.3 dB at 0.5, 30.7 at 1.0, 30.2 at 1.5."""
+    opacity: Annotated[float, Range(0, 1, open_low=True)] = 0.3
+    """Opacity of a new Gaussian. Studio: 29.3 dB at 0.3, 29.5 at 0.1."""
+    cell: Positive = 1.0
+    """Side of the frustum cells that keep duplicates out, in units of the distance between samples."""
+    occupied_opacity: Share = 0.1
+    """An existing Gaussian that is more opaque than this occupies its cell."""
+
+    @classmethod
+    def for_iterations(cls, iterations: int) -> Self:
+        """Insertion from the first twentieth to half of the run."""
+        every = steps_between_evaluations(iterations)
+        return cls(start=every, stop=max(iterations // 2, every + 1), every=every)
 
 
 def under_reconstructed(depth: Tensor, valid: Tensor, prior: Tensor, support: Tensor, tau_u: float | Tensor) -> Tensor:
@@ -72,9 +114,7 @@ def first_of_each(keys: Tensor) -> Tensor:
 class Densify(Hook):
     """Inserts Gaussians where the prior has a surface that the render lacks or puts at another depth."""
 
-    def __init__(self, config: DensifyConfig) -> None:
-        self.config = config
-        self.window = Window(config.start, config.stop, config.every)
+    config: DensifyConfig
 
     def edit(self, context: Context) -> Edit | None:
         """Points from the under-reconstructed pixels of the evaluated views, within the budget."""

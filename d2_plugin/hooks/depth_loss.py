@@ -2,19 +2,41 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from d2_plugin.config import DepthLossConfig
 from d2_plugin.protocol import View
 from d2_plugin.rasterizer import rasterize
+from d2_plugin.settings import Every, NotNegative, Positive, Share, Steps
 
-from .hook import Context, Hook, Window
-from .prior import VerifiedPixels
+from .hook import Context, Hook, HookConfig
+from .prior import TrustedPixels
 from .rendered_depth import EPSILON
+
+
+@dataclass(frozen=True)
+class DepthLossConfig(HookConfig):
+    """Verified-depth supervision."""
+
+    start: Steps = 1
+    """First step at which it is added."""
+    stop: Steps | None = None
+    """First step at which it is no longer added; none: to the end."""
+    every: Every = 4
+    """Steps between additions: a depth changes slowly, and the loss costs time at each step that has it."""
+    weight: NotNegative = 0.8
+    """lambda_d of each addition; what matters is weight / every.
+    Studio, 2000 steps, 4 views per evaluation: 28.5 dB at 0.4 / 2, 28.6 at 0.8 / 4.
+    Studio, 1210 steps, an earlier version: 29.3 dB and depth AbsRel .086 at 0.2 / 1, 29.1 dB and .073 at 1 / 1, 0.4 dB
+    less without the loss."""
+    epsilon: Positive = 0.01
+    """epsilon_rho of the Charbonnier penalty, on relative depth residuals."""
+    tau_v: Share = 0.5
+    """Pixels whose accumulated alpha does not exceed this are left out."""
 
 
 def charbonnier(residual: Tensor, epsilon: float) -> Tensor:
@@ -23,13 +45,15 @@ def charbonnier(residual: Tensor, epsilon: float) -> Tensor:
     return residual * (residual / (root + epsilon))
 
 
-def depth_loss(depth: Tensor, valid: Tensor, prior: Tensor, verified: Tensor, epsilon: float) -> Tensor:
-    """L_depth: mean of rho((D_hat - D*) / (D* + eps)) over pixels that are verified and validly rendered; a scalar.
+def depth_loss(depth: Tensor, valid: Tensor, prior: Tensor, trusted: Tensor, epsilon: float) -> Tensor:
+    """L_depth: mean of rho((D_hat - D*) / (D* + eps)) over pixels that are trusted and validly rendered; a scalar.
+
+    The paper's mean is over Omega^v; trusted pixels are those, and the ones that two cameras agree on.
 
     All maps [H, W]; 0 with zero gradients where there is no such pixel. Pixels are selected before any arithmetic,
     so NaN or infinity elsewhere in the prior cannot leak in.
     """
-    mask = valid & verified
+    mask = valid & trusted
     target = torch.where(mask, prior, torch.ones_like(prior))
     residual = torch.where(mask, depth - target, torch.zeros_like(depth)) / (target + EPSILON)
     return charbonnier(residual, epsilon).sum() / (mask.sum() + EPSILON)
@@ -41,7 +65,7 @@ class _PixelDepthLoss(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        context: Any, depth_sum: Tensor, alpha: Tensor, pixels: VerifiedPixels, tau_v: float, epsilon: float
+        context: Any, depth_sum: Tensor, alpha: Tensor, pixels: TrustedPixels, tau_v: float, epsilon: float
     ) -> Tensor:
         z, a = (values.flatten().index_select(0, pixels.index) for values in (depth_sum, alpha))
         valid = (a > tau_v).to(a)
@@ -68,12 +92,12 @@ class _PixelDepthLoss(torch.autograd.Function):
         return scattered(gradient * by_depth_sum), scattered(-gradient * by_alpha), None, None, None
 
 
-def pixel_depth_loss(depth_sum: Tensor, alpha: Tensor, pixels: VerifiedPixels, tau_v: float, epsilon: float) -> Tensor:
-    """L_depth of a render: `depth_loss` of `rendered_depth`, computed at the verified pixels alone.
+def pixel_depth_loss(depth_sum: Tensor, alpha: Tensor, pixels: TrustedPixels, tau_v: float, epsilon: float) -> Tensor:
+    """L_depth of a render: `depth_loss` of `rendered_depth`, computed at the trusted pixels alone.
 
     Args:
         depth_sum, alpha: sum of w z and of w, [H, W], differentiable once.
-        pixels: where D* is verified, and D* there.
+        pixels: where D* is trusted, and D* there.
         tau_v: pixels whose alpha does not exceed this are left out.
         epsilon: epsilon_rho of the Charbonnier penalty, on relative residuals.
     """
@@ -83,17 +107,15 @@ def pixel_depth_loss(depth_sum: Tensor, alpha: Tensor, pixels: VerifiedPixels, t
 class DepthLoss(Hook):
     """Adds lambda_d L_depth of the views of the present step."""
 
-    def __init__(self, config: DepthLossConfig) -> None:
-        self.config = config
-        self.window = Window(config.start, config.stop, config.every)
+    config: DepthLossConfig
 
     def loss(self, context: Context) -> Tensor | None:
-        """lambda_d times the mean of L_depth over the step's views that have verified pixels."""
-        pairs = [(view, context.prior.verified(view)) for view in context.views]
+        """lambda_d times the mean of L_depth over the step's views that have trusted pixels."""
+        pairs = [(view, context.prior.trusted(view)) for view in context.views]
         terms = [self._term(context, view, pixels) for view, pixels in pairs if pixels is not None]
         return self.config.weight * torch.stack(terms).mean() if terms else None
 
-    def _term(self, context: Context, view: View, pixels: VerifiedPixels) -> Tensor:
+    def _term(self, context: Context, view: View, pixels: TrustedPixels) -> Tensor:
         depth_sum, alpha = depth_and_alpha(context, view)
         return pixel_depth_loss(depth_sum, alpha, pixels, self.config.tau_v, self.config.epsilon)
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
 from d2_plugin.protocol import Backbone, DepthPrior, Edit, Splats, Survey, View
 from d2_plugin.rasterizer import survey
+from d2_plugin.settings import Every, Settings, Steps
 
 from .prior import PriorLoader
 
@@ -27,6 +28,33 @@ class Window:
     def due(self, step: int) -> bool:
         """Whether the hook runs at `step` (1-based, as trainers count)."""
         return self.start <= step and (self.stop is None or step < self.stop) and step % self.every == 0
+
+
+@dataclass(frozen=True)
+class HookConfig(Settings):
+    """When a hook runs. A hook's own settings are a subclass of this, in the file of the hook."""
+
+    start: Steps = 1
+    """First step at which it may run."""
+    stop: Steps | None = None
+    """First step at which it no longer runs; none: it runs to the end."""
+    every: Every = 1
+    """Steps from one time to the next."""
+
+    @classmethod
+    def for_iterations(cls, iterations: int) -> Self:
+        """The defaults with a schedule that fits a run of so many steps."""
+        return cls()
+
+    @property
+    def window(self) -> Window:
+        """The steps at which the hook is due."""
+        return Window(self.start, self.stop, self.every)
+
+
+def steps_between_evaluations(iterations: int) -> int:
+    """Of hooks that edit structure: a hundred, in short runs a twentieth of the run."""
+    return max(1, min(100, iterations // 20))
 
 
 class Surveyed(NamedTuple):
@@ -66,11 +94,15 @@ class Context:
 
 
 class Hook:
-    """Base of all hooks: does nothing. Per-Gaussian state is declared by implementing `follow`."""
+    """Base of all hooks: does nothing. One that keeps state per Gaussian implements `follow` and `reset`."""
 
-    window = Window()
     settling = 0
     """Evaluations at the start in which the hook only gathers evidence and so cannot change anything yet."""
+
+    def __init__(self, config: Any) -> None:
+        """`config` is an instance of the hook's own `HookConfig`."""
+        self.config = config
+        self.window: Window = config.window
 
     def loss(self, context: Context) -> Tensor | None:
         """A term to add to the training loss of this step, or None."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -23,11 +24,14 @@ class Store(Protocol):
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
 
 
-class VerifiedPixels(NamedTuple):
-    """Omega^v of one view: where D* is verified, and D* there."""
+@dataclass(frozen=True, eq=False)
+class TrustedPixels:
+    """What may supervise one view: where D* is trusted (see `DepthPrior.trusted`), and D* there."""
 
-    index: Tensor  # [K] int64, row * width + column
-    depth: Tensor  # [K] float32
+    index: Tensor
+    """[K] int64, row * width + column."""
+    depth: Tensor
+    """[K] float32, world units."""
 
 
 class PriorLoader:
@@ -37,7 +41,7 @@ class PriorLoader:
         self.store, self.keep_bytes = store, keep_bytes
         self._kept: OrderedDict[tuple[str, int], DepthPrior | None] = OrderedDict()
         self._cameras = CameraCheck()
-        self._pixels: dict[tuple[str, int], VerifiedPixels] = {}
+        self._pixels: dict[tuple[str, int], TrustedPixels] = {}
 
     def __call__(self, view: View) -> DepthPrior | None:
         """D* of the view, or None where the store has none; refuses one made for another size, K or pose."""
@@ -48,21 +52,21 @@ class PriorLoader:
         prior = self.store.prior(*key)
         if prior is not None:
             self._check(view, prior)
-            prior = _with_depth(DepthPrior(*(None if t is None else t.to(view.K.device) for t in prior)))
+            prior = _with_depth(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior))
         self._kept[key] = prior
         while len(self._kept) > 1 and sum(map(_bytes, self._kept.values())) > self.keep_bytes:
             dropped, _ = self._kept.popitem(last=False)
             self._pixels.pop(dropped, None)
         return prior
 
-    def verified(self, view: View) -> VerifiedPixels | None:
-        """The verified pixels of the view, or None where there is not one."""
+    def trusted(self, view: View) -> TrustedPixels | None:
+        """The trusted pixels of the view, or None where there is not one."""
         key, prior = (view.camera, view.frame), self(view)
         if prior is None:
             return None
         if key not in self._pixels:
             index = torch.nonzero(prior.trusted.flatten()).squeeze(1)
-            self._pixels[key] = VerifiedPixels(index, prior.depth.flatten()[index])
+            self._pixels[key] = TrustedPixels(index, prior.depth.flatten()[index])
         pixels = self._pixels[key]
         return pixels if len(pixels.index) else None
 
@@ -86,7 +90,7 @@ def _with_depth(prior: DepthPrior) -> DepthPrior:
 
 
 def _bytes(prior: DepthPrior | None) -> int:
-    """Of a prior on the device, and of as many verified pixels as it may have."""
+    """Of a prior on the device, and of as many trusted pixels as it may have."""
     if prior is None:
         return 0
     return sum(t.numel() * t.element_size() for t in prior if t is not None) + 12 * prior.depth.numel()

@@ -3,22 +3,58 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
 
-from d2_plugin.config import PruneConfig
+from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Edit
+from d2_plugin.settings import AtLeastOne, Every, Positive, Share, Steps
 
-from .hook import Context, Hook, Surveyed, Window
+from .hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
 from .rendered_depth import EPSILON
+
+
+@dataclass(frozen=True)
+class PruneConfig(HookConfig):
+    """Consistency-aware removal of Gaussians."""
+
+    start: Steps = 300
+    """First step at which it may run."""
+    stop: Steps | None = 2000
+    """First step at which it no longer runs."""
+    every: Every = 100
+    """Steps between evaluations."""
+    tau_u: Positive = 0.1
+    """Relative depth error at which E_k saturates."""
+    tau_p: Share = 0.75
+    """Score above which an evaluation counts against a Gaussian."""
+    lambda_e: Share = 0.5
+    """Weight of depth inconsistency; lambda_e + lambda_o = 1."""
+    lambda_o: Share = 0.5
+    """Weight of missing opacity contribution."""
+    patience: AtLeastOne = 3
+    """Evaluations in a row, each touching trusted pixels, before a Gaussian is removed."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if abs(self.lambda_e + self.lambda_o - 1) > 1e-9:
+            raise D2Error(f"lambda_e = {self.lambda_e} and lambda_o = {self.lambda_o} must sum to 1: set both")
+
+    @classmethod
+    def for_iterations(cls, iterations: int) -> Self:
+        """Pruning from a fifth to two thirds of the run: the last third only refines."""
+        return cls(start=iterations // 5, stop=2 * iterations // 3, every=steps_between_evaluations(iterations))
 
 
 def depth_inconsistency(error: Tensor, weight: Tensor, tau_u: float) -> Tensor:
     """E_k = min(E~_k / tau_u, 1) in 0..1, [N].
 
-    `error` [N] is the sum of w |z - D*| / (D* + eps) over verified pixels and `weight` [N] the sum of w; where a
-    Gaussian touches no verified pixel (weight 0) E_k is 0, as there is no evidence against it.
+    `error` [N] is the sum of w |z - D*| / (D* + eps) over trusted pixels and `weight` [N] the sum of w; where a
+    Gaussian touches no trusted pixel (weight 0) E_k is 0, as there is no evidence against it. The paper sums over
+    Omega^v; trusted pixels are those, and the ones that two cameras agree on.
     """
     touched = weight > 0
     mean = torch.where(touched, error, torch.zeros_like(error)) / torch.where(touched, weight + EPSILON, 1.0)
@@ -52,11 +88,12 @@ def gather(evaluation: Sequence[Surveyed], count: int) -> tuple[Tensor, Tensor, 
 
 
 class Prune(Hook):
-    """Removes Gaussians whose score stays above tau_p in consecutive evaluations that touched verified pixels."""
+    """Removes Gaussians whose score stays above tau_p in consecutive evaluations that touched trusted pixels."""
+
+    config: PruneConfig
 
     def __init__(self, config: PruneConfig) -> None:
-        self.config = config
-        self.window = Window(config.start, config.stop, config.every)
+        super().__init__(config)
         self.settling = config.patience - 1
         self.streak: Tensor | None = None  # [N] evaluations in a row with S_k > tau_p
 

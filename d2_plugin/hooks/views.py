@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import torch
 
@@ -43,7 +44,7 @@ class ViewSampler:
             queue += [frames[i] for i in torch.randperm(len(frames), generator=generator).tolist()]
         return queue.pop()
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         """The known views and the position in their order; tensors and plain values only."""
         return {
             "views": [vars(view).copy() for view in self._views.values()],
@@ -51,7 +52,7 @@ class ViewSampler:
             "next_camera": self._next_camera,
         }
 
-    def load_state_dict(self, state: Mapping[str, object]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`."""
         self._views = {(v["camera"], v["frame"]): View(**v) for v in state["views"]}
         self._queues = {camera: list(queue) for camera, queue in state["queues"].items()}

@@ -13,9 +13,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-
-SH_C0 = 0.28209479177387814
-"""Value of the constant spherical harmonic: colour = 0.5 + SH_C0 * f_dc."""
+from d2_plugin.gaussians.spherical_harmonics import SH_C0
 
 ALPHA_MIN = 1 / 255
 """Gaussians that never reach this opacity are not drawn by any rasterizer and are left out."""

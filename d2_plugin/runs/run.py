@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -55,11 +54,7 @@ class Run:
         path = folder / "run.json"
         if not path.is_file():
             raise D2Error(f"{folder} holds no run: expected run.json; give the --output folder of `d2 train`")
-        table = json.loads(path.read_text())
-        tuples: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value for key, value in table.items()
-        }
-        return cls(RunSettings(**tuples), folder)
+        return cls(RunSettings.from_table(json.loads(path.read_text()), str(path)), folder)
 
     @property
     def uses_prior(self) -> bool:
@@ -243,10 +238,10 @@ class Run:
 
 def _claim(folder: Path, settings: RunSettings) -> None:
     """Take the folder, or find this very run in it; anything else is refused and nothing is written."""
-    identity = json.loads(json.dumps(asdict(settings)))
+    identity = settings.as_table()
     path = folder / "run.json"
     if path.is_file():
-        found = json.loads(path.read_text())
+        found = RunSettings.from_table(json.loads(path.read_text()), str(path)).as_table()
         changed = sorted(k for k in identity.keys() | found.keys() if identity.get(k) != found.get(k))
         if changed:
             raise D2Error(

@@ -2,79 +2,119 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import Annotated, Any, Literal
 
 from d2_plugin import registry
 from d2_plugin.config import D2Config, for_iterations
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.hooks.table import HOOKS
 from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.settings import FORMAT, AtLeastOne, Count, Positional, Range, Seed, Settings, declared, of_this_format
 
-HOOK_NAMES = ("prior", "densify", "prune", "depth_loss")
-TABLES = ("backbone", "d2", "densify", "prune", "depth_loss", "priors", "plan")
+HOOK_NAMES = ("prior", *HOOKS)
+"""What `--hooks` may name; "prior" alone builds the depth prior and trains without it."""
+TABLES = ("backbone", "d2", *HOOKS, "priors", "plan")
 """What a configuration file may hold."""
-OVERRIDABLE = ("temporal", "stereo")
-"""Decisions of the plan that `[plan]` may take; the others follow from them and from the depth sources."""
 
 
 @dataclass(frozen=True)
-class RunSettings:
+class PlanChoices(Settings):
+    """Decisions of the plan that `[plan]` may take; the others follow from them and from the depth sources."""
+
+    temporal: bool | None = None
+    """Whether the scene has a temporal dimension; none: as the plan measures it."""
+    stereo: bool | None = None
+    """Whether the cameras are matched; none: as the plan measures it."""
+
+
+OVERRIDABLE = tuple(choice.name for choice in declared(PlanChoices))
+
+
+@dataclass(frozen=True)
+class RunSettings(Settings):
     """What is trained, on what, for how long. Two runs with equal settings are the same run."""
 
-    capture: str
+    capture: Annotated[str, Positional()]
+    """Folder of the capture, or a file that describes it."""
     train_cameras: tuple[str, ...]
+    """Cameras to train with, as the capture names them."""
     backbone: str = "yang4d"
-    iterations: int = 3000
+    """Name of a registered backbone."""
+    iterations: Annotated[int, Range(1, unit="steps")] = 3000
+    """Steps to train."""
     hooks: tuple[str, ...] = HOOK_NAMES
-    seed: int = 0
-    downscale: int = 1
-    frames: tuple[int, ...] | None = None
+    """Parts of the method that are used."""
+    seed: Seed = 0
+    """Seed of everything that is drawn at random."""
+    downscale: AtLeastOne = 1
+    """Pictures are this many times smaller than recorded, along each side."""
+    frames: tuple[Count, ...] | None = None
+    """Numbers of the frames to use; none: all."""
     test_cameras: tuple[str, ...] | None = None
+    """Cameras to score with; none: all that do not train."""
     mono_onnx: str | None = None
-    mono_kind: str | None = None
+    """ONNX model of monocular depth."""
+    mono_kind: Literal["relative", "metric"] | None = None
+    """What the model returns: relative (inverse depth up to scale and shift) or metric (depth)."""
     priors: str | None = None
-    device: str = "cpu"
-    """Where the trainer runs: cpu or cuda."""
+    """Folder of a finished depth prior; none: the run builds its own."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where the trainer runs."""
     overrides: Mapping[str, Any] = field(default_factory=dict)
     """Tables over the defaults, see `TABLES`."""
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], place: str) -> RunSettings:
+        """From what `as_table` made, or a version of it that this one reads; `place` names the file in errors."""
+        return cls.from_dict(of_this_format(table, place), place)
+
+    def as_table(self) -> dict[str, Any]:
+        """Plain values and the version of the format, as JSON has them."""
+        return {"version": FORMAT} | json.loads(json.dumps(asdict(self)))
 
 
 def check(settings: RunSettings) -> RunSettings:
     """The same settings with absolute paths, or a D2Error for what cannot be."""
     if not settings.train_cameras:
         raise D2Error("no training camera: name at least one with --train-cameras")
-    if settings.iterations < 1:
-        raise D2Error(f"--iterations is {settings.iterations}: give at least 1")
     for name in settings.hooks:
         if name not in HOOK_NAMES:
             raise unknown_name("hook", name, [*HOOK_NAMES, "all", "none"])
-    if settings.mono_onnx and settings.mono_kind not in ("relative", "metric"):
+    if settings.mono_onnx and settings.mono_kind is None:
         raise D2Error("--mono-onnx needs --mono-kind relative (inverse depth) or metric (depth): a file does not tell")
     _check_device(settings.device)
-    for name in settings.overrides:
-        if name not in TABLES:
-            raise unknown_name("table", name, TABLES)
-    for name in settings.overrides.get("plan", {}):
-        if name not in OVERRIDABLE:
-            raise unknown_name("decision of plan", name, OVERRIDABLE)
-    prior_settings(settings)
-    hook_config(settings, Path())
-    backbone = registry.load(registry.BACKBONES, settings.backbone)
-    backbone.settings_from(settings.overrides.get("backbone", {}))
+    _check_overrides(settings)
     paths = ("capture", "mono_onnx", "priors")
     absolute = {name: str(Path(path).resolve()) for name in paths if (path := getattr(settings, name)) is not None}
-    return replace(settings, **absolute)  # a run is found again from any folder
+    return replace(settings, **absolute)  # type: ignore[arg-type]  # a run is found again from any folder
 
 
 def _check_device(name: str) -> None:
-    if name not in ("cpu", "cuda"):
-        raise unknown_name("device", name, ("cpu", "cuda"))
+    import torch
+
     if name == "cuda" and not torch.cuda.is_available():
         raise D2Error("--device cuda, but torch finds no CUDA device here: leave out --device to train on the CPU")
+
+
+def _check_overrides(settings: RunSettings) -> None:
+    for name in settings.overrides:
+        if name not in TABLES:
+            raise unknown_name("table", name, TABLES)
+    choices = _over({}, settings.overrides.get("plan", {}), "plan")
+    for name in choices:
+        if name not in OVERRIDABLE:
+            raise unknown_name("decision of plan", name, OVERRIDABLE)
+    PlanChoices.from_dict(choices, "plan")
+    prior_settings(settings)
+    hook_config(settings, Path())
+    for name in set(HOOKS) & set(settings.overrides):  # those of hooks that are off as well
+        HOOKS[name].config.from_dict(settings.overrides[name], name)
+    backbone = registry.load(registry.BACKBONES, settings.backbone)
+    backbone.settings_from(settings.overrides.get("backbone", {}))
 
 
 def prior_settings(settings: RunSettings) -> PriorSettings:
@@ -87,9 +127,13 @@ def hook_config(settings: RunSettings, priors: Path) -> D2Config:
     """The hooks of a run with schedules that fit its length, and the user's tables over the defaults."""
     hooks = tuple(name for name in settings.hooks if name != "prior")
     config = for_iterations(hooks, settings.iterations, prior=str(priors), seed=settings.seed)
-    tables = {name: settings.overrides.get(name, {}) for name in hooks}
-    return D2Config.from_dict(
-        {name: value for name, value in vars(config).items() if name not in hooks}
-        | dict(settings.overrides.get("d2", {}))
-        | {name: vars(getattr(config, name)) | tables[name] for name in hooks}
-    )
+    plain = {name: value for name, value in asdict(config).items() if name not in HOOKS}
+    tables = {name: _over(asdict(getattr(config, name)), settings.overrides.get(name, {}), name) for name in hooks}
+    return D2Config.from_dict(_over(plain, settings.overrides.get("d2", {}), "d2") | tables)
+
+
+def _over(defaults: Mapping[str, Any], table: Any, name: str) -> dict[str, Any]:
+    """The defaults with the user's table over them."""
+    if not isinstance(table, Mapping):
+        raise D2Error(f"{name} must be a table of settings, got {table!r}: write [{name}] above them")
+    return {**defaults, **table}

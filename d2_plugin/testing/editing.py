@@ -139,6 +139,8 @@ def _remove(example: Example) -> Iterator[str]:
 
 
 def _grow(example: Example) -> Iterator[str]:
+    if example.grow is None:
+        return
     count = len(example.backbone)
     listener = _Listener(example.backbone)
     example.backbone.on_resize(listener)
@@ -206,6 +208,8 @@ def _row_states(optimizer: torch.optim.Optimizer, parameter: Tensor, count: int)
 
 def state_round_trip(first: Example, second: Example) -> Iterator[str]:
     """A model that was edited, saved, and loaded into another must be itself."""
+    if first.state_dict is None or second.load_state_dict is None:
+        return
     first.backbone.remove(some_rows(first))
     first.backbone.insert(some_points(first, first.views[0]))
     second.load_state_dict(first.state_dict())

@@ -113,7 +113,7 @@ def _random_state(example: Example) -> Iterator[str]:
 
 def _rendered_depth(example: Example) -> Iterator[str]:
     backbone, camera = example.backbone, example.cameras[0]
-    if not hasattr(backbone, "rendered_depth"):
+    if not hasattr(backbone, "rendered_depth") or example.render is None:
         return
     example.render(camera)
     view = backbone.view(camera)
@@ -135,6 +135,14 @@ def _rendered_depth(example: Example) -> Iterator[str]:
     example.render(camera)
     if backbone.rendered_depth(backbone.view(example.cameras[1])) is not None:
         yield "rendered_depth hands out the render of one camera for another"
+        return
+    for other in example.cameras[:2]:
+        example.render(other)
+    batch = [backbone.rendered_depth(backbone.view(other)) for other in example.cameras[:2]]
+    if any(maps is None for maps in batch):
+        yield "rendered_depth knows the last render alone: find those of a batch by camera and frame"
+    elif not torch.allclose(batch[0][1], alpha, rtol=1e-3, atol=1e-4):
+        yield "rendered_depth hands out the render of one camera of a batch for another"
 
 
 READING: dict[str, Check] = {

@@ -250,7 +250,7 @@ def draw_in(mimic: ModuleType, model, background: list[int], camera, **options) 
 def warm(model, deform) -> Deformable3DAdapter:
     """The adapter after the warm-up."""
     adapter = Deformable3DAdapter(model, deform, warm_up=10)
-    adapter.active(10)
+    adapter.begin_step(10)
     return adapter
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from types import SimpleNamespace
 
@@ -20,12 +19,10 @@ from d2_plugin.adapters.deformable3d import Deformable3DAdapter
 from d2_plugin.adapters.ex4dgs import Ex4DGSAdapter
 from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
-from d2_plugin.adapters.keys import KeysByPose, PriorKey, frame_of_time, key_from_picture, one_picture_each
-from d2_plugin.adapters.probe import probe_package
+from d2_plugin.adapters.keys import PriorKey
 from d2_plugin.adapters.spacetime import SpacetimeAdapter
 from d2_plugin.config import DepthLossConfig
 from d2_plugin.protocol import Points, View
-from d2_plugin.rasterizer import rasterize
 
 DEPTH_ALONE = D2Config(depth_loss=DepthLossConfig(every=1))
 
@@ -37,66 +34,6 @@ def fudan_model(**attributes: object):
     vars(model).update(attributes)
     model.training_setup(default_options())
     return model, scene
-
-
-class TestNames:
-    @pytest.mark.parametrize(
-        ("picture", "key"),
-        [
-            ("cam01_0003", ("cam01", 3)),
-            ("/data/scene/images/cam01_0003.png", ("cam01", 3)),
-            ("/data/scene/cam01/images/0003.png", ("cam01", 3)),
-            ("scene/cam07/frame_00012.jpg", ("cam07", 12)),
-            ("a_b_12.png", ("a_b", 12)),
-            (r"C:\scene\cam02\images\0004.png", ("cam02", 4)),
-        ],
-    )
-    def test_pictures_tell_camera_and_frame(self, picture: str, key: tuple[str, int]) -> None:
-        assert key_from_picture(picture) == key
-
-    def test_a_name_without_a_camera_is_refused_with_the_way_out(self) -> None:
-        with pytest.raises(D2Error, match=r"picture '0003.png' does not say its camera.*function `key`"):
-            key_from_picture("0003.png")
-
-    def test_a_moving_camera_has_a_prior_for_each_picture(self) -> None:
-        assert one_picture_each(SimpleNamespace(image_name="r_014.png")) == ("r_014", 0)
-
-    def test_a_time_between_frames_is_refused(self) -> None:
-        assert frame_of_time(0.06, 50, first=10) == 13
-        with pytest.raises(D2Error, match=r"time 0.0333333 is frame 1.67 of 50"):
-            frame_of_time(1 / 30, 50)
-
-    def test_cameras_without_names_are_found_by_their_pose(self) -> None:
-        poses = {view.camera: view.T_camera_world for view in make_views() if view.frame == 0}
-        keys = KeysByPose(poses, lambda camera: round(2 * camera.timestamp))
-        camera = cameras_of(timestamp=lambda view: view.time)[5]
-        assert keys(camera) == ("cam2", 1)
-        camera.world_view_transform = camera.world_view_transform + 0.5
-        with pytest.raises(D2Error, match="stands at none of the known poses"):
-            keys(camera)
-
-    def test_the_index_that_hust_calls_a_name_leads_to_the_path(self) -> None:
-        model, scene = hust4d.make()
-        adapter = Hust4DAdapter(model, scene, "fine")
-        assert [(adapter.view(c).camera, adapter.view(c).frame) for c in scene.cameras] == [
-            (view.camera, view.frame) for view in make_views()
-        ]
-
-        infos = [SimpleNamespace(image_path=path) for path in scene.train_camera.dataset.image_paths]
-        listed = SimpleNamespace(train_camera=SimpleNamespace(dataset=infos))
-        assert Hust4DAdapter(model, listed, "fine").view(scene.cameras[4]).camera == "cam1"
-
-    def test_spacetime_and_ex4dgs_count_frames_by_time(self) -> None:
-        model, scene = spacetime.make()
-        assert SpacetimeAdapter(model, 2).view(scene.cameras[4]).frame == 1
-        model, scene = ex4dgs.make()
-        view = Ex4DGSAdapter(model, first_frame=100).view(scene.cameras[4])
-        assert (view.camera, view.frame) == ("cam1", 101)
-
-    def test_a_key_of_ones_own_goes_before_everything(self) -> None:
-        model, scene = fudan.make()
-        view = FudanAdapter(model, key=lambda camera: PriorKey("mine", 9)).view(scene.train_cameras[1.0][0])
-        assert (view.camera, view.frame) == ("mine", 9)
 
 
 class TestFieldsOfView:
@@ -206,9 +143,9 @@ class TestDeformations:
     def test_before_the_warm_up_nothing_is_deformed(self) -> None:
         model, deform, _ = deformable3d.make()
         adapter = Deformable3DAdapter(model, deform, warm_up=30)
-        adapter.active(29)
+        adapter.begin_step(29)
         assert torch.equal(adapter.slice_at(make_views()[0]).means, model._xyz)
-        adapter.active(30)
+        adapter.begin_step(30)
         assert not torch.equal(adapter.slice_at(make_views()[0]).means, model._xyz)
 
     def test_the_length_of_a_quaternion_scales_the_covariance(self) -> None:
@@ -261,70 +198,6 @@ class TestDeformations:
         assert isinstance(eager.loss(10, scene.cameras[:2]), Tensor)
         with pytest.raises(D2Error, match="stage must be one of coarse, fine, got 'medium'"):
             Hust4DAdapter(model, scene, "medium")
-
-
-class TestProbe:
-    def test_without_a_package_one_sentence_says_who_renders(self, caplog: pytest.LogCaptureFixture) -> None:
-        model, scene = fudan_model()
-        d2 = D2Hooks(DEPTH_ALONE, FudanAdapter(model, scene), TinyStore())
-        with caplog.at_level(logging.INFO, logger="d2_plugin.adapters.inria"):
-            for step in (1, 2):
-                d2.loss(step, scene.train_cameras[1.0][0])
-        assert caplog.text.count("no render of the trainer was passed along") == 1
-
-    def test_fudans_own_render_is_used_and_equals_ours(self, caplog: pytest.LogCaptureFixture) -> None:
-        model, scene = fudan_model()
-        adapter = FudanAdapter(model, scene)
-        d2 = D2Hooks(DEPTH_ALONE, adapter, TinyStore())
-        camera = scene.train_cameras[1.0][1]
-        with caplog.at_level(logging.INFO, logger="d2_plugin.adapters.inria"):
-            reused = d2.loss(1, adapter.rendered(camera, fudan.render(camera, model, [0, 0, 0])))
-        assert "the trainer's own render has depth and alpha with gradients" in caplog.text
-        assert adapter.probe.usable
-        torch.testing.assert_close(reused, d2.loss(2, camera))
-        reused.backward()
-        assert model._xyz.grad.any()
-
-    @pytest.mark.parametrize(
-        ("mend", "sentence"),
-        [
-            (lambda p: p.pop("alpha"), "has no alpha"),
-            (lambda p: p.update(depth=p["depth"].detach()), "has a depth without a gradient"),
-            (lambda p: p.update(depth=p["depth"] / p["alpha"].clamp_min(1e-6)), "is divided by alpha"),
-            (lambda p: p.update(depth=p["depth"] * 1.5), "is not the sum of w z"),
-            (lambda p: p.update(alpha=p["alpha"] * 0.8), "an alpha that is not the sum of the weights"),
-            (lambda p: p.update(depth=p["depth"][:, :5]), "a depth of shape"),
-        ],
-    )
-    def test_any_other_meaning_of_depth_leads_to_our_own_rasterizer(self, mend, sentence: str) -> None:
-        model, scene = fudan_model()
-        adapter = FudanAdapter(model, scene)
-        camera = scene.train_cameras[1.0][0]
-        package = fudan.render(camera, model, [0, 0, 0])
-        mend(package)
-        d2 = D2Hooks(DEPTH_ALONE, adapter, TinyStore())
-        torch.testing.assert_close(d2.loss(1, adapter.rendered(camera, package)), d2.loss(2, camera))
-        assert not adapter.probe.usable
-        assert sentence in adapter.probe.sentence
-
-    def test_a_render_of_nothing_is_judged_again_later(self) -> None:
-        model, scene = fudan_model()
-        camera = scene.train_cameras[1.0][0]
-        package = fudan.render(camera, model, [0, 0, 0])
-        splats = FudanAdapter(model).slice_at(FudanAdapter(model).view(camera))
-        own = rasterize(splats, torch.zeros(len(splats.means), 1), camera.drawn_view())
-        empty = own._replace(alpha=torch.zeros_like(own.alpha))
-        assert not probe_package(package, empty, (model._xyz, model._opacity)).final
-        assert probe_package(package, own, (model._xyz, model._opacity)).usable
-
-    def test_ex4dgs_says_acc_and_divides_so_ours_is_used(self) -> None:
-        model, scene = ex4dgs.make()
-        model._scaling.data += 1.0
-        model.training_setup(default_options())
-        adapter = Ex4DGSAdapter(model)
-        d2 = D2Hooks(DEPTH_ALONE, adapter, TinyStore())
-        d2.loss(1, adapter.rendered(scene.cameras[0], ex4dgs.render(scene.cameras[0], model, [0, 0, 0])))
-        assert "has no alpha" in adapter.probe.sentence
 
 
 class TestEx4DGS:

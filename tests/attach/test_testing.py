@@ -12,7 +12,7 @@ from tiny import BACKBONES, make_adapter, make_model, make_views
 
 from d2_plugin.adapters.watched import WatchedModel
 from d2_plugin.backbones.densify import grow
-from d2_plugin.protocol import RasterSettings, Splats
+from d2_plugin.protocol import RasterSettings, Render, Splats, View
 from d2_plugin.testing import CHECKS, ContractError, Example, check_backbone
 
 
@@ -188,7 +188,41 @@ def normalised_depth(adapter: WatchedModel) -> None:
 
 
 def any_camera(adapter: WatchedModel) -> None:
-    adapter.rendered_depth = lambda view: adapter._rendered and adapter._rendered[1:]
+    kept: list[tuple[torch.Tensor, torch.Tensor]] = []
+    rendered = adapter.rendered
+
+    def remember(view: View, render: Render) -> None:
+        rendered(view, render)
+        kept[:] = [(render.depth_sum, render.alpha)]
+
+    adapter.rendered = remember
+    adapter.rendered_depth = lambda view: kept.pop() if kept else None
+
+
+def last_only(adapter: WatchedModel) -> None:
+    rendered = adapter.rendered
+
+    def remember(view: View, render: Render) -> None:
+        adapter._renders.forget()
+        rendered(view, render)
+
+    adapter.rendered = remember
+
+
+def swaps_a_batch(adapter: WatchedModel) -> None:
+    """Hands out the renders of a batch in the wrong order."""
+    rendered_depth, put = adapter.rendered_depth, adapter._renders.put
+    views: list[View] = []
+
+    def remember(view: View, render: object) -> None:
+        views.append(view)
+        put(view, render)
+
+    def wrong(view: View) -> object:
+        others = [other for other in views[-2:] if other is not view]
+        return rendered_depth(view if view not in views or not others else others[0])
+
+    adapter._renders.put, adapter.rendered_depth = remember, wrong
 
 
 def refuses(adapter: WatchedModel) -> None:
@@ -240,6 +274,8 @@ def mirrored(view: object) -> torch.Tensor:
         (draws, "the global random state changes"),
         (normalised_depth, "depth_sum is not the slice's"),
         (any_camera, "render of one camera for another"),
+        (last_only, "rendered_depth knows the last render alone"),
+        (swaps_a_batch, "the render of one camera of a batch for another"),
         (refuses, "insert: the backbone raised RuntimeError: no room"),
     ],
 )

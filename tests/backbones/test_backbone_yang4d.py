@@ -111,7 +111,7 @@ class TestColour:
 
     def test_time_modulates_with_the_cosine_of_the_phase(self) -> None:
         coefficients = torch.zeros(1, sh.channel_count(0, 1), 3)
-        coefficients[:, 1] = 0.4 / sh.C0
+        coefficients[:, 1] = 0.4 / sh.SH_C0
         color = sh.colors(coefficients, torch.ones(1, 3), torch.tensor([1 / 6]), 0, 1)
         torch.testing.assert_close(color, torch.full((1, 3), 0.5 + 0.4 * math.cos(math.pi / 3)))
 

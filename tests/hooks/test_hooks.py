@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,10 +18,10 @@ from d2_plugin.hooks.densify import (
     under_reconstructed,
 )
 from d2_plugin.hooks.depth_loss import charbonnier, depth_loss, pixel_depth_loss
-from d2_plugin.hooks.prior import VerifiedPixels
+from d2_plugin.hooks.prior import PriorLoader, TrustedPixels
 from d2_plugin.hooks.prune import depth_inconsistency, opacity_contribution, pruning_score
 from d2_plugin.hooks.rendered_depth import relative_discrepancy, rendered_depth
-from d2_plugin.protocol import View
+from d2_plugin.protocol import DepthPrior, Label, View
 
 
 def tensor(*values: float) -> torch.Tensor:
@@ -94,8 +95,19 @@ class TestCharbonnier:
             assert r.grad.item() == 0
 
 
+@pytest.mark.parametrize("label", list(Label))
+def test_trusted_are_verified_and_agreed_pixels_and_no_others(label: Label) -> None:
+    prior = DepthPrior(torch.ones(2, 2), torch.full((2, 2), int(label), dtype=torch.uint8))
+    assert prior.verified.all() == (label == Label.VERIFIED)
+    assert prior.trusted.all() == (label in (Label.VERIFIED, Label.AGREED))
+    assert prior.support.all() == (label in (Label.VERIFIED, Label.AGREED, Label.MONO))
+    view = View("a", 0, 0.0, torch.eye(4), torch.eye(3), 2, 2)
+    pixels = PriorLoader(SimpleNamespace(prior=lambda camera, frame: prior)).trusted(view)
+    assert (pixels is not None) == prior.trusted.all()
+
+
 class TestDepthLoss:
-    def test_counts_only_pixels_that_are_verified_and_validly_rendered(self) -> None:
+    def test_counts_only_pixels_that_are_trusted_and_validly_rendered(self) -> None:
         depth, prior = tensor(2.0, 2.0, 2.0), tensor(1.0, 4.0, 8.0)
         valid, verified = torch.tensor([True, True, False]), torch.tensor([True, False, True])
         expected = charbonnier(tensor(1.0), 0.01).squeeze()
@@ -145,7 +157,7 @@ class TestPixelDepthLoss:
     @settings(max_examples=50, deadline=None)
     def test_equals_the_composed_formula_with_its_gradient(self, seed: int) -> None:
         depth_sum, alpha, prior, verified = self.maps(seed)
-        pixels = VerifiedPixels(torch.nonzero(verified.flatten()).squeeze(1), prior[verified])
+        pixels = TrustedPixels(torch.nonzero(verified.flatten()).squeeze(1), prior[verified])
         gradients = []
         for fast in (False, True):
             z, a = depth_sum.clone().requires_grad_(), alpha.clone().requires_grad_()
@@ -162,13 +174,13 @@ class TestPixelDepthLoss:
     def test_gradcheck(self) -> None:
         depth_sum, alpha, prior, verified = self.maps(1)
         alpha = torch.where((alpha - 0.5).abs() < 0.01, 0.6, alpha)  # away from the step at tau_v
-        pixels = VerifiedPixels(torch.nonzero(verified.flatten()).squeeze(1), prior[verified])
+        pixels = TrustedPixels(torch.nonzero(verified.flatten()).squeeze(1), prior[verified])
         inputs = (depth_sum.requires_grad_(), alpha.requires_grad_())
         assert torch.autograd.gradcheck(lambda z, a: pixel_depth_loss(z, a, pixels, 0.5, 0.01), inputs)
 
     def test_is_finite_where_nothing_is_rendered(self) -> None:
         z, a = torch.zeros(2, 3, requires_grad=True), torch.zeros(2, 3, requires_grad=True)
-        loss = pixel_depth_loss(z, a, VerifiedPixels(torch.tensor([0, 4]), torch.tensor([1e-3, 1e6])), 0.5, 0.01)
+        loss = pixel_depth_loss(z, a, TrustedPixels(torch.tensor([0, 4]), torch.tensor([1e-3, 1e6])), 0.5, 0.01)
         loss.backward()
         assert loss == 0
         assert not z.grad.any()

@@ -102,12 +102,27 @@ def assert_finite(model: SplatModel) -> None:
         assert torch.isfinite(parameter).all(), name
 
 
-@pytest.mark.parametrize("label", [Label.EMPTY, Label.MONO, Label.CONFLICT])
-def test_case_25_without_a_verified_pixel_there_is_no_depth_loss(model: SplatModel, label: Label) -> None:
+TRUSTED = (Label.VERIFIED, Label.AGREED)
+
+
+@pytest.mark.parametrize("label", [label for label in Label if label not in TRUSTED])
+def test_case_25_without_a_trusted_pixel_there_is_no_depth_loss(model: SplatModel, label: Label) -> None:
     d2 = D2Hooks(DEPTH_LOSS, make_adapter(model), unlabelled(label))
     view = make_views()[0]
     model.render(view)
     assert d2.loss(1, view) == 0.0
+
+
+@pytest.mark.parametrize("label", TRUSTED)
+def test_every_trusted_pixel_supervises_and_judges(model: SplatModel, label: Label) -> None:
+    """The cases with no such pixel can fail."""
+    prune = PruneConfig(start=1, every=1, patience=1, tau_p=0.0)
+    config = replace(DEPTH_LOSS, prune=prune, views_per_evaluation=6)
+    d2 = D2Hooks(config, make_adapter(model), unlabelled(label))
+    for view in make_views():
+        model.render(view)
+        assert d2.loss(1, view) > 0
+    assert d2.step(2).removed > 0
 
 
 def test_case_25_where_nothing_is_rendered_the_depth_loss_is_zero_with_zero_gradients(model: SplatModel) -> None:
@@ -215,9 +230,12 @@ def test_case_33_a_gaussian_that_no_view_sees_is_not_judged(model: SplatModel) -
     assert torch.equal(model.gaussians["base_colors"][:10].detach(), before)
 
 
-def test_case_34_without_verified_pixels_nothing_is_pruned_whatever_the_threshold(model: SplatModel) -> None:
+@pytest.mark.parametrize("label", [label for label in Label if label not in TRUSTED])
+def test_case_34_without_trusted_pixels_nothing_is_pruned_whatever_the_threshold(
+    model: SplatModel, label: Label
+) -> None:
     config = D2Config(prune=PruneConfig(start=1, every=1, patience=1, tau_p=0.0), views_per_evaluation=6)
-    d2 = D2Hooks(config, make_adapter(model), unlabelled(Label.MONO))
+    d2 = D2Hooks(config, make_adapter(model), unlabelled(label))
     for view in make_views():
         d2.loss(1, view)
     for number in range(2, 6):

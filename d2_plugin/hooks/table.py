@@ -1,0 +1,44 @@
+"""The one list of hooks: what configuration, plugin, runs, help and errors know of them comes from here.
+
+Adding a hook touches one file and this table. The file holds its settings and its class,
+
+    @dataclass(frozen=True)
+    class ShrinkConfig(HookConfig):
+        \"\"\"Keeps Gaussians small.\"\"\"
+
+        weight: NotNegative = 0.01
+        \"\"\"Of the mean variance.\"\"\"
+
+    class Shrink(Hook):
+        def loss(self, context: Context) -> Tensor:
+            return self.config.weight * context.backbone.slice_at(context.views[0]).covariances.mean()
+
+and the table one row: `"shrink": HookRow(ShrinkConfig, Shrink, edits_structure=False)`. From then on `[shrink]` in TOML
+builds it, every setting of it is checked, `d2 train --hooks` knows its name, and its state is saved and resumed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from .densify import Densify, DensifyConfig
+from .depth_loss import DepthLoss, DepthLossConfig
+from .hook import Hook, HookConfig
+from .prune import Prune, PruneConfig
+
+
+class HookRow(NamedTuple):
+    """What there is to know of one hook."""
+
+    config: type[HookConfig]
+    hook: type[Hook]
+    edits_structure: bool
+    """Whether it inserts or removes Gaussians; its evaluations survey several views, and it retires when idle."""
+
+
+HOOKS: dict[str, HookRow] = {
+    "densify": HookRow(DensifyConfig, Densify, edits_structure=True),
+    "prune": HookRow(PruneConfig, Prune, edits_structure=True),
+    "depth_loss": HookRow(DepthLossConfig, DepthLoss, edits_structure=False),
+}
+"""Hooks by name, in the order in which they run."""

@@ -1,0 +1,189 @@
+"""One value against its declared kind and range, and names for the common kinds of number."""
+
+from __future__ import annotations
+
+import math
+import types
+from collections.abc import Sequence
+from dataclasses import dataclass, is_dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from d2_plugin.errors import D2Error, unknown_name
+
+
+@dataclass(frozen=True)
+class Range:
+    """Where a number may lie, and its unit; bounds that are None do not bound. Infinity is refused unless allowed."""
+
+    low: float | None = None
+    high: float | None = None
+    unit: str = ""
+    open_low: bool = False
+    """The lower bound itself is refused."""
+    open_high: bool = False
+    """The upper bound itself is refused."""
+    infinite: bool = False
+    """Infinity is a value."""
+
+    def holds(self, value: float) -> bool:
+        """Whether `value`, whole or not, lies inside; NaN never does."""
+        if isinstance(value, float) and (math.isnan(value) or (math.isinf(value) and not self.infinite)):
+            return False
+        above = self.low is None or value > self.low or (value == self.low and not self.open_low)
+        return above and (self.high is None or value < self.high or (value == self.high and not self.open_high))
+
+    def __str__(self) -> str:
+        low = "" if self.low is None else f"{'above' if self.open_low else 'at least'} {self.low:g}"
+        high = "" if self.high is None else f"{'below' if self.open_high else 'at most'} {self.high:g}"
+        return " and ".join(part for part in (low, high) if part) or "finite"
+
+
+@dataclass(frozen=True)
+class Positional:
+    """Marks a setting that the command line takes by its place, not behind a flag: `Annotated[str, Positional()]`."""
+
+
+Count = Annotated[int, Range(0)]
+"""A whole number, 0 or more."""
+Steps = Annotated[int, Range(0, unit="steps")]
+"""Optimizer steps, 0 or more."""
+Every = Annotated[int, Range(1, unit="steps")]
+"""Optimizer steps from one time to the next, 1 or more."""
+AtLeastOne = Annotated[int, Range(1)]
+"""A whole number, 1 or more."""
+Seed = Annotated[int, Range(0, 2**63 - 1)]
+"""Seed of a random generator."""
+Positive = Annotated[float, Range(0, open_low=True)]
+"""A number above 0."""
+NotNegative = Annotated[float, Range(0)]
+"""A number, 0 or more."""
+Share = Annotated[float, Range(0, 1)]
+"""A part of a whole, 0..1."""
+Angle = Annotated[float, Range(0, 180, unit="degrees")]
+"""An angle, 0 to 180 degrees."""
+
+
+class OutOfRange(D2Error):
+    """A value of the right type that lies outside its declared range."""
+
+
+def options_of(kind: Any) -> tuple[Any, ...]:
+    """The kinds of which a value may be: the members of a union, else the kind itself."""
+    return get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+
+
+def checked(kind: Any, limits: Range, value: Any, name: str) -> Any:
+    """`value` as the declared kind, or a D2Error that names the setting.
+
+    `kind` and `limits` are what `Declared.kind` and `Declared.range` hold.
+    """
+    options = options_of(kind)
+    if value is None and type(None) in options:
+        return None
+    options = tuple(option for option in options if option is not type(None))
+    if len(options) == 1:
+        return _as_kind(*_inner(options[0], limits), value, name)
+    unfit: D2Error | None = None
+    for option in options:
+        try:
+            return _as_kind(*_inner(option, limits), value, name)
+        except D2Error as error:
+            says_more = isinstance(error, OutOfRange) or (isinstance(value, str) and _is_choice(option))
+            unfit = error if says_more and unfit is None else unfit
+    raise unfit or _wrong(name, "must be " + " or ".join(_noun(_inner(option, limits)[0]) for option in options), value)
+
+
+def _as_kind(kind: Any, limits: Range, value: Any, name: str) -> Any:
+    """`value` as one kind that is no union; a number of numpy or torch is the Python number that it holds."""
+    value = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value
+    if kind is Any:
+        return value
+    if _is_choice(kind):
+        return _as_choice(kind, value, name)
+    if get_origin(kind) is tuple:
+        return _as_tuple(get_args(kind), limits, value, name)
+    if kind in (int, float):
+        return _as_number(kind, limits, value, name)
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    if isinstance(value, get_origin(kind) or kind):
+        return value
+    raise _wrong(name, f"must be {_noun(kind)}", value)
+
+
+def _is_choice(kind: Any) -> bool:
+    return get_origin(kind) is Literal
+
+
+def _as_choice(kind: Any, value: Any, name: str) -> Any:
+    choices = get_args(kind)
+    if any(type(value) is type(choice) and value == choice for choice in choices):
+        return value
+    if isinstance(value, str) and all(isinstance(choice, str) for choice in choices):
+        raise unknown_name(name, value, choices)
+    raise _wrong(name, f"must be {_noun(kind)}", value)
+
+
+def _as_number(kind: type, limits: Range, value: Any, name: str) -> int | float:
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    if not whole and not (kind is float and isinstance(value, float)):
+        raise _wrong(name, f"must be {_noun(kind)}", value)
+    try:
+        number = kind(value)
+    except OverflowError:
+        raise OutOfRange(str(_wrong(name, "must be a number below 1.8e308 in size", value))) from None
+    if not limits.holds(number):
+        unit = f" {limits.unit}" if limits.unit else ""
+        raise OutOfRange(str(_wrong(name, f"must be {limits}{unit}", value)))
+    return number
+
+
+def _as_tuple(kinds: Sequence[Any], limits: Range, value: Any, name: str) -> tuple[Any, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise _wrong(name, "must be a list", value)
+    endless = len(kinds) == 2 and kinds[1] is Ellipsis
+    if not endless and len(value) != len(kinds):
+        raise _wrong(name, f"must be a list of {len(kinds)} values", value)
+    each = [kinds[0]] * len(value) if endless else kinds
+    pairs = zip(each, value, strict=True)
+    return tuple(checked(*_inner(kind, limits), item, f"{name}[{i}]") for i, (kind, item) in enumerate(pairs))
+
+
+def _inner(kind: Any, limits: Range) -> tuple[Any, Range]:
+    """A kind inside a union or tuple, and its range: its own, else that of the whole."""
+    bare, own = bare_and_range(kind)
+    return bare, own if own != Range() else limits
+
+
+def bare_and_range(hint: Any) -> tuple[Any, Range]:
+    """The bare type of an annotation and its range."""
+    if get_origin(hint) is Annotated:
+        bare, *extras = get_args(hint)
+        return bare, next((extra for extra in extras if isinstance(extra, Range)), Range())
+    return hint, Range()
+
+
+def _noun(kind: Any) -> str:
+    """What a value of this kind is called in a sentence."""
+    if _is_choice(kind):
+        return f"one of {', '.join(map(str, get_args(kind)))}"
+    if get_origin(kind) is tuple:
+        return "a list"
+    if get_origin(kind) is not None or is_dataclass(kind):
+        return "a table of settings"
+    words = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
+    return words.get(kind) or f"a {kind.__name__}"
+
+
+def _wrong(name: str, must: str, value: Any) -> D2Error:
+    return D2Error(f"setting {name} {must}, got {shown(value)}")
+
+
+def shown(value: Any) -> str:
+    """A value on one short line."""
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # Python refuses to write a number of more than some thousand digits
+        text = f"a {type(value).__name__} too long to be written"
+    return text if len(text) < 80 else text[:76] + " ..."

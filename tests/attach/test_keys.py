@@ -1,0 +1,77 @@
+"""Which camera and frame of the prior a trainer's camera object stands for."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+from mimics import ex4dgs, fudan, hust4d, spacetime
+from mimics.inria import cameras_of
+from tiny import make_views
+
+from d2_plugin import D2Error
+from d2_plugin.adapters.ex4dgs import Ex4DGSAdapter
+from d2_plugin.adapters.fudan import FudanAdapter
+from d2_plugin.adapters.hust4d import Hust4DAdapter
+from d2_plugin.adapters.keys import KeysByPose, PriorKey, frame_of_time, key_from_picture, one_picture_each
+from d2_plugin.adapters.spacetime import SpacetimeAdapter
+
+
+class TestNames:
+    @pytest.mark.parametrize(
+        ("picture", "key"),
+        [
+            ("cam01_0003", ("cam01", 3)),
+            ("/data/scene/images/cam01_0003.png", ("cam01", 3)),
+            ("/data/scene/cam01/images/0003.png", ("cam01", 3)),
+            ("scene/cam07/frame_00012.jpg", ("cam07", 12)),
+            ("a_b_12.png", ("a_b", 12)),
+            (r"C:\scene\cam02\images\0004.png", ("cam02", 4)),
+        ],
+    )
+    def test_pictures_tell_camera_and_frame(self, picture: str, key: tuple[str, int]) -> None:
+        assert key_from_picture(picture) == key
+
+    def test_a_name_without_a_camera_is_refused_with_the_way_out(self) -> None:
+        with pytest.raises(D2Error, match=r"picture '0003.png' does not say its camera.*function `key`"):
+            key_from_picture("0003.png")
+
+    def test_a_moving_camera_has_a_prior_for_each_picture(self) -> None:
+        assert one_picture_each(SimpleNamespace(image_name="r_014.png")) == ("r_014", 0)
+
+    def test_a_time_between_frames_is_refused(self) -> None:
+        assert frame_of_time(0.06, 50, first=10) == 13
+        with pytest.raises(D2Error, match=r"time 0.0333333 is frame 1.67 of 50"):
+            frame_of_time(1 / 30, 50)
+
+    def test_cameras_without_names_are_found_by_their_pose(self) -> None:
+        poses = {view.camera: view.T_camera_world for view in make_views() if view.frame == 0}
+        keys = KeysByPose(poses, lambda camera: round(2 * camera.timestamp))
+        camera = cameras_of(timestamp=lambda view: view.time)[5]
+        assert keys(camera) == ("cam2", 1)
+        camera.world_view_transform = camera.world_view_transform + 0.5
+        with pytest.raises(D2Error, match="stands at none of the known poses"):
+            keys(camera)
+
+    def test_the_index_that_hust_calls_a_name_leads_to_the_path(self) -> None:
+        model, scene = hust4d.make()
+        adapter = Hust4DAdapter(model, scene, "fine")
+        assert [(adapter.view(c).camera, adapter.view(c).frame) for c in scene.cameras] == [
+            (view.camera, view.frame) for view in make_views()
+        ]
+
+        infos = [SimpleNamespace(image_path=path) for path in scene.train_camera.dataset.image_paths]
+        listed = SimpleNamespace(train_camera=SimpleNamespace(dataset=infos))
+        assert Hust4DAdapter(model, listed, "fine").view(scene.cameras[4]).camera == "cam1"
+
+    def test_spacetime_and_ex4dgs_count_frames_by_time(self) -> None:
+        model, scene = spacetime.make()
+        assert SpacetimeAdapter(model, 2).view(scene.cameras[4]).frame == 1
+        model, scene = ex4dgs.make()
+        view = Ex4DGSAdapter(model, first_frame=100).view(scene.cameras[4])
+        assert (view.camera, view.frame) == ("cam1", 101)
+
+    def test_a_key_of_ones_own_goes_before_everything(self) -> None:
+        model, scene = fudan.make()
+        view = FudanAdapter(model, key=lambda camera: PriorKey("mine", 9)).view(scene.train_cameras[1.0][0])
+        assert (view.camera, view.frame) == ("mine", 9)

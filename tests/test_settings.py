@@ -1,0 +1,250 @@
+"""One declaration per setting: whatever is wrong is refused in one sentence that names it, whatever is right stays."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from dataclasses import MISSING, asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from d2_plugin.errors import D2Error
+from d2_plugin.settings import (
+    FORMAT,
+    AtLeastOne,
+    Count,
+    Positional,
+    Positive,
+    Range,
+    Seed,
+    Settings,
+    Share,
+    Steps,
+    declared,
+    of_this_format,
+)
+
+
+@dataclass(frozen=True)
+class Inner(Settings):
+    """A table inside.
+
+    Its second line.
+    """
+
+    part: Share = 0.5
+
+
+@dataclass(frozen=True)
+class Base(Settings):
+    """What two have in common."""
+
+    start: Steps = 1
+    """The first step
+    of all."""
+
+
+@dataclass(frozen=True)
+class Example(Base):
+    """One setting of each kind."""
+
+    name: Annotated[str, Positional()] = "studio"
+    kind: Literal["relative", "metric"] = "relative"
+    """What the network returns."""
+    weight: Positive = 1.0
+    reach: Annotated[float, Range(0, infinite=True, unit="m")] = math.inf
+    share: Share = 0.5
+    stop: Steps | None = None
+    tau: Literal["auto"] | Positive = "auto"
+    levels: tuple[AtLeastOne, ...] = (1, 2)
+    bounds: tuple[Positive, Positive] | None = None
+    folder: Path | None = None
+    on: bool = True
+    seed: Seed = 0
+    inner: Inner = field(default_factory=Inner)
+    maybe: Inner | None = None
+
+
+NAMES = {setting.name: setting for setting in declared(Example)}
+
+ANYTHING = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.just(10**400),
+    st.just(-(10**5000)),
+    st.floats(allow_nan=True, allow_infinity=True),
+    st.text(max_size=5),
+    st.sampled_from(["auto", "relative", "metric"]),
+    st.lists(st.one_of(st.integers(-3, 3), st.floats(), st.text(max_size=2), st.none()), max_size=3),
+    st.dictionaries(st.sampled_from(["part", "parts"]), st.floats(), max_size=1),
+    st.builds(object),
+    st.floats().map(np.float64),
+    st.integers(-5, 5).map(np.int64),
+    st.booleans().map(np.bool_),
+    st.floats(width=32).map(torch.tensor),
+    st.just(np.zeros(3)),
+    st.just(Inner()),
+)
+
+
+def right(name: str, value: Any) -> bool:
+    """The declaration of `Example` once more, by hand."""
+    value = value.item() if isinstance(value, (np.generic, torch.Tensor)) else value
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    finite = number and abs(value) <= sys.float_info.max
+    whole = number and isinstance(value, int)
+    part = isinstance(value, dict) and set(value) <= {"part"} and all(0 <= v <= 1 for v in value.values())
+    match name:
+        case "start" | "stop" | "seed":
+            return (name == "stop" and value is None) or (whole and value >= 0 and (name != "seed" or value < 2**63))
+        case "name":
+            return isinstance(value, str)
+        case "kind":
+            return isinstance(value, str) and value in ("relative", "metric")
+        case "weight" | "tau":
+            return (name == "tau" and isinstance(value, str) and value == "auto") or (finite and value > 0)
+        case "reach":
+            return (number and value == math.inf) or (finite and value >= 0)
+        case "share":
+            return finite and 0 <= value <= 1
+        case "levels":
+            return isinstance(value, list) and all(type(v) is int and v >= 1 for v in value)
+        case "bounds":
+            pair = isinstance(value, list) and len(value) == 2
+            return value is None or (pair and all(type(v) in (int, float) and 0 < v < math.inf for v in value))
+        case "folder":
+            return value is None or isinstance(value, str)
+        case "on":
+            return isinstance(value, bool)
+        case "inner" | "maybe":
+            return isinstance(value, Inner) or part or (name == "maybe" and value is None)
+    raise AssertionError(name)
+
+
+@given(st.sampled_from(sorted(NAMES)), ANYTHING)
+def test_a_wrong_value_is_one_sentence_with_its_name_and_a_right_one_passes(name: str, value: Any) -> None:
+    if right(name, value):
+        Example.from_dict({name: value}, "run")
+        return
+    with pytest.raises(D2Error) as refusal:
+        Example.from_dict({name: value}, "run")
+    assert f"run.{name}" in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@given(st.sampled_from(sorted(set(NAMES) - {"inner", "maybe"})), ANYTHING)
+def test_python_is_checked_as_files_are(name: str, value: Any) -> None:
+    try:
+        through_file = Example.from_dict({name: value})
+    except D2Error:
+        with pytest.raises(D2Error, match=rf"Example\.{name}"):
+            Example(**{name: value})
+    else:
+        assert Example(**{name: value}) == through_file
+
+
+@given(
+    st.builds(
+        Example,
+        start=st.integers(0, 10**6),
+        kind=st.sampled_from(["relative", "metric"]),
+        weight=st.floats(1e-300, 1e300),
+        stop=st.none() | st.integers(0, 9),
+        tau=st.just("auto") | st.floats(1e-9, 1e9),
+        levels=st.lists(st.integers(1, 99), max_size=4),
+        bounds=st.none() | st.tuples(st.floats(1e-3, 1), st.floats(1, 9)),
+        maybe=st.none() | st.builds(Inner, part=st.floats(0, 1)),
+    )
+)
+def test_settings_survive_json(settings: Example) -> None:
+    assert Example.from_dict(json.loads(json.dumps(asdict(settings)))) == settings
+
+
+def test_whole_numbers_become_floats_and_lists_tuples() -> None:
+    made = Example(weight=2, levels=[3, 4], bounds=[1, 2], folder="a/b")
+    assert (made.weight, made.levels, made.bounds, made.folder) == (2.0, (3, 4), (1.0, 2.0), Path("a/b"))
+    assert isinstance(made.weight, float)
+    assert isinstance(Example(start=np.int64(3)).start, int)
+
+
+@pytest.mark.parametrize(
+    ("table", "sentence"),
+    [
+        ({"start": -1}, r"setting run\.start must be at least 0 steps, got -1"),
+        ({"share": 2}, r"setting run\.share must be at least 0 and at most 1, got 2"),
+        ({"share": math.nan}, r"setting run\.share must be at least 0 and at most 1, got nan"),
+        ({"weight": 0}, r"setting run\.weight must be above 0, got 0"),
+        ({"weight": 10**400}, r"setting run\.weight must be a number below 1.8e308 in size, got 1000.* \.\.\.$"),
+        ({"weight": "much"}, r"setting run\.weight must be a number, got 'much'"),
+        ({"on": 1}, r"setting run\.on must be true or false, got 1"),
+        ({"start": 1.5}, r"setting run\.start must be a whole number, got 1.5"),
+        ({"kind": "metrc"}, r"unknown run\.kind 'metrc': have metric, relative; did you mean 'metric'\?"),
+        ({"kind": 3}, r"setting run\.kind must be one of relative, metric, got 3"),
+        ({"tau": [1]}, r"setting run\.tau must be one of auto or a number, got \[1\]"),
+        ({"tau": -1}, r"setting run\.tau must be above 0, got -1"),
+        ({"tau": "aut"}, r"unknown run\.tau 'aut': have auto; did you mean 'auto'\?"),
+        ({"levels": [1, 0]}, r"setting run\.levels\[1\] must be at least 1, got 0"),
+        ({"bounds": [1]}, r"setting run\.bounds must be a list of 2 values, got \[1\]"),
+        ({"strat": 3}, r"unknown setting of run 'strat': have .*; did you mean 'start'\?"),
+        ({"inner": 3}, r"run\.inner must be a table of settings, got 3: write \[run\.inner\] above them"),
+        ({"inner": {"prat": 1}}, r"unknown setting of run\.inner 'prat': have part; did you mean 'part'\?"),
+        ({"inner": {"part": 2}}, r"setting run\.inner\.part must be at least 0 and at most 1, got 2"),
+    ],
+)
+def test_a_mistake_is_told_with_what_was_expected_and_what_to_do(table: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(D2Error, match=sentence):
+        Example.from_dict(table, "run")
+
+
+def test_the_top_of_a_file_has_no_name() -> None:
+    with pytest.raises(D2Error, match=r"^setting inner\.part must be"):
+        Example.from_dict({"inner": {"part": -1}}, "")
+    with pytest.raises(D2Error, match=r"^unknown setting 'inne'"):
+        Example.from_dict({"inne": {}}, "")
+
+
+def test_a_setting_without_a_default_is_asked_for() -> None:
+    @dataclass(frozen=True)
+    class Needy(Settings):
+        name: str
+        count: Count = 0
+
+    with pytest.raises(D2Error, match="capture must have name: add what is missing"):
+        Needy.from_dict({"count": 1}, "capture")
+    assert declared(Needy)[0].default is MISSING
+
+
+def test_help_range_unit_and_place_are_found() -> None:
+    assert [name for name, setting in NAMES.items() if setting.positional] == ["name"]
+    assert NAMES["start"].help == "The first step of all."
+    assert NAMES["kind"].help == "What the network returns."
+    assert NAMES["inner"].help == "A table inside."
+    assert NAMES["reach"].range.unit == "m"
+    assert NAMES["start"].range == Range(0, unit="steps")
+    assert NAMES["levels"].default == (1, 2)
+    assert next(iter(NAMES)) == "start", "a base's settings come first"
+
+
+def test_a_class_without_source_has_no_help() -> None:
+    space: dict[str, Any] = {"dataclass": dataclass, "Settings": Settings, "Count": Count}
+    text = "@dataclass(frozen=True)\nclass Typed(Settings):\n    count: Count = 3\n    '''Help.'''"
+    exec(compile(text, "nowhere", "exec", dont_inherit=True), space)
+    assert declared(space["Typed"])[0].help == ""
+
+
+@pytest.mark.parametrize("version", [FORMAT + 1, 0, "1", True, None])
+def test_a_file_of_another_version_is_named(version: object) -> None:
+    with pytest.raises(D2Error, match=f"d2.toml has settings of version {version!r}, and this d2-4dgs reads version 1"):
+        of_this_format({"version": version}, "d2.toml")
+
+
+def test_a_file_without_a_version_is_of_the_first() -> None:
+    assert of_this_format({"prior": "x"}, "d2.toml") == of_this_format({"prior": "x", "version": 1}, "d2.toml")
