@@ -161,7 +161,12 @@ def test_doctor_names_compiler_device_and_extras(capsys: pytest.CaptureFixture[s
 def test_plan_names_each_decision_with_its_measurement(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", str(capture), "--train-cameras", CAMERAS]) == 0
     notes, lines = [], []
-    for line in capsys.readouterr().out.splitlines():
+    recording, *rest = capsys.readouterr().out.splitlines()
+    assert recording == (
+        "recording  room: layout folder, 4 cameras (train0, train1, train2, test0), frames 0 to 1 (2) at 30 per second, "
+        "96x54 pixels"
+    )
+    for line in rest:
         (notes if line.split()[0] == "note" else lines).append(line)
     assert notes, "what is known about the recording is said"
     assert [line.split()[1] for line in lines] == ["temporal", "stereo", "monocular", "verification"]
