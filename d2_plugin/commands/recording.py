@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from d2_plugin.commands.form import Form, Given, Group
 from d2_plugin.errors import D2Error, unknown_name
@@ -165,6 +165,8 @@ def say_plan(plan: ScenePlan) -> None:
 
 def _spelled(setting: Declared) -> Declared:
     """A setting of a run as a command line takes it."""
+    if setting.name == "mono_kind":  # TEMPORARY, as HELP: until RunSettings says so itself
+        setting = setting._replace(kind=Literal["relative", "metric"] | None)
     said = f"{setting.help or HELP.get(setting.name, '')} {WRITTEN.get(setting.name, '')}".strip()
     return setting._replace(help=said, positional=setting.name == "capture")
 

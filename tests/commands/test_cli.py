@@ -163,8 +163,8 @@ def test_plan_names_each_decision_with_its_measurement(capture: Path, capsys: py
     notes, lines = [], []
     recording, *rest = capsys.readouterr().out.splitlines()
     assert recording == (
-        "recording  room: layout folder, 4 cameras (train0, train1, train2, test0), frames 0 to 1 (2) at 30 per second, "
-        "96x54 pixels"
+        "recording  room: layout folder, 4 cameras (train0, train1, train2, test0), frames 0 to 1 (2) "
+        "at 12 per second, 96x54 pixels"
     )
     for line in rest:
         (notes if line.split()[0] == "note" else lines).append(line)
@@ -279,16 +279,22 @@ class TestMistakes:
         assert "30x20" in message
         assert "96x54" in message
 
-    def test_a_damaged_prior_is_named(
-        self, capture: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    def test_a_damaged_prior_is_named_and_that_frame_alone_is_built_again(
+        self, capture: Path, finished: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
     ) -> None:
         priors = tmp_path / "priors"
-        shutil.copytree(finished / "priors" / "priors", priors / "priors")
-        shutil.copy(finished / "priors" / "store.json", priors)
+        shutil.copytree(finished / "priors", priors)
         array = priors / "priors" / "train1" / "00000.npy"
         array.write_bytes(array.read_bytes()[:500])
+        written = {path: path.stat().st_mtime_ns for path in (priors / "priors").rglob("*.npy")}
         with pytest.raises(D2Error, match="camera train1, frame 0 is damaged"):
             PriorStore.open(priors)
+        assert train(capture, tmp_path / "run", "--priors", str(priors)) == 0
+        assert "train1/00000" in caplog.text
+        assert "is damaged" in caplog.text
+        again = {path for path, time in written.items() if path.stat().st_mtime_ns != time}
+        assert again == {array}
+        assert array.read_bytes() == (finished / "priors" / "priors" / "train1" / "00000.npy").read_bytes()
 
     def test_onnx_without_its_kind(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "--mono-kind" in refused(capsys, train(capture, tmp_path / "x", "--mono-onnx", "net.onnx"))
