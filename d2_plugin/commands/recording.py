@@ -24,17 +24,18 @@ CAPTURE = ("capture", "train_cameras", "frames", "downscale", "mono_onnx", "mono
 """Settings of a run that say what is trained on."""
 
 WRITTEN = {
+    "capture": "images/CAMERA/FRAME.png with cameras.json, or as N3DV, Technicolor, ENeRF-Outdoor, COLMAP or "
+    "transforms.json lay it out.",
     "train_cameras": "Names joined by commas, as in 00,02,05,07; or preset:2, preset:3, preset:4 for a known data set.",
     "test_cameras": "Names joined by commas; all others where left out.",
-    "frames": "first:last or first:last:step, the last one included; all where left out.",
+    "frames": "Written first:last or first:last:step, the last one included; all where left out.",
     "hooks": "all, none, or names of prior, densify, prune, depth_loss joined by commas.",
     "priors": "OUTPUT/priors where left out.",
 }
 """How some settings are written on a command line, behind what their docstrings say."""
 
 HELP = {
-    "capture": "Folder of the recording: images/CAMERA/FRAME.png with cameras.json, or as N3DV, Technicolor, "
-    "ENeRF-Outdoor, COLMAP or transforms.json lay it out.",
+    "capture": "Folder of the recording.",
     "downscale": "Train on pictures this many times smaller.",
     "mono_onnx": "Monocular depth network as an ONNX file.",
     "mono_kind": "What the network predicts: relative (inverse depth) or metric (depth).",
@@ -56,7 +57,10 @@ class ConfigFile(Settings):
 
 @dataclass(frozen=True)
 class PlanChoices:
-    """Decisions of the plan that are taken by hand; the others follow from cameras and depth sources."""
+    """Decisions of the plan that are taken by hand; the others follow from cameras and depth sources.
+
+    TEMPORARY: `d2_plugin.runs.settings` will have this class, and its own is taken where it has.
+    """
 
     temporal: bool | None = None
     """Whether Gaussians move and fade over time. Measured where it is left out."""
@@ -97,6 +101,7 @@ def all_tables(backbone: str) -> dict[str, Group]:
     from d2_plugin import registry
     from d2_plugin.config import D2Config
     from d2_plugin.priors.settings import PriorSettings
+    from d2_plugin.runs import settings
 
     hooks = {s.name: kind for s in declared(D2Config) for kind in (s.kind, *get_args(s.kind)) if is_dataclass(kind)}
     module: Any = registry.load(registry.BACKBONES, backbone)
@@ -105,7 +110,7 @@ def all_tables(backbone: str) -> dict[str, Group]:
         "d2": Group(D2Config, tuple(hooks)),
         "priors": Group(PriorSettings),
         "backbone": Group(type(module.settings_from({}))),
-        "plan": Group(PlanChoices),
+        "plan": Group(getattr(settings, "PlanChoices", PlanChoices)),
     }
 
 
