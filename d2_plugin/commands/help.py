@@ -91,7 +91,7 @@ def _bounds(where: Range) -> str:
     if where.high is not None and where.high > LARGE:
         where = replace(where, high=None)
     bounds = str(where) if (where.low, where.high) != (None, None) else ""
-    return f"{bounds} {where.unit}".strip()
+    return ", ".join(part for part in (where.unit, bounds) if part)
 
 
 def _default(setting: Declared) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from d2_plugin.commands.form import Form, Given
 from d2_plugin.commands.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
 from d2_plugin.commands.study_form import study_form
+from d2_plugin.errors import D2Error
 
 if TYPE_CHECKING:
     from d2_plugin.captures import Capture
@@ -35,6 +36,8 @@ def run(given: Given) -> None:
     from d2_plugin.runs.scene import Scene
     from d2_plugin.runs.settings import check
 
+    if given.values["verify"]:
+        raise D2Error("--verify is cut short or given a value: write --verify")
     scene = Scene.open(check(run_settings(given)))
     say(f"recording  {described(scene.capture)}")
     say_notes(scene.capture.notes)

@@ -27,22 +27,25 @@ WRITTEN = {
     "capture": "images/CAMERA/FRAME.png with cameras.json, or as N3DV, Technicolor, ENeRF-Outdoor, COLMAP or "
     "transforms.json lay it out.",
     "train_cameras": "Names joined by commas, as in 00,02,05,07; or preset:2, preset:3, preset:4 for a known data set.",
-    "test_cameras": "Names joined by commas; all others where left out.",
-    "frames": "Written first:last or first:last:step, the last one included; all where left out.",
+    "test_cameras": "Names joined by commas.",
+    "frames": "Written first:last or first:last:step, the last one included.",
     "hooks": "all, none, or names of prior, densify, prune, depth_loss joined by commas.",
-    "priors": "OUTPUT/priors where left out.",
 }
 """How some settings are written on a command line, behind what their docstrings say."""
 
 HELP = {
     "capture": "Folder of the recording.",
+    "train_cameras": "Cameras to train with.",
+    "test_cameras": "Cameras to score with; all others where left out.",
+    "frames": "Which frames; all where left out.",
     "downscale": "Train on pictures this many times smaller.",
     "mono_onnx": "Monocular depth network as an ONNX file.",
     "mono_kind": "What the network predicts: relative (inverse depth) or metric (depth).",
     "backbone": "Which 4D Gaussian model.",
     "iterations": "Optimizer steps, one view each.",
+    "hooks": "Parts of the method that are used.",
     "seed": "Of every random choice.",
-    "priors": "Folder of the depth prior.",
+    "priors": "Folder of the depth prior; OUTPUT/priors where left out.",
 }
 """TEMPORARY, for settings of a run that have no docstring yet. Delete it once `RunSettings` has them all."""
 

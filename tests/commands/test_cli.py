@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.store import PriorStore
+from d2_plugin.runs.run import Run
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
@@ -82,22 +84,28 @@ def test_a_run_leaves_scores_pictures_configuration_and_checkpoint(finished: Pat
     assert (finished / "checkpoint.pt").is_file()
 
 
-def test_a_cut_off_run_continues_to_the_same_score(capture: Path, finished: Path, tmp_path: Path) -> None:
-    import torch
+def test_a_cut_off_run_continues_to_the_same_score(
+    capture: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class CutOff(Exception):
+        pass
 
-    from d2_plugin.runs.run import Run
-
-    first = Run.load(finished)
     output = tmp_path / "again"
-    shutil.copytree(finished, output)
-    (output / "checkpoint.pt").unlink()
-    (output / "metrics.json").unlink()
-    run = Run(first.settings, output)
-    extent, sparse = run._points()
-    trainer = run._trainer(extent, sparse)
-    trainer.run(until=24)
-    run._save(trainer)
-    assert train(capture, output) == 0
+    save, steps = Run._save, list[int]()
+
+    def cut_off(run: Run, trainer: Any) -> None:
+        save(run, trainer)
+        steps.append(trainer.step)
+        if trainer.step == 24:
+            raise CutOff
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "_save", cut_off)
+        with pytest.raises(CutOff):
+            train(capture, output)
+        steps.clear()
+        assert train(capture, output) == 0
+    assert steps == [28, 32, 36, 40], "it goes on from where it was cut off"
     ends = [torch.load(folder / "checkpoint.pt", weights_only=True)["model"] for folder in (finished, output)]
     for name, value in ends[0]["parameters"].items():
         assert torch.equal(value, ends[1]["parameters"][name]), name

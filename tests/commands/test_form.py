@@ -162,7 +162,7 @@ class TestHelp:
     def test_says_unit_range_default_and_what_is_needed(self) -> None:
         text = " ".join(help_text(form_of(), ["--help"]).split())
         assert "usage: d2 work PLACE --output PATH [more flags]" in text
-        assert "--steps N How long. (at least 0 steps; default 10)" in text
+        assert "--steps N How long. (steps, at least 0; default 10)" in text
         assert "--share X How much. (at least 0 and at most 1; default 0.5)" in text
         assert "--kind relative|metric What." in text
         assert "--no-pictures Less. --" not in text
@@ -176,7 +176,7 @@ class TestHelp:
         table = " ".join(help_text(form, ["--help", "prune.edges"]).split())
         assert "[prune.edges] How edges are found." in table
         assert (
-            "--prune.edges.width N Of the window. Studio: 28.9 dB at 3, 28.1 at 5. (at least 1 pixels; default 3)"
+            "--prune.edges.width N Of the window. Studio: 28.9 dB at 3, 28.1 at 5. (pixels, at least 1; default 3)"
             in table
         )
         assert "--prune.every" not in table
