@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from d2_plugin.commands.form import Form, Given
-from d2_plugin.commands.recording import ConfigFile, recording_form, run_settings
+from d2_plugin.commands.arguments.form import Form, Given
+from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings
 from d2_plugin.commands.train import TABLES
 from d2_plugin.settings import Range, Seed
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from d2_plugin.commands.form import HELP, Form
-from d2_plugin.commands.study_form import study_form
+from d2_plugin.commands.arguments.form import HELP, Form
+from d2_plugin.commands.arguments.study_form import study_form
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.settings import Positional, Settings
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from d2_plugin import __version__
-from d2_plugin.commands.form import HELP
-from d2_plugin.commands.help import entry, help_text
+from d2_plugin.commands.arguments.form import HELP
+from d2_plugin.commands.arguments.help import entry, help_text
 from d2_plugin.errors import D2Error, unknown_name
 
 COMMANDS = (

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from d2_plugin.commands.form import Form
+from d2_plugin.commands.arguments.form import Form
 from d2_plugin.settings import Positional, Settings
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from d2_plugin.commands.form import Form
+from d2_plugin.commands.arguments.form import Form
 
 
 def form(words: list[str]) -> Form:

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from d2_plugin.commands.form import Form, Given
-from d2_plugin.commands.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
-from d2_plugin.commands.study_form import study_form
+from d2_plugin.commands.arguments.form import Form, Given
+from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
+from d2_plugin.commands.arguments.study_form import study_form
 from d2_plugin.errors import D2Error
 
 if TYPE_CHECKING:

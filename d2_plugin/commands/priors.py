@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from d2_plugin.commands.form import Form, Given
-from d2_plugin.commands.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
+from d2_plugin.commands.arguments.form import Form, Given
+from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Range
 

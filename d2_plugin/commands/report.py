@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from d2_plugin.commands.form import Form
-from d2_plugin.commands.study_form import study_form
+from d2_plugin.commands.arguments.form import Form
+from d2_plugin.commands.arguments.study_form import study_form
 
 
 def form(words: list[str]) -> Form:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from d2_plugin.commands.form import Form, Given
-from d2_plugin.commands.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
+from d2_plugin.commands.arguments.form import Form, Given
+from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
 
 OF_THE_RUN = ("test_cameras", "backbone", "iterations", "hooks", "priors", "seed", "device")
 TABLES = ("densify", "prune", "depth_loss", "d2", "priors", "backbone", "plan")

@@ -15,9 +15,9 @@ import pytest
 
 from d2_plugin.captures.export.folder import save_capture
 from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.commands.arguments.form import Form, Given
+from d2_plugin.commands.arguments.recording import all_tables
 from d2_plugin.commands.cli import COMMANDS, main
-from d2_plugin.commands.form import Form, Given
-from d2_plugin.commands.recording import all_tables
 from d2_plugin.config import DensifyConfig
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.runs.run import Run

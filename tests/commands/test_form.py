@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 
 import pytest
 
-from d2_plugin.commands.form import Form, Given, Group
-from d2_plugin.commands.help import help_text
+from d2_plugin.commands.arguments.form import Form, Given, Group
+from d2_plugin.commands.arguments.help import help_text
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Positional, Range, Settings, Share, Steps, declared
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, is_dataclass
 from typing import Any, NamedTuple, TypeVar, get_args
 
-from d2_plugin.commands.text import bare, flag_of, item_kind, read
+from d2_plugin.commands.arguments.text import bare, flag_of, item_kind, read
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Declared, declared
 

@@ -7,8 +7,8 @@ import textwrap
 from collections.abc import Collection, Sequence
 from dataclasses import MISSING, replace
 
-from d2_plugin.commands.form import HELP, Form, Section, said
-from d2_plugin.commands.text import bare, flag_of, item_kind, limits, placeholder, shown
+from d2_plugin.commands.arguments.form import HELP, Form, Section, said
+from d2_plugin.commands.arguments.text import bare, flag_of, item_kind, limits, placeholder, shown
 from d2_plugin.errors import unknown_name
 from d2_plugin.settings import Declared, Range
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 
-from d2_plugin.commands.form import Form
+from d2_plugin.commands.arguments.form import Form
 
 
 def study_form(command: str, module_name: str, settings: str) -> Form:
