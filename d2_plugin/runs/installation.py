@@ -17,7 +17,7 @@ OPTIONAL = {
     "onnxruntime": ("mono", "monocular depth from an ONNX network"),
     "pycolmap": ("stereo", "sparse points from known cameras"),
     "cv2": ("image", "pictures, videos, the OpenCV stereo sweep"),
-    "kornia": ("image", "image operations that tests compare with"),
+    "kornia": ("test", "image operations that tests compare with"),
     "rich": ("cli", "progress bars"),
     "matplotlib": ("report", "plots of `d2 bench`"),
     "distributed": ("cluster", "priors built by several processes or machines"),
