@@ -2,11 +2,74 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import importlib.util
+import os
+import platform
+
+from d2_plugin import __version__, compiler, registry
 from d2_plugin.commands.arguments.form import Form
+
+OPTIONAL = {
+    "onnxruntime": ("mono", "monocular depth from an ONNX network"),
+    "pycolmap": ("stereo", "sparse points from known cameras"),
+    "cv2": ("image", "pictures, videos, the OpenCV stereo sweep"),
+    "kornia": ("test", "image operations that tests compare with"),
+    "rich": ("cli", "progress bars"),
+    "matplotlib": ("report", "plots of `d2 bench`"),
+    "distributed": ("cluster", "priors built by several processes or machines"),
+}
 
 
 def form(words: list[str]) -> Form:
     """What `d2 doctor` takes: nothing."""
-    from d2_plugin.runs.installation import report
-
     return Form("d2 doctor", __doc__ or "", (), lambda given: report())
+
+
+def report() -> str:
+    """A few lines a person can paste into an issue."""
+    import torch
+
+    from d2_plugin.priors.colmap import mvs as colmap_mvs
+
+    lines = [
+        f"d2-4dgs {__version__}, Python {platform.python_version()}, torch {torch.__version__}, {os.cpu_count()} cores",
+        f"device      {_device()}",
+        f"compiler    {_compiler()}",
+        f"cache       {compiler.cache_folder()}",
+        f"backbones   {', '.join(registry.names(registry.BACKBONES))}",
+    ]
+    lines += [f"{module:12}{_state(module, extra, purpose)}" for module, (extra, purpose) in OPTIONAL.items()]
+    return "\n".join([*lines, f"{'COLMAP':12}{colmap_mvs.why_not_usable() or 'PatchMatch on CUDA'}"])
+
+
+def _device() -> str:
+    import torch
+
+    if torch.cuda.is_available():
+        return f"{torch.cuda.get_device_name()}; {_cuda_kernels()}"
+    return "CPU only: no CUDA device found"
+
+
+def _cuda_kernels() -> str:
+    from d2_plugin.rasterizer import nvrtc
+
+    try:
+        nvrtc.library()
+    except nvrtc.NoCuda as error:
+        return f"no CUDA kernels: {error}"
+    return "CUDA kernels compile through NVRTC at first use"
+
+
+def _compiler() -> str:
+    try:
+        return " ".join(compiler.find_compiler())
+    except compiler.NoCompiler as error:
+        return f"none: {error}"
+
+
+def _state(module: str, extra: str, purpose: str) -> str:
+    if importlib.util.find_spec(module) is None:
+        return f"missing: no {purpose}; run `pip install 'd2-4dgs[{extra}]'`"
+    names = importlib.metadata.packages_distributions().get(module, [module])
+    return f"{importlib.metadata.version(names[0])} ({purpose})"

@@ -7,6 +7,6 @@ from d2_plugin.commands.arguments.form import Form
 
 def form(words: list[str]) -> Form:
     """What `d2 export-capture` takes."""
-    from d2_plugin.runs.capture_export import CaptureExport, run
+    from d2_plugin.study.capture_export import CaptureExport, run
 
     return Form.of("d2 export-capture", __doc__, CaptureExport, run)
