@@ -193,3 +193,45 @@ def test_a_setting_may_be_written_in_a_way_of_its_own() -> None:
     readers: dict[str, Any] = {"names": lambda text: ("everyone",) if text == "all" else (text,)}
     form = Form("d2 work", "", declared(Sweep), lambda given: None, readers=readers)
     assert form.parse(["--names", "all"]).values["names"] == ("everyone",)
+
+
+@dataclass(frozen=True)
+class Unions(Settings):
+    """Kinds that are not one plain type."""
+
+    stop: int | Literal["end"] = "end"
+    near: Annotated[float, Range(0, open_low=True)] | None = None
+    limits: tuple[float, float] | None = None
+    sizes: tuple[Annotated[int, Range(1)], ...] = ()
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        (["--stop", "5"], "stop", 5),
+        (["--stop", "end"], "stop", "end"),
+        (["--near", "2"], "near", 2.0),
+        (["--near", "none"], "near", None),
+        (["--limits", "1,9.5"], "limits", (1.0, 9.5)),
+        (["--sizes", "1:3"], "sizes", (1, 2, 3)),
+    ],
+)
+def test_a_union_takes_the_kind_that_a_word_looks_like(words: list[str], name: str, value: object) -> None:
+    found = getattr(given(*words, kind=Unions).make(Unions), name)
+    assert found == value
+    assert type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--near", "0"], "--near must be above 0, got 0"),
+        (["--limits", "1"], "--limits must be a list of 2 values"),
+        (["--sizes", "0,1"], r"--sizes\[0\] must be at least 1, got 0"),
+        (["--stop", "never"], "--stop"),
+    ],
+)
+def test_a_union_checks_what_stands_inside(words: list[str], message: str) -> None:
+    with pytest.raises(D2Error, match=message):
+        given(*words, kind=Unions)
+    assert "(above 0)" in help_text(form_of(Unions), ["--help"])

@@ -29,7 +29,7 @@ WRITTEN = {
     "train_cameras": "Names joined by commas, as in 00,02,05,07; or preset:2, preset:3, preset:4 for a known data set.",
     "test_cameras": "Names joined by commas.",
     "frames": "Written first:last or first:last:step, the last one included.",
-    "hooks": "all, none, or names of prior, densify, prune, depth_loss joined by commas.",
+    "hooks": "all, none, or names joined by commas.",
 }
 """How some settings are written on a command line, behind what their docstrings say."""
 
