@@ -124,8 +124,12 @@ def resolve_cameras(
         return train, test, ()
     if len(train) > 1:
         raise D2Error(f"'{', '.join(train)}' mixes a preset with other names: give the preset alone, or names only")
-    split = camera_preset(open_capture(path, intersect=True), train[0])
-    return split.train, split.test if test is None else test, split.notes
+    capture = open_capture(path, intersect=True)
+    split = camera_preset(capture, train[0])
+    chosen = split.test if test is None else test
+    # A run reads the chosen cameras alone (see `Scene.open`), so what the other ones lack is said here or nowhere.
+    said_by_the_run = open_capture(path, cameras=dict.fromkeys((*split.train, *chosen))).notes
+    return split.train, chosen, (*split.notes, *(note for note in capture.notes if note not in said_by_the_run))
 
 
 def published_frames(capture: Capture) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""What is installed, what is missing for which feature, which compiler and caches are used."""
+"""What is installed, what is missing for which feature, and which compiler and caches are used."""
 
 from __future__ import annotations
 
@@ -7,24 +7,30 @@ import importlib.util
 import os
 import platform
 
-import torch
-
 from d2_plugin import __version__, compiler, registry
-from d2_plugin.priors.colmap import mvs as colmap_mvs
-from d2_plugin.rasterizer import nvrtc
+from d2_plugin.commands.arguments.form import Form
 
 OPTIONAL = {
     "onnxruntime": ("mono", "monocular depth from an ONNX network"),
     "pycolmap": ("stereo", "sparse points from known cameras"),
     "cv2": ("image", "pictures, videos, the OpenCV stereo sweep"),
-    "kornia": ("image", "image operations that tests compare with"),
+    "kornia": ("test", "image operations that tests compare with"),
     "rich": ("cli", "progress bars"),
     "distributed": ("cluster", "priors built by several processes or machines"),
 }
 
 
+def form(words: list[str]) -> Form:
+    """What `d2 doctor` takes: nothing."""
+    return Form("d2 doctor", __doc__ or "", (), lambda given: report())
+
+
 def report() -> str:
     """A few lines a person can paste into an issue."""
+    import torch
+
+    from d2_plugin.priors.colmap import mvs as colmap_mvs
+
     lines = [
         f"d2-4dgs {__version__}, Python {platform.python_version()}, torch {torch.__version__}, {os.cpu_count()} cores",
         f"device      {_device()}",
@@ -37,12 +43,16 @@ def report() -> str:
 
 
 def _device() -> str:
+    import torch
+
     if torch.cuda.is_available():
         return f"{torch.cuda.get_device_name()}; {_cuda_kernels()}"
     return "CPU only: no CUDA device found"
 
 
 def _cuda_kernels() -> str:
+    from d2_plugin.rasterizer import nvrtc
+
     try:
         nvrtc.library()
     except nvrtc.NoCuda as error:

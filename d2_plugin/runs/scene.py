@@ -22,8 +22,14 @@ class Scene:
 
     @classmethod
     def open(cls, settings: RunSettings) -> Scene:
-        """Open the capture that `settings` name, split its cameras, and measure what it needs."""
-        capture = open_capture(settings.capture, frames=settings.frames, downscale=settings.downscale)
+        """Open the capture that `settings` name, split its cameras, and measure what it needs.
+
+        Where training and test cameras are both named, as a camera preset does, only those are read and checked: a
+        preset passes over cameras without calibration or pictures, so the run must not refuse them.
+        """
+        test = settings.test_cameras
+        named = None if test is None else dict.fromkeys((*settings.train_cameras, *test))
+        capture = open_capture(settings.capture, cameras=named, frames=settings.frames, downscale=settings.downscale)
         train, test = _split(capture, settings)
         plan = plan_scene(capture, train, _mono_source(capture, settings), prior_settings(settings))
         return cls(capture, train, test, plan.override(**settings.overrides.get("plan", {})))

@@ -22,7 +22,7 @@ from d2_plugin.captures.export.ply import PointCloud
 from d2_plugin.captures.readers.colmap_model import read_model, read_points
 from d2_plugin.captures.rotations import quaternion_of_rotation, rotation_of_quaternion
 from d2_plugin.captures.synthetic.room import synthetic_capture
-from d2_plugin.commands.export_capture import main
+from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 
 CLOUD = PointCloud(
@@ -182,7 +182,8 @@ def test_mistakes_are_one_sentence(original: Capture, tmp_path: Path) -> None:
 def test_the_command_writes_points_and_says_where(tmp_path: Path, capsys) -> None:
     source = save_capture(smooth_capture(("00", "01", "02", "03"), frames=3), tmp_path / "source")
     command = f"{source} --format transforms --output {tmp_path / 'scene'} --train-cameras 00,02"
-    main([*command.split(), "--test-cameras", "01", "--frames", "0:1", "--downscale", "4", "--points", "50"])
+    more = ["--test-cameras", "01", "--frames", "0:1", "--downscale", "4", "--points", "50"]
+    assert main(["export-capture", *command.split(), *more]) == 0
     assert f"in {tmp_path / 'scene'} (transforms)" in capsys.readouterr().out
     content = json.loads((tmp_path / "scene" / "export.json").read_text())
     assert (list(content["cameras"]), content["test_cameras"]) == (["00", "02", "01"], ["01"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.store import PriorStore
+from d2_plugin.runs.run import Run
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
@@ -82,22 +84,28 @@ def test_a_run_leaves_scores_pictures_configuration_and_checkpoint(finished: Pat
     assert (finished / "checkpoint.pt").is_file()
 
 
-def test_a_cut_off_run_continues_to_the_same_score(capture: Path, finished: Path, tmp_path: Path) -> None:
-    import torch
+def test_a_cut_off_run_continues_to_the_same_score(
+    capture: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class CutOff(Exception):
+        pass
 
-    from d2_plugin.runs.run import Run
-
-    first = Run.load(finished)
     output = tmp_path / "again"
-    shutil.copytree(finished, output)
-    (output / "checkpoint.pt").unlink()
-    (output / "metrics.json").unlink()
-    run = Run(first.settings, output)
-    extent, sparse = run._points()
-    trainer = run._trainer(extent, sparse)
-    trainer.run(until=24)
-    run._save(trainer)
-    assert train(capture, output) == 0
+    save, steps = Run._save, list[int]()
+
+    def cut_off(run: Run, trainer: Any) -> None:
+        save(run, trainer)
+        steps.append(trainer.step)
+        if trainer.step == 24:
+            raise CutOff
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "_save", cut_off)
+        with pytest.raises(CutOff):
+            train(capture, output)
+        steps.clear()
+        assert train(capture, output) == 0
+    assert steps == [28, 32, 36, 40], "it goes on from where it was cut off"
     ends = [torch.load(folder / "checkpoint.pt", weights_only=True)["model"] for folder in (finished, output)]
     for name, value in ends[0]["parameters"].items():
         assert torch.equal(value, ends[1]["parameters"][name]), name
@@ -161,7 +169,12 @@ def test_doctor_names_compiler_device_and_extras(capsys: pytest.CaptureFixture[s
 def test_plan_names_each_decision_with_its_measurement(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", str(capture), "--train-cameras", CAMERAS]) == 0
     notes, lines = [], []
-    for line in capsys.readouterr().out.splitlines():
+    recording, *rest = capsys.readouterr().out.splitlines()
+    assert recording == (
+        "recording  room: layout folder, 4 cameras (train0, train1, train2, test0), frames 0 to 1 (2) "
+        "at 12 per second, 96x54 pixels"
+    )
+    for line in rest:
         (notes if line.split()[0] == "note" else lines).append(line)
     assert notes, "what is known about the recording is said"
     assert [line.split()[1] for line in lines] == ["temporal", "stereo", "monocular", "verification"]
@@ -274,16 +287,22 @@ class TestMistakes:
         assert "30x20" in message
         assert "96x54" in message
 
-    def test_a_damaged_prior_is_named(
-        self, capture: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    def test_a_damaged_prior_is_named_and_that_frame_alone_is_built_again(
+        self, capture: Path, finished: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
     ) -> None:
         priors = tmp_path / "priors"
-        shutil.copytree(finished / "priors" / "priors", priors / "priors")
-        shutil.copy(finished / "priors" / "store.json", priors)
+        shutil.copytree(finished / "priors", priors)
         array = priors / "priors" / "train1" / "00000.npy"
         array.write_bytes(array.read_bytes()[:500])
+        written = {path: path.stat().st_mtime_ns for path in (priors / "priors").rglob("*.npy")}
         with pytest.raises(D2Error, match="camera train1, frame 0 is damaged"):
             PriorStore.open(priors)
+        assert train(capture, tmp_path / "run", "--priors", str(priors)) == 0
+        assert "train1/00000" in caplog.text
+        assert "is damaged" in caplog.text
+        again = {path for path, time in written.items() if path.stat().st_mtime_ns != time}
+        assert again == {array}
+        assert array.read_bytes() == (finished / "priors" / "priors" / "train1" / "00000.npy").read_bytes()
 
     def test_onnx_without_its_kind(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "--mono-kind" in refused(capsys, train(capture, tmp_path / "x", "--mono-onnx", "net.onnx"))

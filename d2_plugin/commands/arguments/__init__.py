@@ -1,0 +1,1 @@
+"""What a command takes: from declared settings to flags, help and checked values."""

@@ -1,0 +1,222 @@
+"""What a command takes, made from declared settings: the one way from words on a command line to checked values.
+
+Flags, types, ranges, defaults and help are those of the dataclasses (`d2_plugin.settings.declared`). A setting marked
+`Positional` is taken by its place. Tables of settings are given by dotted flags, as `--priors.stereo.min-angle 2`.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, is_dataclass
+from typing import Any, NamedTuple, TypeVar, get_args
+
+from d2_plugin.commands.arguments.text import bare, flag_of, item_kind, read
+from d2_plugin.errors import D2Error
+from d2_plugin.settings import Declared, declared
+
+Made = TypeVar("Made")
+
+HELP = ("--help", "-h", "--help-all")
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a person gave, checked, with the defaults of the rest."""
+
+    values: dict[str, Any]
+    """By the name of the setting."""
+    tables: dict[str, Any] = field(default_factory=dict)
+    """Settings given by dotted flags, nested as TOML nests them; without defaults."""
+
+    def make(self, kind: Callable[..., Made], **more: Any) -> Made:
+        """An instance of a dataclass from the values that it declares, and `more`."""
+        names = {setting.name for setting in declared(kind)}
+        return kind(**{name: value for name, value in self.values.items() if name in names} | more)
+
+
+class Group(NamedTuple):
+    """A table of settings: the dataclass that declares it, and what of it is given elsewhere."""
+
+    kind: type
+    without: tuple[str, ...] = ()
+
+
+class Section(NamedTuple):
+    """One table with its dotted name, ready for flags and for help."""
+
+    name: str
+    about: str
+    settings: tuple[Declared, ...]
+
+
+@dataclass(frozen=True)
+class Form:
+    """The words that a command understands, and what it does with them."""
+
+    command: str
+    """As it is typed, `d2 train`."""
+    about: str
+    settings: tuple[Declared, ...]
+    run: Callable[[Given], str | None]
+    """Does the work; what it returns is printed."""
+    groups: Callable[[Mapping[str, str]], Mapping[str, Group]] = lambda typed: {}
+    """Tables of settings by name. They may depend on what was typed for other flags, as those of the backbone do."""
+    readers: Mapping[str, Callable[[str], Any]] = field(default_factory=dict)
+    """Settings that are written in a way of their own."""
+    words: Callable[[Sequence[str]], object] | None = None
+    """TEMPORARY, for study/ until it has `run(settings)`: takes all words as they are. Delete it after the merge."""
+
+    @classmethod
+    def of(cls, command: str, about: str | None, kind: Callable[..., Made], run: Callable[[Made], str | None]) -> Form:
+        """The form of a command that takes the settings of one dataclass and nothing else."""
+        return cls(command, about or "", declared(kind), lambda given: run(given.make(kind)))
+
+    def parse(self, words: Sequence[str]) -> Given:
+        """The checked values of a command line.
+
+        Raises:
+            D2Error: an unknown flag, with the nearest one suggested; a wrong, missing or surplus value.
+        """
+        places, given = self._split(words)
+        values = {s.name: s.default for s in self.settings if s.default is not MISSING}
+        by_name = {s.name: s for s in self.settings}
+        for name, texts in given.items():
+            if name in by_name:
+                values[name] = self._read(by_name[name], texts)
+        values |= self._placed(places)
+        missing = [said(setting) for setting in self.settings if setting.name not in values]
+        if missing:
+            raise D2Error(f"{self.command} needs {' and '.join(missing)}: `{self.command} --help` says what that is")
+        return Given(values, self._tables({name: texts for name, texts in given.items() if "." in name}, words))
+
+    def sections(self, words: Sequence[str]) -> dict[str, Section]:
+        """All tables of a command line by their dotted names, those inside others too."""
+        groups = self.groups(_typed(words))
+        found = [s for name, group in groups.items() for s in _sections(name, group.kind, group.without)]
+        return {section.name: section for section in found}
+
+    def _split(self, words: Sequence[str]) -> tuple[list[str], dict[str, list[str]]]:
+        """Words taken by their place, and the words of each flag by the name of its setting."""
+        queue, places, given = deque(words), list[str](), dict[str, list[str]]()
+        while queue:
+            word = queue.popleft()
+            if not _is_flag(word):
+                places.append(word)
+                continue
+            flag, attached, value = word.partition("=")
+            name = self._name(flag, words)
+            given[name] = [value] if attached else self._take(name, queue)
+            if not given[name]:
+                raise D2Error(f"{flag} needs a value: `{self.command} --help` says which")
+        return places, given
+
+    def _take(self, name: str, queue: deque[str]) -> list[str]:
+        """The words that belong to a flag: one, but none or `true` or `false` for a switch.
+
+        A list takes all words up to the next flag where no word of the command is taken by its place.
+        """
+        setting = next((s for s in self.settings if s.name == name), None)
+        if setting is not None and bare(setting.kind) is bool:
+            return [queue.popleft()] if queue and queue[0].lower() in ("true", "false") else ["true"]
+        many = setting is not None and item_kind(setting.kind) is not None
+        many = many and not any(s.positional for s in self.settings)
+        taken: list[str] = []
+        while queue and not _is_flag(queue[0]) and (many or not taken):
+            taken.append(queue.popleft())
+        return taken
+
+    def _name(self, flag: str, words: Sequence[str]) -> str:
+        """The setting of a flag: spelled out, or cut short where that fits one flag alone."""
+        wanted = "--" + flag.lstrip("-").replace("_", "-")
+        own = {flag_of(s.name): s.name for s in self.settings if not s.positional}
+        begun = [name for known, name in own.items() if known.startswith(wanted)]
+        if wanted in own or len(begun) == 1:
+            return own.get(wanted, begun[0] if begun else "")
+        dotted = {flag_of(name): name for name in self._dotted(words)}
+        if wanted in dotted:
+            return dotted[wanted]
+        raise D2Error(f"unknown flag {flag} of {self.command}{self._hint(wanted, [*own, *dotted])}")
+
+    def _hint(self, flag: str, known: Sequence[str]) -> str:
+        whole = {name.rsplit(".", 1)[-1].lstrip("-"): name for name in known if "." in name}  # without its table
+        spelled = {name: name for name in known} | {f"--{last}": name for last, name in whole.items()}
+        near = [*difflib.get_close_matches(flag, known, n=1), *difflib.get_close_matches(flag, spelled, n=1)]
+        return f"; did you mean {spelled[near[0]]}?" if near else f": `{self.command} --help` lists the flags"
+
+    def _dotted(self, words: Sequence[str]) -> dict[str, Declared]:
+        sections = self.sections(words).values()
+        return {f"{section.name}.{s.name}": s for section in sections for s in section.settings}
+
+    def _tables(self, dotted: Mapping[str, Sequence[str]], words: Sequence[str]) -> dict[str, Any]:
+        """The dotted settings, checked and nested."""
+        tables: dict[str, Any] = {}
+        known = self._dotted(words) if dotted else {}
+        for name, texts in dotted.items():
+            *path, last = name.split(".")
+            table = tables
+            for part in path:
+                table = table.setdefault(part, {})
+            table[last] = _as_toml(read(known[name], texts, flag_of(name)))
+        return tables
+
+    def _read(self, setting: Declared, texts: Sequence[str]) -> Any:
+        if setting.name in self.readers:
+            return self.readers[setting.name](",".join(texts))
+        return read(setting, texts, said(setting))
+
+    def _placed(self, words: Sequence[str]) -> dict[str, Any]:
+        """The settings that are taken by their place, in the order of their declaration."""
+        left, values = list(words), {}
+        for setting in (s for s in self.settings if s.positional):
+            count = len(left) if item_kind(setting.kind) is not None else 1
+            taken, left = left[:count], left[count:]
+            if taken:
+                values[setting.name] = self._read(setting, taken)
+        if left:
+            raise D2Error(f"{self.command} has no place for '{left[0]}': `{self.command} --help` says what it takes")
+        return values
+
+
+def said(setting: Declared) -> str:
+    """How a person names a setting: by its flag, or in capitals where it is taken by its place."""
+    return setting.name.upper() if setting.positional else flag_of(setting.name)
+
+
+def about_class(kind: type) -> str:
+    """The first line of a class's docstring; none where the class has only the one that dataclass makes."""
+    text = (kind.__doc__ or "").strip()
+    return "" if text.startswith(f"{kind.__name__}(") else text.partition("\n")[0]
+
+
+def _sections(name: str, kind: type, without: tuple[str, ...] = ()) -> Iterator[Section]:
+    """The table `name` and the tables inside it."""
+    settings = [setting for setting in declared(kind) if setting.name not in without]
+    inner = {s.name: option for s in settings for option in (s.kind, *get_args(s.kind)) if is_dataclass(option)}
+    yield Section(name, about_class(kind), tuple(s for s in settings if s.name not in inner))
+    for place, option in inner.items():
+        if isinstance(option, type):
+            yield from _sections(f"{name}.{place}", option)
+
+
+def _is_flag(word: str) -> bool:
+    return re.match(r"--?[A-Za-z]", word) is not None
+
+
+def _typed(words: Sequence[str]) -> dict[str, str]:
+    """The word behind each flag by the flag's name, read without knowing the flags."""
+    found = {}
+    for word, following in zip(words, [*words[1:], ""]):
+        if _is_flag(word):
+            flag, attached, value = word.partition("=")
+            found[flag.lstrip("-").replace("-", "_")] = value if attached else following
+    return found
+
+
+def _as_toml(value: Any) -> Any:
+    """A value as TOML would give it."""
+    if isinstance(value, tuple):
+        return [_as_toml(item) for item in value]
+    return value if isinstance(value, (bool, int, float, str, type(None))) else str(value)

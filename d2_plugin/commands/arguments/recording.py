@@ -1,0 +1,192 @@
+"""What names a recording and the settings of a run: declared once, for `d2 train`, `priors`, `plan` and `ablate`.
+
+Defaults come first, the tables of a --config file over them, and flags over both.
+"""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+from d2_plugin.commands.arguments.form import Form, Given, Group
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.settings import Declared, Settings, declared
+
+if TYPE_CHECKING:
+    from d2_plugin.runs.plan import ScenePlan
+    from d2_plugin.runs.settings import RunSettings
+
+CAPTURE = ("capture", "train_cameras", "frames", "downscale", "mono_onnx", "mono_kind")
+"""Settings of a run that say what is trained on."""
+
+WRITTEN = {
+    "capture": "images/CAMERA/FRAME.png with cameras.json, or as N3DV, Technicolor, ENeRF-Outdoor, COLMAP or "
+    "transforms.json lay it out.",
+    "train_cameras": "Names joined by commas, as in 00,02,05,07; or preset:2, preset:3, preset:4 for a known data set.",
+    "test_cameras": "Names joined by commas.",
+    "frames": "Written first:last or first:last:step, the last one included.",
+    "hooks": "all, none, or names joined by commas.",
+}
+"""How some settings are written on a command line, behind what their docstrings say."""
+
+HELP = {
+    "capture": "Folder of the recording.",
+    "train_cameras": "Cameras to train with.",
+    "test_cameras": "Cameras to score with; all others where left out.",
+    "frames": "Which frames; all where left out.",
+    "downscale": "Train on pictures this many times smaller.",
+    "mono_onnx": "Monocular depth network as an ONNX file.",
+    "mono_kind": "What the network predicts: relative (inverse depth) or metric (depth).",
+    "backbone": "Which 4D Gaussian model.",
+    "iterations": "Optimizer steps, one view each.",
+    "hooks": "Parts of the method that are used.",
+    "seed": "Of every random choice.",
+    "priors": "Folder of the depth prior; OUTPUT/priors where left out.",
+}
+"""TEMPORARY, for settings of a run that have no docstring yet. Delete it once `RunSettings` has them all."""
+
+
+@dataclass(frozen=True)
+class ConfigFile(Settings):
+    """The file of settings that every command on a recording takes."""
+
+    config: Path | None = None
+    """TOML file with tables of settings over the defaults, as `--help` lists them."""
+
+
+@dataclass(frozen=True)
+class PlanChoices:
+    """Decisions of the plan that are taken by hand; the others follow from cameras and depth sources.
+
+    TEMPORARY: `d2_plugin.runs.settings` will have this class, and its own is taken where it has.
+    """
+
+    temporal: bool | None = None
+    """Whether Gaussians move and fade over time. Measured where it is left out."""
+
+
+def recording_form(
+    command: str,
+    about: str | None,
+    run: Callable[[Given], str | None],
+    more: Sequence[str] = (),
+    options: type = ConfigFile,
+    tables: Sequence[str] = (),
+) -> Form:
+    """The form of a command on a recording.
+
+    Args:
+        command: as it is typed.
+        about: the text above its help.
+        run: what it does.
+        more: settings of a run that it takes beside those in `CAPTURE`.
+        options: the dataclass of its own settings. One that a run has as well takes that one's place.
+        tables: which tables of settings may be given by dotted flags.
+    """
+    from d2_plugin.runs.settings import RunSettings
+
+    own = declared(options)
+    of_run = {setting.name: _spelled(setting) for setting in declared(RunSettings)}
+    taken = [of_run[name] for name in (*CAPTURE, *more) if name not in {setting.name for setting in own}]
+
+    def groups(typed: Mapping[str, str]) -> dict[str, Group]:
+        return {name: group for name, group in all_tables(_backbone(typed)).items() if name in tables}
+
+    return Form(command, about or "", (*taken, *own), run, groups, {"hooks": hook_names})
+
+
+def all_tables(backbone: str) -> dict[str, Group]:
+    """Every table of settings of a run, with the class that declares it."""
+    from d2_plugin import registry
+    from d2_plugin.config import D2Config
+    from d2_plugin.priors.settings import PriorSettings
+    from d2_plugin.runs import settings
+
+    hooks = {s.name: kind for s in declared(D2Config) for kind in (s.kind, *get_args(s.kind)) if is_dataclass(kind)}
+    module: Any = registry.load(registry.BACKBONES, backbone)
+    return {
+        **{name: Group(kind) for name, kind in hooks.items() if isinstance(kind, type)},
+        "d2": Group(D2Config, tuple(hooks)),
+        "priors": Group(PriorSettings),
+        "backbone": Group(type(module.settings_from({}))),
+        "plan": Group(getattr(settings, "PlanChoices", PlanChoices)),
+    }
+
+
+def run_settings(given: Given, **more: Any) -> RunSettings:
+    """The settings of a run that were given, with camera presets resolved and the tables of file and flags."""
+    from d2_plugin.captures.presets import resolve_cameras
+    from d2_plugin.runs.settings import RunSettings
+
+    train, test, notes = resolve_cameras(
+        given.values["capture"], given.values["train_cameras"], given.values.get("test_cameras")
+    )
+    say_notes(notes)
+    overrides = _over(read_toml(given.values["config"]), given.tables)
+    return given.make(RunSettings, train_cameras=train, test_cameras=test, overrides=overrides, **more)
+
+
+def hook_names(text: str) -> tuple[str, ...]:
+    """Names of hooks joined by commas, or `all` or `none`."""
+    from d2_plugin.runs.settings import HOOK_NAMES
+
+    if text in ("all", "none"):
+        return HOOK_NAMES if text == "all" else ()
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    for name in names:
+        if name not in HOOK_NAMES:
+            raise unknown_name("hook", name, [*HOOK_NAMES, "all", "none"])
+    return names
+
+
+def read_toml(path: Path | None) -> dict[str, Any]:
+    """The tables of a --config file; none where there is no file."""
+    if path is None:
+        return {}
+    try:
+        return tomllib.loads(path.read_text())
+    except FileNotFoundError:
+        raise D2Error(f"no configuration at {path}: write one, or leave out --config") from None
+    except tomllib.TOMLDecodeError as error:
+        raise D2Error(f"{path} is not valid TOML: {error}") from None
+
+
+def say(*lines: str) -> None:
+    """Print at once, before long work starts."""
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.flush()
+
+
+def say_notes(notes: Sequence[str]) -> None:
+    """What is worth knowing about a recording or a choice."""
+    say(*(f"     note  {note}" for note in notes))
+
+
+def say_plan(plan: ScenePlan) -> None:
+    """Each decision with its measurement."""
+    say(*(f"{'use' if one.use else 'leave out':>9}  {one.name:12} {one.reason}" for one in plan.decisions))
+
+
+def _spelled(setting: Declared) -> Declared:
+    """A setting of a run as a command line takes it."""
+    if setting.name == "mono_kind":  # TEMPORARY, as HELP: until RunSettings says so itself
+        setting = setting._replace(kind=Literal["relative", "metric"] | None)
+    said = f"{setting.help or HELP.get(setting.name, '')} {WRITTEN.get(setting.name, '')}".strip()
+    return setting._replace(help=said, positional=setting.name == "capture")
+
+
+def _backbone(typed: Mapping[str, str]) -> str:
+    """The backbone that a command line names; the first of several."""
+    return (typed.get("backbone") or typed.get("backbones") or "yang4d").partition(",")[0]
+
+
+def _over(below: Any, above: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested tables with others over them; neither is changed."""
+    result = dict(below) if isinstance(below, Mapping) else {}
+    for key, value in above.items():
+        result[key] = _over(result.get(key), value) if isinstance(value, Mapping) else value
+    return result

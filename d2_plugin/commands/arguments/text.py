@@ -1,0 +1,112 @@
+"""From what a person types to a checked value of a declared setting, and from a setting to what is typed."""
+
+from __future__ import annotations
+
+import contextlib
+import types
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from d2_plugin.errors import D2Error
+from d2_plugin.settings import Declared, Range, checked
+
+
+def flag_of(name: str) -> str:
+    """The flag of a setting: `priors.stereo.min_angle` is `--priors.stereo.min-angle`."""
+    return "--" + name.replace("_", "-")
+
+
+def read(setting: Declared, texts: Sequence[str], said: str) -> Any:
+    """The value that `texts` stand for, checked against the declaration; `said` is the flag, for the error.
+
+    `none` is None where that is allowed. Lists are joined by commas; those of whole numbers may hold `first:last` and
+    `first:last:step`, the last one included.
+
+    Raises:
+        D2Error: a value of another type, or out of range.
+    """
+    if optional(setting.kind) and [text.lower() for text in texts] == ["none"]:
+        return None
+    item = item_kind(setting.kind)
+    if item is None:
+        return checked(setting.kind, setting.range, _plain(setting.kind, texts[-1]), said)
+    pieces = [piece.strip() for text in texts for piece in text.split(",") if piece.strip()]
+    value = _numbers(pieces, said) if item is int else tuple(_plain(item, piece) for piece in pieces)
+    return checked(setting.kind, setting.range, value, said)
+
+
+def options(kind: Any) -> list[Any]:
+    """The types of a union, or the one type, without what `Annotated` adds."""
+    inner = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+    return [get_args(option)[0] if get_origin(option) is Annotated else option for option in inner]
+
+
+def bare(kind: Any) -> Any:
+    """The first type that is not None."""
+    return next(option for option in options(kind) if option is not type(None))
+
+
+def optional(kind: Any) -> bool:
+    """Whether None is a value."""
+    return type(None) in options(kind)
+
+
+def item_kind(kind: Any) -> Any:
+    """What a list holds; None for what is no list."""
+    kind = bare(kind)
+    return bare(get_args(kind)[0]) if get_origin(kind) is tuple and get_args(kind) else None
+
+
+def limits(setting: Declared) -> Range:
+    """The range of a setting, or that of the values it may hold."""
+    inner = [setting.kind, *get_args(setting.kind), *get_args(bare(setting.kind))]
+    found = [extra for kind in inner for extra in get_args(kind) if isinstance(extra, Range)]
+    return setting.range if setting.range != Range() or not found else found[0]
+
+
+def placeholder(kind: Any) -> str:
+    """What stands for a value in the help."""
+    item, kind = item_kind(kind), bare(kind)
+    if item is not None:
+        one = "NAME" if item is str else placeholder(item)
+        return f"{one},{one}" if get_args(kind)[-1] is not Ellipsis else f"{one},..."
+    if get_origin(kind) is Literal:
+        return "|".join(get_args(kind))
+    return {int: "N", float: "X", bool: "true|false", Path: "PATH", str: "TEXT"}.get(kind, "VALUE")
+
+
+def shown(value: Any) -> str:
+    """A default as it would be typed."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (tuple, list)):
+        return ",".join(map(shown, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _plain(kind: Any, text: str) -> Any:
+    """The value that a word looks like; the word itself where it fits no type, which the check then refuses."""
+    kinds = options(kind)
+    choices = [choice for option in kinds if get_origin(option) is Literal for choice in get_args(option)]
+    named = {str(choice): choice for choice in choices} | ({"true": True, "false": False} if bool in kinds else {})
+    if text in named or text.lower() in named:
+        return named.get(text, named.get(text.lower()))
+    for number in (int, float):
+        if number in kinds:
+            with contextlib.suppress(ValueError):
+                return number(text)
+    return text
+
+
+def _numbers(pieces: Sequence[str], said: str) -> tuple[int, ...]:
+    found: list[int] = []
+    for piece in pieces:
+        try:
+            first, *last = (int(part) for part in piece.split(":"))
+            found += range(first, last[0] + 1, *last[1:]) if last else [first]
+        except (ValueError, TypeError):
+            raise D2Error(
+                f"{said} is '{piece}': give whole numbers joined by commas, or first:last or first:last:step"
+            ) from None
+    return tuple(found)

@@ -1,0 +1,30 @@
+"""One Markdown table of the scores of several runs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from d2_plugin.commands.arguments.form import Form
+from d2_plugin.settings import Positional, Settings
+
+
+@dataclass(frozen=True)
+class Comparison(Settings):
+    """Which runs stand in the table."""
+
+    run_folders: Annotated[tuple[Path, ...], Positional()]
+    """The --output folders of `d2 train`."""
+
+
+def form(words: list[str]) -> Form:
+    """What `d2 compare` takes."""
+    return Form.of("d2 compare", __doc__, Comparison, run)
+
+
+def run(settings: Comparison) -> str:
+    """The table."""
+    from d2_plugin.runs.tables import metrics_table, read_metrics
+
+    return metrics_table({folder.name: read_metrics(folder) for folder in settings.run_folders})

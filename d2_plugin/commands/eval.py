@@ -1,0 +1,34 @@
+"""Score the held-out cameras of a trained run again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from d2_plugin.commands.arguments.form import Form
+from d2_plugin.settings import Positional, Settings
+
+
+@dataclass(frozen=True)
+class Evaluation(Settings):
+    """Which run is scored."""
+
+    run_folder: Annotated[Path, Positional()]
+    """The --output of `d2 train`."""
+    no_pictures: bool = False
+    """Scores only."""
+
+
+def form(words: list[str]) -> Form:
+    """What `d2 eval` takes."""
+    return Form.of("d2 eval", __doc__, Evaluation, run)
+
+
+def run(settings: Evaluation) -> str:
+    """Score the run; returns the table."""
+    from d2_plugin.runs.run import Run
+    from d2_plugin.runs.tables import metrics_table
+
+    metrics = Run.load(settings.run_folder).evaluate(pictures=not settings.no_pictures)
+    return metrics_table({settings.run_folder.name: metrics})

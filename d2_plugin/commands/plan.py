@@ -1,0 +1,57 @@
+"""What the method needs for a recording, and what is left out, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from d2_plugin.commands.arguments.form import Form, Given
+from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
+from d2_plugin.commands.arguments.study_form import study_form
+from d2_plugin.errors import D2Error
+
+if TYPE_CHECKING:
+    from d2_plugin.captures import Capture
+
+
+@dataclass(frozen=True)
+class PlanOptions(ConfigFile):
+    """How the plan is made."""
+
+    verify: bool = False
+    """Measure what each decision saves and costs; `d2 plan --verify --help` says what that takes."""
+
+
+def form(words: list[str]) -> Form:
+    """What `d2 plan` takes; with --verify that of the measurement."""
+    if "--verify" in words:
+        words.remove("--verify")
+        return study_form("d2 plan --verify", "d2_plugin.study.plan_verify", "PlanVerification")
+    return recording_form("d2 plan", __doc__, run, (), PlanOptions, ("priors", "plan"))
+
+
+def run(given: Given) -> None:
+    """Say what the recording is, then each decision."""
+    from d2_plugin.runs.scene import Scene
+    from d2_plugin.runs.settings import check
+
+    if given.values["verify"]:
+        raise D2Error("--verify is cut short or given a value: write --verify")
+    scene = Scene.open(check(run_settings(given)))
+    say(f"recording  {described(scene.capture)}")
+    say_notes(scene.capture.notes)
+    say_plan(scene.plan)
+
+
+def described(capture: Capture) -> str:
+    """Name, layout, cameras, frames and size of the pictures, in one line."""
+    cameras, frames = list(capture.cameras), capture.frames
+    sizes = _each(f"{camera.width}x{camera.height}" for camera in capture.cameras.values())
+    when = f"frames {frames[0]} to {frames[-1]} ({len(frames)})" if len(frames) > 1 else f"frame {frames[0]}"
+    who = f"{len(cameras)} camera{'' if len(cameras) == 1 else 's'} ({', '.join(cameras)})"
+    return f"{capture.name}: layout {capture.layout}, {who}, {when} at {capture.fps:g} per second, {sizes} pixels"
+
+
+def _each(values: Iterable[str]) -> str:
+    return " or ".join(dict.fromkeys(values))

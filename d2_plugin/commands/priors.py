@@ -1,0 +1,79 @@
+"""Build the depth prior of a recording; finished frames are kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from d2_plugin.commands.arguments.form import Form, Given
+from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
+from d2_plugin.errors import D2Error
+from d2_plugin.settings import Range
+
+
+@dataclass(frozen=True, kw_only=True)
+class PriorOptions(ConfigFile):
+    """Where the prior goes and what builds it."""
+
+    output: Path
+    """Folder of the prior store."""
+    shard: str | None = None
+    """Build part I of N only, as I/N with I from 1 to N."""
+    workers: Annotated[int, Range(1, unit="processes")] | None = None
+    """Build with this many processes of this machine."""
+    scheduler: str | None = None
+    """Address of a dask cluster to build on, as tcp://host:8786."""
+
+
+def form(words: list[str]) -> Form:
+    """What `d2 priors` takes."""
+    return recording_form("d2 priors", __doc__, run, (), PriorOptions, ("priors", "plan"))
+
+
+def run(given: Given) -> str:
+    """Build what is missing; returns what the frames came to."""
+    from d2_plugin.priors.sheet import contact_sheet
+    from d2_plugin.priors.store import PriorStore
+    from d2_plugin.runs.run import build_priors_for
+    from d2_plugin.runs.scene import Scene
+    from d2_plugin.runs.settings import check
+    from d2_plugin.runs.start import triangulated_points
+
+    options = given.make(PriorOptions)
+    shard, cluster = part_of(options.shard), cluster_of(options)
+    settings = check(run_settings(given))
+    scene = Scene.open(settings)
+    say_notes(scene.capture.notes)
+    say_plan(scene.plan)
+    points = triangulated_points(scene.capture, scene.train_cameras)["positions"]
+    say(str(build_priors_for(settings, scene, points, options.output, shard=shard, cluster=cluster)))
+    if shard is not None:
+        return f"part {options.shard} of the prior is in {options.output}"
+    sheet = options.output / "contact_sheet.png"
+    contact_sheet(PriorStore.open(options.output), scene.capture, sheet)
+    return f"look at {sheet}"
+
+
+def part_of(text: str | None) -> tuple[int, int] | None:
+    """(index from 0, count) of I/N."""
+    if text is None:
+        return None
+    try:
+        part, count = (int(number) for number in text.split("/"))
+    except ValueError:
+        raise D2Error(f"--shard is '{text}': give I/N, as in 1/4") from None
+    if not 1 <= part <= count:
+        raise D2Error(f"--shard asks for part {part} of {count}: parts are 1 to {count}")
+    return part - 1, count
+
+
+def cluster_of(options: PriorOptions) -> dict[str, Any] | None:
+    """What to hand the frames to, where that is wanted."""
+    if options.workers is None and options.scheduler is None:
+        return None
+    if options.shard is not None:
+        raise D2Error("--shard builds one part on this machine: leave it out with --workers or --scheduler")
+    if options.scheduler is not None:
+        return {"scheduler": options.scheduler}
+    return {"workers": options.workers}

@@ -1,0 +1,45 @@
+"""Train on some cameras and score on the others; a stopped run is continued."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from d2_plugin.commands.arguments.form import Form, Given
+from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
+
+OF_THE_RUN = ("test_cameras", "backbone", "iterations", "hooks", "priors", "seed", "device")
+TABLES = ("densify", "prune", "depth_loss", "d2", "priors", "backbone", "plan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions(ConfigFile):
+    """What `d2 train` takes beside the settings of the run."""
+
+    output: Path
+    """Folder of the run; an unfinished run in it is continued."""
+    export_ply: bool = False
+    """Also write one 3DGS PLY per frame."""
+
+
+def form(words: list[str]) -> Form:
+    """What `d2 train` takes."""
+    return recording_form("d2 train", __doc__, run, OF_THE_RUN, TrainOptions, TABLES)
+
+
+def run(given: Given) -> str:
+    """Train to the end and score; returns the table of scores."""
+    from d2_plugin.runs.run import Run
+    from d2_plugin.runs.tables import metrics_table
+
+    options = given.make(TrainOptions)
+    run = Run(run_settings(given), options.output)
+    say_notes(run.scene.capture.notes)
+    say_plan(run.scene.plan)
+    run.train()
+    say_notes([f"{name} retired at step {step}: it changed next to nothing" for name, step in run.retired.items()])
+    metrics = run.evaluate()
+    if options.export_ply:
+        say(f"{len(run.export_ply())} PLY files in {options.output / 'ply'}")
+    table = metrics_table({options.output.name: metrics})
+    return f"{table}\nmetrics in {options.output / 'metrics.json'}, pictures in {options.output / 'pictures'}"

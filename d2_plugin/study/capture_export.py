@@ -1,0 +1,65 @@
+"""`d2 export-capture`: a recording in the input layout of another repository, with points to start from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+
+from d2_plugin.captures import Capture, open_capture, select_cameras
+from d2_plugin.captures.export.export import export_capture
+from d2_plugin.captures.export.ply import PointCloud
+from d2_plugin.runs.start import MIN_POINTS, initial_points, scene_extent, triangulated_points
+from d2_plugin.settings import Count, Positional, Range, Seed, Settings
+
+
+@dataclass(frozen=True)
+class CaptureExport(Settings):
+    """Which recording is written, in which layout and where."""
+
+    capture: Annotated[Path, Positional()]
+    """Folder of the recording, in any layout that d2 reads."""
+    format: Literal["transforms", "n3dv", "multipleview", "colmap"]
+    """Layout to write; docs/attach says which repository reads which."""
+    output: Path
+    """Folder that does not exist or is empty."""
+    train_cameras: tuple[str, ...] = ()
+    """Names joined by commas; all that are not held out where left out."""
+    test_cameras: tuple[str, ...] = ()
+    """Names of the cameras that are held out, joined by commas."""
+    frames: tuple[int, ...] | None = None
+    """first:last or first:last:step, the last one included; all where left out."""
+    downscale: Annotated[int, Range(1)] = 1
+    """Every block of so many by so many pixels becomes one."""
+    points: Count = MIN_POINTS
+    """Least number of initial points; 0 writes none."""
+    seed: Seed = 0
+    """Of the random points among them."""
+
+
+def run(settings: CaptureExport) -> str:
+    """Write the recording; returns what was written and where."""
+    capture = open_capture(settings.capture, frames=settings.frames, downscale=settings.downscale)
+    held_out = settings.test_cameras
+    train = settings.train_cameras or tuple(name for name in capture.cameras if name not in held_out)
+    capture = select_cameras(capture, [*train, *(name for name in held_out if name not in train)])
+    cloud = start_cloud(capture, train, settings.points, settings.seed) if settings.points > 0 else None
+    export_capture(capture, settings.format, settings.output, test_cameras=held_out, cloud=cloud)
+    points = "no" if cloud is None else len(cloud.positions)
+    written = f"{len(capture.cameras)} cameras, {len(capture.frames)} frames, {points} initial points"
+    return f"{written} in {settings.output} ({settings.format})"
+
+
+def start_cloud(capture: Capture, cameras: Sequence[str], minimum: int = MIN_POINTS, seed: int = 0) -> PointCloud:
+    """Points triangulated from the training cameras, filled up to `minimum` with random ones in what they see.
+
+    The same start as `d2 train` has, so that another repository can be compared with the bundled backbones.
+    """
+    sparse = triangulated_points(capture, cameras)
+    extent = scene_extent(capture, cameras, sparse["positions"])
+    found = (sparse["positions"], sparse["colors"], sparse["frames"])
+    start = initial_points(capture, cameras, found, extent, seed, minimum)
+    return PointCloud(*(np.asarray(part) for part in (start.positions, start.colors, start.times)))

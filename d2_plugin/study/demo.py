@@ -1,0 +1,101 @@
+"""`d2 demo`: a synthetic recording, the backbone alone and with D2, a table and a picture."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from d2_plugin.captures import open_capture
+from d2_plugin.captures.export.folder import save_capture
+from d2_plugin.captures.pictures import read_picture, write_png
+from d2_plugin.captures.synthetic.room import split, synthetic_capture
+from d2_plugin.gaussians import native_slice, native_ssim
+from d2_plugin.rasterizer import native as native_rasterizer
+from d2_plugin.runs.drawing import BACKGROUND, text
+from d2_plugin.runs.run import Run
+from d2_plugin.runs.settings import HOOK_NAMES, RunSettings
+from d2_plugin.runs.tables import metrics_table
+from d2_plugin.settings import Range, Settings
+
+LARGER_BUDGET = {"d2": {"views_per_evaluation": 8}, "densify": {"budget_per_view": 500}}
+"""Eight times the samples in twice the views: more quality for more time than the defaults, which cost little time."""
+
+VARIANTS = {
+    "backbone": ((), {}),
+    "backbone + D2": (HOOK_NAMES, {}),
+    "D2, larger budget": (HOOK_NAMES, LARGER_BUDGET),
+}
+"""Name -> hooks and settings over the defaults."""
+
+
+@dataclass(frozen=True)
+class Demo(Settings):
+    """What the demo writes, and how long it trains."""
+
+    output: Path = Path("d2-demo")
+    """Folder of the recording, the runs and the picture."""
+    iterations: Annotated[int, Range(1, unit="steps")] = 1000
+    """Optimizer steps of each of the three runs."""
+
+
+def run(settings: Demo) -> str:
+    """Write the recording, three runs and comparison.png; returns the table to print.
+
+    All runs start from the same points and take the same number of iterations; a demo that was cut off goes on.
+    """
+    folder = settings.output
+    path = _recording(folder / "capture")
+    _compile_kernels()
+    train, held_out = split(open_capture(path))
+    runs = {}
+    for name, (hooks, overrides) in VARIANTS.items():
+        chosen = RunSettings(
+            *(str(path), tuple(train)),
+            iterations=settings.iterations,
+            hooks=hooks,
+            overrides=overrides,
+            priors=str(folder / "priors") if hooks else None,
+        )
+        run = Run(chosen, folder / name.replace(" + ", "_").replace(", ", "_").replace(" ", "_").lower())
+        run.train()
+        runs[name] = (run, run.evaluate())
+    picture = folder / "comparison.png"
+    _compare({name: run.folder for name, (run, _) in runs.items()}, held_out[len(held_out) // 2], picture)
+    table = metrics_table({name: metrics for name, (_, metrics) in runs.items()})
+    return f"{table}\nThe recording is rendered and its monocular depth is emulated.\nPicture: {picture}"
+
+
+def _recording(path: Path) -> Path:
+    """The recording at `path`: what stands there is whole, because it is written beside and renamed."""
+    if not path.is_dir():
+        unfinished = path.with_name(f"{path.name}.unfinished")
+        if unfinished.is_dir():
+            shutil.rmtree(unfinished)
+        save_capture(synthetic_capture(), unfinished)
+        os.replace(unfinished, path)
+    return path
+
+
+def _compile_kernels() -> None:
+    """Compile what training uses before the clock starts: the first run would pay for all of them."""
+    native_rasterizer.available()
+    native_slice.library()
+    native_ssim.library()
+
+
+def _compare(folders: dict[str, Path], camera: str, picture: Path) -> None:
+    """The same held-out view of every run, one row of panels per run."""
+    rows: list[np.ndarray] = []
+    for name, folder in folders.items():
+        found = sorted((folder / "pictures").glob(f"{camera}_*.png"))
+        panels = read_picture(found[len(found) // 2])
+        title = np.full((14, panels.shape[1], 3), BACKGROUND, np.uint8)
+        letters = text(name)
+        title[4 : 4 + len(letters), 2 : 2 + letters.shape[1]] = letters
+        rows += [title, panels]
+    write_png(picture, np.concatenate(rows))

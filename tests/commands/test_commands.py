@@ -1,0 +1,260 @@
+"""Every `d2` command as a person meets it: its help, its flags, old ones included, and tables given by flags."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from d2_plugin.captures.export.folder import save_capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.commands.arguments.form import Form, Given
+from d2_plugin.commands.arguments.recording import all_tables
+from d2_plugin.commands.cli import COMMANDS, main
+from d2_plugin.config import DensifyConfig
+from d2_plugin.priors.settings import PriorSettings, StereoSettings
+from d2_plugin.runs.run import Run
+from d2_plugin.runs.settings import OVERRIDABLE, TABLES, hook_config, prior_settings
+from d2_plugin.settings import declared
+
+CAMERAS = ["--train-cameras", "train0,train1,train2"]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording small enough to train in seconds."""
+    path = tmp_path_factory.mktemp("recording") / "room"
+    return save_capture(synthetic_capture(cameras=3, held_out=1, frames=2, width=96, height=54), path)
+
+
+def form_of(command: str, words: list[str]) -> Form:
+    return importlib.import_module(f"d2_plugin.commands.{command.replace('-', '_')}").form(words)
+
+
+def parsed(command: str, *words: str) -> Given:
+    rest = list(words)
+    return form_of(command, rest).parse(rest)
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["trian"], []])
+def test_d2_help_imports_neither_torch_nor_numpy(words: Sequence[str]) -> None:
+    code = (
+        "import sys; from d2_plugin.commands.cli import main; main(sys.argv[1:]); "
+        "print('heavy:', *({'torch', 'numpy', 'cv2'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1].strip() == "heavy:"
+
+
+class TestHelp:
+    def test_every_command_stands_there_with_a_sentence(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["--help"]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        for name in COMMANDS:
+            [line] = [line for line in lines if line.startswith(f"  {name} ")]
+            assert len(line.split()) > 5
+
+    @pytest.mark.parametrize("command", ["demo", "plan", "priors", "train", "eval", "compare", "ablate", "doctor"])
+    def test_every_command_explains_each_of_its_settings(
+        self, command: str, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main([command, "--help"]) == 0
+        assert capsys.readouterr().out.startswith(f"usage: d2 {command}")
+        for setting in form_of(command, []).settings:
+            assert setting.help, f"{command}: {setting.name} has no docstring"
+
+    def test_train_shows_tables_with_a_line_each_and_one_on_demand(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["train", "--help"]) == 0
+        short = capsys.readouterr().out
+        assert len(short.splitlines()) < 80
+        assert "--priors.stereo.*" in short
+        assert "budget-per-view" not in short
+        assert main(["train", "--help", "densify"]) == 0
+        table = capsys.readouterr().out
+        assert "--densify.budget-per-view N" in table
+        assert "28.9 dB at 60" in table
+        assert f"default {DensifyConfig().budget_per_view}" in table
+        assert main(["train", "--help-all", "--backbone", "deform"]) == 0
+        assert "--backbone.mlp." in capsys.readouterr().out
+
+    def test_bench_names_its_parts(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["bench", "--help"]) == 0
+        assert "align, raster, scaling or stereo" in capsys.readouterr().out
+        assert main(["bench"]) == 2
+        assert "have align, raster, scaling, stereo" in capsys.readouterr().err
+        assert main(["bench", "sterio"]) == 2
+        assert "did you mean 'stereo'?" in capsys.readouterr().err
+
+
+class TestTables:
+    def test_every_table_of_a_configuration_file_can_be_given_by_flags(self) -> None:
+        assert set(all_tables("yang4d")) == set(TABLES)
+        assert {setting.name for setting in declared(all_tables("yang4d")["plan"].kind)} == set(OVERRIDABLE)
+
+    def test_every_setting_of_the_prior_has_a_flag(self) -> None:
+        sections = form_of("train", []).sections([])
+        stereo = {setting.name for setting in sections["priors.stereo"].settings}
+        assert stereo == {setting.name for setting in declared(StereoSettings)}
+        assert {s.name for s in sections["priors"].settings} | {"stereo", "align"} == {
+            setting.name for setting in declared(PriorSettings)
+        }
+
+    def test_flags_stand_over_the_file_and_the_file_over_the_defaults(self, capture: Path, tmp_path: Path) -> None:
+        config = tmp_path / "d2.toml"
+        config.write_text(
+            "[densify]\nbudget_per_view = 7\nopacity = 0.2\n[priors]\ntau_c = 0.05\n[priors.stereo]\nmin_angle = 3.0\n"
+        )
+        flags = "--densify.budget-per-view 500 --priors.stereo.min-angle 2 --backbone.sh-degree 1 --plan.temporal false"
+        words = [str(capture), *CAMERAS, "--config", str(config), *flags.split(), "--d2.retire-after", "0"]
+        output = tmp_path / "run"
+        assert main(["train", *words, "--iterations", "4", "--hooks", "none", "--output", str(output)]) == 0
+        settings = Run.load(output).settings
+        densify = hook_config(replace(settings, hooks=("densify",)), tmp_path).densify
+        assert densify is not None
+        assert (densify.budget_per_view, densify.opacity) == (500, 0.2)
+        assert densify.tau_v == DensifyConfig().tau_v
+        prior = prior_settings(settings)
+        assert (prior.stereo.min_angle, prior.tau_c) == (2.0, 0.05)
+        assert settings.overrides["backbone"] == {"sh_degree": 1}
+        assert settings.overrides["d2"] == {"retire_after": 0}
+        metrics = json.loads((output / "metrics.json").read_text())
+        assert metrics["plan"]["temporal"]["use"] is False
+
+    def test_the_same_flags_continue_a_run_and_others_are_refused(
+        self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        words = ["train", str(capture), *CAMERAS, "--iterations", "4", "--hooks", "none", "--output", str(tmp_path)]
+        lists = ["--priors.stereo.patchmatch-rounds", "3,1"]
+        assert main([*words, *lists]) == 0
+        assert main([*words, *lists]) == 0
+        assert main([*words, "--priors.stereo.patchmatch-rounds", "3,2"]) == 2
+        assert "other settings of overrides" in capsys.readouterr().err
+
+    def test_the_tables_of_a_backbone_are_those_of_the_chosen_one(self, capsys: pytest.CaptureFixture[str]) -> None:
+        words = ["room", *CAMERAS, "--output", "x"]
+        assert parsed("train", *words, "--backbone", "deform", "--backbone.field", "hexplane").tables == {
+            "backbone": {"field": "hexplane"}
+        }
+        assert main(["train", *words, "--backbone.sh-time-degre", "1"]) == 2
+        assert "did you mean --backbone.sh-time-degree?" in capsys.readouterr().err
+        assert main(["train", *words, "--backbone", "deform", "--backbone.sh-time-degree", "1"]) == 2
+        assert "unknown flag --backbone.sh-time-degree" in capsys.readouterr().err
+
+
+OLD = {
+    "train": "room --train-cameras a,b --test-cameras c --frames 0:8:2 --downscale 2 --mono-onnx n.onnx "
+    "--mono-kind relative --config c.toml --backbone deform --iterations 7 --hooks prior,densify --output o "
+    "--priors p --seed 3 --device cuda --export-ply",
+    "eval": "folder --no-pictures",
+    "compare": "one two three",
+    "ablate": "room --train-cameras a,b --test-cameras c --frames 0:8 --downscale 2 --mono-onnx n --mono-kind metric "
+    "--config c.toml --rows main --backbones yang4d,deform --seeds 0,1 --iterations 5 --jobs 99 --output o",
+    "priors": "room --train-cameras a,b --frames 0:8 --downscale 2 --mono-onnx n --mono-kind metric --config c.toml "
+    "--output o --shard 1/2 --workers 2 --scheduler tcp://a:1",
+    "plan": "room --train-cameras preset:4 --frames 0:8 --downscale 2 --mono-onnx n --mono-kind metric --config c.toml",
+    "demo": "--output o --iterations 5",
+    "doctor": "",
+    "export-capture": "room --format colmap --output o --train-cameras a --test-cameras b --frames 0:1 --downscale 2 "
+    "--points 0 --seed 1",
+    "bench align": "--output o --anchors 10 20 --outliers 0 .2 --methods a b --seeds 1 --seconds .1 --threads 1",
+    "bench raster": "--output o --scenes synth:30 garden --sizes 64x36 --garden g.npz --device cuda --seconds 1 "
+    "--threads 1 --error-limit 5 --no-memory",
+    "bench scaling": "--output o --frames 5 20 --width 64 --iterations 5",
+    "bench stereo": "--output o --rigs pair --data d --makers sweep --defaults-only --width 64 --widen 2 --repeats 2 "
+    "--threads 2",
+    "stability": "--output o --sweeps epsilon",
+    "report": "runs.jsonl folder --output o --no-pictures",
+    "plan --verify": "room --train-cameras a,b --frames 0:8 --downscale 2 --mono-onnx n --mono-kind metric "
+    "--iterations 5 --prior-frames 2 --seeds 0,1 --output o",
+}
+"""All flags of each command before they came from the declared settings."""
+
+
+@pytest.mark.parametrize("command", OLD)
+def test_old_flags_keep_working(command: str) -> None:
+    name, *rest = command.split()
+    words = [*rest, *OLD[command].split()]
+    form = form_of(name, words)
+    if form.words is not None:
+        pytest.skip("study/ reads its words itself until it has `run(settings)`")
+    given = form.parse(words)
+    flags = [word.lstrip("-").replace("-", "_") for word in words if word.startswith("--")]
+    defaults = {setting.name: setting.default for setting in form.settings}
+    for flag in flags:
+        assert given.values[flag] != defaults[flag], flag
+
+
+class TestFlagsOfARun:
+    def test_values_are_those_that_were_written(self) -> None:
+        values = parsed("train", *OLD["train"].split()).values
+        assert values["train_cameras"] == ("a", "b")
+        assert values["frames"] == (0, 2, 4, 6, 8)
+        assert values["hooks"] == ("prior", "densify")
+        assert values["export_ply"] is True
+        assert parsed("train", "room", *CAMERAS, "--output", "o", "--hooks", "none").values["hooks"] == ()
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["--mono-kind", "metrical"], "did you mean 'metric'"),
+            (["--frames", "0-8"], "first:last"),
+            (["--iterations", "many"], "--iterations must be a whole number"),
+            (["--densify.budget-per-view", "many"], "--densify.budget-per-view must be a whole number"),
+            (["--budget-per-view", "5"], "did you mean --densify.budget-per-view?"),
+            (["--iteratoins", "5"], "did you mean --iterations?"),
+        ],
+    )
+    def test_a_mistake_is_one_sentence(
+        self, words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["train", "nowhere", *CAMERAS, "--output", str(tmp_path / "x"), *words]) == 2
+        said = capsys.readouterr().err
+        assert message in said
+        assert len(said.splitlines()) == 1
+
+    def test_what_is_needed_is_asked_for(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["train", "room"]) == 2
+        assert "d2 train needs --train-cameras and --output" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(("part", "message"), [("3/2", "parts are 1 to 2"), ("half", "give I/N")])
+    def test_a_part_that_does_not_exist_is_refused(
+        self, part: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["priors", "room", *CAMERAS, "--output", str(tmp_path), "--shard", part]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_a_preset_passes_over_a_camera_without_calibration_and_so_does_the_run(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room = tmp_path / "room"
+    shutil.copytree(capture, room)
+    names = {"train0": "cam01", "train1": "cam13", "train2": "cam10", "test0": "cam00"}
+    for kind in ("images", "depth", "mono"):
+        for old, new in names.items():
+            (room / kind / old).rename(room / kind / new)
+    description = (room / "cameras.json").read_text()
+    for old, new in names.items():
+        description = description.replace(f'"{old}"', f'"{new}"')
+    (room / "cameras.json").write_text(description)
+    shutil.copytree(room / "images" / "cam01", room / "images" / "cam07")  # pictures without calibration
+    words = ["--train-cameras", "preset:2", "--iterations", "4", "--hooks", "none", "--output", str(tmp_path / "run")]
+    assert main(["train", str(room), *words]) == 0
+    assert "missing: cam07" in capsys.readouterr().out
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert (metrics["train_cameras"], metrics["test_cameras"]) == (["cam01", "cam13"], ["cam10", "cam00"])
+    assert main(["plan", str(room), "--train-cameras", "cam01,cam13"]) == 2  # no preset: whatever does not fit is named
+    assert "cam07" in capsys.readouterr().err
+
+
+def test_an_exported_recording_reads_back(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--format", "transforms", "--output", str(tmp_path / "scene"), "--test-cameras", "test0", "--points", "0"]
+    assert main(["export-capture", str(capture), *words]) == 0
+    assert "4 cameras, 2 frames, no initial points in" in capsys.readouterr().out

@@ -1,0 +1,69 @@
+"""`d2 demo` goes on where it was cut off, and its clock runs for training alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from d2_plugin.captures import open_capture
+from d2_plugin.captures.export import folder as folder_layout
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.commands.cli import main
+from d2_plugin.gaussians import native_slice, native_ssim
+from d2_plugin.rasterizer import native
+from d2_plugin.study import demo
+
+pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
+pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+
+
+class Stopped(Exception):
+    """Raised where a test ends the demo."""
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The demo on a recording of two frames."""
+    tiny = synthetic_capture(cameras=3, held_out=1, frames=2, width=96, height=54)
+    monkeypatch.setattr(demo, "synthetic_capture", lambda: tiny)
+
+
+def test_a_demo_cut_off_while_it_writes_its_recording_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["demo", "--output", str(tmp_path / "demo"), "--iterations", "4"]
+    write, written = folder_layout.write_png, []
+
+    def cut_off(*arguments: object) -> None:
+        if len(written) == 3:
+            raise Stopped
+        written.append(write(*arguments))  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(folder_layout, "write_png", cut_off)
+        with pytest.raises(Stopped):
+            main(command)
+    assert len(written) == 3
+    assert main(command) == 0
+    out = capsys.readouterr().out
+    assert all(f"| {name}" in out for name in demo.VARIANTS)
+    assert (tmp_path / "demo" / "comparison.png").is_file()
+    assert len(open_capture(tmp_path / "demo" / "capture").frames) == 2
+    assert not list((tmp_path / "demo").glob("*unfinished*"))
+
+
+def test_kernels_are_compiled_before_the_clock_of_the_first_run_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    for module, name in ((native, "available"), (native_slice, "library"), (native_ssim, "library")):
+        monkeypatch.setattr(module, name, lambda said=module.__name__: asked.append(said))
+
+    def first_run(run: object) -> None:
+        raise Stopped
+
+    monkeypatch.setattr(demo.Run, "train", first_run)
+    with pytest.raises(Stopped):
+        main(["demo", "--output", str(tmp_path), "--iterations", "4"])
+    assert {name.rsplit(".", 1)[1] for name in asked} == {"native", "native_slice", "native_ssim"}

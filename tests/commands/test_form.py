@@ -1,0 +1,237 @@
+"""Words on a command line become checked values: by the declarations alone, with one sentence for every mistake."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+
+from d2_plugin.commands.arguments.form import Form, Given, Group
+from d2_plugin.commands.arguments.help import help_text
+from d2_plugin.errors import D2Error
+from d2_plugin.settings import Positional, Range, Settings, Share, Steps, declared
+
+
+@dataclass(frozen=True)
+class Edges(Settings):
+    """How edges are found."""
+
+    width: Annotated[int, Range(1, unit="pixels")] = 3
+    """Of the window. Studio: 28.9 dB at 3, 28.1 at 5."""
+    scales: tuple[float, ...] = (0.25, 0.12)
+    """Coarse to fine."""
+
+
+@dataclass(frozen=True)
+class Pruning:
+    """Not a Settings yet: a plain dataclass is read as well."""
+
+    every: int = 100
+    """Steps between evaluations."""
+    stop: int | None = 2000
+    """First step at which it no longer runs."""
+    enabled: bool = True
+    """Whether it runs."""
+    edges: Edges = field(default_factory=Edges)
+
+
+@dataclass(frozen=True)
+class Work(Settings):
+    """What the command does."""
+
+    place: Annotated[Path, Positional()]
+    """Where it is."""
+    output: Path
+    """Where it goes."""
+    frames: tuple[int, ...] | None = None
+    """Which."""
+    names: tuple[str, ...] = ()
+    """Who."""
+    kind: Literal["relative", "metric"] | None = None
+    """What."""
+    steps: Steps = 10
+    """How long."""
+    share: Share = 0.5
+    """How much."""
+    no_pictures: bool = False
+    """Less."""
+
+
+@dataclass(frozen=True)
+class Sweep(Settings):
+    """A command of which no word is taken by its place."""
+
+    sizes: tuple[int, ...] = (1, 2)
+    names: tuple[str, ...] = ()
+
+
+def form_of(kind: type = Work) -> Form:
+    return Form("d2 work", "Works.", declared(kind), lambda given: None, lambda typed: {"prune": Group(Pruning)})
+
+
+def given(*words: str, kind: type = Work) -> Given:
+    fixed = ["room", "--output", "out"] if kind is Work else []
+    return form_of(kind).parse([*fixed, *words])
+
+
+def work(*words: str) -> Work:
+    return given(*words).make(Work)
+
+
+class TestValues:
+    def test_what_is_not_given_keeps_its_default(self) -> None:
+        assert work() == Work(Path("room"), Path("out"))
+
+    @pytest.mark.parametrize(
+        ("words", "name", "value"),
+        [
+            (["--frames", "3:9:3"], "frames", (3, 6, 9)),
+            (["--frames", "0:2,7"], "frames", (0, 1, 2, 7)),
+            (["--frames", "none"], "frames", None),
+            (["--names", "a, b,,c"], "names", ("a", "b", "c")),
+            (["--kind=metric"], "kind", "metric"),
+            (["--steps", "1_000"], "steps", 1000),
+            (["--share", "1"], "share", 1.0),
+            (["--share", "1e-3"], "share", 0.001),
+            (["--no-pictures"], "no_pictures", True),
+            (["--no-pictures", "false"], "no_pictures", False),
+            (["--no_pictures"], "no_pictures", True),
+            (["--no-pic"], "no_pictures", True),
+            (["--steps", "1", "--steps", "2"], "steps", 2),
+        ],
+    )
+    def test_each_kind_is_written_as_a_person_writes_it(self, words: list[str], name: str, value: object) -> None:
+        found = getattr(work(*words), name)
+        assert found == value
+        assert type(found) is type(value)
+
+    def test_a_word_behind_a_switch_or_a_list_is_taken_by_its_place(self) -> None:
+        for flag in (["--no-pictures"], ["--names", "a,b"]):
+            found = form_of().parse([*flag, "room", "--output", "out"]).make(Work)
+            assert found.place == Path("room")
+
+    def test_a_list_takes_several_words_where_none_has_a_place(self) -> None:
+        found = given("--sizes", "5", "20", "80", "--names", "a,b", "c", kind=Sweep).make(Sweep)
+        assert found == Sweep((5, 20, 80), ("a", "b", "c"))
+
+    def test_dotted_flags_become_nested_tables_without_defaults(self) -> None:
+        found = given("--prune.every", "5", "--prune.enabled", "false", "--prune.edges.scales=.5,.1")
+        assert found.tables == {"prune": {"every": 5, "enabled": False, "edges": {"scales": [0.5, 0.1]}}}
+        assert given("--prune.stop", "none").tables == {"prune": {"stop": None}}
+        assert given().tables == {}
+
+
+class TestMistakes:
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["--outptu", "x"], "unknown flag --outptu of d2 work; did you mean --output?"),
+            (["--evry", "5"], "unknown flag --evry of d2 work; did you mean --prune.every?"),
+            (["--prune.edges.widht", "5"], r"did you mean --prune\.edges\.width\?"),
+            (["--zzz"], "unknown flag --zzz of d2 work: `d2 work --help` lists the flags"),
+            (["--n", "a"], "unknown flag --n of d2 work"),
+            (["--steps"], "--steps needs a value"),
+            (["--steps", "--no-pictures"], "--steps needs a value"),
+            (["--steps", "ten"], "setting --steps must be a whole number, got 'ten'"),
+            (["--steps", "-3"], "setting --steps must be at least 0 steps, got -3"),
+            (["--share", "1.5"], "--share must be at least 0 and at most 1, got 1.5"),
+            (["--share", "nan"], "--share must be"),
+            (["--kind", "metrics"], "did you mean 'metric'"),
+            (["--frames", "0-8"], "--frames is '0-8': give whole numbers joined by commas, or first:last"),
+            (["--frames", "0:8:0"], "--frames is '0:8:0'"),
+            (["--prune.edges.width", "0"], "--prune.edges.width must be at least 1 pixels, got 0"),
+            (["--prune.every", "often"], "--prune.every must be a whole number, got 'often'"),
+            (["--prune.enabled", "perhaps"], "--prune.enabled must be"),
+            (["--prune.enabled"], "--prune.enabled needs a value"),
+            (["second"], "d2 work has no place for 'second'"),
+        ],
+    )
+    def test_each_is_one_sentence_that_names_the_flag(self, words: list[str], message: str) -> None:
+        with pytest.raises(D2Error, match=message) as caught:
+            given(*words)
+        assert len(str(caught.value).splitlines()) == 1
+
+    def test_what_is_missing_is_named_all_at_once(self) -> None:
+        with pytest.raises(D2Error, match="d2 work needs PLACE and --output"):
+            form_of().parse([])
+
+
+class TestHelp:
+    def test_says_unit_range_default_and_what_is_needed(self) -> None:
+        text = " ".join(help_text(form_of(), ["--help"]).split())
+        assert "usage: d2 work PLACE --output PATH [more flags]" in text
+        assert "--steps N How long. (steps, at least 0; default 10)" in text
+        assert "--share X How much. (at least 0 and at most 1; default 0.5)" in text
+        assert "--kind relative|metric What." in text
+        assert "--no-pictures Less. --" not in text
+        assert "--output PATH Where it goes. (needed)" in text
+
+    def test_tables_stand_with_a_line_each_and_open_on_demand(self) -> None:
+        form = form_of()
+        short = help_text(form, ["--help"])
+        assert "--prune.edges.*" in short
+        assert "--prune.edges.width" not in short
+        table = " ".join(help_text(form, ["--help", "prune.edges"]).split())
+        assert "[prune.edges] How edges are found." in table
+        assert (
+            "--prune.edges.width N Of the window. Studio: 28.9 dB at 3, 28.1 at 5. (pixels, at least 1; default 3)"
+            in table
+        )
+        assert "--prune.every" not in table
+        assert "--prune.edges.width" in help_text(form, ["--help", "prune"])
+        whole = help_text(form, ["--help-all"])
+        assert all(flag in whole for flag in ("--steps", "--prune.every", "--prune.edges.scales"))
+
+    def test_an_unknown_table_is_answered_with_the_nearest(self) -> None:
+        with pytest.raises(D2Error, match="did you mean 'prune'"):
+            help_text(form_of(), ["--help", "prunes"])
+
+
+def test_a_setting_may_be_written_in_a_way_of_its_own() -> None:
+    readers: dict[str, Any] = {"names": lambda text: ("everyone",) if text == "all" else (text,)}
+    form = Form("d2 work", "", declared(Sweep), lambda given: None, readers=readers)
+    assert form.parse(["--names", "all"]).values["names"] == ("everyone",)
+
+
+@dataclass(frozen=True)
+class Unions(Settings):
+    """Kinds that are not one plain type."""
+
+    stop: int | Literal["end"] = "end"
+    near: Annotated[float, Range(0, open_low=True)] | None = None
+    limits: tuple[float, float] | None = None
+    sizes: tuple[Annotated[int, Range(1)], ...] = ()
+
+
+@pytest.mark.parametrize(
+    ("words", "name", "value"),
+    [
+        (["--stop", "5"], "stop", 5),
+        (["--stop", "end"], "stop", "end"),
+        (["--near", "2"], "near", 2.0),
+        (["--near", "none"], "near", None),
+        (["--limits", "1,9.5"], "limits", (1.0, 9.5)),
+        (["--sizes", "1:3"], "sizes", (1, 2, 3)),
+    ],
+)
+def test_a_union_takes_the_kind_that_a_word_looks_like(words: list[str], name: str, value: object) -> None:
+    found = getattr(given(*words, kind=Unions).make(Unions), name)
+    assert found == value
+    assert type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--near", "0"], "--near must be above 0, got 0"),
+        (["--limits", "1"], "--limits must be a list of 2 values"),
+        (["--sizes", "0,1"], r"--sizes\[0\] must be at least 1, got 0"),
+        (["--stop", "never"], "--stop"),
+    ],
+)
+def test_a_union_checks_what_stands_inside(words: list[str], message: str) -> None:
+    with pytest.raises(D2Error, match=message):
+        given(*words, kind=Unions)
+    assert "(above 0)" in help_text(form_of(Unions), ["--help"])
