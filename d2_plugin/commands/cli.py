@@ -57,9 +57,6 @@ def _answer(words: list[str]) -> str | None:
         raise unknown_name("command", words[0], COMMANDS)
     rest = words[1:]
     form = _module(words[0]).form(rest)
-    if form.words is not None:
-        form.words(rest)
-        return None
     return help_text(form, rest) if any(word in HELP for word in rest) else form.run(form.parse(rest))
 
 

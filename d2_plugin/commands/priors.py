@@ -35,7 +35,7 @@ def run(given: Given) -> str:
     """Build what is missing; returns what the frames came to."""
     from d2_plugin.priors.sheet import contact_sheet
     from d2_plugin.priors.store import PriorStore
-    from d2_plugin.runs.run import build_priors_for
+    from d2_plugin.runs.prior import build_priors_for
     from d2_plugin.runs.scene import Scene
     from d2_plugin.runs.settings import check
     from d2_plugin.runs.start import triangulated_points
@@ -46,7 +46,7 @@ def run(given: Given) -> str:
     scene = Scene.open(settings)
     say_notes(scene.capture.notes)
     say_plan(scene.plan)
-    points = triangulated_points(scene.capture, scene.train_cameras)["positions"]
+    points = triangulated_points(scene.capture, scene.train_cameras).positions
     say(str(build_priors_for(settings, scene, points, options.output, shard=shard, cluster=cluster)))
     if shard is not None:
         return f"part {options.shard} of the prior is in {options.output}"

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
-
 from d2_plugin.captures import Capture, open_capture, select_cameras
 from d2_plugin.captures.export.export import export_capture
 from d2_plugin.captures.export.ply import PointCloud
@@ -59,7 +57,6 @@ def start_cloud(capture: Capture, cameras: Sequence[str], minimum: int = MIN_POI
     The same start as `d2 train` has, so that another repository can be compared with the bundled backbones.
     """
     sparse = triangulated_points(capture, cameras)
-    extent = scene_extent(capture, cameras, sparse["positions"])
-    found = (sparse["positions"], sparse["colors"], sparse["frames"])
-    start = initial_points(capture, cameras, found, extent, seed, minimum)
-    return PointCloud(*(np.asarray(part) for part in (start.positions, start.colors, start.times)))
+    extent = scene_extent(capture, cameras, sparse.positions)
+    start = initial_points(capture, cameras, sparse, extent, seed, minimum)
+    return PointCloud(start.positions, start.colors, start.times)

@@ -182,8 +182,6 @@ def test_old_flags_keep_working(command: str) -> None:
     name, *rest = command.split()
     words = [*rest, *OLD[command].split()]
     form = form_of(name, words)
-    if form.words is not None:
-        pytest.skip("study/ reads its words itself until it has `run(settings)`")
     given = form.parse(words)
     flags = [word.lstrip("-").replace("-", "_") for word in words if word.startswith("--")]
     defaults = {setting.name: setting.default for setting in form.settings}

@@ -66,8 +66,6 @@ class Form:
     """Tables of settings by name. They may depend on what was typed for other flags, as those of the backbone do."""
     readers: Mapping[str, Callable[[str], Any]] = field(default_factory=dict)
     """Settings that are written in a way of their own."""
-    words: Callable[[Sequence[str]], object] | None = None
-    """TEMPORARY, for study/ until it has `run(settings)`: takes all words as they are. Delete it after the merge."""
 
     @classmethod
     def of(cls, command: str, about: str | None, kind: Callable[..., Made], run: Callable[[Made], str | None]) -> Form:

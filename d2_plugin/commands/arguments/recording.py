@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from d2_plugin.commands.arguments.form import Form, Given, Group
 from d2_plugin.errors import D2Error, unknown_name
@@ -33,22 +33,6 @@ WRITTEN = {
 }
 """How some settings are written on a command line, behind what their docstrings say."""
 
-HELP = {
-    "capture": "Folder of the recording.",
-    "train_cameras": "Cameras to train with.",
-    "test_cameras": "Cameras to score with; all others where left out.",
-    "frames": "Which frames; all where left out.",
-    "downscale": "Train on pictures this many times smaller.",
-    "mono_onnx": "Monocular depth network as an ONNX file.",
-    "mono_kind": "What the network predicts: relative (inverse depth) or metric (depth).",
-    "backbone": "Which 4D Gaussian model.",
-    "iterations": "Optimizer steps, one view each.",
-    "hooks": "Parts of the method that are used.",
-    "seed": "Of every random choice.",
-    "priors": "Folder of the depth prior; OUTPUT/priors where left out.",
-}
-"""TEMPORARY, for settings of a run that have no docstring yet. Delete it once `RunSettings` has them all."""
-
 
 @dataclass(frozen=True)
 class ConfigFile(Settings):
@@ -56,17 +40,6 @@ class ConfigFile(Settings):
 
     config: Path | None = None
     """TOML file with tables of settings over the defaults, as `--help` lists them."""
-
-
-@dataclass(frozen=True)
-class PlanChoices:
-    """Decisions of the plan that are taken by hand; the others follow from cameras and depth sources.
-
-    TEMPORARY: `d2_plugin.runs.settings` will have this class, and its own is taken where it has.
-    """
-
-    temporal: bool | None = None
-    """Whether Gaussians move and fade over time. Measured where it is left out."""
 
 
 def recording_form(
@@ -104,7 +77,7 @@ def all_tables(backbone: str) -> dict[str, Group]:
     from d2_plugin import registry
     from d2_plugin.config import D2Config
     from d2_plugin.priors.settings import PriorSettings
-    from d2_plugin.runs import settings
+    from d2_plugin.runs.settings import PlanChoices
 
     hooks = {s.name: kind for s in declared(D2Config) for kind in (s.kind, *get_args(s.kind)) if is_dataclass(kind)}
     module: Any = registry.load(registry.BACKBONES, backbone)
@@ -113,7 +86,7 @@ def all_tables(backbone: str) -> dict[str, Group]:
         "d2": Group(D2Config, tuple(hooks)),
         "priors": Group(PriorSettings),
         "backbone": Group(type(module.settings_from({}))),
-        "plan": Group(getattr(settings, "PlanChoices", PlanChoices)),
+        "plan": Group(PlanChoices),
     }
 
 
@@ -173,10 +146,7 @@ def say_plan(plan: ScenePlan) -> None:
 
 def _spelled(setting: Declared) -> Declared:
     """A setting of a run as a command line takes it."""
-    if setting.name == "mono_kind":  # TEMPORARY, as HELP: until RunSettings says so itself
-        setting = setting._replace(kind=Literal["relative", "metric"] | None)
-    said = f"{setting.help or HELP.get(setting.name, '')} {WRITTEN.get(setting.name, '')}".strip()
-    return setting._replace(help=said, positional=setting.name == "capture")
+    return setting._replace(help=f"{setting.help} {WRITTEN.get(setting.name, '')}".strip())
 
 
 def _backbone(typed: Mapping[str, str]) -> str:
