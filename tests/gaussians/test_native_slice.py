@@ -9,16 +9,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_rotation4d import GOLDEN
+from slice_scenes import AT, CONSTANTS, GOLDEN, random_rows, relative_error
 from tiny import make_model, make_views
 from torch import Tensor
 
 from d2_plugin import D2Error
 from d2_plugin.gaussians import native_slice as kernel
-from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL, native_slice
-from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, reference_slice
+from d2_plugin.gaussians.native_slice import TEMPORAL, native_slice
+from d2_plugin.gaussians.slicing import reference_slice
 
-AT, CONSTANTS = 0.5, (MARGINAL_CUT, LOG_SCALE_LIMIT)
 OUTPUTS = ("means", "covariances", "opacities")
 
 
@@ -33,20 +32,6 @@ def temporal(request: pytest.FixtureRequest) -> bool:
     return request.param
 
 
-def random_rows(count: int, temporal: bool, seed: int = 0, time_scale: float = 0.2) -> dict[str, Tensor]:
-    """Raw parameters in float32; with `time_scale` 0.2 about two in three are drawn at AT."""
-    generator = torch.Generator().manual_seed(seed)
-    rows = {
-        name: torch.randn(*((count, width) if width > 1 else (count,)), generator=generator)
-        for name, width in (TEMPORAL if temporal else STATIC).items()
-    }
-    rows["log_scales"] = rows["log_scales"] * 0.7 - 2
-    if temporal:
-        rows["times"] = rows["times"] * 0.5 + AT
-        rows["log_time_scales"] = rows["log_time_scales"] * 0.3 + math.log(time_scale)
-    return rows
-
-
 def slice_with_gradients(slice_in, rows: Mapping[str, Tensor], dtype: torch.dtype, seed: int = 7, at: float = AT):
     """Outputs, and gradients of a fixed random sum of them, of `slice_in` (native or torch) in `dtype`."""
     raw = {name: value.to(dtype, copy=True).requires_grad_() for name, value in rows.items()}
@@ -55,12 +40,6 @@ def slice_with_gradients(slice_in, rows: Mapping[str, Tensor], dtype: torch.dtyp
     upstream = [torch.randn(output.shape, generator=generator).to(dtype) for output in outputs]
     torch.autograd.backward(outputs, upstream)
     return (*(o.detach() for o in outputs), drawn), {name: value.grad for name, value in raw.items()}
-
-
-def relative_error(value: Tensor, expected: Tensor) -> float:
-    """Relative L2 distance."""
-    difference = torch.linalg.vector_norm(value.double() - expected)
-    return float(difference / torch.linalg.vector_norm(expected).clamp(min=1e-300))
 
 
 @pytest.mark.parametrize("count", [1, 3, 15, 16, 17, 1024, 1040, 3001])

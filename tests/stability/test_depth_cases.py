@@ -11,8 +11,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from slice_scenes import CONSTANTS, random_rows
 from splat_scenes import Scene, random_scene, single
-from test_native_slice import CONSTANTS, random_rows
 from tiny import make_model, make_views
 from torch import Tensor
 from torch.autograd import gradcheck
