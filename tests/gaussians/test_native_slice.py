@@ -9,8 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from slice_rows import AT, CONSTANTS, random_rows, relative_error
-from test_rotation4d import GOLDEN
+from slice_scenes import AT, CONSTANTS, GOLDEN, random_rows, relative_error
 from tiny import make_model, make_views
 from torch import Tensor
 

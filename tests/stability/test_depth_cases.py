@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from slice_rows import CONSTANTS, random_rows
+from slice_scenes import CONSTANTS, random_rows
 from splat_scenes import Scene, random_scene, single
 from tiny import make_model, make_views
 from torch import Tensor

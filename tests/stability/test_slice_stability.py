@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from slice_rows import CONSTANTS, random_rows, relative_error
+from slice_scenes import CONSTANTS, random_rows, relative_error
 from tiny import make_model, make_views
 from torch import Tensor
 
