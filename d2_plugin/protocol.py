@@ -143,10 +143,10 @@ class Survey(NamedTuple):
     Per Gaussian, with w its weight at a pixel (paper: w_{k,q}), z its view depth, D* the prior:
     """
 
-    weight: Tensor  # [M] sum of w over verified pixels
-    error: Tensor  # [M] sum of w |z - D*| / (D* + eps) over verified pixels
+    weight: Tensor  # [M] sum of w over trusted pixels
+    error: Tensor  # [M] sum of w |z - D*| / (D* + eps) over trusted pixels
     max_weight: Tensor  # [M] maximum of w over all pixels; 0 where it contributes nowhere
-    hits: Tensor  # [M] int32, number of verified pixels it contributes to
+    hits: Tensor  # [M] int32, number of trusted pixels it contributes to
     depth_sum: Tensor  # [H, W]
     alpha: Tensor  # [H, W]
 

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from d2_plugin.compiler import load_library
-from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
-from d2_plugin.rasterizer import cuda, ops, reference
+from d2_plugin.protocol import DepthPrior, Label, RasterSettings, Render, Splats, Survey, View
+from d2_plugin.rasterizer import cuda, cuda_frame, ops, reference
 
 HERE = Path(__file__).parent / "rasterizer"
 FORWARD_TOLERANCE, GRADIENT_TOLERANCE = 1e-4, 1e-3
@@ -27,7 +27,7 @@ class ShimLauncher:
         self.descending = descending
         self.launched: list[str] = []
 
-    def launch(self, kernel: str, blocks: int, frame: cuda.Frame, rows: int = 1) -> None:
+    def launch(self, kernel: str, blocks: int, frame: cuda_frame.Frame, rows: int = 1) -> None:
         self.launched.append(kernel)
         run = shim_library(frame.channels or 3).d2_shim_launch
         error = run(kernel.encode(), blocks, rows, self.descending, ctypes.byref(frame))
@@ -36,8 +36,8 @@ class ShimLauncher:
 
 @functools.cache
 def shim_library(channels: int) -> ctypes.CDLL:
-    flags = (f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda.Frame)}", "-ffp-contract=off")
-    headers = (HERE / "cuda_shim.h", cuda.SOURCE, *cuda.HEADERS)
+    flags = (f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda_frame.Frame)}", "-ffp-contract=off")
+    headers = (HERE / "cuda_shim.h", cuda_frame.SOURCE, *cuda_frame.HEADERS)
     library = load_library("cuda-shim", (HERE / "cuda_shim.cpp",), headers, flags)
     library.d2_shim_launch.restype = ctypes.c_char_p
     library.d2_shim_stream.restype = ctypes.c_void_p
@@ -180,7 +180,7 @@ def make_prior(scene: Scene, seed: int = 3) -> DepthPrior:
     generator = torch.Generator().manual_seed(seed)
     size = (scene.view.height, scene.view.width)
     depth = 0.5 + 5 * torch.rand(size, generator=generator)
-    labels = torch.randint(0, 4, size, generator=generator, dtype=torch.uint8)
+    labels = torch.randint(0, len(Label), size, generator=generator, dtype=torch.uint8)
     depth.view(-1)[:21:7] = torch.tensor([0.0, torch.nan, torch.inf])
     return DepthPrior(depth, labels)
 
@@ -188,6 +188,6 @@ def make_prior(scene: Scene, seed: int = 3) -> DepthPrior:
 def survey_kernels(scene: Scene, prior: DepthPrior, device: torch.device, eps: float = 1e-8) -> Survey:
     scene = scene.to(device, torch.float32)
     means, covariances, opacities, _ = scene.splats
-    maps = (prior.depth.to(device), prior.verified.to(device))
+    maps = (prior.depth.to(device), prior.trusted.to(device))
     camera = (scene.view.T_camera_world, scene.view.K, ops._constants(scene.settings))
     return cuda.survey(means, covariances, opacities, *maps, *camera, eps)

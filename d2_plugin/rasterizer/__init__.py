@@ -67,7 +67,8 @@ def survey(
 ) -> Survey:
     """Gather the compositing weights w_{k,q} of one view per Gaussian k, without gradients.
 
-    Verified pixels (Omega^v) are those that the prior labels so and whose depth is finite and positive.
+    Trusted pixels are those of `DepthPrior.trusted` (Omega^v, and what two cameras agree on) whose depth is finite and
+    positive.
 
     Args:
         splats: M Gaussians in the world.
@@ -102,8 +103,11 @@ def _has_kernels(means: Tensor) -> bool:
 def _check(splats: Splats, view: View, settings: RasterSettings, **extra: Tensor | None) -> None:
     """Refuse what the kernels, which trust their pointers, could not survive."""
     count = splats.means.shape[0]
-    expected = {"means": (splats.means, (count, 3)), "covariances": (splats.covariances, (count, 6))}
-    expected["opacities"] = (splats.opacities, (count,))
+    expected: dict[str, tuple[Tensor, tuple[int, ...]]] = {
+        "means": (splats.means, (count, 3)),
+        "covariances": (splats.covariances, (count, 6)),
+        "opacities": (splats.opacities, (count,)),
+    }
     if (colors := extra.get("colors")) is not None:
         channels = colors.shape[-1] if colors.ndim == 2 else 0
         expected["colors"] = (colors, (count, max(channels, 1)))

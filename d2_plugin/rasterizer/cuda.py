@@ -11,11 +11,8 @@ No float is added atomically: the same inputs give the same bits in every run on
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import warnings
-from pathlib import Path
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -23,61 +20,13 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Survey
 
-from .frame import RECORD, PointingFrame
+from .cuda_frame import GATHERERS, MOMENTS, STATISTICS, THREADS, TILE, WARP, Frame, Launcher
+from .cuda_runtime import CudaLauncher
+from .frame import RECORD
+from .nvrtc import NoCuda
 
-KERNELS = Path(__file__).parent / "kernels"
-SOURCE, HEADERS = KERNELS / "gpu.cu", (KERNELS / "splat.h",)
-
-THREADS = 256
-"""Of a block; THREADS of gpu.cu."""
-TILE = 16
-"""Side of a tile in pixels; TILE of gpu.cu."""
-GATHERERS, WARP, MOMENTS, STATISTICS = 8, 32, 7, 4
-"""As in gpu.cu."""
 MOST_PAIRS = 2**31 - 1
 """Slots are 32-bit integers."""
-
-_float, _int, _long, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_int64, ctypes.c_void_p
-
-
-class Frame(PointingFrame):
-    """d2::Frame of kernels/gpu.cu: everything that one call works on; absent pointers stay null."""
-
-    _fields_ = (
-        ("constants", _float * 6),
-        *((name, _int) for name in ("width", "height", "channels", "tiles_x")),
-        ("eps", _float),
-        *((name, _long) for name in ("count", "pairs")),
-        *(
-            (name, _pointer)
-            for name in (
-                *("T_camera_world", "K"),
-                *("means", "covariances", "opacities", "colors", "screen_offsets", "background"),
-                *("prior_depth", "verified"),
-                *("records", "tile_counts", "depths", "by_depth", "slot_ends"),
-                *("slot_tiles", "slot_ids", "ids", "slots", "tile_starts"),
-                *("color", "depth_sum", "alpha", "grad_color", "grad_depth_sum", "grad_alpha"),
-                *("values", "moments"),
-                *("grad_means", "grad_covariances", "grad_opacities", "grad_colors", "grad_screen_offsets"),
-                *("weight", "error", "max_weight", "hits"),
-            )
-        ),
-    )
-
-    @property
-    def tiles(self) -> int:
-        """Number of tiles of the image."""
-        return self.tiles_x * -(-self.height // TILE)
-
-
-class Launcher(Protocol):
-    """Runs kernels of gpu.cu on one device."""
-
-    def launch(self, kernel: str, blocks: int, frame: Frame, rows: int = 1) -> None:
-        """Enqueue `kernel` on a grid of `blocks` x `rows` blocks of THREADS threads; `frame` is copied.
-
-        The kernels are those compiled for `frame.channels` colors (any where it is 0).
-        """
 
 
 @functools.cache
@@ -87,16 +36,12 @@ def launcher(device: torch.device) -> Launcher:
     Raises:
         d2_plugin.rasterizer.nvrtc.NoCuda: no driver, no NVRTC, or an architecture that it does not know.
     """
-    from .cuda_runtime import CudaLauncher
-
     return CudaLauncher(device)
 
 
 @functools.cache
 def available(device: torch.device) -> bool:
     """Whether the kernels can be had on a CUDA device; warns once where they cannot."""
-    from .nvrtc import NoCuda
-
     try:
         launcher(device)
     except NoCuda as error:
@@ -163,10 +108,11 @@ def backward(
     frame.point(grad_color=grad_color, grad_depth_sum=grad_depth_sum, grad_alpha=grad_alpha)
     frame.pairs = (len(lists) - 2 * len(means) - frame.tiles - 1) // 2
     _point_lists(frame, lists)
-    gradients = [torch.empty_like(part) for part in (means, covariances, opacities, colors)]
+    grad_means, grad_covariances = torch.empty_like(means), torch.empty_like(covariances)
+    grad_opacities, grad_colors = torch.empty_like(opacities), torch.empty_like(colors)
     grad_screen_offsets = means.new_empty(len(means), 2)
-    frame.point(grad_means=gradients[0], grad_covariances=gradients[1], grad_opacities=gradients[2])
-    frame.point(grad_colors=gradients[3], grad_screen_offsets=grad_screen_offsets)
+    frame.point(grad_means=grad_means, grad_covariances=grad_covariances, grad_opacities=grad_opacities)
+    frame.point(grad_colors=grad_colors, grad_screen_offsets=grad_screen_offsets)
     # Zeros, since tiles whose pixels are all finished leave the rest of their pairs alone.
     frame.point(values=means.new_zeros(frame.pairs, MOMENTS + channels), moments=means.new_empty(len(means), MOMENTS))
     runs = launcher(means.device)
@@ -178,7 +124,7 @@ def backward(
     grad_background = means.new_zeros(channels)
     if grad_color is not None:
         grad_background = ((1 - alpha)[..., None] * grad_color).sum((0, 1))
-    return *gradients, grad_background, grad_screen_offsets
+    return grad_means, grad_covariances, grad_opacities, grad_colors, grad_background, grad_screen_offsets
 
 
 def survey(
@@ -186,17 +132,17 @@ def survey(
     covariances: Tensor,
     opacities: Tensor,
     prior_depth: Tensor,
-    verified: Tensor,
+    trusted: Tensor,
     T_camera_world: Tensor,
     K: Tensor,
     constants: list[float],
     eps: float,
 ) -> Survey:
-    """See `d2_plugin.rasterizer.survey`; `verified` [H, W] bool, `prior_depth` [H, W] float32."""
+    """See `d2_plugin.rasterizer.survey`; `trusted` [H, W] bool, `prior_depth` [H, W] float32."""
     height, width = prior_depth.shape
     frame = _frame(means, covariances, opacities, T_camera_world, K, width, height, constants)
     frame.eps = eps
-    frame.point(prior_depth=prior_depth, verified=verified)
+    frame.point(prior_depth=prior_depth, trusted=trusted)
     runs = launcher(means.device)
     _bin(runs, frame, means, K)
     weight, error, max_weight = (torch.empty_like(opacities) for _ in range(3))
@@ -269,7 +215,7 @@ def _count_pairs(ends: Tensor, K: Tensor) -> int:
 
 def _point_lists(frame: Frame, lists: Tensor) -> dict[str, Tensor]:
     """Views into one buffer: ids [P], slots [P], by_depth [M], slot_ends [M], tile_starts [tiles + 1]."""
-    sizes = (frame.pairs, frame.pairs, frame.count, frame.count, frame.tiles + 1)
+    sizes = [frame.pairs, frame.pairs, frame.count, frame.count, frame.tiles + 1]
     parts = dict(zip(("ids", "slots", "by_depth", "slot_ends", "tile_starts"), torch.split(lists, sizes)))
     frame.point(**parts)
     return parts

@@ -47,7 +47,7 @@ class Frame(PointingFrame):
             (name, _pointer)
             for name in (
                 *("means", "covariances", "opacities", "colors", "screen_offsets", "background"),
-                *("prior_depth", "verified"),
+                *("prior_depth", "trusted"),
                 *("records", "slots", "tiles", "ids", "blocks"),
                 *("color", "depth_sum", "alpha", "grad_color", "grad_depth_sum", "grad_alpha"),
                 *("grad_means", "grad_covariances", "grad_opacities", "grad_colors"),
@@ -160,12 +160,13 @@ def backward(
     tiles = library().d2_tile_count(frame)
     pairs = (len(lists) - len(means) - 1 - 2 * tiles) // 3
     _point_lists(frame, lists, pairs)
-    gradients = [torch.empty_like(part) for part in (means, covariances, opacities, colors)]
-    gradients += [means.new_empty(channels), means.new_empty(len(means), 2)]
-    frame.point(grad_means=gradients[0], grad_covariances=gradients[1], grad_opacities=gradients[2])
-    frame.point(grad_colors=gradients[3], grad_background=gradients[4], grad_screen_offsets=gradients[5])
+    grad_means, grad_covariances = torch.empty_like(means), torch.empty_like(covariances)
+    grad_opacities, grad_colors = torch.empty_like(opacities), torch.empty_like(colors)
+    grad_background, grad_screen_offsets = means.new_empty(channels), means.new_empty(len(means), 2)
+    frame.point(grad_means=grad_means, grad_covariances=grad_covariances, grad_opacities=grad_opacities)
+    frame.point(grad_colors=grad_colors, grad_background=grad_background, grad_screen_offsets=grad_screen_offsets)
     _run(library().d2_backward, frame, pairs)
-    return tuple(gradients)
+    return grad_means, grad_covariances, grad_opacities, grad_colors, grad_background, grad_screen_offsets
 
 
 def survey(
@@ -173,18 +174,18 @@ def survey(
     covariances: Tensor,
     opacities: Tensor,
     prior_depth: Tensor,
-    verified: Tensor,
+    trusted: Tensor,
     T_camera_world: Tensor,
     K: Tensor,
     constants: list[float],
     eps: float,
 ) -> Survey:
-    """See `d2_plugin.rasterizer.survey`; `verified` [H, W] bool, `prior_depth` [H, W] float32."""
+    """See `d2_plugin.rasterizer.survey`; `trusted` [H, W] bool, `prior_depth` [H, W] float32."""
     height, width = prior_depth.shape
     frame = _frame(T_camera_world, K, width, height, constants, len(means), 0)
     frame.eps = eps
     frame.point(means=means, covariances=covariances, opacities=opacities)
-    frame.point(prior_depth=prior_depth, verified=verified)
+    frame.point(prior_depth=prior_depth, trusted=trusted)
     _, _, pairs = _project(frame, means)
     weight, error, max_weight = (torch.empty_like(opacities) for _ in range(3))
     hits = torch.empty(len(means), dtype=torch.int32)

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.protocol import DepthPrior, Label, RasterSettings, Render, Splats, Survey, View
+from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
 
 from . import cuda, native
 from .frame import RECORD
@@ -48,19 +48,10 @@ def rasterize(
 def survey(splats: Splats, view: View, prior: DepthPrior, settings: RasterSettings, eps: float) -> Survey:
     """See `d2_plugin.rasterizer.survey`; float32."""
     means, covariances, opacities, _ = splats
-    depth, verified = prior.depth.to(means).contiguous(), _verified(prior.labels).to(means.device).contiguous()
+    depth, trusted = prior.depth.to(means).contiguous(), prior.trusted.to(means.device).contiguous()
     camera = (view.T_camera_world, view.K)
     parts = (means.contiguous(), covariances.contiguous(), opacities.contiguous())
-    return Survey(*_survey(*parts, depth, verified, *camera, _constants(settings), eps))
-
-
-def _verified(labels: Tensor) -> Tensor:
-    """`DepthPrior.trusted`; by numpy on the CPU, since torch would wake its own threads for a microsecond of work and
-    wait for them, which takes milliseconds where the cores are busy."""
-    if labels.device.type == "cpu":
-        codes = labels.numpy()
-        return torch.from_numpy((codes == Label.VERIFIED) | (codes == Label.AGREED))
-    return (labels == Label.VERIFIED) | (labels == Label.AGREED)
+    return Survey(*_survey(*parts, depth, trusted, *camera, _constants(settings), eps))
 
 
 def _constants(settings: RasterSettings) -> list[float]:
@@ -92,7 +83,7 @@ _survey = torch.library.custom_op(
     native.survey,
     mutates_args=(),
     device_types="cpu",
-    schema=f"({_SPLATS}, Tensor prior_depth, Tensor verified, {_CAMERA}, float[] constants, float eps) -> "
+    schema=f"({_SPLATS}, Tensor prior_depth, Tensor trusted, {_CAMERA}, float[] constants, float eps) -> "
     "(Tensor weight, Tensor error, Tensor max_weight, Tensor hits, Tensor depth_sum, Tensor alpha)",
 )
 
@@ -119,7 +110,7 @@ def _(grad_color, grad_depth_sum, grad_alpha, means, covariances, opacities, col
 
 
 @_survey.register_fake
-def _(means, covariances, opacities, prior_depth, verified, T_camera_world, K, constants, eps):  # type: ignore[no-untyped-def]
+def _(means, covariances, opacities, prior_depth, trusted, T_camera_world, K, constants, eps):  # type: ignore[no-untyped-def]
     hits = opacities.new_empty(opacities.shape, dtype=torch.int32)
     image = torch.empty_like(prior_depth)
     return *(torch.empty_like(opacities) for _ in range(3)), hits, image, torch.empty_like(image)

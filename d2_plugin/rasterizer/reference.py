@@ -92,8 +92,8 @@ def survey(splats: Splats, view: View, prior: DepthPrior, settings: RasterSettin
     weight, error, max_weight = (empty(len(splats.means)) for _ in range(3))
     hits = torch.zeros(len(splats.means), dtype=torch.int32, device=kept.device)
     depth_sum, alpha = empty(view.height, view.width), empty(view.height, view.width)
-    verified = prior.trusted & torch.isfinite(prior.depth) & (prior.depth > 0)
-    truth = torch.where(verified, prior.depth, 1).to(screen.depths)
+    trusted = prior.trusted & torch.isfinite(prior.depth) & (prior.depth > 0)
+    truth = torch.where(trusted, prior.depth, 1).to(screen.depths)
     for y in range(0, view.height, TILE):
         for x in range(0, view.width, TILE):
             tile = (slice(y, y + TILE), slice(x, x + TILE))
@@ -104,7 +104,7 @@ def survey(splats: Splats, view: View, prior: DepthPrior, settings: RasterSettin
             if not len(rows):
                 continue
             max_weight[rows] = torch.maximum(max_weight[rows], w.amax(0))
-            w, true = w[verified[tile].flatten()], truth[tile][verified[tile]][:, None]
+            w, true = w[trusted[tile].flatten()], truth[tile][trusted[tile]][:, None]
             weight[rows] += w.sum(0)
             error[rows] += (w * (depths - true).abs() / (true + eps)).sum(0)
             hits[rows] += (w > 0).sum(0, dtype=torch.int32)

@@ -208,6 +208,15 @@ def test_survey_is_the_references(backend: torch.device, scene: Scene) -> None:
     assert off.sum() <= 0.02 * len(off), "more than those whose maximum may lie at a cut-off"
 
 
+@pytest.mark.parametrize("label", Label)
+def test_survey_counts_verified_and_agreed_pixels_and_no_others(backend: torch.device, label: Label) -> None:
+    scene = make_scene(60)
+    prior = make_prior(scene)
+    prior.labels.fill_(label)
+    counted = label in (Label.VERIFIED, Label.AGREED)
+    assert bool(survey_kernels(scene, prior, backend).hits.any()) == counted
+
+
 def test_no_result_depends_on_the_order_of_warps_and_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = make_scene(400, 45, 37, scale=0.25)
     upstream = random_upstream(scene)

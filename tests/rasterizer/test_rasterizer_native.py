@@ -15,6 +15,7 @@ import torch
 from splat_scenes import Scene, brute_force, make_view, near_threshold, random_scene, single
 
 from d2_plugin.compiler import NoCompiler, find_compiler
+from d2_plugin.protocol import Label
 from d2_plugin.rasterizer import DepthPrior, Render, Splats, native, ops, rasterize, survey
 
 try:
@@ -46,7 +47,7 @@ def prior_of(scene: Scene) -> DepthPrior:
     size = (scene.view.height, scene.view.width)
     depth = 1 + 4 * torch.rand(size, generator=g)
     depth[0, 0] = torch.nan
-    return DepthPrior(depth, torch.randint(0, 4, size, generator=g, dtype=torch.uint8))
+    return DepthPrior(depth, torch.randint(0, len(Label), size, generator=g, dtype=torch.uint8))
 
 
 SCENES = {
@@ -221,7 +222,7 @@ def test_the_operators_pass_torchs_own_check():
     saved = (*upstream(scene), *detached[:8], constants, *outputs)
     torch.library.opcheck(ops._rasterize_backward, saved)
     prior = prior_of(scene)
-    measured = (*detached[:3], prior.depth, prior.verified, *camera, constants, 1e-8)
+    measured = (*detached[:3], prior.depth, prior.trusted, *camera, constants, 1e-8)
     torch.library.opcheck(ops._survey, measured)
 
 

@@ -364,7 +364,7 @@ D2_INLINE void backward_group(const Frame& f, const Sums& from, int64_t i, int r
 
 // ---------------------------------------------------------------------------------------------------- survey
 
-// State of a block in the survey: transmittance, that of finished pixels, depth sum, and at verified pixels
+// State of a block in the survey: transmittance, that of finished pixels, depth sum, and at trusted pixels
 // 1 / (D* + eps), D* / (D* + eps), 1.
 static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* statistics) {
   constexpr int fields = 6;
@@ -376,13 +376,13 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
     unfinished.add(strip);
     for (int i = 0; i < count; i++) {
       field[i] = 1.f;
-      field[4 * LANES + i] = f.prior_depth[strip.pixel + i], field[5 * LANES + i] = f.verified[strip.pixel + i];
+      field[4 * LANES + i] = f.prior_depth[strip.pixel + i], field[5 * LANES + i] = f.trusted[strip.pixel + i];
     }
   });
   for (int block = 0; block < BLOCKS; block++) {
     float* field = state + block * fields * LANES;
-    const Floats depth = Floats::load(field + 4 * LANES), verified = Floats::load(field + 5 * LANES);
-    const Mask usable = (verified > Floats(0.f)) & (depth > Floats(0.f)) & (depth < Floats(__builtin_inff()));
+    const Floats depth = Floats::load(field + 4 * LANES), trusted = Floats::load(field + 5 * LANES);
+    const Mask usable = (trusted > Floats(0.f)) & (depth > Floats(0.f)) & (depth < Floats(__builtin_inff()));
     const Floats scale = where(usable, Floats(1.f) / (depth + Floats(f.eps)));
     scale.store(field + 3 * LANES);
     (where(usable, depth) * scale).store(field + 4 * LANES);
@@ -397,7 +397,7 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
   for_each_reaching(f, keys, pairs, corner, unfinished.blocks, [&](uint32_t id, const Record& r, uint64_t reached) {
     const Spread spread = lattice.spread(r, corner);
     const Floats depth = r.footprint.depth;
-    Floats sums[4] = {0.f, 0.f, 0.f, 0.f}, largest_weight = 0.f;  // weight, error and hits over verified pixels
+    Floats sums[4] = {0.f, 0.f, 0.f, 0.f}, largest_weight = 0.f;  // weight, error and hits over trusted pixels
     for (uint64_t left = reached; left; left &= left - 1) {
       const int block = __builtin_ctzll(left);
       const Fragment<Floats> here = spread.at(block);
@@ -407,11 +407,11 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
       unfinished.advance(step, transmittance, block, field + LANES).store(field);
       fma(step.weight, depth, Floats::load(field + 2 * LANES)).store(field + 2 * LANES);
       const Floats scale = Floats::load(field + 3 * LANES), true_depth = Floats::load(field + 4 * LANES);
-      const Floats verified = Floats::load(field + 5 * LANES);
+      const Floats trusted = Floats::load(field + 5 * LANES);
       const Floats error = abs(fma(depth, scale, -true_depth));
-      sums[0] = fma(step.weight, verified, sums[0]);
+      sums[0] = fma(step.weight, trusted, sums[0]);
       sums[1] = fma(step.weight, error, sums[1]);
-      sums[2] = sums[2] + where(step.weight > Floats(0.f), verified);
+      sums[2] = sums[2] + where(step.weight > Floats(0.f), trusted);
       largest_weight = max(step.weight, largest_weight);
     }
     const float most = largest(largest_weight);

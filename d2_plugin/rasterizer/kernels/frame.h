@@ -51,8 +51,8 @@ struct Frame {
 
   // Inputs; `screen_offsets` may be null, for a survey also `colors` and `background`.
   const float *means, *covariances, *opacities, *colors, *screen_offsets, *background;
-  const float* prior_depth;  // 0 or less, or not finite: not verified
-  const uint8_t* verified;
+  const float* prior_depth;  // 0 or less, or not finite: not trusted
+  const uint8_t* trusted;
 
   // State of the forward pass. A pair is a Gaussian in a tile: pairs of Gaussian i have the slots slots[i]..slots[i+1]-1
   // in row-major order of tiles; pairs of a tile stand together in `ids` and `blocks`.

@@ -44,8 +44,8 @@ struct Frame {
 
   const float *T_camera_world, *K;  // [4, 4], [3, 3]
   const float *means, *covariances, *opacities, *colors, *screen_offsets, *background;
-  const float* prior_depth;  // 0 or less, or not finite: not verified
-  const unsigned char* verified;
+  const float* prior_depth;  // 0 or less, or not finite: not trusted
+  const unsigned char* trusted;
 
   Record* records;       // [M]
   int* tile_counts;      // [M] tiles of a Gaussian
@@ -523,9 +523,9 @@ D2_KERNEL d2_survey(const Frame f) {
   const Pixel p = pixel_of_thread(f);
   const float log2_alpha_min = log2(f.constants.alpha_min);
   float transmittance = p.inside ? 1.f : 0.f, depth_sum = 0.f;
-  const float truth = p.inside && f.verified[p.index] ? f.prior_depth[p.index] : 0.f;
-  const bool verified = truth > 0.f && truth - truth == 0.f;
-  const float scale = verified ? 1.f / (truth + f.eps) : 0.f, scaled_truth = verified ? truth * scale : 0.f;
+  const float truth = p.inside && f.trusted[p.index] ? f.prior_depth[p.index] : 0.f;
+  const bool trusted = truth > 0.f && truth - truth == 0.f;
+  const float scale = trusted ? 1.f / (truth + f.eps) : 0.f, scaled_truth = trusted ? truth * scale : 0.f;
 
   const auto contribute = [&](int j) {
     const Footprint<float> g = batch.footprint(j);
@@ -533,9 +533,9 @@ D2_KERNEL d2_survey(const Frame f) {
     if (!__any_sync(ALL_LANES, weight > 0.f)) return false;
     depth_sum = fma(weight, g.depth, depth_sum);
     const float error = fabsf(fma(g.depth, scale, -scaled_truth));
-    const float sums[2] = {verified ? weight : 0.f, weight * error};
+    const float sums[2] = {trusted ? weight : 0.f, weight * error};
     const float total = warp_sums(sums);  // weight in the lower half of the lanes, error in the upper
-    const int hits = __popc(__ballot_sync(ALL_LANES, verified && weight > 0.f));
+    const int hits = __popc(__ballot_sync(ALL_LANES, trusted && weight > 0.f));
     float largest = weight;
     for (int distance = WARP / 2; distance > 0; distance /= 2)
       largest = max(largest, __shfl_xor_sync(ALL_LANES, largest, distance));
