@@ -63,11 +63,15 @@ def rasterize(
     screen_offsets: Tensor | None,
     T_camera_world: Tensor,
     K: Tensor,
+    near_edge: Tensor | None,
     width: int,
     height: int,
     constants: list[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """color [H, W, C], depth_sum [H, W], alpha [H, W] and the state that `backward` needs (records, lists)."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """color [H, W, C], depth_sum, alpha and front [H, W], and the state that `backward` needs (records, lists).
+
+    front is empty, [0], without `near_edge` [H, W].
+    """
     frame = _frame(means, covariances, opacities, T_camera_world, K, width, height, constants)
     frame.channels = colors.shape[1]
     frame.point(colors=colors, background=background, screen_offsets=screen_offsets)
@@ -75,15 +79,17 @@ def rasterize(
     records, lists = _bin(runs, frame, means, K)
     color = means.new_empty(height, width, colors.shape[1])
     depth_sum, alpha = means.new_empty(height, width), means.new_empty(height, width)
-    frame.point(color=color, depth_sum=depth_sum, alpha=alpha)
-    runs.launch("d2_render", frame.tiles, frame)
-    return color, depth_sum, alpha, records, lists
+    front = means.new_empty((0,) if near_edge is None else (height, width))
+    frame.point(color=color, depth_sum=depth_sum, alpha=alpha, near_edge=near_edge, front=front)
+    runs.launch("d2_render" if near_edge is None else "d2_render_front", frame.tiles, frame)
+    return color, depth_sum, alpha, front, records, lists
 
 
 def backward(
     grad_color: Tensor | None,
     grad_depth_sum: Tensor | None,
     grad_alpha: Tensor | None,
+    grad_front: Tensor | None,
     means: Tensor,
     covariances: Tensor,
     opacities: Tensor,
@@ -92,10 +98,12 @@ def backward(
     screen_offsets: Tensor | None,
     T_camera_world: Tensor,
     K: Tensor,
+    near_edge: Tensor | None,
     constants: list[float],
     color: Tensor,
     depth_sum: Tensor,
     alpha: Tensor,
+    front: Tensor,
     records: Tensor,
     lists: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -104,8 +112,8 @@ def backward(
     frame = _frame(means, covariances, opacities, T_camera_world, K, width, height, constants)
     frame.channels = channels
     frame.point(colors=colors, background=background, screen_offsets=screen_offsets, records=records)
-    frame.point(color=color, depth_sum=depth_sum, alpha=alpha)
-    frame.point(grad_color=grad_color, grad_depth_sum=grad_depth_sum, grad_alpha=grad_alpha)
+    frame.point(color=color, depth_sum=depth_sum, alpha=alpha, near_edge=near_edge, front=front)
+    frame.point(grad_color=grad_color, grad_depth_sum=grad_depth_sum, grad_alpha=grad_alpha, grad_front=grad_front)
     frame.pairs = (len(lists) - 2 * len(means) - frame.tiles - 1) // 2
     _point_lists(frame, lists)
     grad_means, grad_covariances = torch.empty_like(means), torch.empty_like(covariances)
@@ -116,7 +124,8 @@ def backward(
     # Zeros, since tiles whose pixels are all finished leave the rest of their pairs alone.
     frame.point(values=means.new_zeros(frame.pairs, MOMENTS + channels), moments=means.new_empty(len(means), MOMENTS))
     runs = launcher(means.device)
-    runs.launch("d2_backward", frame.tiles, frame)
+    with_front = near_edge is not None and grad_front is not None
+    runs.launch("d2_backward_front" if with_front else "d2_backward", frame.tiles, frame)
     if (more := channels - (WARP - MOMENTS)) > 0:
         runs.launch("d2_backward_colors", frame.tiles, frame, rows=-(-more // WARP))
     runs.launch("d2_gather", _blocks(len(means) * GATHERERS), frame)
@@ -132,27 +141,29 @@ def survey(
     covariances: Tensor,
     opacities: Tensor,
     prior_depth: Tensor,
-    trusted: Tensor,
+    reliability: Tensor,
+    near_edge: Tensor | None,
     T_camera_world: Tensor,
     K: Tensor,
     constants: list[float],
     eps: float,
 ) -> Survey:
-    """See `d2_plugin.rasterizer.survey`; `trusted` [H, W] bool, `prior_depth` [H, W] float32."""
+    """See `d2_plugin.rasterizer.survey`; `prior_depth`, `reliability` and `near_edge` are [H, W] float32."""
     height, width = prior_depth.shape
     frame = _frame(means, covariances, opacities, T_camera_world, K, width, height, constants)
     frame.eps = eps
-    frame.point(prior_depth=prior_depth, trusted=trusted)
+    frame.point(prior_depth=prior_depth, reliability=reliability, near_edge=near_edge)
     runs = launcher(means.device)
     _bin(runs, frame, means, K)
-    weight, error, max_weight = (torch.empty_like(opacities) for _ in range(3))
+    weight, error, max_weight, front = (torch.empty_like(opacities) for _ in range(4))
     hits = torch.empty_like(opacities, dtype=torch.int32)
     depth_sum, alpha = torch.empty_like(prior_depth), torch.empty_like(prior_depth)
-    frame.point(depth_sum=depth_sum, alpha=alpha, values=means.new_zeros(frame.pairs, STATISTICS))
-    frame.point(weight=weight, error=error, max_weight=max_weight, hits=hits)
-    runs.launch("d2_survey", frame.tiles, frame)
+    statistics = STATISTICS if near_edge is None else STATISTICS + 1
+    frame.point(depth_sum=depth_sum, alpha=alpha, values=means.new_zeros(frame.pairs, statistics))
+    frame.point(weight=weight, error=error, max_weight=max_weight, front_weight=front, hits=hits)
+    runs.launch("d2_survey" if near_edge is None else "d2_survey_front", frame.tiles, frame)
     runs.launch("d2_gather_survey", _blocks(len(means) * GATHERERS), frame)
-    return Survey(weight, error, max_weight, hits, depth_sum, alpha)
+    return Survey(weight, error, max_weight, hits, depth_sum, alpha, front)
 
 
 def _frame(

@@ -34,13 +34,14 @@ class Frame(PointingFrame):
             for name in (
                 *("T_camera_world", "K"),
                 *("means", "covariances", "opacities", "colors", "screen_offsets", "background"),
-                *("prior_depth", "trusted"),
+                *("prior_depth", "reliability", "near_edge"),
                 *("records", "tile_counts", "depths", "by_depth", "slot_ends"),
                 *("slot_tiles", "slot_ids", "ids", "slots", "tile_starts"),
-                *("color", "depth_sum", "alpha", "grad_color", "grad_depth_sum", "grad_alpha"),
+                *("color", "depth_sum", "alpha", "front"),
+                *("grad_color", "grad_depth_sum", "grad_alpha", "grad_front"),
                 *("values", "moments"),
                 *("grad_means", "grad_covariances", "grad_opacities", "grad_colors", "grad_screen_offsets"),
-                *("weight", "error", "max_weight", "hits"),
+                *("weight", "error", "max_weight", "front_weight", "hits"),
             )
         ),
     )

@@ -44,7 +44,16 @@ def test_nvrtc_compiles_the_kernels_without_a_toolkit(
     code, architecture = nvrtc.build(capability, channels)
     assert architecture == f"sm_{capability}"
     assert code.startswith(b"\x7fELF")
-    for kernel in ("project", "list", "render", "backward", "gather", "project_backward", "survey", "gather_survey"):
+    twice = ("render", "backward", "survey")
+    for kernel in (
+        "project",
+        "list",
+        "gather",
+        "project_backward",
+        "gather_survey",
+        *twice,
+        *(f"{k}_front" for k in twice),
+    ):
         assert f"d2_{kernel}".encode() in code
 
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from splat_scenes import Scene, brute_force, make_view, random_scene, single
+from splat_scenes import Scene, brute_force, make_view, near_edge_of, random_scene, single
 from torch.autograd import gradcheck
 
 from d2_plugin.errors import D2Error
@@ -49,7 +49,7 @@ def test_image_is_the_compositing_sum_of_the_definition(seed):
 
 def test_a_moved_world_gives_the_same_image():
     scene = random_scene(5, 80, 24, 20)
-    for part, other in zip(scene.render(), rotated(scene).render()):
+    for part, other in zip(scene.render()[:3], rotated(scene).render()[:3]):
         torch.testing.assert_close(part, other, atol=1e-10, rtol=0)
 
 
@@ -119,7 +119,8 @@ def test_gradients_are_those_of_the_image(seed):
 
     def render(means, covariances, opacities, colors, background, offsets):
         splats = Splats(means, covariances, opacities, torch.arange(4))
-        return tuple(rasterize(splats, colors, scene.view, background=background, screen_offsets=offsets))
+        options = {"background": background, "screen_offsets": offsets, "near_edge": near_edge_of(scene.view, seed)}
+        return tuple(rasterize(splats, colors, scene.view, **options))
 
     # Every entry of the Jacobian for some seeds, a random projection of it (a tenth of the time) for the others.
     assert gradcheck(render, (*scene[:4], background, offsets), fast_mode=seed >= 5), f"seed {seed}"

@@ -1,0 +1,1 @@
+"""One run, from a capture to a held-out score."""

@@ -1,0 +1,51 @@
+"""A capture with its split into training and test cameras, and the plan for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from d2_plugin.captures import Capture, open_capture
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.runs.plan import ScenePlan, plan_scene
+from d2_plugin.runs.settings import RunSettings
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What a run is about: the recording, who trains and who tests, and what is left out."""
+
+    capture: Capture
+    train_cameras: tuple[str, ...]
+    test_cameras: tuple[str, ...]
+    plan: ScenePlan
+
+    @classmethod
+    def open(cls, settings: RunSettings) -> Scene:
+        """Open the capture that `settings` name, split its cameras, and measure what it needs."""
+        capture = open_capture(settings.capture, frames=settings.frames, downscale=settings.downscale)
+        train, test = _split(capture, settings)
+        plan = plan_scene(capture, train, _mono_source(capture, settings))
+        return cls(capture, train, test, plan.override(**settings.overrides.get("plan", {})))
+
+
+def _split(capture: Capture, settings: RunSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Training cameras as named, test cameras as named or all others."""
+    test = settings.test_cameras
+    if test is None:
+        test = tuple(name for name in capture.cameras if name not in settings.train_cameras)
+    for name in (*settings.train_cameras, *test):
+        if name not in capture.cameras:
+            raise unknown_name("camera", name, capture.cameras)
+    both = sorted(set(settings.train_cameras) & set(test))
+    if both:
+        raise D2Error(f"camera {both[0]} is named for training and for test: leave it out of one")
+    return settings.train_cameras, test
+
+
+def _mono_source(capture: Capture, settings: RunSettings) -> str | None:
+    if settings.mono_onnx:
+        return f"ONNX model {Path(settings.mono_onnx).name}"
+    if capture.mono_kind is None:
+        return None
+    return f"{capture.mono_kind} maps on disk" + (" (emulated)" if capture.mono_emulated else "")
