@@ -50,7 +50,7 @@ def probe_package(package: Mapping[str, Any], own: Render, parameters: Sequence[
 
 
 def _compared(depth: Tensor, alpha: Tensor, own: Render) -> Probe:
-    own = Render(*(output.detach() for output in own))
+    own = Render(*(output.detach() for output in own[:3]))
     covered = (own.alpha > COVERED) & (alpha > COVERED)
     if not covered.any():
         return _own_path("covers no pixel yet, so its depth could not be compared")._replace(final=False)

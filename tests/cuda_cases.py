@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from d2_plugin.compiler import load_library
-from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
-from d2_plugin.rasterizer import cuda, ops, reference
+from d2_plugin.protocol import DepthPrior, Label, RasterSettings, Render, Splats, Survey, View
+from d2_plugin.rasterizer import cuda, cuda_frame, ops, reference
+from d2_plugin.rasterizer.evidence import reliability
 
 HERE = Path(__file__).parent / "rasterizer"
 FORWARD_TOLERANCE, GRADIENT_TOLERANCE = 1e-4, 1e-3
@@ -27,7 +28,7 @@ class ShimLauncher:
         self.descending = descending
         self.launched: list[str] = []
 
-    def launch(self, kernel: str, blocks: int, frame: cuda.Frame, rows: int = 1) -> None:
+    def launch(self, kernel: str, blocks: int, frame: cuda_frame.Frame, rows: int = 1) -> None:
         self.launched.append(kernel)
         run = shim_library(frame.channels or 3).d2_shim_launch
         error = run(kernel.encode(), blocks, rows, self.descending, ctypes.byref(frame))
@@ -36,8 +37,8 @@ class ShimLauncher:
 
 @functools.cache
 def shim_library(channels: int) -> ctypes.CDLL:
-    flags = (f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda.Frame)}", "-ffp-contract=off")
-    headers = (HERE / "cuda_shim.h", cuda.SOURCE, *cuda.HEADERS)
+    flags = (f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda_frame.Frame)}", "-ffp-contract=off")
+    headers = (HERE / "cuda_shim.h", cuda_frame.SOURCE, *cuda_frame.HEADERS)
     library = load_library("cuda-shim", (HERE / "cuda_shim.cpp",), headers, flags)
     library.d2_shim_launch.restype = ctypes.c_char_p
     library.d2_shim_stream.restype = ctypes.c_void_p
@@ -51,13 +52,15 @@ class Scene(NamedTuple):
     background: Tensor
     screen_offsets: Tensor
     settings: RasterSettings = RasterSettings()
+    near_edge: Tensor | None = None
 
     def to(self, device: torch.device, dtype: torch.dtype) -> Scene:
         move = functools.partial(torch.Tensor.to, device=device, dtype=dtype)
         splats = Splats(*(move(part) for part in self.splats[:3]), self.splats.rows.to(device))
         view = View("0", 0, 0.0, move(self.view.T_camera_world), move(self.view.K), self.view.width, self.view.height)
         rest = map(move, (self.background, self.screen_offsets))
-        return Scene(splats, move(self.colors), view, *rest, self.settings)
+        edge = None if self.near_edge is None else move(self.near_edge)
+        return Scene(splats, move(self.colors), view, *rest, self.settings, edge)
 
 
 def make_scene(
@@ -94,6 +97,23 @@ def make_scene(
     return Scene(splats, uniform(count, channels), view, uniform(channels), offsets, settings)
 
 
+def with_edge(scene: Scene, seed: int = 7) -> Scene:
+    """The scene with a near edge that lies in front of some Gaussians and behind others, unknown at every third pixel.
+
+    Among them are numbers that are no edge, and edges next to the camera and far beyond everything.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    edge = 7 * torch.rand(scene.view.height, scene.view.width, generator=generator)
+    edge.view(-1)[::3] = 0
+    odd = torch.tensor([torch.nan, torch.inf, -torch.inf, -1.0, 1e-3, 1e6, 1e-35])
+    edge.view(-1)[1 : 1 + 5 * len(odd) : 5] = odd[: len(edge.view(-1)[1 : 1 + 5 * len(odd) : 5])]
+    return scene._replace(near_edge=edge)
+
+
+def camera_of(scene: Scene) -> tuple:
+    return scene.view.T_camera_world, scene.view.K, scene.near_edge
+
+
 def inputs_of(scene: Scene) -> tuple:
     means, covariances, opacities, _ = scene.splats
     return means, covariances, opacities, scene.colors, scene.background, scene.screen_offsets
@@ -102,16 +122,18 @@ def inputs_of(scene: Scene) -> tuple:
 def render_kernels(scene: Scene, device: torch.device) -> tuple[Scene, tuple[Tensor, ...]]:
     """The scene in float32 on `device`, and what `cuda.rasterize` says."""
     scene = scene.to(device, torch.float32)
-    camera = (scene.view.T_camera_world, scene.view.K)
     size = (scene.view.width, scene.view.height)
-    return scene, cuda.rasterize(*inputs_of(scene), *camera, *size, ops._constants(scene.settings))
+    return scene, cuda.rasterize(*inputs_of(scene), *camera_of(scene), *size, ops._constants(scene.settings))
 
 
-def gradients_of_kernels(scene: Scene, device: torch.device, upstream: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+def gradients_of_kernels(
+    scene: Scene, device: torch.device, upstream: tuple[Tensor | None, ...]
+) -> tuple[Tensor, ...]:
+    """Those of `cuda.backward`; upstream gradients that are not given, at the end, are absent."""
     scene, outputs = render_kernels(scene, device)
-    upstream = tuple(part.to(device, torch.float32) for part in upstream)
-    camera = (scene.view.T_camera_world, scene.view.K, ops._constants(scene.settings))
-    return cuda.backward(*upstream, *inputs_of(scene), *camera, *outputs)
+    given = [None if part is None else part.to(device, torch.float32) for part in upstream]
+    given += [None] * (len(Render._fields) - len(given))
+    return cuda.backward(*given, *inputs_of(scene), *camera_of(scene), ops._constants(scene.settings), *outputs)
 
 
 def reference_with_gradients(scene: Scene) -> tuple[Render, tuple[Tensor, ...], tuple]:
@@ -119,19 +141,22 @@ def reference_with_gradients(scene: Scene) -> tuple[Render, tuple[Tensor, ...], 
     scene = scene.to(torch.device("cpu"), torch.float64)
     inputs = [part.requires_grad_() for part in inputs_of(scene)]
     splats = Splats(*inputs[:3], scene.splats.rows)
-    render = reference.rasterize(splats, inputs[3], scene.view, scene.settings, *inputs[4:])
+    render = reference.rasterize(splats, inputs[3], scene.view, scene.settings, *inputs[4:], scene.near_edge)
     upstream = random_upstream(scene)
-    return render, upstream, torch.autograd.grad(render, inputs, upstream)
+    return render, upstream, torch.autograd.grad(render[: len(upstream)], inputs, upstream)
 
 
-def random_upstream(scene: Scene, seed: int = 5) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of color, depth_sum and alpha; 0 where float32 may decide otherwise."""
+def random_upstream(scene: Scene, seed: int = 5) -> tuple[Tensor, ...]:
+    """Gradients of color, depth_sum, alpha and, with a near edge, front; 0 where float32 may decide otherwise."""
     generator = torch.Generator().manual_seed(seed)
     calm = ~near_a_cut_off(scene)
     color, depth_sum, alpha = torch.randn(scene.colors.shape[1] + 2, *calm.shape, generator=generator).double().split(
         (scene.colors.shape[1], 1, 1)
     )
-    return (color * calm).permute(1, 2, 0).contiguous(), depth_sum[0] * calm, alpha[0] * calm
+    upstream = ((color * calm).permute(1, 2, 0).contiguous(), depth_sum[0] * calm, alpha[0] * calm)
+    if scene.near_edge is None:
+        return upstream
+    return (*upstream, torch.randn(calm.shape, generator=generator).double() * calm)
 
 
 @torch.no_grad()
@@ -161,7 +186,10 @@ def relative_error(value: Tensor, expected: Tensor) -> float:
 def assert_same_image(scene: Scene, outputs: tuple[Tensor, ...], render: Render) -> None:
     calm = ~near_a_cut_off(scene)
     assert calm.float().mean() > 0.8, "too few pixels away from the cut-offs to compare"
+    assert (render.front is None) == (len(outputs[3]) == 0)
     for name, value, expected in zip(Render._fields, outputs, render):
+        if expected is None:
+            continue
         worst = (value.cpu().double() - expected.detach())[calm].abs().amax()
         assert worst < FORWARD_TOLERANCE, f"{name} is off by {worst:.2e}"
 
@@ -180,14 +208,21 @@ def make_prior(scene: Scene, seed: int = 3) -> DepthPrior:
     generator = torch.Generator().manual_seed(seed)
     size = (scene.view.height, scene.view.width)
     depth = 0.5 + 5 * torch.rand(size, generator=generator)
-    labels = torch.randint(0, 4, size, generator=generator, dtype=torch.uint8)
+    labels = torch.randint(0, len(Label), size, generator=generator, dtype=torch.uint8)
     depth.view(-1)[:21:7] = torch.tensor([0.0, torch.nan, torch.inf])
     return DepthPrior(depth, labels)
+
+
+def make_reliable(prior: DepthPrior, seed: int = 4) -> DepthPrior:
+    """The prior with a reliability between 0 and 1, and numbers among them that say nothing."""
+    r = torch.rand(prior.depth.shape, generator=torch.Generator().manual_seed(seed))
+    r.view(-1)[1:28:9] = torch.tensor([0.0, torch.nan, torch.inf])
+    return prior._replace(reliability=r)
 
 
 def survey_kernels(scene: Scene, prior: DepthPrior, device: torch.device, eps: float = 1e-8) -> Survey:
     scene = scene.to(device, torch.float32)
     means, covariances, opacities, _ = scene.splats
-    maps = (prior.depth.to(device), prior.verified.to(device))
+    maps = (prior.depth.to(device), reliability(prior).to(device), scene.near_edge)
     camera = (scene.view.T_camera_world, scene.view.K, ops._constants(scene.settings))
     return cuda.survey(means, covariances, opacities, *maps, *camera, eps)

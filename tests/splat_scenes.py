@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -72,6 +73,21 @@ def single(
     return Scene(*(torch.tensor(part, dtype=dtype) for part in numbers), make_view(size, size))
 
 
+def near_edge_of(view: View, seed: int = 3) -> Tensor:
+    """Near edges [H, W] of a prior, float32, among the Gaussians of `random_scene`.
+
+    At every third pixel nothing is known; some numbers are no edge, others next to the camera or far beyond.
+    """
+    g = torch.Generator().manual_seed(seed)
+    edge = 0.5 + 6 * torch.rand(view.height, view.width, generator=g)
+    odd = torch.tensor([math.nan, math.inf, -math.inf, -1.0, 1e-3, 1e6, 1e-35])
+    flat = edge.view(-1)
+    flat[::3] = 0
+    places = flat[1::5][: len(odd)]
+    places.copy_(odd[: len(places)])
+    return edge
+
+
 class Fragments(NamedTuple):
     """Everything that Gaussian i (in front-to-back order, `order`) does at every pixel, by the definition."""
 
@@ -118,6 +134,13 @@ def _screen_covariance(
         limits.append(np.clip(slope, centre - half, centre + half))
     jacobian = np.array([[K[0, 0], 0, -K[0, 0] * limits[0]], [0, K[1, 1], -K[1, 1] * limits[1]]]) / z
     return jacobian @ R @ world @ R.T @ jacobian.T + settings.blur * np.eye(2)
+
+
+def brute_force_front(found: Fragments, near_edge: Tensor) -> np.ndarray:
+    """w max(0, 1 - z / D_near) [M, H, W], 0 where nothing is known."""
+    edge = near_edge.double().numpy()
+    known = np.isfinite(edge) & (edge > 1e-30)
+    return found.weights * np.maximum(0, 1 - found.depths[:, None, None] / np.where(known, edge, 1)) * known
 
 
 def near_threshold(fragments: Fragments, settings: RasterSettings = RasterSettings()) -> np.ndarray:  # noqa: B008

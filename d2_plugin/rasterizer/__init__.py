@@ -3,6 +3,7 @@
     from d2_plugin.rasterizer import RasterSettings, Splats, View, rasterize
 
     render = rasterize(splats, colors, view)                       # color, depth_sum, alpha: all with gradients
+    render = rasterize(splats, colors, view, near_edge=edge)       # and front: the weight in space that must be free
     statistics = survey(splats, view, prior)                       # per Gaussian: what the depth prior says about it
 
 float32 runs in kernels that are compiled at first use, on the CPU (`native`, `d2_plugin.compiler`) or on the GPU
@@ -18,6 +19,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
 
 from . import cuda, native, ops, reference
+from .evidence import check_maps
 
 __all__ = ["DepthPrior", "RasterSettings", "Render", "Splats", "Survey", "View", "rasterize", "survey"]
 
@@ -30,8 +32,12 @@ def rasterize(
     *,
     background: Tensor | None = None,
     screen_offsets: Tensor | None = None,
+    near_edge: Tensor | None = None,
 ) -> Render:
     """Composite Gaussians front to back into color, accumulated depth and alpha.
+
+    With a near edge D_near also into front(p) = sum_i w_i max(0, 1 - z_i / D_near(p)), which is 0 where no Gaussian
+    stands in the space that is known to be free and approaches alpha as they all come to the camera.
 
     Args:
         splats: M Gaussians in the world, float32 or float64; M may be 0. `splats.rows` is not used.
@@ -41,10 +47,13 @@ def rasterize(
         background: [C] seen through what the Gaussians leave transparent; None is black.
         screen_offsets: [M, 2] pixels added to the projected centres. Pass zeros that require gradients to receive
             dL/d(screen mean) as their gradient, which densification accumulates ("viewspace points").
+        near_edge: [H, W] of any floating dtype, in units of depth: D_near, e.g. `DepthPrior.near_edge(k)`. Nothing is
+            known, and front is 0, where it is not positive or not finite. No gradient flows to it. None costs nothing.
 
     Returns:
-        `Render` with gradients to means, covariances, opacities, colors, background and screen_offsets. The gradient
-        of a covariance's off-diagonal entry is that of the stored number, which stands for both places in the matrix.
+        `Render` with gradients to means, covariances, opacities, colors, background and screen_offsets; its `front` is
+        None without a near edge. The gradient of a covariance's off-diagonal entry is that of the stored number, which
+        stands for both places in the matrix. Front has the gradient 0 with respect to a Gaussian exactly at the edge.
 
     A Gaussian with a NaN or an infinity in any attribute is left out, with zero gradient; the others are not affected.
 
@@ -52,8 +61,9 @@ def rasterize(
         D2Error: shapes, dtypes or devices do not fit together.
     """
     _check(splats, view, settings, colors=colors, background=background, screen_offsets=screen_offsets)
+    check_maps(view, None, near_edge)
     path = ops if _has_kernels(splats.means) else reference
-    return path.rasterize(splats, colors, view, settings, background, screen_offsets)
+    return path.rasterize(splats, colors, view, settings, background, screen_offsets, near_edge)
 
 
 @torch.no_grad()
@@ -64,30 +74,28 @@ def survey(
     settings: RasterSettings = RasterSettings(),  # noqa: B008  a frozen value
     *,
     eps: float = 1e-8,
+    near_edge: Tensor | None = None,
 ) -> Survey:
     """Gather the compositing weights w_{k,q} of one view per Gaussian k, without gradients.
 
-    Verified pixels (Omega^v) are those that the prior labels so and whose depth is finite and positive.
+    A pixel counts with its reliability r: `DepthPrior.reliability`, or 1 where the prior is trusted (Omega^v, and what
+    two cameras agree on) and 0 elsewhere. Far pixels never count, nor do those whose depth is not finite and positive.
 
     Args:
         splats: M Gaussians in the world.
         view: camera.
-        prior: D* and its labels, of the view's size.
+        prior: D*, its labels and its reliability, of the view's size.
         settings: constants; the same as in `rasterize` give the same weights.
         eps: epsilon of |z - D*| / (D* + eps), in units of depth.
+        near_edge: [H, W], as in `rasterize`; far pixels count here.
 
     Raises:
         D2Error: shapes, dtypes or devices do not fit together.
     """
     _check(splats, view, settings)
-    size = (view.height, view.width)
-    if prior.depth.shape != size or prior.labels.shape != size:
-        raise D2Error(
-            f"the prior of camera '{view.camera}' has depth {tuple(prior.depth.shape)} and labels "
-            f"{tuple(prior.labels.shape)} but the view is {size}: resample it to the view's height and width"
-        )
+    check_maps(view, prior, near_edge)
     path = ops if _has_kernels(splats.means) else reference
-    return path.survey(splats, view, prior, settings, eps)
+    return path.survey(splats, view, prior, settings, eps, near_edge)
 
 
 def _has_kernels(means: Tensor) -> bool:
@@ -102,8 +110,11 @@ def _has_kernels(means: Tensor) -> bool:
 def _check(splats: Splats, view: View, settings: RasterSettings, **extra: Tensor | None) -> None:
     """Refuse what the kernels, which trust their pointers, could not survive."""
     count = splats.means.shape[0]
-    expected = {"means": (splats.means, (count, 3)), "covariances": (splats.covariances, (count, 6))}
-    expected["opacities"] = (splats.opacities, (count,))
+    expected: dict[str, tuple[Tensor, tuple[int, ...]]] = {
+        "means": (splats.means, (count, 3)),
+        "covariances": (splats.covariances, (count, 6)),
+        "opacities": (splats.opacities, (count,)),
+    }
     if (colors := extra.get("colors")) is not None:
         channels = colors.shape[-1] if colors.ndim == 2 else 0
         expected["colors"] = (colors, (count, max(channels, 1)))

@@ -11,11 +11,8 @@ No float is added atomically: the same inputs give the same bits in every run on
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import warnings
-from pathlib import Path
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -23,61 +20,13 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Survey
 
-from .frame import RECORD, PointingFrame
+from .cuda_frame import GATHERERS, MOMENTS, STATISTICS, THREADS, TILE, WARP, Frame, Launcher
+from .cuda_runtime import CudaLauncher
+from .frame import RECORD
+from .nvrtc import NoCuda
 
-KERNELS = Path(__file__).parent / "kernels"
-SOURCE, HEADERS = KERNELS / "gpu.cu", (KERNELS / "splat.h",)
-
-THREADS = 256
-"""Of a block; THREADS of gpu.cu."""
-TILE = 16
-"""Side of a tile in pixels; TILE of gpu.cu."""
-GATHERERS, WARP, MOMENTS, STATISTICS = 8, 32, 7, 4
-"""As in gpu.cu."""
 MOST_PAIRS = 2**31 - 1
 """Slots are 32-bit integers."""
-
-_float, _int, _long, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_int64, ctypes.c_void_p
-
-
-class Frame(PointingFrame):
-    """d2::Frame of kernels/gpu.cu: everything that one call works on; absent pointers stay null."""
-
-    _fields_ = (
-        ("constants", _float * 6),
-        *((name, _int) for name in ("width", "height", "channels", "tiles_x")),
-        ("eps", _float),
-        *((name, _long) for name in ("count", "pairs")),
-        *(
-            (name, _pointer)
-            for name in (
-                *("T_camera_world", "K"),
-                *("means", "covariances", "opacities", "colors", "screen_offsets", "background"),
-                *("prior_depth", "verified"),
-                *("records", "tile_counts", "depths", "by_depth", "slot_ends"),
-                *("slot_tiles", "slot_ids", "ids", "slots", "tile_starts"),
-                *("color", "depth_sum", "alpha", "grad_color", "grad_depth_sum", "grad_alpha"),
-                *("values", "moments"),
-                *("grad_means", "grad_covariances", "grad_opacities", "grad_colors", "grad_screen_offsets"),
-                *("weight", "error", "max_weight", "hits"),
-            )
-        ),
-    )
-
-    @property
-    def tiles(self) -> int:
-        """Number of tiles of the image."""
-        return self.tiles_x * -(-self.height // TILE)
-
-
-class Launcher(Protocol):
-    """Runs kernels of gpu.cu on one device."""
-
-    def launch(self, kernel: str, blocks: int, frame: Frame, rows: int = 1) -> None:
-        """Enqueue `kernel` on a grid of `blocks` x `rows` blocks of THREADS threads; `frame` is copied.
-
-        The kernels are those compiled for `frame.channels` colors (any where it is 0).
-        """
 
 
 @functools.cache
@@ -87,16 +36,12 @@ def launcher(device: torch.device) -> Launcher:
     Raises:
         d2_plugin.rasterizer.nvrtc.NoCuda: no driver, no NVRTC, or an architecture that it does not know.
     """
-    from .cuda_runtime import CudaLauncher
-
     return CudaLauncher(device)
 
 
 @functools.cache
 def available(device: torch.device) -> bool:
     """Whether the kernels can be had on a CUDA device; warns once where they cannot."""
-    from .nvrtc import NoCuda
-
     try:
         launcher(device)
     except NoCuda as error:
@@ -118,11 +63,15 @@ def rasterize(
     screen_offsets: Tensor | None,
     T_camera_world: Tensor,
     K: Tensor,
+    near_edge: Tensor | None,
     width: int,
     height: int,
     constants: list[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """color [H, W, C], depth_sum [H, W], alpha [H, W] and the state that `backward` needs (records, lists)."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """color [H, W, C], depth_sum, alpha and front [H, W], and the state that `backward` needs (records, lists).
+
+    front is empty, [0], without `near_edge` [H, W].
+    """
     frame = _frame(means, covariances, opacities, T_camera_world, K, width, height, constants)
     frame.channels = colors.shape[1]
     frame.point(colors=colors, background=background, screen_offsets=screen_offsets)
@@ -130,15 +79,17 @@ def rasterize(
     records, lists = _bin(runs, frame, means, K)
     color = means.new_empty(height, width, colors.shape[1])
     depth_sum, alpha = means.new_empty(height, width), means.new_empty(height, width)
-    frame.point(color=color, depth_sum=depth_sum, alpha=alpha)
-    runs.launch("d2_render", frame.tiles, frame)
-    return color, depth_sum, alpha, records, lists
+    front = means.new_empty((0,) if near_edge is None else (height, width))
+    frame.point(color=color, depth_sum=depth_sum, alpha=alpha, near_edge=near_edge, front=front)
+    runs.launch("d2_render" if near_edge is None else "d2_render_front", frame.tiles, frame)
+    return color, depth_sum, alpha, front, records, lists
 
 
 def backward(
     grad_color: Tensor | None,
     grad_depth_sum: Tensor | None,
     grad_alpha: Tensor | None,
+    grad_front: Tensor | None,
     means: Tensor,
     covariances: Tensor,
     opacities: Tensor,
@@ -147,10 +98,12 @@ def backward(
     screen_offsets: Tensor | None,
     T_camera_world: Tensor,
     K: Tensor,
+    near_edge: Tensor | None,
     constants: list[float],
     color: Tensor,
     depth_sum: Tensor,
     alpha: Tensor,
+    front: Tensor,
     records: Tensor,
     lists: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -159,18 +112,20 @@ def backward(
     frame = _frame(means, covariances, opacities, T_camera_world, K, width, height, constants)
     frame.channels = channels
     frame.point(colors=colors, background=background, screen_offsets=screen_offsets, records=records)
-    frame.point(color=color, depth_sum=depth_sum, alpha=alpha)
-    frame.point(grad_color=grad_color, grad_depth_sum=grad_depth_sum, grad_alpha=grad_alpha)
+    frame.point(color=color, depth_sum=depth_sum, alpha=alpha, near_edge=near_edge, front=front)
+    frame.point(grad_color=grad_color, grad_depth_sum=grad_depth_sum, grad_alpha=grad_alpha, grad_front=grad_front)
     frame.pairs = (len(lists) - 2 * len(means) - frame.tiles - 1) // 2
     _point_lists(frame, lists)
-    gradients = [torch.empty_like(part) for part in (means, covariances, opacities, colors)]
+    grad_means, grad_covariances = torch.empty_like(means), torch.empty_like(covariances)
+    grad_opacities, grad_colors = torch.empty_like(opacities), torch.empty_like(colors)
     grad_screen_offsets = means.new_empty(len(means), 2)
-    frame.point(grad_means=gradients[0], grad_covariances=gradients[1], grad_opacities=gradients[2])
-    frame.point(grad_colors=gradients[3], grad_screen_offsets=grad_screen_offsets)
+    frame.point(grad_means=grad_means, grad_covariances=grad_covariances, grad_opacities=grad_opacities)
+    frame.point(grad_colors=grad_colors, grad_screen_offsets=grad_screen_offsets)
     # Zeros, since tiles whose pixels are all finished leave the rest of their pairs alone.
     frame.point(values=means.new_zeros(frame.pairs, MOMENTS + channels), moments=means.new_empty(len(means), MOMENTS))
     runs = launcher(means.device)
-    runs.launch("d2_backward", frame.tiles, frame)
+    with_front = near_edge is not None and grad_front is not None
+    runs.launch("d2_backward_front" if with_front else "d2_backward", frame.tiles, frame)
     if (more := channels - (WARP - MOMENTS)) > 0:
         runs.launch("d2_backward_colors", frame.tiles, frame, rows=-(-more // WARP))
     runs.launch("d2_gather", _blocks(len(means) * GATHERERS), frame)
@@ -178,7 +133,7 @@ def backward(
     grad_background = means.new_zeros(channels)
     if grad_color is not None:
         grad_background = ((1 - alpha)[..., None] * grad_color).sum((0, 1))
-    return *gradients, grad_background, grad_screen_offsets
+    return grad_means, grad_covariances, grad_opacities, grad_colors, grad_background, grad_screen_offsets
 
 
 def survey(
@@ -186,27 +141,29 @@ def survey(
     covariances: Tensor,
     opacities: Tensor,
     prior_depth: Tensor,
-    verified: Tensor,
+    reliability: Tensor,
+    near_edge: Tensor | None,
     T_camera_world: Tensor,
     K: Tensor,
     constants: list[float],
     eps: float,
 ) -> Survey:
-    """See `d2_plugin.rasterizer.survey`; `verified` [H, W] bool, `prior_depth` [H, W] float32."""
+    """See `d2_plugin.rasterizer.survey`; `prior_depth`, `reliability` and `near_edge` are [H, W] float32."""
     height, width = prior_depth.shape
     frame = _frame(means, covariances, opacities, T_camera_world, K, width, height, constants)
     frame.eps = eps
-    frame.point(prior_depth=prior_depth, verified=verified)
+    frame.point(prior_depth=prior_depth, reliability=reliability, near_edge=near_edge)
     runs = launcher(means.device)
     _bin(runs, frame, means, K)
-    weight, error, max_weight = (torch.empty_like(opacities) for _ in range(3))
+    weight, error, max_weight, front = (torch.empty_like(opacities) for _ in range(4))
     hits = torch.empty_like(opacities, dtype=torch.int32)
     depth_sum, alpha = torch.empty_like(prior_depth), torch.empty_like(prior_depth)
-    frame.point(depth_sum=depth_sum, alpha=alpha, values=means.new_zeros(frame.pairs, STATISTICS))
-    frame.point(weight=weight, error=error, max_weight=max_weight, hits=hits)
-    runs.launch("d2_survey", frame.tiles, frame)
+    statistics = STATISTICS if near_edge is None else STATISTICS + 1
+    frame.point(depth_sum=depth_sum, alpha=alpha, values=means.new_zeros(frame.pairs, statistics))
+    frame.point(weight=weight, error=error, max_weight=max_weight, front_weight=front, hits=hits)
+    runs.launch("d2_survey" if near_edge is None else "d2_survey_front", frame.tiles, frame)
     runs.launch("d2_gather_survey", _blocks(len(means) * GATHERERS), frame)
-    return Survey(weight, error, max_weight, hits, depth_sum, alpha)
+    return Survey(weight, error, max_weight, hits, depth_sum, alpha, front)
 
 
 def _frame(
@@ -269,7 +226,7 @@ def _count_pairs(ends: Tensor, K: Tensor) -> int:
 
 def _point_lists(frame: Frame, lists: Tensor) -> dict[str, Tensor]:
     """Views into one buffer: ids [P], slots [P], by_depth [M], slot_ends [M], tile_starts [tiles + 1]."""
-    sizes = (frame.pairs, frame.pairs, frame.count, frame.count, frame.tiles + 1)
+    sizes = [frame.pairs, frame.pairs, frame.count, frame.count, frame.tiles + 1]
     parts = dict(zip(("ids", "slots", "by_depth", "slot_ends", "tile_starts"), torch.split(lists, sizes)))
     frame.point(**parts)
     return parts

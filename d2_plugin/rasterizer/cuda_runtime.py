@@ -12,7 +12,7 @@ import torch
 
 from d2_plugin.errors import D2Error
 
-from .cuda import THREADS, Frame
+from .cuda_frame import THREADS, Frame
 from .nvrtc import NoCuda, build, library
 
 CACHED_CHANNELS = 3
@@ -20,7 +20,7 @@ CACHED_CHANNELS = 3
 
 
 class CudaLauncher:
-    """Launches the kernels on one CUDA device, on torch's current stream (`d2_plugin.rasterizer.cuda.Launcher`)."""
+    """Launches the kernels on one CUDA device, on torch's current stream (`cuda_frame.Launcher`)."""
 
     def __init__(self, device: torch.device) -> None:
         """Compile (or find) the kernels for `device` and load them.

@@ -47,12 +47,13 @@ class Frame(PointingFrame):
             (name, _pointer)
             for name in (
                 *("means", "covariances", "opacities", "colors", "screen_offsets", "background"),
-                *("prior_depth", "verified"),
+                *("prior_depth", "reliability", "near_edge"),
                 *("records", "slots", "tiles", "ids", "blocks"),
-                *("color", "depth_sum", "alpha", "grad_color", "grad_depth_sum", "grad_alpha"),
+                *("color", "depth_sum", "alpha", "front"),
+                *("grad_color", "grad_depth_sum", "grad_alpha", "grad_front"),
                 *("grad_means", "grad_covariances", "grad_opacities", "grad_colors"),
                 *("grad_screen_offsets", "grad_background"),
-                *("weight", "error", "max_weight", "hits"),
+                *("weight", "error", "max_weight", "front_weight", "hits"),
             )
         ),
     )
@@ -115,26 +116,32 @@ def rasterize(
     screen_offsets: Tensor | None,
     T_camera_world: Tensor,
     K: Tensor,
+    near_edge: Tensor | None,
     width: int,
     height: int,
     constants: list[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """color [H, W, C], depth_sum [H, W], alpha [H, W] and the state that `backward` needs (records, lists)."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """color [H, W, C], depth_sum, alpha and front [H, W], and the state that `backward` needs (records, lists).
+
+    front is empty, [0], without `near_edge` [H, W].
+    """
     frame = _frame(T_camera_world, K, width, height, constants, len(means), colors.shape[1])
     frame.point(means=means, covariances=covariances, opacities=opacities, colors=colors)
     frame.point(background=_background(background, colors), screen_offsets=screen_offsets)
     records, lists, pairs = _project(frame, means)
     color = means.new_empty(height, width, colors.shape[1])
     depth_sum, alpha = means.new_empty(height, width), means.new_empty(height, width)
-    frame.point(color=color, depth_sum=depth_sum, alpha=alpha)
+    front = means.new_empty((0,) if near_edge is None else (height, width))
+    frame.point(color=color, depth_sum=depth_sum, alpha=alpha, near_edge=near_edge, front=front)
     _run(library().d2_render, frame, pairs)
-    return color, depth_sum, alpha, records, lists
+    return color, depth_sum, alpha, front, records, lists
 
 
 def backward(
     grad_color: Tensor | None,
     grad_depth_sum: Tensor | None,
     grad_alpha: Tensor | None,
+    grad_front: Tensor | None,
     means: Tensor,
     covariances: Tensor,
     opacities: Tensor,
@@ -143,10 +150,12 @@ def backward(
     screen_offsets: Tensor | None,
     T_camera_world: Tensor,
     K: Tensor,
+    near_edge: Tensor | None,
     constants: list[float],
     color: Tensor,
     depth_sum: Tensor,
     alpha: Tensor,
+    front: Tensor,
     records: Tensor,
     lists: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -155,17 +164,18 @@ def backward(
     frame = _frame(T_camera_world, K, width, height, constants, len(means), channels)
     frame.point(means=means, covariances=covariances, opacities=opacities, colors=colors)
     frame.point(background=_background(background, colors), screen_offsets=screen_offsets, records=records)
-    frame.point(color=color, depth_sum=depth_sum, alpha=alpha)
-    frame.point(grad_color=grad_color, grad_depth_sum=grad_depth_sum, grad_alpha=grad_alpha)
+    frame.point(color=color, depth_sum=depth_sum, alpha=alpha, near_edge=near_edge, front=front)
+    frame.point(grad_color=grad_color, grad_depth_sum=grad_depth_sum, grad_alpha=grad_alpha, grad_front=grad_front)
     tiles = library().d2_tile_count(frame)
     pairs = (len(lists) - len(means) - 1 - 2 * tiles) // 3
     _point_lists(frame, lists, pairs)
-    gradients = [torch.empty_like(part) for part in (means, covariances, opacities, colors)]
-    gradients += [means.new_empty(channels), means.new_empty(len(means), 2)]
-    frame.point(grad_means=gradients[0], grad_covariances=gradients[1], grad_opacities=gradients[2])
-    frame.point(grad_colors=gradients[3], grad_background=gradients[4], grad_screen_offsets=gradients[5])
+    grad_means, grad_covariances = torch.empty_like(means), torch.empty_like(covariances)
+    grad_opacities, grad_colors = torch.empty_like(opacities), torch.empty_like(colors)
+    grad_background, grad_screen_offsets = means.new_empty(channels), means.new_empty(len(means), 2)
+    frame.point(grad_means=grad_means, grad_covariances=grad_covariances, grad_opacities=grad_opacities)
+    frame.point(grad_colors=grad_colors, grad_background=grad_background, grad_screen_offsets=grad_screen_offsets)
     _run(library().d2_backward, frame, pairs)
-    return tuple(gradients)
+    return grad_means, grad_covariances, grad_opacities, grad_colors, grad_background, grad_screen_offsets
 
 
 def survey(
@@ -173,26 +183,27 @@ def survey(
     covariances: Tensor,
     opacities: Tensor,
     prior_depth: Tensor,
-    verified: Tensor,
+    reliability: Tensor,
+    near_edge: Tensor | None,
     T_camera_world: Tensor,
     K: Tensor,
     constants: list[float],
     eps: float,
 ) -> Survey:
-    """See `d2_plugin.rasterizer.survey`; `verified` [H, W] bool, `prior_depth` [H, W] float32."""
+    """See `d2_plugin.rasterizer.survey`; `prior_depth`, `reliability` and `near_edge` are [H, W] float32."""
     height, width = prior_depth.shape
     frame = _frame(T_camera_world, K, width, height, constants, len(means), 0)
     frame.eps = eps
     frame.point(means=means, covariances=covariances, opacities=opacities)
-    frame.point(prior_depth=prior_depth, verified=verified)
+    frame.point(prior_depth=prior_depth, reliability=reliability, near_edge=near_edge)
     _, _, pairs = _project(frame, means)
-    weight, error, max_weight = (torch.empty_like(opacities) for _ in range(3))
+    weight, error, max_weight, front = (torch.empty_like(opacities) for _ in range(4))
     hits = torch.empty(len(means), dtype=torch.int32)
     depth_sum, alpha = torch.empty_like(prior_depth), torch.empty_like(prior_depth)
     frame.point(depth_sum=depth_sum, alpha=alpha)
-    frame.point(weight=weight, error=error, max_weight=max_weight, hits=hits)
+    frame.point(weight=weight, error=error, max_weight=max_weight, front_weight=front, hits=hits)
     _run(library().d2_survey, frame, pairs)
-    return Survey(weight, error, max_weight, hits, depth_sum, alpha)
+    return Survey(weight, error, max_weight, hits, depth_sum, alpha, front)
 
 
 def _background(background: Tensor | None, colors: Tensor) -> Tensor:

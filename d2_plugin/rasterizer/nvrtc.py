@@ -23,7 +23,7 @@ import torch
 from d2_plugin.compiler import CompileError, cache_folder
 from d2_plugin.errors import D2Error
 
-from .cuda import HEADERS, SOURCE, Frame
+from .cuda_frame import HEADERS, SOURCE, Frame
 
 logger = logging.getLogger(__name__)
 

@@ -12,14 +12,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.protocol import DepthPrior, Label, RasterSettings, Render, Splats, Survey, View
+from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
 
 from . import cuda, native
+from .evidence import reliability
 from .frame import RECORD
+
+INPUTS = 9
+"""Tensors that `rasterize` takes: 6 of the Gaussians and what they are drawn on, 2 of the camera, the near edge."""
 
 _CAMERA = "Tensor T_camera_world, Tensor K"
 _SPLATS = "Tensor means, Tensor covariances, Tensor opacities"
-_INPUTS = f"{_SPLATS}, Tensor colors, Tensor? background, Tensor? screen_offsets"
+_INPUTS = f"{_SPLATS}, Tensor colors, Tensor? background, Tensor? screen_offsets, {_CAMERA}, Tensor? near_edge"
+_IMAGES = "Tensor color, Tensor depth_sum, Tensor alpha, Tensor front"
+_STATE = "Tensor records, Tensor lists"
+_UPSTREAM = "Tensor? grad_color, Tensor? grad_depth_sum, Tensor? grad_alpha, Tensor? grad_front"
 
 
 def rasterize(
@@ -29,38 +36,42 @@ def rasterize(
     settings: RasterSettings,
     background: Tensor | None,
     screen_offsets: Tensor | None,
+    near_edge: Tensor | None = None,
 ) -> Render:
     """See `d2_plugin.rasterizer.rasterize`; float32."""
-    outputs = _rasterize(
+    color, depth_sum, alpha, front, *_ = _rasterize(
         *(part.contiguous() for part in splats[:3]),
         colors.contiguous(),
         None if background is None else background.contiguous(),
         None if screen_offsets is None else screen_offsets.contiguous(),
         view.T_camera_world,
         view.K,
+        _map(near_edge, splats.means),
         view.width,
         view.height,
         _constants(settings),
     )
-    return Render(*outputs[:3])
+    return Render(color, depth_sum, alpha, None if near_edge is None else front)
 
 
-def survey(splats: Splats, view: View, prior: DepthPrior, settings: RasterSettings, eps: float) -> Survey:
+def survey(
+    splats: Splats,
+    view: View,
+    prior: DepthPrior,
+    settings: RasterSettings,
+    eps: float,
+    near_edge: Tensor | None = None,
+) -> Survey:
     """See `d2_plugin.rasterizer.survey`; float32."""
     means, covariances, opacities, _ = splats
-    depth, verified = prior.depth.to(means).contiguous(), _verified(prior.labels).to(means.device).contiguous()
-    camera = (view.T_camera_world, view.K)
+    maps = (_map(part, means) for part in (prior.depth, reliability(prior), near_edge))
     parts = (means.contiguous(), covariances.contiguous(), opacities.contiguous())
-    return Survey(*_survey(*parts, depth, verified, *camera, _constants(settings), eps))
+    return Survey(*_survey(*parts, *maps, view.T_camera_world, view.K, _constants(settings), eps))
 
 
-def _verified(labels: Tensor) -> Tensor:
-    """`DepthPrior.trusted`; by numpy on the CPU, since torch would wake its own threads for a microsecond of work and
-    wait for them, which takes milliseconds where the cores are busy."""
-    if labels.device.type == "cpu":
-        codes = labels.numpy()
-        return torch.from_numpy((codes == Label.VERIFIED) | (codes == Label.AGREED))
-    return (labels == Label.VERIFIED) | (labels == Label.AGREED)
+def _map(part: Tensor | None, like: Tensor) -> Tensor | None:
+    """A map of the prior as the kernels read it: in the dtype and on the device of `like`."""
+    return None if part is None else part.detach().to(like).contiguous()
 
 
 def _constants(settings: RasterSettings) -> list[float]:
@@ -73,8 +84,7 @@ _rasterize = torch.library.custom_op(
     native.rasterize,
     mutates_args=(),
     device_types="cpu",
-    schema=f"({_INPUTS}, {_CAMERA}, int width, int height, float[] constants) -> "
-    "(Tensor color, Tensor depth_sum, Tensor alpha, Tensor records, Tensor lists)",
+    schema=f"({_INPUTS}, int width, int height, float[] constants) -> ({_IMAGES}, {_STATE})",
 )
 
 _rasterize_backward = torch.library.custom_op(
@@ -82,8 +92,7 @@ _rasterize_backward = torch.library.custom_op(
     native.backward,
     mutates_args=(),
     device_types="cpu",
-    schema=f"(Tensor? grad_color, Tensor? grad_depth_sum, Tensor? grad_alpha, {_INPUTS}, {_CAMERA}, float[] constants, "
-    "Tensor color, Tensor depth_sum, Tensor alpha, Tensor records, Tensor lists) -> "
+    schema=f"({_UPSTREAM}, {_INPUTS}, float[] constants, {_IMAGES}, {_STATE}) -> "
     "(Tensor means, Tensor covariances, Tensor opacities, Tensor colors, Tensor background, Tensor screen_offsets)",
 )
 
@@ -92,8 +101,9 @@ _survey = torch.library.custom_op(
     native.survey,
     mutates_args=(),
     device_types="cpu",
-    schema=f"({_SPLATS}, Tensor prior_depth, Tensor verified, {_CAMERA}, float[] constants, float eps) -> "
-    "(Tensor weight, Tensor error, Tensor max_weight, Tensor hits, Tensor depth_sum, Tensor alpha)",
+    schema=f"({_SPLATS}, Tensor prior_depth, Tensor reliability, Tensor? near_edge, {_CAMERA}, float[] constants, "
+    "float eps) -> (Tensor weight, Tensor error, Tensor max_weight, Tensor hits, Tensor depth_sum, Tensor alpha, "
+    "Tensor front)",
 )
 
 for _operator, _kernel in ((_rasterize, cuda.rasterize), (_rasterize_backward, cuda.backward), (_survey, cuda.survey)):
@@ -101,44 +111,69 @@ for _operator, _kernel in ((_rasterize, cuda.rasterize), (_rasterize_backward, c
 
 
 @_rasterize.register_fake
-def _(means, covariances, opacities, colors, background, screen_offsets, T_camera_world, K, width, height, constants):  # type: ignore[no-untyped-def]
+def _(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    background: Tensor | None,
+    screen_offsets: Tensor | None,
+    T_camera_world: Tensor,
+    K: Tensor,
+    near_edge: Tensor | None,
+    width: int,
+    height: int,
+    constants: list[float],
+) -> tuple[Tensor, ...]:
     pairs = torch.library.get_ctx().new_dynamic_size()
+    color = means.new_empty(height, width, colors.shape[1])
+    depth_sum, alpha = means.new_empty(height, width), means.new_empty(height, width)
+    front = means.new_empty((0,) if near_edge is None else (height, width))
     return (
-        means.new_empty(height, width, colors.shape[1]),
-        means.new_empty(height, width),
-        means.new_empty(height, width),
+        color,
+        depth_sum,
+        alpha,
+        front,
         means.new_empty(means.shape[0], RECORD),
         means.new_empty(pairs, dtype=torch.int32),
     )
 
 
 @_rasterize_backward.register_fake
-def _(grad_color, grad_depth_sum, grad_alpha, means, covariances, opacities, colors, *rest):  # type: ignore[no-untyped-def]
+def _(
+    grad_color: Tensor | None,
+    grad_depth_sum: Tensor | None,
+    grad_alpha: Tensor | None,
+    grad_front: Tensor | None,
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    *rest: object,
+) -> tuple[Tensor, ...]:
     gradients = [torch.empty_like(part) for part in (means, covariances, opacities, colors)]
     return (*gradients, means.new_empty(colors.shape[1]), means.new_empty(means.shape[0], 2))
 
 
 @_survey.register_fake
-def _(means, covariances, opacities, prior_depth, verified, T_camera_world, K, constants, eps):  # type: ignore[no-untyped-def]
+def _(means: Tensor, covariances: Tensor, opacities: Tensor, prior_depth: Tensor, *rest: object) -> tuple[Tensor, ...]:
+    weight, error, max_weight, front = (torch.empty_like(opacities) for _ in range(4))
     hits = opacities.new_empty(opacities.shape, dtype=torch.int32)
-    image = torch.empty_like(prior_depth)
-    return *(torch.empty_like(opacities) for _ in range(3)), hits, image, torch.empty_like(image)
+    return weight, error, max_weight, hits, torch.empty_like(prior_depth), torch.empty_like(prior_depth), front
 
 
-def _save(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:
+def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
     *tensors, _, _, ctx.constants = inputs
     ctx.save_for_backward(*tensors, *output)
     ctx.set_materialize_grads(False)
 
 
 def _backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-    means, covariances, opacities, colors, background, screen_offsets, *rest = ctx.saved_tensors
-    inputs = (means, covariances, opacities, colors, background, screen_offsets)
-    camera, outputs = rest[:2], rest[2:]
-    upstream = [None if gradient is None else gradient.contiguous() for gradient in gradients[:3]]
-    found = _rasterize_backward(*upstream, *inputs, *camera, ctx.constants, *outputs)
+    inputs, outputs = ctx.saved_tensors[:INPUTS], ctx.saved_tensors[INPUTS:]
+    upstream = [None if gradient is None else gradient.contiguous() for gradient in gradients[:4]]
+    found = _rasterize_backward(*upstream, *inputs, ctx.constants, *outputs)
     wanted = (gradient if asked else None for gradient, asked in zip(found, ctx.needs_input_grad))
-    return (*wanted, None, None, None, None, None)
+    return (*wanted, *(None for _ in range(len(ctx.needs_input_grad) - len(found))))
 
 
 _rasterize.register_autograd(_backward, setup_context=_save)

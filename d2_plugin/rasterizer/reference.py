@@ -8,6 +8,7 @@ a Gaussian with screen mean m, blurred screen covariance S and opacity o has at 
 
 in order of view depth, ties by index. There are no other cut-offs: no 3-sigma radius, no influence of tiles. Everything
 is differentiable by autograd; indices (who is visible, in which order, until when) are chosen without gradients.
+With a near edge D_near(p) of what a depth prior allows, front(p) = sum_i w_i max(0, 1 - z_i / D_near(p)).
 """
 
 from __future__ import annotations
@@ -21,11 +22,16 @@ from torch.utils.checkpoint import checkpoint
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
 
+from .evidence import reliability
+
 TILE = 16
 """Side of the squares of pixels that are composited at once; limits memory, changes nothing else."""
 
 VARIANCE_FLOOR = 1e-8
 """Least variance on the screen where `RasterSettings.blur` is smaller; pixels squared."""
+
+LEAST_EDGE = 1e-30
+"""A near edge that is not beyond this counts as unknown; its inverse would not be finite in float32."""
 
 
 class Projection(NamedTuple):
@@ -53,47 +59,78 @@ def rasterize(
     settings: RasterSettings,
     background: Tensor | None = None,
     screen_offsets: Tensor | None = None,
+    near_edge: Tensor | None = None,
 ) -> Render:
     """See `d2_plugin.rasterizer.rasterize`; any floating dtype, any device."""
     kept = visible(splats, colors, view, settings, screen_offsets)
     screen = project(_take(splats, kept), view, settings, None if screen_offsets is None else screen_offsets[kept])
     values = torch.cat([colors[kept], screen.depths[:, None], torch.ones_like(screen.depths)[:, None]], 1)
-    image = torch.cat([_tile_row(screen, values, view, settings, y) for y in range(0, view.height, TILE)], 0)
+    edge = None if near_edge is None else _known(near_edge, screen.depths)
+    image = torch.cat([_tile_row(screen, values, view, settings, edge, y) for y in range(0, view.height, TILE)], 0)
     # A loss that divides by alpha sends NaN where nobody contributes, which 0 times a weight would not silence.
     image = torch.where(image[..., -1:].detach() > 0, image, 0)
-    color, depth_sum, alpha = image[..., :-2], image[..., -2], image[..., -1]
+    color, depth_sum, alpha = image[..., : colors.shape[1]], image[..., colors.shape[1]], image[..., -1]
     if background is not None:
         color = color + (1 - alpha)[..., None] * background
-    return Render(color, depth_sum, alpha)
+    return Render(color, depth_sum, alpha, None if edge is None else torch.where(edge > 0, image[..., -2], 0))
 
 
-def _tile_row(screen: Projection, values: Tensor, view: View, settings: RasterSettings, y: int) -> Tensor:
-    """Composited `values` [K, V] of a row of tiles, [h, W, V]; the backward pass computes it again, which bounds memory
-    by one row of tiles instead of the image."""
+def _tile_row(
+    screen: Projection, values: Tensor, view: View, settings: RasterSettings, edge: Tensor | None, y: int
+) -> Tensor:
+    """Composited `values` [K, V] of a row of tiles, [h, W, V]; with `edge` the weight in front of it is inserted before
+    the last. The backward pass computes it again, which bounds memory by one row of tiles instead of the image."""
     if torch.is_grad_enabled():
-        return checkpoint(_composite_row, screen, values, view, settings, y, use_reentrant=False)
-    return _composite_row(screen, values, view, settings, y)
+        return checkpoint(_composite_row, screen, values, view, settings, edge, y, use_reentrant=False)
+    return _composite_row(screen, values, view, settings, edge, y)
 
 
-def _composite_row(screen: Projection, values: Tensor, view: View, settings: RasterSettings, y: int) -> Tensor:
+def _composite_row(
+    screen: Projection, values: Tensor, view: View, settings: RasterSettings, edge: Tensor | None, y: int
+) -> Tensor:
     height, row = min(TILE, view.height - y), []
     for x in range(0, view.width, TILE):
         weights, front_to_back = _tile_weights(screen, view, settings, x, y)
-        row.append((weights @ values[front_to_back]).reshape(height, min(TILE, view.width - x), -1))
+        image = weights @ values[front_to_back]
+        if edge is not None:
+            front = (weights * in_front(edge[y : y + TILE, x : x + TILE], screen.depths[front_to_back])).sum(1)
+            image = torch.cat([image[:, :-1], front[:, None], image[:, -1:]], 1)
+        row.append(image.reshape(height, min(TILE, view.width - x), -1))
     return torch.cat(row, 1)
 
 
+def in_front(edge: Tensor, depths: Tensor) -> Tensor:
+    """max(0, 1 - z / D_near) [P, K] of depths [K] at the P pixels of `edge`, which is 0 where nothing is known."""
+    edge = edge.reshape(-1, 1)
+    return torch.relu(edge - depths) / torch.where(edge > 0, edge, 1)
+
+
+def _known(near_edge: Tensor, like: Tensor) -> Tensor:
+    """The near edge in the dtype of `like`, 0 where nothing is known."""
+    edge = near_edge.detach().to(like)
+    return torch.where(edge.isfinite() & (edge > LEAST_EDGE), edge, 0)
+
+
 @torch.no_grad()
-def survey(splats: Splats, view: View, prior: DepthPrior, settings: RasterSettings, eps: float) -> Survey:
+def survey(
+    splats: Splats,
+    view: View,
+    prior: DepthPrior,
+    settings: RasterSettings,
+    eps: float,
+    near_edge: Tensor | None = None,
+) -> Survey:
     """See `d2_plugin.rasterizer.survey`."""
     kept = visible(splats, None, view, settings)
     screen = project(_take(splats, kept), view, settings)
     empty = screen.depths.new_zeros
-    weight, error, max_weight = (empty(len(splats.means)) for _ in range(3))
+    weight, error, max_weight, front = (empty(len(splats.means)) for _ in range(4))
     hits = torch.zeros(len(splats.means), dtype=torch.int32, device=kept.device)
     depth_sum, alpha = empty(view.height, view.width), empty(view.height, view.width)
-    verified = prior.trusted & torch.isfinite(prior.depth) & (prior.depth > 0)
-    truth = torch.where(verified, prior.depth, 1).to(screen.depths)
+    r = reliability(prior).to(screen.depths)
+    counts = r.isfinite() & (r > 0) & prior.depth.isfinite() & (prior.depth > 0)
+    truth = torch.where(counts, prior.depth, 1).to(screen.depths)
+    edge = None if near_edge is None else _known(near_edge, screen.depths)
     for y in range(0, view.height, TILE):
         for x in range(0, view.width, TILE):
             tile = (slice(y, y + TILE), slice(x, x + TILE))
@@ -104,11 +141,14 @@ def survey(splats: Splats, view: View, prior: DepthPrior, settings: RasterSettin
             if not len(rows):
                 continue
             max_weight[rows] = torch.maximum(max_weight[rows], w.amax(0))
-            w, true = w[verified[tile].flatten()], truth[tile][verified[tile]][:, None]
+            if edge is not None:
+                front[rows] += (w * in_front(edge[tile], depths)).sum(0)
+            here = counts[tile].flatten()
+            hits[rows] += (w[here] > 0).sum(0, dtype=torch.int32)
+            w, true = w[here] * r[tile].flatten()[here, None], truth[tile].flatten()[here, None]
             weight[rows] += w.sum(0)
             error[rows] += (w * (depths - true).abs() / (true + eps)).sum(0)
-            hits[rows] += (w > 0).sum(0, dtype=torch.int32)
-    return Survey(weight, error, max_weight, hits, depth_sum, alpha)
+    return Survey(weight, error, max_weight, hits, depth_sum, alpha, front)
 
 
 @torch.no_grad()

@@ -202,7 +202,7 @@ class Run:
         @torch.no_grad()
         def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
             view = make_view(self.scene.capture, camera, frame, self.settings.device)
-            color, depth_sum, alpha = (part.cpu() for part in model.render(view))
+            color, depth_sum, alpha = (part.cpu() for part in model.render(view)[:3])
             solid = alpha > RENDERED_ALPHA
             depth = torch.where(solid, depth_sum / alpha.clamp(min=RENDERED_ALPHA), torch.zeros_like(alpha))
             return color.clamp(0, 1), depth

@@ -1,11 +1,13 @@
 // The kernels of gpu.cu and the CUDA driver that launches them, as a library of the CPU; see cuda_shim.h and test_rasterizer_cuda.py.
 #include "cuda_shim.h"
 
-#include "gpu.cu"
-
 #include <string>
 
+// A library for each number of colors may be loaded at once: without internal linkage they would share the `__shared__`
+// memory of kernels that are instances of templates.
 namespace {
+
+#include "gpu.cu"
 
 struct Kernel {
   const char* name;
@@ -15,11 +17,14 @@ const Kernel KERNELS[] = {
     {"d2_project", d2::d2_project},
     {"d2_list", d2::d2_list},
     {"d2_render", d2::d2_render},
+    {"d2_render_front", d2::d2_render_front},
     {"d2_backward", d2::d2_backward},
+    {"d2_backward_front", d2::d2_backward_front},
     {"d2_backward_colors", d2::d2_backward_colors},
     {"d2_gather", d2::d2_gather},
     {"d2_project_backward", d2::d2_project_backward},
     {"d2_survey", d2::d2_survey},
+    {"d2_survey_front", d2::d2_survey_front},
     {"d2_gather_survey", d2::d2_gather_survey},
 };
 

@@ -24,7 +24,7 @@ from cuda_cases import (
 
 from d2_plugin import D2Error
 from d2_plugin.compiler import NoCompiler
-from d2_plugin.rasterizer import cuda, nvrtc
+from d2_plugin.rasterizer import cuda, cuda_frame, nvrtc
 from d2_plugin.rasterizer import cuda_runtime as runtime
 
 
@@ -44,7 +44,16 @@ def test_nvrtc_compiles_the_kernels_without_a_toolkit(
     code, architecture = nvrtc.build(capability, channels)
     assert architecture == f"sm_{capability}"
     assert code.startswith(b"\x7fELF")
-    for kernel in ("project", "list", "render", "backward", "gather", "project_backward", "survey", "gather_survey"):
+    twice = ("render", "backward", "survey")
+    for kernel in (
+        "project",
+        "list",
+        "gather",
+        "project_backward",
+        "gather_survey",
+        *twice,
+        *(f"{k}_front" for k in twice),
+    ):
         assert f"d2_{kernel}".encode() in code
 
 
@@ -90,7 +99,7 @@ def test_nvrtcs_own_words_are_in_the_error(compiler: nvrtc.Nvrtc) -> None:
 
 
 def frame_size() -> str:
-    return f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda.Frame)}"
+    return f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda_frame.Frame)}"
 
 
 def test_without_nvrtc_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,9 +18,11 @@ from cuda_cases import (
     ShimLauncher,
     assert_same_gradients,
     assert_same_image,
+    camera_of,
     gradients_of_kernels,
     inputs_of,
     make_prior,
+    make_reliable,
     make_scene,
     near_a_cut_off,
     random_upstream,
@@ -29,6 +31,7 @@ from cuda_cases import (
     render_kernels,
     shim_library,
     survey_kernels,
+    with_edge,
 )
 
 from d2_plugin import D2Error
@@ -62,27 +65,38 @@ def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     return torch.device("cpu")
 
 
+edges = pytest.mark.parametrize("edge", [False, True], ids=["", "edge"])
+
+
+@edges
 @pytest.mark.parametrize("size", [(64, 48), (67, 41), (1, 1), (15, 33)], ids=lambda size: "{}x{}".format(*size))
-def test_image_and_gradients_are_the_references_at_any_size(backend: torch.device, size: tuple[int, int]) -> None:
+def test_image_and_gradients_are_the_references_at_any_size(
+    backend: torch.device, size: tuple[int, int], edge: bool
+) -> None:
     scene = make_scene(300, *size)
+    scene = with_edge(scene) if edge else scene
     render, upstream, expected = reference_with_gradients(scene)
     _, outputs = render_kernels(scene, backend)
     assert_same_image(scene, outputs, render)
     assert_same_gradients(gradients_of_kernels(scene, backend, upstream), expected)
 
 
+@edges
 @pytest.mark.parametrize("channels", [1, 40])
-def test_any_number_of_color_channels(backend: torch.device, channels: int) -> None:
+def test_any_number_of_color_channels(backend: torch.device, channels: int, edge: bool) -> None:
     scene = make_scene(120, 40, 24, channels=channels)
+    scene = with_edge(scene) if edge else scene
     render, upstream, expected = reference_with_gradients(scene)
     _, outputs = render_kernels(scene, backend)
     assert_same_image(scene, outputs, render)
     assert_same_gradients(gradients_of_kernels(scene, backend, upstream), expected)
 
 
-def test_many_opaque_layers_and_many_batches(backend: torch.device) -> None:
+@edges
+def test_many_opaque_layers_and_many_batches(backend: torch.device, edge: bool) -> None:
     """700 layers over a tile: three batches of the forward pass, eleven of the backward, most of them hidden."""
     scene = make_scene(700, 33, 17, scale=0.3, opaque=True)
+    scene = with_edge(scene) if edge else scene
     render, upstream, expected = reference_with_gradients(scene)
     assert render.alpha.min() > 0.99
     _, outputs = render_kernels(scene, backend)
@@ -102,7 +116,9 @@ def test_faint_layers_in_many_batches_all_count(backend: torch.device) -> None:
 
 
 def test_without_gaussians_the_image_is_the_background(backend: torch.device) -> None:
-    scene, (color, depth_sum, alpha, *_) = render_kernels(make_scene(0), backend)
+    scene, (color, depth_sum, alpha, front, *_) = render_kernels(with_edge(make_scene(0)), backend)
+    assert front.shape == alpha.shape
+    assert not front.any()
     assert torch.equal(color, scene.background.expand_as(color))
     assert not depth_sum.any()
     assert not alpha.any()
@@ -129,6 +145,57 @@ def test_gaussians_that_are_not_finite_are_left_out_with_zero_gradient(backend: 
         assert not value[broken.to(backend)].any()
 
 
+@edges
+@pytest.mark.parametrize("channels", [3, 40])
+def test_a_loss_that_sends_nan_where_nothing_is_drawn_spoils_no_gradient(
+    backend: torch.device, channels: int, edge: bool
+) -> None:
+    """As normalised depth does: 0 / 0 where alpha is 0."""
+    scene = make_scene(8, channels=channels)
+    scene = with_edge(scene) if edge else scene
+    _, outputs = render_kernels(scene, backend)
+    empty = outputs[2].cpu() == 0
+    assert empty.any()
+    upstream = random_upstream(scene)
+    expected = gradients_of_kernels(scene, backend, upstream)
+    found = gradients_of_kernels(
+        scene, backend, tuple(part.masked_fill(mask_of(empty, part), torch.nan) for part in upstream)
+    )
+    for i in (0, 1, 2, 3, 5):  # the background does shine through there
+        assert torch.equal(found[i], expected[i])
+
+
+def mask_of(pixels: torch.Tensor, part: torch.Tensor) -> torch.Tensor:
+    return pixels[..., None].expand_as(part) if part.ndim == 3 else pixels
+
+
+def test_where_no_space_is_known_to_be_free_no_gradient_of_it_counts(backend: torch.device) -> None:
+    scene = with_edge(make_scene(100))
+    edge = scene.near_edge
+    unknown = ~(edge.isfinite() & (edge > 1e-30))
+    *upstream, on_front = random_upstream(scene)
+    results = [
+        gradients_of_kernels(scene, backend, (*upstream, on_front.masked_fill(unknown, value)))
+        for value in (0, torch.nan)
+    ]
+    assert all(torch.equal(a, b) for a, b in zip(*results))
+
+
+def test_a_near_edge_changes_nothing_but_the_front(backend: torch.device) -> None:
+    scene = make_scene(300)
+    bare, full = (render_kernels(part, backend)[1] for part in (scene, with_edge(scene)))
+    assert all(torch.equal(a, b) for a, b in zip(bare[:3], full[:3]))
+    upstream = random_upstream(scene)
+    for other in (None, torch.zeros_like(upstream[1])):
+        found = gradients_of_kernels(with_edge(scene), backend, (*upstream, other))
+        assert all(torch.equal(a, b) for a, b in zip(found, gradients_of_kernels(scene, backend, upstream)))
+    prior = make_prior(scene)
+    one, two = (survey_kernels(part, prior, backend) for part in (scene, with_edge(scene)))
+    assert all(torch.equal(a, b) for a, b in zip(one[:6], two[:6]))
+    assert not one.front.any()
+    assert two.front.any()
+
+
 def test_gradients_outside_of_the_fov_clamp(backend: torch.device) -> None:
     """Long Gaussians whose centres lie far beside the image, where the Jacobian stands still."""
     scene = make_scene(60, settings=RasterSettings(fov_clamp=0.6), scale=0.3)
@@ -150,24 +217,23 @@ def test_extreme_gaussians_leave_everything_finite(backend: torch.device, seed: 
     covariances = torch.stack([full[:, a, b] for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))], 1)
     means = scene.splats.means * 10 ** (-3 + 9 * draw(2000, 1))
     opacities = torch.where(draw(2000) < 0.5, scene.splats.opacities, (draw(2000) < 0.5).float())
-    scene = scene._replace(splats=Splats(means, covariances, opacities, scene.splats.rows))
+    scene = with_edge(scene._replace(splats=Splats(means, covariances, opacities, scene.splats.rows)))
     _, outputs = render_kernels(scene, backend)
-    upstream = tuple(torch.ones_like(part) for part in outputs[:3])
-    survey_of_it = survey_kernels(scene, make_prior(scene), backend)
-    for value in (*outputs[:3], *gradients_of_kernels(scene, backend, upstream), *survey_of_it):
+    upstream = tuple(torch.ones_like(part) for part in outputs[:4])
+    survey_of_it = survey_kernels(scene, make_reliable(make_prior(scene)), backend)
+    for value in (*outputs[:4], *gradients_of_kernels(scene, backend, upstream), *survey_of_it):
         assert torch.isfinite(value).all()
 
 
-@pytest.mark.parametrize("given", range(3), ids=Render._fields)
+@pytest.mark.parametrize("given", range(4), ids=Render._fields)
 def test_outputs_without_an_upstream_gradient_count_as_zero(backend: torch.device, given: int) -> None:
-    scene = make_scene(100, 32, 32)
+    scene = with_edge(make_scene(100, 32, 32))
     upstream = random_upstream(scene)
     zeros = tuple(part * (i == given) for i, part in enumerate(upstream))
     expected = gradients_of_kernels(scene, backend, zeros)
     scene, outputs = render_kernels(scene, backend)
     absent = [part.to(backend, torch.float32) if i == given else None for i, part in enumerate(upstream)]
-    camera = (scene.view.T_camera_world, scene.view.K, ops._constants(scene.settings))
-    found = cuda.backward(*absent, *inputs_of(scene), *camera, *outputs)
+    found = cuda.backward(*absent, *inputs_of(scene), *camera_of(scene), ops._constants(scene.settings), *outputs)
     assert all(torch.equal(a, b) for a, b in zip(found, expected))
 
 
@@ -189,27 +255,41 @@ def test_equal_depths_are_drawn_in_the_order_of_indices(backend: torch.device) -
     [make_scene(300), make_scene(500, 37, 29, scale=0.3, opaque=True), make_scene(0)],
     ids=["random", "opaque", "empty"],
 )
-def test_survey_is_the_references(backend: torch.device, scene: Scene) -> None:
+@pytest.mark.parametrize("more", [False, True], ids=["", "edge and reliability"])
+def test_survey_is_the_references(backend: torch.device, scene: Scene, more: bool) -> None:
     scene = scene._replace(screen_offsets=torch.zeros_like(scene.screen_offsets))
     calm = ~near_a_cut_off(scene)
     prior = make_prior(scene)
     prior.labels[~calm] = Label.MONO
     prior.labels[calm] = torch.where(prior.labels[calm] == Label.MONO, Label.VERIFIED, prior.labels[calm])
+    if more:
+        scene, prior = with_edge(scene), make_reliable(prior)
+        scene.near_edge[~calm], prior.reliability[~calm] = 0, 0
     double = scene.to(torch.device("cpu"), torch.float64)
-    expected = reference.survey(double.splats, double.view, prior, double.settings, 1e-8)
+    expected = reference.survey(double.splats, double.view, prior, double.settings, 1e-8, double.near_edge)
     found = survey_kernels(scene, prior, backend)
     assert torch.equal(found.hits.cpu(), expected.hits)
     for name in ("depth_sum", "alpha"):
         worst = (getattr(found, name).cpu() - getattr(expected, name))[calm].abs()
         assert not len(worst) or worst.amax() < FORWARD_TOLERANCE
-    for name in ("weight", "error"):
+    assert bool(expected.front.any()) == (more and len(found.front) > 0)
+    for name in ("weight", "error", "front"):
         assert relative_error(getattr(found, name), getattr(expected, name)) < GRADIENT_TOLERANCE
     off = (found.max_weight.cpu() - expected.max_weight).abs() > FORWARD_TOLERANCE
     assert off.sum() <= 0.02 * len(off), "more than those whose maximum may lie at a cut-off"
 
 
+@pytest.mark.parametrize("label", Label)
+def test_survey_counts_verified_and_agreed_pixels_and_no_others(backend: torch.device, label: Label) -> None:
+    scene = make_scene(60)
+    prior = make_prior(scene)
+    prior.labels.fill_(label)
+    counted = label in (Label.VERIFIED, Label.AGREED)
+    assert bool(survey_kernels(scene, prior, backend).hits.any()) == counted
+
+
 def test_no_result_depends_on_the_order_of_warps_and_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = make_scene(400, 45, 37, scale=0.25)
+    scene = with_edge(make_scene(400, 45, 37, scale=0.25))
     upstream = random_upstream(scene)
     results = []
     for descending in (False, True):
@@ -217,12 +297,13 @@ def test_no_result_depends_on_the_order_of_warps_and_blocks(monkeypatch: pytest.
         monkeypatch.setattr(cuda, "launcher", lambda device, launcher=launcher: launcher)
         cpu = torch.device("cpu")
         results.append((*gradients_of_kernels(scene, cpu, upstream), *survey_kernels(scene, make_prior(scene), cpu)))
-        assert {"d2_project", "d2_list", "d2_render", "d2_backward", "d2_survey"} <= set(launcher.launched)
+        named = {"d2_project", "d2_list", "d2_render_front", "d2_backward_front", "d2_survey_front"}
+        assert named <= set(launcher.launched)
     assert all(torch.equal(a, b) for a, b in zip(*results))
 
 
 def test_two_runs_give_the_same_bits(backend: torch.device) -> None:
-    scene = make_scene(300)
+    scene = with_edge(make_scene(300))
     upstream = random_upstream(scene)
     runs = [gradients_of_kernels(scene, backend, upstream) for _ in range(2)]
     assert all(torch.equal(a, b) for a, b in zip(*runs))
@@ -231,13 +312,13 @@ def test_two_runs_give_the_same_bits(backend: torch.device) -> None:
 def test_cpu_and_gpu_kernels_agree(backend: torch.device) -> None:
     if not native.available():
         pytest.skip("no C++ compiler for the CPU kernels")
-    scene = make_scene(300)
+    scene = with_edge(make_scene(300))
     upstream = random_upstream(scene)
     single = scene.to(torch.device("cpu"), torch.float32)
-    camera = (single.view.T_camera_world, single.view.K)
+    camera = camera_of(single)
     constants = ops._constants(scene.settings)
     outputs = native.rasterize(*inputs_of(single), *camera, 64, 48, constants)
-    assert_same_image(scene, render_kernels(scene, backend)[1], Render(*(part.double() for part in outputs[:3])))
+    assert_same_image(scene, render_kernels(scene, backend)[1], Render(*(part.double() for part in outputs[:4])))
     gradients = native.backward(*(part.float() for part in upstream), *inputs_of(single), *camera, constants, *outputs)
     found = gradients_of_kernels(scene, backend, upstream)
     assert_same_gradients(found, tuple(part.double() for part in gradients))
@@ -267,17 +348,20 @@ def test_the_device_decides(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reference, "rasterize", None)
     monkeypatch.setattr(reference, "survey", None)
     device = torch.device("cuda", 0)
-    scene = make_scene(300).to(device, torch.float32)
+    scene = with_edge(make_scene(300)).to(device, torch.float32)
     inputs = [part.requires_grad_() for part in inputs_of(scene)]
     splats = Splats(*inputs[:3], scene.splats.rows)
-    render = rasterize(splats, inputs[3], scene.view, background=inputs[4], screen_offsets=inputs[5])
+    options = {"background": inputs[4], "screen_offsets": inputs[5], "near_edge": scene.near_edge}
+    render = rasterize(splats, inputs[3], scene.view, **options)
     upstream = [torch.randn_like(part) for part in render]
     found = torch.autograd.grad(render, inputs, upstream)
     assert all(part.is_cuda and torch.isfinite(part).all() for part in found)
-    expected = gradients_of_kernels(make_scene(300), device, tuple(upstream))
+    expected = gradients_of_kernels(with_edge(make_scene(300)), device, tuple(upstream))
     assert all(torch.equal(a, b) for a, b in zip(found, expected))
-    assert survey(splats, scene.view, make_prior(make_scene(300))).hits.is_cuda
-    camera = (scene.view.T_camera_world, scene.view.K, 64, 48, ops._constants(RasterSettings()))
+    assert survey(
+        splats, scene.view, make_prior(make_scene(300)), near_edge=with_edge(make_scene(300)).near_edge
+    ).hits.is_cuda
+    camera = (*camera_of(scene), 64, 48, ops._constants(RasterSettings()))
     torch.library.opcheck(torch.ops.d2.rasterize.default, (*inputs, *camera))
 
 

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from splat_scenes import Scene, brute_force, make_view, near_threshold, random_scene, single
+from splat_scenes import Scene, brute_force, make_view, near_edge_of, near_threshold, random_scene, single
 
 from d2_plugin.compiler import NoCompiler, find_compiler
+from d2_plugin.protocol import Label
 from d2_plugin.rasterizer import DepthPrior, Render, Splats, native, ops, rasterize, survey
 
 try:
@@ -28,16 +29,18 @@ NAMES = ("means", "covariances", "opacities", "colors", "background", "screen_of
 def upstream(scene: Scene) -> tuple[torch.Tensor, ...]:
     g = torch.Generator().manual_seed(0)
     height, width = scene.view.height, scene.view.width
-    shapes = ((height, width, scene.colors.shape[1]), (height, width), (height, width))
+    shapes = ((height, width, scene.colors.shape[1]), *[(height, width)] * 3)
     return tuple(torch.randn(shape, generator=g) for shape in shapes)
 
 
-def render_with_gradients(scene: Scene, dtype: torch.dtype) -> tuple[Render, list[torch.Tensor]]:
+def render_with_gradients(scene: Scene, dtype: torch.dtype, edge: bool = False) -> tuple[Render, list[torch.Tensor]]:
     scene = scene.to(dtype).requires_grad()
     background = torch.linspace(0.2, 0.9, scene.colors.shape[1], dtype=dtype).requires_grad_()
     offsets = torch.zeros(len(scene.means), 2, dtype=dtype, requires_grad=True)
-    render = scene.render(background=background, screen_offsets=offsets)
-    loss = sum((part * weight.to(dtype)).sum() for part, weight in zip(render, upstream(scene)))
+    near_edge = near_edge_of(scene.view) if edge else None
+    render = scene.render(background=background, screen_offsets=offsets, near_edge=near_edge)
+    used = [part for part in render if part is not None]
+    loss = sum((part * weight.to(dtype)).sum() for part, weight in zip(used, upstream(scene)))
     return render, list(torch.autograd.grad(loss, (*scene[:4], background, offsets)))
 
 
@@ -46,7 +49,15 @@ def prior_of(scene: Scene) -> DepthPrior:
     size = (scene.view.height, scene.view.width)
     depth = 1 + 4 * torch.rand(size, generator=g)
     depth[0, 0] = torch.nan
-    return DepthPrior(depth, torch.randint(0, 4, size, generator=g, dtype=torch.uint8))
+    return DepthPrior(depth, torch.randint(0, len(Label), size, generator=g, dtype=torch.uint8))
+
+
+def reliable_prior_of(scene: Scene) -> DepthPrior:
+    """With a reliability between 0 and 1, and numbers among them that say nothing."""
+    prior = prior_of(scene)
+    r = torch.rand(prior.depth.shape, generator=torch.Generator().manual_seed(2))
+    r.view(-1)[1:28:9] = torch.tensor([0.0, torch.nan, torch.inf])[: len(r.view(-1)[1:28:9])]
+    return prior._replace(reliability=r)
 
 
 SCENES = {
@@ -62,14 +73,19 @@ SCENES = {
 }
 
 
+edges = pytest.mark.parametrize("edge", [False, True], ids=["", "edge"])
+
+
+@edges
 @pytest.mark.parametrize("name", SCENES)
-def test_float32_kernels_agree_with_the_float64_reference(name):
+def test_float32_kernels_agree_with_the_float64_reference(name, edge):
     scene = SCENES[name]()
-    fast, gradients = render_with_gradients(scene, torch.float32)
-    exact, expected = render_with_gradients(scene, torch.float64)
+    fast, gradients = render_with_gradients(scene, torch.float32, edge)
+    exact, expected = render_with_gradients(scene, torch.float64, edge)
+    assert (fast.front is not None) == (exact.front is not None) == edge
     away = torch.from_numpy(~near_threshold(brute_force(scene)))
     assert away.double().mean() > 0.9, "most pixels must count"
-    for part, other in zip(fast, exact):
+    for part, other in zip(fast[: 3 + edge], exact):
         assert part.dtype == torch.float32
         assert (part.double() - other)[away].abs().max() < 1e-4
     for part, gradient, other in zip(NAMES, gradients, expected):
@@ -77,12 +93,15 @@ def test_float32_kernels_agree_with_the_float64_reference(name):
         assert (gradient.double() - other).norm() <= 1e-3 * other.norm() + 1e-6, part
 
 
+@edges
+@pytest.mark.parametrize("kind", [prior_of, reliable_prior_of])
 @pytest.mark.parametrize("name", SCENES)
-def test_survey_agrees_with_the_float64_reference(name):
+def test_survey_agrees_with_the_float64_reference(name, kind, edge):
     scene = SCENES[name]()
-    prior = prior_of(scene)
-    fast = survey(scene.to(torch.float32).splats, scene.view, prior)
-    exact = survey(scene.splats, scene.view, prior)
+    prior, near_edge = kind(scene), near_edge_of(scene.view) if edge else None
+    fast = survey(scene.to(torch.float32).splats, scene.view, prior, near_edge=near_edge)
+    exact = survey(scene.splats, scene.view, prior, near_edge=near_edge)
+    assert edge or not fast.front.any()
     close = {"rtol": 1e-4, "atol": 2e-4}
     # A Gaussian at a threshold anywhere may differ by that fragment, which is at most alpha_min or transmittance_min.
     for part, other in zip(fast[:3], exact[:3]):
@@ -94,8 +113,10 @@ def test_survey_agrees_with_the_float64_reference(name):
 
 
 def everything(scene: Scene) -> list[torch.Tensor]:
-    render, gradients = render_with_gradients(scene, torch.float32)
-    return [*render, *gradients, *survey(scene.to(torch.float32).splats, scene.view, prior_of(scene))]
+    render, gradients = render_with_gradients(scene, torch.float32, edge=True)
+    splats, edge = scene.to(torch.float32).splats, near_edge_of(scene.view)
+    surveys = [survey(splats, scene.view, kind(scene), near_edge=edge) for kind in (prior_of, reliable_prior_of)]
+    return [*render, *gradients, *surveys[0], *surveys[1]]
 
 
 @pytest.fixture
@@ -187,13 +208,14 @@ def test_inputs_need_not_be_contiguous_and_gradients_may_be_expanded():
         torch.testing.assert_close(part.grad, other.grad, atol=0, rtol=0)
 
 
-@pytest.mark.parametrize("used", [0, 1, 2])
+@pytest.mark.parametrize("used", [0, 1, 2, 3])
 def test_any_one_output_alone_has_its_gradient(used):
     scene = random_scene(10, 80, 25, 25)
     found = []
     for dtype in (torch.float32, torch.float64):
         leaves = scene.to(dtype).requires_grad()
-        found.append(torch.autograd.grad(leaves.render()[used].sum(), leaves[:3]))
+        render = leaves.render(near_edge=near_edge_of(scene.view))
+        found.append(torch.autograd.grad(render[used].sum(), leaves[:3]))
     for gradient, other in zip(*found):
         assert (gradient.double() - other).norm() <= 1e-3 * other.norm()
 
@@ -212,17 +234,18 @@ def test_the_operators_pass_torchs_own_check():
     view = scene.view
     background, offsets = torch.rand(3, requires_grad=True), torch.zeros(40, 2, requires_grad=True)
     constants = [0.2, 0.3, 0.99, 1 / 255, 1e-4, 1.3]
-    camera = (view.T_camera_world, view.K)
-    inputs = (*scene[:4], background, offsets, *camera, 20, 18, constants)
+    camera, edge = (view.T_camera_world, view.K), near_edge_of(view)
+    inputs = (*scene[:4], background, offsets, *camera, edge, 20, 18, constants)
     torch.library.opcheck(ops._rasterize, inputs)
-    torch.library.opcheck(ops._rasterize, (*scene[:4], None, None, *camera, 20, 18, constants))
+    torch.library.opcheck(ops._rasterize, (*scene[:4], None, None, *camera, None, 20, 18, constants))
     detached = [part.detach() if isinstance(part, torch.Tensor) else part for part in inputs]
     outputs = [part.detach() for part in ops._rasterize(*inputs)]
-    saved = (*upstream(scene), *detached[:8], constants, *outputs)
+    saved = (*upstream(scene), *detached[:9], constants, *outputs)
     torch.library.opcheck(ops._rasterize_backward, saved)
     prior = prior_of(scene)
-    measured = (*detached[:3], prior.depth, prior.verified, *camera, constants, 1e-8)
-    torch.library.opcheck(ops._survey, measured)
+    for part in (None, edge):
+        measured = (*detached[:3], prior.depth, prior.trusted.float(), part, *camera, constants, 1e-8)
+        torch.library.opcheck(ops._survey, measured)
 
 
 @pytest.mark.slow
@@ -230,8 +253,9 @@ def test_torch_compile_takes_it_into_one_graph():
     scene = random_scene(12, 40, 20, 18).to(torch.float32).requires_grad()
 
     def loss(means, covariances, opacities, colors):
-        render = rasterize(Splats(means, covariances, opacities, torch.arange(40)), colors, scene.view)
-        return (render.color.sin() + render.alpha[..., None]).sum()
+        splats = Splats(means, covariances, opacities, torch.arange(40))
+        render = rasterize(splats, colors, scene.view, near_edge=near_edge_of(scene.view))
+        return (render.color.sin() + (render.alpha + render.front)[..., None]).sum()
 
     expected = torch.autograd.grad(loss(*scene[:4]), scene[:4])
     compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)

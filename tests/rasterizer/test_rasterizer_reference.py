@@ -8,13 +8,15 @@ import math
 import numpy as np
 import pytest
 import torch
-from splat_scenes import Scene, brute_force, make_view, random_scene, single
+from splat_scenes import Scene, brute_force, make_view, near_edge_of, random_scene, single
 from torch.autograd import gradcheck
 
 from d2_plugin.errors import D2Error
+from d2_plugin.protocol import Label
 from d2_plugin.rasterizer import DepthPrior, RasterSettings, Splats, View, rasterize, survey
 
 SETTINGS = RasterSettings()
+TRUSTED = (Label.VERIFIED, Label.AGREED)
 
 
 def rotated(scene: Scene) -> Scene:
@@ -47,7 +49,7 @@ def test_image_is_the_compositing_sum_of_the_definition(seed):
 
 def test_a_moved_world_gives_the_same_image():
     scene = random_scene(5, 80, 24, 20)
-    for part, other in zip(scene.render(), rotated(scene).render()):
+    for part, other in zip(scene.render()[:3], rotated(scene).render()[:3]):
         torch.testing.assert_close(part, other, atol=1e-10, rtol=0)
 
 
@@ -117,7 +119,8 @@ def test_gradients_are_those_of_the_image(seed):
 
     def render(means, covariances, opacities, colors, background, offsets):
         splats = Splats(means, covariances, opacities, torch.arange(4))
-        return tuple(rasterize(splats, colors, scene.view, background=background, screen_offsets=offsets))
+        options = {"background": background, "screen_offsets": offsets, "near_edge": near_edge_of(scene.view, seed)}
+        return tuple(rasterize(splats, colors, scene.view, **options))
 
     # Every entry of the Jacobian for some seeds, a random projection of it (a tenth of the time) for the others.
     assert gradcheck(render, (*scene[:4], background, offsets), fast_mode=seed >= 5), f"seed {seed}"
@@ -132,15 +135,15 @@ def test_any_image_size_works(size):
 def test_survey_sums_the_weights_of_the_definition():
     scene = random_scene(3, 120, 36, 34)
     random = np.random.default_rng(0)
-    labels = torch.from_numpy(random.integers(0, 4, (34, 36)).astype(np.uint8))
+    labels = torch.from_numpy(random.integers(0, len(Label), (34, 36)).astype(np.uint8))
     depth = torch.from_numpy(random.uniform(0.5, 6, (34, 36)))
     depth[0, :3] = torch.tensor([0.0, torch.nan, -1.0])  # labelled or not, these are no depths
     statistics = survey(scene.splats, scene.view, DepthPrior(depth, labels), eps=1e-3)
 
     found = brute_force(scene)
-    verified = (labels.numpy() == 2) & (np.nan_to_num(depth.numpy()) > 0)
-    w = found.weights * verified
-    safe = np.where(verified, depth.numpy(), 1)
+    trusted = np.isin(labels.numpy(), TRUSTED) & (np.nan_to_num(depth.numpy()) > 0)
+    w = found.weights * trusted
+    safe = np.where(trusted, depth.numpy(), 1)
     error = np.abs(found.depths[:, None, None] - safe) / (safe + 1e-3)
     np.testing.assert_allclose(statistics.weight.numpy(), w.sum((1, 2)), atol=1e-12)
     np.testing.assert_allclose(statistics.error.numpy(), (w * error).sum((1, 2)), atol=1e-11)
@@ -150,7 +153,20 @@ def test_survey_sums_the_weights_of_the_definition():
     np.testing.assert_allclose(statistics.depth_sum.numpy(), scene.render().depth_sum.numpy(), atol=1e-12)
 
 
-def test_survey_without_verified_pixels_still_knows_the_largest_weight():
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("label", Label)
+def test_survey_counts_verified_and_agreed_pixels_and_no_others(label, dtype):
+    scene = single(opacity=0.5, dtype=dtype)
+    prior = DepthPrior(torch.full((15, 15), 3.0), torch.full((15, 15), label, dtype=torch.uint8))
+    statistics = survey(scene.splats, scene.view, prior)
+    alpha = scene.render().alpha
+    counted = label in TRUSTED
+    assert statistics.hits.item() == (alpha > 0).sum().item() * counted
+    assert statistics.weight.item() == pytest.approx(alpha.sum().item() * counted, rel=1e-5)
+    assert statistics.error.item() == pytest.approx(alpha.sum().item() * counted * (4 - 3) / 3, rel=1e-5)
+
+
+def test_survey_without_trusted_pixels_still_knows_the_largest_weight():
     scene = single(opacity=0.5)
     prior = DepthPrior(torch.ones(15, 15), torch.ones(15, 15, dtype=torch.uint8))
     statistics = survey(scene.splats, scene.view, prior)

@@ -154,7 +154,7 @@ def test_a_log_scale_of_100_reaches_no_pixel_as_infinity() -> None:
         model.gaussians["log_time_scales"][4] = 100.0
     render = model.render(make_views()[0])
     render.color.sum().backward()
-    assert all(torch.isfinite(part).all() for part in render)
+    assert all(torch.isfinite(part).all() for part in render[:3])
     assert all(torch.isfinite(parameter.grad).all() for parameter in model.gaussians.parameters.values())
 
 
@@ -240,7 +240,7 @@ def test_a_huge_velocity_carries_a_gaussian_out_of_sight(take_slice, extent: flo
     )
     colors = torch.rand(len(seen.rows) + 1, 3, generator=torch.Generator().manual_seed(0))
     alone = rasterize(seen, colors[:-1], view)
-    for part, expected in zip(rasterize(together, colors, view), alone):
+    for part, expected in zip(rasterize(together, colors, view)[:3], alone):
         assert torch.equal(part, expected)
 
 

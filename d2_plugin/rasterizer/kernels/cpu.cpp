@@ -157,16 +157,30 @@ struct Unfinished {
   }
 };
 
-// State of a block in the forward pass: transmittance, that of finished pixels, depth sum, colors.
-template <int FIXED>
+// Fields `near` and `scale` of a block's state, one after the other.
+D2_INLINE FreeSpace<Floats> load_space(const float* near) { return {Floats::load(near), Floats::load(near + LANES)}; }
+
+// Puts the free space of a strip there; `scale`, if not null, multiplies its own.
+template <class Count>
+D2_INLINE void store_space(const Frame& f, const Strip& strip, Count count, const float* scale, float* near) {
+  for (int i = 0; i < count; i++) {
+    const FreeSpace<float> space = free_space(f.near_edge[strip.pixel + i]);
+    near[i] = space.near, near[LANES + i] = scale ? space.scale * scale[i] : space.scale;
+  }
+}
+
+// State of a block in the forward pass: transmittance, that of finished pixels, depth sum, colors; with FRONT the near
+// edge and the sum of w max(0, D_near - z).
+template <int FIXED, bool FRONT>
 static void render_tile(const Frame& f, int tile) {
-  const int channels = FIXED ? FIXED : f.channels, fields = 3 + channels;
+  const int channels = FIXED ? FIXED : f.channels, edge = 3 + channels, fields = edge + (FRONT ? 2 : 0);
   float* state = scratch().state.reserve(size_t(BLOCKS) * fields * LANES);
   std::fill(state, state + BLOCKS * fields * LANES, 0.f);
   Unfinished unfinished;
   for_each_strip(f, tile, [&](const Strip& strip, auto count) {
     float* field = state + strip.block * fields * LANES + strip.lane;
     for (int i = 0; i < count; i++) field[i] = 1.f;
+    for (int i = 0; FRONT && i < count; i++) field[edge * LANES + i] = free_space(f.near_edge[strip.pixel + i]).near;
     unfinished.add(strip);
   });
 
@@ -186,11 +200,12 @@ static void render_tile(const Frame& f, int tile) {
       const Floats transmittance = Floats::load(field);
       const Step<Floats> step = composite(here.log2_alpha, transmittance, log2_alpha_min, f.constants);
       unfinished.advance(step, transmittance, block, field + LANES).store(field);
-      const auto add = [&](int k, float value) {
-        fma(step.weight, Floats(value), Floats::load(field + k * LANES)).store(field + k * LANES);
+      const auto add = [&](int k, Floats value) {
+        fma(step.weight, value, Floats::load(field + k * LANES)).store(field + k * LANES);
       };
       add(2, r.footprint.depth);
       for (int c = 0; c < channels; c++) add(3 + c, color[c]);
+      if (FRONT) add(edge + 1, before_edge(Floats::load(field + edge * LANES), Floats(r.footprint.depth)));
     }
     f.ids[live] = int32_t(id), f.blocks[live++] = reached;
   });
@@ -203,6 +218,8 @@ static void render_tile(const Frame& f, int tile) {
     for (int i = 0; i < count; i++) transmittance[i] = max(field[i], field[LANES + i]);
     for (int i = 0; i < count; i++) f.alpha[strip.pixel + i] = 1.f - transmittance[i];
     for (int i = 0; i < count; i++) f.depth_sum[strip.pixel + i] = field[2 * LANES + i];
+    for (int i = 0; FRONT && i < count; i++)
+      f.front[strip.pixel + i] = field[(edge + 1) * LANES + i] * free_space(field[edge * LANES + i]).scale;
     float* color = f.color + strip.pixel * channels;
     for (int i = 0; i < count; i++)
       for (int c = 0; c < channels; c++)
@@ -213,10 +230,10 @@ static void render_tile(const Frame& f, int tile) {
 // ---------------------------------------------------------------------------------------------------- backward
 
 // State of a block in the backward pass: transmittance, what is left of sum of w dL/dw, and dL/d of alpha (with the
-// background's share), depth sum and colors at its pixels.
-template <int FIXED>
+// background's share), depth sum and colors at its pixels; with FRONT the free space (2), scaled by dL/d(front).
+template <int FIXED, bool FRONT>
 static void load_gradients(const Frame& f, int tile, float* state, float* background) {
-  const int channels = FIXED ? FIXED : f.channels, fields = 4 + channels;
+  const int channels = FIXED ? FIXED : f.channels, space = 4 + channels, fields = space + (FRONT ? 2 : 0);
   std::fill(state, state + BLOCKS * fields * LANES, 0.f);
   if (background) std::fill(background, background + channels, 0.f);
   for_each_strip(f, tile, [&](const Strip& strip, auto count) {
@@ -230,6 +247,16 @@ static void load_gradients(const Frame& f, int tile, float* state, float* backgr
     if (f.grad_depth_sum)
       for (int i = 0; i < count; i++) on_depth[i] = alpha[i] > 0.f ? f.grad_depth_sum[strip.pixel + i] : 0.f;
     for (int i = 0; i < count; i++) total[i] = fma(on_alpha[i], alpha[i], on_depth[i] * f.depth_sum[strip.pixel + i]);
+    if (FRONT) {
+      // Nothing comes back either where no space is known to be free.
+      float on_front[BLOCK_WIDTH], *near = field + space * LANES;
+      for (int i = 0; i < count; i++) {
+        const bool known = alpha[i] > 0.f && free_space(f.near_edge[strip.pixel + i]).scale > 0.f;
+        on_front[i] = known ? f.grad_front[strip.pixel + i] : 0.f;
+      }
+      store_space(f, strip, count, on_front, near);
+      for (int i = 0; i < count; i++) total[i] = fma(on_front[i], f.front[strip.pixel + i], total[i]);
+    }
     if (f.grad_color)
       for (int c = 0; c < channels; c++) {
         const float behind = f.background[c];
@@ -257,12 +284,12 @@ struct Sums {
   float *moments, *background;
 };
 
-template <int FIXED>
+template <int FIXED, bool FRONT>
 static void backward_tile(const Frame& f, int tile, const Sums& to) {
-  const int channels = FIXED ? FIXED : f.channels, fields = 4 + channels;
+  const int channels = FIXED ? FIXED : f.channels, free = 4 + channels, fields = free + (FRONT ? 2 : 0);
   float* state = scratch().state.reserve(size_t(BLOCKS * fields + 7 + channels) * LANES);
   Floats* loose_sums = reinterpret_cast<Floats*>(state + BLOCKS * fields * LANES);
-  load_gradients<FIXED>(f, tile, state, to.background ? to.background + int64_t(tile) * channels : nullptr);
+  load_gradients<FIXED, FRONT>(f, tile, state, to.background ? to.background + int64_t(tile) * channels : nullptr);
   const Corner corner = corner_of(f, tile);
   const Lattice lattice;
   const float log2_alpha_min = f.log2_alpha_min(), log2_alpha_max = f.log2_alpha_max();
@@ -290,8 +317,14 @@ static void backward_tile(const Frame& f, int tile, const Sums& to) {
       float* field = state + block * fields * LANES;
       const Floats transmittance = Floats::load(field);
       const Step<Floats> step = composite(here.log2_alpha, transmittance, log2_alpha_min, f.constants);
-      const Floats on_depth = Floats::load(field + 3 * LANES);
-      Floats value = fma(on_depth, Floats(r.footprint.depth), Floats::load(field + 2 * LANES));
+      const Floats depth = r.footprint.depth;
+      Floats on_depth = Floats::load(field + 3 * LANES);
+      Floats value = fma(on_depth, depth, Floats::load(field + 2 * LANES));
+      if (FRONT) {
+        const FreeSpace<Floats> space = load_space(field + free * LANES);
+        value = value + in_front(space, depth);
+        on_depth = on_depth - in_front_gradient(space, depth);
+      }
       for (int c = 0; c < channels; c++) {
         const Floats on_color = Floats::load(field + (4 + c) * LANES);
         value = fma(on_color, Floats(color[c]), value);
@@ -364,10 +397,11 @@ D2_INLINE void backward_group(const Frame& f, const Sums& from, int64_t i, int r
 
 // ---------------------------------------------------------------------------------------------------- survey
 
-// State of a block in the survey: transmittance, that of finished pixels, depth sum, and at verified pixels
-// 1 / (D* + eps), D* / (D* + eps), 1.
+// State of a block in the survey: transmittance, that of finished pixels, depth sum, and where the reliability r is
+// positive r / (D* + eps), D* r / (D* + eps), r; with FRONT the free space (2).
+template <bool FRONT>
 static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* statistics) {
-  constexpr int fields = 6;
+  constexpr int fields = FRONT ? 8 : 6;
   float* state = scratch().state.reserve(size_t(BLOCKS) * fields * LANES);
   std::fill(state, state + BLOCKS * fields * LANES, 0.f);
   Unfinished unfinished;
@@ -376,17 +410,19 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
     unfinished.add(strip);
     for (int i = 0; i < count; i++) {
       field[i] = 1.f;
-      field[4 * LANES + i] = f.prior_depth[strip.pixel + i], field[5 * LANES + i] = f.verified[strip.pixel + i];
+      field[4 * LANES + i] = f.prior_depth[strip.pixel + i], field[5 * LANES + i] = f.reliability[strip.pixel + i];
     }
+    if (FRONT) store_space(f, strip, count, nullptr, field + 6 * LANES);
   });
+  const Floats infinity = __builtin_inff();
   for (int block = 0; block < BLOCKS; block++) {
     float* field = state + block * fields * LANES;
-    const Floats depth = Floats::load(field + 4 * LANES), verified = Floats::load(field + 5 * LANES);
-    const Mask usable = (verified > Floats(0.f)) & (depth > Floats(0.f)) & (depth < Floats(__builtin_inff()));
-    const Floats scale = where(usable, Floats(1.f) / (depth + Floats(f.eps)));
+    const Floats depth = Floats::load(field + 4 * LANES), reliability = Floats::load(field + 5 * LANES);
+    const Mask usable = (reliability > Floats(0.f)) & (reliability < infinity) & (depth > Floats(0.f)) & (depth < infinity);
+    const Floats scale = where(usable, Floats(1.f) / (depth + Floats(f.eps)) * reliability);
     scale.store(field + 3 * LANES);
     (where(usable, depth) * scale).store(field + 4 * LANES);
-    where(usable, Floats(1.f)).store(field + 5 * LANES);
+    where(usable, reliability).store(field + 5 * LANES);
   }
 
   const Corner corner = corner_of(f, tile);
@@ -397,7 +433,7 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
   for_each_reaching(f, keys, pairs, corner, unfinished.blocks, [&](uint32_t id, const Record& r, uint64_t reached) {
     const Spread spread = lattice.spread(r, corner);
     const Floats depth = r.footprint.depth;
-    Floats sums[4] = {0.f, 0.f, 0.f, 0.f}, largest_weight = 0.f;  // weight, error and hits over verified pixels
+    Floats sums[4] = {0.f, 0.f, 0.f, 0.f}, largest_weight = 0.f;  // of Statistics, in its order
     for (uint64_t left = reached; left; left &= left - 1) {
       const int block = __builtin_ctzll(left);
       const Fragment<Floats> here = spread.at(block);
@@ -407,11 +443,12 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
       unfinished.advance(step, transmittance, block, field + LANES).store(field);
       fma(step.weight, depth, Floats::load(field + 2 * LANES)).store(field + 2 * LANES);
       const Floats scale = Floats::load(field + 3 * LANES), true_depth = Floats::load(field + 4 * LANES);
-      const Floats verified = Floats::load(field + 5 * LANES);
+      const Floats reliability = Floats::load(field + 5 * LANES);
       const Floats error = abs(fma(depth, scale, -true_depth));
-      sums[0] = fma(step.weight, verified, sums[0]);
+      sums[0] = fma(step.weight, reliability, sums[0]);
       sums[1] = fma(step.weight, error, sums[1]);
-      sums[2] = sums[2] + where(step.weight > Floats(0.f), verified);
+      sums[2] = sums[2] + where((step.weight > Floats(0.f)) & (reliability > Floats(0.f)), Floats(1.f));
+      if (FRONT) sums[3] = fma(step.weight, in_front(load_space(field + 6 * LANES), depth), sums[3]);
       largest_weight = max(step.weight, largest_weight);
     }
     const float most = largest(largest_weight);
@@ -430,27 +467,24 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
 }
 
 static void gather_statistics(const Frame& f, const uint8_t* touched, const Statistics* statistics, int64_t i) {
-  float weight = 0, error = 0, max_weight = 0;
+  float weight = 0, error = 0, front = 0, max_weight = 0;
   int32_t hits = 0;
   for (int64_t slot = f.slots[i]; slot < f.slots[i + 1]; slot++) {
     if (!touched[slot]) continue;
     const Statistics& s = statistics[slot];
-    weight += s.weight, error += s.error, hits += int32_t(s.hits);
+    weight += s.weight, error += s.error, front += s.front, hits += int32_t(s.hits);
     max_weight = std::max(max_weight, s.max_weight);
   }
-  f.weight[i] = weight, f.error[i] = error, f.max_weight[i] = max_weight, f.hits[i] = hits;
+  f.weight[i] = weight, f.error[i] = error, f.front_weight[i] = front, f.max_weight[i] = max_weight, f.hits[i] = hits;
 }
 
 // ---------------------------------------------------------------------------------------------------- the calls
 
 static void render(const Frame& f, int64_t pairs) {
   distribute(f, pairs);
-  parallel_for(f.threads, f.tile_count(), [&](int64_t tile) {
-    if (f.channels == 3)
-      render_tile<3>(f, int(tile));
-    else
-      render_tile<0>(f, int(tile));
-  });
+  const auto render_any = f.channels == 3 ? (f.near_edge ? render_tile<3, true> : render_tile<3, false>)
+                                          : (f.near_edge ? render_tile<0, true> : render_tile<0, false>);
+  parallel_for(f.threads, f.tile_count(), [&](int64_t tile) { render_any(f, int(tile)); });
 }
 
 static void survey(const Frame& f, int64_t pairs) {
@@ -458,7 +492,8 @@ static void survey(const Frame& f, int64_t pairs) {
   uint8_t* touched = scratch().touched.reserve(pairs);
   Statistics* statistics = scratch().statistics.reserve(pairs);
   std::fill(touched, touched + pairs, 0);
-  parallel_for(f.threads, f.tile_count(), [&](int64_t tile) { survey_tile(f, int(tile), touched, statistics); });
+  const auto survey_any = f.near_edge ? survey_tile<true> : survey_tile<false>;
+  parallel_for(f.threads, f.tile_count(), [&](int64_t tile) { survey_any(f, int(tile), touched, statistics); });
   parallel_for(f.threads, f.chunks, [&](int64_t chunk) {
     for (int64_t i = f.chunk_begin(chunk); i < f.chunk_begin(chunk + 1); i++)
       gather_statistics(f, touched, statistics, i);
@@ -471,12 +506,10 @@ static void backward(const Frame& f, int64_t pairs) {
   Sums sums = {scratch().touched.reserve(pairs), scratch().moments.reserve(pairs * stride), nullptr};
   if (f.grad_background) sums.background = scratch().background.reserve(size_t(tiles) * f.channels);
   std::fill(sums.touched, sums.touched + pairs, 0);
-  parallel_for(f.threads, tiles, [&](int64_t tile) {
-    if (f.channels == 3)
-      backward_tile<3>(f, int(tile), sums);
-    else
-      backward_tile<0>(f, int(tile), sums);
-  });
+  const bool front = f.near_edge && f.grad_front;
+  const auto backward_any = f.channels == 3 ? (front ? backward_tile<3, true> : backward_tile<3, false>)
+                                            : (front ? backward_tile<0, true> : backward_tile<0, false>);
+  parallel_for(f.threads, tiles, [&](int64_t tile) { backward_any(f, int(tile), sums); });
   if (f.grad_background)
     for (int c = 0; c < f.channels; c++) {
       double total = 0;

@@ -32,7 +32,7 @@ struct Tile {
 
 // Per (Gaussian, tile), what the survey adds up.
 struct Statistics {
-  float weight, error, hits, max_weight;
+  float weight, error, hits, front, max_weight;
 };
 
 // What binning needs of a projected Gaussian: the blocks that it may reach, inclusive (none where last < first).
@@ -51,8 +51,8 @@ struct Frame {
 
   // Inputs; `screen_offsets` may be null, for a survey also `colors` and `background`.
   const float *means, *covariances, *opacities, *colors, *screen_offsets, *background;
-  const float* prior_depth;  // 0 or less, or not finite: not verified
-  const uint8_t* verified;
+  const float *prior_depth, *reliability;  // a pixel counts where both are finite and positive
+  const float* near_edge;                  // of the free space; null: there is none
 
   // State of the forward pass. A pair is a Gaussian in a tile: pairs of Gaussian i have the slots slots[i]..slots[i+1]-1
   // in row-major order of tiles; pairs of a tile stand together in `ids` and `blocks`.
@@ -63,14 +63,14 @@ struct Frame {
   uint64_t* blocks;  // [pairs] bit b: may contribute to block b; before that, depth and id to sort by
 
   // Outputs of the forward pass and what comes back to them; null where nothing comes back.
-  float *color, *depth_sum, *alpha;
-  const float *grad_color, *grad_depth_sum, *grad_alpha;
+  float *color, *depth_sum, *alpha, *front;
+  const float *grad_color, *grad_depth_sum, *grad_alpha, *grad_front;
 
   // Gradients; the last two may be null.
   float *grad_means, *grad_covariances, *grad_opacities, *grad_colors, *grad_screen_offsets, *grad_background;
 
   // Survey.
-  float *weight, *error, *max_weight;
+  float *weight, *error, *max_weight, *front_weight;
   int32_t* hits;
 
   int tiles_x() const { return (width + TILE_WIDTH - 1) / TILE_WIDTH; }

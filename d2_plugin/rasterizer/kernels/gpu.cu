@@ -22,7 +22,8 @@ constexpr unsigned ALL_LANES = 0xffffffffu;
 constexpr int CHANNELS = D2_CHANNELS;
 constexpr int MOMENTS = 7;                 // of struct Moments
 constexpr int VALUES = MOMENTS + CHANNELS; // per (Gaussian, tile) in the backward pass
-constexpr int STATISTICS = 4;              // weight, error, hits, max_weight
+constexpr int STATISTICS = 4;              // weight, error, hits, max_weight; with a near edge also front
+constexpr int MAX_WEIGHT = 3;              // which of them is a maximum
 constexpr int GATHERERS = 8;               // lanes that add up the tiles of one Gaussian
 
 // A projected Gaussian; 16 numbers, RECORD of native.py.
@@ -44,8 +45,8 @@ struct Frame {
 
   const float *T_camera_world, *K;  // [4, 4], [3, 3]
   const float *means, *covariances, *opacities, *colors, *screen_offsets, *background;
-  const float* prior_depth;  // 0 or less, or not finite: not verified
-  const unsigned char* verified;
+  const float *prior_depth, *reliability;  // a pixel counts where both are finite and positive
+  const float* near_edge;                  // of the free space; null: there is none
 
   Record* records;       // [M]
   int* tile_counts;      // [M] tiles of a Gaussian
@@ -55,12 +56,12 @@ struct Frame {
   int *slot_tiles, *slot_ids;             // [P] by slot
   const int *ids, *slots, *tile_starts;   // [P], [P], [tiles + 1]
 
-  float *color, *depth_sum, *alpha;
-  const float *grad_color, *grad_depth_sum, *grad_alpha;
-  float* values;  // [P, VALUES] by slot, or [P, STATISTICS]; zero before
+  float *color, *depth_sum, *alpha, *front;
+  const float *grad_color, *grad_depth_sum, *grad_alpha, *grad_front;
+  float* values;  // [P, VALUES] by slot, or [P, STATISTICS (+ 1)]; zero before
   float* moments;  // [M, MOMENTS]
   float *grad_means, *grad_covariances, *grad_opacities, *grad_colors, *grad_screen_offsets;
-  float *weight, *error, *max_weight;
+  float *weight, *error, *max_weight, *front_weight;
   int* hits;
 };
 static_assert(sizeof(Frame) == D2_FRAME_SIZE, "Frame differs between cuda.py and gpu.cu");
@@ -240,17 +241,25 @@ D2_DEVICE Visit visit(const Footprint<float>& g, const Pixel& p, float& transmit
   return v;
 }
 
+// The free space at the pixel of this thread; none without a near edge and outside of the image.
+template <bool FRONT>
+D2_DEVICE FreeSpace<float> space_at(const Frame& f, const Pixel& p) {
+  return free_space(FRONT && p.inside ? f.near_edge[p.index] : 0.f);
+}
+
 D2_DEVICE bool any_open(float transmittance) { return __any_sync(ALL_LANES, transmittance > 0.f); }
 
 // ---------------------------------------------------------------------------------------------------- forward
 
-D2_KERNEL d2_render(const Frame f) {
+template <bool FRONT>
+D2_DEVICE void render(const Frame& f) {
   using Gaussians = Batch<THREADS, true>;
   __shared__ Gaussians batch;
   const Pixel p = pixel_of_thread(f);
   const float log2_alpha_min = log2(f.constants.alpha_min);
   const int end = f.tile_starts[blockIdx.x + 1];
-  float transmittance = p.inside ? 1.f : 0.f, depth_sum = 0.f, color[CHANNELS];
+  const FreeSpace<float> space = space_at<FRONT>(f, p);
+  float transmittance = p.inside ? 1.f : 0.f, depth_sum = 0.f, front = 0.f, color[CHANNELS];
   for (int c = 0; c < CHANNELS; c++) color[c] = 0.f;
 
   for (int first = f.tile_starts[blockIdx.x]; first < end; first += THREADS) {
@@ -264,6 +273,7 @@ D2_KERNEL d2_render(const Frame f) {
         const Footprint<float> g = batch.footprint(j);
         const Visit v = visit(g, p, transmittance, log2_alpha_min, f.constants);
         depth_sum = fma(v.step.weight, g.depth, depth_sum);
+        if (FRONT) front = fma(v.step.weight, before_edge(space.near, g.depth), front);
         for (int c = 0; c < CHANNELS; c++) color[c] = fma(v.step.weight, batch.color_of(f, j, c), color[c]);
         if (!any_open(transmittance)) break;
       }
@@ -273,9 +283,13 @@ D2_KERNEL d2_render(const Frame f) {
   transmittance = fabsf(transmittance);
   f.alpha[p.index] = 1.f - transmittance;
   f.depth_sum[p.index] = depth_sum;
+  if (FRONT) f.front[p.index] = front * space.scale;
   for (int c = 0; c < CHANNELS; c++)
     f.color[p.index * CHANNELS + c] = f.background ? fma(transmittance, f.background[c], color[c]) : color[c];
 }
+
+D2_KERNEL d2_render(const Frame f) { render<false>(f); }
+D2_KERNEL d2_render_front(const Frame f) { render<true>(f); }
 
 // ---------------------------------------------------------------------------------------------------- sums
 
@@ -383,7 +397,12 @@ struct Add {
 constexpr int FIRST_COLORS = CHANNELS < WARP - MOMENTS ? CHANNELS : WARP - MOMENTS;
 constexpr int BACKWARD_BATCH = MOMENTS + FIRST_COLORS <= 16 ? 64 : 32;  // what shared memory holds
 
-D2_KERNEL d2_backward(const Frame f) {
+// Where nobody contributes nothing comes back: a loss that divides by alpha sends NaN there, which 0 times a weight would
+// not silence.
+D2_DEVICE bool receives(const Frame& f, const Pixel& p) { return p.inside && f.alpha[p.index] > 0.f; }
+
+template <bool FRONT>
+D2_DEVICE void backward(const Frame& f) {
   constexpr int N = MOMENTS + FIRST_COLORS;
   __shared__ Batch<BACKWARD_BATCH, true> batch;
   __shared__ Shares<BACKWARD_BATCH, N> shares;
@@ -391,13 +410,21 @@ D2_KERNEL d2_backward(const Frame f) {
   const float log2_alpha_min = log2(f.constants.alpha_min), log2_alpha_max = log2(f.constants.alpha_max);
   float transmittance = p.inside ? 1.f : 0.f;
 
-  // dL/d of alpha (with the background's share), depth sum and colors; `behind` starts as the sum of w dL/dw.
+  // dL/d of alpha (with the background's share), depth sum and colors; `space` is scaled by that of the front;
+  // `behind` starts as the sum of w dL/dw.
   float on_alpha = 0.f, on_depth = 0.f, behind = 0.f, on_color[CHANNELS];
   for (int c = 0; c < CHANNELS; c++) on_color[c] = 0.f;
-  if (p.inside) {
+  FreeSpace<float> space = {0.f, 0.f};
+  if (receives(f, p)) {
     on_alpha = f.grad_alpha ? f.grad_alpha[p.index] : 0.f;
     on_depth = f.grad_depth_sum ? f.grad_depth_sum[p.index] : 0.f;
     behind = fma(on_alpha, f.alpha[p.index], on_depth * f.depth_sum[p.index]);
+    if (FRONT) {
+      space = space_at<FRONT>(f, p);
+      const float on_front = space.scale > 0.f ? f.grad_front[p.index] : 0.f;
+      space.scale *= on_front;
+      behind = fma(on_front, f.front[p.index], behind);
+    }
     for (int c = 0; c < CHANNELS; c++) {
       on_color[c] = f.grad_color ? f.grad_color[p.index * CHANNELS + c] : 0.f;
       // The image holds (1 - A) background, which is part of the dependence on alpha and not of the sum over Gaussians.
@@ -412,19 +439,26 @@ D2_KERNEL d2_backward(const Frame f) {
     const Visit v = visit(g, p, transmittance, log2_alpha_min, f.constants);
     const float weight = v.step.weight;
     if (!__any_sync(ALL_LANES, weight > 0.f)) return false;
-    float value = fma(on_depth, g.depth, on_alpha);
+    float value = fma(on_depth, g.depth, on_alpha), on_z = on_depth;
+    if (FRONT) {
+      value = value + in_front(space, g.depth);
+      on_z = on_depth - in_front_gradient(space, g.depth);
+    }
     for (int c = 0; c < CHANNELS; c++) value = fma(on_color[c], batch.color_of(f, j, c), value);
     behind = fnma(weight, value, behind);
     const float on_log_alpha =
         log_alpha_gradient(v.step, v.fragment.log2_alpha, v.transmittance, value, behind, log2_alpha_max);
     const float gu = on_log_alpha * v.fragment.u, gv = on_log_alpha * v.fragment.v;
-    float sums[N] = {on_log_alpha, gu, gv, gu * v.fragment.u, gu * v.fragment.v, gv * v.fragment.v, weight * on_depth};
+    float sums[N] = {on_log_alpha, gu, gv, gu * v.fragment.u, gu * v.fragment.v, gv * v.fragment.v, weight * on_z};
     for (int c = 0; c < FIRST_COLORS; c++) sums[MOMENTS + c] = weight * on_color[c];
     shares.add(j, sums);
     return true;
   };
   gather_tile(f, p, batch, shares, transmittance, VALUES, 0, contribute, Add());
 }
+
+D2_KERNEL d2_backward(const Frame f) { backward<false>(f); }
+D2_KERNEL d2_backward_front(const Frame f) { backward<true>(f); }
 
 // Gradients of the colors from FIRST_COLORS on.
 D2_KERNEL d2_backward_colors(const Frame f) {
@@ -437,7 +471,7 @@ D2_KERNEL d2_backward_colors(const Frame f) {
   float on_color[WARP];
 #pragma unroll
   for (int c = 0; c < WARP; c++)
-    on_color[c] = p.inside && f.grad_color && first + c < CHANNELS ? f.grad_color[p.index * CHANNELS + first + c] : 0.f;
+    on_color[c] = f.grad_color && first + c < CHANNELS && receives(f, p) ? f.grad_color[p.index * CHANNELS + first + c] : 0.f;
 
   const auto contribute = [&](int j) {
     const Visit v = visit(batch.footprint(j), p, transmittance, log2_alpha_min, f.constants);
@@ -511,21 +545,26 @@ D2_KERNEL d2_project_backward(const Frame f) {
 
 // ---------------------------------------------------------------------------------------------------- survey
 
-struct AddOrLargest {  // the last of the statistics is a maximum
+struct AddOrLargest {
   D2_DEVICE float operator()(int k, float total, float share) const {
-    return k == STATISTICS - 1 ? max(total, share) : total + share;
+    return k == MAX_WEIGHT ? max(total, share) : total + share;
   }
 };
 
-D2_KERNEL d2_survey(const Frame f) {
+template <bool FRONT>
+D2_DEVICE void survey(const Frame& f) {
+  constexpr int N = STATISTICS + FRONT, SUMS = FRONT ? 4 : 2;
   __shared__ Batch<128, false> batch;
-  __shared__ Shares<128, STATISTICS> shares;
+  __shared__ Shares<128, N> shares;
   const Pixel p = pixel_of_thread(f);
   const float log2_alpha_min = log2(f.constants.alpha_min);
   float transmittance = p.inside ? 1.f : 0.f, depth_sum = 0.f;
-  const float truth = p.inside && f.verified[p.index] ? f.prior_depth[p.index] : 0.f;
-  const bool verified = truth > 0.f && truth - truth == 0.f;
-  const float scale = verified ? 1.f / (truth + f.eps) : 0.f, scaled_truth = verified ? truth * scale : 0.f;
+  const float truth = p.inside ? f.prior_depth[p.index] : 0.f;
+  float reliability = p.inside ? f.reliability[p.index] : 0.f;
+  const bool counts = truth > 0.f && reliability > 0.f && (truth + reliability) * 0.f == 0.f;
+  reliability = where(counts, reliability);
+  const float scale = where(counts, 1.f / (truth + f.eps) * reliability), scaled_truth = where(counts, truth * scale);
+  const FreeSpace<float> space = space_at<FRONT>(f, p);
 
   const auto contribute = [&](int j) {
     const Footprint<float> g = batch.footprint(j);
@@ -533,33 +572,40 @@ D2_KERNEL d2_survey(const Frame f) {
     if (!__any_sync(ALL_LANES, weight > 0.f)) return false;
     depth_sum = fma(weight, g.depth, depth_sum);
     const float error = fabsf(fma(g.depth, scale, -scaled_truth));
-    const float sums[2] = {verified ? weight : 0.f, weight * error};
-    const float total = warp_sums(sums);  // weight in the lower half of the lanes, error in the upper
-    const int hits = __popc(__ballot_sync(ALL_LANES, verified && weight > 0.f));
+    float sums[SUMS] = {weight * reliability, weight * error};
+    if constexpr (FRONT) sums[2] = weight * in_front(space, g.depth), sums[3] = 0.f;
+    const float total = warp_sums(sums);  // value k in the k-th of SUMS groups of lanes
+    const int hits = __popc(__ballot_sync(ALL_LANES, counts && weight > 0.f));
     float largest = weight;
     for (int distance = WARP / 2; distance > 0; distance /= 2)
       largest = max(largest, __shfl_xor_sync(ALL_LANES, largest, distance));
     float* share = shares.value[warp_index()][j];
     if (lane_index() == 0) share[0] = total, share[2] = float(hits), share[3] = largest;
-    if (lane_index() == WARP / 2) share[1] = total;
+    if (lane_index() == WARP / SUMS) share[1] = total;
+    if (FRONT && lane_index() == 2 * WARP / SUMS) share[STATISTICS] = total;
     return true;
   };
-  gather_tile(f, p, batch, shares, transmittance, STATISTICS, 0, contribute, AddOrLargest());
+  gather_tile(f, p, batch, shares, transmittance, N, 0, contribute, AddOrLargest());
 
   if (!p.inside) return;
   f.alpha[p.index] = 1.f - fabsf(transmittance);
   f.depth_sum[p.index] = depth_sum;
 }
 
-// Adds up the tiles of a Gaussian: weight, error, hits, max_weight.
+D2_KERNEL d2_survey(const Frame f) { survey<false>(f); }
+D2_KERNEL d2_survey_front(const Frame f) { survey<true>(f); }
+
+// Adds up the tiles of a Gaussian: weight, error, hits, max_weight, front_weight.
 D2_KERNEL d2_gather_survey(const Frame f) {
   const Slots s = slots_of_thread(f);
-  const float weight = slot_sum(f, s, STATISTICS, 0), error = slot_sum(f, s, STATISTICS, 1);
+  const int row = STATISTICS + (f.near_edge ? 1 : 0);
+  const float weight = slot_sum(f, s, row, 0), error = slot_sum(f, s, row, 1);
+  const float front = f.near_edge ? slot_sum(f, s, row, STATISTICS) : 0.f;
   int hits = 0;
   float largest = 0.f;
   for (int slot = s.begin + int(threadIdx.x) % GATHERERS; slot < s.end; slot += GATHERERS) {
-    hits += int(f.values[(long long)slot * STATISTICS + 2]);
-    largest = max(largest, f.values[(long long)slot * STATISTICS + 3]);
+    hits += int(f.values[(long long)slot * row + 2]);
+    largest = max(largest, f.values[(long long)slot * row + MAX_WEIGHT]);
   }
   for (int distance = GATHERERS / 2; distance > 0; distance /= 2) {
     hits += __shfl_xor_sync(ALL_LANES, hits, distance);
@@ -567,7 +613,7 @@ D2_KERNEL d2_gather_survey(const Frame f) {
   }
   if (s.rank >= f.count || threadIdx.x % GATHERERS) return;
   const int id = f.by_depth[s.rank];
-  f.weight[id] = weight, f.error[id] = error, f.max_weight[id] = largest, f.hits[id] = hits;
+  f.weight[id] = weight, f.error[id] = error, f.max_weight[id] = largest, f.front_weight[id] = front, f.hits[id] = hits;
 }
 
 }  // namespace d2

@@ -77,7 +77,7 @@ struct Reach {
 template <class S>
 struct Moments {
   S g, gu, gv, guu, guv, gvv;
-  S depth;  // sum of w dL/d(depth sum)
+  S depth;  // sum of w dL/dz at that pixel: of the depth sum, less that of the free space in front
 };
 
 // Intermediate values of the projection that forward and backward share.
@@ -253,6 +253,37 @@ D2_FN S along_u(const Footprint<float>& f, S dx, S dy) {
 template <class S>
 D2_FN S along_v(const Footprint<float>& f, S dy) {
   return S(f.vy) * dy;
+}
+
+// The space that the depth prior says is free at a pixel: nearer than `near`, the near edge D_near of what the prior
+// allows. `scale` is 1 / D_near, or dL/d(front) / D_near. Both are 0 where nothing is known.
+template <class S>
+struct FreeSpace {
+  S near, scale;
+};
+
+// `near` may be anything, NaN included; below LEAST_EDGE it has no finite inverse to rely on.
+constexpr float LEAST_EDGE = 1e-30f;  // of reference.py, too
+template <class S>
+D2_FN FreeSpace<S> free_space(S near) {
+  const auto known = (near > S(LEAST_EDGE)) & (near * S(0.f) >= S(0.f));
+  return {where(known, near), where(known, S(1.f) / near)};
+}
+
+// max(0, D_near - z), and max(0, 1 - z / D_near) from it: by the difference both are exactly 0 at the edge.
+template <class S>
+D2_FN S before_edge(S near, S depth) {
+  return max(near - depth, S(0.f));
+}
+template <class S>
+D2_FN S in_front(const FreeSpace<S>& space, S depth) {
+  return before_edge(space.near, depth) * space.scale;
+}
+
+// The same differentiated by -z; 0 at the edge.
+template <class S>
+D2_FN S in_front_gradient(const FreeSpace<S>& space, S depth) {
+  return where(space.near > depth, space.scale);
 }
 
 // One step of front-to-back compositing. A finished pixel carries its transmittance negated (or 0: the CPU's choice).

@@ -133,7 +133,7 @@ def passes_of(render: RenderScene, scene: Scene, device: torch.device) -> dict[s
             return render(fixed, leaves[3], scene)
 
     def forward_backward() -> object:
-        return torch.autograd.grad(tuple(render(splats, leaves[3], scene)), leaves, weights)
+        return torch.autograd.grad(render(splats, leaves[3], scene)[:3], leaves, weights)
 
     passes = {"forward": forward, "forward+backward": forward_backward}
     if render is _d2:
@@ -201,12 +201,13 @@ def error_of(render: RenderScene, scene: Scene, device: torch.device, truth: Tru
     """
     leaves = leaves_of(scene, device, torch.float32)
     found = render(splats_of(leaves), leaves[3], scene)
-    deviations = [(part.detach().cpu().double() - true.detach()).abs() for part, true in zip(found, truth.render)]
+    pairs = zip(found[:3], truth.render[:3])
+    deviations = [(part.detach().cpu().double() - true.detach()).abs() for part, true in pairs]
     apart = (deviations[0].amax(-1) > THRESHOLD_DEVIATION) | (deviations[2] > THRESHOLD_DEVIATION)
     kept = (~apart[..., None], ~apart, ~apart)
     weights = [torch.where(keep, w.cpu(), 0) for keep, w in zip(kept, upstream(scene, scene.means))]
-    gradients = torch.autograd.grad(tuple(found), leaves, [w.to(device) for w in weights])
-    expected = torch.autograd.grad(tuple(truth.render), truth.leaves, [w.double() for w in weights], retain_graph=True)
+    gradients = torch.autograd.grad(found[:3], leaves, [w.to(device) for w in weights])
+    expected = torch.autograd.grad(truth.render[:3], truth.leaves, [w.double() for w in weights], retain_graph=True)
     errors = {
         name: {**_quantiles(deviation), "over_1e-4": (deviation > 1e-4).double().mean().item()}
         for name, deviation in zip(Render._fields, deviations)

@@ -1,0 +1,292 @@
+"""What the rasterizer knows of the prior: the weight in space that must be free, and how much each pixel counts.
+
+front(p) = sum_i w_i max(0, 1 - z_i / D_near(p)); the paths are held against the definition and against each other.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from splat_scenes import (
+    Scene,
+    brute_force,
+    brute_force_front,
+    near_edge_of,
+    near_threshold,
+    random_scene,
+    single,
+)
+from torch.autograd import gradcheck
+
+from d2_plugin.errors import D2Error
+from d2_plugin.protocol import Label
+from d2_plugin.rasterizer import DepthPrior, Splats, rasterize, survey
+
+both_paths = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+
+
+def everywhere(scene: Scene, value: float) -> torch.Tensor:
+    return torch.full((scene.view.height, scene.view.width), value, dtype=torch.float64)
+
+
+def stack(*layers: Scene) -> Scene:
+    return Scene(*(torch.cat(parts) for parts in zip(*(layer[:4] for layer in layers))), layers[0].view)
+
+
+def prior_with(scene: Scene, label: Label = Label.VERIFIED, depth: float = 3.0, **maps: torch.Tensor) -> DepthPrior:
+    size = (scene.view.height, scene.view.width)
+    return DepthPrior(torch.full(size, depth), torch.full(size, label, dtype=torch.uint8), **maps)
+
+
+# ---------------------------------------------------------------- the definition
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_front_is_the_sum_of_the_definition(seed):
+    scene = random_scene(seed, 150, 37, 41)
+    edge = near_edge_of(scene.view, seed)
+    expected = brute_force_front(brute_force(scene), edge)
+    np.testing.assert_allclose(scene.render(near_edge=edge).front.numpy(), expected.sum(0), atol=1e-12)
+    prior = prior_with(scene)
+    front = survey(scene.splats, scene.view, prior, near_edge=edge).front
+    np.testing.assert_allclose(front.numpy(), expected.sum((1, 2)), atol=1e-11)
+    assert expected.sum() > 1, "some stand in free space"
+
+
+def test_front_of_one_gaussian_falls_linearly_with_its_depth_to_nothing_at_the_edge():
+    for depth, share in ((1.0, 0.75), (2.0, 0.5), (4.0, 0.0), (5.0, 0.0)):
+        scene = single(depth=depth, opacity=0.5)
+        front = scene.render(near_edge=everywhere(scene, 4.0)).front
+        assert front[7, 7].item() == pytest.approx(0.5 * share, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_gradients_of_front_are_exact(seed):
+    scene = random_scene(seed, 5, 7, 5, channels=1, radius=3.0).requires_grad()
+    edge = 0.5 + 6 * torch.rand(5, 7, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+    def front(means, covariances, opacities):
+        return rasterize(
+            Splats(means, covariances, opacities, torch.arange(5)), scene.colors, scene.view, near_edge=edge
+        ).front
+
+    assert gradcheck(front, scene[:3], fast_mode=seed >= 5), f"seed {seed}"
+
+
+@both_paths
+def test_a_gradient_of_front_pushes_behind_the_edge_and_fades(dtype):
+    scene = single(depth=2.0, opacity=0.5, dtype=dtype).requires_grad()
+    front = scene.render(near_edge=everywhere(scene, 4.0)).front.sum()
+    on_means, on_opacities = torch.autograd.grad(front, (scene.means, scene.opacities))
+    assert on_means[0, 2] < 0, "farther is better"
+    assert on_opacities[0] > 0, "fainter is better"
+
+
+# ---------------------------------------------------------------- the edge itself
+
+
+@both_paths
+@pytest.mark.parametrize("depth", [0.3, 3.7, 1e3])
+def test_at_the_edge_front_and_its_gradients_are_exactly_zero(dtype, depth):
+    """Also where 1 / D_near is not exact: 1 - z / D_near by a multiplication would leave a rounding error."""
+    scene = single(depth=depth, opacity=0.5, variance=0.01 * depth**2, dtype=dtype).requires_grad()
+    front = scene.render(near_edge=everywhere(scene, scene.means[0, 2].item())).front
+    assert not front.any()
+    assert not any(part.any() for part in torch.autograd.grad(front.sum(), scene[:3]))
+
+
+@both_paths
+def test_a_hair_before_the_edge_front_keeps_its_digits(dtype):
+    scene = single(depth=4.0, opacity=0.5, dtype=dtype)
+    edge = np.nextafter(np.float32(4), np.float32(5))
+    front = scene.render(near_edge=everywhere(scene, float(edge))).front[7, 7].item()
+    assert front == pytest.approx(0.5 * (float(edge) - 4) / float(edge), rel=1e-5)
+
+
+# ---------------------------------------------------------------- stiff cases
+
+
+@both_paths
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, -math.inf, 1e-40, 1e-30])
+def test_where_nothing_is_known_front_is_zero_without_gradient(dtype, value):
+    scene = random_scene(3, 40, 20, 20).to(dtype).requires_grad()
+    edge = everywhere(scene, value)
+    render = scene.render(near_edge=edge)
+    assert render.front.shape == (20, 20)
+    assert not render.front.any()
+    assert not any(part.any() for part in torch.autograd.grad(render.front.sum(), scene[:3]))
+    assert not survey(scene.to(dtype).splats, scene.view, prior_with(scene), near_edge=edge).front.any()
+
+
+@both_paths
+def test_a_loss_that_sends_nan_where_nothing_is_known_spoils_no_gradient(dtype):
+    scene = random_scene(3, 40, 20, 20).to(dtype).requires_grad()
+    edge = near_edge_of(scene.view)
+    known = edge.isfinite() & (edge > 1e-30)
+    front = scene.render(near_edge=edge).front
+    (front / known.to(front))[known].sum().backward()
+    for part in scene[:3]:
+        assert part.grad.isfinite().all()
+        assert part.grad.any()
+
+
+@both_paths
+def test_edges_of_nine_decades_in_one_picture(dtype):
+    scene = random_scene(4, 200, 40, 30).to(dtype).requires_grad()
+    edge = everywhere(scene, 1e-3)
+    edge[:, 20:] = 1e6
+    render = scene.render(near_edge=edge)
+    assert not render.front[:, :20].any(), "nothing is nearer than a millimetre"
+    torch.testing.assert_close(render.front[:, 20:], render.alpha[:, 20:], atol=1e-5, rtol=0)
+    for part in torch.autograd.grad(render.front.sum(), scene[:3]):
+        assert part.isfinite().all()
+
+
+@both_paths
+def test_of_opaque_layers_only_the_seen_ones_are_in_front(dtype):
+    layers = [single(depth=1 + 0.01 * i, opacity=0.8, variance=1e4, dtype=dtype) for i in range(50)]
+    scene = stack(*layers).requires_grad()
+    edge = everywhere(scene, 2.0)
+    render = scene.render(near_edge=edge)
+    expected = sum(0.8 * 0.2**i * (1 - (1 + 0.01 * i) / 2) for i in range(5))
+    assert render.front[7, 7].item() == pytest.approx(expected, abs=1e-5)
+    gradients = torch.autograd.grad(render.front.sum(), scene[:3])
+    assert all((part[5:] == 0).all() for part in gradients)
+    assert not survey(scene.to(dtype).splats, scene.view, prior_with(scene), near_edge=edge).front[5:].any()
+
+
+@both_paths
+@pytest.mark.parametrize("factor", [1 - 1e-5, 1 + 1e-5])
+def test_the_smallest_alpha_is_cut_in_front_as_in_the_image(dtype, factor):
+    scene = single(opacity=factor / 255, variance=0.05, dtype=dtype)
+    render = scene.render(near_edge=everywhere(scene, 8.0))
+    torch.testing.assert_close(render.front, render.alpha / 2)
+    assert (render.front > 0).sum().item() == (factor > 1)
+
+
+@both_paths
+def test_no_gradient_of_front_flows_through_a_clamped_alpha_but_the_depth_has_one(dtype):
+    scene = single(opacity=1.0, variance=1e6, size=5, dtype=dtype).requires_grad()
+    front = scene.render(near_edge=everywhere(scene, 8.0)).front
+    on_means, on_opacities = torch.autograd.grad(front.sum(), (scene.means, scene.opacities))
+    assert not on_opacities.any()
+    assert on_means[0, 2].item() == pytest.approx(-25 * 0.99 / 8, rel=1e-4)
+
+
+@both_paths
+def test_without_gaussians_front_is_zero(dtype):
+    scene = Scene(*(part[:0].to(dtype) for part in random_scene(0, 3, 9, 8)[:4]), random_scene(0, 3, 9, 8).view)
+    edge = everywhere(scene, 2.0)
+    assert torch.equal(scene.render(near_edge=edge).front, torch.zeros(8, 9, dtype=dtype))
+    assert survey(scene.splats, scene.view, prior_with(scene), near_edge=edge).front.shape == (0,)
+
+
+# ---------------------------------------------------------------- what it must not change
+
+
+@both_paths
+def test_a_near_edge_changes_no_bit_of_anything_else(dtype):
+    scene = random_scene(6, 300, 61, 47).to(dtype)
+    results = []
+    for edge in (None, near_edge_of(scene.view)):
+        leaves = scene.requires_grad()
+        render = leaves.render(near_edge=edge)
+        assert (render.front is None) == (edge is None)
+        gradients = torch.autograd.grad(render.color.sum() + render.depth_sum.sin().sum(), leaves[:4])
+        statistics = survey(scene.splats, scene.view, prior_with(scene), near_edge=edge)
+        results.append([*render[:3], *gradients, *statistics[:6]])
+    assert all(torch.equal(part, other) for part, other in zip(*results))
+
+
+def test_both_paths_agree_about_the_survey_in_front():
+    scene = random_scene(7, 200, 50, 40)
+    edge = near_edge_of(scene.view)
+    edge[torch.from_numpy(near_threshold(brute_force(scene)))] = 0
+    fast, exact = (
+        survey(s.splats, s.view, prior_with(s), near_edge=edge).front for s in (scene.to(torch.float32), scene)
+    )
+    assert (fast.double() - exact).norm() < 1e-5 * exact.norm()
+
+
+def test_maps_that_do_not_fit_are_named():
+    scene = single()
+    with pytest.raises(D2Error, match=r"near_edge has shape \(15, 14\), expected \(15, 15\)"):
+        scene.render(near_edge=torch.ones(15, 14))
+    with pytest.raises(D2Error, match="near_edge is torch.int64, expected floating-point depths"):
+        survey(scene.splats, scene.view, prior_with(scene), near_edge=torch.ones(15, 15, dtype=torch.int64))
+    with pytest.raises(D2Error, match=r"reliability \(3, 3\) but the view is \(15, 15\): resample it"):
+        survey(scene.splats, scene.view, prior_with(scene, reliability=torch.ones(3, 3)))
+
+
+# ---------------------------------------------------------------- reliability
+
+
+def test_the_survey_weighs_by_reliability_as_defined():
+    scene = random_scene(3, 120, 36, 34)
+    random = np.random.default_rng(0)
+    depth = torch.from_numpy(random.uniform(0.5, 6, (34, 36)))
+    depth[0, :3] = torch.tensor([0.0, torch.nan, -1.0])
+    r = torch.from_numpy(random.uniform(0, 1, (34, 36)))
+    r[1, :5] = torch.tensor([0.0, torch.nan, torch.inf, -1.0, 1.0])
+    labels = torch.from_numpy(random.integers(0, len(Label), (34, 36)).astype(np.uint8))
+    statistics = survey(scene.splats, scene.view, DepthPrior(depth, labels, reliability=r), eps=1e-3)
+
+    found = brute_force(scene)
+    counts = np.isfinite(r.numpy()) & (np.nan_to_num(r.numpy()) > 0) & (np.nan_to_num(depth.numpy()) > 0)
+    counts &= labels.numpy() != Label.FAR
+    w = found.weights * np.where(counts, r.numpy(), 0)
+    safe = np.where(counts, depth.numpy(), 1)
+    error = np.abs(found.depths[:, None, None] - safe) / (safe + 1e-3)
+    np.testing.assert_allclose(statistics.weight.numpy(), w.sum((1, 2)), atol=1e-12)
+    np.testing.assert_allclose(statistics.error.numpy(), (w * error).sum((1, 2)), atol=1e-11)
+    np.testing.assert_array_equal(statistics.hits.numpy(), (w > 0).sum((1, 2)))
+    np.testing.assert_allclose(statistics.max_weight.numpy(), found.weights.max((1, 2)), atol=1e-12)
+
+
+@both_paths
+def test_without_a_map_reliability_is_one_where_the_prior_is_trusted(dtype):
+    scene = random_scene(3, 120, 36, 34).to(dtype)
+    g = torch.Generator().manual_seed(0)
+    labels = torch.randint(0, len(Label), (34, 36), generator=g, dtype=torch.uint8)
+    prior = DepthPrior(1 + 4 * torch.rand(34, 36, generator=g), labels)
+    stated = prior._replace(reliability=prior.trusted.float())
+    one, two = (survey(scene.splats, scene.view, which) for which in (prior, stated))
+    assert all(torch.equal(part, other) for part, other in zip(one, two))
+    half = survey(scene.splats, scene.view, prior._replace(reliability=0.5 * prior.trusted))
+    for name in ("weight", "error"):
+        torch.testing.assert_close(2 * getattr(half, name), getattr(one, name))
+    assert torch.equal(half.hits, one.hits)
+
+
+@both_paths
+def test_far_pixels_judge_no_depth_but_what_stands_in_front_of_them(dtype):
+    scene = single(depth=4.0, opacity=0.5, dtype=dtype)
+    prior = prior_with(scene, Label.FAR, depth=100.0, reliability=torch.ones(15, 15))
+    statistics = survey(scene.splats, scene.view, prior, near_edge=prior.near_edge(3.0))
+    assert statistics.weight.item() == statistics.error.item() == statistics.hits.item() == 0
+    assert statistics.front.item() == pytest.approx(0.96 * scene.render().alpha.sum().item(), rel=1e-5)
+
+
+# ---------------------------------------------------------------- the near edge of a prior
+
+
+def test_near_edge_of_a_prior_is_k_sigmas_before_its_depth():
+    sigma = torch.tensor([[0.0, 0.1, 0.5, math.inf, math.nan, -0.1, 0.1, 0.1, 0.1]])
+    depth = torch.tensor([[2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 0.0, math.nan, math.inf]])
+    prior = DepthPrior(depth, torch.full((1, 9), Label.MONO, dtype=torch.uint8), sigma=sigma)
+    torch.testing.assert_close(prior.near_edge(3.0), torch.tensor([[2.0, 1.4, 0, 0, 0, 0, 0, 0, 0]]))
+
+
+def test_near_edge_of_far_pixels_is_their_depth_whatever_sigma_says():
+    prior = DepthPrior(torch.tensor([[50.0, 0.0]]), torch.full((1, 2), Label.FAR, dtype=torch.uint8))
+    for sigma in (None, torch.tensor([[math.inf, 0.1]]), torch.tensor([[0.3, math.nan]])):
+        assert prior._replace(sigma=sigma).near_edge(2.0).tolist() == [[50.0, 0.0]]
+
+
+def test_near_edge_without_sigma_is_the_depth_of_trusted_pixels():
+    prior = DepthPrior(torch.full((1, len(Label)), 2.0), torch.arange(len(Label), dtype=torch.uint8)[None])
+    expected = [2.0 if label in (Label.VERIFIED, Label.AGREED, Label.FAR) else 0.0 for label in Label]
+    assert prior.near_edge(3.0).tolist() == [expected]
