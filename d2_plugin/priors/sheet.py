@@ -20,6 +20,7 @@ LABEL_COLORS = {
     Label.VERIFIED: (80, 190, 90),
     Label.CONFLICT: (210, 70, 60),
     Label.AGREED: (60, 190, 200),
+    Label.FAR: (170, 150, 210),
 }
 """RGB of each label in the sheet."""
 
@@ -76,7 +77,7 @@ def depth_colors(depth: np.ndarray) -> np.ndarray:
 
 
 def label_colors(labels: np.ndarray) -> np.ndarray:
-    """RGB uint8 [H, W, 3]: grey empty, blue mono-only, green verified, red conflict, cyan agreed."""
+    """RGB uint8 [H, W, 3]: grey empty, blue mono-only, green verified, red conflict, cyan agreed, lilac far."""
     palette = np.array([LABEL_COLORS[label] for label in Label], np.uint8)
     return palette[labels]
 
