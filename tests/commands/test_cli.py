@@ -314,9 +314,9 @@ class TestMistakes:
         config.write_text("[prune]\ntau_pp = 0.5\n")
         message = refused(capsys, train(capture, tmp_path / "x", "--config", str(config)))
         assert "unknown setting of prune 'tau_pp'" in message
-        config.write_text("[plan]\nstereo = false\n")
+        config.write_text("[plan]\nverification = false\n")
         message = refused(capsys, train(capture, tmp_path / "x", "--config", str(config)))
-        assert "unknown decision of plan 'stereo': have temporal" in message
+        assert "'verification': have stereo, temporal" in message
         config.write_text("[backbone]\nsh_degre = 1\n")
         message = refused(capsys, train(capture, tmp_path / "y", "--hooks", "none", "--config", str(config)))
         assert "did you mean 'sh_degree'?" in message

@@ -19,9 +19,9 @@ def test_settings_come_from_tables_and_unknown_names_are_refused() -> None:
     )
     assert (settings.tau_c, settings.depth_range, settings.stereo.matcher) == (0.2, (1, 9), "sweep")
     assert settings.align.local_scales == ()
-    with pytest.raises(D2Error, match=r"unknown setting in \[priors.stereo\] 'matchers': .* did you mean 'matcher'"):
+    with pytest.raises(D2Error, match="unknown setting of priors.stereo 'matchers': .* did you mean 'matcher'"):
         PriorSettings.from_dict({"stereo": {"matchers": "sweep"}})
-    with pytest.raises(D2Error, match=r"unknown setting in \[priors\] 'tauc': .* did you mean 'tau_c'"):
+    with pytest.raises(D2Error, match="unknown setting of priors 'tauc': .* did you mean 'tau_c'"):
         PriorSettings.from_dict({"tauc": 0.2})
     with pytest.raises(D2Error, match="priors.tau_c must be a number, got 'small'"):
         PriorSettings.from_dict({"tau_c": "small"})
