@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple, Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 
@@ -23,6 +24,7 @@ class Label(IntEnum):
     VERIFIED = 2  # geometric depth confirmed by aligned monocular depth (Omega^v)
     CONFLICT = 3  # the two sources disagree: discarded
     AGREED = 4  # no geometric depth, but aligned monocular depths of two cameras agree: an addition to the paper
+    FAR = 5  # sky and what lies beyond any parallax: the depth is only a lower bound: an addition to the paper
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +84,17 @@ class DepthPrior(NamedTuple):
 
     `colors` [H, W, 3] uint8 are the pixels of the picture the prior was made for: inserted Gaussians start with them,
     and a trainer's camera need not keep its picture in memory.
+
+    `sigma` [H, W] float32 is the relative standard deviation of D*, infinite where nothing is known. `reliability`
+    [H, W] float32 in 0..1, r(p), is how much a pixel counts where depth is judged. None stands for the paper: sigma is
+    0 and r is 1 at trusted pixels; elsewhere sigma is infinite and r is 0. No map holds NaN.
     """
 
     depth: Tensor
     labels: Tensor
     colors: Tensor | None = None
+    sigma: Tensor | None = None
+    reliability: Tensor | None = None
 
     @property
     def verified(self) -> Tensor:
@@ -102,6 +110,21 @@ class DepthPrior(NamedTuple):
     def support(self) -> Tensor:
         """Omega^p: pixels that have a depth at all (trusted or mono-only), bool [H, W]."""
         return self.trusted | (self.labels == Label.MONO)
+
+    @property
+    def far(self) -> Tensor:
+        """Pixels whose depth is only a lower bound, bool [H, W]."""
+        return self.labels == Label.FAR
+
+    def near_edge(self, k: float) -> Tensor:
+        """D_near(p) = D*(p) max(0, 1 - k sigma(p)), [H, W]: the prior says that space nearer than this is free.
+
+        0 where nothing is known: no depth, or no finite sigma. At far pixels it is the depth itself, a lower bound.
+        """
+        sigma = torch.where(self.trusted, 0.0, torch.inf) if self.sigma is None else self.sigma
+        sigma = torch.where(self.far, 0.0, sigma).to(self.depth)
+        known = self.depth.isfinite() & (self.depth > 0) & sigma.isfinite() & (sigma >= 0)
+        return torch.where(known, self.depth * (1 - k * sigma).clamp(min=0), 0.0)
 
 
 class CameraRecord(NamedTuple):
@@ -135,20 +158,23 @@ class Render(NamedTuple):
     color: Tensor  # [H, W, C] sum of w_i c_i (plus the background's share)
     depth_sum: Tensor  # [H, W] sum of w_i z_i, not normalised
     alpha: Tensor  # [H, W] A(p) = sum of w_i
+    front: Tensor | None = None  # [H, W] sum of w_i max(0, 1 - z_i / D_near); None without a near edge
 
 
 class Survey(NamedTuple):
     """Compositing weights of one view, gathered per Gaussian (M rows of the surveyed `Splats`) and per pixel.
 
-    Per Gaussian, with w its weight at a pixel (paper: w_{k,q}), z its view depth, D* the prior:
+    Per Gaussian, with w its weight at a pixel (paper: w_{k,q}), z its view depth, D* the prior, r its reliability (the
+    paper: 1 at trusted pixels, 0 elsewhere), D_near the near edge of what it allows:
     """
 
-    weight: Tensor  # [M] sum of w over verified pixels
-    error: Tensor  # [M] sum of w |z - D*| / (D* + eps) over verified pixels
+    weight: Tensor  # [M] sum of w r
+    error: Tensor  # [M] sum of w r |z - D*| / (D* + eps)
     max_weight: Tensor  # [M] maximum of w over all pixels; 0 where it contributes nowhere
-    hits: Tensor  # [M] int32, number of verified pixels it contributes to
+    hits: Tensor  # [M] int32, number of pixels with r > 0 that it contributes to
     depth_sum: Tensor  # [H, W]
     alpha: Tensor  # [H, W]
+    front: Tensor  # [M] sum of w max(0, 1 - z / D_near): weight where space is free; 0 without a near edge
 
 
 ResizeListener = Callable[[Tensor], None]
