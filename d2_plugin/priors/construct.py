@@ -1,6 +1,7 @@
 """D* of the views of one instant from its two sources: align, correct, verify, fuse, let cameras agree.
 
-A map per pixel that comes to D* is a field of `FusedPrior`: it is made in `_view` here and written by the store.
+A further map per pixel is a field of `FusedPrior` that `Construction._view` fills, and a column of the store's
+`PRIOR_DTYPE` that `PriorStore.write` writes; the colours of the picture go that way.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Sensor maps of planar depth lie beside the pictures as depth/CAMERA/FRAME.npy or .png, with depth/depth.json: {"scale":
 world units per stored number}, or {"unit": "m" | "cm" | "mm"} where the calibration is in metres. 0, NaN and infinity
-are no depth. True depth for evaluation, depth/CAMERA/FRAME.npz, is another thing and never read here. Workspaces are
-read by `d2_plugin.priors.colmap.points.workspace`.
+are no depth. True depth for evaluation (depth/CAMERA/FRAME.npz) is never read here. Workspaces are read by
+`d2_plugin.priors.colmap.workspace`.
 """
 
 from __future__ import annotations

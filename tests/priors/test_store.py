@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.store import DepthRange, PriorStore
+from d2_plugin.priors.store import FORMAT, DepthRange, PriorStore
 from d2_plugin.protocol import Label
 
 SHAPE = (12, 17)
@@ -163,7 +163,7 @@ def test_stores_of_other_captures_formats_and_other_folders_are_refused(store: P
         PriorStore.open(tmp_path / "nowhere")
     described = json.loads((store.path / "store.json").read_text())
     (store.path / "store.json").write_text(json.dumps({**described, "format": 99}))
-    with pytest.raises(D2Error, match="format 99"):
+    with pytest.raises(D2Error, match=f"has format 99 but this version reads format {FORMAT}: build the priors anew"):
         PriorStore.open(store.path)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("do not lose me")

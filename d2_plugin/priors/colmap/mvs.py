@@ -197,7 +197,7 @@ def write_model(folder: Path, cameras: Sequence[Camera]) -> None:
 
 
 def run_patch_match(workspace: Path, seconds: float, command: Sequence[str] | None = None) -> None:
-    """Run COLMAP on a workspace in a process of its own, which it may abort without taking ours along.
+    """Run COLMAP on a workspace in a process of its own: where COLMAP aborts its process, ours goes on.
 
     Args:
         workspace: as `write_workspace` leaves it.
@@ -205,7 +205,7 @@ def run_patch_match(workspace: Path, seconds: float, command: Sequence[str] | No
         command: what to start with the workspace as last argument; the child of this package where None.
 
     Raises:
-        D2Error: it ended with an error or a signal, with its last words, or took too long.
+        D2Error: it ended with an error or a signal, which is quoted, or took too long.
     """
     # -P: the folder of the script has modules of its own that must not stand in for others.
     command = command or [sys.executable, "-P", str(CHILD)]
@@ -235,7 +235,7 @@ def _ending(code: int) -> str:
 
 
 def _last_words(text: str) -> str:
-    """The last line that tells something; glog puts a stack trace (`@ 0x...`) behind what went wrong."""
+    """The last line that says what went wrong; glog prints a stack trace (`@ 0x...`) after it."""
     lines = [line.strip() for line in text.splitlines()]
     telling = [line for line in lines if line and not line.startswith(("@", "***", "terminate called"))]
     return telling[-1][:300] if telling else "without a word"

@@ -8,6 +8,7 @@ matches still count. No other module imports pycolmap into this process.
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import tempfile
 import zipfile
@@ -17,13 +18,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.errors import D2Error, missing_extra
 from d2_plugin.priors.colmap.matching import Features, epipolar_matches, fundamental_matrix, same_spot
+from d2_plugin.settings import Angle, Positive, Range, Settings, Share
 
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue in the grey picture that features are found in (ITU-R BT.601)."""
@@ -31,25 +33,27 @@ LUMA = np.array([0.299, 0.587, 0.114])
 DESCRIPTOR_LENGTH = 128
 """Numbers in a SIFT descriptor."""
 
+PixelError = Annotated[float, Range(0, unit="pixels", open_low=True)]
+
 
 @dataclass(frozen=True)
-class TriangulationSettings:
+class TriangulationSettings(Settings):
     """What counts as a feature, a match and a point."""
 
-    peak_threshold: float = 0.0033
+    peak_threshold: Positive = 0.0033
     """SIFT contrast threshold; half of COLMAP's, since the epipolar test is strict."""
-    max_features: int = 8192
+    max_features: Annotated[int, Range(1)] = 8192
     """Strongest features kept per picture."""
-    max_ratio: float = 0.8
+    max_ratio: Share = 0.8
     """Angle to the best match over angle to the second best (Lowe's ratio test)."""
-    max_angle: float = 0.7
-    """Largest angle between matching descriptors, radians."""
-    epipolar_error: float = 1.0
-    """Largest Sampson distance of a match from the known epipolar geometry, pixels."""
-    reprojection_error: float = 2.0
-    """Largest reprojection error of a point, pixels."""
-    min_angle: float = 0.5
-    """Smallest angle between two rays that meet in a point, degrees."""
+    max_angle: Annotated[float, Range(0, math.pi, unit="radians")] = 0.7
+    """Largest angle between matching descriptors."""
+    epipolar_error: PixelError = 1.0
+    """Largest Sampson distance of a match from the known epipolar geometry."""
+    reprojection_error: PixelError = 2.0
+    """Largest reprojection error of a point."""
+    min_angle: Angle = 0.5
+    """Smallest angle between two rays that meet in a point."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,8 +43,9 @@ class WorkspaceDepth:
         place: path of the workspace; `{frame}` in it stands for the frame number.
         settings: `colmap_geometric` says whether maps of the geometric pass are wanted where there are any.
         cameras: the cameras whose poses are compared.
-        frames: of the capture. Where there are several, a picture is told from others by its frame: a workspace of one
-            instant, as many captures have for their initial points, must not become the depth of all instants.
+        frames: of the capture. Where there are several, a picture serves only the frame that its name tells: a
+            workspace of one instant, as many captures have for their initial points, must not become the depth of all
+            instants.
     """
 
     name: ClassVar[str] = "workspace"

@@ -282,8 +282,10 @@ class _Problem:
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> float:
-    """Inner product on one core: BLAS splits vectors of this length over threads, which wait for each other and for
-    whatever else runs, and takes 20 times as long on a busy machine."""
+    """Inner product on one core: BLAS splits vectors of this length over threads that wait for each other.
+
+    Measured: on a busy machine BLAS takes 20 times as long.
+    """
     return float(np.einsum("i,i->", a, b))
 
 

@@ -10,7 +10,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.settings import Angle, Count, NotNegative, Positive, Range, Seed, Settings, Share
 
 MatcherName = Literal["auto", "sensor", "workspace", "colmap", "patchmatch", "sweep"]
-"""What matches views, or where depth that nobody has to match lies on disk."""
+"""What matches views, or what kind of depth on disk is taken in place of matching."""
 
 Pixels = Annotated[int, Range(0, unit="pixels")]
 Side = Annotated[int, Range(1, unit="pixels")]

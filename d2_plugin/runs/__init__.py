@@ -1,1 +1,0 @@
-"""One run, from a capture to a held-out score."""
