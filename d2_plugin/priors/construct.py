@@ -127,10 +127,12 @@ class Construction:
             return fuse(mono.depth, stereo.depth, tau_c=settings.tau_c, variant=variant, hanging=hanging)
         unknown = np.full_like(stereo.sigma, np.inf)
         alone, at_anchors = (unknown, unknown) if mono.uncertainty is None else mono.uncertainty[:2]
+        # A map that was not aligned has no sigma to verify by: that row of the paper's table keeps its fixed threshold.
+        allowed = settings.conflict_sigmas * np.hypot(at_anchors, stereo.sigma)
         return fuse(
             mono.depth,
             stereo.depth,
-            tau_c=settings.conflict_sigmas * np.hypot(at_anchors, stereo.sigma),
+            tau_c=settings.tau_c if variant == "dual_unaligned" else allowed,
             variant=variant,
             hanging=hanging,
             sigma_mono=alone,

@@ -24,7 +24,8 @@ def test_the_sheet_shows_picture_depth_and_labels_of_every_view(tmp_path: Path) 
         labels = np.full((36, 64), Label.MONO, np.uint8)
         labels[:, 32:] = Label.CONFLICT
         depth = np.where(labels == Label.MONO, capture.depth(camera, 0), 0)
-        prior = FusedPrior(depth, labels, capture.image(camera, 0))
+        sigma = np.where(labels == Label.MONO, 0.05, np.inf).astype(np.float32)
+        prior = FusedPrior(depth, labels, sigma, capture.image(camera, 0))
         record = {"shares": prior.shares(), "refused": "", "monocular": "maps"}
         store.write(camera, 0, prior, record)
     sheet = cv2.imread(str(contact_sheet(store, capture, tmp_path / "out" / "sheet.png", width=64)))[..., ::-1]

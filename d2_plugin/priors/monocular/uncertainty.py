@@ -99,7 +99,7 @@ def measured_skill(aligned: np.ndarray, anchors: np.ndarray, settings: AlignSett
     for hole in left_out_regions(anchors.shape):
         rest = np.where(hole, 0, anchors).astype(np.float32)
         held = hole & (anchors > 0) & (aligned > 0)
-        if held.sum() < 20 or np.count_nonzero(rest) < settings.min_anchors:
+        if held.sum() < 20 or np.count_nonzero(rest) < max(settings.min_anchors, 1):
             continue
         corrected = corrected_depth(aligned, rest, settings)
         error = np.abs(np.log(corrected[held] / anchors[held]))

@@ -40,6 +40,8 @@ def geometric_sigma(
 ) -> np.ndarray:
     """Relative standard deviation of D^g, float32 [H, W]; infinite where there is no depth or no parallax.
 
+    NaN in any of the maps says that nothing is known of the pixel, so its sigma is infinite too.
+
     Args:
         depth: D^g [H, W], 0 where there is none.
         cost: matching cost 1 - NCC [H, W], 0 where it is not known.
@@ -47,10 +49,12 @@ def geometric_sigma(
         parallax: root of the sum over confirming sources of P^2 [H, W], pixels per unit of log depth.
         spread: root mean square relative difference to the depths of the confirming sources [H, W].
     """
-    known = (depth > 0) & (parallax > 0)
+    known = (depth > 0) & (parallax > 0) & np.isfinite(depth) & ~np.isnan(cost) & ~np.isnan(coherence)
+    known &= np.isfinite(spread)
+    cost, coherence, spread = (np.where(known, map_, 0) for map_ in (cost, coherence, spread))
     pixels = MATCHING + PER_COST * np.maximum(cost, 0) + PER_INCOHERENCE * (1 - np.clip(coherence, 0, 1))
     matching = pixels / np.where(known, parallax, 1)
-    scatter = OF_SCATTER * plane_scatter(depth)
+    scatter = OF_SCATTER * plane_scatter(np.where(np.isfinite(depth), depth, 0))
     variance = matching**2 + scatter**2 + (OF_SPREAD * spread) ** 2 + FLOOR**2
     return np.where(known, np.sqrt(variance), np.inf).astype(np.float32)
 
@@ -81,7 +85,7 @@ def plane_scatter(depth: np.ndarray, window: int = WINDOW) -> np.ndarray:
     uu, vv = mean(weight * columns**2) - u * u, mean(weight * rows**2) - v * v
     uv, yy = mean(weight * rows * columns) - u * v, mean(inverse**2) - y * y
     uy, vy = mean(inverse * columns) - u * y, mean(inverse * rows) - v * y
-    uu, vv = uu + 1e-3, vv + 1e-3  # a window of one row or one pixel has no slope across it
+    uu, vv = uu + 1e-6, vv + 1e-6  # a window of one row or one pixel has no slope across it
     determinant = uu * vv - uv * uv
     explained = (vv * uy * uy - 2 * uv * uy * vy + uu * vy * vy) / determinant
     return np.where(known, np.sqrt(np.maximum(yy - explained, 0)) / np.where(known, inverse, 1), 0)
