@@ -46,7 +46,7 @@ class Calibration:
     labels: dict[Label, LabelCalibration]
     """The labels that some pixel carries."""
     sky_found: float
-    """Share of the pixels without a true depth (a sky) that are labelled far; NaN where there are none."""
+    """Share of the pixels without a true depth that are labelled far; NaN where there are none."""
     false_far: float
     """Share of the pixels with a true depth that are labelled far."""
 
@@ -58,10 +58,9 @@ class Calibration:
         for label, found in self.labels.items():
             shares = f"{found.share:9.1%}{found.within:15.1%}{found.within_two:10.1%}"
             lines.append(f"{_shown(label):10}{shares}{found.sigma:9.4f}{found.error:9.4f}")
-        if np.isfinite(self.sky_found):
-            lines.append(f"far: {self.sky_found:.1%} of the sky, {self.false_far:.1%} of everything else")
-        elif self.false_far > 0:
-            lines.append(f"far: {self.false_far:.1%} of the pixels, none of which is sky")
+        if self.sky_found > 0 or self.false_far > 0:
+            sky = f"{self.sky_found:.1%}" if np.isfinite(self.sky_found) else "none"
+            lines.append(f"far: {sky} of the pixels without a true depth, {self.false_far:.1%} of the others")
         return "\n".join(lines)
 
 

@@ -33,7 +33,7 @@ WITHIN = 1.2
 surface: on studio the 90 % quantile of the error is .011 within, .17 beyond."""
 NEAR = 0.1
 """And within this relative difference, whatever is declared."""
-BESIDE = 0.15
+BESIDE = 0.03
 """Share of the step to the surface that may remain as error."""
 STEPS = 3
 """Secant steps along the ray; the third changes a depth by less than .0005."""
