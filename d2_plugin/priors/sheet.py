@@ -106,7 +106,8 @@ def sigma_colors(sigma: np.ndarray, depth: np.ndarray) -> np.ndarray:
     inside = np.clip(sigma, SURE, UNSURE)
     level = np.log(inside / SURE) / np.log(UNSURE / SURE)
     colors = cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1]
-    shown = np.where(np.isfinite(sigma)[..., None], np.maximum(colors, (20, 12, 30)), np.uint8(UNKNOWN))
+    darkest = (20, 12, 30)  # a depth that is certain must not look like none
+    shown = np.where(np.isfinite(sigma)[..., None], np.maximum(colors, darkest), UNKNOWN)
     return np.where((depth > 0)[..., None], shown, 0).astype(np.uint8)
 
 

@@ -2,7 +2,7 @@
 
     STORE/store.json                     format, and what the store was built for
     STORE/priors/CAMERA/FRAME.npy        structured [H, W]: depth uint16 (logarithmic, 0 = empty), label,
-                                         sigma uint8 (logarithmic, 255 = infinite), RGB uint8
+                                         sigma uint8 (logarithmic, 0 = 0, 255 = infinite), RGB uint8
     STORE/priors/CAMERA/FRAME.json       record: a, b, gap, status, shares, settings, hashes, depth range, checksum
     STORE/cache/...                      stereo and monocular maps, so that other fusion settings cost seconds
 
@@ -63,14 +63,19 @@ class DepthRange:
         return np.concatenate([[0.0], table]).astype(np.float32)[codes]
 
 
-SIGMA = np.append(np.geomspace(1e-4, 1.0, 255), np.inf).astype(np.float32)
-"""The relative standard deviations that the codes 0 to 255 stand for."""
+SIGMA = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 254), [np.inf]]).astype(np.float32)
+"""The relative standard deviations that the codes 0 to 255 stand for; 0 is the paper's certainty."""
 
 
 def encode_sigma(sigma: np.ndarray) -> np.ndarray:
-    """Relative standard deviation float [H, W] to codes uint8: the nearest there is, infinite above 1."""
-    position = np.log(np.maximum(sigma, SIGMA[0]) / SIGMA[0]) * (254 / np.log(SIGMA[254] / SIGMA[0]))
-    return np.where(sigma <= 1, np.rint(np.minimum(position, 254)), 255).astype(np.uint8)
+    """Relative standard deviation float [H, W] to codes uint8: the nearest there is, infinite above 1.
+
+    Only an exact 0 stays 0; what is smaller than the smallest step becomes that step.
+    """
+    steps = np.log(SIGMA[254] / SIGMA[1])
+    position = 1 + np.log(np.clip(sigma, SIGMA[1], 1) / SIGMA[1]) * (253 / steps)
+    codes = np.where(sigma <= 1, np.rint(np.minimum(position, 254)), 255)
+    return np.where(sigma == 0, 0, codes).astype(np.uint8)
 
 
 class PriorStore:

@@ -19,6 +19,7 @@ from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, PriorSummary, build_priors
 from d2_plugin.priors.construct import NO_MAP, SCALE_UNKNOWN
+from d2_plugin.priors.monocular.align import align
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo import match
 from d2_plugin.priors.store import PriorStore
@@ -336,6 +337,35 @@ def test_each_ablation_row_can_be_built(plain: Capture, tmp_path: Path, variant:
     else:
         assert shares["conflict"] == 0
         assert shares["verified"] == pytest.approx(dual["verified"] + dual["conflict"])
+
+
+def test_the_papers_preset_is_the_papers_equations_and_nothing_else(plain: Capture, tmp_path: Path) -> None:
+    """One line fitted to the anchors, e < tau_c, D^g where verified, the aligned map where alone; no evidence, no FAR."""
+    settings = PriorSettings.paper(stereo=SETTINGS.stereo)
+    build_priors(plain, NAMES, tmp_path / "dual", settings)
+    build_priors(plain, NAMES, tmp_path / "mvs", replace(settings, variant="mvs"))
+    dual, mvs = PriorStore.open(tmp_path / "dual"), PriorStore.open(tmp_path / "mvs")
+    accepted = 0
+    for name in NAMES:
+        found, mono, geometric = dual.prior(name, 0), plain.mono(name, 0), mvs.prior(name, 0).depth.numpy()
+        alignment = align(mono, geometric, kind="relative", settings=settings.align)
+        if not alignment.accepted:
+            assert not found.labels.any()
+            continue
+        known, z_far = geometric > 0, 3 * np.percentile(geometric[geometric > 0], 99.5)
+        inverse = alignment.scale * mono.astype(np.float64) + alignment.shift
+        aligned = np.where(inverse > 1 / z_far, 1 / np.maximum(inverse, 1 / z_far), 0)
+        verified = known & (np.abs(aligned - geometric) < 0.1 * geometric)
+        labels = np.select(
+            [verified, known, aligned > 0], [Label.VERIFIED, Label.CONFLICT, Label.MONO], int(Label.EMPTY)
+        )
+        differ = found.labels.numpy() != labels
+        assert differ.mean() < 1e-3, "but where rounding of stored depth crosses a threshold"
+        depth = np.select([labels == Label.VERIFIED, labels == Label.MONO], [geometric, aligned], 0)
+        np.testing.assert_allclose(found.depth.numpy()[~differ], depth[~differ], rtol=1e-4)
+        np.testing.assert_array_equal(found.sigma.numpy(), np.where(found.verified, 0, np.inf))
+        accepted += 1
+    assert accepted
 
 
 def test_the_papers_plain_construction_is_a_preset_and_less_exact(plain: Capture, built: tuple, tmp_path: Path) -> None:

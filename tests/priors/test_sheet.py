@@ -38,7 +38,7 @@ def test_the_sheet_shows_picture_depth_and_labels_of_every_view(tmp_path: Path) 
     assert not row[8:, 64 + 32 : 128].any()
     assert (row[:8, 64:] == LABEL_COLORS[Label.FAR]).all()
     expected = sigma_colors(np.full((1, 1), 0.05), np.ones((1, 1)))[0, 0].astype(int)
-    np.testing.assert_allclose(row[8:, 3 * 64 : 3 * 64 + 32].astype(int), expected[None, None], atol=3)
+    np.testing.assert_allclose(row[8:, 3 * 64 : 3 * 64 + 32].astype(int), np.broadcast_to(expected, (28, 32, 3)), atol=3)
     assert not row[8:, 3 * 64 + 32 :].any()
     with pytest.raises(D2Error, match="no prior at frames 1"):
         contact_sheet(store, capture, tmp_path / "none.png", frames=[1])

@@ -78,10 +78,12 @@ def test_a_map_of_one_depth_and_a_map_of_none_survive() -> None:
         np.testing.assert_allclose(depth_range.decode(depth_range.encode(depth)), depth, rtol=1e-6)
 
 
-def test_sigma_above_one_is_infinite_and_below_the_smallest_code_is_the_smallest() -> None:
+def test_sigma_above_one_is_infinite_and_only_an_exact_zero_is_zero() -> None:
     sigma = np.array([0.0, 1e-9, 1e-4, 0.5, 1.0, 1.01, 1e9, np.inf], np.float32)
     found = SIGMA[encode_sigma(sigma)]
-    np.testing.assert_allclose(found, [1e-4, 1e-4, 1e-4, 0.5, 1, np.inf, np.inf, np.inf], rtol=0.02)
+    np.testing.assert_allclose(found, [0, 1e-4, 1e-4, 0.5, 1, np.inf, np.inf, np.inf], rtol=0.02)
+    every = SIGMA[encode_sigma(SIGMA)]
+    np.testing.assert_array_equal(every, SIGMA)
 
 
 @pytest.mark.parametrize("bad", [np.nan, -0.1])

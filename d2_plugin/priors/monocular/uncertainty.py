@@ -10,7 +10,7 @@ picture to picture; that one number, the scale, is measured in each picture.
 
 with d the distance to the nearest anchor (picture widths), g = |log(D / D of that anchor)|, e and e' the span of log D
 within 0.5 % and 2 % of the width, r = log(D / median anchor) where it is positive. A pixel without an anchor is harder
-than an anchor that was left out (no texture, an edge, seen once): K = 1.28 on all recordings with truth.
+than an anchor that was left out (no texture, an edge, seen once): K = 1.25 on all recordings with truth.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from d2_plugin.priors.settings import AlignSettings
 
 FLOOR, DISTANCE, GAP, EDGE, WIDE_EDGE, BEYOND = 0.051, 1.19, 0.79, 2.76, 0.16, 0.086
 """f0 and fd (of d itself) to fr; fitted once to the true errors of studio, plaza and a rendered room together."""
-HARDER = 1.28
+HARDER = 1.25
 """K."""
 NEXT = 0.003
 """How far the next anchor lies where a pixel's own is left out, picture widths."""
