@@ -19,17 +19,17 @@ import numpy as np
 
 from d2_plugin.priors.extras import opencv
 
-MATCHING = 0.03
+MATCHING = 0.12
 """Error of the best match, pixels."""
-PER_COST = 0.15
+PER_COST = 0.02
 """Further error per unit of matching cost 1 - NCC, pixels."""
-PER_INCOHERENCE = 5.0
+PER_INCOHERENCE = 2.5
 """Further error where none of the neighbours lies on the same surface, pixels."""
-OF_SCATTER = 0.65
+OF_SCATTER = 0.13
 """Share of the scatter about the local plane."""
-OF_SPREAD = 0.35
+OF_SPREAD = 0.06
 """Share of the difference to the sources' own depths."""
-FLOOR = 7e-4
+FLOOR = 9.5e-4
 """What no map is better than: calibration, resampling, the nearest pixel of a source."""
 WINDOW = 7
 """Side of the window of the local plane, pixels."""
