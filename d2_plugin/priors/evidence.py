@@ -39,6 +39,10 @@ STEPS = 3
 """Secant steps along the ray; the third changes a depth by less than .0005."""
 MET = 3e-3
 """The ray has met the surface when their depths differ by less than this share."""
+MISSED = 0.5
+"""A ray that misses by more, in log depth, is not followed."""
+OVERSHOT = 2.0
+"""Nor one whose first step is so many times farther than allowed."""
 CONTINUOUS = 1.1
 """Four neighbours of a map whose depths differ by a larger factor are no surface."""
 
@@ -130,24 +134,42 @@ def _apart_from_nearest(points: _Points, pair: ViewPair, depth: np.ndarray) -> n
 def _intersection(points: _Points, pair: ViewPair, theirs: FusedPrior) -> tuple[np.ndarray, np.ndarray]:
     """Where the points' rays meet the surface that another view verified: (depth [K], 0 where nowhere; sigma [K])."""
     surface = np.where(theirs.labels == Label.VERIFIED, theirs.depth, 0)
-    allowed = np.minimum(WITHIN * points.sigma, NEAR)
-    depth = points.depth.copy()
-    miss, known = _miss(points, pair, surface, depth)
-    for _ in range(STEPS):
-        ahead, known_ahead = _miss(points, pair, surface, depth * 1.001)
-        slope = (ahead - miss) / np.log(1.001)
-        usable = known & known_ahead & (np.abs(slope) > 0.2)
-        step = np.where(usable, -miss / np.where(usable, slope, 1), 0)
-        depth = depth * np.exp(np.clip(step, -0.2, 0.2))
-        miss, known = _miss(points, pair, surface, depth)
-    moved = np.abs(np.log(depth / points.depth))
-    met = known & (np.abs(miss) < MET) & (moved < allowed)
-    at = pair.project(points.columns, points.rows, depth)
+    depth, sigma = np.zeros_like(points.depth), np.full_like(points.depth, np.inf)
+    # Most rays start where nothing is verified; those whose first step leaves the allowed way several times over
+    # meet nothing either. Only the others are followed.
+    miss, known = _miss(points, pair, surface, points.depth)
+    near = np.flatnonzero(known & (np.abs(miss) < MISSED))
+    points, miss = _Points(*(values[near] for values in points)), miss[near]
+    step = _step(points, pair, surface, points.depth, miss)
+    kept = np.abs(step) < OVERSHOT * _allowed(points)
+    near, step, points = near[kept], step[kept], _Points(*(values[kept] for values in points))
+    along = points.depth * np.exp(step)
+    for _ in range(STEPS - 1):
+        miss, known = _miss(points, pair, surface, along)
+        along = along * np.exp(np.where(known, _step(points, pair, surface, along, miss), 0))
+    miss, known = _miss(points, pair, surface, along)
+    moved = np.abs(np.log(along / points.depth))
+    met = known & (np.abs(miss) < MET) & (moved < _allowed(points))
+    at = pair.project(points.columns, points.rows, along)
     height, width = surface.shape
     row = np.clip(np.rint(np.where(met, at.y, 0)), 0, height - 1).astype(np.int64)
     column = np.clip(np.rint(np.where(met, at.x, 0)), 0, width - 1).astype(np.int64)
-    sigma = np.hypot(theirs.sigma[row, column], BESIDE * moved)
-    return np.where(met, depth, 0), np.where(met, sigma, np.inf)
+    depth[near] = np.where(met, along, 0)
+    sigma[near] = np.where(met, np.hypot(theirs.sigma[row, column], BESIDE * moved), np.inf)
+    return depth, sigma
+
+
+def _allowed(points: _Points) -> np.ndarray:
+    """How far in log depth [K] a ray may be followed."""
+    return np.minimum(WITHIN * points.sigma, NEAR)
+
+
+def _step(points: _Points, pair: ViewPair, surface: np.ndarray, depth: np.ndarray, miss: np.ndarray) -> np.ndarray:
+    """Secant step in log depth [K] towards the surface, 0 where it is not known or runs along the ray."""
+    ahead, known = _miss(points, pair, surface, depth * 1.001)
+    slope = (ahead - miss) / np.log(1.001)
+    usable = known & (np.abs(slope) > 0.2)
+    return np.clip(np.where(usable, -miss / np.where(usable, slope, 1), 0), -0.2, 0.2)
 
 
 def _miss(
@@ -169,9 +191,10 @@ def _interpolated(depth: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.n
     left = np.clip(np.floor(np.where(inside, x, 0)), 0, width - 2).astype(np.int64)
     top = np.clip(np.floor(np.where(inside, y, 0)), 0, height - 2).astype(np.int64)
     right, down = np.where(inside, x, 0) - left, np.where(inside, y, 0) - top
-    corners = np.stack([depth[top + i, left + j] for i in (0, 1) for j in (0, 1)])
-    nearest = corners.min(0)
-    known = inside & (nearest > 0) & (corners.max(0) < CONTINUOUS * nearest)
-    inverse = 1 / np.where(known, corners, 1)
+    first, flat = top * width + left, np.ascontiguousarray(depth).ravel()
+    corners = [flat[first + offset] for offset in (0, 1, width, width + 1)]
+    nearest, farthest = np.minimum.reduce(corners), np.maximum.reduce(corners)
+    known = inside & (nearest > 0) & (farthest < CONTINUOUS * nearest)
+    inverse = [1 / np.where(known, corner, 1).astype(np.float64) for corner in corners]
     upper, lower = (inverse[i] * (1 - right) + inverse[i + 1] * right for i in (0, 2))
     return known, 1 / (upper * (1 - down) + lower * down)
