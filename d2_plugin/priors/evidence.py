@@ -137,9 +137,10 @@ def _intersection(points: _Points, pair: ViewPair, theirs: FusedPrior) -> tuple[
     depth, sigma = np.zeros_like(points.depth), np.full_like(points.depth, np.inf)
     # Most rays start where nothing is verified; those whose first step leaves the allowed way several times over
     # meet nothing either. Only the others are followed.
+    near = np.flatnonzero(_apart_from_nearest(points, pair, surface) < MISSED)
+    points = _Points(*(values[near] for values in points))
     miss, known = _miss(points, pair, surface, points.depth)
-    near = np.flatnonzero(known & (np.abs(miss) < MISSED))
-    points, miss = _Points(*(values[near] for values in points)), miss[near]
+    near, miss, points = near[known], miss[known], _Points(*(values[known] for values in points))
     step = _step(points, pair, surface, points.depth, miss)
     kept = np.abs(step) < OVERSHOT * _allowed(points)
     near, step, points = near[kept], step[kept], _Points(*(values[kept] for values in points))

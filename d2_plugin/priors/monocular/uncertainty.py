@@ -34,7 +34,7 @@ WIDTH = 160
 """Columns of the picture at which all this is computed: its terms are in picture widths."""
 PATTERNS, REGIONS = 6, 4
 """How often regions are left out, and how many at a time."""
-COMPARED = 2
+COMPARED = 1
 """Patterns in which the map is also compared with no network at all."""
 SMALLEST, LARGEST = 0.05, 0.6
 """Sides of the regions, picture widths; drawn evenly in their logarithm."""
