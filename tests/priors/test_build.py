@@ -340,7 +340,7 @@ def test_each_ablation_row_can_be_built(plain: Capture, tmp_path: Path, variant:
 
 
 def test_the_papers_preset_is_the_papers_equations_and_nothing_else(plain: Capture, tmp_path: Path) -> None:
-    """One line fitted to the anchors, e < tau_c, D^g where verified, the aligned map where alone; no evidence, no FAR."""
+    """One line fitted to the anchors, e < tau_c, D^g where verified, the aligned map where alone, no evidence."""
     settings = PriorSettings.paper(stereo=SETTINGS.stereo)
     build_priors(plain, NAMES, tmp_path / "dual", settings)
     build_priors(plain, NAMES, tmp_path / "mvs", replace(settings, variant="mvs"))
