@@ -1,4 +1,4 @@
-"""A contact sheet of a prior store: picture, D* and labels side by side, to be looked at before training."""
+"""A contact sheet of a prior store: picture, D*, labels and sigma side by side, to be looked at before training."""
 
 from __future__ import annotations
 
@@ -20,11 +20,23 @@ LABEL_COLORS = {
     Label.VERIFIED: (80, 190, 90),
     Label.CONFLICT: (210, 70, 60),
     Label.AGREED: (60, 190, 200),
-    Label.FAR: (170, 150, 210),
+    Label.FAR: (200, 215, 235),
 }
 """RGB of each label in the sheet."""
 
-CAPTION = 18  # height of the line above a row, pixels
+SURE, UNSURE = 0.001, 0.5
+"""Sigma at the dark and at the bright end of its colours, which are logarithmic; an infinite sigma is grey."""
+UNKNOWN = (120, 120, 120)
+"""RGB of a pixel with a depth of which nothing tells how wrong it may be."""
+TITLES = (
+    "picture",
+    "D*: near red, far blue, none black",
+    "green verified, cyan agreed, blue mono, pale far, red conflict",
+    f"sigma: dark {SURE:.1%}, bright {UNSURE:.0%}, grey unknown",
+)
+"""Of the four panels of a row."""
+
+CAPTION = 18  # height of a line of text, pixels
 
 
 def contact_sheet(
@@ -34,7 +46,7 @@ def contact_sheet(
     frames: Sequence[int] | None = None,
     width: int = 320,
 ) -> Path:
-    """Write a PNG with one row per camera and frame: picture | D* in false colour (near is red) | labels.
+    """Write a PNG with one row per camera and frame: picture | D* (near is red) | labels | sigma.
 
     Args:
         store: the priors.
@@ -56,9 +68,10 @@ def contact_sheet(
     ]
     if not rows:
         raise D2Error(f"{store.path} has no prior at frames {', '.join(map(str, chosen))}: build them first")
+    titles = np.concatenate([_line(cv2, title, width, 0.32) for title in TITLES], axis=1)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), np.concatenate(rows)[..., ::-1]):
+    if not cv2.imwrite(str(path), np.concatenate([titles, *rows])[..., ::-1]):
         raise D2Error(f"the contact sheet could not be written to {path}: choose a name that ends in .png")
     return path
 
@@ -77,30 +90,60 @@ def depth_colors(depth: np.ndarray) -> np.ndarray:
 
 
 def label_colors(labels: np.ndarray) -> np.ndarray:
-    """RGB uint8 [H, W, 3]: grey empty, blue mono-only, green verified, red conflict, cyan agreed, lilac far."""
+    """RGB uint8 [H, W, 3]: grey empty, blue mono-only, green verified, red conflict, cyan agreed, pale blue far."""
     palette = np.array([LABEL_COLORS[label] for label in Label], np.uint8)
     return palette[labels]
 
 
+def sigma_colors(sigma: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """RGB uint8 [H, W, 3] of log sigma from `SURE` (dark) to `UNSURE` (bright); `UNKNOWN` if infinite, black if empty.
+
+    Args:
+        sigma: relative standard deviation [H, W].
+        depth: D* [H, W], 0 where there is none.
+    """
+    cv2 = opencv("the contact sheet")
+    inside = np.clip(sigma, SURE, UNSURE)
+    level = np.log(inside / SURE) / np.log(UNSURE / SURE)
+    colors = cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1]
+    darkest = (20, 12, 30)  # a depth that is certain must not look like none
+    shown = np.where(np.isfinite(sigma)[..., None], np.maximum(colors, darkest), UNKNOWN)
+    return np.where((depth > 0)[..., None], shown, 0).astype(np.uint8)
+
+
 def _row(cv2: ModuleType, image: np.ndarray, prior: DepthPrior, caption: str, width: int) -> np.ndarray:
     size = (width, round(width * image.shape[0] / image.shape[1]))
-    panels = [
-        cv2.resize(image, size, interpolation=cv2.INTER_AREA),
-        cv2.resize(depth_colors(prior.depth.numpy()), size, interpolation=cv2.INTER_NEAREST),
-        cv2.resize(label_colors(prior.labels.numpy()), size, interpolation=cv2.INTER_NEAREST),
-    ]
-    head = np.full((CAPTION, 3 * width, 3), 255, np.uint8)
-    cv2.putText(head, caption, (4, CAPTION - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
-    return np.concatenate([head, np.concatenate(panels, axis=1)])
+    depth, labels = prior.depth.numpy(), prior.labels.numpy()
+    sigma = np.full(depth.shape, np.inf, np.float32) if prior.sigma is None else prior.sigma.numpy()
+    # Of a far pixel only a lower bound is known, so it takes no part in the colours of depth and sigma.
+    far = labels == Label.FAR
+    surface = np.where(far, 0, depth)
+    maps = [depth_colors(surface), label_colors(labels), sigma_colors(sigma, surface)]
+    for map_ in maps:
+        map_[far] = LABEL_COLORS[Label.FAR]
+    panels = [cv2.resize(image, size, interpolation=cv2.INTER_AREA)]
+    panels += [cv2.resize(map_, size, interpolation=cv2.INTER_NEAREST) for map_ in maps]
+    return np.concatenate([_line(cv2, caption, len(panels) * width, 0.4), np.concatenate(panels, axis=1)])
+
+
+def _line(cv2: ModuleType, text: str, width: int, size: float) -> np.ndarray:
+    """One line of black text on white, RGB uint8 [CAPTION, width, 3]."""
+    line = np.full((CAPTION, width, 3), 255, np.uint8)
+    cv2.putText(line, text, (4, CAPTION - 5), cv2.FONT_HERSHEY_SIMPLEX, size, (0, 0, 0), 1, cv2.LINE_AA)
+    return line
 
 
 def _caption(store: PriorStore, camera: str, frame: int) -> str:
     record = store.record(camera, frame) or {}
-    if record["refused"]:
-        return f"camera {camera}, frame {frame}: refused, {record['refused']}"
-    shares = ", ".join(f"{name} {share:.0%}" for name, share in record["shares"].items())
+    sigmas = record.get("sigmas", {})
+    shares = ", ".join(
+        f"{name} {share:.0%}" + (f" (sigma {100 * sigmas[name]:.2g} %)" if sigmas.get(name) else "")
+        for name, share in record["shares"].items()
+        if share > 0
+    )
     source = f"; {record['monocular']}" if record["monocular"] else ""
-    return f"camera {camera}, frame {frame}: {shares}{source}"
+    refused = f"; map refused: {record['refused']}" if record["refused"] else ""
+    return f"camera {camera}, frame {frame}: {shares}{refused or source}"
 
 
 def _spread(frames: Sequence[int], count: int) -> list[int]:

@@ -4,19 +4,33 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Any
 
-SHOWN = {"verified": "verified", "agreed": "agreed", "mono only": "mono", "conflict": "conflict", "empty": "empty"}
+SHOWN = {
+    "verified": "verified",
+    "agreed": "agreed",
+    "mono only": "mono",
+    "far": "far",
+    "conflict": "conflict",
+    "empty": "empty",
+}
 """Columns of the summary, and the share each shows."""
+
+DECLARED = {"verified": "verified", "agreed": "agreed", "mono only": "mono"}
+"""Columns that also show a median sigma."""
 
 
 @dataclass
 class PriorSummary:
-    """What a build did: mean shares of the labels per camera, refused views and why, notes on what was left out."""
+    """What a build did, as means over the frames of each camera, and what it left out and why."""
 
     built: int = 0
     kept: int = 0
     shares: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Mean share of the pixels with each label, by camera."""
+    sigmas: dict[str, dict[str, list[float]]] = field(default_factory=dict)
+    """Median sigma of each frame's pixels with each label, by camera; frames without a finite one are left out."""
     refused: list[tuple[str, int, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     _counts: Counter[str] = field(default_factory=Counter)
@@ -29,6 +43,10 @@ class PriorSummary:
         for label, share in record["shares"].items():
             mean[label] += (share - mean[label]) / (count + 1)
         self._counts[camera] += 1
+        sigmas = self.sigmas.setdefault(camera, {})
+        for label, sigma in record.get("sigmas", {}).items():
+            if sigma is not None:
+                sigmas.setdefault(label, []).append(sigma)
         if record["refused"]:
             self.refused.append((camera, frame, record["refused"]))
 
@@ -41,19 +59,40 @@ class PriorSummary:
             for label, value in share.items():
                 mean[label] += (value - mean[label]) * part._counts[camera] / total
             self._counts[camera] = total
+        for camera, labels in part.sigmas.items():
+            sigmas = self.sigmas.setdefault(camera, {})
+            for label, values in labels.items():
+                sigmas.setdefault(label, []).extend(values)
         self.refused = sorted([*self.refused, *part.refused], key=lambda refusal: refusal[1])
         self.notes += [note for note in part.notes if note not in self.notes]
 
+    def sigma(self, camera: str, label: str) -> float | None:
+        """Median over the frames of the median sigma of a label's pixels; None where it is infinite or paper's 0."""
+        values = self.sigmas.get(camera, {}).get(label, [])
+        return median(values) or None if values else None
+
     def __str__(self) -> str:
-        lines = [
-            f"{self.built} priors built, {self.kept} kept",
-            f"{'camera':12}" + "  ".join(f"{name:>9}" for name in SHOWN),
-        ]
-        for camera, share in self.shares.items():
-            values = (share[label] for label in SHOWN.values())
-            lines.append(f"{camera:12}" + "  ".join(f"{value:9.1%}" for value in values))
+        lines = [f"{self.built} priors built, {self.kept} kept", *self._share_lines(), *self._sigma_lines()]
         reasons = Counter(reason for _, _, reason in self.refused)
         for reason, count in reasons.most_common():
             examples = [f"{camera}/{frame}" for camera, frame, why in self.refused if why == reason][:3]
             lines.append(f"refused {count}x ({', '.join(examples)}{', ...' if count > 3 else ''}): {reason}")
         return "\n".join([*lines, *self.notes])
+
+    def _share_lines(self) -> list[str]:
+        lines = [f"{'camera':12}" + "  ".join(f"{name:>9}" for name in SHOWN)]
+        for camera, share in self.shares.items():
+            values = (share.get(label, 0.0) for label in SHOWN.values())
+            lines.append(f"{camera:12}" + "  ".join(f"{value:9.1%}" for value in values))
+        return lines
+
+    def _sigma_lines(self) -> list[str]:
+        """Median sigma per camera and label; nothing where no sigma was declared, as in the paper."""
+        rows = {camera: [self.sigma(camera, label) for label in DECLARED.values()] for camera in self.shares}
+        if all(value is None for values in rows.values() for value in values):
+            return []
+        lines = [f"{'sigma':12}" + "  ".join(f"{name:>9}" for name in DECLARED)]
+        for camera, values in rows.items():
+            shown = (f"{'-':>9}" if value is None else f"{value:9.2%}" for value in values)
+            lines.append(f"{camera:12}" + "  ".join(shown))
+        return lines

@@ -365,7 +365,7 @@ def test_pictures_with_lens_distortion_are_refused(still: Capture) -> None:
 def test_priors_from_a_workspace_pass_the_common_filter(capture: Capture) -> None:
     write_maps(capture, "colmap/00000", 0, 3.0)
     write_maps(capture, "colmap/00001", 1, 0.2)
-    summary = build_priors(capture, NAMES, capture.path / "priors", PriorSettings())
+    summary = build_priors(capture, NAMES, capture.path / "priors", PriorSettings(agreement=0.0))
     assert min(share["verified"] for share in summary.shares.values()) > 0.3
     store = PriorStore.open(capture.path / "priors")
     for frame in capture.frames:
@@ -374,6 +374,21 @@ def test_priors_from_a_workspace_pass_the_common_filter(capture: Capture) -> Non
         np.testing.assert_allclose(prior.depth.numpy()[verified], truth[verified], rtol=2e-4)
     survivors = store.record("train1", 0)["stereo"]["survivors"]
     assert 0 < survivors["kept"] <= survivors["confirmed"] < survivors["matched"]
+
+
+def test_what_other_cameras_saw_adds_to_the_depth_of_a_workspace_and_is_right(capture: Capture) -> None:
+    write_maps(capture, "colmap/00000", 0, 3.0)
+    write_maps(capture, "colmap/00001", 1, 0.2)
+    verified = {}
+    for agreement in (0.0, 0.02):
+        build_priors(capture, NAMES, capture.path / "p", PriorSettings(agreement=agreement))
+        prior = PriorStore.open(capture.path / "p").prior("train1", 0)
+        verified[agreement] = prior.verified.numpy()
+    assert not (verified[0.0] & ~verified[0.02]).any()
+    added = verified[0.02] & ~verified[0.0]
+    assert added.any()
+    truth = capture.depth("train1", 0)
+    assert np.median(np.abs(prior.depth.numpy() / truth - 1)[added]) < 0.002
 
 
 @pytest.mark.parametrize(

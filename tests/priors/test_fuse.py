@@ -36,6 +36,29 @@ def test_fusion_takes_geometric_depth_where_verified_and_monocular_where_it_is_a
     assert prior.shares() == {"empty": 0.2, "mono": 0.2, "verified": 0.2, "conflict": 0.4, "agreed": 0.0, "far": 0.0}
 
 
+def test_the_papers_sigma_is_zero_where_verified_and_infinite_elsewhere() -> None:
+    np.testing.assert_array_equal(fuse(MONO, GEOMETRIC, tau_c=0.1).sigma, [[0, np.inf, np.inf, np.inf, np.inf]])
+    np.testing.assert_array_equal(empty_prior((1, 2)).sigma, [[np.inf, np.inf]])
+
+
+def test_each_depth_has_the_sigma_of_its_source_and_what_has_none_is_unknown() -> None:
+    sigma_mono, sigma_geometric = np.full_like(MONO, 0.2), np.full_like(MONO, 0.01)
+    prior = fuse(MONO, GEOMETRIC, tau_c=0.1, sigma_mono=sigma_mono, sigma_geometric=sigma_geometric)
+    np.testing.assert_allclose(prior.sigma, [[0.01, np.inf, np.inf, 0.2, np.inf]])
+    medians = prior.sigmas()
+    assert medians["verified"] == pytest.approx(0.01)
+    assert medians["mono"] == pytest.approx(0.2)
+    assert medians["conflict"] is medians["empty"] is medians["agreed"] is None
+
+
+def test_verification_by_a_map_judges_each_pixel_by_its_own_tolerance() -> None:
+    tolerance = np.array([[0.01, 0.6, 0.6, 0.6, 0.6]], np.float32)
+    labels = fuse(MONO, GEOMETRIC, tau_c=tolerance).labels
+    np.testing.assert_array_equal(
+        labels, [[Label.CONFLICT, Label.VERIFIED, Label.CONFLICT, Label.MONO, Label.EMPTY]]
+    )
+
+
 @pytest.mark.parametrize(
     ("variant", "depth", "labels"),
     [

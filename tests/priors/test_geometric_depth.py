@@ -65,21 +65,29 @@ def test_half_resolution_comes_back_at_full_size(pair: Capture) -> None:
     assert wrong < 0.03
 
 
+def geometric(depth: np.ndarray) -> GeometricDepth:
+    """One view's depth with a sigma of one per cent."""
+    sigma = np.where(depth > 0, 0.01, np.inf).astype(np.float32)
+    return GeometricDepth(depth, np.zeros(depth.shape), np.ones(depth.shape, np.uint8), {}, sigma)
+
+
 def test_enlarging_a_plane_is_exact_and_an_edge_is_left_out() -> None:
     v, u = np.mgrid[:20, :30]
     inverse = 0.2 + 0.001 * u + 0.002 * v
-    small = GeometricDepth((1 / inverse).astype(np.float32), np.zeros((20, 30)), np.ones((20, 30), np.uint8), {})
+    small = geometric((1 / inverse).astype(np.float32))
     large = enlarged(small, 60, 40, tolerance=0.05)
     v, u = (np.mgrid[:40, :60] + 0.5) / 2 - 0.5
     inside = np.s_[2:-2, 2:-2]  # the outermost pixels extrapolate, and take the value at the rim
     np.testing.assert_allclose(large.depth[inside], (1 / (0.2 + 0.001 * u + 0.002 * v))[inside], rtol=1e-5)
     step = np.where(np.arange(30) < 15, 2.0, 4.0)[None].repeat(20, 0).astype(np.float32)
-    edge = enlarged(GeometricDepth(step, np.zeros((20, 30)), np.ones((20, 30), np.uint8), {}), 60, 40)
+    edge = enlarged(geometric(step), 60, 40)
     assert set(np.unique(edge.depth)) == {0, 2, 4}
     assert not edge.depth[:, 29:31].any()
     hole = step.copy()
     hole[10, 5] = 0
-    assert not enlarged(GeometricDepth(hole, step, step, {}), 60, 40).depth[20:22, 10:12].any()
+    assert not enlarged(geometric(hole), 60, 40).depth[20:22, 10:12].any()
+    np.testing.assert_array_equal(np.isfinite(edge.sigma), edge.depth > 0)
+    np.testing.assert_array_equal(edge.sigma[edge.depth > 0], np.float32(0.01))
 
 
 def test_the_running_minimum_is_that_of_the_whole_volume_with_a_parabola() -> None:

@@ -10,7 +10,7 @@ import pytest
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.sheet import LABEL_COLORS, contact_sheet, depth_colors, label_colors
+from d2_plugin.priors.sheet import LABEL_COLORS, UNKNOWN, contact_sheet, depth_colors, label_colors, sigma_colors
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
 
@@ -23,17 +23,24 @@ def test_the_sheet_shows_picture_depth_and_labels_of_every_view(tmp_path: Path) 
     for camera in capture.cameras:
         labels = np.full((36, 64), Label.MONO, np.uint8)
         labels[:, 32:] = Label.CONFLICT
-        depth = np.where(labels == Label.MONO, capture.depth(camera, 0), 0)
-        prior = FusedPrior(depth, labels, capture.image(camera, 0))
+        labels[:8] = Label.FAR
+        depth = np.where(labels == Label.CONFLICT, 0, capture.depth(camera, 0))
+        sigma = np.where(labels == Label.MONO, 0.05, np.inf).astype(np.float32)
+        prior = FusedPrior(depth, labels, sigma, capture.image(camera, 0))
         record = {"shares": prior.shares(), "refused": "", "monocular": "maps"}
         store.write(camera, 0, prior, record)
     sheet = cv2.imread(str(contact_sheet(store, capture, tmp_path / "out" / "sheet.png", width=64)))[..., ::-1]
-    assert sheet.shape == (2 * (36 + 18), 3 * 64, 3)
-    row = sheet[18 : 18 + 36]
+    assert sheet.shape == (18 + 2 * (18 + 36), 4 * 64, 3)
+    row = sheet[36 : 36 + 36]
     np.testing.assert_allclose(row[:, :64].astype(int), capture.image("train0", 0), atol=1)
     assert tuple(row[10, 2 * 64 + 10]) == LABEL_COLORS[Label.MONO]
     assert tuple(row[10, 2 * 64 + 50]) == LABEL_COLORS[Label.CONFLICT]
-    assert not row[:, 64 + 32 : 128].any()
+    assert not row[8:, 64 + 32 : 128].any()
+    assert (row[:8, 64:] == LABEL_COLORS[Label.FAR]).all()
+    expected = sigma_colors(np.full((1, 1), 0.05), np.ones((1, 1)))[0, 0].astype(int)
+    shown = row[8:, 3 * 64 : 3 * 64 + 32].astype(int)
+    np.testing.assert_allclose(shown, np.broadcast_to(expected, shown.shape), atol=3)
+    assert not row[8:, 3 * 64 + 32 :].any()
     with pytest.raises(D2Error, match="no prior at frames 1"):
         contact_sheet(store, capture, tmp_path / "none.png", frames=[1])
 
@@ -45,6 +52,17 @@ def test_near_is_red_far_is_blue_and_empty_is_black() -> None:
     assert blue[2] > blue[0]
     assert not black.any()
     assert not depth_colors(np.zeros((2, 2))).any()
+
+
+def test_sigma_is_brighter_where_it_is_larger_grey_where_unknown_and_black_without_a_depth() -> None:
+    sigma = np.array([[0.0, 1e-3, 0.01, 0.1, 0.5, 1.0, np.inf, 0.1]])
+    colors = sigma_colors(sigma, np.array([[1.0] * 7 + [0.0]]))[0].astype(int)
+    brightness = colors[:6].sum(axis=1)
+    assert (np.diff(brightness) >= 0).all()
+    assert brightness[1] < brightness[2] < brightness[3] < brightness[4]
+    assert tuple(colors[6]) == UNKNOWN
+    assert not colors[7].any()
+    assert colors[0].any(), "a certain depth is not shown as none"
 
 
 def test_each_label_has_its_own_colour() -> None:

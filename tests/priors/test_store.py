@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.store import FORMAT, DepthRange, PriorStore
+from d2_plugin.priors.store import FORMAT, SIGMA, DepthRange, PriorStore, encode_sigma
 from d2_plugin.protocol import Label
 
 SHAPE = (12, 17)
@@ -25,7 +25,9 @@ def some_prior(seed: int = 0) -> FusedPrior:
     rng = np.random.default_rng(seed)
     labels = rng.integers(0, 4, SHAPE).astype(np.uint8)
     supported = (labels == Label.MONO) | (labels == Label.VERIFIED)
-    return FusedPrior(np.where(supported, rng.uniform(1, 9, SHAPE), 0).astype(np.float32), labels, IMAGE)
+    depth = np.where(supported, rng.uniform(1, 9, SHAPE), 0).astype(np.float32)
+    sigma = np.where(supported, np.exp(rng.uniform(np.log(1e-4), 0, SHAPE)), np.inf).astype(np.float32)
+    return FusedPrior(depth, labels, sigma, IMAGE)
 
 
 @pytest.fixture
@@ -40,12 +42,13 @@ def array_file(store: PriorStore, camera: str = "a", frame: int = 0) -> Path:
     return store.entries.location(camera, frame)
 
 
-def test_depth_labels_and_colours_come_back(store: PriorStore) -> None:
+def test_depth_labels_sigma_and_colours_come_back(store: PriorStore) -> None:
     prior = PriorStore.open(store.path).prior("a", 0)
     expected = some_prior()
     np.testing.assert_allclose(prior.depth.numpy(), expected.depth, rtol=2e-5)
     np.testing.assert_array_equal(prior.depth.numpy() == 0, expected.depth == 0)
     np.testing.assert_array_equal(prior.labels.numpy(), expected.labels)
+    np.testing.assert_allclose(prior.sigma.numpy(), expected.sigma, rtol=0.02)
     np.testing.assert_array_equal(prior.colors.numpy(), IMAGE)
     assert int(prior.verified.sum()) == int((expected.labels == Label.VERIFIED).sum())
 
@@ -73,6 +76,24 @@ def test_a_map_of_one_depth_and_a_map_of_none_survive() -> None:
     for depth in (np.full((3, 3), 2.5), np.zeros((3, 3))):
         depth_range = DepthRange.of(depth)
         np.testing.assert_allclose(depth_range.decode(depth_range.encode(depth)), depth, rtol=1e-6)
+
+
+def test_sigma_above_one_is_infinite_and_only_an_exact_zero_is_zero() -> None:
+    sigma = np.array([0.0, 1e-9, 1e-4, 0.5, 1.0, 1.01, 1e9, np.inf], np.float32)
+    found = SIGMA[encode_sigma(sigma)]
+    np.testing.assert_allclose(found, [0, 1e-4, 1e-4, 0.5, 1, np.inf, np.inf, np.inf], rtol=0.02)
+    every = SIGMA[encode_sigma(SIGMA)]
+    np.testing.assert_array_equal(every, SIGMA)
+
+
+@pytest.mark.parametrize("bad", [np.nan, -0.1])
+def test_sigma_that_is_no_standard_deviation_is_refused(store: PriorStore, bad: float) -> None:
+    prior = some_prior(1)
+    prior.sigma[2, 3] = bad
+    with pytest.raises(D2Error, match="camera a, frame 0 has a sigma that is no map"):
+        store.write("a", 0, prior, {})
+    with pytest.raises(D2Error, match="has a sigma that is no map"):
+        store.write("a", 0, replace(prior, sigma=prior.sigma[1:]), {})
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])

@@ -1,0 +1,115 @@
+"""Declared against true error: what share of D* lies within sigma and 2 sigma of the true depth.
+
+A normal error lies within sigma at 68 % and within 2 sigma at 95 % of the pixels. Real errors have longer tails, so
+60 to 80 % and at least 90 % count as calibrated here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from d2_plugin.captures.capture import Capture
+from d2_plugin.priors.store import PriorStore
+from d2_plugin.protocol import Label
+
+DECLARED = (Label.VERIFIED, Label.AGREED, Label.MONO)
+"""Labels whose sigma is held against the truth; far pixels claim only a lower bound of depth."""
+
+
+@dataclass(frozen=True)
+class LabelCalibration:
+    """How the pixels of one label compare with the truth; shares are NaN where there are no such pixels."""
+
+    pixels: int
+    """Pixels with this label at which the true depth is known and sigma is finite."""
+    share: float
+    """Of all pixels of the views that have a true depth map."""
+    within: float
+    """Share of |log(D / true)| within sigma."""
+    within_two: float
+    """The same within 2 sigma."""
+    sigma: float
+    """Median declared sigma."""
+    error: float
+    """Median of |log(D / true)|."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """D* of one capture held against its true depth."""
+
+    views: int
+    """Pictures that have both a prior and a true depth map."""
+    labels: dict[Label, LabelCalibration]
+    """The labels that some pixel carries."""
+    sky_found: float
+    """Share of the pixels without a true depth that are labelled far; NaN where there are none."""
+    false_far: float
+    """Share of the pixels with a true depth that are labelled far."""
+
+    def __str__(self) -> str:
+        lines = [
+            f"held against the true depth of {self.views} views:",
+            f"{'label':10}{'share':>9}{'within sigma':>15}{'2 sigma':>10}{'sigma':>9}{'error':>9}",
+        ]
+        for label, found in self.labels.items():
+            shares = f"{found.share:9.1%}{found.within:15.1%}{found.within_two:10.1%}"
+            lines.append(f"{_shown(label):10}{shares}{found.sigma:9.4f}{found.error:9.4f}")
+        if self.sky_found > 0 or self.false_far > 0:
+            sky = f"{self.sky_found:.1%}" if np.isfinite(self.sky_found) else "none"
+            lines.append(f"far: {sky} of the pixels without a true depth, {self.false_far:.1%} of the others")
+        return "\n".join(lines)
+
+
+def held_against_truth(store: PriorStore, capture: Capture, frames: Sequence[int] | None = None) -> Calibration | None:
+    """Compare D* with the true depth of the capture, None where it has none.
+
+    Pixels at which nothing tells sigma, so that it is infinite, promise nothing and are left out.
+
+    Args:
+        store: the priors.
+        capture: the recording they were built for; 0 in a true depth map is a place without depth, such as sky.
+        frames: all of the store where None.
+    """
+    collected: dict[Label, list[np.ndarray]] = {label: [] for label in DECLARED}
+    views = pixels = sky = sky_far = surface_far = 0
+    for frame in store.frames if frames is None else frames:
+        for camera in store.cameras:
+            truth = capture.depth(camera, frame)
+            prior = None if truth is None else store.prior(camera, frame)
+            if truth is None or prior is None or prior.sigma is None:
+                continue
+            depth, labels, sigma = prior.depth.numpy(), prior.labels.numpy(), prior.sigma.numpy()
+            known, far = np.isfinite(truth) & (truth > 0), labels == Label.FAR
+            views, pixels, sky = views + 1, pixels + truth.size, sky + int((~known).sum())
+            sky_far, surface_far = sky_far + int((far & ~known).sum()), surface_far + int((far & known).sum())
+            for label, found in collected.items():
+                mask = known & (labels == label) & np.isfinite(sigma)
+                error = np.abs(np.log(depth[mask] / truth[mask].astype(np.float64)))
+                found.append(np.stack([error, sigma[mask]]))
+    if not views:
+        return None
+    held = {label: _held(np.concatenate(found, axis=1), pixels) for label, found in collected.items()}
+    return Calibration(
+        views,
+        {label: found for label, found in held.items() if found.pixels},
+        sky_far / sky if sky else float("nan"),
+        surface_far / max(pixels - sky, 1),
+    )
+
+
+def _held(found: np.ndarray, pixels: int) -> LabelCalibration:
+    """Of errors and sigmas [2, K] of one label."""
+    error, sigma = found
+    if not error.size:
+        return LabelCalibration(0, 0.0, *[float("nan")] * 4)
+    within, within_two = (float((error <= times * sigma).mean()) for times in (1, 2))
+    medians = float(np.median(sigma)), float(np.median(error))
+    return LabelCalibration(error.size, error.size / pixels, within, within_two, *medians)
+
+
+def _shown(label: Label) -> str:
+    return "mono only" if label == Label.MONO else label.name.lower()

@@ -1,0 +1,217 @@
+"""What other cameras say about a mono-only depth: surfaces are taken, maps that meet agree, the rest stays as it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from d2_plugin.captures.capture import Camera
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.priors.build import build_priors
+from d2_plugin.priors.evidence import AGREED, ALONE, BESIDE, NEAR, WITHIN, with_evidence
+from d2_plugin.priors.fuse import FusedPrior, empty_prior
+from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.priors.store import PriorStore
+from d2_plugin.protocol import DepthPrior, Label
+
+WIDTH, HEIGHT, WALL, SIGMA = 40, 30, 4.0, 0.05
+TOLERANCE = 0.02
+
+
+def camera(x: float, width: int = WIDTH, height: int = HEIGHT) -> Camera:
+    """At (x, 0, 0), looking along z."""
+    pose = np.eye(4)
+    pose[0, 3] = -x
+    K = np.array([[30.0, 0, width / 2], [0, 30.0, height / 2], [0, 0, 1]])
+    return Camera("camera", width, height, K, pose)
+
+
+CAMERAS = {"left": camera(0.0), "right": camera(0.5)}
+
+
+def slanted(view: Camera) -> np.ndarray:
+    """Depth [H, W] of the plane z = 4 + 0.3 x - 0.2 y, seen by a camera that looks along z."""
+    x, y = (np.arange(size) + 0.5 for size in (view.width, view.height))
+    ray_x, ray_y = np.meshgrid((x - view.K[0, 2]) / view.K[0, 0], (y - view.K[1, 2]) / view.K[1, 1])
+    return (WALL + 0.3 * -view.T_camera_world[0, 3]) / (1 - 0.3 * ray_x + 0.2 * ray_y)
+
+
+def prior_of(depth: np.ndarray | float, label: Label = Label.MONO, sigma: float = SIGMA) -> FusedPrior:
+    """One label everywhere."""
+    depth = np.broadcast_to(np.asarray(depth, np.float32), (HEIGHT, WIDTH)).copy()
+    return FusedPrior(depth, np.full(depth.shape, int(label), np.uint8), np.full(depth.shape, sigma, np.float32))
+
+
+def left_of(left: FusedPrior, right: FusedPrior) -> FusedPrior:
+    """The left view after the right one was asked."""
+    return with_evidence({"left": left, "right": right}, CAMERAS, TOLERANCE)["left"]
+
+
+def share(prior: FusedPrior, label: Label) -> float:
+    return float((prior.labels == label).mean())
+
+
+def test_maps_that_put_a_wall_at_one_place_agree_where_both_cameras_see_it() -> None:
+    agreed = with_evidence({"left": prior_of(WALL), "right": prior_of(WALL)}, CAMERAS, TOLERANCE)
+    shift = 30 * 0.5 / WALL  # pixels between the two pictures
+    for prior in agreed.values():
+        assert share(prior, Label.AGREED) == pytest.approx(1 - shift / WIDTH, abs=1 / WIDTH)
+        both = prior.labels == Label.AGREED
+        np.testing.assert_allclose(prior.sigma[both], AGREED * SIGMA, rtol=1e-6)
+        np.testing.assert_allclose(prior.sigma[~both], SIGMA, rtol=1e-6)
+        np.testing.assert_array_equal(prior.depth, np.float32(WALL))
+    assert (agreed["left"].labels[:, : int(shift)] == Label.MONO).all(), "what one camera alone sees stays mono-only"
+
+
+def test_maps_that_differ_by_more_than_the_tolerance_do_not_and_both_are_less_sure() -> None:
+    asked = with_evidence({"left": prior_of(WALL), "right": prior_of(WALL * 1.03)}, CAMERAS, TOLERANCE)
+    for prior in asked.values():
+        assert share(prior, Label.MONO) == 1
+        np.testing.assert_allclose(np.unique(prior.sigma), [SIGMA, ALONE * SIGMA], rtol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [0.96, 0.99, 1.0, 1.02, 1.05])
+def test_a_surface_that_another_camera_verified_is_taken_along_the_ray(factor: float) -> None:
+    truth, theirs = slanted(CAMERAS["left"]), slanted(CAMERAS["right"])
+    asked = left_of(prior_of(truth * factor), prior_of(theirs, Label.VERIFIED, 0.001))
+    met = asked.labels == Label.VERIFIED
+    assert met[2:-2, 8:-2].all(), "the right camera sees all but the columns at the left"
+    assert not met[:, 0].any()
+    np.testing.assert_allclose(asked.depth[met], truth[met], rtol=1e-3)
+    expected = np.hypot(0.001, BESIDE * np.abs(np.log(factor)))
+    np.testing.assert_allclose(asked.sigma[met], expected, rtol=0.05, atol=2e-4)
+    beside = ~met
+    np.testing.assert_array_equal(asked.depth[beside], (truth * factor).astype(np.float32)[beside])
+
+
+@pytest.mark.parametrize(
+    ("sigma", "away", "taken"),
+    [
+        (0.02, 0.9 * WITHIN * 0.02, True),
+        (0.02, 1.1 * WITHIN * 0.02, False),
+        (0.4, 0.9 * NEAR, True),
+        (0.4, 1.1 * NEAR, False),
+        (np.inf, 0.9 * NEAR, True),
+        (np.inf, 1.1 * NEAR, False),
+    ],
+)
+def test_a_surface_farther_than_sigma_or_than_near_is_another_surface(sigma: float, away: float, taken: bool) -> None:
+    truth, theirs = slanted(CAMERAS["left"]), slanted(CAMERAS["right"])
+    asked = left_of(prior_of(truth * np.exp(away), sigma=sigma), prior_of(theirs, Label.VERIFIED, 0.001))
+    assert (share(asked, Label.VERIFIED) > 0.5) == taken
+    assert (share(asked, Label.VERIFIED) == 0) != taken
+
+
+def test_what_nothing_is_known_of_stays_unknown_however_well_two_maps_agree() -> None:
+    asked = left_of(prior_of(WALL, sigma=np.inf), prior_of(WALL, sigma=np.inf))
+    assert share(asked, Label.AGREED) > 0.5
+    assert np.isinf(asked.sigma).all()
+
+
+def test_only_mono_only_pixels_ever_change() -> None:
+    generator = np.random.default_rng(0)
+    labels = generator.integers(0, len(Label), (HEIGHT, WIDTH)).astype(np.uint8)
+    known = ~np.isin(labels, (Label.EMPTY, Label.CONFLICT))
+    depth = np.where(known, WALL, 0).astype(np.float32)
+    prior = FusedPrior(depth, labels, np.where(known, SIGMA, np.inf).astype(np.float32))
+    for theirs in (prior_of(WALL), prior_of(WALL * 1.01, Label.VERIFIED, 0.001)):
+        asked = left_of(prior, theirs)
+        other = labels != Label.MONO
+        for map_, before in ((asked.depth, depth), (asked.labels, labels), (asked.sigma, prior.sigma)):
+            np.testing.assert_array_equal(map_[other], before[other])
+        changed = asked.labels != labels
+        assert changed.any()
+        assert (labels[changed] == Label.MONO).all()
+        assert np.isin(asked.labels[changed], (Label.AGREED, Label.VERIFIED)).all()
+    np.testing.assert_array_equal(prior.labels, labels)
+
+
+@pytest.mark.parametrize("label", [Label.FAR, Label.AGREED, Label.EMPTY, Label.CONFLICT])
+def test_far_and_empty_pixels_have_no_say_and_agreed_ones_do(label: Label) -> None:
+    theirs = prior_of(WALL if label in (Label.FAR, Label.AGREED) else 0.0, label)
+    asked = left_of(prior_of(WALL), theirs)
+    if label == Label.AGREED:
+        assert share(asked, Label.AGREED) > 0.5
+    else:
+        assert share(asked, Label.MONO) == 1
+        np.testing.assert_array_equal(asked.sigma, np.float32(SIGMA))
+
+
+def test_points_behind_another_camera_or_off_its_picture_are_not_looked_up() -> None:
+    turned = camera(0.0)
+    turned.T_camera_world[:3, :3] = np.diag([-1.0, 1, -1])  # looks away
+    for there in (turned, camera(1e6), camera(-1e6)):
+        for theirs in (prior_of(WALL), prior_of(WALL, Label.VERIFIED, 0.001)):
+            asked = with_evidence({"left": prior_of(WALL), "away": theirs}, {"left": camera(0), "away": there}, 0.02)
+            assert share(asked["left"], Label.MONO) == 1
+            np.testing.assert_array_equal(asked["left"].sigma, np.float32(SIGMA))
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 5), (5, 1), (2, 2)])
+def test_pictures_of_a_pixel_or_a_row_are_possible(height: int, width: int) -> None:
+    rig = {"left": camera(0, width, height), "right": camera(1e-3, width, height)}
+    full = np.full((height, width), WALL, np.float32)
+    sigma = np.full_like(full, SIGMA)
+    mono = FusedPrior(full, np.full(full.shape, 1, np.uint8), sigma)
+    agreed = with_evidence({"left": mono, "right": mono}, rig, TOLERANCE)["left"]
+    assert share(agreed, Label.AGREED) == 1
+    verified = FusedPrior(full, np.full(full.shape, 2, np.uint8), sigma)
+    asked = with_evidence({"left": mono, "right": verified}, rig, TOLERANCE)["left"]
+    assert np.isfinite(asked.depth).all()
+    assert not np.isnan(asked.sigma).any()
+
+
+def test_a_view_without_depth_neither_asks_nor_answers() -> None:
+    nothing = empty_prior((HEIGHT, WIDTH))
+    asked = with_evidence({"left": prior_of(WALL), "right": nothing}, CAMERAS, TOLERANCE)
+    np.testing.assert_array_equal(asked["left"].labels, Label.MONO)
+    np.testing.assert_array_equal(asked["left"].sigma, np.float32(SIGMA))
+    for map_, before in zip((asked["right"].depth, asked["right"].labels), (nothing.depth, nothing.labels)):
+        np.testing.assert_array_equal(map_, before)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e6])
+def test_the_unit_of_the_world_does_not_matter(unit: float) -> None:
+    truth, theirs = slanted(CAMERAS["left"]), slanted(CAMERAS["right"])
+    asked = left_of(prior_of(truth * 1.02), prior_of(theirs, Label.VERIFIED, 0.001))
+    scaled_cameras = {"left": camera(0.0), "right": camera(0.5 * unit)}
+    scaled = with_evidence(
+        {"left": prior_of(truth * 1.02 * unit), "right": prior_of(theirs * unit, Label.VERIFIED, 0.001)},
+        scaled_cameras,
+        TOLERANCE,
+    )["left"]
+    same = scaled.labels == asked.labels
+    assert same.mean() > 0.97, "but for points that rounding moves across the rim of the picture"
+    np.testing.assert_allclose(scaled.depth[same] / unit, asked.depth[same], rtol=1e-5)
+    np.testing.assert_allclose(scaled.sigma[same], asked.sigma[same], rtol=1e-3)
+
+
+def test_trusted_is_verified_and_agreed_and_far_is_neither_trusted_nor_supported() -> None:
+    prior = DepthPrior(torch.ones(1, 6), torch.arange(6, dtype=torch.uint8)[None])
+    assert prior.trusted.tolist() == [[False, False, True, False, True, False]]
+    assert prior.support.tolist() == [[False, True, True, False, True, False]]
+    assert prior.verified.tolist() == [[False, False, True, False, False, False]]
+    assert prior.far.tolist() == [[False, False, False, False, False, True]]
+
+
+def test_the_builder_asks_other_cameras_for_the_dual_prior_alone(tmp_path: Path) -> None:
+    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+    capture = synthetic_capture(cameras=3, held_out=0, frames=1, width=160, height=90)
+    names = list(capture.cameras)
+
+    def labels(folder: str, settings: PriorSettings) -> np.ndarray:
+        build_priors(capture, names, tmp_path / folder, settings)
+        store = PriorStore.open(tmp_path / folder)
+        return np.stack([store.prior(name, capture.frames[0]).labels.numpy() for name in names])
+
+    with_it, without = labels("on", PriorSettings()), labels("off", PriorSettings(agreement=0.0))
+    assert (with_it == Label.AGREED).any()
+    changed = with_it != without
+    assert (without[changed] == Label.MONO).all()
+    assert set(np.unique(with_it[changed])) == {Label.AGREED, Label.VERIFIED}
+    for variant in ("dual_unverified", "mono"):
+        assert not (labels(variant, PriorSettings(variant=variant)) == Label.AGREED).any()
+    assert PriorSettings.paper().agreement == 0

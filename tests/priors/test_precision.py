@@ -1,0 +1,90 @@
+"""The precision of geometric depth: a plane scatters nowhere, parallax and noise count, nothing unknown is precise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from d2_plugin.priors.stereo.precision import FLOOR, MATCHING, WINDOW, geometric_sigma, plane_scatter
+
+pytest.importorskip("cv2")
+
+
+def plane(height: int, width: int, unit: float = 1.0) -> np.ndarray:
+    """Depth float32 [H, W] of a slanted plane: inverse depth is linear over the picture."""
+    v, u = np.mgrid[:height, :width]
+    return (unit / (0.2 + 0.1 * u / width + 0.05 * v / height)).astype(np.float32)
+
+
+def sigma_of(depth: np.ndarray, **changes: np.ndarray | float) -> np.ndarray:
+    """Sigma with no cost, full coherence, no spread and a parallax of 100 pixels, but for `changes`."""
+    values = {"cost": 0.0, "coherence": 1.0, "parallax": 100.0, "spread": 0.0} | changes
+    return geometric_sigma(depth, **{name: np.broadcast_to(value, depth.shape) for name, value in values.items()})
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e6])
+@pytest.mark.parametrize(("height", "width"), [(40, 60), (1014, 1352)])
+def test_a_plane_does_not_scatter_whatever_the_unit_and_the_size(unit: float, height: int, width: int) -> None:
+    assert plane_scatter(plane(height, width, unit)).max() < 2e-5
+
+
+@pytest.mark.parametrize("noise", [1e-3, 1e-2])
+def test_the_scatter_is_the_noise(noise: float) -> None:
+    depth = plane(120, 160)
+    noisy = depth * np.exp(noise * np.random.default_rng(0).standard_normal(depth.shape))
+    # Of the window's WINDOW^2 values the plane takes three.
+    expected = noise * np.sqrt(1 - 3 / WINDOW**2)
+    assert np.sqrt(np.mean(plane_scatter(noisy)[4:-4, 4:-4] ** 2)) == pytest.approx(expected, rel=0.03)
+    assert np.median(sigma_of(noisy)) > np.median(sigma_of(depth))
+
+
+def test_sigma_is_the_matching_error_over_the_parallax_and_falls_with_it() -> None:
+    depth = plane(40, 60)
+    found = [float(np.median(sigma_of(depth, parallax=parallax))) for parallax in (1.0, 10.0, 100.0, 1e4, 1e9)]
+    assert found == sorted(found, reverse=True)
+    assert found[0] == pytest.approx(np.hypot(MATCHING, FLOOR), rel=1e-3)
+    assert found[-1] == pytest.approx(FLOOR, rel=1e-3)
+
+
+def test_cost_incoherence_and_spread_all_make_it_less_sure() -> None:
+    depth = plane(40, 60)
+    best = np.median(sigma_of(depth, parallax=20.0))
+    for worse in ({"cost": 0.5}, {"coherence": 0.5}, {"spread": 0.05}):
+        assert np.median(sigma_of(depth, parallax=20.0, **worse)) > 1.02 * best
+
+
+def test_where_anything_is_unknown_sigma_is_infinite_and_never_nan() -> None:
+    depth = plane(40, 60)
+    for row, value in enumerate((0.0, -1.0, np.nan, np.inf)):
+        depth[row] = value
+    unknown = {"parallax": (4, 0.0), "cost": (5, np.nan), "coherence": (6, np.nan), "spread": (7, np.nan)}
+    maps = {name: np.full(depth.shape, default) for name, default in (("parallax", 50.0), ("coherence", 1.0))}
+    maps |= {name: np.zeros(depth.shape) for name in ("cost", "spread")}
+    for name, (row, value) in unknown.items():
+        maps[name][row] = value
+    sigma = geometric_sigma(depth, **maps)
+    assert np.isinf(sigma[:8]).all()
+    assert np.isfinite(sigma[8:]).all()
+    assert (sigma > 0).all()
+    assert sigma.dtype == np.float32
+
+
+def test_values_outside_of_their_range_count_as_its_ends() -> None:
+    depth = plane(20, 30)
+    np.testing.assert_array_equal(sigma_of(depth, coherence=7.0), sigma_of(depth, coherence=1.0))
+    np.testing.assert_array_equal(sigma_of(depth, coherence=-7.0), sigma_of(depth, coherence=0.0))
+    np.testing.assert_array_equal(sigma_of(depth, cost=-1.0), sigma_of(depth, cost=0.0))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (2, 2), (7, 5)])
+def test_pictures_of_a_pixel_or_a_row_have_a_sigma(shape: tuple[int, int]) -> None:
+    sigma = sigma_of(plane(*shape))
+    assert np.isfinite(sigma).all()
+    assert np.isinf(sigma_of(np.zeros(shape, np.float32))).all()
+
+
+def test_depths_from_a_millimetre_to_a_thousand_kilometres_in_one_map() -> None:
+    depth = np.geomspace(1e-3, 1e6, 64 * 64).reshape(64, 64).astype(np.float32)
+    sigma = sigma_of(depth)
+    assert not np.isnan(sigma).any()
+    assert (sigma >= FLOOR * 0.999).all()
