@@ -14,11 +14,11 @@ import numpy as np
 
 from d2_plugin.captures.capture import Camera, MonoKind
 from d2_plugin.priors.evidence import with_evidence
-from d2_plugin.priors.far import far_pixels
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.fuse import FusedPrior, empty_prior, fuse, hanging_pixels
 from d2_plugin.priors.monocular.align import Alignment, align, aligned_depth, aligned_inverse, not_aligned
 from d2_plugin.priors.monocular.correct import corrected_depth
+from d2_plugin.priors.monocular.far import far_pixels
 from d2_plugin.priors.monocular.maps import MonoSource
 from d2_plugin.priors.monocular.uncertainty import Skill, Uncertainty, monocular_uncertainty
 from d2_plugin.priors.settings import PriorSettings

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from d2_plugin.priors.far import far_pixels
 from d2_plugin.priors.monocular.align import Alignment, AlignStatus, aligned_inverse
+from d2_plugin.priors.monocular.far import far_pixels
 
 pytest.importorskip("cv2")
 
