@@ -162,9 +162,8 @@ class _Builder:
         common = (
             CONSTRUCTION_VERSION,
             settings.variant,
-            settings.tau_c,
-            settings.z_far_factor,
-            settings.hanging_limit,
+            [settings.uncertainty, settings.conflict_sigmas, settings.tau_c],
+            [settings.z_far_factor, settings.hanging_limit, settings.far],
             asdict(settings.align),
             geometric,
             [settings.agreement, *maps.values()] if self.construction.agrees else None,

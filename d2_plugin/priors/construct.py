@@ -13,16 +13,19 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.captures.capture import Camera, MonoKind
+from d2_plugin.priors.evidence import with_evidence
+from d2_plugin.priors.far import far_pixels
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.fuse import FusedPrior, empty_prior, fuse, hanging_pixels
-from d2_plugin.priors.monocular.agree import with_agreement
-from d2_plugin.priors.monocular.align import Alignment, align, aligned_depth, not_aligned
+from d2_plugin.priors.monocular.align import Alignment, align, aligned_depth, aligned_inverse, not_aligned
 from d2_plugin.priors.monocular.correct import corrected_depth
 from d2_plugin.priors.monocular.maps import MonoSource
+from d2_plugin.priors.monocular.uncertainty import Skill, Uncertainty, monocular_uncertainty
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.cache import DepthCache, StoredDepth
+from d2_plugin.protocol import Label
 
-CONSTRUCTION_VERSION = 3  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 4  # raise it when alignment or fusion change what they return
 
 NO_GEOMETRY = "no geometric depth survived the filter"
 NO_MAP = "there is no monocular map of this frame"
@@ -37,6 +40,8 @@ class ViewPrior:
     refused: str
     """Why the view has no depth; empty where it has."""
     alignment: Alignment | None
+    skill: Skill | None
+    """What left-out anchors say about the monocular map; None where that was not asked."""
     stereo: dict[str, Any] | None
     """What the cache of geometric depth recorded."""
 
@@ -45,18 +50,24 @@ class ViewPrior:
         return {
             "refused": self.refused,
             "alignment": None if self.alignment is None else self.alignment.as_json(),
+            "skill": None if self.skill is None else self.skill.as_json(),
             "stereo": self.stereo,
             "shares": self.maps.shares(),
+            "sigmas": self.maps.sigmas(),
         }
 
 
 @dataclass(frozen=True, eq=False)
 class AlignedMap:
-    """D-bar^m of one view, float32 [H, W] (0 = none), how it was aligned, and why the view is refused if it is."""
+    """D-bar^m of one view, float32 [H, W] (0 = none), how it was aligned, and why it is refused if it is."""
 
     depth: np.ndarray
     alignment: Alignment | None = None
     refused: str = ""
+    uncertainty: Uncertainty | None = None
+    """How wrong it may be; None where the settings do not ask."""
+    inverse: np.ndarray | None = None
+    """Aligned inverse depth [H, W], also where it is no depth: 0 and below is infinitely far."""
 
 
 class Construction:
@@ -88,23 +99,44 @@ class Construction:
         if not self.agrees:
             return views
         maps = {name: view.maps for name, view in views.items()}
-        agreed = with_agreement(maps, self.cameras, self.settings.agreement, self.settings.tau_c)
-        return {name: replace(view, maps=agreed[name]) for name, view in views.items()}
+        informed = with_evidence(maps, self.cameras, self.settings.agreement)
+        return {name: replace(view, maps=informed[name]) for name, view in views.items()}
 
     def _view(self, name: str, frame: Frame, stereo: StoredDepth | None) -> ViewPrior:
         """D* of one camera, before it is compared with the others."""
         image = frame.images[name]
-        geometric = np.zeros(image.shape[:2], np.float32) if stereo is None else stereo.depth
-        mono = self._aligned(name, frame, geometric)
+        nothing = np.zeros(image.shape[:2], np.float32)
+        if stereo is None:
+            stereo = StoredDepth(nothing, np.full_like(nothing, np.inf), {})
+        mono = self._aligned(name, frame, stereo.depth)
+        maps = self._fused(mono, stereo)
+        if self.settings.far and self.settings.variant == "dual" and mono.inverse is not None:
+            maps = _with_far(maps, far_pixels(mono.inverse, stereo.depth, image), stereo.depth)
+        recorded = {key: value for key, value in stereo.record.items() if key != "checksum"} or None
+        skill = None if mono.uncertainty is None else mono.uncertainty.skill
+        return ViewPrior(replace(maps, colors=image), mono.refused, mono.alignment, skill, recorded)
+
+    def _fused(self, mono: AlignedMap, stereo: StoredDepth) -> FusedPrior:
+        """Verification and fusion. A map that was refused leaves the stereo depth alone, or nothing in the paper."""
+        settings, variant = self.settings, self.settings.variant
+        if mono.refused and not (settings.uncertainty and variant == "dual"):
+            return empty_prior(stereo.depth.shape)
         if mono.refused:
-            maps = empty_prior(geometric.shape)
-        else:
-            hanging = hanging_pixels(mono.depth, self.settings.hanging_limit)
-            maps = fuse(
-                mono.depth, geometric, tau_c=self.settings.tau_c, variant=self.settings.variant, hanging=hanging
-            )
-        recorded = None if stereo is None else {k: v for k, v in stereo.record.items() if k != "checksum"}
-        return ViewPrior(replace(maps, colors=image), mono.refused, mono.alignment, recorded)
+            variant = "mvs"
+        hanging = hanging_pixels(mono.depth, settings.hanging_limit)
+        if not settings.uncertainty:
+            return fuse(mono.depth, stereo.depth, tau_c=settings.tau_c, variant=variant, hanging=hanging)
+        unknown = np.full_like(stereo.sigma, np.inf)
+        alone, at_anchors = (unknown, unknown) if mono.uncertainty is None else mono.uncertainty[:2]
+        return fuse(
+            mono.depth,
+            stereo.depth,
+            tau_c=settings.conflict_sigmas * np.hypot(at_anchors, stereo.sigma),
+            variant=variant,
+            hanging=hanging,
+            sigma_mono=alone,
+            sigma_geometric=stereo.sigma,
+        )
 
     def _aligned(self, name: str, frame: Frame, geometric: np.ndarray) -> AlignedMap:
         """The monocular map in world units, where there is one and its scale can be known."""
@@ -121,13 +153,29 @@ class Construction:
             return AlignedMap(nothing, alignment, alignment.status.value)
         anchors = geometric[geometric > 0]
         z_far = self.settings.z_far_factor * float(np.percentile(anchors, 99.5)) if anchors.size else np.inf
-        depth = aligned_depth(prediction, alignment, z_far)
-        if self.settings.variant != "dual_unaligned":
-            depth = corrected_depth(depth, geometric, self.settings.align)
-        return AlignedMap(depth, alignment)
+        aligned = aligned_depth(prediction, alignment, z_far)
+        if self.settings.variant == "dual_unaligned":
+            return AlignedMap(aligned, alignment)
+        depth = corrected_depth(aligned, geometric, self.settings.align)
+        known = self.settings.uncertainty and anchors.size > 0
+        uncertainty = monocular_uncertainty(aligned, geometric, self.settings.align) if known else None
+        return AlignedMap(depth, alignment, "", uncertainty, aligned_inverse(prediction, alignment))
 
     def _fit(self, prediction: np.ndarray, geometric: np.ndarray, kind: MonoKind) -> Alignment:
         """The alignment; a metric map is taken as it is where there is no geometric depth to fit it to."""
         if self.geometric is None or self.settings.variant == "dual_unaligned":
             return not_aligned(kind)
         return align(prediction, geometric, kind=kind, settings=self.settings.align)
+
+
+def _with_far(maps: FusedPrior, far: np.ndarray, geometric: np.ndarray) -> FusedPrior:
+    """Far pixels take the farthest geometric depth of the view: what is known of them is that they lie behind it."""
+    if not far.any():
+        return maps
+    bound = np.float32(np.percentile(geometric[geometric > 0], 99.5))
+    return replace(
+        maps,
+        depth=np.where(far, bound, maps.depth),
+        labels=np.where(far, np.uint8(Label.FAR), maps.labels),
+        sigma=np.where(far, np.float32(np.inf), maps.sigma),
+    )

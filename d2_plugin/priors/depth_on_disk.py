@@ -29,7 +29,7 @@ from d2_plugin.priors.stereo.filter import GeometricDepth, filter_depths, remove
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
 
-FILTER_VERSION = 1  # raise it when the filter changes what it returns, so that caches are not trusted
+FILTER_VERSION = 2  # raise it when the filter changes what it returns, so that caches are not trusted
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """Metres per unit."""
@@ -178,7 +178,8 @@ def filter_sensor(depth: np.ndarray, settings: StereoSettings) -> GeometricDepth
         "settled": int(np.count_nonzero(settled)),
         "kept": int(np.count_nonzero(final)),
     }
-    return GeometricDepth(final, np.zeros(depth.shape, np.float32), np.zeros(depth.shape, np.uint8), survivors)
+    sigma = np.where(final > 0, np.float32(settings.sensor_sigma), np.float32(np.inf))
+    return GeometricDepth(final, np.zeros(depth.shape, np.float32), np.zeros(depth.shape, np.uint8), survivors, sigma)
 
 
 def flying_pixels(depth: np.ndarray) -> np.ndarray:

@@ -21,13 +21,21 @@ NEVER = 1e3  # beyond any logarithm of a float32 depth: neutral in a minimum or,
 class FusedPrior:
     """All maps per pixel of D* of one view, as numpy arrays: what the construction fills and the store writes.
 
-    `depth` [H, W] float32 is planar z, 0 where empty; `labels` [H, W] uint8 holds `Label`; `colors` [H, W, 3] uint8 is
-    the picture that it was made for, None until the construction adds it.
+    `depth` [H, W] float32 is planar z, 0 where empty; `labels` [H, W] uint8 holds `Label`; `sigma` [H, W] float32 is
+    the relative standard deviation of the depth, infinite where nothing tells it; `colors` [H, W, 3] uint8 is the
+    picture that it was made for, None until the construction adds it.
     """
 
     depth: np.ndarray
     labels: np.ndarray
+    sigma: np.ndarray
     colors: np.ndarray | None = None
+
+    def sigmas(self) -> dict[str, float | None]:
+        """Median sigma of the pixels that carry each label; None where it is infinite or there are none."""
+        found = {label: self.sigma[self.labels == label] for label in Label}
+        medians = {label: float(np.median(values)) if values.size else np.inf for label, values in found.items()}
+        return {label.name.lower(): value if np.isfinite(value) else None for label, value in medians.items()}
 
     def shares(self) -> dict[str, float]:
         """Share of the pixels that carry each label."""
@@ -48,8 +56,8 @@ def cross_source_discrepancy(mono: np.ndarray, geometric: np.ndarray, epsilon: f
     return np.where(known, relative, np.inf).astype(np.float32)
 
 
-def verified_region(discrepancy: np.ndarray, tau_c: float) -> np.ndarray:
-    """Omega^v: pixels of Omega^g whose discrepancy is below tau_c, bool [H, W]."""
+def verified_region(discrepancy: np.ndarray, tau_c: float | np.ndarray) -> np.ndarray:
+    """Omega^v: pixels of Omega^g whose discrepancy is below tau_c, bool [H, W]; tau_c may be a map [H, W]."""
     return discrepancy < tau_c
 
 
@@ -77,9 +85,11 @@ def fuse(
     mono: np.ndarray,
     geometric: np.ndarray,
     *,
-    tau_c: float,
+    tau_c: float | np.ndarray,
     variant: Variant = "dual",
     hanging: np.ndarray | None = None,
+    sigma_mono: np.ndarray | None = None,
+    sigma_geometric: np.ndarray | None = None,
 ) -> FusedPrior:
     """D* and its labels from aligned monocular depth and filtered geometric depth.
 
@@ -88,9 +98,11 @@ def fuse(
     Args:
         mono: D-bar^m float [H, W], 0 where it has none.
         geometric: D^g float [H, W], 0 where it has none.
-        tau_c: largest relative discrepancy of a verified pixel.
+        tau_c: largest relative discrepancy of a verified pixel, one number or a map [H, W].
         variant: one of `VARIANTS`; `dual_unaligned` fuses like `dual` and expects the unaligned map as `mono`.
         hanging: bool [H, W], pixels whose monocular depth may verify but is left out where it would stand alone.
+        sigma_mono, sigma_geometric: relative standard deviations [H, W] of the two. Where they are left out, those of
+            the paper: 0 at verified pixels and infinite elsewhere.
 
     Raises:
         D2Error: maps of two sizes, or an unknown variant.
@@ -101,20 +113,26 @@ def fuse(
         raise D2Error(f"monocular depth is {mono.shape}, geometric depth {geometric.shape}: bring both to one size")
     alone = mono if hanging is None else np.where(hanging, 0, mono)
     if variant == "mono":
-        return _labelled(alone, np.zeros_like(geometric), alone > 0)
-    if variant == "mvs":
-        return _labelled(np.zeros_like(mono), geometric, geometric > 0)
-    if variant == "dual_unverified":
-        return _labelled(alone, geometric, geometric > 0)
-    return _labelled(alone, geometric, verified_region(cross_source_discrepancy(mono, geometric), tau_c))
+        geometric, verified = np.zeros_like(geometric), alone > 0
+    elif variant == "mvs":
+        alone, verified = np.zeros_like(mono), geometric > 0
+    elif variant == "dual_unverified":
+        verified = geometric > 0
+    else:
+        verified = verified_region(cross_source_discrepancy(mono, geometric), tau_c)
+    depth, labels = _labelled(alone, geometric, verified)
+    if sigma_mono is None or sigma_geometric is None:
+        return FusedPrior(depth, labels, np.where(labels == Label.VERIFIED, 0, np.inf).astype(np.float32))
+    sigma = np.where(geometric > 0, sigma_geometric, sigma_mono)
+    return FusedPrior(depth, labels, np.where(depth > 0, sigma, np.inf).astype(np.float32))
 
 
 def empty_prior(shape: tuple[int, int]) -> FusedPrior:
     """D* of a frame that was refused: no depth anywhere."""
-    return FusedPrior(np.zeros(shape, np.float32), np.zeros(shape, np.uint8))
+    return FusedPrior(np.zeros(shape, np.float32), np.zeros(shape, np.uint8), np.full(shape, np.inf, np.float32))
 
 
-def _labelled(mono: np.ndarray, geometric: np.ndarray, verified: np.ndarray) -> FusedPrior:
+def _labelled(mono: np.ndarray, geometric: np.ndarray, verified: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     known = geometric > 0
     labels = np.full(mono.shape, Label.EMPTY, np.uint8)
     labels[~known & (mono > 0)] = Label.MONO
@@ -122,4 +140,4 @@ def _labelled(mono: np.ndarray, geometric: np.ndarray, verified: np.ndarray) -> 
     labels[verified] = Label.VERIFIED
     supported = (labels == Label.VERIFIED) | (labels == Label.MONO)
     depth = np.where(supported, np.where(known, geometric, mono), 0)
-    return FusedPrior(depth.astype(np.float32), labels)
+    return depth.astype(np.float32), labels

@@ -35,17 +35,27 @@ class PriorSettings(Settings):
 
     variant: Variant = "dual"
     """What D* is made of: `dual`, or one of the paper's ablation rows (see `Variant`)."""
+    uncertainty: bool = True
+    """Declare a standard deviation per pixel and verify by it: two sources conflict when they differ by more than
+    `conflict_sigmas`, and a map that cannot be aligned leaves stereo as it is. Off: the paper's fixed `tau_c`, sigma 0
+    at verified pixels and infinite elsewhere, and no depth at all where the map cannot be aligned."""
+    conflict_sigmas: Positive = 3.0
+    """Standard deviations of their difference above which the two sources conflict (with `uncertainty`)."""
     tau_c: NotNegative = 0.1
-    """A geometric depth is verified when aligned monocular depth differs by less than this share of it. Measured on
-    studio at .05, .1, .15: verified 33.2, 33.8, 34.1 % of the pixels, of which .1, .4, .7 % are off by over 5 %."""
+    """A geometric depth is verified when aligned monocular depth differs by less than this share of it (without
+    `uncertainty`). Measured on studio at .05, .1, .15: verified 33.2, 33.8, 34.1 % of the pixels, of which .1, .4, .7 %
+    are off by over 5 %."""
     z_far_factor: Positive = 3.0
     """Aligned monocular depth beyond this multiple of the 99.5 percentile of the anchors is left empty."""
     hanging_limit: NotNegative = 0.08
     """Mono-only pixels are left empty where monocular depth spans more than this share within 1 % of the picture's
     width: they hang between two surfaces. 0 keeps them, as the paper does."""
     agreement: NotNegative = 0.02
-    """Mono-only pixels whose depth another camera's confirms within this share may prune and supervise as well (`dual`
-    alone); 0 leaves that out, as the paper does. Measured: see `d2_plugin.priors.monocular.agree`."""
+    """Two cameras' monocular depths agree within this share (`dual` alone). 0 leaves the other cameras out, as in the
+    paper: they neither confirm nor contradict a mono-only pixel. Measured: see `d2_plugin.priors.evidence`."""
+    far: bool = True
+    """Find sky and what lies beyond any parallax (`dual` alone); off, as in the paper, such pixels are like all others.
+    Measured on plaza: 93 % of the sky, and nothing else; no pixel of studio, sear_steak or a rendered room."""
     depth_range: tuple[Positive, Positive] | None = None
     """Near and far of the stereo search, world units; by default from sparse points, the data set, or the baselines."""
     mono_onnx: str | None = None
@@ -72,7 +82,7 @@ class PriorSettings(Settings):
         """The paper's construction and nothing else: absolute residuals, one scale and shift, blurred edges kept,
         each camera for itself."""
         align = AlignSettings(residual="absolute", epsilon=0.01, local_scales=())
-        return cls(hanging_limit=0.0, agreement=0.0, align=align, **changes)
+        return cls(uncertainty=False, hanging_limit=0.0, agreement=0.0, far=False, align=align, **changes)
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], where: str = "priors") -> PriorSettings:

@@ -20,6 +20,7 @@ LABEL_COLORS = {
     Label.VERIFIED: (80, 190, 90),
     Label.CONFLICT: (210, 70, 60),
     Label.AGREED: (60, 190, 200),
+    Label.FAR: (200, 215, 235),
 }
 """RGB of each label in the sheet."""
 

@@ -1,14 +1,16 @@
 """Depth priors on disk: one memory-mapped array and one record per camera and frame.
 
     STORE/store.json                     format, and what the store was built for
-    STORE/priors/CAMERA/FRAME.npy        structured [H, W]: depth uint16 (logarithmic, 0 = empty), label, RGB uint8
+    STORE/priors/CAMERA/FRAME.npy        structured [H, W]: depth uint16 (logarithmic, 0 = empty), label,
+                                         sigma uint8 (logarithmic, 255 = infinite), RGB uint8
     STORE/priors/CAMERA/FRAME.json       record: a, b, gap, status, shares, settings, hashes, depth range, checksum
     STORE/cache/...                      stereo and monocular maps, so that other fusion settings cost seconds
 
-Logarithmic depth in 16 bits is exact to 1e-5 in a room and to 1.6e-4 from 1e-3 to 1e6. The picture lies beside it, at 6
-bytes per pixel in all: inserted Gaussians take its colours, and training need not open the capture for them. Every file
-is written under a temporary name and renamed, the array before its record: a record therefore vouches for its array, a
-build that is killed loses the frame in work, and readers never see half a file.
+Logarithmic depth in 16 bits is exact to 1e-5 in a room and to 1.6e-4 from 1e-3 to 1e6; sigma in 8 bits is exact to 2 %.
+The picture lies beside them, at 7 bytes per pixel in all: inserted Gaussians take its colours, and training need not
+open the capture for them. Every file is written under a temporary name and renamed, the array before its record: a
+record therefore vouches for its array, a build that is killed loses the frame in work, and readers never see half a
+file.
 """
 
 from __future__ import annotations
@@ -26,10 +28,10 @@ from d2_plugin.priors.files import Entry, EntryFolder, read_json, write_json
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import CameraRecord, DepthPrior, Label
 
-FORMAT = 2
+FORMAT = 3
 """Of store.json and of the arrays; raise it when either changes."""
 
-PRIOR_DTYPE = np.dtype([("depth", "<u2"), ("label", "u1"), ("color", "u1", (3,))])
+PRIOR_DTYPE = np.dtype([("depth", "<u2"), ("label", "u1"), ("sigma", "u1"), ("color", "u1", (3,))])
 """The maps of a `FusedPrior` as they are stored, pixel by pixel."""
 
 CODES = 65534  # depth codes 1..65535; 0 is empty
@@ -59,6 +61,16 @@ class DepthRange:
         """Codes uint16 to depth float32, 0 where empty; through a table, since a million exponentials are slow."""
         table = np.exp(np.linspace(np.log(self.near), np.log(self.far), CODES + 1))
         return np.concatenate([[0.0], table]).astype(np.float32)[codes]
+
+
+SIGMA = np.append(np.geomspace(1e-4, 1.0, 255), np.inf).astype(np.float32)
+"""The relative standard deviations that the codes 0 to 255 stand for."""
+
+
+def encode_sigma(sigma: np.ndarray) -> np.ndarray:
+    """Relative standard deviation float [H, W] to codes uint8: the nearest there is, infinite above 1."""
+    position = np.log(np.maximum(sigma, SIGMA[0]) / SIGMA[0]) * (254 / np.log(SIGMA[254] / SIGMA[0]))
+    return np.where(sigma <= 1, np.rint(np.minimum(position, 254)), 255).astype(np.uint8)
 
 
 class PriorStore:
@@ -140,7 +152,8 @@ class PriorStore:
         codes = entry.array(PRIOR_DTYPE)
         depth = DepthRange(*entry.record["depth_range"]).decode(codes["depth"])
         labels, colors = np.ascontiguousarray(codes["label"]), np.ascontiguousarray(codes["color"])
-        return DepthPrior(torch.from_numpy(depth), torch.from_numpy(labels), torch.from_numpy(colors))
+        sigma = SIGMA[codes["sigma"]]
+        return DepthPrior(*(torch.from_numpy(map_) for map_ in (depth, labels, colors, sigma)))
 
     def record(self, camera: str, frame: int) -> dict[str, Any] | None:
         """What is known about one prior: alignment, shares, settings, hashes; None where the store has none."""
@@ -163,13 +176,14 @@ class PriorStore:
         """Store all maps of one prior and its record.
 
         Raises:
-            D2Error: no colours or those of another size, depth that is not finite or negative, or labels that
-                contradict it.
+            D2Error: no colours or those of another size, depth that is not finite or negative, sigma that is NaN or
+                negative, or labels that contradict the depth.
         """
         _check(prior, f"the prior of camera {camera}, frame {frame}")
         depth_range = DepthRange.of(prior.depth)
         codes = np.empty(prior.depth.shape, PRIOR_DTYPE)
         codes["depth"], codes["label"], codes["color"] = depth_range.encode(prior.depth), prior.labels, prior.colors
+        codes["sigma"] = encode_sigma(prior.sigma)
         self.entries.write(camera, frame, codes, {**record, "depth_range": [depth_range.near, depth_range.far]})
 
     def _entry(self, camera: str, frame: int) -> Entry | None:
@@ -193,7 +207,9 @@ def _check(prior: FusedPrior, what: str) -> None:
         raise D2Error(f"{what} has {int(bad.sum())} depths that are NaN, infinite or negative: use 0 for unknown depth")
     if labels.max(initial=0) > max(Label):
         raise D2Error(f"{what} has label {int(labels.max())}: labels are 0 to {int(max(Label))}")
-    supported = np.isin(labels, (Label.MONO, Label.VERIFIED, Label.AGREED))
+    if prior.sigma.shape != depth.shape or not (prior.sigma >= 0).all():
+        raise D2Error(f"{what} has a sigma that is no map [H, W] of numbers >= 0: use infinity where nothing is known")
+    supported = np.isin(labels, (Label.MONO, Label.VERIFIED, Label.AGREED, Label.FAR))
     if not np.array_equal(supported, depth > 0):
-        known = "mono-only, verified and agreed"
+        known = "mono-only, verified, agreed and far"
         raise D2Error(f"{what} has labels that contradict its depth: exactly {known} pixels have a depth")

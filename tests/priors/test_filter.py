@@ -10,7 +10,8 @@ import pytest
 from d2_plugin.captures.capture import Capture
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo.filter import count_confirmations, filter_depths, remove_speckles, texture_mask
+from d2_plugin.priors.stereo.confirm import confirm
+from d2_plugin.priors.stereo.filter import filter_depths, remove_speckles, texture_mask
 from d2_plugin.priors.stereo.geometric_depth import gray
 
 pytest.importorskip("cv2")
@@ -104,7 +105,7 @@ def test_more_confirmations_can_be_asked_for(capture: Capture) -> None:
         kept.append(filter_depths(grays, cameras, depths, costs, settings)[1].valid.mean())
     assert kept[0] > kept[1] > 0
     assert kept[2] == kept[1]  # there are only two other views
-    count = count_confirmations(1, cameras, depths, SETTINGS)
+    count = confirm(1, cameras, depths, SETTINGS).sources
     assert set(np.unique(count)) == {0, 1, 2}
 
 

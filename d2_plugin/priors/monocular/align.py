@@ -139,6 +139,18 @@ def aligned_depth(mono: np.ndarray, alignment: Alignment, z_far: float) -> np.nd
     return _depth(mono.astype(np.float64), alignment.scale, alignment.shift, alignment.kind, z_far).astype(np.float32)
 
 
+def aligned_inverse(mono: np.ndarray, alignment: Alignment) -> np.ndarray:
+    """Aligned inverse depth float64 [H, W], also where it is no depth: 0 and below is infinitely far, NaN is unknown.
+
+    The zero of a saturated ReLU says "farther than I can tell" and is taken at its word.
+    """
+    value = alignment.scale * mono.astype(np.float64) + alignment.shift
+    if alignment.kind == "metric":
+        with np.errstate(divide="ignore"):
+            return np.where(value > 0, 1 / np.where(value > 0, value, 1), np.nan)
+    return np.where(mono == 0, np.minimum(value, 0), value)
+
+
 def predicted(mono: np.ndarray) -> np.ndarray:
     """Pixels at which the network said something, bool: finite, and not the zero of a saturated ReLU.
 

@@ -13,7 +13,10 @@ from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.files import EntryFolder
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.stereo.filter import GeometricDepth
-from d2_plugin.priors.store import DepthRange
+from d2_plugin.priors.store import SIGMA, DepthRange, encode_sigma
+
+STEREO_DTYPE = np.dtype([("depth", "<u2"), ("sigma", "u1")])
+"""Geometric depth as it is stored, pixel by pixel."""
 
 
 class GeometricSource(Protocol):
@@ -40,14 +43,16 @@ class GeometricSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class StoredDepth:
-    """D^g of one view as the cache gives it back: `depth` float32 [H, W] (0 = none) and what is recorded about it."""
+    """D^g of one view as the cache gives it back: `depth` float32 [H, W] (0 = none), its relative standard
+    deviation `sigma` float32 [H, W] (infinite where there is none), and what is recorded about it."""
 
     depth: np.ndarray
+    sigma: np.ndarray
     record: dict[str, Any]
 
 
 class DepthCache:
-    """Depth of a source, computed once and kept as 16-bit logarithmic depth.
+    """Depth of a source, computed once and kept as logarithms: depth in 16 bits, sigma in 8.
 
     Args:
         source: computes what is missing.
@@ -71,8 +76,9 @@ class DepthCache:
         for camera in self.source.cameras:
             entry = self.entries.find_current(camera.name, frame.number, key)
             if entry is not None:
-                depth = DepthRange(*entry.record["depth_range"]).decode(entry.array())
-                found[camera.name] = StoredDepth(depth, entry.record)
+                codes = entry.array(STEREO_DTYPE)
+                depth = DepthRange(*entry.record["depth_range"]).decode(codes["depth"])
+                found[camera.name] = StoredDepth(depth, SIGMA[codes["sigma"]], entry.record)
         return found
 
     def _store(self, frame: Frame, results: Sequence[GeometricDepth]) -> None:
@@ -85,4 +91,6 @@ class DepthCache:
                 "depth_range": [depth_range.near, depth_range.far],
                 "survivors": {name: int(count) for name, count in result.survivors.items()},
             }
-            self.entries.write(camera.name, frame.number, depth_range.encode(result.depth), record)
+            codes = np.empty(result.depth.shape, STEREO_DTYPE)
+            codes["depth"], codes["sigma"] = depth_range.encode(result.depth), encode_sigma(result.sigma)
+            self.entries.write(camera.name, frame.number, codes, record)

@@ -17,8 +17,9 @@ import numpy as np
 
 from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.geometry import Projection, pixel_grid, triangulation_angle, view_pair
 from d2_plugin.priors.stereo.coherence import surface_coherence
+from d2_plugin.priors.stereo.confirm import confirm
+from d2_plugin.priors.stereo.precision import geometric_sigma
 from d2_plugin.priors.stereo.settings import StereoSettings
 
 
@@ -28,13 +29,15 @@ class GeometricDepth:
 
     `depth` [H, W] float32 is planar z, 0 where nothing survived (the complement of M^g); `cost` [H, W] float32 is
     1 - NCC in 0..2; `confirmations` [H, W] uint8 counts the sources that agree; `survivors` tells how many pixels were
-    left after each test, in order.
+    left after each test, in order; `sigma` [H, W] float32 is the relative standard deviation of the depth, infinite
+    where there is none.
     """
 
     depth: np.ndarray
     cost: np.ndarray
     confirmations: np.ndarray
     survivors: dict[str, int]
+    sigma: np.ndarray
 
     @property
     def valid(self) -> np.ndarray:
@@ -65,13 +68,13 @@ def filter_depths(
     matched = [np.where(cost < settings.cost_max, depth, 0) for depth, cost in zip(known, costs)]
     textured = [np.where(texture_mask(gray, settings), depth, 0) for gray, depth in zip(grays, matched)]
     # The unfiltered map is asked: a neighbour that matched badly may still tell where the surface runs.
-    coherent = [coherence_mask(gray, depth, settings) for gray, depth in zip(grays, known)]
-    candidates = [np.where(mask, depth, 0) for mask, depth in zip(coherent, textured)]
+    coherent = [coherence(gray, depth, settings) for gray, depth in zip(grays, known)]
+    candidates = [np.where(share >= settings.coherence_min, z, 0) for share, z in zip(coherent, textured)]
     results = []
     for index, (gray, cost) in enumerate(zip(grays, costs)):
-        count = count_confirmations(index, cameras, candidates, settings)
+        confirmation = confirm(index, cameras, candidates, settings)
         needed = min(settings.min_sources, len(cameras) - 1)
-        confirmed = np.where(count >= max(needed, 1), candidates[index], 0)
+        confirmed = np.where(confirmation.sources >= max(needed, 1), candidates[index], 0)
         final = remove_speckles(confirmed, settings.speckle_size, settings.relative_depth_max)
         survivors = {
             "pixels": gray.size,
@@ -81,7 +84,8 @@ def filter_depths(
             "confirmed": int(np.count_nonzero(confirmed)),
             "kept": int(np.count_nonzero(final)),
         }
-        results.append(GeometricDepth(final, np.asarray(cost, np.float32), count, survivors))
+        sigma = geometric_sigma(final, cost, coherent[index], confirmation.parallax, confirmation.spread)
+        results.append(GeometricDepth(final, np.asarray(cost, np.float32), confirmation.sources, survivors, sigma))
     return results
 
 
@@ -95,52 +99,11 @@ def texture_mask(gray: np.ndarray, settings: StereoSettings) -> np.ndarray:
     return np.sqrt(np.maximum(square - mean * mean, 0)) > settings.texture_min
 
 
-def coherence_mask(gray: np.ndarray, depth: np.ndarray, settings: StereoSettings) -> np.ndarray:
-    """Pixels [H, W] bool that lie on one surface with enough of their neighbours (see `surface_coherence`)."""
-    share = surface_coherence(
+def coherence(gray: np.ndarray, depth: np.ndarray, settings: StereoSettings) -> np.ndarray:
+    """Share of the neighbours [H, W], 0..1, that lie on one surface with a pixel (see `surface_coherence`)."""
+    return surface_coherence(
         gray, depth, settings.coherence_radius, settings.relative_depth_max, settings.coherence_contrast
     )
-    return share >= settings.coherence_min
-
-
-def count_confirmations(
-    index: int, cameras: Sequence[Camera], depths: Sequence[np.ndarray], settings: StereoSettings
-) -> np.ndarray:
-    """How many other views confirm each depth of view `index`, uint8 [H, W].
-
-    A source confirms when its own depth, read at the pixel on which ours lands, takes us back to within
-    `reprojection_max` pixels (COLMAP's geometric consistency), agrees to `relative_depth_max` in our view, and the two
-    rays meet at an angle between `min_angle` and `max_angle`.
-    """
-    reference, depth = cameras[index], depths[index]
-    u, v = pixel_grid(reference)
-    count = np.zeros(depth.shape, np.uint8)
-    for other, source in enumerate(cameras):
-        if other == index:
-            continue
-        pair = view_pair(reference, source)
-        forth = pair.project(u, v, depth)
-        seen = sample_nearest(depths[other], forth)
-        back = view_pair(source, reference).project(forth.x, forth.y, seen)
-        with np.errstate(invalid="ignore", over="ignore"):
-            near_pixel = np.hypot(back.x - u, back.y - v) < settings.reprojection_max
-            near_depth = np.abs(back.z - depth) < settings.relative_depth_max * depth
-        angle = np.rad2deg(triangulation_angle(reference, pair, depth))
-        trusted = (angle > settings.min_angle) & (angle < settings.max_angle)
-        count += (depth > 0) & (seen > 0) & near_pixel & near_depth & trusted
-    return count
-
-
-def sample_nearest(depth: np.ndarray, at: Projection) -> np.ndarray:
-    """`depth` at the nearest pixel of `at`, 0 outside of the image or behind the camera.
-
-    Nearest on purpose: a value interpolated across an occlusion edge belongs to no surface.
-    """
-    height, width = depth.shape
-    inside = (at.z > 0) & (at.x > -0.5) & (at.y > -0.5) & (at.x < width - 0.5) & (at.y < height - 0.5)
-    column = np.rint(np.where(inside, at.x, 0)).astype(np.int32)
-    row = np.rint(np.where(inside, at.y, 0)).astype(np.int32)
-    return np.where(inside, depth[row, column], 0)
 
 
 def remove_speckles(depth: np.ndarray, size: int, relative_step: float) -> np.ndarray:

@@ -142,6 +142,7 @@ def enlarged(result: GeometricDepth, width: int, height: int, tolerance: float =
         depth=np.where(smooth, depth, 0).astype(np.float32),
         cost=result.cost[row][:, column],
         confirmations=result.confirmations[row][:, column],
+        sigma=np.where(smooth, result.sigma[row][:, column], np.float32(np.inf)),
     )
 
 

@@ -91,6 +91,8 @@ class StereoSettings(Settings):
     """A source confirms only where both rays meet at less than this; beyond, views look too different for a match to
     mean anything. Measured on a synthetic pair with plain walls: 10.5 % of the depths are off by more than 5 % without
     this limit, .9 % with it, and as many are right."""
+    sensor_sigma: Share = 0.01
+    """Relative standard deviation of a depth sensor; matched depth declares its own."""
     speckle_size: Pixels = 20
     """Connected pieces of the depth map with fewer pixels are dropped."""
     reuse_static: bool = True

@@ -1,0 +1,177 @@
+"""What the other cameras of an instant say about a mono-only depth; an addition to the paper.
+
+A mono-only pixel is a point in space, and other cameras look there too.
+
+- Where the pixel's ray meets a surface that another camera measured by stereo, near the monocular depth, the two
+  sources confirm each other and the surface is taken: the pixel is verified. Measured on studio, plaza and a rendered
+  room: the median error of these pixels falls from .009 to .001, and one pixel in six to ten gains by it.
+- Where two cameras' monocular depths meet, each confirms the other as far as their errors are independent, which is
+  not far: both were bent by anchors of one scene, and one network errs alike in both. So agreement takes 30 % off sigma
+  and no more; where sigma is infinite, as in a sky, it stays so.
+- Where others see the place and nobody meets the point, one of them is wrong: sigma grows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from d2_plugin.captures.capture import Camera
+from d2_plugin.priors.fuse import FusedPrior
+from d2_plugin.priors.geometry import ViewPair, view_pair
+from d2_plugin.protocol import Label
+
+AGREED = 0.7
+"""Factor of sigma where another camera's monocular depth agrees."""
+ALONE = 1.25
+"""Factor of sigma where others see the place and none agrees."""
+WITHIN = 1.2
+"""A surface confirms a monocular depth within this many of its standard deviations. Farther ones are often another
+surface: on studio the 90 % quantile of the error is .011 within, .17 beyond."""
+NEAR = 0.1
+"""And within this relative difference, whatever is declared."""
+BESIDE = 0.15
+"""Share of the step to the surface that may remain as error."""
+STEPS = 3
+"""Secant steps along the ray; the third changes a depth by less than .0005."""
+MET = 3e-3
+"""The ray has met the surface when their depths differ by less than this share."""
+CONTINUOUS = 1.1
+"""Four neighbours of a map whose depths differ by a larger factor are no surface."""
+
+
+class _Points(NamedTuple):
+    """K pixels of one view with the depth and sigma that are asked about."""
+
+    columns: np.ndarray
+    rows: np.ndarray
+    depth: np.ndarray
+    sigma: np.ndarray
+
+
+class _Answer(NamedTuple):
+    """What the other cameras make of K points; all [K]."""
+
+    depth: np.ndarray
+    """Depth at which the ray meets a surface of another camera; 0 where there is none."""
+    sigma: np.ndarray
+    """Of that depth."""
+    difference: np.ndarray
+    """|log difference| to the nearest monocular depth of another camera; infinite where there is none."""
+    seen: np.ndarray
+    """Whether another camera has a depth where the point lies in its picture."""
+
+
+def with_evidence(
+    priors: Mapping[str, FusedPrior], cameras: Mapping[str, Camera], tolerance: float
+) -> dict[str, FusedPrior]:
+    """The priors of one instant, each mono-only pixel with what the other cameras say.
+
+    Args:
+        priors: D* of synchronized views, by camera.
+        cameras: their calibrations.
+        tolerance: largest relative difference at which two monocular depths agree.
+    """
+    return {name: _informed(name, priors, cameras, tolerance) for name in priors}
+
+
+def _informed(
+    name: str, priors: Mapping[str, FusedPrior], cameras: Mapping[str, Camera], tolerance: float
+) -> FusedPrior:
+    prior = priors[name]
+    rows, columns = np.nonzero(prior.labels == Label.MONO)
+    depth, sigma = (map_[rows, columns].astype(np.float64) for map_ in (prior.depth, prior.sigma))
+    points = _Points(columns, rows, depth, sigma)
+    answer = _ask(points, name, priors, cameras)
+    met, agreed = answer.depth > 0, answer.difference < tolerance
+    factor = np.where(agreed, AGREED, np.where(answer.seen, ALONE, 1.0))
+    labels, depths, sigmas = prior.labels.copy(), prior.depth.copy(), prior.sigma.copy()
+    labels[rows, columns] = np.where(met, Label.VERIFIED, np.where(agreed, Label.AGREED, Label.MONO))
+    depths[rows, columns] = np.where(met, answer.depth, depth)
+    sigmas[rows, columns] = np.where(met, answer.sigma, factor * sigma)
+    return replace(prior, depth=depths, labels=labels, sigma=sigmas)
+
+
+def _ask(
+    points: _Points, name: str, priors: Mapping[str, FusedPrior], cameras: Mapping[str, Camera]
+) -> _Answer:
+    count = len(points.depth)
+    depth, sigma = np.zeros(count), np.full(count, np.inf)
+    difference, seen = np.full(count, np.inf), np.zeros(count, bool)
+    for other, theirs in priors.items():
+        if other == name or not count:
+            continue
+        pair = view_pair(cameras[name], cameras[other])
+        mono = np.where(np.isin(theirs.labels, (Label.MONO, Label.AGREED)), theirs.depth, 0)
+        apart = _apart_from_nearest(points, pair, mono)
+        np.minimum(difference, apart, out=difference)
+        seen |= np.isfinite(apart)
+        found, precision = _intersection(points, pair, theirs)
+        seen |= found > 0
+        better = precision < sigma
+        depth[better], sigma[better] = found[better], precision[better]
+    return _Answer(depth, sigma, difference, seen)
+
+
+def _apart_from_nearest(points: _Points, pair: ViewPair, depth: np.ndarray) -> np.ndarray:
+    """|log difference| [K] between the points and another view's map at the pixels they fall on; infinite off it."""
+    at = pair.project(points.columns, points.rows, points.depth)
+    height, width = depth.shape
+    inside = (at.z > 0) & (at.x > -0.5) & (at.x < width - 0.5) & (at.y > -0.5) & (at.y < height - 0.5)
+    column, row = (np.rint(np.where(inside, value, 0)).astype(np.int64) for value in (at.x, at.y))
+    known = np.where(inside, depth[row, column], 0)
+    both = known > 0
+    return np.where(both, np.abs(np.log(np.where(both, at.z, 1) / np.where(both, known, 1))), np.inf)
+
+
+def _intersection(points: _Points, pair: ViewPair, theirs: FusedPrior) -> tuple[np.ndarray, np.ndarray]:
+    """Where the points' rays meet the surface that another view verified: (depth [K], 0 where nowhere; sigma [K])."""
+    surface = np.where(theirs.labels == Label.VERIFIED, theirs.depth, 0)
+    allowed = np.minimum(WITHIN * points.sigma, NEAR)
+    depth = points.depth.copy()
+    miss, known = _miss(points, pair, surface, depth)
+    for _ in range(STEPS):
+        ahead, known_ahead = _miss(points, pair, surface, depth * 1.001)
+        slope = (ahead - miss) / np.log(1.001)
+        usable = known & known_ahead & (np.abs(slope) > 0.2)
+        step = np.where(usable, -miss / np.where(usable, slope, 1), 0)
+        depth = depth * np.exp(np.clip(step, -0.2, 0.2))
+        miss, known = _miss(points, pair, surface, depth)
+    moved = np.abs(np.log(depth / points.depth))
+    met = known & (np.abs(miss) < MET) & (moved < allowed)
+    at = pair.project(points.columns, points.rows, depth)
+    height, width = surface.shape
+    row = np.clip(np.rint(np.where(met, at.y, 0)), 0, height - 1).astype(np.int64)
+    column = np.clip(np.rint(np.where(met, at.x, 0)), 0, width - 1).astype(np.int64)
+    sigma = np.hypot(theirs.sigma[row, column], BESIDE * moved)
+    return np.where(met, depth, 0), np.where(met, sigma, np.inf)
+
+
+def _miss(
+    points: _Points, pair: ViewPair, surface: np.ndarray, depth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(log of the points' depth in the other view over the surface's there [K], where that is known [K])."""
+    at = pair.project(points.columns, points.rows, depth)
+    inside = at.z > 0
+    known, there = _interpolated(surface, np.where(inside, at.x, -9), np.where(inside, at.y, -9))
+    return np.log(np.where(known, at.z, 1) / np.where(known, there, 1)), known
+
+
+def _interpolated(depth: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(where four neighbours are one surface [K], depth there [K]): bilinear in inverse depth, linear over a plane."""
+    height, width = depth.shape
+    if min(height, width) < 2:
+        return np.zeros(x.shape, bool), np.ones(x.shape)
+    inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+    left = np.clip(np.floor(np.where(inside, x, 0)), 0, width - 2).astype(np.int64)
+    top = np.clip(np.floor(np.where(inside, y, 0)), 0, height - 2).astype(np.int64)
+    right, down = np.where(inside, x, 0) - left, np.where(inside, y, 0) - top
+    corners = np.stack([depth[top + i, left + j] for i in (0, 1) for j in (0, 1)])
+    nearest = corners.min(0)
+    known = inside & (nearest > 0) & (corners.max(0) < CONTINUOUS * nearest)
+    inverse = 1 / np.where(known, corners, 1)
+    upper, lower = (inverse[i] * (1 - right) + inverse[i + 1] * right for i in (0, 2))
+    return known, 1 / (upper * (1 - down) + lower * down)

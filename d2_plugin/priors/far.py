@@ -1,0 +1,80 @@
+"""Sky and whatever else lies beyond any parallax; an addition to the paper.
+
+No one thing tells a sky. Four together do: the monocular map puts it beyond the farthest depth that stereo measured,
+near the smallest value it has in the picture; no stereo depth lies in it; the picture is smooth there; and it reaches
+the rim. From pixels where the first holds clearly, the region grows to the outline that blurred maps give to it, as far
+as the colour is that of the sky beside it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.priors.extras import opencv
+
+CLEARLY = 0.4
+"""Inverse depth, in units of that of the farthest anchors, below which a pixel is clearly beyond."""
+PERHAPS = 0.9
+"""And below which it may be."""
+SMOOTH = 0.04
+"""Largest standard deviation of the grey value (0..1) within 5x5 pixels of a sky."""
+COLOR = 0.06
+"""Largest distance of a colour (RGB, 0..1) from the mean sky around it."""
+LEAST = 0.005
+"""Smallest share of the picture that a sky has."""
+AROUND = 0.04
+"""Reach of "around", picture widths."""
+
+
+def far_pixels(inverse: np.ndarray, geometric: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """Where the view sees beyond any parallax, bool [H, W].
+
+    Args:
+        inverse: aligned inverse depth of the monocular map [H, W]; 0 and below are infinitely far, NaN unknown.
+        geometric: D^g [H, W], 0 where there is none.
+        image: RGB uint8 [H, W, 3].
+    """
+    anchors = geometric[geometric > 0]
+    if anchors.size == 0:
+        return np.zeros(geometric.shape, bool)
+    cv2: Any = opencv("finding the sky")
+    beyond = np.where(np.isfinite(inverse), inverse, np.inf) * np.percentile(anchors, 99.5)
+    measured = cv2.dilate((geometric > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    gray = image.astype(np.float32).mean(-1) / 255
+    mean = cv2.blur(gray, (5, 5))
+    smooth = np.sqrt(np.maximum(cv2.blur(gray * gray, (5, 5)) - mean * mean, 0)) < SMOOTH
+    clear = _large(cv2, (beyond < CLEARLY) & smooth & ~measured, rim=True)
+    if not clear.any():
+        return clear
+    colored = _like_around(cv2, image.astype(np.float32) / 255, clear)
+    candidates = (clear | ((beyond < PERHAPS) & colored)) & ~measured
+    return _touching(cv2, candidates, clear)
+
+
+def _large(cv2: Any, mask: np.ndarray, rim: bool) -> np.ndarray:
+    """The connected pieces that are large enough and reach the rim of the picture."""
+    _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    left, top, width, height, area = stats.T
+    at_rim = (left == 0) | (top == 0) | (left + width == mask.shape[1]) | (top + height == mask.shape[0])
+    keep = (area >= LEAST * mask.size) & (at_rim | (not rim))
+    keep[0] = False
+    return keep[pieces]
+
+
+def _like_around(cv2: Any, image: np.ndarray, clear: np.ndarray) -> np.ndarray:
+    """Pixels whose colour is that of the clear pixels around them."""
+    sigma = AROUND * clear.shape[1]
+    weight = cv2.GaussianBlur(clear.astype(np.float32), (0, 0), sigma)
+    mean = cv2.GaussianBlur(image * clear[..., None], (0, 0), sigma) / np.maximum(weight, 1e-6)[..., None]
+    return (weight > 1e-3) & (np.linalg.norm(image - mean, axis=-1) < COLOR)
+
+
+def _touching(cv2: Any, mask: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """The connected pieces of `mask` that hold a seed."""
+    count, pieces = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    keep = np.zeros(count, bool)
+    keep[np.unique(pieces[seeds & mask])] = True
+    keep[0] = False
+    return keep[pieces]

@@ -1,0 +1,181 @@
+"""How wrong a monocular depth may be, told by what leaving regions of anchors out shows.
+
+The residual at an anchor says nothing: the anchor shaped the map that it is compared with. So regions of anchors are
+left out of the local correction, and the corrected map is held against them. Their errors follow one shape in every
+recording measured: they grow with the distance to the nearest anchor, with how far the depth lies from that anchor's
+(the map extrapolates), and at the edges of the map. How large they are differs from network to network and from
+picture to picture; that one number, the scale, is measured in each picture.
+
+    sigma = K scale sqrt(f0^2 + fd^2 d + (fg g)^2 + (fe e)^2 + (fw e')^2 + (fr r)^2)
+
+with d the distance to the nearest anchor (picture widths), g = |log(D / D of that anchor)|, e and e' the span of log D
+within 0.5 % and 2 % of the width, r = log(D / median anchor) where it is positive. A pixel without an anchor is harder
+than an anchor that was left out (no texture, an edge, seen once): K = 1.35 on all recordings with truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.monocular.correct import corrected_depth
+from d2_plugin.priors.settings import AlignSettings
+
+FLOOR, DISTANCE, GAP, EDGE, WIDE_EDGE, BEYOND = 0.051, 1.19, 0.79, 2.76, 0.16, 0.086
+"""f0 and fd (of d itself) to fr; fitted once to the true errors of studio, plaza and a rendered room together."""
+HARDER = 1.35
+"""K."""
+NEXT = 0.003
+"""How far the next anchor lies where a pixel's own is left out, picture widths."""
+WIDTH = 160
+"""Columns of the picture at which all this is computed: its terms are in picture widths."""
+PATTERNS, REGIONS = 6, 4
+"""How often regions are left out, and how many at a time."""
+COMPARED = 2
+"""Patterns in which the map is also compared with no network at all."""
+SMALLEST, LARGEST = 0.05, 0.6
+"""Sides of the regions, picture widths; drawn evenly in their logarithm."""
+LEAST = 200
+"""With fewer left-out anchors in all, the scale is not known."""
+HOPELESS = 0.5
+"""A larger sigma says nothing about depth: it becomes infinite."""
+EVER = 1e3
+"""Beyond any logarithm of a float32 depth: neutral in a minimum or, negated, in a maximum."""
+
+
+class Skill(NamedTuple):
+    """What left-out anchors say about one map."""
+
+    scale: float
+    """How large its errors are, in units of their common shape; NaN where too few anchors could be left out."""
+    error: float
+    """Median of |log(map / anchor)| over left-out anchors."""
+    error_without: float
+    """The same for a constant map corrected by the same anchors: what no network at all would give."""
+
+    def as_json(self) -> dict[str, float | None]:
+        """Plain values for the record beside a stored prior; NaN becomes None."""
+        return {name: value if np.isfinite(value) else None for name, value in self._asdict().items()}
+
+
+class Uncertainty(NamedTuple):
+    """How wrong a corrected monocular map may be; maps [H, W] float32, infinite where nothing tells."""
+
+    sigma: np.ndarray
+    """Relative standard deviation where the map stands alone."""
+    at_anchors: np.ndarray
+    """The same if the pixel's own anchor had not shaped the map: what verification compares with."""
+    skill: Skill
+
+
+def monocular_uncertainty(aligned: np.ndarray, geometric: np.ndarray, settings: AlignSettings) -> Uncertainty:
+    """How wrong the corrected map may be, from the anchors that can be left out.
+
+    Args:
+        aligned: aligned monocular depth before local correction [H, W], 0 where it has none.
+        geometric: D^g, the anchors [H, W], 0 where there are none.
+        settings: of the local correction.
+    """
+    small, anchors = _shrunk(aligned), _shrunk(geometric)
+    skill = measured_skill(small, anchors, settings)
+    unknown = np.full(aligned.shape, np.inf, np.float32)
+    if not np.isfinite(skill.scale):
+        return Uncertainty(unknown, unknown, skill)
+    corrected = corrected_depth(small, anchors, settings)
+    shapes = error_shape(corrected, anchors), error_shape(corrected, anchors, left_out=True)
+    sigma, at_anchors = (_enlarged(HARDER * skill.scale * shape, aligned.shape) for shape in shapes)
+    sigma = np.where((aligned > 0) & (sigma < HOPELESS), sigma, np.float32(np.inf))
+    return Uncertainty(sigma, at_anchors, skill)
+
+
+def measured_skill(aligned: np.ndarray, anchors: np.ndarray, settings: AlignSettings) -> Skill:
+    """Errors at anchors [H, W] that were left out of the correction of `aligned` [H, W]."""
+    ratios: list[np.ndarray] = []
+    errors: list[np.ndarray] = []
+    without: list[np.ndarray] = []
+    for hole in left_out_regions(anchors.shape):
+        rest = np.where(hole, 0, anchors).astype(np.float32)
+        held = hole & (anchors > 0) & (aligned > 0)
+        if held.sum() < 20 or np.count_nonzero(rest) < settings.min_anchors:
+            continue
+        corrected = corrected_depth(aligned, rest, settings)
+        error = np.abs(np.log(corrected[held] / anchors[held]))
+        ratios.append(error / error_shape(corrected, rest)[held])
+        errors.append(error)
+        if len(without) < COMPARED:
+            flat = corrected_depth(np.full_like(rest, np.median(rest[rest > 0])), rest, settings)
+            without.append(np.abs(np.log(flat[held] / anchors[held])))
+    if sum(map(len, errors)) < LEAST:
+        return Skill(np.nan, np.nan, np.nan)
+    scale = np.quantile(np.concatenate(ratios), 0.68)
+    return Skill(float(scale), float(np.median(np.concatenate(errors))), float(np.median(np.concatenate(without))))
+
+
+def left_out_regions(shape: tuple[int, int]) -> Iterator[np.ndarray]:
+    """Masks [H, W] of squares, the same for every picture of that size."""
+    height, width = shape
+    random = np.random.default_rng(0)
+    for _ in range(PATTERNS):
+        hole = np.zeros(shape, bool)
+        for side in np.exp(random.uniform(np.log(SMALLEST), np.log(LARGEST), REGIONS)) * width:
+            top, left = random.uniform(-side / 2, height - side / 2), random.uniform(-side / 2, width - side / 2)
+            rows, columns = (slice(max(round(a), 0), max(round(a + side), 0)) for a in (top, left))
+            hole[rows, columns] = True
+        yield hole
+
+
+def error_shape(depth: np.ndarray, anchors: np.ndarray, left_out: bool = False) -> np.ndarray:
+    """The shape that errors follow, up to the scale, [H, W].
+
+    Args:
+        depth: the corrected map [H, W].
+        anchors: D^g [H, W], 0 where there is none.
+        left_out: pretend that each pixel's own anchor had been left out: the next one is `NEXT` away, and nothing is
+            known of how far the depth lies from it.
+    """
+    cv2: Any = opencv("the uncertainty of monocular depth")
+    known = anchors > 0
+    width = depth.shape[1]
+    log_depth = np.log(np.where(depth > 0, depth, 1)).astype(np.float32)
+    distance, label = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    by_label = np.zeros(int(label.max()) + 1, np.float32)
+    by_label[label[known]] = np.log(anchors[known])
+    gap = np.abs(log_depth - by_label[label])
+    if left_out:
+        distance, gap = np.full_like(distance, NEXT * width), np.zeros_like(gap)
+    beyond = np.maximum(log_depth - np.median(by_label[label[known]]), 0)
+    edge, wide_edge = (_span(cv2, log_depth, depth > 0, share * width) for share in (0.005, 0.02))
+    squares = (
+        FLOOR**2,
+        DISTANCE**2 * np.minimum(distance / width, 0.3),
+        (GAP * np.minimum(gap, 0.6)) ** 2,
+        (EDGE * np.minimum(edge, 0.7)) ** 2,
+        (WIDE_EDGE * np.minimum(wide_edge, 1)) ** 2,
+        (BEYOND * beyond) ** 2,
+    )
+    return np.sqrt(sum(squares))
+
+
+def _span(cv2: Any, values: np.ndarray, known: np.ndarray, radius: float) -> np.ndarray:
+    """Largest minus smallest known value within a square of that radius, pixels."""
+    side = 2 * max(1, round(radius)) + 1
+    kernel = np.ones((side, side), np.uint8)
+    largest = cv2.dilate(np.where(known, values, np.float32(-EVER)), kernel)
+    smallest = cv2.erode(np.where(known, values, np.float32(EVER)), kernel)
+    return np.where(largest < smallest, 0, largest - smallest)
+
+
+def _shrunk(depth: np.ndarray) -> np.ndarray:
+    """Every k-th pixel: depth is never averaged across an edge."""
+    step = max(1, round(depth.shape[1] / WIDTH))
+    return np.ascontiguousarray(depth[step // 2 :: step, step // 2 :: step], np.float32)
+
+
+def _enlarged(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    cv2: Any = opencv("the uncertainty of monocular depth")
+    return cv2.resize(values.astype(np.float32), shape[::-1], interpolation=cv2.INTER_NEAREST)
