@@ -103,7 +103,7 @@ def test_bench_writes_rows_table_and_plot(tmp_path, monkeypatch: pytest.MonkeyPa
 def test_an_unknown_rig_or_maker_is_told(tmp_path) -> None:
     with pytest.raises(D2Error, match="unknown rig 'studi'.*did you mean 'studio'"):
         load_rigs("studi", None)
-    with pytest.raises(D2Error, match="unknown stereo maker 'patchmach'.*did you mean 'patchmatch'"):
+    with pytest.raises(D2Error, match="unknown stereo matcher 'patchmach'.*did you mean 'patchmatch'"):
         bench_stereo(tmp_path, rigs=["synthetic2"], makers=["patchmach"])
     with pytest.raises(D2Error, match="no such capture"):
         load_rigs("studio", tmp_path)
