@@ -26,7 +26,7 @@ class Label(IntEnum):
     VERIFIED = 2  # geometric depth confirmed by aligned monocular depth (Omega^v)
     CONFLICT = 3  # the two sources disagree: discarded
     AGREED = 4  # no geometric depth, but aligned monocular depths of two cameras agree: an addition to the paper
-    FAR = 5  # sky and what lies beyond any parallax: the depth is only a lower bound: an addition to the paper
+    FAR = 5  # sky and all beyond parallax, depth is only a lower bound: an addition to the paper
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from splat_scenes import near_edge_of
 from torch import Tensor
 
 from d2_plugin.compiler import load_library
@@ -98,16 +99,8 @@ def make_scene(
 
 
 def with_edge(scene: Scene, seed: int = 7) -> Scene:
-    """The scene with a near edge that lies in front of some Gaussians and behind others, unknown at every third pixel.
-
-    Among them are numbers that are no edge, and edges next to the camera and far beyond everything.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    edge = 7 * torch.rand(scene.view.height, scene.view.width, generator=generator)
-    edge.view(-1)[::3] = 0
-    odd = torch.tensor([torch.nan, torch.inf, -torch.inf, -1.0, 1e-3, 1e6, 1e-35])
-    edge.view(-1)[1 : 1 + 5 * len(odd) : 5] = odd[: len(edge.view(-1)[1 : 1 + 5 * len(odd) : 5])]
-    return scene._replace(near_edge=edge)
+    """The scene with a near edge, in front of some Gaussians and behind others."""
+    return scene._replace(near_edge=near_edge_of(scene.view, seed))
 
 
 def camera_of(scene: Scene) -> tuple:

@@ -77,7 +77,7 @@ def depth_colors(depth: np.ndarray) -> np.ndarray:
 
 
 def label_colors(labels: np.ndarray) -> np.ndarray:
-    """RGB uint8 [H, W, 3]: grey empty, blue mono-only, green verified, red conflict, cyan agreed."""
+    """RGB uint8 [H, W, 3]: grey empty, blue mono-only, green verified, red conflict, cyan agreed, lilac far."""
     palette = np.array([LABEL_COLORS[label] for label in Label], np.uint8)
     return palette[labels]
 

@@ -6,8 +6,8 @@
     render = rasterize(splats, colors, view, near_edge=edge)       # and front: the weight in space that must be free
     statistics = survey(splats, view, prior)                       # per Gaussian: what the depth prior says about it
 
-float32 runs in kernels that are compiled at first use, on the CPU (`native`, `d2_plugin.compiler`) or on the GPU
-(`cuda`, by NVRTC), wherever the Gaussians are; float64 in `reference`.
+float32 runs in kernels that are compiled at first use: on the CPU (`native`, `d2_plugin.compiler`) or on the GPU
+(`cuda`, by NVRTC), wherever the Gaussians are. float64 runs in `reference`.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def survey(
 
 
 def _has_kernels(means: Tensor) -> bool:
-    """The device decides: CUDA kernels on a GPU, those of the CPU there, the reference for everything else."""
+    """Whether kernels run on the device of `means`: on a GPU or the CPU, in float32, where they can be compiled."""
     if means.dtype != torch.float32:
         return False
     if means.device.type == "cuda":

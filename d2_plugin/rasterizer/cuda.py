@@ -41,7 +41,7 @@ def launcher(device: torch.device) -> Launcher:
 
 @functools.cache
 def available(device: torch.device) -> bool:
-    """Whether the kernels can be had on a CUDA device; warns once where they cannot."""
+    """Whether the kernels are available on a CUDA device; warns once where they are not."""
     try:
         launcher(device)
     except NoCuda as error:

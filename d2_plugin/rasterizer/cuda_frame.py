@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import ctypes
-from pathlib import Path
 from typing import Protocol
 
-from .frame import PointingFrame
+from .frame import KERNELS, PointingFrame
 
-KERNELS = Path(__file__).parent / "kernels"
 SOURCE, HEADERS = KERNELS / "gpu.cu", (KERNELS / "splat.h",)
 
 THREADS = 256

@@ -16,7 +16,7 @@ from .cuda_frame import THREADS, Frame
 from .nvrtc import NoCuda, build, library
 
 CACHED_CHANNELS = 3
-"""Whose kernels serve where colors do not matter (survey)."""
+"""Number of colors of the kernels that also run the survey, which needs no colors."""
 
 
 class CudaLauncher:

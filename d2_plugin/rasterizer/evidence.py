@@ -10,9 +10,10 @@ from d2_plugin.protocol import DepthPrior, View
 
 
 def reliability(prior: DepthPrior) -> Tensor:
-    """r(p) [H, W]: how much D* counts there. 1 at trusted pixels and 0 elsewhere where the prior has no map of it.
+    """r(p) [H, W]: how much D* counts at each pixel.
 
-    Always 0 at far pixels, whose depth is a lower bound and judges nothing.
+    A prior without such a map has 1 where it is trusted and 0 elsewhere. Far pixels always have 0, since their depth is
+    a lower bound and judges nothing.
     """
     if prior.reliability is None:
         return prior.trusted.to(torch.float32)

@@ -1,11 +1,15 @@
-"""What the descriptions of a call that go to the CPU and to the GPU kernels have in common."""
+"""The common part of the two Frames, which describe one call to the kernels of the CPU and of the GPU."""
 
 from __future__ import annotations
 
 import ctypes
+from pathlib import Path
 from typing import Self
 
 from torch import Tensor
+
+KERNELS = Path(__file__).parent / "kernels"
+"""Sources of the kernels."""
 
 RECORD = 16
 """Floats of a projected Gaussian, one cache line; the same everywhere, so that the operators have one shape."""

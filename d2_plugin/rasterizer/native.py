@@ -11,7 +11,6 @@ import ctypes
 import functools
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -20,10 +19,9 @@ from d2_plugin.compiler import NoCompiler, load_library
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Survey
 
-from .frame import RECORD, PointingFrame
+from .frame import KERNELS, RECORD, PointingFrame
 from .reference import refuse_skew
 
-KERNELS = Path(__file__).parent / "kernels"
 SOURCES = (KERNELS / "cpu.cpp",)
 HEADERS = tuple(KERNELS / name for name in ("splat.h", "simd.h", "parallel.h", "frame.h", "binning.h"))
 FLAGS = ("-ffp-contract=off",)
@@ -83,7 +81,7 @@ def library() -> ctypes.CDLL:
 
 
 def available() -> bool:
-    """Whether the kernels can be had; warns once where they cannot for want of a compiler."""
+    """Whether the kernels are available; warns once where no compiler is found."""
     global _available
     # A plain variable and no functools.cache: torch.compile looks through the one but into the other.
     if _available is None:

@@ -32,7 +32,7 @@ FLAGS = ("--std=c++17", "--fmad=false")
 
 
 class NoCuda(D2Error):
-    """The kernels cannot be had on this GPU; whoever has a slower way should take it."""
+    """The kernels are not available on this GPU; a caller with a slower way takes it."""
 
 
 class Binary(NamedTuple):

@@ -1,4 +1,4 @@
-"""Splatting in plain torch: the oracle of the kernels (float64, gradcheck) and the way out without a compiler.
+"""Splatting in plain torch: the oracle of the kernels (float64, gradcheck) and the fallback without a compiler.
 
 The image is the compositing sum of 3D Gaussian Splatting (Kerbl et al. 2023) with the constants of `RasterSettings`:
 a Gaussian with screen mean m, blurred screen covariance S and opacity o has at pixel centre p

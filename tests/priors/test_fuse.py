@@ -33,7 +33,7 @@ def test_fusion_takes_geometric_depth_where_verified_and_monocular_where_it_is_a
     np.testing.assert_array_equal(
         prior.labels, [[Label.VERIFIED, Label.CONFLICT, Label.CONFLICT, Label.MONO, Label.EMPTY]]
     )
-    assert prior.shares() == {"empty": 0.2, "mono": 0.2, "verified": 0.2, "conflict": 0.4, "agreed": 0.0}
+    assert prior.shares() == {"empty": 0.2, "mono": 0.2, "verified": 0.2, "conflict": 0.4, "agreed": 0.0, "far": 0.0}
 
 
 @pytest.mark.parametrize(

@@ -134,6 +134,17 @@ def test_a_loss_that_sends_nan_where_nothing_is_known_spoils_no_gradient(dtype):
 
 
 @both_paths
+def test_the_share_of_alpha_that_stands_in_front_has_gradients_though_it_is_0_by_0_beside_the_gaussian(dtype):
+    scene = single(depth=2.0, size=41, dtype=dtype).requires_grad()
+    render = scene.render(near_edge=everywhere(scene, 4.0))
+    drawn = render.alpha > 0
+    assert not drawn.all()
+    (render.front / render.alpha)[drawn].sum().backward()
+    assert scene.means.grad[0, 2].item() == pytest.approx(-drawn.sum().item() / 4, rel=1e-4)
+    assert all(part.grad.isfinite().all() for part in scene[:3])
+
+
+@both_paths
 def test_edges_of_nine_decades_in_one_picture(dtype):
     scene = random_scene(4, 200, 40, 30).to(dtype).requires_grad()
     edge = everywhere(scene, 1e-3)

@@ -251,10 +251,11 @@ def test_the_operators_pass_torchs_own_check():
 @pytest.mark.slow
 def test_torch_compile_takes_it_into_one_graph():
     scene = random_scene(12, 40, 20, 18).to(torch.float32).requires_grad()
+    edge = near_edge_of(scene.view)
 
     def loss(means, covariances, opacities, colors):
         splats = Splats(means, covariances, opacities, torch.arange(40))
-        render = rasterize(splats, colors, scene.view, near_edge=near_edge_of(scene.view))
+        render = rasterize(splats, colors, scene.view, near_edge=edge)
         return (render.color.sin() + (render.alpha + render.front)[..., None]).sum()
 
     expected = torch.autograd.grad(loss(*scene[:4]), scene[:4])
