@@ -19,6 +19,8 @@ DEGREE = 3
 """Of the harmonics."""
 RATE = 1e-2
 """Learning rate of the constant term; the others learn at a fifth of it."""
+KEPT_BYTES = 256 << 20
+"""Memory for the harmonics of cameras that were seen before."""
 
 
 class Background:
@@ -44,11 +46,13 @@ class Background:
 
     def _basis(self, view: View) -> Tensor:
         """Harmonics of every pixel's direction [H * W, (DEGREE + 1)^2]; kept, since cameras mostly stand still."""
-        key = (view.camera, view.width, view.height, tuple(view.T_camera_world[:3, :3].flatten().tolist()))
+        camera = torch.cat([view.T_camera_world[:3, :3].flatten(), view.K.to(view.T_camera_world).flatten()])
+        key = (view.width, view.height, *camera.tolist())
         if key not in self._bases:
-            if len(self._bases) >= 16:
+            values = basis(_directions(view), DEGREE).to(self.constant)
+            if sum(map(_bytes, self._bases.values())) + _bytes(values) > KEPT_BYTES:
                 self._bases.clear()
-            self._bases[key] = basis(_directions(view), DEGREE)
+            self._bases[key] = values
         return self._bases[key]
 
     def state_dict(self) -> dict[str, Any]:
@@ -65,6 +69,10 @@ class Background:
         self.constant.copy_(state["constant"])
         self.harmonics.copy_(state["harmonics"])
         self.optimizer.load_state_dict(state["optimizer"])
+
+
+def _bytes(values: Tensor) -> int:
+    return values.numel() * values.element_size()
 
 
 def _directions(view: View) -> Tensor:

@@ -113,7 +113,10 @@ class SplatModel(ABC):
         return sh.colors(coefficients, splats.means - centre, phase, self.settings.sh_degree, time_degree)
 
     def render(self, view: View, background: Tensor | None = None) -> Render:
-        """Colour, depth sum and alpha of one view, differentiable; remembers what `accumulate` needs afterwards."""
+        """Colour, depth sum and alpha of one view, differentiable; remembers what `accumulate` needs afterwards.
+
+        A given `background` colour takes the place of the model's own background.
+        """
         splats = self.slice_at(view)
         colors = self.colors(view, splats)
         self._drawn = splats.rows
@@ -123,7 +126,8 @@ class SplatModel(ABC):
         )
         for observer in self.observers:
             observer.rendered(view, render)
-        return render if self.background is None else self.background.behind(render, view)
+        own = self.background if background is None else None
+        return render if own is None else own.behind(render, view)
 
     def regularization(self) -> Tensor | float:
         """A term of the training loss that concerns no picture; 0.0 where there is none."""

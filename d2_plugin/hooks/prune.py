@@ -80,10 +80,9 @@ def pruning_score(inconsistency: Tensor, contribution: Tensor, lambda_e: float, 
 def gather(evaluation: Sequence[Surveyed], count: int, free_space: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Sum the surveys of several views per Gaussian: error, weight, weight maxima, observations, each [count].
 
-    Weight in free space is evidence with the error 1 - z / D_near that it has there.
+    Weight in free space, times how deep in it 1 - z / D_near, is evidence with the relative error 1.
     """
-    device = evaluation[0].survey.weight.device
-    error, weight, maxima, observations = torch.zeros(4, count, device=device)
+    error, weight, maxima, observations = evaluation[0].survey.weight.new_zeros(4, count)
     for _, splats, _, survey in evaluation:
         if free_space:
             error.index_add_(0, splats.rows, survey.front)

@@ -183,11 +183,15 @@ class Run:
             extent=extent.radius,
             duration=capture.seconds(capture.frames[-1]),
             temporal=self.scene.plan.uses("temporal"),
-            settings={"background": self._sees_far()} | dict(self.settings.overrides.get("backbone", {})),
+            settings=self._background() | dict(self.settings.overrides.get("backbone", {})),
         )
         training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
         pictures = TrainingFrames(capture, cameras, self.settings.device)
         return backbone.Trainer(model, pictures, training, self._attach if attach and self.uses_prior else None)
+
+    def _background(self) -> dict[str, Any]:
+        """The backbone's setting where the scene needs it: one of somebody else's may not know the name."""
+        return {"background": True} if self._sees_far() else {}
 
     def _sees_far(self) -> bool:
         """Whether the depth prior, where there is one, found far pixels: only then a background pays."""
