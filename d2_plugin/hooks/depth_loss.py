@@ -83,9 +83,7 @@ class _PixelDepthLoss(torch.autograd.Function):
     costs 2.7 ms a step at 320x180 on one thread, this .5 ms (medians)."""
 
     @staticmethod
-    def forward(
-        context: Any, depth_sum: Tensor, alpha: Tensor, pixels: KnownPixels, config: DepthLossConfig
-    ) -> Tensor:
+    def forward(context: Any, depth_sum: Tensor, alpha: Tensor, pixels: KnownPixels, config: DepthLossConfig) -> Tensor:
         tau_v = config.tau_v
         z, a = (values.flatten().index_select(0, pixels.index) for values in (depth_sum, alpha))
         weight = (config.sigma_full / pixels.sigma.clamp(min=config.sigma_full)) * (a > tau_v)
