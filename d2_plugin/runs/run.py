@@ -183,7 +183,7 @@ class Run:
             extent=extent.radius,
             duration=capture.seconds(capture.frames[-1]),
             temporal=self.scene.plan.uses("temporal"),
-            settings=self._background() | dict(self.settings.overrides.get("backbone", {})),
+            settings=(self._background() if attach else {}) | dict(self.settings.overrides.get("backbone", {})),
         )
         training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
         pictures = TrainingFrames(capture, cameras, self.settings.device)
@@ -198,12 +198,13 @@ class Run:
         if not (self.priors / "store.json").is_file():
             return False
         store = PriorStore.open(self.priors)
-        keys = ((camera, frame) for camera in self.scene.train_cameras for frame in self.scene.capture.frames)
+        cameras = [camera for camera in self.scene.train_cameras if camera in store.cameras]
+        keys = ((camera, frame) for camera in cameras for frame in self.scene.capture.frames)
         records = [record for key in keys if (record := store.record(*key)) is not None]
         return bool(records) and sum(r["shares"].get("far", 0.0) for r in records) / len(records) > FAR_SHARE
 
     def _trained(self) -> Any:
-        """The trainer at the last checkpoint, without hooks."""
+        """The trainer at the last checkpoint, without hooks or a look at the prior: the checkpoint says it all."""
         trainer = self._trainer(self._points(), attach=False)
         if not self._restore(trainer):
             raise D2Error(f"{self.folder} holds no checkpoint yet: run `d2 train` to its end first")
