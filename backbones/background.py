@@ -19,8 +19,8 @@ DEGREE = 3
 """Of the harmonics."""
 RATE = 1e-2
 """Learning rate of the constant term; the others learn at a fifth of it."""
-KEPT_BYTES = 256 << 20
-"""Memory for the harmonics of cameras that were seen before."""
+KEPT_BYTES = 512 << 20
+"""Memory for the harmonics of cameras that were seen before: 3.5 MiB for each camera of 320x180 pixels."""
 
 
 class Background:
