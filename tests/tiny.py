@@ -63,7 +63,9 @@ class TinyStore:
         return DepthPrior(depth, labels, torch.full((HEIGHT, WIDTH, 3), 128, dtype=torch.uint8))
 
 
-def make_model(count: int = 60, temporal: bool = True, seed: int = 0, backbone: str = "yang4d") -> SplatModel:
+def make_model(
+    count: int = 60, temporal: bool = True, seed: int = 0, backbone: str = "yang4d", background: bool = False
+) -> SplatModel:
     """Gaussians scattered between the cameras and beyond the plane; `backbone` is one of `BACKBONES`."""
     generator = torch.Generator().manual_seed(seed)
     positions = torch.rand(count, 3, generator=generator) * torch.tensor([3.0, 2.0, 3.0]) + torch.tensor(
@@ -71,7 +73,7 @@ def make_model(count: int = 60, temporal: bool = True, seed: int = 0, backbone: 
     )
     growth = DensifySettings(start=0.1, stop=0.9, every=7, gradient=5e-3, budget=150)
     colors, times = torch.rand(count, 3, generator=generator), torch.rand(count, generator=generator) / 2
-    shared = {"temporal": temporal, "initial_opacity": 0.5, "densify": growth}
+    shared = {"temporal": temporal, "initial_opacity": 0.5, "densify": growth, "background": background}
     if backbone == "yang4d":
         settings = Yang4DSettings(**shared)
         return Yang4D.from_points(positions, colors, times, settings, extent=2.0, duration=0.5)

@@ -9,7 +9,7 @@ from typing import Annotated, Self
 import torch
 from torch import Tensor
 
-from d2_plugin.protocol import Edit, Label, Points, Splats, View
+from d2_plugin.protocol import DepthPrior, Edit, Label, Points, Splats, View
 from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
 
 from .hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
@@ -29,9 +29,11 @@ class DensifyConfig(HookConfig):
     tau_v: Share = 0.5
     """A rendered depth is valid where the accumulated alpha exceeds this."""
     tau_u: Positive = 0.1
-    """Relative depth error above which a verified pixel counts as under-reconstructed."""
+    """Relative depth error above which a pixel counts as under-reconstructed, where its depth is that exact."""
+    tau_u_sigmas: Positive = 2.5
+    """And beyond this many standard deviations of a depth that is less exact."""
     tau_u_mono: Annotated[float, Range(0, infinite=True)] = 0.2
-    """The same for every other pixel that has a depth: aligned monocular depth is itself off by some per cent."""
+    """The threshold of pixels without a finite sigma: they may propose and no more."""
     budget_per_view: Count = 60
     """Samples drawn per evaluated view. A larger budget buys quality with time.
     Studio, all 20 frames, 2000 steps, three seeds: 28.9 dB at 60, with training 1.13 to 1.17 times as long as the bare
@@ -133,8 +135,7 @@ class Densify(Hook):
         """New points of one view that no existing Gaussian and no point of an earlier view already stands for."""
         config, view, prior = self.config, surveyed.view, surveyed.prior
         depth, valid = rendered_depth(surveyed.survey.depth_sum, surveyed.survey.alpha, config.tau_v)
-        tau_u = torch.where(prior.labels == Label.VERIFIED, config.tau_u, config.tau_u_mono)
-        region = under_reconstructed(depth, valid, prior.depth, prior.support, tau_u)
+        region = under_reconstructed(depth, valid, prior.depth, prior.support, self._tau_u(prior))
         pixels = sample_pixels(region, budget, generator)
         column, row = pixels.unbind(-1)
         target = prior.depth[row, column]
@@ -153,6 +154,14 @@ class Densify(Hook):
             scales[free],
             torch.full_like(target, config.opacity)[free],
         )
+
+    def _tau_u(self, prior: DepthPrior) -> Tensor:
+        """The relative depth error [H, W] that counts as under-reconstructed, by how exact each pixel is."""
+        config = self.config
+        if prior.sigma is None:
+            return torch.where(prior.labels == Label.VERIFIED, config.tau_u, config.tau_u_mono)
+        exact = (config.tau_u_sigmas * prior.sigma).clamp(min=config.tau_u)
+        return torch.where(torch.isfinite(prior.sigma), exact, config.tau_u_mono)
 
     def _spacing(self, region: int, sampled: int) -> float:
         """Mean distance in pixels between samples of the region, at least one pixel."""

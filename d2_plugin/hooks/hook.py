@@ -16,6 +16,9 @@ from d2_plugin.settings import Every, Settings, Steps
 
 from .prior import PriorLoader
 
+FREE_SIGMAS = 3.0
+"""Space is known to be free up to D* less this many standard deviations."""
+
 
 @dataclass(frozen=True)
 class Window:
@@ -90,7 +93,8 @@ class Context:
         if prior is None:
             return None
         splats = self.backbone.slice_at(view)
-        return Surveyed(view, splats, prior, survey(splats, view, prior, self.backbone.settings))
+        near_edge = None if prior.sigma is None else prior.near_edge(FREE_SIGMAS)
+        return Surveyed(view, splats, prior, survey(splats, view, prior, self.backbone.settings, near_edge=near_edge))
 
 
 class Hook:

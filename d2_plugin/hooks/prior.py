@@ -24,14 +24,22 @@ class Store(Protocol):
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
 
 
+JUDGES = 0.05
+"""Largest sigma of a pixel that may judge a Gaussian: an error of 10 %, at which E_k saturates, is two of these."""
+
+
 @dataclass(frozen=True, eq=False)
-class TrustedPixels:
-    """What may supervise one view: where D* is trusted (see `DepthPrior.trusted`), and D* there."""
+class KnownPixels:
+    """What may supervise one view: where something is known of D*, and how much; all [K]."""
 
     index: Tensor
-    """[K] int64, row * width + column."""
+    """int64, row * width + column."""
     depth: Tensor
-    """[K] float32, world units."""
+    """float32, world units; at far pixels a lower bound."""
+    sigma: Tensor
+    """float32, relative standard deviation of the depth; 0 at far pixels and, in the paper, at verified ones."""
+    far: Tensor
+    """bool: only a depth in front of `depth` is wrong."""
 
 
 class PriorLoader:
@@ -41,7 +49,7 @@ class PriorLoader:
         self.store, self.keep_bytes = store, keep_bytes
         self._kept: OrderedDict[tuple[str, int], DepthPrior | None] = OrderedDict()
         self._cameras = CameraCheck()
-        self._pixels: dict[tuple[str, int], TrustedPixels] = {}
+        self._pixels: dict[tuple[str, int], KnownPixels] = {}
 
     def __call__(self, view: View) -> DepthPrior | None:
         """D* of the view, or None where the store has none; refuses one made for another size, K or pose."""
@@ -52,21 +60,20 @@ class PriorLoader:
         prior = self.store.prior(*key)
         if prior is not None:
             self._check(view, prior)
-            prior = _with_depth(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior))
+            prior = _usable(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior))
         self._kept[key] = prior
         while len(self._kept) > 1 and sum(map(_bytes, self._kept.values())) > self.keep_bytes:
             dropped, _ = self._kept.popitem(last=False)
             self._pixels.pop(dropped, None)
         return prior
 
-    def trusted(self, view: View) -> TrustedPixels | None:
-        """The trusted pixels of the view, or None where there is not one."""
+    def known(self, view: View) -> KnownPixels | None:
+        """The pixels of the view of whose depth something is known, or None where there is not one."""
         key, prior = (view.camera, view.frame), self(view)
         if prior is None:
             return None
         if key not in self._pixels:
-            index = torch.nonzero(prior.trusted.flatten()).squeeze(1)
-            self._pixels[key] = TrustedPixels(index, prior.depth.flatten()[index])
+            self._pixels[key] = _known(prior)
         pixels = self._pixels[key]
         return pixels if len(pixels.index) else None
 
@@ -83,14 +90,29 @@ class PriorLoader:
             self._cameras.check(view, record, prior.depth)
 
 
-def _with_depth(prior: DepthPrior) -> DepthPrior:
-    """The same prior, empty where the depth is no finite positive number: no store can put NaN into a loss."""
+def _usable(prior: DepthPrior) -> DepthPrior:
+    """The same prior, empty where the depth is no finite positive number: no store can put NaN into a loss.
+
+    Pixels judge Gaussians where sigma is small, whatever their label.
+    """
     usable = torch.isfinite(prior.depth) & (prior.depth > 0)
-    return prior if usable.all() else prior._replace(labels=torch.where(usable, prior.labels, int(Label.EMPTY)))
+    prior = prior._replace(labels=torch.where(usable, prior.labels, int(Label.EMPTY)))
+    if prior.sigma is None or prior.reliability is not None:
+        return prior
+    return prior._replace(reliability=(prior.support & (prior.sigma <= JUDGES)).to(prior.depth))
+
+
+def _known(prior: DepthPrior) -> KnownPixels:
+    """Pixels with a finite sigma, and far ones; without sigma, as in the paper, the trusted ones."""
+    known = prior.trusted if prior.sigma is None else prior.support & torch.isfinite(prior.sigma)
+    index = torch.nonzero((known | prior.far).flatten()).squeeze(1)
+    depth, far = prior.depth.flatten()[index], prior.far.flatten()[index]
+    sigma = torch.zeros_like(depth) if prior.sigma is None else prior.sigma.flatten()[index].masked_fill(far, 0)
+    return KnownPixels(index, depth, sigma, far)
 
 
 def _bytes(prior: DepthPrior | None) -> int:
-    """Of a prior on the device, and of as many trusted pixels as it may have."""
+    """Of a prior on the device, and of as many known pixels as it may have."""
     if prior is None:
         return 0
-    return sum(t.numel() * t.element_size() for t in prior if t is not None) + 12 * prior.depth.numel()
+    return sum(t.numel() * t.element_size() for t in prior if t is not None) + 17 * prior.depth.numel()

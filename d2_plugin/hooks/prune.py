@@ -36,7 +36,9 @@ class PruneConfig(HookConfig):
     lambda_o: Share = 0.5
     """Weight of missing opacity contribution."""
     patience: AtLeastOne = 3
-    """Evaluations in a row, each touching trusted pixels, before a Gaussian is removed."""
+    """Evaluations in a row, each with evidence, before a Gaussian is removed."""
+    free_space: bool = True
+    """Whether standing in space that the prior says is free counts as inconsistency too; the paper has no such term."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -75,11 +77,16 @@ def pruning_score(inconsistency: Tensor, contribution: Tensor, lambda_e: float, 
     return lambda_e * inconsistency + lambda_o * (1 - contribution)
 
 
-def gather(evaluation: Sequence[Surveyed], count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Sum the surveys of several views per Gaussian: error, weight, weight maxima, observations, each [count]."""
-    device = evaluation[0].survey.weight.device
-    error, weight, maxima, observations = torch.zeros(4, count, device=device)
+def gather(evaluation: Sequence[Surveyed], count: int, free_space: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Sum the surveys of several views per Gaussian: error, weight, weight maxima, observations, each [count].
+
+    Weight in free space, times how deep in it 1 - z / D_near, is evidence with the relative error 1.
+    """
+    error, weight, maxima, observations = evaluation[0].survey.weight.new_zeros(4, count)
     for _, splats, _, survey in evaluation:
+        if free_space:
+            error.index_add_(0, splats.rows, survey.front)
+            weight.index_add_(0, splats.rows, survey.front)
         error.index_add_(0, splats.rows, survey.error)
         weight.index_add_(0, splats.rows, survey.weight)
         maxima.index_add_(0, splats.rows, survey.max_weight)
@@ -88,7 +95,7 @@ def gather(evaluation: Sequence[Surveyed], count: int) -> tuple[Tensor, Tensor, 
 
 
 class Prune(Hook):
-    """Removes Gaussians whose score stays above tau_p in consecutive evaluations that touched trusted pixels."""
+    """Removes Gaussians whose score stays above tau_p in consecutive evaluations with evidence."""
 
     config: PruneConfig
 
@@ -102,7 +109,7 @@ class Prune(Hook):
         if not context.evaluation:
             return None
         config, count = self.config, len(context.backbone)
-        error, weight, maxima, observations = gather(context.evaluation, count)
+        error, weight, maxima, observations = gather(context.evaluation, count, config.free_space)
         inconsistency = depth_inconsistency(error, weight, config.tau_u)
         contribution = opacity_contribution(maxima, observations)
         high = pruning_score(inconsistency, contribution, config.lambda_e, config.lambda_o) > config.tau_p

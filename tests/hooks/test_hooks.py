@@ -17,8 +17,7 @@ from d2_plugin.hooks.densify import (
     sample_pixels,
     under_reconstructed,
 )
-from d2_plugin.hooks.depth_loss import charbonnier, depth_loss, pixel_depth_loss
-from d2_plugin.hooks.prior import PriorLoader, TrustedPixels
+from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.hooks.prune import depth_inconsistency, opacity_contribution, pruning_score
 from d2_plugin.hooks.rendered_depth import relative_discrepancy, rendered_depth
 from d2_plugin.protocol import DepthPrior, Label, View
@@ -72,29 +71,6 @@ class TestRenderedDepth:
         torch.testing.assert_close(relative_discrepancy(tensor(1.1, 1.1e6), tensor(1.0, 1e6)), tensor(0.1, 0.1))
 
 
-class TestCharbonnier:
-    def test_equals_the_formula(self) -> None:
-        r = torch.linspace(-3, 3, 31, dtype=torch.float64)
-        torch.testing.assert_close(charbonnier(r, 0.1), torch.sqrt(r**2 + 0.01) - 0.1)
-
-    def test_equals_kornia_rescaled(self) -> None:
-        kornia = pytest.importorskip("kornia", reason="kornia is in the `test` extra")
-        r = torch.linspace(-3, 3, 31, dtype=torch.float64)
-        expected = 0.1 * kornia.losses.charbonnier_loss(r / 0.1, torch.zeros_like(r))
-        torch.testing.assert_close(charbonnier(r, 0.1), expected)
-
-    @pytest.mark.parametrize("value", [0.0, 1e-30, 1e20])
-    def test_is_finite_with_finite_gradient_at_extremes_in_float32(self, value: float) -> None:
-        r = torch.tensor([value], requires_grad=True)
-        loss = charbonnier(r, 0.01)
-        loss.sum().backward()
-        assert torch.isfinite(loss).all()
-        assert torch.isfinite(r.grad).all()
-        assert loss.item() == pytest.approx(value if value > 1 else 0.0, rel=1e-6, abs=1e-12)
-        if value == 0:
-            assert r.grad.item() == 0
-
-
 @pytest.mark.parametrize("label", list(Label))
 def test_trusted_are_verified_and_agreed_pixels_and_no_others(label: Label) -> None:
     prior = DepthPrior(torch.ones(2, 2), torch.full((2, 2), int(label), dtype=torch.uint8))
@@ -102,89 +78,8 @@ def test_trusted_are_verified_and_agreed_pixels_and_no_others(label: Label) -> N
     assert prior.trusted.all() == (label in (Label.VERIFIED, Label.AGREED))
     assert prior.support.all() == (label in (Label.VERIFIED, Label.AGREED, Label.MONO))
     view = View("a", 0, 0.0, torch.eye(4), torch.eye(3), 2, 2)
-    pixels = PriorLoader(SimpleNamespace(prior=lambda camera, frame: prior)).trusted(view)
-    assert (pixels is not None) == prior.trusted.all()
-
-
-class TestDepthLoss:
-    def test_counts_only_pixels_that_are_trusted_and_validly_rendered(self) -> None:
-        depth, prior = tensor(2.0, 2.0, 2.0), tensor(1.0, 4.0, 8.0)
-        valid, verified = torch.tensor([True, True, False]), torch.tensor([True, False, True])
-        expected = charbonnier(tensor(1.0), 0.01).squeeze()
-        torch.testing.assert_close(depth_loss(depth, valid, prior, verified, 0.01), expected)
-
-    def test_no_common_pixel_gives_zero_loss_and_zero_gradient(self) -> None:
-        depth = torch.ones(4, requires_grad=True)
-        loss = depth_loss(depth, torch.zeros(4, dtype=torch.bool), torch.ones(4), torch.ones(4, dtype=torch.bool), 0.01)
-        loss.backward()
-        assert loss.item() == 0
-        assert (depth.grad == 0).all()
-
-    @pytest.mark.parametrize("bad", [float("nan"), float("inf"), 0.0, -1.0])
-    def test_bad_prior_pixels_outside_the_mask_never_leak(self, bad: float) -> None:
-        depth = torch.tensor([1.0, 2.0], requires_grad=True)
-        verified = torch.tensor([True, False])
-        loss = depth_loss(depth, torch.ones(2, dtype=torch.bool), tensor(1.1, bad), verified, 0.01)
-        loss.backward()
-        assert torch.isfinite(loss)
-        assert torch.isfinite(depth.grad).all()
-
-    @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
-    def test_does_not_depend_on_the_scale_of_the_scene(self, scale: float) -> None:
-        mask = torch.ones(2, dtype=torch.bool)
-        reference = depth_loss(tensor(1.1, 3.0), mask, tensor(1.0, 4.0), mask, 0.01)
-        scaled = depth_loss(tensor(1.1, 3.0) * scale, mask, tensor(1.0, 4.0) * scale, mask, 0.01)
-        torch.testing.assert_close(scaled, reference, rtol=2e-5, atol=0)
-
-    def test_depths_a_billion_apart_in_one_picture_weigh_alike(self) -> None:
-        mask = torch.ones(2, dtype=torch.bool)
-        loss = depth_loss(tensor(1.1e-3, 1.1e6), mask, tensor(1e-3, 1e6), mask, 0.01)
-        torch.testing.assert_close(loss, charbonnier(tensor(0.1), 0.01).squeeze(), rtol=1e-4, atol=0)
-
-
-class TestPixelDepthLoss:
-    """The fast form that the hook uses is the paper's formula, value and gradient."""
-
-    @staticmethod
-    def maps(
-        seed: int, shape: tuple[int, int] = (7, 9)
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        generator = torch.Generator().manual_seed(seed)
-        depth_sum, alpha, prior, chance = torch.rand(4, *shape, generator=generator, dtype=torch.float64)
-        return depth_sum * 3, alpha, prior + 0.5, chance < 0.4
-
-    @given(st.integers(0, 10_000))
-    @settings(max_examples=50, deadline=None)
-    def test_equals_the_composed_formula_with_its_gradient(self, seed: int) -> None:
-        depth_sum, alpha, prior, verified = self.maps(seed)
-        pixels = TrustedPixels(torch.nonzero(verified.flatten()).squeeze(1), prior[verified])
-        gradients = []
-        for fast in (False, True):
-            z, a = depth_sum.clone().requires_grad_(), alpha.clone().requires_grad_()
-            if fast:
-                loss = pixel_depth_loss(z, a, pixels, 0.5, 0.01)
-            else:
-                depth, valid = rendered_depth(z, a, 0.5)
-                loss = depth_loss(depth, valid, prior, verified, 0.01)
-            (3 * loss).backward()
-            gradients.append((loss.detach(), z.grad, a.grad))
-        for composed, closed in zip(*gradients, strict=True):
-            torch.testing.assert_close(closed, composed, rtol=1e-7, atol=1e-12)
-
-    def test_gradcheck(self) -> None:
-        depth_sum, alpha, prior, verified = self.maps(1)
-        alpha = torch.where((alpha - 0.5).abs() < 0.01, 0.6, alpha)  # away from the step at tau_v
-        pixels = TrustedPixels(torch.nonzero(verified.flatten()).squeeze(1), prior[verified])
-        inputs = (depth_sum.requires_grad_(), alpha.requires_grad_())
-        assert torch.autograd.gradcheck(lambda z, a: pixel_depth_loss(z, a, pixels, 0.5, 0.01), inputs)
-
-    def test_is_finite_where_nothing_is_rendered(self) -> None:
-        z, a = torch.zeros(2, 3, requires_grad=True), torch.zeros(2, 3, requires_grad=True)
-        loss = pixel_depth_loss(z, a, TrustedPixels(torch.tensor([0, 4]), torch.tensor([1e-3, 1e6])), 0.5, 0.01)
-        loss.backward()
-        assert loss == 0
-        assert not z.grad.any()
-        assert not a.grad.any()
+    pixels = PriorLoader(SimpleNamespace(prior=lambda camera, frame: prior)).known(view)
+    assert (pixels is not None) == (prior.trusted | prior.far).all()
 
 
 class TestPruning:

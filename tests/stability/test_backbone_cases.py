@@ -60,9 +60,9 @@ class Store:
         return DepthPrior(depth, labels, exact.colors)
 
 
-def unlabelled(label: Label) -> Store:
-    """The exact depth, every pixel labelled alike."""
-    return Store(lambda depth, labels: (torch.full_like(depth, DISTANCE), torch.full_like(labels, int(label))))
+def unlabelled(label: Label, distance: float = DISTANCE) -> Store:
+    """One depth, by default the exact one, every pixel labelled alike."""
+    return Store(lambda depth, labels: (torch.full_like(depth, distance), torch.full_like(labels, int(label))))
 
 
 def with_bad_pixels(bad: float) -> Store:
@@ -105,12 +105,20 @@ def assert_finite(model: SplatModel) -> None:
 TRUSTED = (Label.VERIFIED, Label.AGREED)
 
 
-@pytest.mark.parametrize("label", [label for label in Label if label not in TRUSTED])
+@pytest.mark.parametrize("label", [label for label in Label if label not in (*TRUSTED, Label.FAR)])
 def test_case_25_without_a_trusted_pixel_there_is_no_depth_loss(model: SplatModel, label: Label) -> None:
     d2 = D2Hooks(DEPTH_LOSS, make_adapter(model), unlabelled(label))
     view = make_views()[0]
     model.render(view)
     assert d2.loss(1, view) == 0.0
+
+
+def test_case_25_far_pixels_supervise_what_lies_in_front_of_them_alone(model: SplatModel) -> None:
+    view = make_views()[0]
+    for bound, in_front in ((1.0, False), (100.0, True)):  # the Gaussians are between 1.5 and 4.5
+        d2 = D2Hooks(DEPTH_LOSS, make_adapter(model), unlabelled(Label.FAR, bound))
+        model.render(view)
+        assert (d2.loss(1, view) > 0) == in_front
 
 
 @pytest.mark.parametrize("label", TRUSTED)

@@ -1,0 +1,88 @@
+"""What lies behind all Gaussians: a colour at infinity that depends on the direction alone, for skies.
+
+Spherical harmonics of the viewing direction, so a held-out camera sees the same sky, and too smooth to stand in for a
+surface. Composited with what the Gaussians leave of a ray: color + (1 - alpha) background.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from d2_plugin.gaussians.spherical_harmonics import basis
+from d2_plugin.rasterizer import Render, View
+
+DEGREE = 3
+"""Of the harmonics."""
+RATE = 1e-2
+"""Learning rate of the constant term; the others learn at a fifth of it."""
+KEPT_BYTES = 512 << 20
+"""Memory for the harmonics of cameras that were seen before: 3.5 MiB for each camera of 320x180 pixels."""
+
+
+class Background:
+    """Colours at infinity with their optimizer."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.constant = nn.Parameter(torch.zeros(1, 3, device=device))
+        self.harmonics = nn.Parameter(torch.zeros((DEGREE + 1) ** 2 - 1, 3, device=device))
+        groups = [{"params": [self.constant], "lr": RATE}, {"params": [self.harmonics], "lr": RATE / 5}]
+        self.optimizer = torch.optim.Adam(groups, eps=1e-15)
+        self._bases: dict[tuple[Any, ...], Tensor] = {}
+
+    def behind(self, render: Render, view: View) -> Render:
+        """The render with the background where the Gaussians leave some of a ray."""
+        colors = (self._basis(view) @ torch.cat([self.constant, self.harmonics]) + 0.5).clamp(0, 1)
+        colors = colors.view(view.height, view.width, 3)
+        return render._replace(color=render.color + (1 - render.alpha)[..., None] * colors)
+
+    def optimize(self) -> None:
+        """One optimizer step, gradients cleared."""
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def _basis(self, view: View) -> Tensor:
+        """Harmonics of every pixel's direction [H * W, (DEGREE + 1)^2]; kept, since cameras mostly stand still."""
+        camera = torch.cat([view.T_camera_world[:3, :3].flatten(), view.K.to(view.T_camera_world).flatten()])
+        key = (view.width, view.height, *camera.tolist())
+        if key not in self._bases:
+            values = basis(_directions(view), DEGREE).to(self.constant)
+            if sum(map(_bytes, self._bases.values())) + _bytes(values) > KEPT_BYTES:
+                self._bases.clear()
+            self._bases[key] = values
+        return self._bases[key]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Colours and optimizer."""
+        return {
+            "constant": self.constant.detach().clone(),
+            "harmonics": self.harmonics.detach().clone(),
+            "optimizer": self.optimizer.state_dict(),
+        }
+
+    @torch.no_grad()
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from `state_dict()`."""
+        self.constant.copy_(state["constant"])
+        self.harmonics.copy_(state["harmonics"])
+        self.optimizer.load_state_dict(state["optimizer"])
+
+
+def _bytes(values: Tensor) -> int:
+    return values.numel() * values.element_size()
+
+
+def _directions(view: View) -> Tensor:
+    """Unit directions in the world [H * W, 3] of the pixels' centres, row by row."""
+    like = view.T_camera_world
+    rows, columns = torch.meshgrid(
+        torch.arange(view.height, dtype=like.dtype, device=like.device) + 0.5,
+        torch.arange(view.width, dtype=like.dtype, device=like.device) + 0.5,
+        indexing="ij",
+    )
+    pixels = torch.stack([columns, rows, torch.ones_like(rows)], -1).reshape(-1, 3)
+    rays = torch.linalg.solve(view.K.to(like), pixels.T).T @ view.T_camera_world[:3, :3]
+    return rays / rays.norm(dim=-1, keepdim=True)

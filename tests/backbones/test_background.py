@@ -1,0 +1,266 @@
+"""The colour at infinity: off unless asked for, the same from every camera, saved with the model, no surface."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from tiny import (
+    ALL_HOOKS,
+    BACKBONES,
+    TinyFrames,
+    TinyStore,
+    is_finite,
+    make_adapter,
+    make_model,
+    make_trainer,
+    make_views,
+)
+from tiny import parameters as of_the_gaussians
+from torch import Tensor
+
+from d2_plugin.backbones import background as module
+from d2_plugin.backbones.background import Background
+from d2_plugin.backbones.model import SplatModel, SplatSettings
+from d2_plugin.backbones.trainer import Trainer, TrainSettings
+from d2_plugin.plugin import D2Hooks
+from d2_plugin.protocol import Render, View
+from d2_plugin.rasterizer import rasterize
+
+
+@pytest.fixture(params=BACKBONES)
+def backbone(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+def parameters(trainer: Trainer) -> list[Tensor]:
+    sky = trainer.model.background
+    own = [] if sky is None else [sky.constant.detach().clone(), sky.harmonics.detach().clone()]
+    return [*of_the_gaussians(trainer).values(), *own]
+
+
+def same(a: Trainer, b: Trainer) -> bool:
+    return all(torch.equal(*pair) for pair in zip(parameters(a), parameters(b), strict=True))
+
+
+def some_sky(seed: int = 0) -> Background:
+    """A sky with all its harmonics, nowhere clamped."""
+    sky = Background(torch.device("cpu"))
+    with torch.no_grad():
+        sky.harmonics.uniform_(-0.05, 0.05, generator=torch.Generator().manual_seed(seed))
+    return sky
+
+
+def nothing(view: View) -> Render:
+    empty = view.K.new_zeros(view.height, view.width)
+    return Render(view.K.new_zeros(view.height, view.width, 3), empty, empty)
+
+
+def sky_of(sky: Background, view: View) -> Tensor:
+    """The background alone [H, W, 3]."""
+    return sky.behind(nothing(view), view).color
+
+
+def turned(view: View, angle: float) -> View:
+    c, s = math.cos(angle), math.sin(angle)
+    turn = torch.tensor([[c, 0, s, 0.3], [0, 1, 0, -2.0], [-s, 0, c, 0.7], [0, 0, 0, 1]])
+    return replace(view, T_camera_world=turn @ view.T_camera_world, camera="held out")
+
+
+class TestOff:
+    def test_it_is_off_unless_asked_for(self, backbone: str) -> None:
+        model = make_model(backbone=backbone)
+        assert not SplatSettings().background
+        assert model.background is None
+        state = model.state_dict()
+        assert "background" not in state.get("gaussians", state)
+
+    def test_off_is_what_the_rasterizer_returns(self, backbone: str) -> None:
+        model, view = make_model(backbone=backbone), make_views()[0]
+        splats = model.slice_at(view)
+        expected = rasterize(splats, model.colors(view, splats), view)
+        for part, other in zip(model.render(view)[:3], expected[:3], strict=True):
+            assert torch.equal(part, other)
+
+    def test_it_changes_a_run(self, backbone: str) -> None:
+        runs = [make_trainer(iterations=6, backbone=backbone, background=on) for on in (False, True)]
+        for trainer in runs:
+            trainer.run()
+        changed = [not torch.equal(*pair) for pair in zip(*(list(of_the_gaussians(t).values()) for t in runs))]
+        assert any(changed)
+        assert is_finite(runs[1])
+
+
+class TestState:
+    @pytest.mark.parametrize("hooks", [True, False], ids=["all hooks", "no hooks"])
+    def test_a_resumed_run_is_bitwise_the_uninterrupted_one(self, backbone: str, hooks: bool) -> None:
+        def make(**model: object) -> Trainer:
+            return make_trainer(ALL_HOOKS if hooks else None, iterations=6, backbone=backbone, **model)
+
+        whole, first = make(background=True), make(background=True)
+        whole.run()
+        first.run(until=3)
+        buffer = io.BytesIO()
+        torch.save(first.state_dict(), buffer)
+        for background in (True, False):  # the state decides, whatever the model was created with
+            buffer.seek(0)
+            second = make(background=background, seed=99)
+            second.load_state_dict(torch.load(buffer, weights_only=True))
+            assert second.step == 3
+            second.run()
+            assert same(whole, second)
+
+    @pytest.mark.parametrize("part", ["constant", "harmonics", "optimizer"])
+    def test_a_resume_without_a_part_of_it_differs(self, part: str) -> None:
+        whole, first, second = (make_trainer(iterations=6, background=True) for _ in range(3))
+        whole.run()
+        first.run(until=3)
+        state = first.state_dict()
+        state["model"]["background"][part] = second.model.state_dict()["background"][part]
+        second.load_state_dict(state)
+        second.run()
+        assert not same(whole, second)
+
+    def test_a_checkpoint_without_one_loads_into_a_model_that_has_one(self, backbone: str) -> None:
+        bare, other = (make_model(backbone=backbone, background=on) for on in (False, True))
+        other.load_state_dict(bare.state_dict())
+        assert other.background is None
+        assert torch.equal(other.render(make_views()[0]).color, bare.render(make_views()[0]).color)
+
+    def test_the_state_does_not_change_with_the_model(self) -> None:
+        sky = some_sky()
+        state = sky.state_dict()
+        before = state["harmonics"].clone()
+        sky_of(sky, make_views()[0]).sum().backward()
+        sky.optimize()
+        assert torch.equal(state["harmonics"], before)
+        assert not torch.equal(sky.harmonics, before)
+        assert sky.harmonics.grad is None
+
+
+class TestColour:
+    def test_gradients_reach_alpha_and_the_colours(self) -> None:
+        sky, view = some_sky(), make_views()[0]
+        color, alpha = torch.rand(24, 32, 3), torch.rand(24, 32).requires_grad_()
+        depth_sum = torch.rand(24, 32)
+        render = sky.behind(Render(color, depth_sum, alpha), view)
+        behind = sky_of(sky, view)
+        torch.testing.assert_close(render.color, color + (1 - alpha)[..., None] * behind)
+        assert render.depth_sum is depth_sum
+        assert render.alpha is alpha
+        render.color.sum().backward()
+        torch.testing.assert_close(alpha.grad, -behind.sum(-1).detach())
+        assert sky.constant.grad.all()
+        assert sky.harmonics.grad.any(1).all()
+
+    def test_gradients_reach_the_opacities_of_a_model(self, backbone: str) -> None:
+        found = []
+        for on in (False, True):
+            model = make_model(backbone=backbone, background=on)
+            model.render(make_views()[0]).color.sum().backward()
+            found.append(model.gaussians["opacity_logits"].grad)
+        assert not torch.equal(*found)
+
+    def test_a_direction_has_one_colour_whatever_camera_sees_it(self) -> None:
+        """Of a camera that is elsewhere and turned, one pixel whose ray is that of a pixel of the first."""
+        sky, view = some_sky(), make_views()[0]
+        expected = sky_of(sky, view)
+        assert (expected.amax((0, 1)) - expected.amin((0, 1))).min() > 0.02, "a sky of one colour shows nothing"
+        for row, column in ((0, 0), (11, 20), (23, 31)):
+            other = turned(view, 0.4)
+            ray = torch.linalg.solve(view.K, torch.tensor([column + 0.5, row + 0.5, 1.0]))
+            ray = other.T_camera_world[:3, :3] @ view.T_camera_world[:3, :3].T @ ray
+            K = torch.tensor([[40.0, 0, 0.5 - 40 * ray[0] / ray[2]], [0, 40.0, 0.5 - 40 * ray[1] / ray[2]], [0, 0, 1]])
+            found = sky_of(sky, replace(other, K=K, width=1, height=1))
+            torch.testing.assert_close(found[0, 0], expected[row, column], atol=1e-5, rtol=0)
+
+    def test_where_a_camera_stands_makes_no_difference(self) -> None:
+        sky, (left, _, right) = some_sky(), make_views()[:3]
+        assert torch.equal(sky_of(sky, left), sky_of(sky, right))
+
+    def test_another_lens_on_the_same_camera_sees_other_directions(self) -> None:
+        sky, view = some_sky(), make_views()[0]
+        zoomed = replace(view, K=view.K * torch.tensor([2.0, 2.0, 1.0])[:, None])
+        wide = sky_of(sky, view)
+        assert torch.equal(sky_of(sky, zoomed), sky_of(some_sky(), zoomed)), "remembered from the other lens"
+        assert not torch.equal(sky_of(sky, zoomed), wide)
+
+    def test_a_view_in_float64_is_drawn_as_the_gaussians_are(self) -> None:
+        model, view = make_model(background=True), make_views()[0]
+        exact = replace(view, K=view.K.double(), T_camera_world=view.T_camera_world.double())
+        torch.testing.assert_close(model.render(exact).color, model.render(view).color)
+
+    def test_a_given_colour_takes_its_place(self) -> None:
+        view, white = make_views()[0], torch.ones(3)
+        plain, with_sky = make_model(), make_model(background=True)
+        assert torch.equal(with_sky.render(view, white).color, plain.render(view, white).color)
+
+    def test_memory_does_not_grow_with_moving_cameras(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(module, "KEPT_BYTES", 3 * 24 * 32 * 16 * 4)
+        sky, view = some_sky(), make_views()[0]
+        for i in range(10):
+            sky_of(sky, turned(view, i / 10))
+            assert len(sky._bases) <= 3
+        sky_of(sky, view)
+        assert len(sky._bases) > 1, "nothing is kept"
+
+    @pytest.mark.parametrize("bright", [0.02, 0.6, 0.98])
+    def test_a_sky_is_learned_and_a_held_out_camera_sees_it(self, bright: float) -> None:
+        class Sky(TinyFrames):
+            def image(self, index: int) -> Tensor:
+                return torch.full((24, 32, 3), bright)
+
+        model = make_model(1, background=True)
+        model.select(torch.arange(0))
+        sky, frames = model.background, Sky()
+        for step in range(200):
+            index = step % 3
+            (model.render(frames.views[index]).color - frames.image(index)).abs().mean().backward()
+            model.optimize(step, 200)
+        assert (sky_of(sky, turned(frames.views[0], 0.1)) - bright).abs().mean() < 0.02
+
+
+class TestNeighbours:
+    """What listens to a model, or takes its Gaussians, knows nothing of the background."""
+
+    def test_the_trainers_render_is_handed_to_the_depth_loss_as_before(self, backbone: str) -> None:
+        views = make_views()[:2]
+        found = []
+        for on in (False, True):
+            model = make_model(backbone=backbone, background=on)
+            adapter = make_adapter(model)
+            model.render(views[0])
+            found.append([*adapter.rendered_depth(views[0])])
+            d2 = D2Hooks(replace(ALL_HOOKS, densify=None, prune=None), adapter, TinyStore())
+            model.render(views[1])
+            loss = d2.loss(1, views[1])
+            found[-1] += [loss, *torch.autograd.grad(loss, [model.gaussians["positions"]])]
+        for bare, sky in zip(*found, strict=True):
+            assert torch.equal(bare, sky)
+        assert found[0][-1].any()
+
+    def test_screen_space_gradients_are_counted(self, backbone: str) -> None:
+        model, view = make_model(backbone=backbone, background=True), make_views()[0]
+        model.render(view).color.square().sum().backward()
+        model.accumulate(view)
+        assert model.gaussians.statistics["screen_gradient"].any()
+
+    def test_the_exported_gaussians_are_those_of_the_model(self, backbone: str) -> None:
+        models: list[SplatModel] = [make_model(backbone=backbone, background=on) for on in (False, True)]
+        view = make_views()[0]
+        exported: list[Callable[[SplatModel], Tensor]] = [
+            lambda model: model.slice_at(view).means,
+            lambda model: model.colors(view, model.slice_at(view)),
+        ]
+        for part in exported:
+            assert torch.equal(*map(part, models))
+
+
+def test_the_bare_trainer_takes_a_model_with_a_background() -> None:
+    trainer = Trainer(make_model(background=True), TinyFrames(), TrainSettings(iterations=3, seed=0))
+    trainer.run()
+    assert trainer.model.background.constant.detach().any()

@@ -1,0 +1,227 @@
+"""Pruning: the paper's scores, written out, and what standing in free space adds to them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tiny import (
+    ALL_HOOKS,
+    HEIGHT,
+    WIDTH,
+    TinyStore,
+    make_adapter,
+    make_model,
+    make_trainer,
+    make_views,
+    parameters,
+    same,
+)
+from torch import Tensor
+
+from d2_plugin.hooks.hook import FREE_SIGMAS, Context
+from d2_plugin.hooks.prior import PriorLoader
+from d2_plugin.hooks.prune import Prune, PruneConfig, depth_inconsistency, gather, opacity_contribution, pruning_score
+from d2_plugin.plugin import D2Hooks
+from d2_plugin.protocol import DepthPrior, Label, RasterSettings, Splats, View
+from d2_plugin.rasterizer import rasterize
+
+EVERY_ONE = PruneConfig(patience=1)
+
+
+class Fixed:
+    """A backbone of Gaussians that stay as they are."""
+
+    settings = RasterSettings()
+
+    def __init__(self, splats: Splats) -> None:
+        self.splats = splats
+
+    def __len__(self) -> int:
+        return len(self.splats.means)
+
+    def slice_at(self, view: View) -> Splats:
+        return self.splats
+
+
+def double(view: View) -> View:
+    return replace(view, K=view.K.double(), T_camera_world=view.T_camera_world.double())
+
+
+def context(splats: Splats, views: list[View], prior: DepthPrior) -> Context:
+    loader = PriorLoader(SimpleNamespace(prior=lambda camera, frame: prior))
+    return Context(1, Fixed(splats), [], loader, torch.Generator(), lambda: views)
+
+
+def scattered(seed: int) -> Splats:
+    """Forty Gaussians before and behind the plane z = 3, float64."""
+    g = torch.Generator().manual_seed(seed)
+    unit = torch.rand(40, 5, generator=g, dtype=torch.float64)
+    means = unit[:, :3] * torch.tensor([3.0, 2, 3]) + torch.tensor([-1.5, -1, 1.5])
+    variance = (0.05 + 0.1 * unit[:, 3:4]) ** 2
+    covariances = variance * torch.tensor([1.0, 0, 0, 1, 0, 1]).double()
+    return Splats(means, covariances, 0.1 + 0.8 * unit[:, 4], torch.arange(40))
+
+
+def compositing_weights(splats: Splats, view: View) -> Tensor:
+    """w_{k,p} [H, W, N]: the picture in which every Gaussian has a colour channel of its own."""
+    return rasterize(splats, torch.eye(len(splats.means)).double(), view).color
+
+
+def papers_sigma(prior: DepthPrior) -> DepthPrior:
+    return prior._replace(sigma=torch.where(prior.verified, 0.0, torch.inf))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("with_sigma", [False, True])
+def test_the_scores_are_the_papers(seed: int, with_sigma: bool) -> None:
+    """E~: sum over Omega^v of w |z - D*| / (D* + eps), over sum of w; O: mean of max w; S = .5 E + .5 (1 - O)."""
+    splats, views, prior = scattered(seed), [double(view) for view in make_views()[:3]], TinyStore().prior("", 0)
+    error, total, maxima, seen = torch.zeros(4, 40, dtype=torch.float64)
+    for view in views:
+        w = compositing_weights(splats, view)
+        z = splats.means[:, 2]  # the cameras look along z from z = 0
+        on = w[prior.labels == Label.VERIFIED]
+        error += (on * (z - 3.0).abs() / (3.0 + 1e-8)).sum(0)
+        total += on.sum(0)
+        maxima += w.amax((0, 1))
+        seen += w.amax((0, 1)) > 0
+    inconsistency = torch.where(total > 0, (error / (total + 1e-8) / 0.1).clamp(max=1), 0)
+    contribution = torch.where(seen > 0, maxima / seen.clamp(min=1), 0)
+    score = 0.5 * inconsistency + 0.5 * (1 - contribution)
+    torch.testing.assert_close(pruning_score(inconsistency, contribution, 0.5, 0.5), score, rtol=0, atol=0)
+    prior = papers_sigma(prior) if with_sigma else prior
+    config = replace(EVERY_ONE, free_space=not with_sigma)  # without sigma no space is known to be free
+    found = context(splats, views, prior)
+    sums = gather(found.evaluation, 40, config.free_space)
+    torch.testing.assert_close(depth_inconsistency(*sums[:2], 0.1), inconsistency, rtol=1e-7, atol=1e-9)
+    torch.testing.assert_close(opacity_contribution(*sums[2:]), contribution, rtol=1e-7, atol=1e-9)
+    edit = Prune(replace(config, tau_p=0.7)).edit(found)
+    assert torch.equal(edit.remove, (score > 0.7) & (total > 0))
+    assert 0 < int(edit.remove.sum()) < 40
+
+
+class SigmaStore(TinyStore):
+    """The same prior, with the sigma that stands for the paper."""
+
+    def prior(self, camera: str, frame: int) -> DepthPrior:
+        return papers_sigma(super().prior(camera, frame))
+
+
+def test_a_run_with_the_papers_sigma_is_bitwise_the_run_without_sigma(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = replace(ALL_HOOKS, prune=replace(ALL_HOOKS.prune, free_space=False))
+    runs = []
+    for store in (TinyStore, SigmaStore):
+        monkeypatch.setattr("tiny.TinyStore", store)
+        trainer = make_trainer(config)
+        trainer.run()
+        runs.append(trainer)
+    assert {entry.action for entry in runs[0].d2.trace} == {"loss", "insert", "remove"}
+    assert same(*map(parameters, runs))
+    monkeypatch.undo()
+    with_term = make_trainer(ALL_HOOKS)
+    with_term.run()
+    assert same(parameters(runs[0]), parameters(with_term)), "without sigma no space is known to be free"
+
+
+def test_a_survey_without_sigma_has_no_front() -> None:
+    splats, views, prior = scattered(0), [double(view) for view in make_views()[:1]], TinyStore().prior("", 0)
+    assert not context(splats, views, prior).evaluation[0].survey.front.any()
+    assert context(splats, views, papers_sigma(prior)).evaluation[0].survey.front.any()
+
+
+VERIFIED, UNCERTAIN, BEYOND = 5, 16, 27
+"""Columns in the middle of three bands: exact, sigma .2 (free up to 1.2 = 3 (1 - 3 x .2)), far beyond 50."""
+CAST = {
+    "on the surface": (VERIFIED, 3.0),
+    "before the surface": (VERIFIED, 1.5),
+    "within three sigmas": (UNCERTAIN, 2.0),
+    "before three sigmas": (UNCERTAIN, 0.6),
+    "before the far": (BEYOND, 10.0),
+    "behind the bound": (BEYOND, 60.0),
+}
+FLOATING = {"before the surface", "before three sigmas", "before the far"}
+
+
+def bands() -> DepthPrior:
+    labels = torch.full((HEIGHT, WIDTH), int(Label.MONO), dtype=torch.uint8)
+    labels[:, :11], labels[:, 22:] = Label.VERIFIED, Label.FAR
+    depth = torch.where(labels == Label.FAR, 50.0, 3.0)
+    sigma = torch.where(labels == Label.MONO, 0.2, torch.where(labels == Label.VERIFIED, 0.0, torch.inf))
+    return DepthPrior(depth, labels, sigma=sigma)
+
+
+def cast(view: View) -> Splats:
+    """One translucent Gaussian for each part, about a pixel wide, apart from each other."""
+    columns, z = torch.tensor(list(CAST.values())).unbind(-1)
+    rows = torch.tensor([6.0, 18.0]).repeat(3)
+    centres = torch.stack([columns + 0.5, rows + 0.5, torch.ones(6)], -1)
+    in_camera = torch.linalg.solve(view.K, centres.T).T * z[:, None]
+    covariances = (0.03 * z[:, None]) ** 2 * torch.tensor([1.0, 0, 0, 1, 0, 1])
+    return Splats(in_camera - view.T_camera_world[:3, 3], covariances, torch.full((6,), 0.3), torch.arange(6))
+
+
+def removed(hook: Prune, prior: DepthPrior) -> set[str]:
+    """Who goes after one more evaluation of the cast."""
+    view = make_views()[0]
+    edit = hook.edit(context(cast(view), [view], prior))
+    return set() if edit is None else {name for name, gone in zip(CAST, edit.remove.tolist(), strict=True) if gone}
+
+
+def test_what_floats_in_free_space_goes_after_patience_and_a_surface_never() -> None:
+    hook = Prune(PruneConfig(patience=3))
+    assert [removed(hook, bands()) for _ in range(5)] == [set(), set(), FLOATING, FLOATING, FLOATING]
+
+
+def test_without_the_term_only_the_papers_evidence_counts() -> None:
+    hook = Prune(PruneConfig(patience=3, free_space=False))
+    assert [removed(hook, bands()) for _ in range(4)] == [set(), set(), {"before the surface"}, {"before the surface"}]
+    with_term = Prune(PruneConfig(patience=1))
+    assert removed(with_term, bands()._replace(sigma=None)) == {"before the surface"}
+
+
+def test_the_sums_are_those_of_the_two_kinds_of_evidence() -> None:
+    splats, views = scattered(1), [double(view) for view in make_views()[:2]]
+    prior = bands()
+    edge = prior.near_edge(FREE_SIGMAS).double()
+    error, total = torch.zeros(2, 40, dtype=torch.float64)
+    for view in views:
+        w, z = compositing_weights(splats, view), splats.means[:, 2]
+        front = w * (1 - z / edge[..., None]).clamp(min=0)
+        on = torch.where(prior.verified[..., None], w, 0)
+        error += (on * (z - 3.0).abs() / 3.0 + front).sum((0, 1))
+        total += (on + front).sum((0, 1))
+    found = gather(context(splats, views, prior).evaluation, 40, True)
+    torch.testing.assert_close(found[0], error, rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(found[1], total, rtol=1e-6, atol=1e-9)
+
+
+def test_streaks_of_free_space_follow_their_gaussians_and_are_saved() -> None:
+    hook, resumed = Prune(PruneConfig(patience=3)), Prune(PruneConfig(patience=3))
+    for _ in range(2):
+        removed(hook, bands())
+    streaks = [2 * (name in FLOATING) for name in CAST]
+    assert hook.streak.tolist() == streaks
+    resumed.load_state_dict(hook.state_dict())
+    assert removed(resumed, bands()) == removed(hook, bands()) == FLOATING
+    hook.follow(torch.tensor([1, -1, 0]))
+    assert hook.streak.tolist() == [3, 0, 0]
+
+
+def test_far_pixels_alone_reach_the_hook_through_the_plugin() -> None:
+    """A prior of sky alone removes translucent Gaussians before it, through D2Hooks and a real backbone."""
+    everywhere = torch.full((HEIGHT, WIDTH), int(Label.FAR), dtype=torch.uint8)
+    sky = DepthPrior(torch.full((HEIGHT, WIDTH), 50.0), everywhere, sigma=torch.full((HEIGHT, WIDTH), torch.inf))
+    config = replace(ALL_HOOKS, densify=None, depth_loss=None, prune=PruneConfig(start=1, every=1, patience=1))
+    left = {}
+    for free_space in (True, False):
+        model = make_model()
+        store = SimpleNamespace(prior=lambda camera, frame: sky)
+        chosen = replace(config, prune=replace(config.prune, free_space=free_space))
+        d2 = D2Hooks(chosen, make_adapter(model), store)
+        d2.loss(1, make_views())
+        d2.step(1)
+        left[free_space] = len(model)
+    assert left[True] < left[False] == 60
