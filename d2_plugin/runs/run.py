@@ -145,7 +145,10 @@ class Run:
         }
 
     def export_ply(self) -> list[Path]:
-        """One 3DGS PLY per frame under ply/: the Gaussians of that instant, temporal opacity folded in."""
+        """One 3DGS PLY per frame under ply/: the Gaussians of that instant, temporal opacity folded in.
+
+        A background is not among them, since the format has no place for it: what it showed is black in a viewer.
+        """
         from d2_plugin.runs.gaussian_ply import write_ply
 
         trainer = self._trained()
