@@ -1,7 +1,8 @@
 """What lies behind all Gaussians: a colour at infinity that depends on the direction alone, for skies.
 
 Spherical harmonics of the viewing direction, so a held-out camera sees the same sky, and too smooth to stand in for a
-surface. Composited with what the Gaussians leave of a ray: color + (1 - alpha) background.
+surface. Composited with what the Gaussians leave of a ray: color + (1 - alpha) background. That smooth a colour needs
+no evaluation at each pixel: it is computed at a few directions and interpolated.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from d2_plugin.gaussians.spherical_harmonics import basis
@@ -19,8 +21,10 @@ DEGREE = 3
 """Of the harmonics."""
 RATE = 1e-2
 """Learning rate of the constant term; the others learn at a fifth of it."""
-KEPT_BYTES = 512 << 20
-"""Memory for the harmonics of cameras that were seen before: 3.5 MiB for each camera of 320x180 pixels."""
+NODES = 40
+"""Directions across the picture at which the colour is computed; smaller pictures have one at each pixel."""
+KEPT_CAMERAS = 256
+"""Cameras whose harmonics are kept."""
 
 
 class Background:
@@ -35,8 +39,12 @@ class Background:
 
     def behind(self, render: Render, view: View) -> Render:
         """The render with the background where the Gaussians leave some of a ray."""
-        colors = (self._basis(view) @ torch.cat([self.constant, self.harmonics]) + 0.5).clamp(0, 1)
-        colors = colors.view(view.height, view.width, 3)
+        rows, columns, stride = _nodes(view)
+        coarse = (self._basis(view) @ torch.cat([self.constant, self.harmonics]) + 0.5).clamp(0, 1)
+        nodes = coarse.view(rows, columns, 3).permute(2, 0, 1)[None]
+        size = (stride * (rows - 1) + 1, stride * (columns - 1) + 1)
+        fine = F.interpolate(nodes, size, mode="bilinear", align_corners=True)[0]
+        colors = fine[:, : view.height, : view.width].permute(1, 2, 0)
         return render._replace(color=render.color + (1 - render.alpha)[..., None] * colors)
 
     def optimize(self) -> None:
@@ -45,12 +53,12 @@ class Background:
         self.optimizer.zero_grad(set_to_none=True)
 
     def _basis(self, view: View) -> Tensor:
-        """Harmonics of every pixel's direction [H * W, (DEGREE + 1)^2]; kept, since cameras mostly stand still."""
+        """Harmonics of the nodes' directions [nodes, (DEGREE + 1)^2]; kept, since cameras mostly stand still."""
         camera = torch.cat([view.T_camera_world[:3, :3].flatten(), view.K.to(view.T_camera_world).flatten()])
         key = (view.width, view.height, *camera.tolist())
         if key not in self._bases:
             values = basis(_directions(view), DEGREE).to(self.constant)
-            if sum(map(_bytes, self._bases.values())) + _bytes(values) > KEPT_BYTES:
+            if len(self._bases) >= KEPT_CAMERAS:
                 self._bases.clear()
             self._bases[key] = values
         return self._bases[key]
@@ -71,18 +79,18 @@ class Background:
         self.optimizer.load_state_dict(state["optimizer"])
 
 
-def _bytes(values: Tensor) -> int:
-    return values.numel() * values.element_size()
+def _nodes(view: View) -> tuple[int, int, int]:
+    """Rows and columns of nodes and the pixels between them; the last ones lie beyond the picture."""
+    stride = max(1, view.width // NODES)
+    return (view.height - 1) // stride + 2, (view.width - 1) // stride + 2, stride
 
 
 def _directions(view: View) -> Tensor:
-    """Unit directions in the world [H * W, 3] of the pixels' centres, row by row."""
+    """Unit directions in the world [nodes, 3] of the nodes' pixel centres, row by row."""
     like = view.T_camera_world
-    rows, columns = torch.meshgrid(
-        torch.arange(view.height, dtype=like.dtype, device=like.device) + 0.5,
-        torch.arange(view.width, dtype=like.dtype, device=like.device) + 0.5,
-        indexing="ij",
-    )
+    *counts, stride = _nodes(view)
+    axes = [stride * torch.arange(count, dtype=like.dtype, device=like.device) + 0.5 for count in counts]
+    rows, columns = torch.meshgrid(*axes, indexing="ij")
     pixels = torch.stack([columns, rows, torch.ones_like(rows)], -1).reshape(-1, 3)
     rays = torch.linalg.solve(view.K.to(like), pixels.T).T @ view.T_camera_world[:3, :3]
     return rays / rays.norm(dim=-1, keepdim=True)

@@ -116,6 +116,11 @@ class DepthPrior(NamedTuple):
         return self.trusted | (self.labels == Label.MONO)
 
     @property
+    def measured(self) -> bool:
+        """Whether sigma was measured: the paper's 0 and infinity alone claim no error and know no free space."""
+        return self.sigma is not None and bool(((self.sigma > 0) & self.sigma.isfinite()).any() | self.far.any())
+
+    @property
     def far(self) -> Tensor:
         """Pixels whose depth is only a lower bound, bool [H, W]."""
         return self.labels == Label.FAR

@@ -93,7 +93,7 @@ class Context:
         if prior is None:
             return None
         splats = self.backbone.slice_at(view)
-        near_edge = None if prior.sigma is None else prior.near_edge(FREE_SIGMAS)
+        near_edge = prior.near_edge(FREE_SIGMAS) if prior.measured else None
         return Surveyed(view, splats, prior, survey(splats, view, prior, self.backbone.settings, near_edge=near_edge))
 
 

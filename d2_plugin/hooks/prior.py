@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
@@ -26,6 +27,11 @@ class Store(Protocol):
 
 JUDGES = 0.05
 """Largest sigma of a pixel that may judge a Gaussian: an error of 10 %, at which E_k saturates, is two of these."""
+
+
+OUTLINE = 2
+"""Pixels along the outline of a sky that say nothing: a Gaussian a pixel wide, two pixels inside of the surface, would
+else stand in free space."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,13 +99,20 @@ class PriorLoader:
 def _usable(prior: DepthPrior) -> DepthPrior:
     """The same prior, empty where the depth is no finite positive number: no store can put NaN into a loss.
 
-    Pixels judge Gaussians where sigma is small, whatever their label.
+    It is also empty at the outline of what is far: a Gaussian of the surface in front spills over it. Pixels judge
+    Gaussians where sigma is small, whatever their label.
     """
-    usable = torch.isfinite(prior.depth) & (prior.depth > 0)
+    usable = torch.isfinite(prior.depth) & (prior.depth > 0) & ~(prior.far & ~_inside(prior.far))
     prior = prior._replace(labels=torch.where(usable, prior.labels, int(Label.EMPTY)))
     if prior.sigma is None or prior.reliability is not None:
         return prior
     return prior._replace(reliability=(prior.support & (prior.sigma <= JUDGES)).to(prior.depth))
+
+
+def _inside(far: Tensor) -> Tensor:
+    """The far pixels [H, W] at least `OUTLINE` pixels inside of what is far; the rim of the picture is no outline."""
+    others = (~far).float()[None, None]
+    return F.max_pool2d(others, 2 * OUTLINE + 1, stride=1, padding=OUTLINE)[0, 0] == 0
 
 
 def _known(prior: DepthPrior) -> KnownPixels:

@@ -178,6 +178,14 @@ class TestColour:
             found = sky_of(sky, replace(other, K=K, width=1, height=1))
             torch.testing.assert_close(found[0, 0], expected[row, column], atol=1e-5, rtol=0)
 
+    def test_a_large_picture_is_interpolated_between_a_few_directions(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        view = make_views()[0]
+        K = view.K * torch.tensor([10.0, 10, 1])[:, None]
+        large = replace(view, K=K, width=10 * view.width, height=10 * view.height)
+        coarse = sky_of(some_sky(), large)
+        monkeypatch.setattr(module, "NODES", large.width)
+        assert (coarse - sky_of(some_sky(), large)).abs().max() < 2e-3
+
     def test_where_a_camera_stands_makes_no_difference(self) -> None:
         sky, (left, _, right) = some_sky(), make_views()[:3]
         assert torch.equal(sky_of(sky, left), sky_of(sky, right))
@@ -200,7 +208,7 @@ class TestColour:
         assert torch.equal(with_sky.render(view, white).color, plain.render(view, white).color)
 
     def test_memory_does_not_grow_with_moving_cameras(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(module, "KEPT_BYTES", 3 * 24 * 32 * 16 * 4)
+        monkeypatch.setattr(module, "KEPT_CAMERAS", 3)
         sky, view = some_sky(), make_views()[0]
         for i in range(10):
             sky_of(sky, turned(view, i / 10))

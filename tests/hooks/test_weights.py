@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from d2_plugin.hooks import prior as loading
 from d2_plugin.hooks.densify import Densify, DensifyConfig, under_reconstructed
 from d2_plugin.hooks.depth_loss import DepthLoss, DepthLossConfig, depth_loss, pixel_depth_loss
 from d2_plugin.hooks.hook import Context
@@ -20,6 +21,12 @@ from d2_plugin.protocol import DepthPrior, Label, View
 CONFIG = DepthLossConfig(tau_v=0.5, epsilon=0.01, sigma_full=0.05)
 SHAPE = (7, 9)
 seeds = st.integers(0, 10_000)
+
+
+@pytest.fixture(autouse=True)
+def single_far_pixels_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here far pixels lie alone, all outline; `TestOutline` shows what that leaves out."""
+    monkeypatch.setattr(loading, "OUTLINE", 0)
 
 
 def loader_of(prior: DepthPrior) -> tuple[PriorLoader, View]:
@@ -232,3 +239,16 @@ class TestStiff:
         backbone = SimpleNamespace(rendered_depth=lambda view: rendered)
         loss = DepthLoss(CONFIG).loss(Context(1, backbone, [view], loader, torch.Generator()))
         assert loss.item() == pytest.approx(CONFIG.weight * (6 / 9 - 0.01), rel=1e-3)
+
+
+class TestOutline:
+    def test_the_outline_of_a_sky_says_nothing_and_the_rim_of_the_picture_is_no_outline(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(loading, "OUTLINE", 2)
+        labels = torch.full((10, 12), int(Label.VERIFIED), dtype=torch.uint8)
+        labels[:6] = int(Label.FAR)
+        sigma = torch.where(labels == Label.FAR, torch.inf, 0.01)
+        found = known(DepthPrior(torch.full((10, 12), 5.0), labels, None, sigma))
+        assert sorted({int(i) // 12 for i in found.index[found.far]}) == [0, 1, 2, 3]
+        assert sorted({int(i) // 12 for i in found.index[~found.far]}) == [6, 7, 8, 9]

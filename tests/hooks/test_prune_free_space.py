@@ -128,8 +128,10 @@ def test_a_run_with_the_papers_sigma_is_bitwise_the_run_without_sigma(monkeypatc
 
 def test_a_survey_without_sigma_has_no_front() -> None:
     splats, views, prior = scattered(0), [double(view) for view in make_views()[:1]], TinyStore().prior("", 0)
-    assert not context(splats, views, prior).evaluation[0].survey.front.any()
-    assert context(splats, views, papers_sigma(prior)).evaluation[0].survey.front.any()
+    for paper in (prior, papers_sigma(prior)):
+        assert not context(splats, views, paper).evaluation[0].survey.front.any(), "the paper knows no free space"
+    measured = prior._replace(sigma=torch.where(prior.trusted, 0.01, torch.inf))
+    assert context(splats, views, measured).evaluation[0].survey.front.any()
 
 
 VERIFIED, UNCERTAIN, BEYOND = 5, 16, 27
@@ -185,7 +187,7 @@ def test_without_the_term_only_the_papers_evidence_counts() -> None:
 def test_the_sums_are_those_of_the_two_kinds_of_evidence() -> None:
     splats, views = scattered(1), [double(view) for view in make_views()[:2]]
     prior = bands()
-    edge = prior.near_edge(FREE_SIGMAS).double()
+    edge = PriorLoader(SimpleNamespace(prior=lambda *key: prior))(views[0]).near_edge(FREE_SIGMAS).double()
     error, total = torch.zeros(2, 40, dtype=torch.float64)
     for view in views:
         w, z = compositing_weights(splats, view), splats.means[:, 2]
