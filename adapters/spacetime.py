@@ -33,7 +33,7 @@ class SpacetimeAdapter(InriaAdapter):
         duration: number of frames, the variable of that name in train.py; timestamps are frame / duration.
         first_frame: number of the frame at time 0.
         settings: constants of its rasterizer, where they were changed.
-        key: the prior of a camera, where `image_name` is not the camera's name in the prior store.
+        key: finds the prior of a camera; needed where `image_name` is not the camera's name in the prior store.
     """
 
     pruning = ("prune_points", "prune_pointswithemsmask")

@@ -50,7 +50,7 @@ class Recipe:
     model: tuple[str, str] = ("scene.gaussian_model", "GaussianModel")
     renderer: tuple[str, str] = ("gaussian_renderer", "render")
     heard: Callable[[Any, Mapping[str, Any]], None] | None = None
-    """What the adapter learns from the named arguments of each render, where they say something."""
+    """Hands the adapter what it needs from the named arguments of each render."""
     seen: dict[str, tuple[str, str]] = field(default_factory=lambda: {"scene": ("scene", "Scene")})
     """Classes whose latest instance is remembered, by its field of `Objects`."""
 

@@ -55,7 +55,7 @@ class ScenePlan:
         return (*self.measured, *self._following())
 
     def uses(self, name: str) -> bool:
-        """Whether the named part is used; a part that there is no question of is not."""
+        """Whether the named part is used; False for a part on which nothing had to be decided."""
         return any(d.use for d in self.decisions if d.name == name)
 
     @property
@@ -71,7 +71,7 @@ class ScenePlan:
         """The same plan with some of the measured decisions taken by the user; None leaves a decision alone.
 
         Raises:
-            D2Error: what is asked for cannot be, such as stereo with one camera.
+            D2Error: what is asked for is impossible, such as stereo with one camera.
         """
         return replace(self, measured=tuple(_overridden(d, choices.get(d.name)) for d in self.measured))
 
@@ -143,7 +143,7 @@ def _temporal(capture: Capture, cameras: Sequence[str]) -> Decision:
 def _geometric(
     capture: Capture, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None
 ) -> tuple[Decision, ...]:
-    """Sensor and stereo: depth that lies on disk is taken before anything is matched."""
+    """Sensor and stereo: where a sensor's depth lies on disk, nothing is matched."""
     found = find_depth_on_disk(capture, cameras, settings.stereo)
     if found is not None and found.name == SensorDepth.name:
         reason = "a sensor measured the depth: nothing is matched"

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from d2_plugin.captures.capture import Capture
 from d2_plugin.captures.pictures import picture_size, read_picture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.captures.selection import select_cameras
+from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.runs import drawing, metrics
 from d2_plugin.runs.evaluation import RenderView, evaluate

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.captures.selection import select_cameras
+from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.evaluation import evaluate
 from d2_plugin.runs.tables import latex_table, metrics_table, read_metrics, view_tables, write_tables

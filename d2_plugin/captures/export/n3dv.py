@@ -70,7 +70,7 @@ def llff_row(camera: Camera, near_far: tuple[float, float]) -> np.ndarray:
 
 
 def depth_bounds(camera: Camera, cloud: PointCloud | None) -> tuple[float, float]:
-    """Near and far depth: as declared, or as the points have it."""
+    """Near and far depth: as declared, or from the points."""
     if camera.near_far is not None:
         return camera.near_far
     if cloud is not None:

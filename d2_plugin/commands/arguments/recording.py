@@ -39,7 +39,7 @@ class ConfigFile(Settings):
     """The file of settings that every command on a recording takes."""
 
     config: Path | None = None
-    """TOML file with tables of settings over the defaults, as `--help` lists them."""
+    """TOML file with tables of settings, as `--help` lists them; they replace the defaults."""
 
 
 def recording_form(
