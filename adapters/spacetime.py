@@ -76,7 +76,7 @@ class SpacetimeAdapter(InriaAdapter):
         return PriorKey(PurePosixPath(str(camera.image_name)).stem, frame)
 
     def _append(self, points: Points) -> None:
-        """Still Gaussians around the time of their frame, as wide in time as those of its own start.
+        """Gaussians that do not move, centred on the time of their frame, as wide in time as the initial ones.
 
         Colours are stored as they are, twice in the full model, whose second half and `_features_t` feed its decoder.
         """

@@ -110,7 +110,7 @@ RECIPES = {
 
 
 def recipe(name: str) -> Recipe:
-    """The recipe of that name; an unknown one is refused with the names that there are."""
+    """The recipe of that name; an unknown name is refused, with the known ones."""
     if name not in RECIPES:
         raise unknown_name("repository", name, RECIPES)
     return RECIPES[name]

@@ -21,7 +21,7 @@ class PriorOptions(ConfigFile):
     shard: str | None = None
     """Build part I of N only, as I/N with I from 1 to N."""
     workers: Annotated[int, Range(1, unit="processes")] | None = None
-    """Build with this many processes of this machine."""
+    """Build with this many processes on this machine."""
     scheduler: str | None = None
     """Address of a dask cluster to build on, as tcp://host:8786."""
 

@@ -84,7 +84,7 @@ class ScenePlan:
     def _following(self) -> tuple[Decision, Decision]:
         mono = Decision("monocular", self.mono_source is not None, self.mono_source or "no maps on disk and no network")
         if mono.use and self.mono_kind == "relative" and not self.geometric:
-            mono = replace(mono, use=False, reason=f"{mono.reason}: no geometric depth tells their scale")
+            mono = replace(mono, use=False, reason=f"{mono.reason}: no geometric depth gives their scale")
         both = self.geometric and mono.use
         reason = "two depth sources check each other" if both else "there is one depth source at most"
         return mono, Decision("verification", both, reason)

@@ -1,4 +1,4 @@
-"""What a run is: its settings, checked, and what follows from them before anything is computed."""
+"""The settings of a run, their checks, and what follows from them before anything is computed."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def _edited(example: Example, what: str, edit: Callable[[], object]) -> tuple[li
     if len(listener.reports) != len(second.reports):
         return [f"{what} is reported to one listener only: on_resize must keep them all"], torch.empty(0)
     if not listener.reports and len(backbone) != count:
-        return [f"{what} changes {count} Gaussians to {len(backbone)} without telling on_resize"], torch.empty(0)
+        return [f"{what} changes {count} Gaussians to {len(backbone)} without a report to on_resize"], torch.empty(0)
     for index, was, now in zip(listener.reports, [count, *listener.counts], listener.counts):
         if mistake := _mistake(what, index, was, now):
             return [mistake], index
@@ -145,8 +145,9 @@ def _grow(example: Example) -> Iterator[str]:
     listener = _Listener(example.backbone)
     example.backbone.on_resize(listener)
     example.grow()
-    if len(example.backbone) != count and not listener.reports:
-        yield f"the backbone's own densification goes from {count} to {len(example.backbone)} without telling on_resize"
+    grown = len(example.backbone)
+    if grown != count and not listener.reports:
+        yield f"the backbone's own densification goes from {count} to {grown} without a report to on_resize"
     for index, now in zip(listener.reports, listener.counts):
         if len(index) != now:
             yield f"the backbone's own densification reports {len(index)} rows when there are {now}"

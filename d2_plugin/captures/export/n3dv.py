@@ -20,7 +20,7 @@ from d2_plugin.errors import D2Error
 log = logging.getLogger(__name__)
 
 READ_FRAMES = 24
-"""Frames of each camera that Deformable-3D-Gaussians reads (scene/__init__.py), whatever there is."""
+"""Frames of each camera that Deformable-3D-Gaussians reads (scene/__init__.py), however many there are."""
 
 
 def write_n3dv(export: Export) -> Written:
