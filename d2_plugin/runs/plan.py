@@ -143,7 +143,7 @@ def _temporal(capture: Capture, cameras: Sequence[str]) -> Decision:
 def _geometric(
     capture: Capture, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None
 ) -> tuple[Decision, ...]:
-    """Sensor and stereo: where a sensor's depth lies on disk, nothing is matched."""
+    """Sensor and stereo: depth on disk, from a sensor or COLMAP, is used first."""
     found = find_depth_on_disk(capture, cameras, settings.stereo)
     if found is not None and found.name == SensorDepth.name:
         reason = "a sensor measured the depth: nothing is matched"
