@@ -60,7 +60,7 @@ def intrinsics(camera: Any, width: int, height: int) -> Tensor:
 
 
 def correct_fields_of_view(cameras: Iterable[Any]) -> int:
-    """Give cameras whose FoVx is -1 the fields of view that their focal lengths mean; returns how many there were.
+    """Set fields of view of -1 from the camera's focal lengths; returns how many cameras were mended.
 
     fudan's reader leaves -1 where transforms.json has fl_x (dataset_readers.py:276), and its rasterizer then takes
     tan(-0.5) for the Jacobian of every Gaussian: footprints come out 1.69 and 1.27 times too large and sheared (issue

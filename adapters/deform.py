@@ -43,10 +43,10 @@ class DeformAdapter(WatchedModel[Deform]):
 
     @torch.no_grad()
     def insert(self, points: Points) -> int:
-        """Isotropic Gaussians whose deformed position at each point's time is the point; returns their number.
+        """Insert isotropic Gaussians that the field moves onto each point at the point's time; returns their number.
 
-        Where the field cannot be inverted a Gaussian takes the offset of its nearest neighbour. Its canonical scale
-        allows for the field's: what appears at that instant has the scale that was asked for.
+        Where the field cannot be inverted a Gaussian takes the offset of its nearest neighbour. The canonical scale
+        makes up for the field's, so the Gaussian has the scale that was asked for at that instant.
         """
         canonical, log_scale_offsets = points.positions.clone(), torch.zeros_like(points.scales)
         for time in points.times.unique().tolist():

@@ -34,7 +34,8 @@ class Deformable3DAdapter(InriaAdapter):
         warm_up: iteration from which the field is used (opt.warm_up).
         is_6dof: whether the field returns rigid motions [N, 4, 4] (dataset.is_6dof); read from the network by default.
         settings: constants of its rasterizer, where they were changed.
-        key: the prior of a camera, where its picture's name does not tell (poses_bounds.npy with pictures 0000.png).
+        key: finds the prior of a camera; needed where the picture's name does not say camera and frame
+        (poses_bounds.npy with pictures 0000.png).
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class Deformable3DAdapter(InriaAdapter):
 
     @property
     def deforms(self) -> bool:
-        """Whether the field is used in the present step, which `begin_step` was told."""
+        """Whether the field is used in the present step, the one given to `begin_step`."""
         return self._step >= self.warm_up
 
     def slice_at(self, view: View) -> Splats:

@@ -43,14 +43,14 @@ class Ex4DGSAdapter(InriaAdapter):
         near, far: dataset.near and dataset.far.
         first_frame: number of the frame at timestamp 0.
         settings: constants of its rasterizer, where they were changed.
-        key: the prior of a camera, where `image_name` is not the camera's name in the prior store.
+        key: finds the prior of a camera; needed where `image_name` is not the camera's name in the prior store.
     """
 
     appending = ("densification_postfix", "densification_postfix_onlystatic")
     evidence = dict.fromkeys(
         (*InriaAdapter.evidence, "xyz_error_accum", "xyz_ssim_error_accum", "error_denom"), 0.0
     ) | {"min_radii2D": 1000.0, "xyz_error_min": 1000.0, "xyz_error_min_timestamp": -1.0}
-    """With the two that its own callers extend by hand, without which the next prune_points fails."""
+    """Also the two that the repository's callers extend by hand: without them its next prune_points fails."""
 
     def __init__(
         self,

@@ -44,9 +44,9 @@ class FudanAdapter(InriaAdapter):
         gaussians: the model, after `training_setup` and, when resuming, after `restore`.
         scene: its `Scene`; where transforms.json carries focal lengths, the fields of view of its cameras are -1 and
             get corrected (see `correct_fields_of_view`), but only if a hook is on: without hooks nothing changes.
-        correct_fov: False leaves the fields of view alone, for going on with a model that was trained with them.
+        correct_fov: False leaves the fields of view alone, to continue a model that was trained with them.
         settings: constants of its rasterizer, where they were changed.
-        key: the prior of a camera, where its picture's name does not tell.
+        key: finds the prior of a camera; needed where the picture's name does not say camera and frame.
     """
 
     evidence = InriaAdapter.evidence | {"t_gradient_accum": 0.0}

@@ -7,7 +7,7 @@
 
 gsplat has no instance whose methods could be watched: strategies swap the dict's entries. But every operation on
 Gaussians carries along each tensor in the strategy's `state` (ops.py: duplicate, split, remove, relocate, sample_add),
-so a column of row numbers in there tells afterwards what became of each row.
+so a column of row numbers in there shows afterwards what became of each row.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class GsplatAdapter:
         return len(self.parameters["means"])
 
     def _rows(self, points: Points) -> dict[str, Tensor]:
-        """Raw rows of every parameter; refuses one whose start is not known."""
+        """Raw rows of every parameter; refuses a parameter whose starting value is not known."""
         count, like = len(points.positions), points.positions
         quats = like.new_zeros(count, 4)
         quats[:, 0] = 1
@@ -149,7 +149,7 @@ class GsplatAdapter:
         for name, parameter in self.parameters.items():
             if name not in known or known[name].shape[1:] != parameter.shape[1:]:
                 raise D2Error(
-                    f"parameter '{name}' of shape {tuple(parameter.shape)} is not one that gsplat starts: give the "
+                    f"parameter '{name}' of shape {tuple(parameter.shape)} is not one of gsplat's own: give the "
                     "adapter a function `new_rows` that returns its rows for inserted points"
                 )
         return {name: known[name] for name in self.parameters}
@@ -191,7 +191,7 @@ class GsplatAdapter:
             self._tell(index)
 
     def _report_growth(self) -> None:
-        """Without row numbers: growth appends (gsplat's sample_add); shrinking is left to the net of D2Hooks."""
+        """Without row numbers: growth means appended rows (gsplat's sample_add); D2Hooks notices shrinking."""
         if self._count > self._known:
             index = self._numbers() - 1
             index[self._known :] = -1

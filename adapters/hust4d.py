@@ -42,7 +42,7 @@ class Hust4DAdapter(InriaAdapter):
         active_stages: the stages in which hooks run. The coarse one fits one still scene to all instants, which the
             prior of a moving surface contradicts, so it is left alone by default.
         settings: constants of its rasterizer, where they were changed.
-        key: the prior of a camera, where the picture's path does not tell.
+        key: finds the prior of a camera; needed where the picture's path does not say camera and frame.
     """
 
     evidence = InriaAdapter.evidence | {"_deformation_accum": 0.0}

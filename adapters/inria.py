@@ -47,7 +47,7 @@ class RawRows(NamedTuple):
 
 @dataclass(frozen=True)
 class RenderedCamera:
-    """A camera together with what the trainer has just rendered for it; no tuple, which would be read as a batch."""
+    """A camera together with what the trainer has just rendered for it. Not a tuple: that would be read as a batch."""
 
     camera: Any
     package: Mapping[str, Any]
@@ -64,7 +64,7 @@ class InriaAdapter(ABC):
     pruning: ClassVar[tuple[str, ...]] = ("prune_points",)
     """Methods that delete the rows of a mask [N], True = delete."""
     evidence: ClassVar[dict[str, float]] = {"xyz_gradient_accum": 0.0, "denom": 0.0, "max_radii2D": 0.0}
-    """What an insertion would erase, though it is about the Gaussians that were there, and the value of a new row."""
+    """Statistics of existing Gaussians that the repository's insertion would erase, with the value for a new row."""
 
     def __init__(self, gaussians: Any, settings: RasterSettings | None = None, key: KeyOf | None = None) -> None:
         self.gaussians, self.settings = gaussians, settings or RasterSettings()
@@ -98,7 +98,7 @@ class InriaAdapter(ABC):
         return view
 
     def begin_step(self, step: int) -> None:
-        """Learn which training step it is; what was rendered in an earlier one is of no more use."""
+        """Note the training step; renders of earlier steps are out of date and forgotten."""
         if step != self._step:
             self._renders.forget()
         self._step = step
@@ -155,7 +155,7 @@ class InriaAdapter(ABC):
             log.info("%s", sentence)
 
     def detach(self) -> None:
-        """Give the instance its own methods back; another adapter of the same instance does this to the one before."""
+        """Restore the instance's own methods; a later adapter of the same instance calls this on the earlier one."""
         for name, earlier in self._overridden.items():
             if earlier is None:
                 delattr(self.gaussians, name)
@@ -227,7 +227,7 @@ class InriaAdapter(ABC):
 
     @contextmanager
     def _evidence_kept(self) -> Iterator[None]:
-        """Lets an insertion pass and puts the accumulators of the old rows back, with new ones for the new rows."""
+        """Lets an insertion run, then restores the accumulators of the old rows, with fresh ones for the new rows."""
         found = {name: getattr(self.gaussians, name, None) for name in self.evidence}
         before = {name: value for name, value in found.items() if isinstance(value, Tensor) and value.numel()}
         count = len(self.gaussians._xyz)
@@ -253,7 +253,7 @@ class InriaAdapter(ABC):
         )
 
     def _probed(self, view: View, package: Mapping[str, Any]) -> Probe:
-        """What the trainer's render of this view is good for, beside our own render of the same view."""
+        """Whether the trainer's render of this view can be used, judged against our own render of it."""
         with torch.no_grad():
             splats = self.slice_at(view)
             own = rasterize(splats, splats.means.new_zeros(len(splats.means), 1), view, self.settings)

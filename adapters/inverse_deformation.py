@@ -43,7 +43,7 @@ def invert_deformation(
         deform: canonical positions [K, 3] to deformed ones [K, 3]; row r always belongs to target r, so that every
             point may have its own time.
         targets: [K, 3] world.
-        means: [M, 3] world, the deformed positions of the Gaussians that there are; M may be 0.
+        means: [M, 3] world, the deformed positions of the existing Gaussians; M may be 0.
         offsets: [M, 3], their deformed minus their canonical positions.
         tolerance: largest residual that is accepted, world units, one number or [K].
         steps: evaluations of the field after the first.
@@ -89,7 +89,7 @@ def invert_at_times(
     Args:
         points: K points; `times` in the field's unit.
         deformed: canonical positions [n, 3] and a time to deformed positions [n, 3].
-        present: canonical positions [N, 3] of the Gaussians that there are.
+        present: canonical positions [N, 3] of the existing Gaussians.
         tolerance: largest accepted residual in standard deviations of each point: one that is off by half of its own
             width still covers its pixel, whatever the unit of length.
     """

@@ -1,8 +1,8 @@
-"""Whether a trainer's own render may stand in for ours: it needs depth and alpha, both with gradients, and our meaning.
+"""Whether a trainer's own render can replace ours: its depth and alpha need gradients and the same meaning.
 
 Depth is the sum of w z in most rasterizers, but divided by alpha in Ex4DGS, the median in SpacetimeGaussians, and
-without a gradient in the main branch of depth-diff-gaussian-rasterization. No package says which of these it holds, so
-one render is compared with our own.
+without a gradient in the main branch of depth-diff-gaussian-rasterization. A render package does not say which of these
+it holds, so one render is compared with our own.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def probe_package(package: Mapping[str, Any], own: Render, parameters: Sequence[
     """Judge a render package (keys `depth` and `alpha`) of the view that `own` shows.
 
     `parameters` are positions and opacities of the Gaussians, to which depth and alpha must have gradients that are not
-    all zero; they are taken aside, `.grad` is left alone.
+    all zero; they are computed separately, and `.grad` is not touched.
     """
     missing = [name for name in ("depth", "alpha") if not isinstance(package.get(name), Tensor)]
     if missing:

@@ -27,5 +27,5 @@ class Renders(Generic[Render]):
         return self._by_key.pop((view.camera, view.frame), None)
 
     def forget(self) -> None:
-        """Let all of them go."""
+        """Forget all renders."""
         self._by_key.clear()

@@ -33,7 +33,7 @@ class SpacetimeAdapter(InriaAdapter):
         duration: number of frames, the variable of that name in train.py; timestamps are frame / duration.
         first_frame: number of the frame at time 0.
         settings: constants of its rasterizer, where they were changed.
-        key: the prior of a camera, where `image_name` is not the camera's name in the prior store.
+        key: finds the prior of a camera; needed where `image_name` is not the camera's name in the prior store.
     """
 
     pruning = ("prune_points", "prune_pointswithemsmask")
@@ -76,7 +76,7 @@ class SpacetimeAdapter(InriaAdapter):
         return PriorKey(PurePosixPath(str(camera.image_name)).stem, frame)
 
     def _append(self, points: Points) -> None:
-        """Still Gaussians around the time of their frame, as wide in time as those of its own start.
+        """Gaussians that do not move, centred on the time of their frame, as wide in time as the initial ones.
 
         Colours are stored as they are, twice in the full model, whose second half and `_features_t` feed its decoder.
         """

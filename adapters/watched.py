@@ -60,13 +60,13 @@ class WatchedModel(Observer, Generic[Model]):
         self._tell(index)
 
     def rendered(self, view: View, render: Render) -> None:
-        """Remember what the model has rendered; without gradients it only ends what was remembered of the view."""
+        """Remember a render; one without gradients only makes the earlier render of its view forgotten."""
         self._renders.take(view)
         if render.alpha.requires_grad:
             self._renders.put(view, (render.depth_sum, render.alpha))
 
     def optimized(self) -> None:
-        """The parameters changed: what was rendered with the old ones is of no more use."""
+        """The parameters changed: renders made with the old ones are out of date and forgotten."""
         self._renders.forget()
 
     def _tell(self, index: Tensor) -> None:

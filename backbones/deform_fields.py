@@ -177,7 +177,7 @@ class HexPlaneField(Field):
         self.heads = zero_linear(settings.width, sum(SPLITS))
 
     def columns(self, places: Tensor, fraction: float) -> Tensor:
-        """See `Field.columns`; outside of the box the planes go on as they end."""
+        """See `Field.columns`; outside the box the planes keep their border values."""
         inside = places.clamp(-1, 1).T.contiguous()
         levels = [self._level(space, time, inside, fraction) for space, time in zip(self.space, self.time)]
         return self.heads(F.relu(self.features(torch.cat(levels).T)))

@@ -38,7 +38,7 @@ def identity_quaternions(count: int, like: Tensor) -> Tensor:
 def nearest_neighbour_scales(positions: Tensor, neighbours: int = 3) -> Tensor:
     """Root mean square distance [N] to the nearest points, at least 1e-7; a lone point gets 1e-2.
 
-    With fewer than `neighbours` other points, those that there are count.
+    With fewer than `neighbours` other points, all of them count.
     """
     count = len(positions)
     if count < 2:
@@ -49,7 +49,7 @@ def nearest_neighbour_scales(positions: Tensor, neighbours: int = 3) -> Tensor:
 
 
 def refuse_temporal(table: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The table of a backbone as it is, unless it decides whether there is time: that is the plan's to say."""
+    """The table of a backbone unchanged; `temporal` is refused, because the plan decides whether there is time."""
     if "temporal" in table:
         raise D2Error("unknown setting of backbone 'temporal': whether there is time is decided by `[plan] temporal`")
     return table

@@ -39,14 +39,14 @@ NATIVE_FLAGS = (("-march=native",), ("-mcpu=native",), ())
 """How compilers are asked for this CPU's instructions, best first; the last one always works."""
 
 MESSAGE_LIMIT = 4000
-"""Characters of a compiler's words in an error: the first mistake is there, what follows from it need not be."""
+"""How many characters of a compiler's output an error repeats: enough for the first mistake."""
 
 _loaded: dict[Path, ctypes.CDLL] = {}
 _guard = threading.Lock()
 
 
 class NoCompiler(D2Error):
-    """There is no C++17 compiler; whoever has a slower way should take it."""
+    """There is no C++17 compiler; a caller with a slower way should use that."""
 
 
 class CompileError(D2Error):

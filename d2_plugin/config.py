@@ -2,7 +2,7 @@
 
 The paper's supplement, which fixes thresholds, weights and schedules, is not public: the defaults are this project's
 own choices, set by measurement. "Studio" in a docstring means the rendered studio capture (320x180, four training views
-00 02 05 07, frames 0 to 8, emulated monocular depth, one seed), the number held-out PSNR.
+00 02 05 07, frames 0 to 8, emulated monocular depth, one seed), the numbers are held-out PSNR.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class D2Config(_HookTables):
     views_per_evaluation: AtLeastOne = 4
     """Training views surveyed at each structure update, taken in turn over all cameras and frames."""
     retire_after: Count = 5
-    """Evaluations in a row that change next to nothing after which a structure hook retires; 0: never."""
+    """A structure hook retires after this many evaluations in a row that change next to nothing; 0: never."""
     retire_below: Share = 1e-3
-    """Share of the Gaussians; an evaluation that changes fewer has changed next to nothing."""
+    """An evaluation that changes a smaller share of the Gaussians than this has changed next to nothing."""
     seed: Seed = 0
     """Seed of D2's own random generator."""
 

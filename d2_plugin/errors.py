@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class D2Error(ValueError):
-    """A mistake in input or configuration, told in one sentence: what, expected and got, what to do.
+    """A mistake in input or configuration, in one sentence: what, expected and got, what to do.
 
     The `d2` command prints it without a traceback and exits with code 2.
     """

@@ -153,7 +153,7 @@ class D2Hooks:
         self._count = len(self.backbone)
 
     def _begin(self, step: int) -> None:
-        """Tell the backbone which step this is, where it wants to know, and notice what nobody reported."""
+        """Tell the backbone the step, if it has `begin_step`, and notice changes that nobody reported."""
         begin = getattr(self.backbone, "begin_step", None)
         if begin is not None:
             begin(step)
@@ -172,7 +172,7 @@ class D2Hooks:
         return Context(step, self.backbone, views, self._prior, self.generator, sample)
 
     def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
-        """Leave out a structure hook whose last evaluations changed next to nothing: its surveys cost time."""
+        """Retire a structure hook whose last evaluations changed next to nothing, because its surveys cost time."""
         config, hook = self.config, self.hooks[name]
         if not config.retire_after or not HOOKS[name].edits_structure or not context.evaluation:
             return

@@ -20,7 +20,7 @@ def names(group: str) -> list[str]:
 
 
 def load(group: str, name: str) -> Any:
-    """The registered object of that name; an unknown one is refused with the names that there are."""
+    """The registered object of that name; an unknown name is refused, with the known ones."""
     points = _points(group)
     if name not in points:
         raise unknown_name(group.rsplit(".", 1)[1].removesuffix("s"), name, points)

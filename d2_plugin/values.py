@@ -24,7 +24,7 @@ class Range:
     open_high: bool = False
     """The upper bound itself is refused."""
     infinite: bool = False
-    """Infinity is a value."""
+    """Infinity is allowed."""
 
     def holds(self, value: float) -> bool:
         """Whether `value`, whole or not, lies inside; NaN never does."""

@@ -42,7 +42,7 @@ def launch(options: argparse.Namespace, command: Sequence[str]) -> Session | Non
     """Prepare the process for the repository and run `command`, its script and arguments, inside it."""
     script = Path(command[0])
     if not script.is_file():
-        raise D2Error(f"no script at {script}: give the repository's train.py and its arguments behind --")
+        raise D2Error(f"no script at {script}: give the repository's train.py and its arguments after --")
     _check_device(options.cpu)
     sys.argv = list(command)
     sys.path.insert(0, str(script.resolve().parent))
@@ -78,7 +78,7 @@ def _store(config: D2Config, exported: Path | None) -> Any:
 
 
 def _refuse_restart(path: str, arguments: Sequence[str]) -> NoReturn:
-    """4DGaussians replaces its process when its loss is not a number, which would go on without D2, and for ever."""
+    """Stop a trainer that restarts itself, as 4DGaussians does when its loss is not a number: D2 would be lost."""
     raise D2Error(
         f"the trainer wants to restart itself as {' '.join(map(str, arguments[:2]))}, as 4DGaussians does when its "
         "loss is not a number (its issue 215): stopped here"
@@ -90,7 +90,7 @@ def _parsed(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
     at = arguments.index("--") if "--" in arguments else len(arguments)
     options, command = _parser().parse_args(arguments[:at]), arguments[at + 1 :]
     if not command:
-        raise D2Error("no script to run: put the repository's train.py and its arguments behind --")
+        raise D2Error("no script to run: put the repository's train.py and its arguments after --")
     return options, command
 
 
@@ -101,9 +101,8 @@ def _parser() -> argparse.ArgumentParser:
         description="Run another repository's train.py with D2 attached, no line of it edited.",
     )
     parser.add_argument("repository", choices=sorted(RECIPES), help="which codebase the script belongs to")
-    parser.add_argument("--d2", type=Path, default=None, help="configuration; without one the bare trainer is run")
-    parser.add_argument(
-        "--exported", type=Path, default=None, help="folder of d2 export-capture, where the prior is of its source"
-    )
-    parser.add_argument("--cpu", action="store_true", help="without a GPU: cuda means cpu, our modules replace builds")
+    parser.add_argument("--d2", type=Path, default=None, help="configuration of D2; without it the bare trainer runs")
+    exported = "folder that d2 export-capture wrote, if the prior was built from its source"
+    parser.add_argument("--exported", type=Path, default=None, help=exported)
+    parser.add_argument("--cpu", action="store_true", help="no GPU: cuda means cpu, D2's modules replace CUDA builds")
     return parser

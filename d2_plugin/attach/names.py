@@ -20,7 +20,7 @@ class RenamedStore:
 
     @classmethod
     def of_export(cls, store: Any, folder: Path) -> RenamedStore:
-        """With the names of an exported folder, or of the source itself where it names them so already."""
+        """The priors under the names of an exported folder; names that the source uses itself are kept."""
         path = folder / EXPORT_FILE
         try:
             described = json.loads(path.read_text())

@@ -50,7 +50,7 @@ class Recipe:
     model: tuple[str, str] = ("scene.gaussian_model", "GaussianModel")
     renderer: tuple[str, str] = ("gaussian_renderer", "render")
     heard: Callable[[Any, Mapping[str, Any]], None] | None = None
-    """What the adapter learns from the named arguments of each render, where they say something."""
+    """Hands the adapter what it needs from the named arguments of each render."""
     seen: dict[str, tuple[str, str]] = field(default_factory=lambda: {"scene": ("scene", "Scene")})
     """Classes whose latest instance is remembered, by its field of `Objects`."""
 
@@ -110,7 +110,7 @@ RECIPES = {
 
 
 def recipe(name: str) -> Recipe:
-    """The recipe of that name; an unknown one is refused with the names that there are."""
+    """The recipe of that name; an unknown name is refused, with the known ones."""
     if name not in RECIPES:
         raise unknown_name("repository", name, RECIPES)
     return RECIPES[name]

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 class AddGradient(torch.autograd.Function):
     """The picture unchanged; its backward pass also sends `weight` into `term`, as if weight * term were in the loss.
 
-    A trainer that hands its picture to a loss of its own thereby minimises the sum, with nothing of it edited.
+    So a trainer that computes its own loss from this picture minimises the sum, and none of its code is edited.
     """
 
     @staticmethod
@@ -42,10 +42,10 @@ class AddGradient(torch.autograd.Function):
 class Session:
     """One run of a foreign train.py with D2 attached.
 
-    Iterations are the trainer's own, as its `update_learning_rate(iteration)` says them, before or after rendering, and
-    counted from 1 where it has no such method.
-    Trainers that draw a batch divide their loss by its size or take the mean: D2's term is weighted likewise by the
-    number of pictures that the step before drew, and left out of the very first step, when nobody knows it yet.
+    The number of the iteration is what the trainer gives to `update_learning_rate(iteration)`, before or after
+    rendering. Where it has no such method, iterations are counted from 1.
+    A trainer that draws a batch takes the mean of its loss, and D2's term is divided by the batch size in the same way.
+    That size is the number of pictures in the step before, so the first step has no term.
     """
 
     def __init__(self, recipe: Recipe, config: D2Config, store: Store | None = None) -> None:

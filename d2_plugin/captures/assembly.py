@@ -28,7 +28,7 @@ from d2_plugin.errors import D2Error
 log = logging.getLogger(__name__)
 
 BLACK_NOTED = 1e-3
-"""A note says how much of an undistorted picture is black where it is more than this share."""
+"""Black share of an undistorted picture above which a note reports it."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class FolderSource:
         return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        """Monocular map float32 [h, w] exactly as stored (its holes and NaN are the reader's to judge), or None."""
+        """Monocular map float32 [h, w] exactly as stored (holes and NaN included), or None."""
         path = self.monos.get(camera, {}).get(frame)
         return None if path is None else _load_array(path, None).astype(np.float32)
 
@@ -71,7 +71,7 @@ def assembled(
 ) -> Capture:
     """The capture of `cameras` (pinholes) whose pictures are `images`; every note is also logged.
 
-    `lenses` says how the pictures were recorded where that was not by the pinholes: they are undistorted when read.
+    `lenses` describes the cameras whose recorded pictures are distorted; those are undistorted when read.
     """
     kind, emulated, mono_notes = _mono_description(path)
     monos = _maps(path / "mono", list(cameras), ".npy")
@@ -102,7 +102,7 @@ def _lens_notes(bent: Mapping[str, Lens], cameras: Mapping[str, Camera]) -> tupl
     worst = max(shares, key=lambda name: shares[name])
     note = f"lens distortion of {', '.join(bent)} is undone when a picture is read"
     if shares[worst] > BLACK_NOTED:
-        note += f"; where nothing was recorded a picture is black: up to {shares[worst]:.1%} ({worst})"
+        note += f"; pixels that were not recorded are black: up to {shares[worst]:.1%} ({worst})"
     return (note,)
 
 
@@ -160,7 +160,7 @@ def _words_of_source(path: Path) -> list[str]:
 
 
 def _words_of_calibration(path: Path) -> list[str]:
-    """`mono` in cameras.json, where there is such a file; another program's file of that name says nothing."""
+    """`mono` in cameras.json, where there is such a file; a file of that name from another program counts as none."""
     try:
         content = json.loads((path / "cameras.json").read_text())
     except (OSError, ValueError):

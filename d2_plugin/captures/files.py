@@ -52,7 +52,7 @@ def common_frames(files: Mapping[str, Iterable[int]], where: Path) -> tuple[tupl
 def cameras_with_pictures(
     calibrated: Iterable[str], pictured: Collection[str], asked: tuple[str, ...] | None, intersect: bool, where: Path
 ) -> tuple[list[str], tuple[str, ...]]:
-    """(cameras to read, notes) of those that `where` describes; those that are `asked` for, or all.
+    """(cameras to read, notes): the cameras that are `asked` for, or all that `where` describes.
 
     Where nothing was asked for, cameras without pictures and pictures of cameras that `where` does not describe are
     refused by name, or left out with a note where `intersect`. A camera that is asked for must have both.

@@ -25,10 +25,10 @@ KEPT_MAPS = 8
 """Cameras whose resampling map stays in memory (6 bytes per pixel each)."""
 
 COVERAGE_STEP = 8
-"""Steps in pixels, across and down, at which it is measured how much of a picture is black."""
+"""Grid step in pixels, across and down, for measuring how much of a picture is black."""
 
 NEVER = 1e-12
-"""A fold counts as none where 1 / a^2 is below this: it lies a million focal lengths away from the centre."""
+"""A fold is ignored where 1 / a^2 is below this: it lies a million focal lengths away from the centre."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class UndistortedSource:
-    """The pictures of `source` as pinhole cameras would have taken them; maps lying on disk are of these already."""
+    """The pictures of `source` as pinhole cameras would have taken them; maps on disk fit these already."""
 
     source: Source
     lenses: Mapping[str, Lens]

@@ -1,4 +1,4 @@
-"""Which camera and which frame a picture shows, told from its name, for data sets that list pictures one by one.
+"""Which camera and which frame a picture shows, read from its name, for data sets that list pictures one by one.
 
 Three habits are understood: CAMERA/FRAME.png, CAMERA_FRAME.png, and one picture per camera. Folders called `images` or
 `.` say nothing about the camera, wherever they stand.
@@ -48,7 +48,7 @@ def by_prefix(name: str) -> Shot | None:
 
 
 def arrange(names: Iterable[str], still: Callable[[list[str]], bool]) -> tuple[dict[str, Shot], Reading | None]:
-    """Camera and frame of every name, and the reading that told them.
+    """Camera and frame of every name, and the reading that was used.
 
     `still` says whether the pictures of one presumed camera were taken from one pose. Where that holds for no reading,
     as in a still scene photographed by one moving camera, every picture is a camera of its own at frame 0 and the

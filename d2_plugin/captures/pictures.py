@@ -82,7 +82,7 @@ def shrink_picture(picture: np.ndarray, factor: int) -> np.ndarray:
 
 
 def shrink_depth(depth: np.ndarray, factor: int, tolerance: float = 0.05) -> np.ndarray:
-    """Depth float32 [H // factor, W // factor] of blocks of pixels; 0 (unknown) where a block knows nothing.
+    """Depth float32 [H // factor, W // factor] of blocks of pixels; 0 (unknown) where no depth in a block is known.
 
     A plain mean would put points into the air at depth edges: the mean goes over the pixels of a block that lie
     within the relative `tolerance` of the block's (lower) median, so that every value belongs to one surface.

@@ -127,7 +127,7 @@ def resolve_cameras(
     capture = open_capture(path, intersect=True)
     split = camera_preset(capture, train[0])
     chosen = split.test if test is None else test
-    # A run reads the chosen cameras alone (see `Scene.open`), so what the other ones lack is said here or nowhere.
+    # A run reads the chosen cameras alone (see `Scene.open`), so only this note says what the others lack.
     said_by_the_run = open_capture(path, cameras=dict.fromkeys((*split.train, *chosen))).notes
     return split.train, chosen, (*split.notes, *(note for note in capture.notes if note not in said_by_the_run))
 

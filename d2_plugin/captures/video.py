@@ -12,7 +12,7 @@ from d2_plugin.captures.pictures import opencv
 from d2_plugin.errors import D2Error
 
 SKIP_LIMIT = 32
-"""A frame this little ahead is reached by decoding on; any other by a seek, which decodes from a key frame."""
+"""A frame at most this far ahead is reached by decoding on; any other by a seek, which starts at a key frame."""
 
 
 class VideoHeader(NamedTuple):

@@ -63,7 +63,7 @@ def _answer(words: list[str]) -> str | None:
 def _overview() -> str:
     lines = [entry(name, (_module(name).__doc__ or "").partition("\n")[0]) for name in COMMANDS]
     head = "Dual-source depth priors for 4D Gaussian Splatting from two to four cameras."
-    foot = "`d2 COMMAND --help` says what a command takes; `d2 --version` tells the version."
+    foot = "`d2 COMMAND --help` says what a command takes; `d2 --version` prints the version."
     return "\n".join(["usage: d2 COMMAND ...", "", head, "", *lines, "", foot])
 
 

@@ -24,7 +24,7 @@ class PlanOptions(ConfigFile):
 
 
 def form(words: list[str]) -> Form:
-    """What `d2 plan` takes; with --verify that of the measurement."""
+    """What `d2 plan` takes; with --verify, what the measurement takes."""
     if "--verify" in words:
         words.remove("--verify")
         return study_form("d2 plan --verify", "d2_plugin.study.plan_verify", "PlanVerification")
@@ -37,7 +37,7 @@ def run(given: Given) -> None:
     from d2_plugin.runs.settings import check
 
     if given.values["verify"]:
-        raise D2Error("--verify is cut short or given a value: write --verify")
+        raise D2Error("--verify is a switch: write it in full and without a value")
     scene = Scene.open(check(run_settings(given)))
     say(f"recording  {described(scene.capture)}")
     say_notes(scene.capture.notes)

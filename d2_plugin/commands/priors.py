@@ -21,7 +21,7 @@ class PriorOptions(ConfigFile):
     shard: str | None = None
     """Build part I of N only, as I/N with I from 1 to N."""
     workers: Annotated[int, Range(1, unit="processes")] | None = None
-    """Build with this many processes of this machine."""
+    """Build with this many processes on this machine."""
     scheduler: str | None = None
     """Address of a dask cluster to build on, as tcp://host:8786."""
 
@@ -32,7 +32,7 @@ def form(words: list[str]) -> Form:
 
 
 def run(given: Given) -> str:
-    """Build what is missing; returns what the frames came to."""
+    """Build what is missing; returns a summary of the frames."""
     from d2_plugin.priors.sheet import contact_sheet
     from d2_plugin.priors.store import PriorStore
     from d2_plugin.runs.prior import build_priors_for
@@ -69,7 +69,7 @@ def part_of(text: str | None) -> tuple[int, int] | None:
 
 
 def cluster_of(options: PriorOptions) -> dict[str, Any] | None:
-    """What to hand the frames to, where that is wanted."""
+    """What builds the frames, if not this process."""
     if options.workers is None and options.scheduler is None:
         return None
     if options.shard is not None:

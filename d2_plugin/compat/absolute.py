@@ -83,7 +83,7 @@ def absolute_gradient(drawing: Drawing, picture: Tensor, gradient: Tensor) -> Te
     """Sum over pixels p of |dL_p/d(screen centre)|, [M, 2] in pixels, for `gradient` [H, W, C] = dL/d(picture).
 
     Raises:
-        NoCompiler: there is none, and no other way to these sums.
+        NoCompiler: there is no compiler, and these sums have no other way.
     """
     splats, values, view, settings = drawing
     kept = visible(splats, None, view, settings)

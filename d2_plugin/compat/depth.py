@@ -47,7 +47,7 @@ class GaussianRasterizer(threedgs.GaussianRasterizer):
 
 @functools.cache
 def _can_sum() -> bool:
-    """Whether absolute gradients can be had; says once where they cannot."""
+    """Whether absolute gradients are available; warns once where they are not."""
     try:
         absolute.library()
     except NoCompiler as error:

@@ -13,7 +13,7 @@ PAIRS = 1 << 22
 """Distances held in memory at a time."""
 
 FARTHEST_CELL = 1 << 19
-"""Cells are counted up to here from the median, along each axis."""
+"""Largest number of a cell, counted from the median along each axis."""
 
 
 def distCUDA2(points: Tensor) -> Tensor:

@@ -74,12 +74,12 @@ def _kernel() -> ctypes.CDLL:
     """The kernel, where `can_slice` has found that there is one."""
     found = library()
     if found is None:
-        raise NoCompiler("the slice in C++ needs a compiler: take `reference_slice`, which `can_slice` leads to")
+        raise NoCompiler("the slice in C++ needs a compiler: use `reference_slice` where `can_slice` is False")
     return found
 
 
 def can_slice(raw: Mapping[str, Tensor]) -> bool:
-    """Whether these parameters are the kernel's: float32 on the CPU, where there is a compiler."""
+    """Whether the kernel takes these parameters: float32 on the CPU, where there is a compiler."""
     fit = all(tensor.dtype == torch.float32 and tensor.device.type == "cpu" for tensor in raw.values())
     return fit and library() is not None
 

@@ -51,12 +51,12 @@ def _kernel() -> ctypes.CDLL:
     """The kernel, where `can_compare` has found that there is one."""
     found = library()
     if found is None:
-        raise NoCompiler("the loss in C++ needs a compiler: take `reference_photometric_loss`")
+        raise NoCompiler("the loss in C++ needs a compiler: use `reference_photometric_loss` without one")
     return found
 
 
 def can_compare(image: Tensor, target: Tensor) -> bool:
-    """Whether these pictures are the kernel's: float32 on the CPU, a fixed target, and there is a compiler."""
+    """Whether the kernel takes these pictures: float32 on the CPU, a fixed target, and there is a compiler."""
     fit = all(part.dtype == torch.float32 and part.device.type == "cpu" for part in (image, target))
     same = image.ndim == 3 and image.shape == target.shape and image.numel() > 0
     return fit and same and not target.requires_grad and library() is not None

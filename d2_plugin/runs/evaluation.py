@@ -57,7 +57,7 @@ def evaluate(
         {"test": mean of each metric over the views that have it (null where none has),
         "per_view": [{"camera", "frame", metric: value, ...}], "per_frame": [{"frame", mean over cameras}],
         "per_camera": [{"camera", mean over frames}], "variants": {metric: definition}}. The first frame of a camera
-        has no flicker, the others are held against the frame before them in `frames`.
+        has no flicker, the others are compared with the frame before them in `frames`.
 
     Raises:
         D2Error: a render of another size than the camera's or with values that are not finite.

@@ -94,7 +94,7 @@ class Lpips:
 
 
 def find_lpips(net: str = "alex", folder: Path | None = None) -> Lpips | None:
-    """LPIPS from weight files in `folder` or the usual places, or None (said once in the log) where there are none."""
+    """LPIPS from weight files in `folder` or the usual places, or None (logged once) where there are none."""
     if net not in _FILES:
         raise unknown_name("LPIPS network", net, _FILES)
     places = [folder] if folder is not None else list(_usual_places())

@@ -102,7 +102,7 @@ def _depths(
     depth_range: tuple[float, float] | None,
     points: np.ndarray | None,
 ) -> np.ndarray | None:
-    """Depths [D] at which the things in a camera's picture lie, or None where nothing tells them."""
+    """Depths [D] at which the things in a camera's picture lie, or None if they are unknown."""
     if depth_range is None and points is not None:
         visible = _visible_depths(camera, points)
         if visible.size >= ENOUGH_POINTS:

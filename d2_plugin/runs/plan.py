@@ -55,7 +55,7 @@ class ScenePlan:
         return (*self.measured, *self._following())
 
     def uses(self, name: str) -> bool:
-        """Whether the named part is used; a part that there is no question of is not."""
+        """Whether the named part is used; False for a part on which nothing had to be decided."""
         return any(d.use for d in self.decisions if d.name == name)
 
     @property
@@ -71,7 +71,7 @@ class ScenePlan:
         """The same plan with some of the measured decisions taken by the user; None leaves a decision alone.
 
         Raises:
-            D2Error: what is asked for cannot be, such as stereo with one camera.
+            D2Error: what is asked for is impossible, such as stereo with one camera.
         """
         return replace(self, measured=tuple(_overridden(d, choices.get(d.name)) for d in self.measured))
 
@@ -84,7 +84,7 @@ class ScenePlan:
     def _following(self) -> tuple[Decision, Decision]:
         mono = Decision("monocular", self.mono_source is not None, self.mono_source or "no maps on disk and no network")
         if mono.use and self.mono_kind == "relative" and not self.geometric:
-            mono = replace(mono, use=False, reason=f"{mono.reason}: no geometric depth tells their scale")
+            mono = replace(mono, use=False, reason=f"{mono.reason}: no geometric depth gives their scale")
         both = self.geometric and mono.use
         reason = "two depth sources check each other" if both else "there is one depth source at most"
         return mono, Decision("verification", both, reason)
@@ -143,7 +143,7 @@ def _temporal(capture: Capture, cameras: Sequence[str]) -> Decision:
 def _geometric(
     capture: Capture, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None
 ) -> tuple[Decision, ...]:
-    """Sensor and stereo: depth that lies on disk is taken before anything is matched."""
+    """Sensor and stereo: depth on disk, from a sensor or COLMAP, is used first."""
     found = find_depth_on_disk(capture, cameras, settings.stereo)
     if found is not None and found.name == SensorDepth.name:
         reason = "a sensor measured the depth: nothing is matched"

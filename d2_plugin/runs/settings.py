@@ -1,4 +1,4 @@
-"""What a run is: its settings, checked, and what follows from them before anything is computed."""
+"""The settings of a run, their checks, and what follows from them before anything is computed."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class PlanChoices(Settings):
     """Decisions of the plan that `[plan]` may take; the others follow from them and from the depth sources."""
 
     temporal: bool | None = None
-    """Whether the scene has a temporal dimension; none: as the plan measures it."""
+    """Whether the scene has a temporal dimension; if not given, the plan measures it."""
     stereo: bool | None = None
-    """Whether the cameras are matched; none: as the plan measures it."""
+    """Whether the cameras are matched; if not given, the plan measures it."""
 
 
 OVERRIDABLE = tuple(choice.name for choice in declared(PlanChoices))
@@ -51,17 +51,17 @@ class RunSettings(Settings):
     seed: Seed = 0
     """Seed of everything that is drawn at random."""
     downscale: AtLeastOne = 1
-    """Pictures are this many times smaller than recorded, along each side."""
+    """Make pictures this many times smaller along each side."""
     frames: tuple[Count, ...] | None = None
-    """Numbers of the frames to use; none: all."""
+    """Numbers of the frames to use; all if not given."""
     test_cameras: tuple[str, ...] | None = None
-    """Cameras to score with; none: all that do not train."""
+    """Cameras to score with; all that do not train if not given."""
     mono_onnx: str | None = None
     """ONNX model of monocular depth."""
     mono_kind: Literal["relative", "metric"] | None = None
     """What the model returns: relative (inverse depth up to scale and shift) or metric (depth)."""
     priors: str | None = None
-    """Folder of a finished depth prior; none: the run builds its own."""
+    """Folder of a finished depth prior; without it the run builds its own."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the trainer runs."""
     overrides: Mapping[str, Any] = field(default_factory=dict)
@@ -85,7 +85,7 @@ def check(settings: RunSettings) -> RunSettings:
         if name not in HOOK_NAMES:
             raise unknown_name("hook", name, [*HOOK_NAMES, "all", "none"])
     if settings.mono_onnx and settings.mono_kind is None:
-        raise D2Error("--mono-onnx needs --mono-kind relative (inverse depth) or metric (depth): a file does not tell")
+        raise D2Error("--mono-onnx needs --mono-kind relative (inverse depth) or metric (depth): the file names none")
     _check_device(settings.device)
     _check_overrides(settings)
     paths = ("capture", "mono_onnx", "priors")

@@ -45,7 +45,7 @@ class TimedPoints:
         return cls(*(np.concatenate(values) for values in zip(*together, strict=True)))
 
     def save(self, path: Path) -> None:
-        """Write an .npz with one array per attribute; a file that is there is replaced at once."""
+        """Write an .npz with one array per attribute; an existing file is replaced in one step."""
         temporary = path.with_suffix(".tmp.npz")
         np.savez(temporary, positions=self.positions, colors=self.colors, times=self.times)
         os.replace(temporary, path)
@@ -173,7 +173,7 @@ def _random_points(capture: Capture, camera: str, extent: Extent, count: int, rn
 def triangulated_points(capture: Capture, cameras: Sequence[str], instants: int = 5) -> TimedPoints:
     """Points triangulated with the known poses at up to `instants` frames spread over the recording.
 
-    There are none for a single camera, or where pycolmap is not installed; the latter is said in a warning.
+    There are none for a single camera, or where pycolmap is not installed; the latter gives a warning.
     """
     chosen = np.unique(np.linspace(0, len(capture.frames) - 1, instants).round().astype(int))
     try:

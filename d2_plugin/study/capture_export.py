@@ -25,17 +25,17 @@ class CaptureExport(Settings):
     output: Path
     """Folder that does not exist or is empty."""
     train_cameras: tuple[str, ...] = ()
-    """Names joined by commas; all that are not held out where left out."""
+    """Names of the cameras to train with, joined by commas; if left out, all that are not held out."""
     test_cameras: tuple[str, ...] = ()
     """Names of the cameras that are held out, joined by commas."""
     frames: tuple[int, ...] | None = None
-    """first:last or first:last:step, the last one included; all where left out."""
+    """first:last or first:last:step, the last one included; if left out, all frames."""
     downscale: Annotated[int, Range(1)] = 1
-    """Every block of so many by so many pixels becomes one."""
+    """Make pictures this many times smaller along each side."""
     points: Count = MIN_POINTS
     """Least number of initial points; 0 writes none."""
     seed: Seed = 0
-    """Of the random points among them."""
+    """Seed of the random points among them."""
 
 
 def run(settings: CaptureExport) -> str:
@@ -52,7 +52,7 @@ def run(settings: CaptureExport) -> str:
 
 
 def start_cloud(capture: Capture, cameras: Sequence[str], minimum: int = MIN_POINTS, seed: int = 0) -> PointCloud:
-    """Points triangulated from the training cameras, filled up to `minimum` with random ones in what they see.
+    """Points triangulated from the training cameras, filled up to `minimum` with random ones that the cameras see.
 
     The same start as `d2 train` has, so that another repository can be compared with the bundled backbones.
     """

@@ -1,8 +1,8 @@
 """`d2 plan --verify`: each decision of the plan taken both ways on the capture itself, with its saving and its cost.
 
 Time and memory are those of the work that the decision is about (training, or building priors), each measured in a
-process of its own. The cost is what leaving the part out loses: held-out dB, or verified pixels; negative is a gain.
-Whether it costs anything is a verdict over at least three seeds, see `verdict`.
+process of its own. The cost of leaving a part out is what is lost without it, in held-out dB or in verified pixels;
+a negative cost is a gain. With at least three seeds the cost has a verdict.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class PlanVerification(Settings):
     train_cameras: tuple[str, ...]
     """Names of the cameras that train; or preset:2, preset:3, preset:4 for a known data set."""
     frames: tuple[int, ...] | None = None
-    """Which frames; all of the recording where none is named."""
+    """Numbers of the frames to use; all if not given."""
     downscale: Annotated[int, Range(1)] = 1
     """Make pictures this many times smaller."""
     mono_onnx: str | None = None

@@ -60,7 +60,7 @@ def _row(folder: Path) -> Row:
 
 
 def command_of(metrics: dict[str, Any], settings: dict[str, Any], output: str) -> str:
-    """The `d2 train` of a run as far as its folder tells: names instead of paths, and what differs from the default."""
+    """The `d2 train` command of a run, from what its folder holds: names instead of paths, and no defaults."""
     hooks = metrics["hooks"]
     words = ["d2", "train", metrics["capture"], "--train-cameras", ",".join(metrics["train_cameras"])]
     words += ["--backbone", metrics["backbone"], "--iterations", str(metrics["iterations"])]

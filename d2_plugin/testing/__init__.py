@@ -9,8 +9,8 @@
     def test_my_adapter_keeps_the_contract() -> None:
         check_backbone(make)
 
-Nothing of a test framework is needed. The bundled backbones pass the same checks; docs/your-backbone.md has an example
-from the first line to this test.
+No test framework is needed. The bundled backbones pass the same checks; docs/your-backbone.md has an example from the
+first line to this test.
 """
 
 from __future__ import annotations

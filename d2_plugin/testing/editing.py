@@ -48,9 +48,9 @@ def _edited(example: Example, what: str, edit: Callable[[], object]) -> tuple[li
     backbone.on_resize(second)
     edit()
     if len(listener.reports) != len(second.reports):
-        return [f"{what} is told to one listener only: on_resize must keep them all"], torch.empty(0)
+        return [f"{what} is reported to one listener only: on_resize must keep them all"], torch.empty(0)
     if not listener.reports and len(backbone) != count:
-        return [f"{what} changes {count} Gaussians to {len(backbone)} without telling on_resize"], torch.empty(0)
+        return [f"{what} changes {count} Gaussians to {len(backbone)} without a report to on_resize"], torch.empty(0)
     for index, was, now in zip(listener.reports, [count, *listener.counts], listener.counts):
         if mistake := _mistake(what, index, was, now):
             return [mistake], index
@@ -63,7 +63,7 @@ def _mistake(what: str, index: Tensor, was: int, now: int) -> str | None:
     if index.dtype != torch.int64 or index.ndim != 1:
         return f"{what} reports {index.dtype} {tuple(index.shape)}, expected an index, int64 [N_new]"
     if len(index) != now:
-        return f"{what} reports an index of {len(index)} rows when there are {now}: tell after the change, N_new rows"
+        return f"{what} reports an index of {len(index)} rows when there are {now}: report N_new rows, after the change"
     if ((index < -1) | (index >= was)).any():
         return f"{what} reports rows outside -1..{was - 1}: row r of the index is where row r was, -1 if new"
     return None
@@ -145,8 +145,9 @@ def _grow(example: Example) -> Iterator[str]:
     listener = _Listener(example.backbone)
     example.backbone.on_resize(listener)
     example.grow()
-    if len(example.backbone) != count and not listener.reports:
-        yield f"the backbone's own densification goes from {count} to {len(example.backbone)} without telling on_resize"
+    grown = len(example.backbone)
+    if grown != count and not listener.reports:
+        yield f"the backbone's own densification goes from {count} to {grown} without a report to on_resize"
     for index, now in zip(listener.reports, listener.counts):
         if len(index) != now:
             yield f"the backbone's own densification reports {len(index)} rows when there are {now}"

@@ -124,7 +124,7 @@ class TestEveryRepository:
             assert (value[count:] == adapter.evidence[accumulator]).all(), accumulator
 
     def test_the_repositorys_own_edits_are_reported_row_by_row(self, name: str) -> None:
-        """Ids in positions and in Adam's moments follow the index that listeners are told."""
+        """Ids in positions and in Adam's moments follow the index that listeners receive."""
         adapter = next(iter(drawn(name)))[0]
         model = adapter.gaussians
         sum((getattr(model, attribute) * 0).sum() for _, attribute in model.columns).backward()
@@ -156,7 +156,7 @@ class TestEveryRepository:
     @settings(max_examples=40, deadline=None)
     @given(sequence=st.lists(st.sampled_from(["clone", "split", "insert", "remove", "extract"]), max_size=8))
     def test_rows_are_followed_through_any_edits(self, name: str, sequence: list[str]) -> None:
-        """Rows are numbered anew before every edit; what listeners are told must lead back to the numbers."""
+        """Rows are numbered anew before every edit; the reports to listeners must lead back to the numbers."""
         model, make_adapter, _, _ = next(iter(variants(name)))
         model.training_setup(default_options())
         adapter, told = make_adapter(), []

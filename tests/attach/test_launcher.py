@@ -260,7 +260,7 @@ class TestCommand:
 
     def test_mistakes_are_one_sentence(self, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
         assert main(["fudan", "--d2", "d2.toml"]) == 2
-        assert "put the repository's train.py and its arguments behind --" in capsys.readouterr().err
+        assert "put the repository's train.py and its arguments after --" in capsys.readouterr().err
         assert main(["fudan", "--", str(tmp_path / "train.py")]) == 2
         assert "no script at" in capsys.readouterr().err
 

@@ -49,7 +49,7 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
 
 
 def bend_field(model: SplatModel, strength: float = 0.02) -> None:
-    """A deformation field, where there is one, no longer is still."""
+    """A deformation field, where there is one, moves its Gaussians."""
     if getattr(model, "field", None) is not None:
         model.deforms = True
         with torch.no_grad():

@@ -31,7 +31,7 @@ def kind(request: pytest.FixtureRequest) -> str:
 
 
 def make_field(kind: str, seed: int = 0) -> MlpField | HexPlaneField:
-    """A field in float64 whose last layer no longer is zero."""
+    """A field in float64 whose last layer is not zero any more."""
     generator = torch.Generator().manual_seed(seed)
     box = Box(torch.tensor([0.5, -1.0, 3.0]), torch.tensor([2.0, 1.0, 3.0]), 1.5)
     if kind == "mlp":

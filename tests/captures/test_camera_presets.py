@@ -1,4 +1,4 @@
-"""Camera presets: nested, without the cameras that are known to be unsound, and told in words."""
+"""Camera presets: nested, without the cameras that are known to be unsound, and explained in words."""
 
 from __future__ import annotations
 

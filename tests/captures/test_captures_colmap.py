@@ -179,7 +179,7 @@ def test_a_distorted_camera_becomes_a_pinhole(tmp_path: Path) -> None:
     shown = capture.image("cam01", 0)
     assert (shown[12, 15] == 200).all()
     assert (shown[0, 0] == 0).all()  # not recorded
-    assert any(re.search(r"a picture is black: up to [\d.]+% \(", note) for note in capture.notes)
+    assert any(re.search(r"that were not recorded are black: up to [\d.]+% \(", note) for note in capture.notes)
 
 
 def test_models_without_undistortion_are_refused(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def test_a_user_may_decide_otherwise_and_the_plan_says_so(moving) -> None:
 def test_stereo_left_out_by_the_user_leaves_out_what_follows_from_it(moving) -> None:
     plan = plan_scene(moving, ["train0", "train1"], "relative maps").override(stereo=False)
     assert [plan.uses(name) for name in ("stereo", "verification", "monocular")] == [False] * 3
-    assert "no geometric depth tells their scale" in plan.as_dict()["monocular"]["reason"]
+    assert "no geometric depth gives their scale" in plan.as_dict()["monocular"]["reason"]
     metric = plan_scene(replace(moving, mono_kind="metric"), ["train0", "train1"], "metric maps").override(stereo=False)
     assert [metric.uses(name) for name in ("stereo", "verification", "monocular")] == [False, False, True]
 

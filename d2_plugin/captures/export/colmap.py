@@ -58,7 +58,7 @@ def write_multipleview(export: Export) -> Written:
     camera's focal length for all, and tests on frames of the cameras it trains on: held-out cameras are not written.
     """
     if export.cloud is None:
-        raise D2Error("the layout multipleview needs initial points, which its reader does not make up: give some")
+        raise D2Error("the layout multipleview needs initial points, because its reader makes none: give some")
     kept = {name: export.capture.cameras[name] for name in export.train_cameras}
     for camera in kept.values():
         refuse_off_centre(camera, "multipleview")

@@ -20,7 +20,7 @@ from d2_plugin.errors import D2Error
 log = logging.getLogger(__name__)
 
 READ_FRAMES = 24
-"""Frames of each camera that Deformable-3D-Gaussians reads (scene/__init__.py), whatever there is."""
+"""Frames of each camera that Deformable-3D-Gaussians reads (scene/__init__.py), however many there are."""
 
 
 def write_n3dv(export: Export) -> Written:
@@ -70,7 +70,7 @@ def llff_row(camera: Camera, near_far: tuple[float, float]) -> np.ndarray:
 
 
 def depth_bounds(camera: Camera, cloud: PointCloud | None) -> tuple[float, float]:
-    """Near and far depth: as declared, or as the points have it."""
+    """Near and far depth: as declared, or from the points."""
     if camera.near_far is not None:
         return camera.near_far
     if cloud is not None:

@@ -24,7 +24,7 @@ from d2_plugin.captures.readers.colmap_model import ColmapImage, ColmapModel, fi
 from d2_plugin.errors import D2Error
 
 COLMAP_FPS = 30.0
-"""Frame rate taken, and noted: a COLMAP model says nothing about time."""
+"""Frame rate that is assumed, with a note: a COLMAP model says nothing about time."""
 
 SAME_POSE = 0.02
 """Poses of one standing camera may differ by this much (radians, and share of the scene's camera spread): bundle
@@ -89,7 +89,7 @@ def _shots(model: ColmapModel, files: Iterable[str]) -> tuple[dict[str, ColmapIm
                 left_out += 1
     notes = (f"{left_out} pictures left out because the COLMAP model has no pose for them",) if left_out else ()
     if reading is None and len(poses) > 1:
-        notes = (*notes, "every picture is a camera of its own at one instant, as their names or poses tell no frames")
+        notes = (*notes, "every picture is a camera of its own at one instant: neither names nor poses show frames")
     return dict(sorted(poses.items())), shots, notes
 
 
@@ -118,7 +118,7 @@ def _centre(image: ColmapImage) -> np.ndarray:
 def _camera(
     name: str, image: ColmapImage, model: ColmapModel, files: FrameFiles, frames: tuple[int, ...]
 ) -> tuple[Camera, Lens]:
-    """The pinhole camera of the undistorted pictures, and the lens that the recorded ones need undone."""
+    """The pinhole camera of the undistorted pictures, and the lens of the recorded ones."""
     where, found = str(model.folder), model.cameras[image.camera]
     size = picture_size(files[frames[0]])
     lens = found.lens(where)

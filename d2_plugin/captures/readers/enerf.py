@@ -27,7 +27,7 @@ ENERF_FPS = 60.0
 """Frame rate at which EasyVolcap plays the data set; the files name none."""
 
 NOT_USED = ("masks", "mask", "bgmtv2", "bkgd", "vhull", "background.ply")
-"""What recordings of this layout may hold besides, and this reader leaves alone: the whole picture is the truth."""
+"""What recordings of this layout may also hold. It is not used, because the whole picture is the truth."""
 
 
 class OpencvYaml:
@@ -129,7 +129,7 @@ def _agreed(
 def _camera(
     name: str, intrinsics: OpencvYaml, extrinsics: OpencvYaml, files: FrameFiles, frame: int
 ) -> tuple[Camera, Lens]:
-    """The pinhole camera of the undistorted pictures, and the lens that the recorded ones need undone."""
+    """The pinhole camera of the undistorted pictures, and the lens of the recorded ones."""
     size, where = picture_size(files[frame]), str(intrinsics.path)
     K = _shaped(intrinsics.matrix(f"K_{name}"), (3, 3), f"K_{name}", where)
     width, height = intrinsics.number(f"W_{name}"), intrinsics.number(f"H_{name}")
@@ -164,5 +164,5 @@ def _shaped(matrix: np.ndarray | None, shape: tuple[int, ...], key: str, where: 
 
 
 def _text(node: Any) -> str:
-    """A name, also where it is written without quotes and read as a number."""
+    """A name as text: YAML reads a name without quotes as a number."""
     return node.string() if node.isString() else str(int(node.real()))

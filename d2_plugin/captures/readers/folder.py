@@ -24,7 +24,7 @@ from d2_plugin.errors import D2Error, unknown_name
 CALIBRATION = "cameras.json"
 
 DEFAULT_FPS = 30.0
-"""Frame rate taken, and noted, where cameras.json names none."""
+"""Frame rate that is assumed, with a note, where cameras.json names none."""
 
 
 def is_folder(path: Path) -> bool:

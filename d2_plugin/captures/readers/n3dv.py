@@ -49,7 +49,7 @@ def open_n3dv(path: Path, cameras: tuple[str, ...] | None = None, intersect: boo
 
     A camera whose video or folder is empty is refused by name, and so are rows without a camera. Where `intersect`
     both are left out with a note: an empty camera keeps its row, and of the whole rig (`RIG_SIZE` rows) the number in
-    a camera's name says which row is its own. Otherwise nothing tells whose the rows are.
+    a camera's name says which row is its own. Otherwise nothing says which row belongs to which camera.
     """
     videos = {video.stem: video for video in sorted(path.glob("cam*.mp4"))}
     extracted = {} if videos else _extracted(path)

@@ -129,7 +129,7 @@ def _repaired(images: dict[str, FrameFiles], scene: str) -> tuple[dict[str, Fram
 
 
 def _camera(name: str, row: np.ndarray, picture: Path, scene: str, path: Path) -> tuple[Camera, Lens]:
-    """The pinhole camera of the undistorted pictures, and the lens that the recorded ones need undone."""
+    """The pinhole camera of the undistorted pictures, and the lens of the recorded ones."""
     where = str(path / PARAMETERS)
     focal, cu, cv, aspect, skew = row[:5]
     distortion = tuple(row[5:-7].tolist()) if "undist" not in picture.stem.lower() else ()

@@ -159,7 +159,7 @@ def _rate(value: Any) -> float | None:
 
 
 def _timed(shots: dict[str, Shot], times: dict[str, float]) -> tuple[dict[str, Shot], float]:
-    """Frames and their rate; frames are counted by time where the numbers in names do not run with it."""
+    """Frames and their rate; frames are counted by time where the numbers in names do not grow with it."""
     numbers, instants = zip(*sorted({(shots[name].frame, time) for name, time in times.items()}), strict=True)
     distinct = sorted(set(instants))
     if list(instants) == distinct and len(set(numbers)) == len(numbers):
@@ -175,7 +175,7 @@ def _still(group: list[_Entry]) -> bool:
 
 
 def _camera(name: str, entry: _Entry) -> tuple[Camera, Lens]:
-    """The pinhole camera of the undistorted pictures, and the lens that the recorded ones need undone."""
+    """The pinhole camera of the undistorted pictures, and the lens of the recorded ones."""
     size, where = picture_size(entry.file), str(entry.listed_in)
     try:
         given = {key: float(entry.intrinsics[key]) for key in _NUMBERS if key in entry.intrinsics}
@@ -223,7 +223,7 @@ def _lens(K: np.ndarray, given: dict[str, float], model: str, where: str) -> Len
 
 
 def _split_notes(entries: dict[str, _Entry], shots: dict[str, Shot]) -> tuple[str, ...]:
-    """Which cameras the files name for what; the split of a run stays a setting."""
+    """Which cameras each file lists; how a run splits them stays a setting."""
     listed: dict[str, set[str]] = {}
     for name, entry in entries.items():
         listed.setdefault(entry.listed_in.name, set()).add(shots[name].camera)

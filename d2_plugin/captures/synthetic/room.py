@@ -93,7 +93,7 @@ def synthetic_capture(
 
 
 def split(capture: Capture) -> tuple[list[str], list[str]]:
-    """(training cameras, held-out cameras) of a synthetic capture, told by their names."""
+    """(training cameras, held-out cameras) of a synthetic capture, by their names."""
     train = [name for name in capture.cameras if name.startswith("train")]
     return train, [name for name in capture.cameras if name not in train]
 

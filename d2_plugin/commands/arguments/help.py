@@ -54,7 +54,7 @@ def _overview(form: Form) -> str:
 def _tables(form: Form, sections: Collection[Section]) -> str:
     """One line per table."""
     titles = [entry(f"--{section.name.replace('_', '-')}.*", _counted(section)) for section in sections]
-    head = "Tables of settings, as in a --config file and over it:"
+    head = "Tables of settings; they may also stand in a --config file, and flags win:"
     foot = (
         f"`{form.command} --help {next(iter(sections)).name}` shows the settings of one table, "
         f"`{form.command} --help-all` all of them."

@@ -39,7 +39,7 @@ class ConfigFile(Settings):
     """The file of settings that every command on a recording takes."""
 
     config: Path | None = None
-    """TOML file with tables of settings over the defaults, as `--help` lists them."""
+    """TOML file with tables of settings, as `--help` lists them; they replace the defaults."""
 
 
 def recording_form(
@@ -57,7 +57,7 @@ def recording_form(
         about: the text above its help.
         run: what it does.
         more: settings of a run that it takes beside those in `CAPTURE`.
-        options: the dataclass of its own settings. One that a run has as well takes that one's place.
+        options: the dataclass of the command's own settings; they replace settings of a run with the same name.
         tables: which tables of settings may be given by dotted flags.
     """
     from d2_plugin.runs.settings import RunSettings

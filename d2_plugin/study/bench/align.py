@@ -39,13 +39,13 @@ class AlignBench(Settings):
     outliers: tuple[Share, ...] = (0.0, 0.2, 0.4, 0.6)
     """Shares of the anchors that are wrong."""
     methods: tuple[str, ...] = ()
-    """Names of methods as the table shows them; all where none is named."""
+    """Names of methods as the table shows them; all if not given."""
     seeds: Annotated[int, Range(1)] = 3
     """Problems per case; figures are medians over them."""
     seconds: NotNegative = 0.03
     """Time for which each fit is repeated, seconds."""
     threads: Annotated[int, Range(1)] | None = None
-    """CPU threads of torch; torch's own choice where left out. The fits themselves use one."""
+    """CPU threads of torch; if not given, torch chooses. The fits themselves use one."""
     output: Path = Path("bench-align")
     """Folder of the results."""
 

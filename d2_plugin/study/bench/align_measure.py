@@ -76,7 +76,7 @@ class AlignProblem:
 
 
 def align_problem(kind: MonoKind, anchors: int, outliers: float, seed: int = 0) -> AlignProblem:
-    """`anchors` of them, of which the share `outliers` has the geometric depth of another place in the room."""
+    """A problem of `anchors` points; the share `outliers` has the geometric depth of another place in the room."""
     rng = np.random.default_rng([seed, anchors, round(100 * outliers)])
     truth, elsewhere = np.exp(rng.uniform(float(np.log(ROOM[0])), float(np.log(ROOM[1])), (2, anchors)))
     target = 1 / truth if kind == "relative" else truth

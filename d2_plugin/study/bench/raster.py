@@ -56,7 +56,7 @@ class RasterBench(Settings):
     seconds: NotNegative = 3.0
     """About how long each pass is repeated, seconds."""
     threads: Annotated[int, Range(1)] | None = None
-    """CPU threads; torch's own choice where left out."""
+    """CPU threads; if not given, torch chooses."""
     error_limit: Count = 60_000
     """Most Gaussians for which the error is measured; with more of them the truth in float64 takes minutes."""
     no_memory: bool = False

@@ -36,11 +36,11 @@ class StereoBench(Settings):
 
     rigs: tuple[str, ...] = ()
     """Rendered: synthetic2, synthetic3, synthetic4. From --data: studio, art, laundry, motorcycle, teddy. All that are
-    there where none is named."""
+    available if not given."""
     data: Path | None = None
     """Folder with the captures studio/ and middlebury/."""
     makers: tuple[str, ...] = ()
-    """Matchers, of patchmatch, sweep, sgbm and colmap (which needs CUDA); all that run here if none is named."""
+    """Matchers, of patchmatch, sweep, sgbm and colmap (which needs CUDA); all that run here if not given."""
     defaults_only: bool = False
     """Leave out what is varied about a matcher."""
     width: Annotated[int, Range(32, unit="pixels")] = 320

@@ -107,7 +107,7 @@ def _alone(rows: Sequence[Row]) -> dict[str, float]:
 
 
 def _missing(cases: Mapping[str, Sequence[Row]]) -> str:
-    """Which gains are not drawn because there is nothing that they would be relative to."""
+    """Which gains are not drawn, because the backbone alone was not run."""
     lost = [
         f"{name} on {case}" for case, rows in cases.items() for name in _backbones_of(rows) if name not in _alone(rows)
     ]

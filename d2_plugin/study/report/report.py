@@ -23,7 +23,7 @@ from .training import training
 BUILDERS: dict[str, Callable[[Sequence[Row]], Section]] = {
     build.__name__: build for build in (training, ablation, alignment, stereo, raster, stability, plan, scaling)
 }
-"""What makes a section of the rows of a kind, in the order of the page."""
+"""The function that makes a section from the rows of a kind, in the order of the page."""
 
 LEAD = (
     "Every figure here was measured by a command of this package and is shown with the machine, the commit and the "

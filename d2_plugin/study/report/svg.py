@@ -1,6 +1,6 @@
 """Plots as SVG, the only plot engine of this package.
 
-It stays in place of a plotting library because the report needs what matplotlib's SVG does not give: text stays text,
+It is used instead of a plotting library because the report needs what matplotlib's SVG does not give: text stays text,
 every mark carries its numbers as a tooltip, colours follow the reader's light or dark setting through one style sheet
 that a page states once, and a file of a few kilobytes changes in a diff where a number changed. Series differ by shape
 as well as by colour.

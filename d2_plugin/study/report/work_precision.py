@@ -42,7 +42,7 @@ class Drawn(NamedTuple):
 
 
 def drawn(found: Sequence[Mean]) -> list[Drawn]:
-    """Those of the means that have a place in a plot."""
+    """The means that can be plotted."""
     return [Drawn(mean, mean.seconds, mean.error) for mean in found if mean.error is not None and mean.seconds]
 
 

@@ -34,7 +34,7 @@ class StabilitySettings(Settings):
     """Settings of `d2 stability`."""
 
     sweeps: tuple[str, ...] = ()
-    """Names of sweeps; all where none is named. An unknown name is answered by the list."""
+    """Names of sweeps; all if not given. An unknown name shows the list."""
     output: Path = Path("runs.jsonl")
     """File that the rows are added to."""
 
