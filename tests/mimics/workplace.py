@@ -30,7 +30,8 @@ def furnish(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         prior = TinyStore().prior(view.camera, view.frame)
         camera = {"K": view.K.tolist(), "T_camera_world": view.T_camera_world.tolist()}
         picture = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
-        fused = FusedPrior(prior.depth.numpy(), prior.labels.numpy(), picture)
+        sigma = np.where(prior.trusted.numpy(), np.float32(0), np.float32(np.inf))
+        fused = FusedPrior(prior.depth.numpy(), prior.labels.numpy(), sigma, picture)
         store.write(view.camera, view.frame, fused, {"camera": camera})
     (folder / "d2.toml").write_text(replace(HOOKS, prior="prior").to_toml())
     monkeypatch.chdir(folder)
