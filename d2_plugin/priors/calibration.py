@@ -71,10 +71,9 @@ class Calibration:
     """Share of the pixels with a true depth that are labelled far."""
 
     def __str__(self) -> str:
-        lines = [
-            f"held against the true depth of {self.views} views:",
-            f"{'label':10}{'share':>9}{'within sigma':>15}{'2 sigma':>10}{'sigma':>9}{'error':>9}",
-        ]
+        header = f"{'label':10}{'share':>9}{'within sigma':>15}{'2 sigma':>10}{'sigma':>9}{'error':>9}"
+        lines = [f"held against the true depth of {self.views} views:"]
+        lines.append(header if self.labels else "no pixel with a true depth has a finite sigma")
         for label, found in self.labels.items():
             shares = f"{found.share:9.1%}{found.within:15.1%}{found.within_two:10.1%}"
             lines.append(f"{shown(label):10}{shares}{found.sigma:9.4f}{found.error:9.4f}")
@@ -150,10 +149,10 @@ def _held(found: np.ndarray, pixels: int) -> LabelCalibration:
     """Of errors and sigmas [2, K] of one label."""
     error, sigma = found
     if not error.size:
-        return LabelCalibration(0, 0.0, *[float("nan")] * 4)
+        unknown = float("nan")
+        return LabelCalibration(0, 0.0, unknown, unknown, unknown, unknown)
     within, within_two = (float((error <= times * sigma).mean()) for times in (1, 2))
-    medians = float(np.median(sigma)), float(np.median(error))
-    curve = reliability_curve(error, sigma)
+    medians, curve = (float(np.median(sigma)), float(np.median(error))), reliability_curve(error, sigma)
     return LabelCalibration(error.size, error.size / pixels, within, within_two, *medians, curve)
 
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 
@@ -70,14 +70,19 @@ class Case(NamedTuple):
 def run(settings: PriorsBench) -> str:
     """Measure and add the rows; a table per capture, and where the rows lie."""
     torch.set_num_threads(settings.threads)
-    lists = {name: ",".join(map(str, getattr(settings, name))) for name in ("rigs", "train_cameras", "frames")}
-    command, told = command_line("bench priors", settings, **lists), []
+    command, told = _command(settings), []
     for case in cases(settings):
         found, seconds = measure(case)
         append_rows(settings.output, rows_of(case, found, seconds, command))
         told.append(f"{case.name}, {seconds:.2f} s per picture, {found}")
         logger.info("the prior of %s is measured", case.name)
     return "\n\n".join([*told, f"rows are in {settings.output}; `d2 report {settings.output}` draws them"])
+
+
+def _command(settings: PriorsBench) -> str:
+    """As it is typed: captures stand apart, the values of a flag are joined by commas."""
+    joined = {name: ",".join(map(str, getattr(settings, name))) for name in ("rigs", "train_cameras", "frames")}
+    return command_line("bench priors", settings, False, **joined)
 
 
 def cases(settings: PriorsBench) -> list[Case]:
@@ -139,7 +144,9 @@ def measure(case: Case) -> tuple[Calibration, float]:
 
 def rows_of(case: Case, found: Calibration, seconds: float, command: str = "") -> list[Row]:
     """A row per label that a pixel carries, and one about far pixels."""
-    about = {
+    about: dict[str, Any] = {
+        "command": command,
+        "seconds": seconds,
         "cameras": list(case.cameras),
         "frames": list(case.capture.frames),
         "mono_emulated": case.capture.mono_emulated,
@@ -149,8 +156,6 @@ def rows_of(case: Case, found: Calibration, seconds: float, command: str = "") -
         make_row(
             *("priors", case.name, shown(label)),
             error=abs(held.within - NORMAL_SHARE),
-            seconds=seconds,
-            command=command,
             share=held.share,
             within=held.within,
             within_two=held.within_two,
@@ -161,8 +166,5 @@ def rows_of(case: Case, found: Calibration, seconds: float, command: str = "") -
         )
         for label, held in found.labels.items()
     ]
-    far = {"sky_found": found.sky_found, "false_far": found.false_far}
-    return [
-        *rows,
-        make_row("priors", case.name, FAR, error=found.false_far, seconds=seconds, command=command, **far, **about),
-    ]
+    far: dict[str, Any] = {"sky_found": found.sky_found, "false_far": found.false_far}
+    return [*rows, make_row("priors", case.name, FAR, error=found.false_far, **far, **about)]
