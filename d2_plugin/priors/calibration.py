@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,23 @@ from d2_plugin.protocol import Label
 
 DECLARED = (Label.VERIFIED, Label.AGREED, Label.MONO)
 """Labels whose sigma is held against the truth; far pixels claim only a lower bound of depth."""
+
+NORMAL_SHARE = 0.6827
+"""Share of normal errors that lie within one standard deviation."""
+BINS_PER_DECADE = 4
+"""Bins of the curve: the declared sigma within one differs by a factor of 1.8 at most."""
+LEAST_SHARE, LEAST_PIXELS = 0.01, 30
+"""A bin counts where it holds this share of the label's pixels, and this many: fewer say nothing about a quantile."""
+
+
+class CurvePoint(NamedTuple):
+    """One bin of the reliability curve; on the diagonal, error = sigma, it is calibrated."""
+
+    sigma: float
+    """Median declared sigma of the bin."""
+    error: float
+    """What `NORMAL_SHARE` of |log(D / true)| in the bin lies within."""
+    pixels: int
 
 
 @dataclass(frozen=True)
@@ -35,6 +53,8 @@ class LabelCalibration:
     """Median declared sigma."""
     error: float
     """Median of |log(D / true)|."""
+    curve: tuple[CurvePoint, ...] = ()
+    """True against declared error by bins of the declared one, ascending; see `reliability_curve`."""
 
 
 @dataclass(frozen=True)
@@ -51,17 +71,21 @@ class Calibration:
     """Share of the pixels with a true depth that are labelled far."""
 
     def __str__(self) -> str:
-        lines = [
-            f"held against the true depth of {self.views} views:",
-            f"{'label':10}{'share':>9}{'within sigma':>15}{'2 sigma':>10}{'sigma':>9}{'error':>9}",
-        ]
+        header = f"{'label':10}{'share':>9}{'within sigma':>15}{'2 sigma':>10}{'sigma':>9}{'error':>9}"
+        lines = [f"held against the true depth of {self.views} views:"]
+        lines.append(header if self.labels else "no pixel with a true depth has a finite sigma")
         for label, found in self.labels.items():
             shares = f"{found.share:9.1%}{found.within:15.1%}{found.within_two:10.1%}"
-            lines.append(f"{_shown(label):10}{shares}{found.sigma:9.4f}{found.error:9.4f}")
+            lines.append(f"{shown(label):10}{shares}{found.sigma:9.4f}{found.error:9.4f}")
         if self.sky_found > 0 or self.false_far > 0:
             sky = f"{self.sky_found:.1%}" if np.isfinite(self.sky_found) else "none"
             lines.append(f"far: {sky} of the pixels without a true depth, {self.false_far:.1%} of the others")
         return "\n".join(lines)
+
+
+def frames_with_truth(capture: Capture, cameras: Sequence[str]) -> list[int]:
+    """The frames of the capture at which one of these cameras at least has a true depth map."""
+    return [f for f in capture.frames if any(capture.depth(camera, f) is not None for camera in cameras)]
 
 
 def held_against_truth(store: PriorStore, capture: Capture, frames: Sequence[int] | None = None) -> Calibration | None:
@@ -101,15 +125,37 @@ def held_against_truth(store: PriorStore, capture: Capture, frames: Sequence[int
     )
 
 
+def reliability_curve(error: np.ndarray, sigma: np.ndarray) -> tuple[CurvePoint, ...]:
+    """True against declared error in logarithmic bins of the declared one; the bins' edges are 10^(k / 4).
+
+    Args:
+        error: |log(D / true)| [K].
+        sigma: declared relative standard deviation [K]. A sigma of 0 has no place on a logarithmic axis.
+
+    Returns:
+        The bins that hold pixels enough, by ascending sigma.
+    """
+    error, sigma = error[sigma > 0], sigma[sigma > 0]
+    bins = np.floor(BINS_PER_DECADE * np.log10(sigma)).astype(int)
+    least = max(LEAST_PIXELS, LEAST_SHARE * sigma.size)
+    inside = [bins == place for place, pixels in zip(*np.unique(bins, return_counts=True)) if pixels >= least]
+    return tuple(
+        CurvePoint(float(np.median(sigma[mask])), float(np.quantile(error[mask], NORMAL_SHARE)), int(mask.sum()))
+        for mask in inside
+    )
+
+
 def _held(found: np.ndarray, pixels: int) -> LabelCalibration:
     """Of errors and sigmas [2, K] of one label."""
     error, sigma = found
     if not error.size:
-        return LabelCalibration(0, 0.0, *[float("nan")] * 4)
+        unknown = float("nan")
+        return LabelCalibration(0, 0.0, unknown, unknown, unknown, unknown)
     within, within_two = (float((error <= times * sigma).mean()) for times in (1, 2))
-    medians = float(np.median(sigma)), float(np.median(error))
-    return LabelCalibration(error.size, error.size / pixels, within, within_two, *medians)
+    medians, curve = (float(np.median(sigma)), float(np.median(error))), reliability_curve(error, sigma)
+    return LabelCalibration(error.size, error.size / pixels, within, within_two, *medians, curve)
 
 
-def _shown(label: Label) -> str:
+def shown(label: Label) -> str:
+    """The label as a person reads it."""
     return "mono only" if label == Label.MONO else label.name.lower()

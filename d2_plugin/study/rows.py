@@ -23,6 +23,7 @@ Row = dict[str, Any]
 KINDS = {
     "alignment": "relative objective gap F / F* - 1 of the fit",
     "stereo": "1 - F at 1 % of geometric depth",
+    "priors": "distance of the share of errors within sigma from 68.3 %; of far pixels, the false share",
     "raster": "99.9th percentile of the colour's deviation from float64, 0..1",
     "training": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
     "ablation": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",

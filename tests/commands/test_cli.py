@@ -125,8 +125,11 @@ def test_priors_are_built_in_parts_and_shown_on_a_sheet(
     build = ["priors", str(capture), "--train-cameras", CAMERAS, "--output", str(tmp_path)]
     assert main([*build, "--shard", "2/2"]) == 0
     assert not (tmp_path / "contact_sheet.png").exists()
+    assert "held against" not in capsys.readouterr().out, "a part is not the whole"
     assert main(build) == 0
-    assert "verified" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "verified" in told
+    assert "held against the true depth of" in told
     assert (tmp_path / "contact_sheet.png").is_file()
     whole, joined = PriorStore.open(finished / "priors"), PriorStore.open(tmp_path)
     for camera in CAMERAS.split(","):

@@ -23,6 +23,7 @@ from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import OVERRIDABLE, TABLES, hook_config, prior_settings
 from d2_plugin.settings import declared
+from d2_plugin.study.bench import BENCHMARKS
 
 CAMERAS = ["--train-cameras", "train0,train1,train2"]
 
@@ -86,9 +87,10 @@ class TestHelp:
 
     def test_bench_names_its_parts(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["bench", "--help"]) == 0
-        assert "align, raster, scaling or stereo" in capsys.readouterr().out
+        told = capsys.readouterr().out
+        assert all(f"{name:9} {benchmark.help}" in told for name, benchmark in BENCHMARKS.items())
         assert main(["bench"]) == 2
-        assert "have align, raster, scaling, stereo" in capsys.readouterr().err
+        assert "have align, priors, raster, scaling, stereo" in capsys.readouterr().err
         assert main(["bench", "sterio"]) == 2
         assert "did you mean 'stereo'?" in capsys.readouterr().err
 

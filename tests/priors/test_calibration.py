@@ -89,6 +89,7 @@ def test_far_pixels_count_against_the_sky_and_infinite_sigma_promises_nothing(tm
     assert found.sky_found == pytest.approx(0.8)
     assert found.false_far == pytest.approx(0.1)
     assert found.labels == {}
+    assert "no pixel with a true depth has a finite sigma" in str(found)
     assert "far: 80.0% of the pixels without a true depth, 10.0% of the others" in str(found)
 
 

@@ -17,11 +17,12 @@ from .ablation import ablation
 from .limits import plan, scaling, stability
 from .page import Picture, html, markdown
 from .precision import alignment, raster, stereo
+from .priors import priors
 from .sections import Section
 from .training import training
 
 BUILDERS: dict[str, Callable[[Sequence[Row]], Section]] = {
-    build.__name__: build for build in (training, ablation, alignment, stereo, raster, stability, plan, scaling)
+    build.__name__: build for build in (training, ablation, alignment, stereo, priors, raster, stability, plan, scaling)
 }
 """The function that makes a section from the rows of a kind, in the order of the page."""
 

@@ -1,0 +1,184 @@
+"""`d2 bench priors`: the curve of known errors is where it belongs, rows say what was found, the report draws them."""
+
+from __future__ import annotations
+
+import shutil
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from d2_plugin.captures.export.folder import save_capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.commands.bench import form
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.calibration import NORMAL_SHARE, Calibration, frames_with_truth, reliability_curve
+from d2_plugin.study.bench.priors import Case, PriorsBench, cases, rows_of, run
+from d2_plugin.study.report.priors import COUNTED, DIAGONAL, priors
+from d2_plugin.study.report.report import make_report
+from d2_plugin.study.rows import Row, make_row, read_rows
+
+pytest.importorskip("cv2")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two cameras, three frames, true depth at the first and the last."""
+    room = synthetic_capture(2, held_out=0, frames=3, width=96, height=54)
+    path = save_capture(room, tmp_path_factory.mktemp("recordings") / "den")
+    for depth in path.glob("depth/*/00001.*"):
+        depth.unlink()
+    return path
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, list[Row]]:
+    output = tmp_path_factory.mktemp("bench") / "runs.jsonl"
+    told = run(PriorsBench(rigs=("synthetic4",), width=96, frames=(0,), output=output))
+    return told, read_rows([output])
+
+
+# ---------------------------------------------------------------- the curve
+
+
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_the_curve_of_known_errors_lies_as_many_times_above_the_diagonal_as_they_are_too_large(times: float) -> None:
+    rng = np.random.default_rng(0)
+    sigma = 10 ** rng.uniform(-3, -1, 200_000)
+    curve = reliability_curve(np.abs(times * sigma * rng.standard_normal(sigma.size)), sigma)
+    assert len(curve) == 8, "two decades at four bins"
+    for point in curve:
+        assert point.error == pytest.approx(times * point.sigma, rel=0.05)
+    assert [point.sigma for point in curve] == sorted(point.sigma for point in curve)
+    assert sum(point.pixels for point in curve) == sigma.size
+
+
+def test_bins_of_a_few_pixels_and_a_sigma_of_zero_have_no_mark() -> None:
+    few, rare = np.full(29, 0.02), np.concatenate([np.full(10_000, 0.02), np.full(50, 0.5)])
+    assert reliability_curve(few, few) == ()
+    assert [point.pixels for point in reliability_curve(rare, rare)] == [10_000]
+    assert reliability_curve(np.zeros(100), np.zeros(100)) == ()
+    assert reliability_curve(np.zeros(0), np.zeros(0)) == ()
+
+
+# ---------------------------------------------------------------- the benchmark
+
+
+def test_a_rendered_rig_is_measured_without_any_data(measured: tuple[str, list[Row]]) -> None:
+    told, rows = measured
+    assert "synthetic4, 4 views" in told
+    assert "held against the true depth of 4 views" in told
+    assert {row["kind"] for row in rows} == {"priors"}
+    assert [row["method"] for row in rows] == ["verified", "agreed", "mono only", "far"]
+    for row in rows[:-1]:
+        assert row["error"] == pytest.approx(abs(row["within"] - NORMAL_SHARE))
+        assert 0 < row["share"] < 1
+        assert row["seconds"] > 0
+        assert row["mono_emulated"]
+        assert all(len(point) == 3 for point in row["curve"])
+    assert rows[0]["command"] == ("d2 bench priors --rigs synthetic4 --frames 0 --width 96 --output runs.jsonl"), (
+        "no folder of this machine"
+    )
+
+
+def test_the_default_is_the_rig_of_four_and_captures_replace_it(recording: Path) -> None:
+    (default,) = cases(PriorsBench(width=32))
+    assert default.name == "synthetic4, 4 views"
+    assert len(default.capture.frames) == 2, "the first and the last"
+    (named,) = cases(PriorsBench((str(recording),)))
+    assert named.capture.name == "den"
+    assert named.capture.frames == (0, 2), "those with a true depth"
+    both = cases(PriorsBench((str(recording),), ("synthetic3",), width=32))
+    assert [case.name for case in both] == ["den, 2 views", "synthetic3, 3 views"]
+
+
+def test_named_cameras_are_those_of_the_captures_that_have_them_all(recording: Path) -> None:
+    settings = PriorsBench((str(recording),), ("synthetic3",), ("train0", "train2"), width=32)
+    assert [case.cameras for case in cases(settings)] == [("train0", "train1"), ("train0", "train2")]
+
+
+def test_what_cannot_be_compared_is_refused_in_a_sentence(recording: Path, tmp_path: Path) -> None:
+    blind = shutil.copytree(recording, tmp_path / "blind")
+    shutil.rmtree(blind / "depth")
+    with pytest.raises(D2Error, match=r"^blind has no true depth, .*: name captures that have one$"):
+        cases(PriorsBench((str(blind),)))
+    with pytest.raises(D2Error, match="den has no true depth at frame 1: choose from frames 0, 2 by --frames"):
+        cases(PriorsBench((str(recording),), frames=(1,)))
+    with pytest.raises(D2Error, match="unknown camera 'train9'"):
+        cases(PriorsBench((str(recording),), train_cameras=("train9",)))
+    with pytest.raises(D2Error, match="unknown rig 'synthetc2'.*did you mean 'synthetic2'"):
+        cases(PriorsBench(rigs=("synthetc2",)))
+
+
+def test_frames_with_truth_are_those_of_any_of_the_cameras(recording: Path) -> None:
+    capture = cases(PriorsBench((str(recording),)))[0].capture
+    assert frames_with_truth(capture, ["train0"]) == [0, 2]
+    assert frames_with_truth(capture, []) == []
+
+
+def test_its_flags_are_lists_joined_by_commas() -> None:
+    words = ["room", "den", "--rigs", "synthetic3", "--train-cameras", "a,b", "--frames", "0,8", "--output", "o"]
+    values = form(["priors"]).parse(words).values
+    assert values["captures"] == ("room", "den")
+    assert values["train_cameras"] == ("a", "b")
+    assert values["frames"] == (0, 8)
+
+
+# ---------------------------------------------------------------- the report
+
+
+def label_row(case: str, label: str, share: float, within: float, curve: list) -> Row:
+    more = {"within_two": 0.95, "median_sigma": 0.02, "median_error": 0.01}
+    return make_row("priors", case, label, error=0.0, seconds=1.0, share=share, within=within, curve=curve, **more)
+
+
+def marks(svg: str) -> list[ET.Element]:
+    return [e for e in ET.fromstring(svg).iter() if len(e) and e[0].tag.endswith("title") and "pixels" in e[0].text]
+
+
+def test_the_diagram_has_a_mark_per_bin_and_the_diagonal(measured: tuple[str, list[Row]], tmp_path: Path) -> None:
+    _, rows = measured
+    make_report(rows, tmp_path)
+    svg, text = (tmp_path / "priors.svg").read_text(), (tmp_path / "report.md").read_text()
+    assert len(marks(svg)) == sum(len(row["curve"]) for row in rows[:-1]) > 0
+    assert DIAGONAL in svg
+    assert "true error, 68 % quantile" in svg
+    assert "| synthetic4, 4 views | mono only |" in text
+    assert "emulated, not predicted" in text
+
+
+def test_rare_labels_and_small_bins_are_faded_and_the_last_measurement_counts() -> None:
+    curve = [[0.01, 0.02, 900], [0.02, 0.03, 30]]
+    old = label_row("room", "mono only", 0.5, 0.2, curve) | {"commit": "before"}
+    rows = [
+        old,
+        label_row("room", "verified", 0.5, 0.2, curve),
+        label_row("room", "verified", 0.5, 0.7, curve),
+        label_row("room", "agreed", COUNTED / 2, 0.9, curve),
+    ]
+    section = priors(rows)
+    faded = [mark for mark in marks(section.figures["priors"]) if "faded" in mark.get("class", "")]
+    assert len(marks(section.figures["priors"])) == 4
+    assert len(faded) == 3
+    table = section.tables[0][1]
+    assert [row[1] for row in table.rows] == ["verified", "agreed"]
+    assert table.best == {(0, 3), (0, 4), (1, 4)}
+
+
+def test_the_headline_counts_the_labels_that_meet_the_goal_and_names_the_others() -> None:
+    shares = {"verified": 0.7, "agreed": 0.85, "mono only": 0.59}
+    rows = [label_row("room", label, 0.3, within, []) for label, within in shares.items()]
+    (headline,) = priors(rows).headlines
+    assert "for 1 of 3 labels; not for room: agreed (85 % and 95 %), room: mono only (59 % and 95 %)" in headline
+    assert "not for" not in priors(rows[:1]).headlines[0]
+
+
+def test_a_capture_without_any_label_has_a_row_and_no_curve() -> None:
+    capture = synthetic_capture(1, held_out=0, frames=1, width=32, height=18)
+    rows = rows_of(Case("sky, 1 views", capture, ("train0",)), Calibration(1, {}, 0.9, 0.01), 1.0)
+    assert [(row["method"], row["error"]) for row in rows] == [("far", 0.01)]
+    section = priors(rows)
+    assert "nothing was measured" in section.figures["priors"]
+    assert [title for title, _ in section.tables] == ["Far pixels"], "every capture has a row, also without labels"
+    assert section.tables[0][1].rows == (("sky, 1 views", "90.0%", "1.0%"),)
