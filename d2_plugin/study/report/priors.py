@@ -39,7 +39,7 @@ def priors(rows: Sequence[Row]) -> Section:
         "pixels of one label whose sigma is alike; 68 % of their true errors |log(D / true)| are smaller than its "
         f"height. It is faded where it holds less than {_whole(FAINT)} of that label's pixels. On the dashed diagonal "
         "the prior is as wrong as it says; above, it is overconfident, and below, too cautious. Goal, for every label "
-        f"that {_whole(COUNTED)} of the pixels carry: {_GOAL_TEXT}; what meets it stands out in the table. A pixel "
+        f"that {_whole(COUNTED)} of the pixels carry: {_goal()}; what meets it stands out in the table. A pixel "
         "without a true depth is sky, or nobody measured it."
         + (" Monocular depth of some captures is emulated, not predicted." if emulated else ""),
         {"priors": figure(plots, "Reliability: true error against declared sigma", columns=3, size=(340, 330))},
@@ -112,18 +112,20 @@ def _headline(rows: Sequence[Row]) -> str:
     """How many labels meet the goal, and which do not."""
     counted = [row for row in rows if row.get("within") is not None and row["share"] >= COUNTED]
     missed = [row for row in counted if not (_in_goal(row) and row["within_two"] >= GOAL_TWO)]
-    shown_missed = ", ".join(
-        f"{row['case']}: {row['method']} ({_whole(row['within'])} and {_whole(row['within_two'])})" for row in missed
-    )
-    told = f"{_GOAL_TEXT} for {len(counted) - len(missed)} of {len(counted)} labels"
-    return told + (f"; not for {shown_missed}" if missed else "") if counted else ""
+    if not counted:
+        return ""
+    others = [f"{case} ({', '.join(row['method'] for row in mine)})" for case, mine in cases_of(missed).items()]
+    met = f"{_goal()} for {len(counted) - len(missed)} of {len(counted)} labels"
+    return f"{met}; not for {'; '.join(others)}" if others else met
 
 
 def _whole(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-_GOAL_TEXT = f"{100 * GOAL[0]:.0f} to {_whole(GOAL[1])} of the errors within sigma and at least {_whole(GOAL_TWO)} within 2 sigma"
+def _goal() -> str:
+    low, high = GOAL
+    return f"{100 * low:.0f} to {_whole(high)} of the errors within sigma, at least {_whole(GOAL_TWO)} within 2 sigma"
 
 
 def _percent(row: Mapping[str, float | None], name: str) -> str:
