@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from d2_plugin.commands.arguments.form import Form, Given
 from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Range
 
-if TYPE_CHECKING:
-    from d2_plugin.runs.scene import Scene
-
 HELD_FRAMES = 8
-"""At most this many frames are held against the true depth."""
+"""At most this many frames are held against the true depth: the errors of all their pixels are in memory at once."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +36,7 @@ def form(words: list[str]) -> Form:
 
 def run(given: Given) -> str:
     """Build what is missing; returns a summary of the frames."""
-    from d2_plugin.priors.calibration import held_against_truth
+    from d2_plugin.priors.calibration import frames_with_truth, held_against_truth
     from d2_plugin.priors.sheet import contact_sheet
     from d2_plugin.priors.store import PriorStore
     from d2_plugin.runs.prior import build_priors_for
@@ -58,19 +55,12 @@ def run(given: Given) -> str:
     if shard is not None:
         return f"part {options.shard} of the prior is in {options.output}"
     store, sheet = PriorStore.open(options.output), options.output / "contact_sheet.png"
-    calibration = held_against_truth(store, scene.capture, _held_frames(scene))
+    frames = frames_with_truth(scene.capture, scene.train_cameras, HELD_FRAMES)
+    calibration = held_against_truth(store, scene.capture, frames)
     if calibration is not None:
         say(str(calibration))
     contact_sheet(store, scene.capture, sheet)
     return f"look at {sheet}"
-
-
-def _held_frames(scene: Scene) -> list[int]:
-    """Frames with a true depth, spread over the recording: few, as the errors of all their pixels are held at once."""
-    from d2_plugin.priors.calibration import frames_with_truth
-
-    frames = frames_with_truth(scene.capture, scene.train_cameras)
-    return [frames[i * len(frames) // HELD_FRAMES] for i in range(HELD_FRAMES)] if len(frames) > HELD_FRAMES else frames
 
 
 def part_of(text: str | None) -> tuple[int, int] | None:

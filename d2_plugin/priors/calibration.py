@@ -83,9 +83,12 @@ class Calibration:
         return "\n".join(lines)
 
 
-def frames_with_truth(capture: Capture, cameras: Sequence[str]) -> list[int]:
-    """The frames of the capture at which one of these cameras at least has a true depth map."""
-    return [f for f in capture.frames if any(capture.depth(camera, f) is not None for camera in cameras)]
+def frames_with_truth(capture: Capture, cameras: Sequence[str], most: int | None = None) -> list[int]:
+    """The frames at which one of these cameras at least has a true depth map; `most` of them, spread, where given."""
+    frames = [f for f in capture.frames if any(capture.depth(camera, f) is not None for camera in cameras)]
+    if most is None or len(frames) <= most:
+        return frames
+    return [frames[place] for place in np.linspace(0, len(frames) - 1, most).round().astype(int)]
 
 
 def held_against_truth(store: PriorStore, capture: Capture, frames: Sequence[int] | None = None) -> Calibration | None:

@@ -115,6 +115,9 @@ def test_frames_with_truth_are_those_of_any_of_the_cameras(recording: Path) -> N
     capture = cases(PriorsBench((str(recording),)))[0].capture
     assert frames_with_truth(capture, ["train0"]) == [0, 2]
     assert frames_with_truth(capture, []) == []
+    long = synthetic_capture(1, held_out=0, frames=9, width=16, height=9)
+    assert frames_with_truth(long, ["train0"], most=3) == [0, 4, 8], "spread over the recording"
+    assert frames_with_truth(long, ["train0"], most=9) == list(range(9))
 
 
 def test_its_flags_are_lists_joined_by_commas() -> None:
