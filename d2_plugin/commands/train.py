@@ -39,6 +39,8 @@ def run(given: Given) -> str:
     run.train()
     say_notes([f"{name} retired at step {step}: it changed next to nothing" for name, step in run.retired.items()])
     metrics = run.evaluate()
+    if metrics["background"]:
+        say("background: the prior found sky, so directions have a colour of their own at infinity")
     if options.export_ply:
         say(f"{len(run.export_ply())} PLY files in {options.output / 'ply'}")
     table = metrics_table({options.output.name: metrics})

@@ -137,6 +137,7 @@ class Run:
             "backbone": self.settings.backbone,
             "hooks": list(self.settings.hooks),
             "retired": self.retired,
+            "background": getattr(trainer.model, "background", None) is not None,
             "plan": scene.plan.as_dict(),
             "capture": scene.capture.name,
             "mono_emulated": scene.capture.mono_emulated,
