@@ -116,7 +116,7 @@ def test_a_decision_has_a_verdict_from_three_seeds_on(costs: tuple[float, ...], 
 
 
 def test_the_recorded_command_is_the_one_that_makes_the_rows() -> None:
-    settings = PlanVerification("/data/room", ("a", "b"), (0, 2, 4), mono_kind="metric", output=Path("/tmp/rows.jsonl"))
+    settings = PlanVerification("/data/room", ("a", "b"), (0, 2, 4), mono_kind="metric", output=Path("/mnt/rows.jsonl"))
     words = "d2 plan --verify room --train-cameras a,b --frames 0:4:2 --mono-kind metric --output rows.jsonl"
     assert plan_verify._command(settings) == words
 
