@@ -49,7 +49,8 @@ class SplatSettings(Settings):
     """Opacity of the Gaussians at the start."""
     background: bool = False
     """Whether directions have a colour of their own at infinity, for skies. `d2 train` switches it on where the depth
-    prior found far pixels. Plaza, 5 frames, 2000 steps, one seed: 22.07 dB with, 21.04 dB without."""
+    prior found far pixels. Plaza, 2000 steps, three seeds, the backbone alone: 14.87 dB
+    with, 13.19 without."""
     raster: RasterSettings = field(default_factory=RasterSettings)
     """Constants of the rasterizer."""
     densify: DensifySettings = field(default_factory=DensifySettings)

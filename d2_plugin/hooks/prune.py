@@ -38,7 +38,9 @@ class PruneConfig(HookConfig):
     patience: AtLeastOne = 3
     """Evaluations in a row, each with evidence, before a Gaussian is removed."""
     free_space: bool = True
-    """Whether standing in space that the prior says is free counts as inconsistency too; the paper has no such term."""
+    """Whether standing in space that the prior says is free counts as inconsistency too; the paper has no such term.
+    One seed, 2000 steps, larger budget: plaza 22.24 dB without, 22.49 with and 11 % fewer Gaussians; studio 31.74 dB
+    without, 31.65 with."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -4,7 +4,7 @@ A mono-only pixel is a point in space, and other cameras look there too.
 
 - Where the pixel's ray meets a surface that another camera measured by stereo, near the monocular depth, the two
   sources confirm each other and the surface is taken: the pixel is verified. Measured on studio, plaza and a rendered
-  room: the median error of these pixels falls from .009 to .001, and one pixel in six to ten gains by it.
+  room: the median error of these pixels falls from .009 to .001, and 13, 2 and 10 % of the mono-only pixels gain by it.
 - Where two cameras' monocular depths meet, each confirms the other as far as their errors are independent, which is
   not far: both were bent by anchors of one scene, and one network errs alike in both. So agreement takes 30 % off sigma
   and no more; where sigma is infinite, as in a sky, it stays so.
@@ -36,7 +36,7 @@ NEAR = 0.1
 BESIDE = 0.03
 """Share of the step to the surface that may remain as error."""
 STEPS = 3
-"""Secant steps along the ray; the third changes a depth by less than .0005."""
+"""Secant steps along the ray."""
 MET = 3e-3
 """The ray has met the surface when their depths differ by less than this share."""
 MISSED = 0.5

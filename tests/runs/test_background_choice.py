@@ -128,6 +128,7 @@ class TestAFinishedRun:
             trained._sees_far()
         model = trained._trained().model
         assert model.background is not None
+        assert trained.evaluate(pictures=False)["background"] is True
         assert model.background.constant.detach().any()
 
     def test_the_exported_files_hold_the_gaussians_alone(self, trained: Run) -> None:
