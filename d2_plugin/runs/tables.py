@@ -107,11 +107,21 @@ def write_tables(metrics: Metrics, folder: Path) -> None:
 
 
 def read_metrics(folder: Path) -> dict[str, Any]:
-    """The metrics.json of a run folder."""
+    """The metrics.json of a run folder.
+
+    Raises:
+        D2Error: there is none, or it is damaged.
+    """
+    path = folder / "metrics.json"
     try:
-        return json.loads((folder / "metrics.json").read_text())
+        table = json.loads(path.read_text())
     except FileNotFoundError:
         raise D2Error(f"{folder} has no metrics.json: finish `d2 train` there, or run `d2 eval`") from None
+    except ValueError as error:
+        raise D2Error(f"{path} is damaged ({error}): run `d2 eval` on that folder") from None
+    if not isinstance(table, dict):
+        raise D2Error(f"{path} is damaged (no table of scores): run `d2 eval` on that folder")
+    return table
 
 
 def _columns(scored: Sequence[Mapping[str, Any]]) -> list[Column]:

@@ -92,3 +92,10 @@ def test_evaluation_leaves_both_tables_in_the_run_folder(metrics: dict[str, Any]
     assert f"yang4d prune & {metrics['test']['psnr']:.4f}" in latex
     with pytest.raises(D2Error, match="has no metrics.json: finish `d2 train`"):
         read_metrics(tmp_path)
+
+
+@pytest.mark.parametrize("content", [b"", b'{"test": {"psnr": 2', b"[1, 2]", b"\xff\xfe"])
+def test_a_damaged_file_of_scores_is_one_sentence(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "metrics.json").write_bytes(content)
+    with pytest.raises(D2Error, match="metrics.json is damaged .*: run `d2 eval` on that folder"):
+        read_metrics(tmp_path)
