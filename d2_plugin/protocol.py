@@ -159,6 +159,9 @@ class RasterSettings(Settings):
     """A pixel is finished before the Gaussian that would bring its transmittance to this value or below."""
     fov_clamp: Annotated[float, Range(0, open_low=True, infinite=True)] = 1.3
     """x/z and y/z are clamped to this multiple of tan(fov/2) in the projection's Jacobian."""
+    antialiased: bool = False
+    """Whether what the blur spreads is taken off the opacity (the 2D filter of Mip-Splatting, Yu et al. 2024): a
+    Gaussian smaller than a pixel then looks alike from every distance."""
 
 
 class Render(NamedTuple):

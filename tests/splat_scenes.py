@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
+from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize, reference
 
 
 class Scene(NamedTuple):
@@ -111,10 +111,14 @@ def brute_force(scene: Scene, settings: RasterSettings = RasterSettings()) -> Fr
         x, y, z = points[i]
         if z <= settings.near:
             continue
-        inverse = np.linalg.inv(_screen_covariance(packed[i], pose[:3, :3], x, y, z, K, view, settings))
+        screen = _screen_covariance(packed[i], pose[:3, :3], x, y, z, K, view, settings)
+        inverse, share = np.linalg.inv(screen), 1.0
+        if settings.antialiased:
+            own = np.linalg.det(screen - settings.blur * np.eye(2)) / np.linalg.det(screen)
+            share = math.sqrt(max(own, reference.LEAST_AREA))
         dx, dy = columns - (K[0, 0] * x / z + K[0, 2]), rows - (K[1, 1] * y / z + K[1, 2])
         power = inverse[0, 0] * dx**2 + 2 * inverse[0, 1] * dx * dy + inverse[1, 1] * dy**2
-        unclamped[i] = np.where(finished, 0, opacities[i] * np.exp(-power / 2))
+        unclamped[i] = np.where(finished, 0, share * opacities[i] * np.exp(-power / 2))
         alpha = np.where(unclamped[i] < settings.alpha_min, 0, np.minimum(unclamped[i], settings.alpha_max))
         after[i] = np.where(alpha > 0, transmittance * (1 - alpha), 1)
         finished |= after[i] <= settings.transmittance_min

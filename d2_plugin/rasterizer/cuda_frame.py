@@ -23,7 +23,7 @@ class Frame(PointingFrame):
     """d2::Frame of kernels/gpu.cu: everything that one call works on; absent pointers stay null."""
 
     _fields_ = (
-        ("constants", _float * 6),
+        ("constants", _float * 7),
         *((name, _int) for name in ("width", "height", "channels", "tiles_x")),
         ("eps", _float),
         *((name, _long) for name in ("count", "pairs")),

@@ -37,7 +37,7 @@ class Frame(PointingFrame):
         ("rotation", _float * 9),
         ("translation", _float * 3),
         *((name, _float) for name in ("focal_x", "focal_y", "center_x", "center_y", "image_width", "image_height")),
-        ("constants", _float * 6),
+        ("constants", _float * 7),
         *((name, _int) for name in ("width", "height", "channels", "threads", "chunks")),
         ("eps", _float),
         ("count", _long),

@@ -76,7 +76,7 @@ def _map(part: Tensor | None, like: Tensor) -> Tensor | None:
 
 def _constants(settings: RasterSettings) -> list[float]:
     """In the order of d2::Constants (kernels/splat.h), which is that of the dataclass."""
-    return list(dataclasses.astuple(settings))
+    return [float(value) for value in dataclasses.astuple(settings)]
 
 
 _rasterize = torch.library.custom_op(

@@ -34,6 +34,11 @@ LEAST_EDGE = 1e-30
 """A near edge that is not beyond this counts as unknown; its inverse would not be finite in float32."""
 
 
+LEAST_AREA = 2.5e-5
+"""Least share of its own area in its blurred area that a Gaussian is taken to have, as Mip-Splatting's code does: an
+edge-on Gaussian has none, and the logarithm no derivative there."""
+
+
 class Projection(NamedTuple):
     """Gaussians on the screen. S^-1 = L L^T is evaluated as a sum of squares, (x - slope y)^2 / variance_x_given_y +
     y^2 / variance_y, which cannot turn negative by rounding however long and thin a Gaussian is."""
@@ -194,14 +199,25 @@ def project(splats: Splats, view: View, settings: RasterSettings, screen_offsets
     covariance = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
     screen = jacobian @ covariance @ jacobian.mT
     floor = max(settings.blur, VARIANCE_FLOOR)
-    variance_x = screen[:, 0, 0].clamp(min=0) + floor
-    variance_y = screen[:, 1, 1].clamp(min=0) + floor
+    own_x, own_y = screen[:, 0, 0].clamp(min=0), screen[:, 1, 1].clamp(min=0)
+    variance_x, variance_y = own_x + floor, own_y + floor
     slope = screen[:, 0, 1] / variance_y
     given_y = (variance_x - slope * screen[:, 0, 1]).clamp(min=floor)
     centers = slopes * focal + principal
     if screen_offsets is not None:
         centers = centers + screen_offsets
-    return Projection(centers, variance_x, variance_y, slope, given_y, depths, splats.opacities)
+    opacities = splats.opacities
+    if settings.antialiased:
+        opacities = opacities * _compensation(own_x, own_y, screen[:, 0, 1], floor)
+    return Projection(centers, variance_x, variance_y, slope, given_y, depths, opacities)
+
+
+def _compensation(own_x: Tensor, own_y: Tensor, covariance: Tensor, floor: float) -> Tensor:
+    """sqrt(det S / det(S + floor I)) [K], the 2D filter of Mip-Splatting (Yu et al. 2024), of S without the blur: a
+    Gaussian smaller than a pixel, which the blur makes larger, gets fainter by as much."""
+    own = own_x * own_y - covariance.square()
+    blurred = own.clamp(min=0) + floor * (own_x + own_y + floor)
+    return (own / blurred).clamp(min=LEAST_AREA).sqrt()
 
 
 def refuse_skew(skew: float) -> None:

@@ -16,7 +16,7 @@ from splat_scenes import Scene, brute_force, make_view, near_edge_of, near_thres
 
 from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.protocol import Label
-from d2_plugin.rasterizer import DepthPrior, Render, Splats, native, ops, rasterize, survey
+from d2_plugin.rasterizer import DepthPrior, RasterSettings, Render, Splats, native, ops, rasterize, survey
 
 try:
     find_compiler()
@@ -233,7 +233,7 @@ def test_the_operators_pass_torchs_own_check():
     scene = random_scene(12, 40, 20, 18).to(torch.float32).requires_grad()
     view = scene.view
     background, offsets = torch.rand(3, requires_grad=True), torch.zeros(40, 2, requires_grad=True)
-    constants = [0.2, 0.3, 0.99, 1 / 255, 1e-4, 1.3]
+    constants = ops._constants(RasterSettings(antialiased=True))
     camera, edge = (view.T_camera_world, view.K), near_edge_of(view)
     inputs = (*scene[:4], background, offsets, *camera, edge, 20, 18, constants)
     torch.library.opcheck(ops._rasterize, inputs)

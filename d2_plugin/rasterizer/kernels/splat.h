@@ -37,6 +37,8 @@ D2_FN float reciprocal(float a) { return 1.f / a; }
 constexpr float LN_2 = 0.693147180559945f, HALF_EXPONENT = 0.849321800288019f;  // sqrt(log2(e) / 2)
 // Least variance on the screen where the blur is smaller, pixels squared (VARIANCE_FLOOR of reference.py).
 constexpr float VARIANCE_FLOOR = 1e-8f;
+// Least share of its own area in its blurred area that a Gaussian is taken to have (LEAST_AREA of reference.py).
+constexpr float LEAST_AREA = 2.5e-5f;
 
 // Plain data, laid out alike in native.py and cuda.py.
 struct Camera {
@@ -47,6 +49,7 @@ struct Camera {
 
 struct Constants {  // RasterSettings
   float near, blur, alpha_max, alpha_min, transmittance_min, fov_clamp;
+  float antialiased;  // 0 or 1
 };
 
 template <class S>
@@ -147,6 +150,23 @@ struct Projected {
   decltype(S() > S()) visible;  // in front, opaque enough, everything finite; not yet whether it touches the image
 };
 
+// What the blur does to the area of a footprint: determinants of the screen covariance without and with it. The
+// difference of products cancels for thin Gaussians, by far less than LEAST_AREA of the blurred one.
+template <class S>
+struct Area {
+  S own_x, own_y, covariance;  // the screen covariance without the blur
+  S own, blurred;              // determinants
+  S share;                     // own / blurred, at least LEAST_AREA
+};
+
+template <class S>
+D2_FN Area<S> area_of(S own_x, S own_y, S covariance, S floor) {
+  Area<S> a = {own_x, own_y, covariance, fnma(covariance, covariance, own_x * own_y), S(0.f), S(0.f)};
+  a.blurred = fma(floor, own_x + own_y + floor, max(a.own, S(0.f)));
+  a.share = max(a.own / a.blurred, S(LEAST_AREA));
+  return a;
+}
+
 // Elliptical weighted average projection (Zwicker et al. 2001). offset_x, offset_y: screen_offsets.
 template <class S>
 D2_FN Projected<S> project(const Gaussian<S>& g, S offset_x, S offset_y, const Camera& camera, const Constants& c) {
@@ -155,8 +175,8 @@ D2_FN Projected<S> project(const Gaussian<S>& g, S offset_x, S offset_y, const C
   transform(g.covariance, j.row_x, along_x);
   transform(g.covariance, j.row_y, along_y);
   const S floor = S(max(c.blur, VARIANCE_FLOOR));
-  const S variance_x = max(dot(j.row_x, along_x), S(0.f)) + floor;
-  const S variance_y = max(dot(j.row_y, along_y), S(0.f)) + floor;
+  const S own_x = max(dot(j.row_x, along_x), S(0.f)), own_y = max(dot(j.row_y, along_y), S(0.f));
+  const S variance_x = own_x + floor, variance_y = own_y + floor;
   const S covariance = dot(j.row_y, along_x), slope = covariance / variance_y;
   // The Schur complement is at least the blur; rounding alone can bring it below.
   const S variance_x_given_y = max(fnma(slope, covariance, variance_x), floor);
@@ -169,6 +189,12 @@ D2_FN Projected<S> project(const Gaussian<S>& g, S offset_x, S offset_y, const C
   f.uy = -slope * f.ux;
   f.vy = S(HALF_EXPONENT) / sqrt(variance_y);
   f.log2_opacity = log2(max(g.opacity, S(1e-30f)));
+  // The same for all Gaussians. Mip-Splatting (Yu et al. 2024): what the blur spreads it must not add.
+  auto opaque = g.opacity >= S(c.alpha_min);
+  if (c.antialiased != 0.f) {
+    f.log2_opacity = fma(S(0.5f), log2(area_of(own_x, own_y, covariance, floor).share), f.log2_opacity);
+    opaque = f.log2_opacity >= S(log2(c.alpha_min));
+  }
   f.depth = j.point[2];
 
   const S squared = S(2.f * LN_2) * max(f.log2_opacity - S(log2(c.alpha_min)), S(0.f));
@@ -178,7 +204,7 @@ D2_FN Projected<S> project(const Gaussian<S>& g, S offset_x, S offset_y, const C
   S finite = (f.x + f.y) * S(0.f) + (out.reach.x + out.reach.y) * S(0.f) + (f.uy + f.depth) * S(0.f);
   for (int k = 0; k < 3; k++) finite = finite + g.mean[k] * S(0.f);
   for (int k = 0; k < 6; k++) finite = finite + g.covariance[k] * S(0.f);
-  out.visible = (f.depth > S(c.near)) & (g.opacity >= S(c.alpha_min)) & (finite + g.opacity * S(0.f) >= S(0.f));
+  out.visible = (f.depth > S(c.near)) & opaque & (finite + g.opacity * S(0.f) >= S(0.f));
   return out;
 }
 
@@ -192,11 +218,25 @@ D2_FN void project_backward(const Gaussian<S>& g, const Footprint<S>& f, const M
   // dL/d(screen covariance) = 1/2 L (sum g (u, v) (u, v)^T) L^T with L L^T the inverse: no division by a determinant.
   const S half = S(0.5f * per_unit * per_unit);
   const S uu_y = fma(f.uy, m.guu, f.vy * m.guv);
-  const S g_xx = half * f.ux * f.ux * m.guu;
-  const S g_xy = S(2.f) * half * f.ux * uu_y;  // of the stored number, which stands for both places
-  const S g_yy = half * fma(f.uy, uu_y, f.vy * fma(f.uy, m.guv, f.vy * m.gvv));
+  S g_xx = half * f.ux * f.ux * m.guu;
+  S g_xy = S(2.f) * half * f.ux * uu_y;  // of the stored number, which stands for both places
+  S g_yy = half * fma(f.uy, uu_y, f.vy * fma(f.uy, m.guv, f.vy * m.gvv));
 
   const Jacobian<S> j = linearise(g.mean, camera, c);
+  S along_x[3], along_y[3];
+  transform(g.covariance, j.row_x, along_x);
+  transform(g.covariance, j.row_y, along_y);
+  if (c.antialiased != 0.f) {
+    // ln alpha has 1/2 ln(own area / blurred area) in it, constant where the share is at its least.
+    const S floor = S(max(c.blur, VARIANCE_FLOOR));
+    const S own_x = max(dot(j.row_x, along_x), S(0.f)), own_y = max(dot(j.row_y, along_y), S(0.f));
+    const Area<S> a = area_of(own_x, own_y, dot(j.row_y, along_x), floor);
+    const auto free = a.share > S(LEAST_AREA);
+    const S per_own = where(free, m.g / a.own), per_blurred = where(free, m.g / a.blurred);
+    g_xx = fma(S(0.5f), fnma(per_blurred, a.own_y + floor, per_own * a.own_y), g_xx);
+    g_yy = fma(S(0.5f), fnma(per_blurred, a.own_x + floor, per_own * a.own_x), g_yy);
+    g_xy = fnma(a.covariance, per_own - per_blurred, g_xy);
+  }
   for (int a = 0, entry = 0; a < 3; a++)
     for (int b = a; b < 3; b++, entry++) {
       const S cross = fma(j.row_x[a], j.row_y[b], j.row_x[b] * j.row_y[a]);
@@ -205,9 +245,6 @@ D2_FN void project_backward(const Gaussian<S>& g, const Footprint<S>& f, const M
     }
   out.opacity = m.g / g.opacity;
 
-  S along_x[3], along_y[3];
-  transform(g.covariance, j.row_x, along_x);
-  transform(g.covariance, j.row_y, along_y);
   S row_x[3], row_y[3];
   for (int k = 0; k < 3; k++) {
     row_x[k] = fma(S(2.f) * g_xx, along_x[k], g_xy * along_y[k]);
