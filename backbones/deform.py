@@ -114,8 +114,9 @@ class Deform(SplatModel):
         return rotation_matrices_3d(unit_quaternions(rows["rotations"]))
 
     def regularization(self) -> Tensor | float:
-        """What keeps the field smooth."""
-        return self.field.regularization() if self.field is not None and self.deforms else 0.0
+        """What keeps the field smooth, and what `SplatModel` adds."""
+        smooth = self.field.regularization() if self.field is not None and self.deforms else 0.0
+        return smooth + super().regularization()
 
     def optimize(self, step: int, iterations: int) -> None:
         """One step of both optimizers, gradients cleared; learning rates and noise for the next step set."""

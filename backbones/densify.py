@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torch import Tensor
 from d2_plugin.settings import Count, Every, NotNegative, Positive, Settings, Share, Steps
 
 from .gaussians import Gaussians
+from .relocate import relocate, wander
 
 
 class Growable(Protocol):
@@ -32,6 +33,9 @@ class DensifySettings(Settings):
 
     enabled: bool = True
     """Whether the backbone changes the number of its Gaussians at all."""
+    method: Literal["split", "relocate"] = "split"
+    """What an edit does: "split" clones and splits where the screen-space gradient is large and prunes (3DGS),
+    "relocate" moves the Gaussians that pruning would remove to opaque ones and grows by a share (3DGS-MCMC)."""
     start: Share = 0.05
     """Share of the run before the first edit."""
     stop: Share = 0.6
@@ -53,6 +57,11 @@ class DensifySettings(Settings):
     Official: every 3000 of 30000 steps. In runs of some thousand steps a reset costs 1 dB on studio."""
     budget: Count = 100_000
     """No growth beyond this number of Gaussians."""
+    growth: NotNegative = 0.05
+    """By what share an edit of method "relocate" increases their number."""
+    wander: NotNegative = 0.1
+    """Noise of method "relocate" on the positions of nearly transparent Gaussians, in their standard deviations a
+    step; it falls to none at the last step."""
 
 
 @torch.no_grad()
@@ -60,9 +69,15 @@ def densify(model: Growable, settings: DensifySettings, step: int, iterations: i
     """Clone, split, prune and reset as scheduled; all structure changes go through model.append and model.select."""
     if not settings.enabled or not settings.start * iterations <= step <= settings.stop * iterations:
         return
+    if settings.method == "relocate":
+        wander(model, settings.wander * (1 - step / max(iterations, 1)), generator)
     if step % settings.every == 0:
-        grow(model, settings, generator)
-        prune(model, settings)
+        if settings.method == "relocate":
+            room = min(int(settings.growth * len(model)), max(settings.budget - len(model), 0))
+            relocate(model, ~kept(model, settings), room, generator)
+        else:
+            grow(model, settings, generator)
+            prune(model, settings)
         for value in model.gaussians.statistics.values():
             value.zero_()
     if settings.reset_every and step % settings.reset_every == 0:
@@ -93,12 +108,17 @@ def grow(model: Growable, settings: DensifySettings, generator: torch.Generator)
 
 def prune(model: Growable, settings: DensifySettings) -> None:
     """Remove Gaussians that are nearly transparent or as large as the scene."""
+    keep = kept(model, settings)
+    if not keep.all():
+        model.select(torch.nonzero(keep).squeeze(-1))
+
+
+def kept(model: Growable, settings: DensifySettings) -> Tensor:
+    """Which Gaussians [N] are neither nearly transparent nor as large as the scene."""
     raw = model.gaussians
     opaque = torch.sigmoid(raw["opacity_logits"]) >= settings.opacity
     bounded = raw["log_scales"].exp().amax(-1) <= settings.scale_fraction * model.extent
-    keep = opaque & bounded
-    if not keep.all():
-        model.select(torch.nonzero(keep).squeeze(-1))
+    return opaque & bounded
 
 
 def _scatter_children(model: Growable, rows: dict[str, Tensor], children: slice, generator: torch.Generator) -> None:

@@ -59,6 +59,16 @@ class Gaussians:
         """Set one named tensor and forget its moments (an opacity reset, for instance)."""
         self._replace(name, lambda old: values.to(old), keep_moments=False)
 
+    @torch.no_grad()
+    def revise(self, name: str, index: Tensor, values: Tensor, keep: bool = False) -> None:
+        """Set some rows of one named tensor; their moments are zero from then on, unless they are to be kept."""
+        parameter = self.parameters[name]
+        parameter.index_copy_(0, index, values.to(parameter))
+        moments = {} if keep else self.optimizer.state.get(parameter, {})
+        for key in ("exp_avg", "exp_avg_sq"):
+            if key in moments:
+                moments[key].index_fill_(0, index, 0.0)
+
     def state_dict(self) -> dict[str, Any]:
         """Everything that an exact continuation needs."""
         return {

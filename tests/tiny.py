@@ -64,16 +64,18 @@ class TinyStore:
 
 
 def make_model(
-    count: int = 60, temporal: bool = True, seed: int = 0, backbone: str = "yang4d", background: bool = False
+    count: int = 60, temporal: bool = True, seed: int = 0, backbone: str = "yang4d", **chosen: object
 ) -> SplatModel:
-    """Gaussians scattered between the cameras and beyond the plane; `backbone` is one of `BACKBONES`."""
+    """Gaussians scattered between the cameras and beyond the plane; `backbone` is one of `BACKBONES`.
+
+    `chosen` are settings of every backbone, over those of the tests."""
     generator = torch.Generator().manual_seed(seed)
     positions = torch.rand(count, 3, generator=generator) * torch.tensor([3.0, 2.0, 3.0]) + torch.tensor(
         [-1.5, -1, 1.5]
     )
     growth = DensifySettings(start=0.1, stop=0.9, every=7, gradient=5e-3, budget=150)
     colors, times = torch.rand(count, 3, generator=generator), torch.rand(count, generator=generator) / 2
-    shared = {"temporal": temporal, "initial_opacity": 0.5, "densify": growth, "background": background}
+    shared = {"temporal": temporal, "initial_opacity": 0.5, "densify": growth} | chosen
     if backbone == "yang4d":
         settings = Yang4DSettings(**shared)
         return Yang4D.from_points(positions, colors, times, settings, extent=2.0, duration=0.5)
