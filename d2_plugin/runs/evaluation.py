@@ -16,6 +16,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.runs import metrics
 from d2_plugin.runs.drawing import Panel, color_scale, colorize, side_by_side
 from d2_plugin.runs.lpips import Lpips
+from d2_plugin.runs.plan import CHANGED, MOVING_SHARE
 
 RenderView = Callable[[str, int], tuple[Tensor, Tensor | None]]
 """(camera name, frame) -> (RGB [H, W, 3] in 0..1, planar depth [H, W] or None).
@@ -69,24 +70,27 @@ def evaluate(
     if output is not None:
         output.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
+    networks = {"lpips": lpips, "lpips_vgg": lpips_vgg}
+    still: np.ndarray | None = None  # what the camera sees where nothing moves
     before: tuple[str, Tensor, Tensor] | None = None  # camera, render and truth of the view before
     for done, (camera, frame) in enumerate(views, start=1):
+        if before is None or before[0] != camera:
+            still, before = still_picture(capture, camera, instants), None
         truth = torch.from_numpy(capture.image(camera, frame).astype(np.float32) / 255)
         color, depth = _checked(render(camera, frame), truth.shape, camera, frame)
         true_depth = capture.depth(camera, frame)
-        scores = _scores(color, depth, truth, true_depth) | {
-            "lpips": None if lpips is None else lpips(color, truth),
-            "lpips_vgg": None if lpips_vgg is None else lpips_vgg(color, truth),
-            "flicker": metrics.flicker(color, truth, *before[1:]) if before and before[0] == camera else None,
-        }
-        rows.append({"camera": camera, "frame": frame, **{name: scores[name] for name in metrics.VARIANTS}})
+        compared = metrics.Compared(
+            *(color, truth, depth, None if true_depth is None else torch.from_numpy(true_depth)),
+            *(_moving(truth, still), None if before is None else before[1:], networks),
+        )
+        scores = {name: metric.score(compared) for name, metric in metrics.METRICS.items()}
+        rows.append({"camera": camera, "frame": frame, **scores})
         before = (camera, color, truth)
         if output is not None:
             panels = _panels(rows[-1], truth.numpy(), color.numpy(), depth, true_depth)
             write_png(output / f"{camera}_{frame:05d}.png", side_by_side(panels))
         if progress is not None:
             progress(done, len(views))
-    networks = {"lpips": lpips, "lpips_vgg": lpips_vgg}
     return {
         "test": _means(rows),
         "per_view": rows,
@@ -96,21 +100,23 @@ def evaluate(
     }
 
 
-def _scores(
-    color: Tensor, depth: Tensor | None, truth: Tensor, true_depth: np.ndarray | None
-) -> dict[str, float | None]:
-    absrel, delta1 = None, None
-    if depth is not None and true_depth is not None:
-        z = torch.from_numpy(true_depth)
-        absrel, delta1 = metrics.depth_absrel(depth, z), metrics.depth_delta1(depth, z)
-    return {
-        "psnr": metrics.psnr(color, truth),
-        "ssim1": metrics.ssim_range1(color, truth),
-        "ssim2": metrics.ssim_range2(color, truth),
-        "ssim_3dgs": metrics.ssim_3dgs(color, truth),
-        "depth_absrel": absrel,
-        "depth_delta1": delta1,
-    }
+def still_picture(capture: Capture, camera: str, frames: Sequence[int], most: int = 9) -> np.ndarray | None:
+    """What a camera sees where nothing moves, [H, W, 3] in 0..1: the median of up to `most` frames spread in time.
+
+    None where there are fewer than three frames: the median of two is neither.
+    """
+    if len(frames) < 3:
+        return None
+    chosen = np.unique(np.linspace(0, len(frames) - 1, most).round().astype(int))
+    return np.median([capture.image(camera, frames[i]) for i in chosen], axis=0).astype(np.float32) / 255
+
+
+def _moving(truth: Tensor, still: np.ndarray | None) -> np.ndarray | None:
+    """The pixels [H, W] that differ from the still picture; None where hardly any does."""
+    if still is None:
+        return None
+    moving = np.abs(truth.numpy() - still).max(-1) > CHANGED
+    return moving if moving.mean() > MOVING_SHARE else None
 
 
 def _checked(

@@ -2,7 +2,7 @@
 
 Images are tensors [H, W, 3] in 0..1 and every function returns one number per image; tables are means over images.
 All arithmetic is float64 on the CPU. `flicker` alone needs two instants.
-`VARIANTS` says in words which definition stands behind each key of metrics.json.
+`METRICS`, at the end, says in words which definition stands behind each key of metrics.json, and computes it.
 
 The published SSIM_1 and SSIM_2 columns of dense-view papers are scikit-image's `structural_similarity` with a uniform
 7x7 window and a data range of 1 or 2. For the same window SSIM_2 >= SSIM_1 in practice; tables where it is lower mix
@@ -12,7 +12,8 @@ two definitions.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -26,27 +27,41 @@ GAUSSIAN_SIGMA = 1.5
 K1, K2 = 0.01, 0.03
 """SSIM's stabilising constants, times the data range."""
 
+LEAST_SLOPE = 0.1
+"""Contrast of a render, as a share of the truth's, below which no exposure explains it."""
+
 STRIP_ROWS = 32
 """How many rows of the picture are compared at a time."""
 
-VARIANTS = {
-    "psnr": "20 log10(1 / sqrt(MSE)) per image in dB, then the mean over images",
-    "ssim1": "uniform 7x7 window, sample covariance, 3 px border dropped, data range 1 (scikit-image)",
-    "ssim2": "uniform 7x7 window, sample covariance, 3 px border dropped, data range 2 (scikit-image)",
-    "ssim_3dgs": "Gaussian 11x11 window with sigma 1.5, zero padding, biased covariance (3DGS)",
-    "lpips": "version 0.1 on AlexNet, pictures in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)",
-    "lpips_vgg": "version 0.1 on VGG16, pictures in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)",
-    "flicker": "mean |(I_t - I_s) - (T_t - T_s)| of render I and truth T, s the frame compared before t (this project)",
-    "depth_absrel": "mean |z - z*| / z* over true depth; a missing rendered depth counts as 1",
-    "depth_delta1": "share of true depth with max(z / z*, z* / z) < 1.25; a missing rendered depth counts as a miss",
-}
 
+def psnr(image: Tensor, truth: Tensor, within: np.ndarray | None = None) -> float:
+    """Peak signal to noise ratio in dB, 20 log10(1 / sqrt(MSE)); infinite for equal pictures.
 
-def psnr(image: Tensor, truth: Tensor) -> float:
-    """Peak signal to noise ratio in dB, 20 log10(1 / sqrt(MSE)); infinite for equal pictures."""
+    `within` [H, W] bool are the pixels that count; all where None. At least one must.
+    """
     first, second = _pair(image, truth)
-    error = float(np.square(first - second).mean())
+    squared = np.square(first - second)
+    error = float(squared.mean() if within is None else squared[:, within].mean())
     return -10 * math.log10(error) if error > 0 else math.inf
+
+
+def psnr_color_corrected(image: Tensor, truth: Tensor) -> float:
+    """PSNR after the best affine change of each channel: exposure and white balance are no error of the model.
+
+    The least squares fit is a truth + b = image, undone on the image and clamped to 0..1, as gsplat's evaluation does
+    (`color_correct_affine`; multinerf's older one is quadratic and mixes channels). Fitted this way round a blurred
+    image is not made paler, which would flatter it. A channel in which nothing agrees keeps its contrast.
+    """
+    render, target = _pair(image, truth)
+    corrected = np.stack([_corrected(*channels) for channels in zip(render, target, strict=True)], -1)
+    return psnr(torch.from_numpy(corrected), truth.detach().cpu().double())
+
+
+def _corrected(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    deviation = truth - truth.mean()
+    slope = float((deviation * image).sum()) / max(float(np.square(deviation).sum()), 1e-12)
+    slope = slope if slope > LEAST_SLOPE else 1.0
+    return np.clip((image - image.mean()) / slope + truth.mean(), 0, 1)
 
 
 def ssim_range1(image: Tensor, truth: Tensor) -> float:
@@ -174,3 +189,87 @@ def _pair(image: Tensor, truth: Tensor, window: int = 1) -> tuple[np.ndarray, np
         )
     first, second = (picture.detach().cpu().double().permute(2, 0, 1).numpy() for picture in (image, truth))
     return np.ascontiguousarray(first), np.ascontiguousarray(second)
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """One view as it is scored."""
+
+    image: Tensor
+    truth: Tensor
+    depth: Tensor | None = None
+    true_depth: Tensor | None = None
+    moving: np.ndarray | None = None
+    """[H, W] bool, pixels of the truth that show something that moves; None where nothing does or nobody knows."""
+    before: tuple[Tensor, Tensor] | None = None
+    """Render and truth of the frame before, of the same camera."""
+    networks: Mapping[str, Callable[[Tensor, Tensor], float] | None] = field(default_factory=dict)
+
+    @property
+    def depths(self) -> tuple[Tensor, Tensor] | None:
+        """Rendered and true depth where there are both."""
+        return None if self.depth is None or self.true_depth is None else (self.depth, self.true_depth)
+
+    def by_network(self, name: str) -> float | None:
+        """What a network says of the two pictures; None where it is not there."""
+        network = self.networks.get(name)
+        return None if network is None else network(self.image, self.truth)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A key of metrics.json: its definition in words, and its value for one view."""
+
+    variant: str
+    score: Callable[[Compared], float | None]
+
+
+METRICS = {
+    "psnr": Metric(
+        "20 log10(1 / sqrt(MSE)) per image in dB, then the mean over images", lambda c: psnr(c.image, c.truth)
+    ),
+    "psnr_cc": Metric(
+        "PSNR after the best affine change of each channel, a truth + b = image undone (gsplat color_correct_affine)",
+        lambda c: psnr_color_corrected(c.image, c.truth),
+    ),
+    "psnr_moving": Metric(
+        "PSNR of the pixels that differ by more than 12/255 from the median of their camera's frames (this project)",
+        lambda c: None if c.moving is None else psnr(c.image, c.truth, c.moving),
+    ),
+    "ssim1": Metric(
+        "uniform 7x7 window, sample covariance, 3 px border dropped, data range 1 (scikit-image)",
+        lambda c: ssim_range1(c.image, c.truth),
+    ),
+    "ssim2": Metric(
+        "uniform 7x7 window, sample covariance, 3 px border dropped, data range 2 (scikit-image)",
+        lambda c: ssim_range2(c.image, c.truth),
+    ),
+    "ssim_3dgs": Metric(
+        "Gaussian 11x11 window with sigma 1.5, zero padding, biased covariance (3DGS)",
+        lambda c: ssim_3dgs(c.image, c.truth),
+    ),
+    "lpips": Metric(
+        "version 0.1 on AlexNet, pictures in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)",
+        lambda c: c.by_network("lpips"),
+    ),
+    "lpips_vgg": Metric(
+        "version 0.1 on VGG16, pictures in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)",
+        lambda c: c.by_network("lpips_vgg"),
+    ),
+    "flicker": Metric(
+        "mean |(I_t - I_s) - (T_t - T_s)| of render I and truth T, s the frame compared before t (this project)",
+        lambda c: None if c.before is None else flicker(c.image, c.truth, *c.before),
+    ),
+    "depth_absrel": Metric(
+        "mean |z - z*| / z* over true depth; a missing rendered depth counts as 1",
+        lambda c: None if c.depths is None else depth_absrel(*c.depths),
+    ),
+    "depth_delta1": Metric(
+        "share of true depth with max(z / z*, z* / z) < 1.25; a missing rendered depth counts as a miss",
+        lambda c: None if c.depths is None else depth_delta1(*c.depths),
+    ),
+}
+"""All metrics, in the order of metrics.json. One row is all that a metric takes; `tables.COLUMNS` shows it."""
+
+VARIANTS = {name: metric.variant for name, metric in METRICS.items()}
+"""The definition of each metric in words."""

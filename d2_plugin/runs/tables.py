@@ -35,6 +35,8 @@ class Column:
 
 COLUMNS = (
     Column("PSNR", r"PSNR$\uparrow$", "psnr", ".2f", True, unit="dB"),
+    Column("PSNR cc", r"PSNR$_\mathrm{cc}\uparrow$", "psnr_cc", ".2f", True, always=False, unit="dB"),
+    Column("PSNR moving", r"PSNR$_\mathrm{moving}\uparrow$", "psnr_moving", ".2f", True, always=False, unit="dB"),
     Column("SSIM1", r"SSIM$_1\uparrow$", "ssim1", ".4f", True),
     Column("SSIM2", r"SSIM$_2\uparrow$", "ssim2", ".4f", True),
     Column("LPIPS", r"LPIPS$\downarrow$", "lpips", ".4f", False),
@@ -48,7 +50,7 @@ COLUMNS = (
 PAPER_COLUMNS = tuple(column for column in COLUMNS if column.key in ("psnr", "ssim1", "ssim2", "lpips"))
 """The columns of the paper's tables, which print four digits."""
 
-STUDY_COLUMNS = tuple(c for c in COLUMNS if c.key in ("psnr", "ssim1", "ssim2", "lpips", "depth_absrel"))
+STUDY_COLUMNS = tuple(c for c in COLUMNS if c.key in ("psnr", "psnr_moving", "ssim1", "ssim2", "lpips", "depth_absrel"))
 """The columns by which variants are compared: no single one of them says which is better."""
 
 

@@ -198,3 +198,39 @@ def test_captions_of_large_pictures_are_larger() -> None:
     small, large = (drawing.Panel("caption", np.zeros((30, width, 3), np.uint8)) for width in (240, 1352))
     assert drawing.side_by_side([small]).shape == (30 + 20, 240, 3)
     assert drawing.side_by_side([large, large]).shape == (30 + 80, 2 * 1352 + drawing.GAP, 3)
+
+
+def moving_capture(share: float) -> Capture:
+    """Five frames of one camera: noise that stands still, and a white bar that moves over `share` of the rows."""
+    still = np.random.default_rng(0).integers(40, 120, (40, 72, 3)).astype(np.uint8)
+    base = synthetic_capture(cameras=3, frames=5, width=72, height=40)
+
+    class Moving(Capture):
+        def image(self, camera: str, frame: int) -> np.ndarray:
+            picture = still.copy()
+            picture[: round(40 * share), 10 * frame : 10 * frame + 8] = 255
+            return picture
+
+    moving = object.__new__(Moving)
+    moving.__dict__.update(base.__dict__)
+    return moving
+
+
+def test_what_moves_is_scored_by_itself() -> None:
+    capture = moving_capture(0.5)
+
+    def render(camera: str, frame: int) -> tuple[Tensor, None]:
+        """Right where nothing moves; the bar is too dark."""
+        truth = torch.from_numpy(capture.image(camera, frame).astype(np.float32) / 255)
+        return torch.where(truth == 1, 0.9, truth), None
+
+    scores = evaluate(render, capture, ["test0"], capture.frames)["test"]
+    assert scores["psnr_moving"] == pytest.approx(20, abs=1e-4)
+    assert scores["psnr"] > 25
+
+
+@pytest.mark.parametrize(("share", "frames"), [(0.0, 5), (0.5, 2)], ids=["nothing moves", "two frames"])
+def test_where_nothing_moves_there_is_no_such_score(share: float, frames: int) -> None:
+    capture = moving_capture(share)
+    render = lambda camera, frame: (torch.zeros(40, 72, 3), None)  # noqa: E731
+    assert evaluate(render, capture, ["test0"], capture.frames[:frames])["test"]["psnr_moving"] is None

@@ -185,7 +185,38 @@ def test_leaving_depth_out_never_flatters(missing: float) -> None:
 
 def test_every_metric_has_its_definition_in_words() -> None:
     named = {"psnr", "ssim1", "ssim2", "ssim_3dgs", "lpips", "lpips_vgg", "flicker", "depth_absrel", "depth_delta1"}
-    assert named == set(metrics.VARIANTS)
+    assert named | {"psnr_cc", "psnr_moving"} == set(metrics.VARIANTS)
     assert "range 1" in metrics.VARIANTS["ssim1"]
     assert "range 2" in metrics.VARIANTS["ssim2"]
-    assert len(set(metrics.VARIANTS.values())) == len(named)
+    assert len(set(metrics.VARIANTS.values())) == len(metrics.VARIANTS)
+
+
+@pytest.fixture(scope="module")
+def picture() -> torch.Tensor:
+    """A smooth picture between .2 and .8."""
+    rows, columns = torch.meshgrid(torch.linspace(0, 6, 40), torch.linspace(0, 9, 50), indexing="ij")
+    return 0.5 + 0.3 * torch.stack([torch.sin(columns), torch.cos(rows), torch.sin(rows + columns)], -1)
+
+
+def test_another_exposure_and_white_balance_are_no_error_after_colour_correction(picture: torch.Tensor) -> None:
+    other = picture * torch.tensor([1.2, 0.9, 1.05]) + torch.tensor([0.02, 0.05, -0.04])
+    assert metrics.psnr(other, picture) < 25
+    assert metrics.psnr_color_corrected(other, picture) > 90
+    assert metrics.psnr_color_corrected(picture, picture) > 90
+
+
+def test_colour_correction_neither_flatters_a_blurred_render_nor_invents_contrast(picture: torch.Tensor) -> None:
+    """Noise is divided by the slope as well: no fit in the other direction, which would fade it out."""
+    noise = 0.2 * torch.rand(picture.shape, generator=torch.Generator().manual_seed(0)) - 0.1
+    noisy = picture + noise
+    assert metrics.psnr_color_corrected(noisy, picture) == pytest.approx(metrics.psnr(noisy, picture), abs=0.2)
+    flat = torch.full_like(picture, 0.3)
+    assert metrics.psnr_color_corrected(flat, picture) == pytest.approx(metrics.psnr(picture.mean((0, 1)) + 0 * flat, picture))
+
+
+def test_psnr_within_a_mask_counts_those_pixels_alone(picture: torch.Tensor) -> None:
+    within = torch.zeros(40, 50, dtype=torch.bool)
+    within[5:9, 10:30] = True
+    worse = picture + torch.where(within, 0.1, 0.0)[..., None]
+    assert metrics.psnr(worse, picture, within.numpy()) == pytest.approx(20, abs=1e-4)
+    assert metrics.psnr(worse, picture, ~within.numpy()) == math.inf
