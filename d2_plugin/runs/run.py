@@ -138,6 +138,7 @@ class Run:
             "hooks": list(self.settings.hooks),
             "retired": self.retired,
             "background": getattr(trainer.model, "background", None) is not None,
+            "appearance": getattr(trainer.model, "appearance", None) is not None,
             "plan": scene.plan.as_dict(),
             "capture": scene.capture.name,
             "mono_emulated": scene.capture.mono_emulated,
@@ -179,6 +180,7 @@ class Run:
     def _trainer(self, triangulated: TimedPoints, attach: bool = True) -> Any:
         """A new trainer of the backbone, with hooks where the run has some and `attach` allows it."""
         backbone: Any = registry.load(registry.BACKBONES, self.settings.backbone)
+        self.scene = self.scene.with_points(triangulated, self.settings)
         capture, cameras = self.scene.capture, self.scene.train_cameras
         extent = scene_extent(capture, cameras, triangulated.positions)
         start = initial_points(capture, cameras, triangulated, extent, self.settings.seed)
@@ -187,15 +189,16 @@ class Run:
             extent=extent.radius,
             duration=capture.seconds(capture.frames[-1]),
             temporal=self.scene.plan.uses("temporal"),
-            settings=(self._background() if attach else {}) | dict(self.settings.overrides.get("backbone", {})),
+            settings=(self._needed() if attach else {}) | dict(self.settings.overrides.get("backbone", {})),
         )
         training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
         pictures = TrainingFrames(capture, cameras, self.settings.device)
         return backbone.Trainer(model, pictures, training, self._attach if attach and self.uses_prior else None)
 
-    def _background(self) -> dict[str, Any]:
-        """The backbone's setting where the scene needs it: one of somebody else's may not know the name."""
-        return {"background": True} if self._sees_far() else {}
+    def _needed(self) -> dict[str, Any]:
+        """The backbone's settings that the scene needs, those alone: one of somebody else's may not know the names."""
+        needed = {"background": self._sees_far(), "appearance": self.scene.plan.uses("appearance")}
+        return {name: True for name, needs in needed.items() if needs}
 
     def _sees_far(self) -> bool:
         """Whether the depth prior, where there is one, found far pixels: only then a background pays."""

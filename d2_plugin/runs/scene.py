@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from d2_plugin.captures import Capture, open_capture
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.runs.plan import ScenePlan, plan_scene
+from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
 from d2_plugin.runs.settings import RunSettings, prior_settings
+from d2_plugin.runs.start import TimedPoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,12 @@ class Scene:
         train, test = _split(capture, settings)
         plan = plan_scene(capture, train, _mono_source(capture, settings), prior_settings(settings))
         return cls(capture, train, test, plan.override(**settings.overrides.get("plan", {})))
+
+    def with_points(self, points: TimedPoints, settings: RunSettings) -> Scene:
+        """The same scene with what triangulated points decide: whether the cameras' exposures differ."""
+        decision = appearance_decision(self.capture, self.train_cameras, points.positions, points.times)
+        plan = self.plan.with_decision(decision).override(**settings.overrides.get("plan", {}))
+        return replace(self, plan=plan)
 
 
 def _split(capture: Capture, settings: RunSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:

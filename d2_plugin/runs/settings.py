@@ -29,6 +29,8 @@ class PlanChoices(Settings):
     """Whether the scene has a temporal dimension; if not given, the plan measures it."""
     stereo: bool | None = None
     """Whether the cameras are matched; if not given, the plan measures it."""
+    appearance: bool | None = None
+    """Whether each training camera learns a change of colour; if not given, triangulated points decide."""
 
 
 OVERRIDABLE = tuple(choice.name for choice in declared(PlanChoices))
