@@ -19,6 +19,8 @@ from d2_plugin.settings import NotNegative, Positive, Range, Settings
 from .appearance import Appearance
 from .background import Background
 from .densify import DensifySettings, densify
+from .dropout import Dropout
+from .early_stop import EarlyStopSettings
 from .gaussians import Gaussians
 
 STATISTICS = ("screen_gradient", "seen")
@@ -52,6 +54,8 @@ class SplatSettings(Settings):
     """Weight of the mean opacity in the loss; what no picture needs fades and is pruned. 3DGS-MCMC: 0.01."""
     scale_weight: NotNegative = 0.0
     """Weight of the mean standard deviation, in extents of the scene, in the loss. 3DGS-MCMC: 0.01 in its own unit."""
+    dropout: Annotated[float, Range(0, 1, open_high=True)] = 0.0
+    """Chance that a training render leaves a Gaussian out, at the last step; it grows from none. DropGaussian: 0.2."""
     background: bool = False
     """Whether directions have a colour of their own at infinity, for skies. `d2 train` switches it on where the depth
     prior found far pixels. Plaza, 2000 steps, three seeds, the backbone alone: 14.87 dB
@@ -63,6 +67,8 @@ class SplatSettings(Settings):
     """Constants of the rasterizer."""
     densify: DensifySettings = field(default_factory=DensifySettings)
     """The backbone's own density control."""
+    early_stop: EarlyStopSettings = field(default_factory=EarlyStopSettings)
+    """Whether held-out patches end a run before its last step."""
 
 
 class Observer:
@@ -93,6 +99,7 @@ class SplatModel(ABC):
         self.gaussians.statistics = {name: rows["positions"].new_zeros(len(rows["positions"])) for name in STATISTICS}
         self.background = Background(self.gaussians.device) if settings.background else None
         self.appearance = Appearance(self.gaussians.device) if settings.appearance else None
+        self.dropout = Dropout(settings.dropout) if settings.dropout else None
         self.observers: list[Observer] = []
         self.screen_offsets: Tensor | None = None
         self._drawn: Tensor | None = None
@@ -132,6 +139,8 @@ class SplatModel(ABC):
         splats = self.slice_at(view)
         colors = self.colors(view, splats)
         self._drawn = splats.rows
+        if self.dropout is not None and torch.is_grad_enabled():
+            splats = splats._replace(opacities=self.dropout.thinned(splats.opacities))
         self.screen_offsets = splats.means.new_zeros(len(splats.means), 2, requires_grad=torch.is_grad_enabled())
         render = rasterize(
             splats, colors, view, self.settings.raster, background=background, screen_offsets=self.screen_offsets
@@ -172,6 +181,8 @@ class SplatModel(ABC):
             self.background.optimize()
         if self.appearance is not None:
             self.appearance.optimize()
+        if self.dropout is not None:
+            self.dropout.advance(step, iterations)
         s = self.settings
         rate = decayed_rate(s.position_rate, s.position_rate_final, step, iterations)
         self.gaussians.set_learning_rate("positions", rate * self.extent)
@@ -201,7 +212,7 @@ class SplatModel(ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, statistics and optimizer: enough for a bitwise continuation."""
-        parts = {"background": self.background, "appearance": self.appearance}
+        parts = {"background": self.background, "appearance": self.appearance, "dropout": self.dropout}
         return self.gaussians.state_dict() | {name: part.state_dict() for name, part in parts.items() if part}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -210,6 +221,8 @@ class SplatModel(ABC):
         self.background = Background(self.gaussians.device) if "background" in state else None
         if self.background is not None:
             self.background.load_state_dict(state["background"])
+        if self.dropout is not None:
+            self.dropout.load_state_dict(state["dropout"])
         self.appearance = Appearance(self.gaussians.device) if "appearance" in state else None
         if self.appearance is not None:
             self.appearance.load_state_dict(state["appearance"])

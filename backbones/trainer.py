@@ -16,10 +16,21 @@ from d2_plugin.gaussians.photometric import photometric_loss
 from d2_plugin.rasterizer import Render, View
 from d2_plugin.settings import Seed, Settings, Share, Steps
 
+from .early_stop import EarlyStop, EarlyStopSettings
+
+
+class Chosen(Protocol):
+    """What the loop needs of a backbone's settings."""
+
+    @property
+    def early_stop(self) -> EarlyStopSettings: ...
+
 
 class Model(Protocol):
     """What the loop needs of a backbone."""
 
+    @property
+    def settings(self) -> Chosen: ...
     def render(self, view: View, background: Tensor | None = None) -> Render: ...
     def regularization(self) -> Tensor | float: ...
     def accumulate(self, view: View) -> None: ...
@@ -70,19 +81,26 @@ class Trainer:
     ) -> None:
         self.model, self.frames, self.settings = model, frames, settings
         self.step = 0
+        self.early_stop = EarlyStop(model.settings.early_stop, settings.seed)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
         self.d2 = attach(model) if attach else None  # D2, line 1: after the optimizer exists
 
+    @property
+    def stopped(self) -> bool:
+        """Whether held-out patches of the training pictures have ended the run before its last step."""
+        return self.early_stop.stopped
+
     def run(self, until: int | None = None, on_step: Callable[[int, float], None] | None = None) -> None:
         """Train up to and including step `until` (default: all); `on_step(step, loss)` reports each one."""
         model, iterations, d2 = self.model, self.settings.iterations, self.d2
-        while self.step < (iterations if until is None else until):
+        while self.step < (iterations if until is None else until) and not self.stopped:
             self.step += 1
             index = self._next_view()
             view = self.frames.views[index]
             render = model.render(view)
-            loss = photometric_loss(render.color, self.frames.image(index), self.settings.ssim_weight)
+            target = self.early_stop.target(index, self.frames.image(index), render.color)
+            loss = photometric_loss(render.color, target, self.settings.ssim_weight)
             logged = loss.item()
             loss = loss + model.regularization()
             if d2 is not None:
@@ -103,6 +121,7 @@ class Trainer:
             "model": self.model.state_dict(),
             "generator": self._generator.get_state(),
             "queue": list(self._queue),
+            "early_stop": self.early_stop.state_dict(),
             "d2": self.d2.state_dict() if self.d2 is not None else None,
         }
 
@@ -112,11 +131,13 @@ class Trainer:
         self.model.load_state_dict(state["model"])
         self._generator.set_state(state["generator"].cpu())
         self._queue = list(state["queue"])
+        self.early_stop.load_state_dict(state.get("early_stop", {"rounds": [], "errors": []}))  # absent until 0.1.0
         if self.d2 is not None:
             self.d2.load_state_dict(state["d2"])
 
     def _next_view(self) -> int:
         """Every view once, in a new random order each time round."""
         if not self._queue:
+            self.early_stop.end_round()
             self._queue = torch.randperm(len(self.frames.views), generator=self._generator).tolist()
         return self._queue.pop()

@@ -80,7 +80,7 @@ class Run:
         iterations = self.settings.iterations
         chunk = max(iterations // CHECKPOINTS, 1)
         with progress_bar("train", iterations) as bar:
-            while trainer.step < iterations:
+            while trainer.step < iterations and not getattr(trainer, "stopped", False):
                 until = min((trainer.step // chunk + 1) * chunk, iterations)
                 with self._timed("train"):
                     trainer.run(until, lambda step, loss: bar.update(step, f"loss {loss:.4f}"))
