@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from d2_plugin.rasterizer import Render
 
-RATE = 1e-3
-"""Learning rate of the changes; a gain that is 20 % off takes some hundred steps of its camera."""
+RATE = 5e-3
+"""Learning rate of the changes: a gain that is 20 % off takes about fifty steps of its camera."""
 
 
 class Appearance:
