@@ -51,18 +51,22 @@ class SplatSettings(Settings):
     initial_opacity: Annotated[float, Range(0, 1, open_low=True)] = 0.1
     """Opacity of the Gaussians at the start."""
     opacity_weight: NotNegative = 0.0
-    """Weight of the mean opacity in the loss; what no picture needs fades and is pruned. 3DGS-MCMC: 0.01."""
+    """Weight of the mean opacity in the loss; what no picture needs fades and is pruned. 3DGS-MCMC: 0.01.
+    At 0.01, 500 steps, one seed: studio -.04 dB with D2 and -.01 without, plaza -.75 and +.43; SSIM1 never rises."""
     scale_weight: NotNegative = 0.0
-    """Weight of the mean standard deviation, in extents of the scene, in the loss. 3DGS-MCMC: 0.01 in its own unit."""
+    """Weight of the mean standard deviation, in extents of the scene, in the loss. 3DGS-MCMC: 0.01 in its own unit.
+    At 0.1, 500 steps, one seed: studio +.22 dB with D2 and -.19 without, plaza -.91 and -.81."""
     dropout: Annotated[float, Range(0, 1, open_high=True)] = 0.0
-    """Chance that a training render leaves a Gaussian out, at the last step; it grows from none. DropGaussian: 0.2."""
+    """Chance that a training render leaves a Gaussian out, at the last step; it grows from none. DropGaussian: 0.2.
+    At 0.2, 500 steps, one seed: studio +.26 dB with D2 and -1.29 without, plaza -.57 and +.58."""
     background: bool = False
     """Whether directions have a colour of their own at infinity, for skies. `d2 train` switches it on where the depth
     prior found far pixels. Plaza, 2000 steps, three seeds, the backbone alone: 14.87 dB
     with, 13.19 without."""
     appearance: bool = False
     """Whether each training camera has an affine change of colour of its own. `d2 train` switches it on where the
-    cameras' exposures differ."""
+    cameras' exposures differ.
+    Studio with gains from .8 to 1.2, alone, 500 steps, one seed: 20.83 dB without, 23.88 with."""
     raster: RasterSettings = field(default_factory=RasterSettings)
     """Constants of the rasterizer."""
     densify: DensifySettings = field(default_factory=DensifySettings)
