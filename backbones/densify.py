@@ -36,8 +36,8 @@ class DensifySettings(Settings):
     method: Literal["split", "relocate"] = "split"
     """What an edit does: "split" clones and splits where the screen-space gradient is large and prunes (3DGS),
     "relocate" moves the Gaussians that pruning would remove to opaque ones and grows by a share (3DGS-MCMC).
-    "relocate" with growth 0.1 against "split", four views, 500 steps, one seed: studio -.68 dB with D2 and -.26 without,
-    plaza -1.50 and -.56."""
+    "relocate" with growth 0.1 against "split", four views, 500 steps, one seed: studio -.68 dB with D2 and -.26
+    without, plaza -1.50 and -.56."""
     start: Share = 0.05
     """Share of the run before the first edit."""
     stop: Share = 0.6
