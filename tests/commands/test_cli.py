@@ -319,7 +319,7 @@ class TestMistakes:
         assert "unknown setting of prune 'tau_pp'" in message
         config.write_text("[plan]\nverification = false\n")
         message = refused(capsys, train(capture, tmp_path / "x", "--config", str(config)))
-        assert "'verification': have stereo, temporal" in message
+        assert "'verification': have appearance, stereo, temporal" in message
         config.write_text("[backbone]\nsh_degre = 1\n")
         message = refused(capsys, train(capture, tmp_path / "y", "--hooks", "none", "--config", str(config)))
         assert "did you mean 'sh_degree'?" in message
