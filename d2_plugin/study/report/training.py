@@ -40,7 +40,7 @@ def training(rows: Sequence[Row]) -> Section:
             "training": figure(plots, "Held-out PSNR against minutes", columns=3, size=(340, 320)),
             "training-time": bars(stacked, ("prior", "training"), "min", "Minutes of prior and training per method"),
         },
-        (("Mean ± deviation over seeds", scores_table("method", groups)),),
+        (("Mean ± standard error over seeds", scores_table("method", groups)),),
         sources=sources_of(rows),
         headlines=tuple(line for case, mine in cases_of(scored(rows)).items() if (line := _headline(case, mine))),
     )
