@@ -134,6 +134,7 @@ class Run:
             "cpu_seconds": {name: round(value, 3) for name, value in self.cpu_seconds.items()},
             "train_cameras": list(scene.train_cameras),
             "test_cameras": list(scene.test_cameras),
+            "protocol": self.settings.protocol,
             "backbone": self.settings.backbone,
             "hooks": list(self.settings.hooks),
             "guidance": None if self.guidance is None else dict(self.guidance.identity()),

@@ -65,6 +65,8 @@ class RunSettings(Settings):
     """Folder of a finished depth prior; without it the run builds its own."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the trainer runs."""
+    protocol: str | None = None
+    """Name of the preset or protocol that chose the cameras; cameras that are named have none."""
     overrides: Mapping[str, Any] = field(default_factory=dict)
     """Tables over the defaults, see `TABLES`."""
 

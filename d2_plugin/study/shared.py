@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -51,12 +52,13 @@ class Shared:
             shutil.copyfile(self.points, run / "points.npz")
 
 
-def share(settings: RunSettings, folder: Path) -> Shared:
+def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None = None) -> Shared:
     """Make what is missing in `folder`: points.npz, priors/dual and shared.json.
 
     Args:
         settings: of any run of the comparison; its tables for the prior hold, its variant does not.
         folder: of the comparison, absolute.
+        cluster: what builds the frames in place of this process, as for `build_priors_for`; no CPU time is known then.
     """
     path = folder / "shared.json"
     if path.is_file():
@@ -70,9 +72,10 @@ def share(settings: RunSettings, folder: Path) -> Shared:
         triangulated_points(scene.capture, scene.train_cameras).save(points)
     store = folder / "priors" / FULL
     whole = not (store / "store.json").is_file()
-    build_priors_for(full, scene, TimedPoints.load(points).positions, store)
+    build_priors_for(full, scene, TimedPoints.load(points).positions, store, cluster=cluster)
     background = sees_far(store, scene.train_cameras, scene.capture.frames)
-    took = (time.monotonic() - start, time.process_time() - cpu) if whole else (None, None)
+    used = time.process_time() - cpu if cluster is None else None
+    took = (time.monotonic() - start, used) if whole else (None, None)
     shared = Shared(folder, background, *took)
     write_json(path, {"background": background, "seconds": took[0], "cpu_seconds": took[1]})
     return shared

@@ -141,9 +141,10 @@ def write(results: Mapping[Job, Metrics], presets: Sequence[Preset], output: Pat
 def _row(job: Job, metrics: Metrics, command: str) -> Row:
     scores = metrics["test"] or {}
     psnr = scores.get("psnr")
+    protocol = job.settings.protocol
     return make_row(
         "ablation",
-        f"{metrics['capture']}, {len(metrics['train_cameras'])} cameras",
+        f"{metrics['capture']}, {len(metrics['train_cameras'])} cameras" + (f", {protocol}" if protocol else ""),
         f"{job.backbone} {job.preset}",
         f"seed {job.seed}",
         error=None if psnr is None else 10 ** (-psnr / 20),
@@ -153,4 +154,5 @@ def _row(job: Job, metrics: Metrics, command: str) -> Row:
         gaussians=metrics["gaussians"],
         iterations=metrics["iterations"],
         prior_seconds=_prior_seconds(job),
+        protocol=protocol,
     )

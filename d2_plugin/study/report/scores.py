@@ -37,6 +37,11 @@ def scored(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if score(row, "psnr") is not None]
 
 
+def one_per_seed(rows: Sequence[Row]) -> list[Row]:
+    """Runs that differ by seed alone, each seed once: a run that was repeated with its seed is no further one."""
+    return list({row["seed"] if row.get("seed") is not None else row["setting"]: row for row in rows}.values())
+
+
 def average(rows: Sequence[Row], name: str) -> float:
     """The mean of a field that every row has."""
     return mean(row[name] for row in rows)

@@ -11,7 +11,7 @@ from d2_plugin.study.verdict import LEAST_SEEDS
 
 from .ablation import PAPER_TEXT
 from .plots import Axis, Plot, Point, Series
-from .scores import Group, average, psnr, scored, scores_table
+from .scores import Group, average, one_per_seed, psnr, scored, scores_table
 from .sections import Section, cases_of, sources_of
 from .svg import bars, figure
 from .work_precision import colors_of, pareto_front
@@ -96,8 +96,10 @@ def _published_levels(case: str, x: Axis, color: int) -> list[Series]:
 
 
 def _variants(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Rows of the same method and number of steps, which differ by seed."""
-    groups: dict[str, list[Row]] = {}
+    """Rows of the same method, steps and commit, which differ by seed; the commit is told where they differ."""
+    groups: dict[tuple[str, str | None], list[Row]] = {}
     for row in rows:
-        groups.setdefault(f"{row['method']}, {row['iterations']} steps", []).append(row)
-    return groups
+        groups.setdefault((f"{row['method']}, {row['iterations']} steps", row["commit"]), []).append(row)
+    names = [name for name, _ in groups]
+    told = {key: f"{key[0]} ({key[1]})" if names.count(key[0]) > 1 else key[0] for key in groups}
+    return {told[key]: one_per_seed(mine) for key, mine in groups.items()}
