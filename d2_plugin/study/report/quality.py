@@ -9,6 +9,7 @@ from d2_plugin.runs.markup import Table
 from d2_plugin.runs.tables import STUDY_COLUMNS, Column
 from d2_plugin.study.ablation.claims import EXPLANATION, claims_table
 from d2_plugin.study.rows import Row
+from d2_plugin.study.training.measured import TRY
 from d2_plugin.study.verdict import Estimate, seeds_in_words
 
 from .plots import Axis, Plot, Point, Series
@@ -28,7 +29,7 @@ class Length:
 
     method: str
     target: str
-    """What they were meant for: `30 s`, or `2000 steps`; tries have one of their own."""
+    """What they were meant for: `30 s`, `2000 steps`, or a try that looked for such a length."""
     rows: Sequence[Row]
 
     def minutes(self, prior: bool = False) -> float:
@@ -82,7 +83,7 @@ def _distinct(rows: Sequence[Row]) -> list[Row]:
     kept: dict[str, Row] = {}
     for row in rows:
         known = kept.get(row["fingerprint"])
-        if known is None or (known["budget"] is None and row["budget"] is not None):
+        if known is None or known["target"] == TRY:
             kept[row["fingerprint"]] = row
     return list(kept.values())
 
@@ -96,7 +97,7 @@ def _lengths(rows: Sequence[Row]) -> list[Length]:
 
 
 def _target(row: Row) -> str:
-    return f"{row['iterations']} steps" if row["budget"] is None else f"{row['budget']:g} s"
+    return f"try of {row['iterations']} steps" if row["target"] == TRY else row["target"]
 
 
 def _groups(cases: Mapping[str, Sequence[Length]]) -> list[Group]:
@@ -112,7 +113,7 @@ def _groups(cases: Mapping[str, Sequence[Length]]) -> list[Group]:
 
 def _shared_targets(found: Sequence[Length]) -> list[str]:
     """What at least two methods were measured at; all there is where there is one method only."""
-    targets = list(dict.fromkeys(length.target for length in found))
+    targets = list(dict.fromkeys(length.target for length in found if not length.target.startswith(TRY)))
     shared = [t for t in targets if sum(length.target == t for length in found) > 1]
     return shared or targets
 
@@ -125,9 +126,7 @@ def _mean(length: Length, column: Column) -> Estimate | None:
     return Estimate.of([score(row, column.key) for row in length.rows])
 
 
-def _plot(
-    case: str, found: Sequence[Length], column: Column, colors: Mapping[str, int], prior: bool = False
-) -> Plot:
+def _plot(case: str, found: Sequence[Length], column: Column, colors: Mapping[str, int], prior: bool = False) -> Plot:
     """One metric of one capture over minutes."""
     known = [(length, mean) for length in found if (mean := _mean(length, column)) is not None]
     sign = -1 if column.larger_is_better else 1

@@ -45,9 +45,7 @@ RIVALS: dict[str, Rival] = {
     "sparse_points": Rival(
         "Sparse-point depth (gsplat)", "points", SparsePointsConfig.for_iterations, SparsePointDepth
     ),
-    "dense_start": Rival(
-        "Dense start (GC-4DGS)", "stereo", lambda iterations: DenseStartConfig(), start=dense_points
-    ),
+    "dense_start": Rival("Dense start (GC-4DGS)", "stereo", lambda iterations: DenseStartConfig(), start=dense_points),
 }
 
 

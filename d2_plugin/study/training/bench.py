@@ -30,7 +30,7 @@ from d2_plugin.study.shared import Shared, monocular_seconds, same_backbone, sha
 
 from .budget import TRIES, Timed, fits, nearest, next_steps
 from .cases import Case, case_of
-from .measured import Work
+from .measured import TRY, Work
 from .spread import Line, follow, workers
 
 
@@ -116,7 +116,7 @@ def _lines(settings: TrainingBench, text: str, known: Sequence[Row]) -> Iterator
 def _line(settings: TrainingBench, case: Case, shared: Shared, preset: Preset, known: Sequence[Row]) -> Line:
     """All targets of one method: the length of a run is tried with the first seed, then the other seeds follow."""
     template = _Template(settings, case, shared, preset)
-    found = {(row["fingerprint"], row["budget"]): row for row in known if row["kind"] == "quality"}
+    found = {(row["fingerprint"], row["target"]): row for row in known if row["kind"] == "quality"}
     tried: list[Timed] = [
         (row["iterations"], row["seconds"])
         for row in found.values()
@@ -126,32 +126,31 @@ def _line(settings: TrainingBench, case: Case, shared: Shared, preset: Preset, k
     def missing(works: Sequence[Work]) -> list[Work]:
         return [work for work in works if work.key not in found]
 
-    for kind, target in _targets(settings):
-        budget = target if kind == "seconds" else None
-        steps = round(target)
-        if budget is not None:
-            steps = _settled(found, template, budget) or 0
+    for kind, size in _targets(settings):
+        target, steps = (f"{size:g} s", 0) if kind == "seconds" else (f"{size:g} steps", round(size))
+        if not steps:
+            steps = _settled(found, template, target) or 0
             for _ in range(TRIES if not steps else 0):
-                length = next_steps(budget, tried)
+                length = next_steps(size, tried)
                 if any(length == n for n, _ in tried):
                     break
-                rows = yield missing([template.work(length, settings.seeds[0], None)])
+                rows = yield missing([template.work(length, settings.seeds[0], TRY)])
                 if any(row["failed"] for row in rows):
                     return
                 tried += [(row["iterations"], row["seconds"]) for row in rows]
-                if tried and fits(budget, tried[-1]):
+                if tried and fits(size, tried[-1]):
                     break
-            steps = steps or nearest(budget, tried)
-        rows = yield missing([template.work(steps, seed, budget) for seed in settings.seeds])
+            steps = steps or nearest(size, tried)
+        rows = yield missing([template.work(steps, seed, target) for seed in settings.seeds])
         if rows and all(row["failed"] for row in rows):
             return
         tried += [(row["iterations"], row["seconds"]) for row in rows if row["seconds"]]
 
 
-def _settled(found: dict[tuple[str, float | None], Row], template: _Template, budget: float) -> int | None:
-    """The number of steps that an earlier call chose for this budget."""
-    mine = (template.case.name, template.method, budget)
-    return next((r["iterations"] for r in found.values() if (r["case"], r["method"], r["budget"]) == mine), None)
+def _settled(found: dict[tuple[str, str], Row], template: _Template, target: str) -> int | None:
+    """The number of steps that an earlier call chose for this time."""
+    mine = (template.case.name, template.method, target)
+    return next((r["iterations"] for r in found.values() if (r["case"], r["method"], r["target"]) == mine), None)
 
 
 class _Template:
@@ -163,7 +162,7 @@ class _Template:
         self.command = command_line("bench training", settings, False, **_joined(settings))
         self.prior_seconds = _prior_seconds(preset, case, shared)
 
-    def work(self, steps: int, seed: int, budget: float | None) -> Work:
+    def work(self, steps: int, seed: int, target: str) -> Work:
         """One run of so many steps."""
         base = self.case.settings
         run = replace(base, hooks=self.preset.hooks, seed=seed, iterations=steps, priors=str(self.shared.priors))
@@ -172,7 +171,7 @@ class _Template:
         folder = self.shared.folder / "runs" / self.settings.backbone / name / f"{steps}steps" / f"seed{seed}"
         job = Job(self.preset.name, base.backbone, seed, same_backbone(run, self.shared), folder, self.preset.rival)
         about = {"prior_seconds": self.prior_seconds, "protocol": base.protocol}
-        return Work(job, self.shared, self.case.name, self.method, self.command, budget, about)
+        return Work(job, self.shared, self.case.name, self.method, self.command, target, about)
 
 
 def _tables(path: Path | None) -> dict[str, Any]:

@@ -15,6 +15,9 @@ from d2_plugin.study.rivals.table import rival
 from d2_plugin.study.rows import Row, make_row
 from d2_plugin.study.shared import Shared
 
+TRY = "try"
+"""Target of a run that looks for the number of steps of a budget: drawn, and in no table."""
+
 
 @dataclass(frozen=True, eq=False)
 class Work:
@@ -25,15 +28,15 @@ class Work:
     case: str
     method: str
     command: str
-    budget: float | None = None
-    """CPU seconds that the run is meant for; None where its steps were asked for, or it was a try."""
+    target: str
+    """What the run is meant for: `30 s`, `2000 steps`, or `TRY`."""
     about: Mapping[str, Any] = field(default_factory=dict)
     """Further fields of the row."""
 
     @property
-    def key(self) -> tuple[str, float | None]:
+    def key(self) -> tuple[str, str]:
         """What makes two of them the same measurement, on whatever machine its files lie."""
-        return fingerprint(self.job), self.budget
+        return fingerprint(self.job), self.target
 
 
 def fingerprint(job: Job) -> str:
@@ -90,7 +93,8 @@ def row_of(work: Work, metrics: Mapping[str, Any]) -> Row:
 
 def _row(work: Work, **found: Any) -> Row:
     settings = work.job.settings
-    about = {"budget": work.budget, "iterations": settings.iterations, "seed": settings.seed} | dict(work.about)
+    about: dict[str, Any] = {"target": work.target, "iterations": settings.iterations, "seed": settings.seed}
+    about |= work.about
     setting = f"{settings.iterations} steps, seed {settings.seed}"
     about["fingerprint"] = fingerprint(work.job)
     return make_row("quality", work.case, work.method, setting, command=work.command, **found, **about)
