@@ -242,6 +242,14 @@ def test_an_unknown_rival_is_answered_with_the_nearest() -> None:
         rival("pearsn", 100)
 
 
+def tensors_in(state: object) -> list[Tensor]:
+    """All tensors of a nested state, in its order."""
+    if isinstance(state, Tensor):
+        return [state]
+    parts = state.values() if isinstance(state, dict) else state if isinstance(state, list | tuple) else ()
+    return [tensor for part in parts for tensor in tensors_in(part)]
+
+
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     capture = synthetic_capture(cameras=3, held_out=1, frames=2, width=96, height=54)
@@ -276,7 +284,7 @@ class TestOnARecording:
         run = Run.load(ablation / "yang4d" / "dense_start" / "seed0")
         points = run.prepare(priors=False)
         started = rival("dense_start", 24).start(run.scene, points, ablation / "priors" / "dual")
-        assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 1
+        assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of six pictures rounds
         np.testing.assert_array_equal(started.positions[: len(points)], points.positions)
         assert set(started.times) == {0.0, run.scene.capture.seconds(1)}
 
@@ -294,7 +302,9 @@ class TestOnARecording:
         again = Run(settings, tmp_path / "cut", guidance)
         again.train()
         ours, theirs = (torch.load(f / "checkpoint.pt", weights_only=True) for f in (tmp_path / "cut", whole))
-        torch.testing.assert_close(ours["model"], theirs["model"], rtol=0, atol=0)
+        mine, others = tensors_in(ours["model"]), tensors_in(theirs["model"])
+        assert len(mine) == len(others) > 10
+        assert all(torch.equal(a, b) for a, b in zip(mine, others, strict=True))
 
     def test_a_rivals_run_can_be_scored_but_not_trained_by_others(self, ablation: Path) -> None:
         run = Run.load(ablation / "yang4d" / "pearson" / "seed0")

@@ -52,7 +52,7 @@ def dense_points(inputs: Inputs, config: DenseStartConfig) -> TimedPoints:
         if (depth := inputs.stereo_depth(camera, frame)) is not None
     ]
     if not sum(map(len, parts)):
-        raise D2Error(f"stereo found no depth in {inputs.priors}: a dense start needs cameras that see the same")
+        raise D2Error("stereo found no depth for a dense start: it needs cameras that see the same, and texture")
     return TimedPoints.joined([inputs.points, *parts])
 
 
