@@ -13,12 +13,15 @@ from d2_plugin.study.training.measured import TRY
 from d2_plugin.study.verdict import Estimate, seeds_in_words
 
 from .plots import Axis, Plot, Point, Series
-from .scores import Group, average, best_of_cases, psnr, score, scored, scores_table
+from .scores import Group, average, best_of_cases, one_per_seed, psnr, score, scored, scores_table
 from .sections import Section, cases_of, sources_of
 from .svg import bars, figure
 from .work_precision import colors_of, pareto_front
 
 DRAWN = tuple(column for column in STUDY_COLUMNS if column.key in ("psnr", "ssim1", "depth_absrel"))
+FRONT_COLOR = 7
+"""Of the dashed line through what no method beats in both score and time."""
+
 FULL = "full"
 """Preset of D² with its defaults; the method of a row is `BACKBONE PRESET`, and a label behind a comma."""
 
@@ -53,7 +56,8 @@ def quality(rows: Sequence[Row]) -> Section:
         "Quality per minute: D², the backbone and rivals",
         "Cameras that trained nothing, against CPU minutes of training on one thread. All methods have the same "
         "starting points, depth inputs and backbone settings. Marks are means over the seeds; a line joins what no "
-        "other length of that method beats, and what another method beats is faded. The prior is counted in the "
+        "other length of that method beats, the dashed one is the Pareto front of all, and what lies behind it is "
+        "faded. The prior is counted in the "
         "second figure and in the bars; rivals that read monocular maps alone are charged for those alone."
         + (" Monocular depth of some captures is emulated, not predicted." if emulated else "")
         + (f" {EXPLANATION}" if order.rows else ""),
@@ -93,7 +97,7 @@ def _lengths(rows: Sequence[Row]) -> list[Length]:
     found: dict[tuple[str, str], list[Row]] = {}
     for row in sorted(rows, key=lambda row: row["seconds"]):
         found.setdefault((row["method"], _target(row)), []).append(row)
-    return [Length(*key, mine) for key, mine in found.items()]
+    return [Length(*key, one_per_seed(mine)) for key, mine in found.items()]
 
 
 def _target(row: Row) -> str:
@@ -131,8 +135,9 @@ def _plot(case: str, found: Sequence[Length], column: Column, colors: Mapping[st
     known = [(length, mean) for length in found if (mean := _mean(length, column)) is not None]
     sign = -1 if column.larger_is_better else 1
     places = [(length.minutes(prior), sign * mean.mean) for length, mean in known]
-    front = set(pareto_front(places))
-    series = []
+    front = pareto_front(places)
+    best_of_all = tuple((places[i][0], known[i][1].mean) for i in front)
+    series = [Series("Pareto front", (), best_of_all, FRONT_COLOR, hollow=True)] if len(colors) > 1 else []
     for name, color in colors.items():
         mine = [i for i, (length, _) in enumerate(known) if length.method == name]
         points = tuple(_point(*known[i], column, places[i][0], i not in front) for i in mine)
