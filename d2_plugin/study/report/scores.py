@@ -61,7 +61,10 @@ def scores_table(what: str, groups: Sequence[Group]) -> Table:
 
 
 def best_of_cases(groups: Sequence[Group], column: Column) -> list[int]:
-    """Index of the group with the best mean of one metric, for each capture that has two groups or more."""
+    """Index of the group with the best mean of one metric, for each capture that has two groups or more.
+
+    However many seeds it has, since the second best is not the best either: how many stands beside it.
+    """
     found = []
     for case in dict.fromkeys(group.case for group in groups):
         values = {

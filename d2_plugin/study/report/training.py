@@ -96,10 +96,17 @@ def _published_levels(case: str, x: Axis, color: int) -> list[Series]:
 
 
 def _variants(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Rows of the same method, steps and commit, which differ by seed; the commit is told where they differ."""
+    """Rows of the same method, steps and commit, which differ by seed; the commit is told where they differ.
+
+    Where one seed has two scores the runs differ by something that their rows do not say, and each stands alone.
+    """
     groups: dict[tuple[str, str | None], list[Row]] = {}
     for row in rows:
         groups.setdefault((f"{row['method']}, {row['iterations']} steps", row["commit"]), []).append(row)
     names = [name for name, _ in groups]
     told = {key: f"{key[0]} ({key[1]})" if names.count(key[0]) > 1 else key[0] for key in groups}
-    return {told[key]: one_per_seed(mine) for key, mine in groups.items()}
+    found: dict[str, list[Row]] = {}
+    for key, mine in groups.items():
+        alike = len({(row["setting"], row["error"]) for row in mine}) == len(one_per_seed(mine))
+        found |= {told[key]: one_per_seed(mine)} if alike else {f"{told[key]}, {row.get('run')}": [row] for row in mine}
+    return found
