@@ -21,7 +21,9 @@ def training(rows: Sequence[Row]) -> Section:
     """Held-out PSNR against minutes of prior and training, their parts as stacked bars, and all scores."""
     emulated = any(row.get("mono_emulated") for row in rows)
     colors = colors_of(rows)
-    plots = [_quality(case, mine, colors) for case, mine in cases_of(scored(rows)).items()]
+    compared = cases_of(scored(rows))
+    several = {case: mine for case, mine in compared.items() if len(mine) > 1} or compared  # one mark is no comparison
+    plots = [_quality(case, mine, colors) for case, mine in several.items()]
     groups = [
         Group(case, name, group) for case, mine in cases_of(rows).items() for name, group in _variants(mine).items()
     ]
