@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,12 +12,15 @@ import numpy as np
 import pytest
 import torch
 from numpy.lib.stride_tricks import sliding_window_view
+from tiny import TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
 
+from d2_plugin import D2Config, D2Hooks
 from d2_plugin.captures.export.folder import save_capture
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
+from d2_plugin.hooks import Context, Hook, HookConfig
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.study.rivals.dense_start import back_projected
@@ -321,3 +326,28 @@ class TestOnARecording:
             Run(settings, folder)
         with pytest.raises(D2Error, match="other settings of guidance"):
             Run(settings, folder, replace(rival("pearson", 24), config=PearsonConfig(weight=0.5)))
+
+
+class TestHooksAsObjects:
+    """`D2Hooks(..., hooks={...})`: what rivals plug in by, and anybody's own hook."""
+
+    class Constant(Hook):
+        def loss(self, context: Context) -> Tensor:
+            return torch.tensor(0.25)
+
+    def test_a_hook_of_ones_own_runs_in_its_window_beside_none_of_d2s(self) -> None:
+        hook = self.Constant(HookConfig(start=2))
+        d2 = D2Hooks(D2Config(retire_after=1), make_adapter(make_model()), TinyStore(), {"constant": hook})
+        assert [float(d2.loss(step, make_views()[:1])) for step in (1, 2)] == [0.0, 0.25]
+        assert d2.step(2).inserted == 0
+        assert set(d2.state_dict()["hooks"]) == {"constant"}
+
+    def test_the_name_of_one_of_d2s_is_refused(self) -> None:
+        with pytest.raises(D2Error, match="named 'prune'"):
+            D2Hooks(D2Config(), make_adapter(make_model()), TinyStore(), {"prune": self.Constant(HookConfig())})
+
+    def test_training_does_not_import_what_it_is_compared_with(self) -> None:
+        code = (
+            "import sys, d2_plugin.runs.run, d2_plugin.commands.train; print([m for m in sys.modules if '.study' in m])"
+        )
+        assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
