@@ -55,10 +55,20 @@ class D2Hooks:
     the global random state is never touched.
     """
 
-    def __init__(self, config: D2Config, backbone: Backbone, store: Store | None = None) -> None:
-        """`store` is anything with `prior(camera, frame) -> DepthPrior | None`; by default the folder config.prior."""
+    def __init__(
+        self,
+        config: D2Config,
+        backbone: Backbone,
+        store: Store | None = None,
+        hooks: Mapping[str, Hook] | None = None,
+    ) -> None:
+        """`store` is anything with `prior(camera, frame) -> DepthPrior | None`; by default the folder config.prior.
+
+        `hooks` are more of them by name, as objects: somebody's own, or what D2 is compared with.
+        """
         self.config, self.backbone = config, backbone
         self.hooks: dict[str, Hook] = {name: HOOKS[name].hook(getattr(config, name)) for name in config.hooks}
+        self.hooks |= _of_other_names(hooks or {})
         self.trace: deque[Trace] = deque(maxlen=1000)
         self.generator = torch.Generator().manual_seed(config.seed)
         self._sampler = ViewSampler()
@@ -73,14 +83,18 @@ class D2Hooks:
 
     @classmethod
     def from_config(
-        cls, config: str | Path | Mapping[str, Any] | D2Config, backbone: Backbone, store: Store | None = None
+        cls,
+        config: str | Path | Mapping[str, Any] | D2Config,
+        backbone: Backbone,
+        store: Store | None = None,
+        hooks: Mapping[str, Hook] | None = None,
     ) -> D2Hooks:
-        """From a TOML file, a mapping or a D2Config."""
+        """From a TOML file, a mapping or a D2Config; `hooks` beside those that it names."""
         if isinstance(config, (str, Path)):
             config = D2Config.from_toml(config)
         elif not isinstance(config, D2Config):
             config = D2Config.from_dict(config)
-        return cls(config, backbone, store)
+        return cls(config, backbone, store, hooks)
 
     @classmethod
     def attach(
@@ -174,7 +188,7 @@ class D2Hooks:
     def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
         """Retire a structure hook whose last evaluations changed next to nothing, because its surveys cost time."""
         config, hook = self.config, self.hooks[name]
-        if not config.retire_after or not HOOKS[name].edits_structure or not context.evaluation:
+        if not config.retire_after or name not in HOOKS or not HOOKS[name].edits_structure or not context.evaluation:
             return
         changed = edit is not None and edit.changes >= max(config.retire_below * len(self.backbone), 1)
         self._idle[name] = 0 if changed else self._idle[name] + 1
@@ -220,6 +234,14 @@ class D2Hooks:
             )
             self._warned = True
         self._count = len(self.backbone)
+
+
+def _of_other_names(hooks: Mapping[str, Hook]) -> dict[str, Hook]:
+    """The hooks that were given as objects; they may not take the name of one of D2's."""
+    for name in hooks:
+        if name in HOOKS:
+            raise D2Error(f"a hook of your own is named '{name}', as one of D2's ({', '.join(HOOKS)}): rename it")
+    return dict(hooks)
 
 
 def _open_store(path: str | None) -> Store:

@@ -1,8 +1,9 @@
 """Which cameras to train on with two, three or four views, and which frames are compared, by data set.
 
-The paper's own camera lists are in a supplement that is not public, and no public code holds lists for two or three
-views. N3DV's four views are those of 4C4D; the other lists are this project's choice. Each data set has one order:
-three views are the two views and one camera more, so scores over the number of views compare like with like.
+The paper's own camera lists are in a supplement that is not public; those of other publications are in
+`d2_plugin.captures.protocols`. N3DV's four views are those of 4C4D; the other lists are this project's choice. Each
+data set has one order: three views are the two views and one camera more, so scores over the number of views compare
+like with like.
 
     preset:4          four views of the data set that the capture is recognised as
     preset:n3dv:4     four views by the order of N3DV, whatever the capture is
@@ -12,22 +13,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from d2_plugin.captures import Capture, open_capture
+from d2_plugin.captures.protocols import OURS, CameraSplit, is_protocol, protocol_split
+from d2_plugin.captures.protocols import PREFIX as PROTOCOL
 from d2_plugin.captures.readers.n3dv import UNSYNCHRONISED
 from d2_plugin.errors import D2Error, unknown_name
 
 PREFIX = "preset:"
 """How a preset begins where camera names are expected."""
-
-
-class CameraSplit(NamedTuple):
-    """Cameras to train on and to score, and what is worth knowing about the choice."""
-
-    train: tuple[str, ...]
-    test: tuple[str, ...]
-    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -117,19 +111,30 @@ def resolve_cameras(
 ) -> tuple[tuple[str, ...], tuple[str, ...] | None, tuple[str, ...]]:
     """(training cameras, test cameras, notes) of a run on the capture in `path`.
 
-    Where `train` is one preset, the capture is opened (headers only) and the names are filled in, those of `test` only
-    where it is None. Names pass through unchanged.
+    Where `train` is one preset or protocol, the capture is opened (headers only) and the names are filled in, those of
+    `test` only where it is None. Names pass through unchanged.
     """
-    if not any(map(is_preset, train)):
+    if split_name(train) is None:
         return train, test, ()
     if len(train) > 1:
         raise D2Error(f"'{', '.join(train)}' mixes a preset with other names: give the preset alone, or names only")
     capture = open_capture(path, intersect=True)
-    split = camera_preset(capture, train[0])
+    split = _split(capture, train[0])
     chosen = split.test if test is None else test
     # A run reads the chosen cameras alone (see `Scene.open`), so only this note says what the others lack.
     said_by_the_run = open_capture(path, cameras=dict.fromkeys((*split.train, *chosen))).notes
     return split.train, chosen, (*split.notes, *(note for note in capture.notes if note not in said_by_the_run))
+
+
+def split_name(train: tuple[str, ...]) -> str | None:
+    """The preset or protocol among what stands for training cameras, None where cameras are named."""
+    return next((text for text in train if is_preset(text) or is_protocol(text)), None)
+
+
+def _split(capture: Capture, text: str) -> CameraSplit:
+    if text.removeprefix(PROTOCOL) in OURS:
+        return camera_preset(capture, f"{PREFIX}{text.rpartition('-')[2]}")
+    return protocol_split(capture, text) if is_protocol(text) else camera_preset(capture, text)
 
 
 def published_frames(capture: Capture) -> tuple[int, ...]:

@@ -21,7 +21,7 @@ class AblationOptions(ConfigFile):
     output: Path
     """Folder of runs, shared priors and tables."""
     rows: tuple[str, ...] = ("ablation", "pruning")
-    """Tables (ablation, pruning, main) or presets, joined by commas; an unknown name shows the list."""
+    """Tables (ablation, pruning, main, rivals) or presets, joined by commas; an unknown name shows the list."""
     backbones: tuple[str, ...] = ("yang4d",)
     """Names joined by commas."""
     seeds: tuple[Seed, ...] = (0, 1, 2)

@@ -61,7 +61,7 @@ def build_priors_on_cluster(
     folder = Path(output).absolute()
     if capture.path is not None:
         capture = replace(capture, path=capture.path.absolute())
-    with _client(scheduler, workers) as client, client.as_current():
+    with cluster_client(scheduler, workers) as client, client.as_current():
         count = _part_count(capture, settings, len(client.nthreads()))
         points = None if sparse_points is None else np.asarray(sparse_points)
         parts = [
@@ -109,12 +109,17 @@ def _joined(parts: list[Any], total: int, progress: Progress | None) -> PriorSum
 
 
 @contextmanager
-def _client(scheduler: str | None, workers: int) -> Iterator[Any]:
-    """A client of the scheduler at that address, or of processes that are started here and ended afterwards."""
+def cluster_client(
+    scheduler: str | None, workers: int, purpose: str = "building priors on a cluster"
+) -> Iterator[Any]:
+    """A client of the scheduler at that address, or of processes that are started here and ended afterwards.
+
+    `purpose` completes the sentence "<purpose> needs dask.distributed".
+    """
     try:
         from distributed import Client, LocalCluster
     except ImportError:
-        raise missing_extra("dask.distributed", "cluster", "building priors on a cluster") from None
+        raise missing_extra("dask.distributed", "cluster", purpose) from None
     if scheduler is not None:
         try:
             client = Client(scheduler, timeout="10s", set_as_default=False)

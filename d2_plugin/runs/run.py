@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,12 @@ from torch import Tensor
 from d2_plugin import registry
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.progress import progress_bar
-from d2_plugin.runs.prior import build_priors_for
+from d2_plugin.runs.prior import FAR_SHARE as FAR_SHARE
+from d2_plugin.runs.prior import build_priors_for, sees_far
 from d2_plugin.runs.provenance import circumstances
-from d2_plugin.runs.scene import Scene
-from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config
+from d2_plugin.runs.scene import Guidance, Remembered, Scene
+from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, claim, hook_config, stored, write_json
 from d2_plugin.runs.start import (
     TimedPoints,
     TrainingFrames,
@@ -34,9 +33,6 @@ from d2_plugin.runs.start import (
 RENDERED_ALPHA = 0.5
 """A rendered depth is reported where the accumulated alpha exceeds this."""
 
-FAR_SHARE = 0.005
-"""Mean share of far pixels in the prior above which the backbone gets a background."""
-
 CHECKPOINTS = 10
 """How often a run is saved. One that was cut off continues from its last checkpoint, bitwise."""
 
@@ -44,11 +40,13 @@ CHECKPOINTS = 10
 class Run:
     """A run folder: run.json (settings), points.npz, priors/, checkpoint.pt, metrics.json, pictures/."""
 
-    def __init__(self, settings: RunSettings, folder: Path) -> None:
-        self.settings, self.folder = check(settings), folder
+    def __init__(self, settings: RunSettings, folder: Path, guidance: Guidance | None = None) -> None:
+        self.settings, self.folder, self.guidance = check(settings), folder, guidance
         self.scene = Scene.open(self.settings)
-        _claim(folder, self.settings)
+        claim(folder, self._identity())
         self.seconds = {"priors": 0.0, "train": 0.0, "eval": 0.0}
+        self.cpu_seconds = dict(self.seconds)
+        """The same in CPU time of this process, which other work on the machine does not change."""
         self.retired: dict[str, int] = {}
         """Hooks that stopped because they changed next to nothing, and at which step."""
 
@@ -58,12 +56,13 @@ class Run:
         path = folder / "run.json"
         if not path.is_file():
             raise D2Error(f"{folder} holds no run: expected run.json; give the --output folder of `d2 train`")
-        return cls(RunSettings.from_table(json.loads(path.read_text()), str(path)), folder)
+        settings, guidance = stored(path)
+        return cls(settings, folder, None if guidance is None else Remembered(guidance))
 
     @property
     def uses_prior(self) -> bool:
-        """Whether any hook of this run needs the depth prior."""
-        return any(name in self.settings.hooks for name in HOOK_NAMES[1:])
+        """Whether anything that guides this run needs the depth prior."""
+        return self.guidance is not None or any(name in self.settings.hooks for name in HOOK_NAMES[1:])
 
     def prepare(self, priors: bool = True) -> TimedPoints:
         """Triangulate the sparse points and build the depth prior where they are missing; returns the points."""
@@ -99,7 +98,7 @@ class Run:
         with self._timed("eval"):
             scores = self._scores(trainer.model, self.folder / "pictures" if pictures else None)
         metrics = scores | self._about(trainer)
-        _write_json(self.folder / "metrics.json", metrics)
+        write_json(self.folder / "metrics.json", metrics)
         write_tables(metrics, self.folder)
         return metrics
 
@@ -132,10 +131,13 @@ class Run:
             "gaussians": len(trainer.model),
             "iterations": trainer.step,
             "seconds": {name: round(value, 3) for name, value in self.seconds.items()},
+            "cpu_seconds": {name: round(value, 3) for name, value in self.cpu_seconds.items()},
             "train_cameras": list(scene.train_cameras),
             "test_cameras": list(scene.test_cameras),
+            "protocol": self.settings.protocol,
             "backbone": self.settings.backbone,
             "hooks": list(self.settings.hooks),
+            "guidance": None if self.guidance is None else dict(self.guidance.identity()),
             "retired": self.retired,
             "background": getattr(trainer.model, "background", None) is not None,
             "appearance": getattr(trainer.model, "appearance", None) is not None,
@@ -183,6 +185,8 @@ class Run:
         self.scene = self.scene.with_points(triangulated, self.settings)
         capture, cameras = self.scene.capture, self.scene.train_cameras
         extent = scene_extent(capture, cameras, triangulated.positions)
+        if self.guidance is not None and attach:
+            triangulated = self.guidance.start(self.scene, triangulated, self.priors)
         start = initial_points(capture, cameras, triangulated, extent, self.settings.seed)
         model = backbone.create(
             *start.tensors(self.settings.device),
@@ -202,13 +206,7 @@ class Run:
 
     def _sees_far(self) -> bool:
         """Whether the depth prior, where there is one, found far pixels: only then a background pays."""
-        if not (self.priors / "store.json").is_file():
-            return False
-        store = PriorStore.open(self.priors)
-        cameras = [camera for camera in self.scene.train_cameras if camera in store.cameras]
-        keys = ((camera, frame) for camera in cameras for frame in self.scene.capture.frames)
-        records = [record for key in keys if (record := store.record(*key)) is not None]
-        return bool(records) and sum(r["shares"].get("far", 0.0) for r in records) / len(records) > FAR_SHARE
+        return sees_far(self.priors, self.scene.train_cameras, self.scene.capture.frames)
 
     def _trained(self) -> Any:
         """The trainer at the last checkpoint, without hooks or a look at the prior: the checkpoint says it all."""
@@ -221,7 +219,14 @@ class Run:
         adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
         config = hook_config(self.settings, self.priors)
         (self.folder / "d2.toml").write_text(config.to_toml())
-        return D2Hooks.from_config(config, backbone=adapter(model))
+        guidance, priors = self.guidance, self.priors
+        others = {} if guidance is None else guidance.hooks(self.scene, self._points(), priors)
+        return D2Hooks.from_config(config, backbone=adapter(model), hooks=others)
+
+    def _identity(self) -> dict[str, Any]:
+        """What makes two runs the same run, as run.json has it."""
+        guidance = {} if self.guidance is None else {"guidance": dict(self.guidance.identity())}
+        return self.settings.as_table() | guidance
 
     def _renderer(self, model: Any) -> Callable[[str, int], tuple[Tensor, Tensor]]:
         @torch.no_grad()
@@ -235,7 +240,7 @@ class Run:
         return render
 
     def _save(self, trainer: Any) -> None:
-        state = trainer.state_dict() | {"seconds": dict(self.seconds)}
+        state = trainer.state_dict() | {"seconds": dict(self.seconds), "cpu_seconds": dict(self.cpu_seconds)}
         temporary = self.folder / "checkpoint.tmp"
         torch.save(state, temporary)
         os.replace(temporary, self.folder / "checkpoint.pt")
@@ -250,38 +255,15 @@ class Run:
             state["d2"] = None
         trainer.load_state_dict(state)
         self.seconds = {name: max(value, self.seconds[name]) for name, value in state["seconds"].items()}
+        before = state.get("cpu_seconds", {})  # 0.1.0 kept none
+        self.cpu_seconds = {name: max(value, before.get(name, 0.0)) for name, value in self.cpu_seconds.items()}
         return True
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
-        start = time.monotonic()
+        start, cpu = time.monotonic(), time.process_time()
         try:
             yield
         finally:
             self.seconds[name] += time.monotonic() - start
-
-
-def _claim(folder: Path, settings: RunSettings) -> None:
-    """Take the folder, or find this very run in it; anything else is refused and nothing is written."""
-    identity = settings.as_table()
-    path = folder / "run.json"
-    if path.is_file():
-        found = RunSettings.from_table(json.loads(path.read_text()), str(path)).as_table()
-        changed = sorted(k for k in identity.keys() | found.keys() if identity.get(k) != found.get(k))
-        if changed:
-            raise D2Error(
-                f"{folder} holds another run, made with other settings of {', '.join(changed)}: "
-                "give another --output, or remove that folder"
-            )
-        return
-    if folder.is_dir() and any(folder.iterdir()):
-        raise D2Error(f"{folder} is not empty and holds no run of ours: give another --output")
-    folder.mkdir(parents=True, exist_ok=True)
-    _write_json(path, identity)
-
-
-def _write_json(path: Path, table: Mapping[str, Any]) -> None:
-    """Write a table; who reads the file meanwhile finds the old one or the new one, whole."""
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(table, indent=1))
-    os.replace(temporary, path)
+            self.cpu_seconds[name] += time.process_time() - cpu

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Protocol
 
 from d2_plugin.captures import Capture, open_capture
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.hooks import Hook
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
 from d2_plugin.runs.settings import RunSettings, prior_settings
 from d2_plugin.runs.start import TimedPoints
@@ -40,6 +43,38 @@ class Scene:
         decision = appearance_decision(self.capture, self.train_cameras, points.positions, points.times)
         plan = self.plan.with_decision(decision).override(**settings.overrides.get("plan", {}))
         return replace(self, plan=plan)
+
+
+class Guidance(Protocol):
+    """What guides a run in place of D2's hooks: an object that is given to it, so a run never imports a rival."""
+
+    def identity(self) -> Mapping[str, Any]:
+        """Its `name` and settings as JSON has them: part of what makes two runs the same run."""
+
+    def start(self, scene: Scene, points: TimedPoints, priors: Path) -> TimedPoints:
+        """What Gaussians start from, given the triangulated points and the folder of the depth prior."""
+
+    def hooks(self, scene: Scene, points: TimedPoints, priors: Path) -> Mapping[str, Hook]:
+        """The hooks that run in place of D2's, by name."""
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """The guidance of a run that lies in a folder: it can be scored and looked at, and only its maker trains it on."""
+
+    found: Mapping[str, Any]
+
+    def identity(self) -> Mapping[str, Any]:
+        """As run.json has it."""
+        return self.found
+
+    def start(self, scene: Scene, points: TimedPoints, priors: Path) -> TimedPoints:
+        """The triangulated points; a checkpoint takes their place."""
+        return points
+
+    def hooks(self, scene: Scene, points: TimedPoints, priors: Path) -> Mapping[str, Hook]:
+        """Refused: what the hooks are is known by name only."""
+        raise D2Error(f"this run is guided by '{self.found['name']}': continue it with the command that began it")
 
 
 def _split(capture: Capture, settings: RunSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:

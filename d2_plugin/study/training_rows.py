@@ -53,6 +53,9 @@ def _row(folder: Path) -> Row:
         gaussians=metrics["gaussians"],
         iterations=metrics["iterations"],
         seed=settings.get("seed"),
+        protocol=settings.get("protocol"),
+        frames=settings.get("frames"),
+        test_cameras=metrics.get("test_cameras"),
         mono_emulated=metrics.get("mono_emulated", False),
         scores=scores,
     )
@@ -66,6 +69,10 @@ def command_of(metrics: dict[str, Any], settings: dict[str, Any], output: str) -
     words += ["--backbone", metrics["backbone"], "--iterations", str(metrics["iterations"])]
     words += ["--hooks", "all" if set(hooks) == set(HOOK_NAMES) else ",".join(hooks) or "none"]
     words += ["--seed", str(settings.get("seed", 0))]
+    if settings.get("frames"):
+        words += ["--frames", ",".join(map(str, settings["frames"]))]
+    if settings.get("test_cameras"):
+        words += ["--test-cameras", ",".join(settings["test_cameras"])]
     for name in ("downscale", "mono_kind"):
         if settings.get(name) not in (None, 1):
             words += [f"--{name.replace('_', '-')}", str(settings[name])]
@@ -77,15 +84,18 @@ def command_of(metrics: dict[str, Any], settings: dict[str, Any], output: str) -
 
 
 def case_of(metrics: dict[str, Any], settings: dict[str, Any]) -> str:
-    """The capture, how many cameras trained, and the size where it is not the capture's own."""
+    """The capture, how many cameras trained, the size where it is not its own, and the protocol where one chose."""
     smaller = settings.get("downscale", 1)
     size = f", 1/{smaller} size" if smaller > 1 else ""
-    return f"{metrics['capture']}, {len(metrics['train_cameras'])} views{size}"
+    protocol = f", {settings['protocol']}" if settings.get("protocol") else ""
+    return f"{metrics['capture']}, {len(metrics['train_cameras'])} views{size}{protocol}"
 
 
 def method_of(metrics: dict[str, Any]) -> str:
     """The backbone with its hooks: `yang4d`, `yang4d + D2`, or the hooks by name."""
     hooks = [name for name in metrics["hooks"] if name != "prior"]
+    if metrics.get("guidance"):
+        return f"{metrics['backbone']} + {metrics['guidance']['name']}"
     if not hooks:
         return metrics["backbone"]
     return f"{metrics['backbone']} + " + ("D2" if set(HOOK_NAMES[1:]) <= set(hooks) else ", ".join(hooks))

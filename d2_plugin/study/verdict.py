@@ -1,4 +1,7 @@
-"""When a difference between runs means something: at least three seeds, and more than two standard errors."""
+"""What runs over several seeds say: means with their standard error, and when a difference means something.
+
+It takes at least three seeds, and more than two standard errors.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,35 @@ LEAST_SEEDS = 3
 """Two seeds agree by chance in far too many experiments, and one has no spread at all."""
 
 _COUNTS = {0: "no seed", 1: "one seed", 2: "two seeds"}
+
+
+def seeds_in_words(count: int) -> str:
+    """What stands beside a mean: `one seed` and `two seeds`, which claim nothing, or the number."""
+    return _COUNTS.get(count, str(count))
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The mean over the seeds, and how far it may be off."""
+
+    mean: float
+    error: float | None
+    """Standard error of the mean, s / sqrt(n) with the sample deviation s; None for a single seed."""
+    seeds: int
+
+    @classmethod
+    def of(cls, values: Sequence[float | None]) -> Estimate | None:
+        """Of what was measured; None where nothing was."""
+        known = [value for value in values if value is not None]
+        if not known:
+            return None
+        error = math.sqrt(variance(known) / len(known)) if len(known) > 1 else None
+        return cls(mean(known), error, len(known))
+
+    def text(self, form: str, sign: str = "±") -> str:
+        """Such as `28.94 ± 0.17`, or the mean alone where there is no error."""
+        error = "" if self.error is None else f" {sign} {format(self.error, form)}"
+        return f"{format(self.mean, form)}{error}"
 
 
 @dataclass(frozen=True)

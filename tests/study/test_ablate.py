@@ -18,6 +18,7 @@ from d2_plugin.study.ablation import tables
 from d2_plugin.study.ablation.claims import Claim, claims
 from d2_plugin.study.ablation.job import Job
 from d2_plugin.study.ablation.presets import PRESETS, TABLES, rows_named
+from d2_plugin.study.verdict import Estimate
 
 
 def settings_of(name: str, capture: str = "room", **tables: object) -> RunSettings:
@@ -89,17 +90,23 @@ def order(**psnr: list[float]) -> dict[str, Claim]:
 
 
 class TestTables:
-    def test_a_cell_is_mean_and_sample_deviation(self) -> None:
+    def test_a_cell_is_mean_and_standard_error(self) -> None:
         text = tables.table(results(full=[28.0, 30.0]), "yang4d", ["full"])
-        assert "| D²-4DGS | 29.00 ± 1.41 |" in text
+        assert "| D²-4DGS | two seeds | 29.00 ± 1.00 |" in text  # the sample deviation, 1.41, over sqrt(2)
         assert "| - |" in text  # LPIPS was not measured
+        assert "| D²-4DGS | 3 | 29.00 ± 0.58 |" in tables.table(results(full=[28.0, 29.0, 30.0]), "yang4d", ["full"])
+
+    def test_one_seed_says_so_and_has_no_error(self) -> None:
+        text = tables.table(results(full=[28.0]), "yang4d", ["full"])
+        assert "| D²-4DGS | one seed | 28.00 |" in text
+        assert "±" not in text
 
     def test_latex_has_a_row_per_variant(self) -> None:
         text = tables.table(
             results(full=[28.0, 30.0], backbone=[25.0, 26.0]), "yang4d", ["backbone", "full"], as_latex=True
         )
         assert text.count(r"\pm") == 2 * 6
-        assert r"D$^2$-4DGS & $29.00 \pm 1.41$" in text
+        assert r"D$^2$-4DGS & two seeds & $29.00 \pm 1.00$" in text
 
     def test_an_order_that_fails_is_said_with_its_margin(self) -> None:
         found = order(full=[28.0, 28.1, 27.9], backbone=[25.0, 25.1, 24.9], no_pruning=[28.5, 28.6, 28.4])
@@ -136,9 +143,16 @@ class TestTables:
         assert "| 22.21 |" in text
         assert "not measured here" in text
 
-    def test_statistics_leave_out_what_was_not_measured(self) -> None:
-        assert tables.statistics([None, 2.0, None]) == (2.0, 0.0)
-        assert tables.statistics([None]) is None
+    def test_a_mean_leaves_out_what_was_not_measured(self) -> None:
+        assert Estimate.of([None, 2.0, None]) == Estimate(2.0, None, 1)
+        assert Estimate.of([None]) is None
+
+    def test_rivals_stand_in_a_table_of_their_own_beside_the_papers(self) -> None:
+        made = results(**{name: [28.0] for name in (*TABLES["pruning"], *TABLES["rivals"])})
+        text = tables.report(made, rows_named(["pruning", "rivals"]))
+        pruning, rivals = text.split("| Pearson depth (FSGS) |", 1)
+        assert "paper's PSNR" in pruning
+        assert "| Dense start (GC-4DGS) |" in rivals
 
 
 def test_the_command_trains_shares_priors_and_repeats_nothing(

@@ -159,6 +159,60 @@ def test_which_variant_is_best_is_said_metric_by_metric(tmp_path: Path) -> None:
     assert found["yang4d mvs_only"][2].startswith("two seeds: no verdict (-0.1")
 
 
+def trained(seed: int, psnr: float, commit: str = "aaa", **more: object) -> Row:
+    """A run of `d2 train` as a row."""
+    about = {"prior_seconds": 0.0, "gaussians": 1, "iterations": 2000, "seed": seed, "run": f"run{psnr}", **more}
+    row = make_row(
+        *("training", "room, 4 views", "yang4d + D2", f"2000 steps, seed {seed}"),
+        error=10 ** (-psnr / 20),
+        seconds=1.0,
+        scores={"psnr": psnr},
+        **about,
+    )
+    return {**row, "commit": commit}
+
+
+def cells(text: str, start: str) -> list[str]:
+    """The cells of the first table line that begins so."""
+    line = next(line for line in text.splitlines() if line.startswith(start))
+    return [cell.strip(" *") for cell in line.strip("|").split("|")]
+
+
+class TestSeeds:
+    def table(self, rows: list[Row], folder: Path) -> str:
+        return make_report(rows, folder)[1].read_text()
+
+    def test_a_mean_has_its_standard_error_and_one_seed_says_so(self, tmp_path: Path) -> None:
+        text = self.table([trained(seed, psnr) for seed, psnr in enumerate((28.0, 29.0, 30.0))], tmp_path / "a")
+        assert cells(text, "| room, 4 views | yang4d + D2, 2000 steps")[2:4] == ["3", "29.00 ± 0.58"]
+        text = self.table([trained(0, 28.0)], tmp_path / "b")
+        assert cells(text, "| room, 4 views | yang4d + D2, 2000 steps")[2:4] == ["one seed", "28.00"]
+
+    def test_a_seed_that_was_run_again_is_no_further_seed(self, tmp_path: Path) -> None:
+        text = self.table([trained(0, 28.0), trained(1, 30.0), trained(0, 28.0)], tmp_path)
+        assert cells(text, "| room, 4 views | yang4d + D2, 2000 steps")[2:4] == ["two seeds", "29.00 ± 1.00"]
+
+    def test_one_seed_with_two_scores_is_two_runs_that_differ_by_more(self, tmp_path: Path) -> None:
+        text = self.table([trained(0, 28.0), trained(0, 22.0)], tmp_path)
+        assert cells(text, "| room, 4 views | yang4d + D2, 2000 steps, run28.0")[2:4] == ["one seed", "28.00"]
+        assert cells(text, "| room, 4 views | yang4d + D2, 2000 steps, run22.0")[2:4] == ["one seed", "22.00"]
+
+
+class TestVersions:
+    def test_commits_that_measured_the_same_run_are_compared_across_commands(self, tmp_path: Path) -> None:
+        rows = [trained(seed, 28.0 + 0.1 * seed) for seed in range(3)]
+        older = [ablated("yang4d full", seed, psnr=27.0 + 0.1 * seed) for seed in range(3)]
+        rows += [{**row, "iterations": 2000, "commit": "bbb"} for row in older]
+        text = make_report(rows, tmp_path)[1].read_text().partition("## Versions")[2]
+        assert cells(text, "| room, 4 views, yang4d + D2, 2000 steps | aaa | bbb")[3] == "holds (+1.00 ± 0.08 dB)"
+
+    def test_fewer_than_three_seeds_or_another_length_are_not_compared(self, tmp_path: Path) -> None:
+        rows = [trained(seed, 28.0) for seed in range(3)]
+        rows += [trained(seed, 27.0, "bbb") for seed in range(2)]
+        rows += [trained(seed, 27.0, "ccc", iterations=1000) for seed in range(3)]
+        assert "## Versions" not in make_report(rows, tmp_path)[1].read_text()
+
+
 def test_a_headline_of_too_few_seeds_has_no_verdict(report: Path) -> None:
     top, _, _ = (report / "report.md").read_text().partition("\n## ")
     assert re.search(r"yang4d \+ D2 PSNR [\d.]+ dB in [\d.]+ min \(2 seeds: no verdict\)", top)

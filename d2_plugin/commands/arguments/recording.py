@@ -26,7 +26,8 @@ CAPTURE = ("capture", "train_cameras", "frames", "downscale", "mono_onnx", "mono
 WRITTEN = {
     "capture": "images/CAMERA/FRAME.png with cameras.json, or as N3DV, Technicolor, ENeRF-Outdoor, COLMAP or "
     "transforms.json lay it out.",
-    "train_cameras": "Names joined by commas, as in 00,02,05,07; or preset:2, preset:3, preset:4 for a known data set.",
+    "train_cameras": "Names joined by commas, as in 00,02,05,07; or preset:2, preset:3, preset:4 for a known data set; "
+    "or protocol:gc-4dgs-4, protocol:4c4d and others for a published split.",
     "test_cameras": "Names joined by commas.",
     "frames": "Written first:last or first:last:step, the last one included.",
     "hooks": "all, none, or names joined by commas.",
@@ -92,7 +93,7 @@ def all_tables(backbone: str) -> dict[str, Group]:
 
 def run_settings(given: Given, **more: Any) -> RunSettings:
     """The settings of a run that were given, with camera presets resolved and the tables of file and flags."""
-    from d2_plugin.captures.presets import resolve_cameras
+    from d2_plugin.captures.presets import resolve_cameras, split_name
     from d2_plugin.runs.settings import RunSettings
 
     train, test, notes = resolve_cameras(
@@ -100,6 +101,7 @@ def run_settings(given: Given, **more: Any) -> RunSettings:
     )
     say_notes(notes)
     overrides = _over(read_toml(given.values["config"]), given.tables)
+    more["protocol"] = split_name(given.values["train_cameras"])
     return given.make(RunSettings, train_cameras=train, test_cameras=test, overrides=overrides, **more)
 
 

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
-from d2_plugin.priors.files import EntryFolder
+from d2_plugin.priors.files import Entry, EntryFolder
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.stereo.filter import GeometricDepth
 from d2_plugin.priors.store import SIGMA, DepthRange, encode_sigma
@@ -51,6 +51,13 @@ class StoredDepth:
     record: dict[str, Any]
 
 
+def stored_depth(entry: Entry) -> StoredDepth:
+    """What one entry of the cache holds."""
+    codes = entry.array(STEREO_DTYPE)
+    depth = DepthRange(*entry.record["depth_range"]).decode(codes["depth"])
+    return StoredDepth(depth, SIGMA[codes["sigma"]], entry.record)
+
+
 class DepthCache:
     """Depth of a source, computed once and kept as logarithms: depth in 16 bits, sigma in 8.
 
@@ -76,9 +83,7 @@ class DepthCache:
         for camera in self.source.cameras:
             entry = self.entries.find_current(camera.name, frame.number, key)
             if entry is not None:
-                codes = entry.array(STEREO_DTYPE)
-                depth = DepthRange(*entry.record["depth_range"]).decode(codes["depth"])
-                found[camera.name] = StoredDepth(depth, SIGMA[codes["sigma"]], entry.record)
+                found[camera.name] = stored_depth(entry)
         return found
 
     def _store(self, frame: Frame, results: Sequence[GeometricDepth]) -> None:

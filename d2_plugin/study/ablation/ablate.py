@@ -1,4 +1,4 @@
-"""`d2 ablate`: the paper's ablation tables on any capture, each variant over several seeds, as mean and deviation."""
+"""`d2 ablate`: the paper's ablation tables, and rivals, on any capture: each row over several seeds."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from d2_plugin.study.ablation.job import Job, Metrics
 from d2_plugin.study.ablation.presets import Preset
 from d2_plugin.study.ablation.tables import report
 from d2_plugin.study.rows import Row, append_rows, make_row
+from d2_plugin.study.shared import same_backbone, share
 
 
 def jobs(
@@ -23,9 +24,15 @@ def jobs(
 ) -> list[Job]:
     """Every run, preset by preset; runs with the same prior settings share one prior under `output`/priors.
 
-    `base` gives capture, cameras, iterations and the user's own tables; hooks, backbone and seed are set here.
+    Where any row uses a prior, points and full prior are made here, and all rows get the background that it asks for.
+
+    Args:
+        base: gives capture, cameras, iterations and the user's own tables; hooks, backbone and seed are set here.
+        presets, backbones, seeds: what is run.
+        output: folder of the ablation.
     """
-    made = []
+    output, made = output.absolute(), []
+    shared = share(base, output) if any(preset.hooks or preset.rival for preset in presets) else None
     for backbone in backbones:
         for preset in presets:
             for seed in seeds:
@@ -33,7 +40,9 @@ def jobs(
                     base, backbone=backbone, hooks=preset.hooks, seed=seed, overrides=preset.merged(base.overrides)
                 )
                 settings = replace(settings, priors=str(output / "priors" / prior_settings(settings).variant))
-                made.append(Job(preset.name, backbone, seed, settings, output / backbone / preset.name / f"seed{seed}"))
+                settings = settings if shared is None else same_backbone(settings, shared)
+                folder = output / backbone / preset.name / f"seed{seed}"
+                made.append(Job(preset.name, backbone, seed, settings, folder, preset.rival))
     return made
 
 
@@ -63,24 +72,22 @@ def run_jobs(work: Sequence[Job], workers: int) -> dict[Job, Metrics]:
 
 def _finished(job: Job) -> Metrics | None:
     """The metrics of a job that ran to its end with the same settings."""
-    from d2_plugin.runs.run import Run
-
     path = job.folder / "metrics.json"
     if not path.is_file():
         return None
-    Run(job.settings, job.folder)  # refuses a folder of other settings, with one sentence
+    job.run()
     metrics = json.loads(path.read_text())
     return metrics if metrics["iterations"] == job.settings.iterations else None
 
 
 def _share(work: Sequence[Job]) -> None:
-    """Triangulate once, and build each prior once, so that runs side by side never build the same thing twice."""
-    from d2_plugin.runs.run import Run
-
+    """Points for every run, and the other priors, each built once: runs side by side never build the same twice."""
     built: set[str | None] = set()
-    points: Path | None = None
+    output = Path(str(work[0].settings.priors)).parents[1]
+    shared = share(work[0].settings, output) if (output / "shared.json").is_file() else None
+    points = output / "points.npz" if shared is not None else None
     for job in work:
-        run = Run(job.settings, job.folder)
+        run = job.run()
         if points is None:
             run.prepare(priors=False)
             points = run.folder / "points.npz"
@@ -91,18 +98,19 @@ def _share(work: Sequence[Job]) -> None:
             built.add(job.settings.priors)
             measured = _prior_seconds_file(job.settings)
             if not measured.exists():  # a build that was cut off and continues would time its second part alone
-                measured.write_text(json.dumps(run.seconds["priors"]))
+                whole = shared is not None and Path(str(job.settings.priors)) == shared.priors
+                measured.write_text(json.dumps(shared.seconds if shared and whole else run.seconds["priors"]))
 
 
 def _prior_seconds_file(settings: RunSettings) -> Path:
     return Path(f"{settings.priors}.seconds.json")
 
 
-def _prior_seconds(settings: RunSettings) -> float | None:
-    """How long the prior of a run took, which others share; 0 without a prior, None where it was not measured."""
-    if not settings.hooks:
+def _prior_seconds(job: Job) -> float | None:
+    """How long the prior of a run took, which others share; 0 without one, None where it was not measured."""
+    if not job.settings.hooks and job.rival is None:
         return 0.0
-    measured = _prior_seconds_file(settings)
+    measured = _prior_seconds_file(job.settings)
     return json.loads(measured.read_text()) if measured.exists() else None
 
 
@@ -114,9 +122,7 @@ def _prepare_worker() -> None:
 
 
 def _run(job: Job) -> Metrics:
-    from d2_plugin.runs.run import Run
-
-    run = Run(job.settings, job.folder)
+    run = job.run()
     run.train()
     return run.evaluate(pictures=job.seed == 0)
 
@@ -135,9 +141,10 @@ def write(results: Mapping[Job, Metrics], presets: Sequence[Preset], output: Pat
 def _row(job: Job, metrics: Metrics, command: str) -> Row:
     scores = metrics["test"] or {}
     psnr = scores.get("psnr")
+    protocol = job.settings.protocol
     return make_row(
         "ablation",
-        f"{metrics['capture']}, {len(metrics['train_cameras'])} cameras",
+        f"{metrics['capture']}, {len(metrics['train_cameras'])} cameras" + (f", {protocol}" if protocol else ""),
         f"{job.backbone} {job.preset}",
         f"seed {job.seed}",
         error=None if psnr is None else 10 ** (-psnr / 20),
@@ -146,5 +153,6 @@ def _row(job: Job, metrics: Metrics, command: str) -> Row:
         scores=scores,
         gaussians=metrics["gaussians"],
         iterations=metrics["iterations"],
-        prior_seconds=_prior_seconds(job.settings),
+        prior_seconds=_prior_seconds(job),
+        protocol=protocol,
     )

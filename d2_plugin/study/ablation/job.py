@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
+from d2_plugin.study.rivals.table import rival
 
 Metrics = Mapping[str, Any]
 """What metrics.json of a run holds."""
@@ -22,3 +24,9 @@ class Job:
     seed: int
     settings: RunSettings
     folder: Path
+    rival: str | None = None
+    """What guides it in place of D2's hooks."""
+
+    def run(self) -> Run:
+        """The run in its folder; refuses a folder of other settings, with one sentence."""
+        return Run(self.settings, self.folder, rival(self.rival, self.settings.iterations))

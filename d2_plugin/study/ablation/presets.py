@@ -8,6 +8,7 @@ from typing import Any
 
 from d2_plugin.errors import unknown_name
 from d2_plugin.runs.settings import HOOK_NAMES
+from d2_plugin.study.rivals.table import RIVALS
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,8 @@ class Preset:
     hooks: tuple[str, ...] = HOOK_NAMES
     overrides: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Tables over the defaults, as in a configuration file."""
+    rival: str | None = None
+    """What guides the run in place of D2's hooks, see `d2_plugin.study.rivals.table`."""
 
     def merged(self, tables: Mapping[str, Any]) -> dict[str, Any]:
         """The user's `tables` with this preset's settings over them; neither is changed."""
@@ -59,6 +62,7 @@ PRESETS: dict[str, Preset] = {
             "D²-4DGS, own densification off",
             overrides={"backbone": {"densify": {"enabled": False}}},
         ),
+        *(Preset(name, found.title, (), rival=name) for name, found in RIVALS.items()),
     )
 }
 """By name. In the prior variants densification, pruning and RGB-D optimization are those of `full`, as in the paper."""
@@ -78,9 +82,10 @@ TABLES: dict[str, tuple[str, ...]] = {
     ),
     "pruning": ("no_pruning", "opacity_only", "depth_only", "full"),
     "main": ("backbone", "full"),
+    "rivals": ("backbone", *RIVALS, "full"),
 }
-"""The rows of each table: the paper's tab:ablation (and one row of ours), its tab:pruning_criteria, and the two that
-its tab:main_results compares. A row that two tables share is run once."""
+"""The rows of each table: the paper's tab:ablation (and one row of ours), its tab:pruning_criteria, the two that its
+tab:main_results compares, and what users would pick instead. A row that two tables share is run once."""
 
 
 def rows_named(names: Sequence[str]) -> tuple[Preset, ...]:

@@ -1,12 +1,12 @@
-"""The tables of an ablation: mean ± deviation over the seeds, and whether the paper's order of the rows holds here."""
+"""The tables of an ablation: mean ± standard error over the seeds, and whether the paper's order of rows holds here."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from statistics import mean, stdev
 
 from d2_plugin.runs.markup import Table, latex, markdown
 from d2_plugin.runs.tables import STUDY_COLUMNS
+from d2_plugin.study.verdict import Estimate, seeds_in_words
 
 from .claims import EXPLANATION, Scores, claims_table
 from .job import Job, Metrics
@@ -14,16 +14,11 @@ from .paper_tables import MARK, SOURCE, paper_rows
 from .paper_tables import TABLES as PAPER_TABLES
 from .presets import PRESETS, TABLES, Preset
 
-OTHERS = (*TABLES["ablation"][:8], "opacity_only", "depth_only")
-"""Rows that the paper puts below the full method."""
+OTHERS = (*TABLES["ablation"][:8], "opacity_only", "depth_only", *TABLES["rivals"][1:-1])
+"""Rows that the paper puts below the full method, and the rivals."""
 
 
-def statistics(values: Sequence[float | None]) -> tuple[float, float] | None:
-    """Mean and sample deviation (0 for a single value); None where nothing was measured."""
-    known = [value for value in values if value is not None]
-    if not known:
-        return None
-    return mean(known), stdev(known) if len(known) > 1 else 0.0
+PLUS_MINUS = r"\pm"
 
 
 def table(
@@ -33,11 +28,11 @@ def table(
     as_latex: bool = False,
     published: Mapping[str, float] | None = None,
 ) -> str:
-    """One table, Markdown or LaTeX: mean ± deviation over seeds per preset; what was not measured shows as `-`.
+    """One table, Markdown or LaTeX: mean ± standard error over seeds per preset; what was not measured shows as `-`.
 
     `published` holds the paper's PSNR by preset: it stands in a column of its own, labelled as the paper's.
     """
-    header = ["variant", *(column.title for column in STUDY_COLUMNS), "Gaussians", "train s"]
+    header = ["variant", "seeds", *(column.title for column in STUDY_COLUMNS), "Gaussians", "train s"]
     lines = [[PRESETS[name].title, *_cells(_of(results, backbone, name), as_latex)] for name in rows]
     if published:
         header.append(f"{MARK} paper's PSNR")
@@ -52,17 +47,16 @@ def _of(results: Mapping[Job, Metrics], backbone: str, preset: str) -> list[Metr
 
 def _cells(runs: Sequence[Metrics], as_latex: bool) -> list[str]:
     scores = [run["test"] or {} for run in runs]
-    found = [(statistics([score.get(column.key) for score in scores]), column.form) for column in STUDY_COLUMNS]
-    found.append((statistics([run["gaussians"] for run in runs]), ".0f"))
-    found.append((statistics([run["seconds"]["train"] for run in runs]), ".1f"))
-    return [_cell(value, form, as_latex) for value, form in found]
+    found = [(Estimate.of([score.get(column.key) for score in scores]), column.form) for column in STUDY_COLUMNS]
+    found.append((Estimate.of([run["gaussians"] for run in runs]), ".0f"))
+    found.append((Estimate.of([run["seconds"]["train"] for run in runs]), ".1f"))
+    return [seeds_in_words(len(runs)), *(_cell(value, form, as_latex) for value, form in found)]
 
 
-def _cell(value: tuple[float, float] | None, form: str, as_latex: bool) -> str:
+def _cell(value: Estimate | None, form: str, as_latex: bool) -> str:
     if value is None:
         return "-"
-    middle, spread = (format(number, form) for number in value)
-    return f"${middle} \\pm {spread}$" if as_latex else f"{middle} ± {spread}"
+    return f"${value.text(form, PLUS_MINUS)}$" if as_latex else value.text(form)
 
 
 def scores_of(results: Mapping[Job, Metrics], backbone: str) -> Scores:
@@ -87,9 +81,11 @@ def report(results: Mapping[Job, Metrics], presets: Sequence[Preset], as_latex: 
         parts.append(f"% {backbone}" if as_latex else f"## {backbone}")
         complete = [title for title, rows in TABLES.items() if title != "main" and set(rows) <= names]
         for title in complete:
-            published = {row.preset: row.psnr for row in paper_rows(title) if row.preset}
+            of_paper = paper_rows(title) if title in PAPER_TABLES else []
+            published = {row.preset: row.psnr for row in of_paper if row.preset}
             parts.append(table(results, backbone, TABLES[title], as_latex, published))
-            parts.append(f"{'% ' if as_latex else ''}{MARK} {SOURCE} ({PAPER_TABLES[title]}).")
+            if of_paper:
+                parts.append(f"{'% ' if as_latex else ''}{MARK} {SOURCE} ({PAPER_TABLES[title]}).")
         if not complete:
             parts.append(table(results, backbone, [preset.name for preset in presets], as_latex))
         order = order_table(results, backbone)

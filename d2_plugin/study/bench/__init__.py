@@ -20,5 +20,6 @@ BENCHMARKS = {
     "raster": Benchmark("d2_plugin.study.bench.raster", "RasterBench", "the rasterizer: time, memory, precision"),
     "scaling": Benchmark("d2_plugin.study.bench.scaling", "ScalingBench", "priors and training over more frames"),
     "stereo": Benchmark("d2_plugin.study.bench.stereo", "StereoBench", "geometric depth: matchers and settings"),
+    "training": Benchmark("d2_plugin.study.training.bench", "TrainingBench", "D², backbone and rivals at equal time"),
 }
 """Every benchmark by name; none is imported before it is asked for."""

@@ -22,7 +22,7 @@ FULL, BACKBONE = "full", "backbone"
 
 
 def ablation(rows: Sequence[Row]) -> Section:
-    """What each variant gains over the backbone alone, every seed a mark, and the scores as mean and deviation."""
+    """What each variant gains over the backbone alone, every seed a mark, and the scores as mean and standard error."""
     cases = cases_of(scored(rows))
     plots = [_gains(case, mine) for case, mine in cases.items()]
     groups = [
@@ -38,7 +38,7 @@ def ablation(rows: Sequence[Row]) -> Section:
         f"not the size.{_missing(cases)}" + (f" Is the full method better? {EXPLANATION}" if order.rows else ""),
         {"ablation": figure(plots, "Gain of each variant over the backbone")},
         (
-            ("Mean ± deviation over seeds", scores_table("variant", groups)),
+            ("Mean ± standard error over seeds", scores_table("variant", groups)),
             *([("Is the full method better?", order)] if order.rows else []),
         ),
         sources=sources_of(rows),

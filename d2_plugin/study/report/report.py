@@ -18,11 +18,14 @@ from .limits import plan, scaling, stability
 from .page import Picture, html, markdown
 from .precision import alignment, raster, stereo
 from .priors import priors
+from .quality import quality
 from .sections import Section
 from .training import training
+from .versions import versions
 
 BUILDERS: dict[str, Callable[[Sequence[Row]], Section]] = {
-    build.__name__: build for build in (training, ablation, alignment, stereo, priors, raster, stability, plan, scaling)
+    build.__name__: build
+    for build in (training, quality, ablation, alignment, stereo, priors, raster, stability, plan, scaling)
 }
 """The function that makes a section from the rows of a kind, in the order of the page."""
 
@@ -72,6 +75,8 @@ def make_report(rows: Sequence[Row], output: Path, pictures: Sequence[Picture] =
         for kind, build in BUILDERS.items()
         if any(row["kind"] == kind for row in rows)
     ]
+    compared = versions(rows)
+    sections += [] if compared is None else [compared]
     output.mkdir(parents=True, exist_ok=True)
     texts = {"report.html": html(sections, pictures, LEAD), "report.md": markdown(sections, LEAD)}
     texts |= {f"{name}.svg": svg for section in sections for name, svg in section.figures.items()}

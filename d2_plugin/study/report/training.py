@@ -11,7 +11,7 @@ from d2_plugin.study.verdict import LEAST_SEEDS
 
 from .ablation import PAPER_TEXT
 from .plots import Axis, Plot, Point, Series
-from .scores import Group, average, psnr, scored, scores_table
+from .scores import Group, average, one_per_seed, psnr, scored, scores_table
 from .sections import Section, cases_of, sources_of
 from .svg import bars, figure
 from .work_precision import colors_of, pareto_front
@@ -21,7 +21,9 @@ def training(rows: Sequence[Row]) -> Section:
     """Held-out PSNR against minutes of prior and training, their parts as stacked bars, and all scores."""
     emulated = any(row.get("mono_emulated") for row in rows)
     colors = colors_of(rows)
-    plots = [_quality(case, mine, colors) for case, mine in cases_of(scored(rows)).items()]
+    compared = cases_of(scored(rows))
+    several = {case: mine for case, mine in compared.items() if len(mine) > 1} or compared  # one mark is no comparison
+    plots = [_quality(case, mine, colors) for case, mine in several.items()]
     groups = [
         Group(case, name, group) for case, mine in cases_of(rows).items() for name, group in _variants(mine).items()
     ]
@@ -40,7 +42,7 @@ def training(rows: Sequence[Row]) -> Section:
             "training": figure(plots, "Held-out PSNR against minutes", columns=3, size=(340, 320)),
             "training-time": bars(stacked, ("prior", "training"), "min", "Minutes of prior and training per method"),
         },
-        (("Mean ± deviation over seeds", scores_table("method", groups)),),
+        (("Mean ± standard error over seeds", scores_table("method", groups)),),
         sources=sources_of(rows),
         headlines=tuple(line for case, mine in cases_of(scored(rows)).items() if (line := _headline(case, mine))),
     )
@@ -96,8 +98,17 @@ def _published_levels(case: str, x: Axis, color: int) -> list[Series]:
 
 
 def _variants(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Rows of the same method and number of steps, which differ by seed."""
-    groups: dict[str, list[Row]] = {}
+    """Rows of the same method, steps and commit, which differ by seed; the commit is told where they differ.
+
+    Where one seed has two scores the runs differ by something that their rows do not say, and each stands alone.
+    """
+    groups: dict[tuple[str, str | None], list[Row]] = {}
     for row in rows:
-        groups.setdefault(f"{row['method']}, {row['iterations']} steps", []).append(row)
-    return groups
+        groups.setdefault((f"{row['method']}, {row['iterations']} steps", row["commit"]), []).append(row)
+    names = [name for name, _ in groups]
+    told = {key: f"{key[0]} ({key[1]})" if names.count(key[0]) > 1 else key[0] for key in groups}
+    found: dict[str, list[Row]] = {}
+    for key, mine in groups.items():
+        alike = len({(row["setting"], row["error"]) for row in mine}) == len(one_per_seed(mine))
+        found |= {told[key]: one_per_seed(mine)} if alike else {f"{told[key]}, {row.get('run')}": [row] for row in mine}
+    return found

@@ -1,0 +1,1 @@
+"""What users would pick instead of D², as hooks on the same backbone, points, steps and depth inputs."""

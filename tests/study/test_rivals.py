@@ -1,0 +1,353 @@
+"""The rivals' losses are the published ones: golden values from numpy, gradients by differences, stiff maps."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.lib.stride_tricks import sliding_window_view
+from tiny import TinyStore, make_adapter, make_model, make_views
+from torch import Tensor
+
+from d2_plugin import D2Config, D2Hooks
+from d2_plugin.captures.export.folder import save_capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.commands.cli import main
+from d2_plugin.errors import D2Error
+from d2_plugin.hooks import Context, Hook, HookConfig
+from d2_plugin.runs.run import Run
+from d2_plugin.runs.settings import RunSettings
+from d2_plugin.study.rivals.dense_start import back_projected
+from d2_plugin.study.rivals.inputs import expected_depth
+from d2_plugin.study.rivals.patch_norm import patch_norm_loss
+from d2_plugin.study.rivals.pearson import PearsonConfig, pearson_correlation, pearson_depth_loss
+from d2_plugin.study.rivals.scale_shift import fitted_scale_and_shift, scale_shift_loss
+from d2_plugin.study.rivals.sparse_points import Seen, at_pixels, sparse_point_loss
+from d2_plugin.study.rivals.table import RIVALS, rival
+
+RNG = np.random.default_rng(7)
+DEPTH = RNG.uniform(2, 9, (23, 31))
+MONO = 3.1 / DEPTH + 0.4 + RNG.normal(0, 0.05, DEPTH.shape)
+MASK = RNG.uniform(size=DEPTH.shape) < 0.8
+FLAT = np.full(DEPTH.shape, 4.0)
+
+
+def tensor(values: np.ndarray, grad: bool = False) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64 if values.dtype != bool else torch.bool, requires_grad=grad)
+
+
+class TestPearson:
+    def test_golden_value(self) -> None:
+        scaled = (MONO - MONO.min()) / (MONO.max() - MONO.min()) * 2000
+        candidates = [np.corrcoef(m.ravel(), DEPTH.ravel())[0, 1] for m in (-scaled, 1 / (scaled + 200))]
+        found = pearson_depth_loss(tensor(DEPTH), tensor(MONO))
+        assert found.item() == pytest.approx(1 - max(candidates), abs=1e-12)
+
+    def test_of_two_candidates_the_better_one_counts(self) -> None:
+        by_offset = 1 / ((1 / DEPTH - (1 / DEPTH).min()) / np.ptp(1 / DEPTH) * 2000 + 200)
+        assert pearson_depth_loss(tensor(by_offset), tensor(1 / DEPTH)).item() == pytest.approx(0, abs=1e-12)
+        assert pearson_depth_loss(tensor(-MONO), tensor(MONO)).item() == pytest.approx(0, abs=1e-12)
+
+    def test_gradient(self) -> None:
+        torch.autograd.gradcheck(lambda d: pearson_depth_loss(d, tensor(MONO[:4, :5])), tensor(DEPTH[:4, :5], True))
+
+    def test_scale_and_shift_of_the_map_change_nothing(self) -> None:
+        a, b = (pearson_depth_loss(tensor(DEPTH), tensor(m)).item() for m in (MONO, 7 * MONO - 2))
+        assert a == pytest.approx(b, abs=1e-12)
+
+    def test_pixels_without_a_map_do_not_count(self) -> None:
+        holes = np.where(MASK, MONO, np.nan)
+        d = tensor(DEPTH, True)
+        pearson_depth_loss(d, tensor(holes)).backward()
+        assert (d.grad[~tensor(MASK)] == 0).all()
+        assert torch.isfinite(d.grad).all()
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize(
+        ("depth", "mono"),
+        [(FLAT, MONO), (DEPTH, FLAT), (FLAT, FLAT), (DEPTH[:1, :1], MONO[:1, :1]), (DEPTH, DEPTH * np.nan)],
+    )
+    def test_where_nothing_can_be_told_the_loss_is_one_without_a_gradient(
+        self, depth: np.ndarray, mono: np.ndarray, dtype: torch.dtype
+    ) -> None:
+        d = tensor(depth).to(dtype).requires_grad_()
+        loss = pearson_depth_loss(d, tensor(mono).to(dtype))
+        loss.backward()
+        assert loss.item() == pytest.approx(1, abs=1e-6)
+        assert (d.grad == 0).all()
+
+    def test_small_values_in_float32_correlate_as_large_ones(self) -> None:
+        x, y = (torch.tensor(values.ravel(), dtype=torch.float32) for values in (DEPTH, MONO))
+        small, large = pearson_correlation(1e-12 * x, 1e-12 * y).item(), pearson_correlation(x, y).item()
+        assert small == pytest.approx(large, abs=1e-5)
+
+    def test_the_later_weight_comes_in_the_last_twentieth(self) -> None:
+        assert PearsonConfig.for_iterations(10_000) == PearsonConfig()
+
+
+class TestScaleShift:
+    def test_golden_value(self) -> None:
+        x, y, m = 1 / DEPTH, MONO, MASK
+        s, t = np.polyfit(x[m], y[m], 1)
+        residual = np.where(m, s * x + t - y, 0)
+        wanted = (residual**2).sum() / (2 * m.sum())
+        for k in range(4):
+            r, n = residual[:: 2**k, :: 2**k], m[:: 2**k, :: 2**k]
+            differences = (np.abs(np.diff(r, axis=1)) * (n[:, 1:] & n[:, :-1])).sum()
+            differences += (np.abs(np.diff(r, axis=0)) * (n[1:] & n[:-1])).sum()
+            wanted += 0.5 * differences / n.sum()
+        assert scale_shift_loss(tensor(x), tensor(y), tensor(m)).item() == pytest.approx(wanted, rel=1e-10)
+
+    def test_gradient_flows_through_the_fit(self) -> None:
+        y, m = tensor(MONO[:6, :7]), tensor(MASK[:6, :7])
+        torch.autograd.gradcheck(lambda x: scale_shift_loss(x, y, m, scales=2), tensor(1 / DEPTH[:6, :7], True))
+
+    def test_a_render_that_differs_by_scale_and_shift_costs_nothing(self) -> None:
+        assert scale_shift_loss(tensor(3 * MONO - 1), tensor(MONO), tensor(MASK)).item() == pytest.approx(0, abs=1e-12)
+
+    @pytest.mark.parametrize("mask", [np.zeros_like(MASK), np.eye(*MASK.shape) > 2])
+    def test_an_empty_mask_costs_nothing(self, mask: np.ndarray) -> None:
+        x = tensor(1 / DEPTH, True)
+        loss = scale_shift_loss(x, tensor(MONO), tensor(mask))
+        loss.backward()
+        assert loss.item() == 0
+        assert (x.grad == 0).all()
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_a_constant_render_and_a_single_pixel_have_no_fit_and_no_gradient(self, dtype: torch.dtype) -> None:
+        one = np.zeros_like(MASK)
+        one[3, 4] = True
+        for render, mask in ((FLAT, MASK), (1 / DEPTH, one)):
+            x = tensor(render).to(dtype).requires_grad_()
+            scale_shift_loss(x, tensor(MONO).to(dtype), tensor(mask)).backward()
+            assert (x.grad == 0).all()
+            assert fitted_scale_and_shift(x[tensor(mask)], tensor(MONO).to(dtype)[tensor(mask)])[0] == 0
+
+
+class TestPatchNorm:
+    SIDE = 5
+
+    def cut(self, values: np.ndarray) -> np.ndarray:
+        """[P, 25], by a window that slides by its own size."""
+        found = sliding_window_view(values, (self.SIDE, self.SIDE))[:: self.SIDE, :: self.SIDE]
+        return found.reshape(-1, self.SIDE**2)
+
+    def normalised(self, values: np.ndarray, whole: bool) -> np.ndarray:
+        p = self.cut(values)
+        deviation = values.std(ddof=1) if whole else p.std(1, ddof=1, keepdims=True)
+        return (p - p.mean(1, keepdims=True)) / (deviation + 0.01 * p.std(ddof=1))
+
+    @pytest.mark.parametrize("whole", [True, False])
+    @pytest.mark.parametrize("tolerance", [0.00025, 0.2])
+    def test_golden_value(self, whole: bool, tolerance: float) -> None:
+        difference = self.normalised(DEPTH, whole) - self.normalised(-MONO, whole)
+        wanted = (difference[np.abs(difference) > tolerance] ** 2).mean()
+        found = patch_norm_loss(tensor(DEPTH), tensor(-MONO), self.SIDE, tolerance, whole)
+        assert found.item() == pytest.approx(wanted, rel=1e-10)
+
+    def test_gradient_of_the_local_one(self) -> None:
+        target = tensor(-MONO[:10, :10])
+        torch.autograd.gradcheck(lambda d: patch_norm_loss(d, target, 5, 1e-9, False), tensor(DEPTH[:10, :10], True))
+
+    def test_the_global_deviation_has_no_gradient(self) -> None:
+        """Scaling the render changes the loss through the centred values alone: the divisor is held."""
+        d = tensor(DEPTH, True)
+        patch_norm_loss(d, tensor(-MONO), 5, 0.0, True).backward()
+        fixed = DEPTH.std(ddof=1)
+
+        def by_hand(x: Tensor) -> Tensor:
+            cut = torch.stack([x[i : i + 5, j : j + 5].flatten() for i in range(0, 20, 5) for j in range(0, 30, 5)])
+            mine = (cut - cut.mean(1, keepdim=True)) / (fixed + 0.01 * cut.std())
+            return (mine - tensor(self.normalised(-MONO, True))).square().mean()
+
+        x = tensor(DEPTH, True)
+        by_hand(x).backward()
+        torch.testing.assert_close(d.grad, x.grad, rtol=1e-9, atol=1e-12)
+
+    @pytest.mark.parametrize("whole", [True, False])
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize("depth", [FLAT, np.zeros_like(FLAT), FLAT[:3, :3], FLAT[:1, :1]])
+    def test_constant_and_tiny_maps_have_finite_gradients(
+        self, depth: np.ndarray, dtype: torch.dtype, whole: bool
+    ) -> None:
+        d = tensor(depth).to(dtype).requires_grad_()
+        loss = patch_norm_loss(d, tensor(-MONO[: depth.shape[0], : depth.shape[1]]).to(dtype), 5, 0.0, whole)
+        loss.backward()
+        assert loss.isfinite()
+        assert d.grad.isfinite().all()
+
+
+class TestSparsePoints:
+    PIXELS = np.array([[0.5, 0.5], [3.25, 7.5], [30.5, 22.5], [12.0, 3.0]])
+    Z = np.array([4.0, 2.5, 7.0, 3.0])
+
+    def bilinear(self, values: np.ndarray) -> np.ndarray:
+        """By hand, with pixel centres at i + 0.5."""
+        found = []
+        for column, row in self.PIXELS - 0.5:
+            j, i = min(int(column), values.shape[1] - 2), min(int(row), values.shape[0] - 2)
+            u, v = column - j, row - i
+            weights = np.outer([1 - v, v], [1 - u, u])
+            found.append((weights * values[i : i + 2, j : j + 2]).sum())
+        return np.array(found)
+
+    def seen(self) -> Seen:
+        return Seen(tensor(self.PIXELS), tensor(self.Z))
+
+    def test_golden_value(self) -> None:
+        wanted = 2.5 * np.abs(1 / self.bilinear(DEPTH) - 1 / self.Z).mean()
+        assert sparse_point_loss(tensor(DEPTH), self.seen(), 2.5).item() == pytest.approx(wanted, rel=1e-12)
+
+    def test_pixel_centres_are_read_as_they_are(self) -> None:
+        np.testing.assert_allclose(at_pixels(tensor(DEPTH), tensor(self.PIXELS)).numpy(), self.bilinear(DEPTH))
+
+    def test_gradient(self) -> None:
+        torch.autograd.gradcheck(lambda d: sparse_point_loss(d, self.seen(), 1.0), tensor(DEPTH, True))
+
+    def test_no_depth_counts_as_infinitely_far_and_no_point_as_nothing(self) -> None:
+        d = tensor(np.zeros_like(DEPTH), True)
+        loss = sparse_point_loss(d, self.seen(), 1.0)
+        loss.backward()
+        assert loss.item() == pytest.approx((1 / self.Z).mean())
+        assert (d.grad == 0).all()
+        assert sparse_point_loss(d, Seen(tensor(np.zeros((0, 2))), tensor(np.zeros(0))), 1.0).item() == 0
+
+
+def test_expected_depth_is_zero_without_gradient_where_little_is_drawn() -> None:
+    alpha = torch.tensor([0.0, 0.4, 0.8], dtype=torch.float64, requires_grad=True)
+    depth, valid = expected_depth(torch.tensor([0.0, 1.0, 2.0], dtype=torch.float64), alpha)
+    assert depth.tolist() == [0, 0, 2.5]
+    assert valid.tolist() == [False, False, True]
+    depth.sum().backward()
+    assert alpha.grad.tolist()[:2] == [0, 0]
+
+
+def test_back_projected_points_project_onto_their_pixels_with_their_colours() -> None:
+    room = synthetic_capture(cameras=2, frames=1, width=48, height=27)
+    name = next(iter(room.cameras))
+    depth = np.where(room.depth(name, 0) > 0, room.depth(name, 0), 0)
+    points = back_projected(room, name, 0, depth, 100, np.random.default_rng(0))
+    camera = room.cameras[name]
+    local = points.positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    pixels = local @ camera.K.T / local[:, 2:]
+    column, row = np.floor(pixels[:, :2]).astype(int).T
+    np.testing.assert_allclose(pixels[:, :2] % 1, 0.5, atol=1e-6)
+    np.testing.assert_allclose(local[:, 2], depth[row, column], rtol=1e-5)
+    np.testing.assert_allclose(points.colors, room.image(name, 0)[row, column] / 255)
+
+
+def test_an_unknown_rival_is_answered_with_the_nearest() -> None:
+    with pytest.raises(D2Error, match="pearson"):
+        rival("pearsn", 100)
+
+
+def tensors_in(state: object) -> list[Tensor]:
+    """All tensors of a nested state, in its order."""
+    if isinstance(state, Tensor):
+        return [state]
+    parts = state.values() if isinstance(state, dict) else state if isinstance(state, list | tuple) else ()
+    return [tensor for part in parts for tensor in tensors_in(part)]
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    capture = synthetic_capture(cameras=3, held_out=1, frames=2, width=96, height=54)
+    return save_capture(capture, tmp_path_factory.mktemp("captures") / "room")
+
+
+@pytest.fixture(scope="module")
+def ablation(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
+    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+    output = tmp_path_factory.mktemp("ablation") / "out"
+    command = ["ablate", str(room), "--train-cameras", "train0,train1,train2", "--rows", "rivals", "--seeds", "0"]
+    assert main([*command, "--iterations", "24", "--jobs", "1", "--output", str(output)]) == 0
+    return output
+
+
+class TestOnARecording:
+    def test_every_rival_trains_on_one_prior_and_says_its_name(self, ablation: Path) -> None:
+        rows = [json.loads(line) for line in (ablation / "runs.jsonl").read_text().splitlines()]
+        assert {row["method"].removeprefix("yang4d ") for row in rows} == {"backbone", *RIVALS, "full"}
+        assert [path.name for path in (ablation / "priors").iterdir() if path.is_dir()] == ["dual"]
+        for name in RIVALS:
+            metrics = json.loads((ablation / "yang4d" / name / "seed0" / "metrics.json").read_text())
+            assert metrics["guidance"]["name"] == name
+            assert metrics["cpu_seconds"]["train"] > 0
+
+    def test_rivals_change_the_run_and_the_dense_one_starts_with_more(self, ablation: Path) -> None:
+        scores = {path.parts[-3]: json.loads(path.read_text()) for path in ablation.rglob("metrics.json")}
+        assert len({metrics["test"]["psnr"] for metrics in scores.values()}) == len(scores)
+
+    def test_a_dense_start_adds_stereo_points_to_the_triangulated_ones(self, ablation: Path) -> None:
+        run = Run.load(ablation / "yang4d" / "dense_start" / "seed0")
+        points = run.prepare(priors=False)
+        started = rival("dense_start", 24).start(run.scene, points, ablation / "priors" / "dual")
+        assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of six pictures rounds
+        np.testing.assert_array_equal(started.positions[: len(points)], points.positions)
+        assert set(started.times) == {0.0, run.scene.capture.seconds(1)}
+
+    def test_a_resumed_rival_is_bitwise_the_uninterrupted_one(self, ablation: Path, tmp_path: Path) -> None:
+        """patch_norm draws at random: its draws come from the run's own generator, which is saved."""
+        whole = ablation / "yang4d" / "patch_norm" / "seed0"
+        stored = json.loads((whole / "run.json").read_text())
+        guidance = rival(stored.pop("guidance")["name"], 24)
+        settings = RunSettings.from_table(stored, "run.json")
+        run = Run(settings, tmp_path / "cut", guidance)
+        (tmp_path / "cut" / "points.npz").write_bytes((whole / "points.npz").read_bytes())
+        trainer = run._trainer(run.prepare())
+        trainer.run(10)
+        run._save(trainer)
+        again = Run(settings, tmp_path / "cut", guidance)
+        again.train()
+        ours, theirs = (torch.load(f / "checkpoint.pt", weights_only=True) for f in (tmp_path / "cut", whole))
+        mine, others = tensors_in(ours["model"]), tensors_in(theirs["model"])
+        assert len(mine) == len(others) > 10
+        assert all(torch.equal(a, b) for a, b in zip(mine, others, strict=True))
+
+    def test_a_rivals_run_can_be_scored_but_not_trained_by_others(self, ablation: Path) -> None:
+        run = Run.load(ablation / "yang4d" / "pearson" / "seed0")
+        assert run.evaluate(pictures=False)["guidance"]["name"] == "pearson"
+        with pytest.raises(D2Error, match="guided by 'pearson'"):
+            run._trainer(run.prepare(priors=False))
+
+    def test_another_rival_does_not_take_the_folder(self, ablation: Path) -> None:
+        folder = ablation / "yang4d" / "pearson" / "seed0"
+        settings = Run.load(folder).settings
+        with pytest.raises(D2Error, match="other settings of guidance"):
+            Run(settings, folder, rival("scale_shift", 24))
+        with pytest.raises(D2Error, match="other settings of guidance"):
+            Run(settings, folder)
+        with pytest.raises(D2Error, match="other settings of guidance"):
+            Run(settings, folder, replace(rival("pearson", 24), config=PearsonConfig(weight=0.5)))
+
+
+class TestHooksAsObjects:
+    """`D2Hooks(..., hooks={...})`: what rivals plug in by, and anybody's own hook."""
+
+    class Constant(Hook):
+        def loss(self, context: Context) -> Tensor:
+            return torch.tensor(0.25)
+
+    def test_a_hook_of_ones_own_runs_in_its_window_beside_none_of_d2s(self) -> None:
+        hook = self.Constant(HookConfig(start=2))
+        d2 = D2Hooks(D2Config(retire_after=1), make_adapter(make_model()), TinyStore(), {"constant": hook})
+        assert [float(d2.loss(step, make_views()[:1])) for step in (1, 2)] == [0.0, 0.25]
+        assert d2.step(2).inserted == 0
+        assert set(d2.state_dict()["hooks"]) == {"constant"}
+
+    def test_the_name_of_one_of_d2s_is_refused(self) -> None:
+        with pytest.raises(D2Error, match="named 'prune'"):
+            D2Hooks(D2Config(), make_adapter(make_model()), TinyStore(), {"prune": self.Constant(HookConfig())})
+
+    def test_training_does_not_import_what_it_is_compared_with(self) -> None:
+        code = (
+            "import sys, d2_plugin.runs.run, d2_plugin.commands.train; print([m for m in sys.modules if '.study' in m])"
+        )
+        assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"

@@ -1,0 +1,223 @@
+"""`d2 bench training`: equal CPU time, rows as they finish, and a rerun that does only what is missing."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from concurrent.futures import Future
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from d2_plugin.captures.export.folder import save_capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.commands.cli import main
+from d2_plugin.errors import D2Error
+from d2_plugin.runs.settings import RunSettings
+from d2_plugin.study.ablation.job import Job
+from d2_plugin.study.ablation.presets import PRESETS
+from d2_plugin.study.report.quality import quality
+from d2_plugin.study.rows import Row, make_row, read_rows
+from d2_plugin.study.shared import Shared, same_backbone
+from d2_plugin.study.training.bench import TrainingBench, _line, _targets
+from d2_plugin.study.training.budget import PILOT, TOLERANCE, fits, nearest, next_steps
+from d2_plugin.study.training.cases import Case, case_of
+from d2_plugin.study.training.measured import TRY, Work, fingerprint
+from d2_plugin.study.training.spread import follow
+
+SETTINGS = RunSettings("room", ("a", "b"))
+
+
+class TestBudget:
+    def test_the_first_try_is_the_pilot(self) -> None:
+        assert next_steps(10, []) == PILOT
+
+    @given(law=st.floats(0.9, 1.6), cost=st.floats(1e-3, 1e-1), target=st.floats(5, 200))
+    def test_a_power_law_is_met_within_three_tries(self, law: float, cost: float, target: float) -> None:
+        tried: list[tuple[int, float]] = []
+        for _ in range(4):
+            steps = next_steps(target, tried)
+            tried.append((steps, cost * steps**law))
+            if fits(target, tried[-1]):
+                break
+        steps = nearest(target, tried)
+        rounding = 1.5 / steps  # few steps cannot meet a time exactly
+        assert abs(cost * steps**law / target - 1) <= TOLERANCE + law * rounding
+
+    def test_noise_between_two_near_lengths_does_not_turn_the_law_around(self) -> None:
+        assert 100 < next_steps(20, [(100, 10.0), (101, 9.0)]) < 300
+
+    def test_the_nearest_is_so_in_ratio(self) -> None:
+        assert nearest(10, [(1, 5.0), (2, 19.0)]) == 2
+
+
+class TestCases:
+    def test_cameras_stand_behind_the_path(self) -> None:
+        case = case_of("data/studio@00+02@01+03", replace(SETTINGS, downscale=2))
+        assert case.name == "studio, 2 views, 1/2 size"
+        assert case.settings.train_cameras == ("00", "02")
+        assert case.settings.test_cameras == ("01", "03")
+        assert case_of("studio@00", SETTINGS).settings.test_cameras is None
+
+    @pytest.mark.parametrize("text", ["studio", "@00", "a@b@c@d", ""])
+    def test_a_capture_without_cameras_is_refused_with_an_example(self, text: str) -> None:
+        with pytest.raises(D2Error, match="PATH@00"):
+            case_of(text, SETTINGS)
+
+    def test_seconds_are_the_default_and_steps_may_stand_alone(self) -> None:
+        assert [value for _, value in _targets(TrainingBench())] == [10, 30, 100]
+        assert _targets(TrainingBench(steps=(50, 20))) == [("steps", 20), ("steps", 50)]
+
+
+def pretend(work: Work, seconds_per_step: float = 0.05) -> Row:
+    """A row as if the run had taken so long."""
+    settings = work.job.settings
+    about = {"target": work.target, "iterations": settings.iterations, "seed": settings.seed, "gaussians": 10}
+    psnr = 20 + math.log(settings.iterations) + 0.01 * settings.seed + (1 if "full" in work.method else 0)
+    scores = {"psnr": psnr, "ssim1": 0.8, "depth_absrel": 0.1}
+    return make_row(
+        *("quality", work.case, work.method, f"{settings.iterations} steps, seed {settings.seed}"),
+        error=10 ** (-psnr / 20),
+        seconds=seconds_per_step * settings.iterations,
+        scores=scores,
+        prior_seconds=3.0 if "full" in work.method else 0.0,
+        fingerprint=fingerprint(work.job),
+        command="d2 bench training",
+        **about,
+    )
+
+
+def now(work: Work) -> Future[Row]:
+    future: Future[Row] = Future()
+    future.set_result(pretend(work))
+    return future
+
+
+def bench(known: Sequence[Row], methods: Sequence[str] = ("backbone", "full"), **more: Any) -> list[Row]:
+    """The rows that one call writes, given what lies there already."""
+    settings = TrainingBench(("room@a+b",), **more)
+    case, shared = Case("room, 2 views", "room", SETTINGS), Shared(Path("/out/room"), False, 3.0, 3.0)
+    lines = [_line(settings, case, shared, PRESETS[name], known) for name in methods]
+    rows: list[Row] = []
+    follow(lines, now, rows.append)
+    return rows
+
+
+class TestPlan:
+    def test_a_budget_is_tried_with_one_seed_and_run_with_all(self) -> None:
+        rows = [row for row in bench([], seconds=(10, 30)) if row["method"] == "yang4d full"]
+        for budget in (10, 30):
+            mine = [row for row in rows if row["target"] == f"{budget} s"]
+            assert sorted(row["seed"] for row in mine) == [0, 1, 2]
+            assert len({row["iterations"] for row in mine}) == 1
+            assert mine[0]["seconds"] == pytest.approx(budget, rel=TOLERANCE)
+        assert {row["seed"] for row in rows if row["target"] == TRY} == {0}
+
+    def test_a_rerun_does_nothing_and_a_wider_one_only_what_is_missing(self) -> None:
+        first = bench([], seconds=(10,), seeds=(0, 1))
+        assert bench(first, seconds=(10,), seeds=(0, 1)) == []
+        more = bench(first, seconds=(10,), seeds=(0, 1, 2))
+        assert [(row["method"], row["seed"]) for row in more] == [("yang4d backbone", 2), ("yang4d full", 2)]
+        assert len(bench(first[:-1], seconds=(10,), seeds=(0, 1))) == 1
+
+    def test_steps_need_no_try(self) -> None:
+        rows = bench([], steps=(70, 20), seeds=(5,))
+        assert [row["iterations"] for row in rows if row["method"] == "yang4d backbone"] == [20, 70]
+
+    def test_other_settings_are_other_runs_wherever_the_files_lie(self) -> None:
+        def job(settings: RunSettings, rival: str | None = None) -> str:
+            return fingerprint(Job("full", "yang4d", 0, settings, Path("x"), rival))
+
+        elsewhere = replace(SETTINGS, capture="/elsewhere/room", priors="/tmp/dual")
+        assert job(elsewhere) == job(replace(SETTINGS, capture="room", priors="dual"))
+        others = [replace(SETTINGS, seed=1), replace(SETTINGS, iterations=5), replace(SETTINGS, downscale=2)]
+        assert len({job(SETTINGS), *map(job, others), job(SETTINGS, "pearson"), job(SETTINGS, "patch_norm")}) == 6
+
+    def test_a_preset_with_a_prior_of_its_own_is_refused(self, tmp_path: Path) -> None:
+        command = ["bench", "training", "room@a", "--methods", "mono_only", "--output", str(tmp_path / "o")]
+        assert main(command) == 2
+
+    def test_an_error_of_a_worker_ends_the_whole(self) -> None:
+        def broken(work: Work) -> Future[Row]:
+            future: Future[Row] = Future()
+            future.set_exception(MemoryError("gone"))
+            return future
+
+        line = _line(
+            TrainingBench(("room@a",), steps=(5,)),
+            Case("room", "room", SETTINGS),
+            Shared(Path("/out"), False, None, None),
+            PRESETS["backbone"],
+            [],
+        )
+        with pytest.raises(MemoryError):
+            follow([line], broken, lambda row: None)
+
+
+class TestSameBackbone:
+    def test_the_full_prior_decides_for_every_row_unless_the_user_does(self) -> None:
+        far, near = (Shared(Path("x"), background, None, None) for background in (True, False))
+        assert same_backbone(SETTINGS, far).overrides == {"backbone": {"background": True}}
+        assert same_backbone(SETTINGS, near) == SETTINGS
+        mine = replace(SETTINGS, overrides={"backbone": {"background": False, "sh_degree": 1}})
+        assert same_backbone(mine, far) == mine
+
+
+class TestReport:
+    def test_three_metrics_two_kinds_of_minutes_and_a_verdict_at_each_time(self) -> None:
+        section = quality(bench([], seconds=(10, 30)))
+        assert set(section.figures) == {"quality", "quality-with-prior", "quality-time"}
+        for name in ("PSNR, dB", "SSIM1", "depth AbsRel"):
+            assert name in section.figures["quality"]
+        tables = dict(section.tables)
+        verdicts = tables["Is D² above the others?"]
+        assert [row[0] for row in verdicts.rows] == ["room, 2 views, 10 s", "room, 2 views, 30 s"]
+        assert all("holds (+1.00 ± 0.01 dB)" in row[2] for row in verdicts.rows)
+
+    def test_one_seed_is_printed_so(self) -> None:
+        section = quality(bench([], seconds=(10,), seeds=(0,)))
+        table = section.tables[0][1]
+        assert {row[2] for row in table.rows} == {"one seed"}
+        assert "one seed: no verdict" in str(dict(section.tables)["Is D² above the others?"].rows)
+
+    def test_a_try_that_became_a_run_counts_once(self) -> None:
+        rows = bench([], seconds=(10,), seeds=(0,))
+        assert len({row["fingerprint"] for row in rows}) < len(rows)
+        notes = quality(rows).figures["quality"].count("yang4d full, 10 s: PSNR")
+        assert notes == 1
+
+    def test_the_minutes_of_the_prior_move_only_who_needs_it(self) -> None:
+        section = quality(bench([], steps=(100,)))
+        full, alone = "yang4d full, 100 steps: PSNR 25.62 ± 0.01", "yang4d backbone, 100 steps: PSNR 24.62 ± 0.01"
+        assert f"{full} (3 seeds), 0.13 min" in section.figures["quality-with-prior"]
+        assert f"{full} (3 seeds), 0.08 min" in section.figures["quality"]
+        assert f"{alone} (3 seeds), 0.08 min" in section.figures["quality-with-prior"]
+
+    def test_a_run_that_failed_is_listed_with_its_reason(self) -> None:
+        rows = bench([], steps=(100,))
+        lost = {**rows[0], "failed": "no stereo", "error": None, "seconds": None, "scores": None, "fingerprint": "x"}
+        assert "no stereo" in str(dict(quality([*rows, lost]).tables)["Runs that failed"].rows)
+
+
+def test_the_command_measures_resumes_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
+    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+    room = save_capture(synthetic_capture(cameras=2, held_out=1, frames=1, width=96, height=54), tmp_path / "room")
+    output = tmp_path / "out"
+    command = ["bench", "training", f"{room}@train0+train1", "--methods", "backbone,dense_start,full", "--seeds", "0"]
+    command += ["--steps", "12", "--jobs", "1", "--output", str(output)]
+    assert main(command) == 0
+    rows = read_rows([output / "training.jsonl"])
+    assert [row["method"] for row in rows] == ["yang4d backbone", "yang4d full", "yang4d dense_start"]
+    assert all(row["seconds"] > 0 and row["scores"]["psnr"] > 5 and not row["failed"] for row in rows)
+    assert str(tmp_path) not in json.dumps(rows)
+    assert not list(output.rglob("checkpoint.pt"))
+    assert main(command) == 0
+    assert read_rows([output / "training.jsonl"]) == rows
+    assert main(["report", str(output / "training.jsonl"), "--output", str(tmp_path / "report")]) == 0
+    assert "one seed" in (tmp_path / "report" / "report.md").read_text()
