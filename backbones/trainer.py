@@ -20,6 +20,7 @@ from d2_plugin.settings import Seed, Settings, Share, Steps
 class Model(Protocol):
     """What the loop needs of a backbone."""
 
+    def look_at(self, views: Sequence[View], pictures: Callable[[int], Tensor]) -> None: ...
     def render(self, view: View, background: Tensor | None = None) -> Render: ...
     def regularization(self) -> Tensor | float: ...
     def accumulate(self, view: View) -> None: ...
@@ -70,6 +71,7 @@ class Trainer:
     ) -> None:
         self.model, self.frames, self.settings = model, frames, settings
         self.step = 0
+        model.look_at(frames.views, frames.image)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
         self.d2 = attach(model) if attach else None  # D2, line 1: after the optimizer exists

@@ -16,7 +16,6 @@ from torch import Tensor
 from d2_plugin import registry
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.prior import build_priors_for
 from d2_plugin.runs.provenance import circumstances
@@ -33,9 +32,6 @@ from d2_plugin.runs.start import (
 
 RENDERED_ALPHA = 0.5
 """A rendered depth is reported where the accumulated alpha exceeds this."""
-
-FAR_SHARE = 0.005
-"""Mean share of far pixels in the prior above which the backbone gets a background."""
 
 CHECKPOINTS = 10
 """How often a run is saved. One that was cut off continues from its last checkpoint, bitwise."""
@@ -187,25 +183,11 @@ class Run:
             extent=extent.radius,
             duration=capture.seconds(capture.frames[-1]),
             temporal=self.scene.plan.uses("temporal"),
-            settings=(self._background() if attach else {}) | dict(self.settings.overrides.get("backbone", {})),
+            settings=dict(self.settings.overrides.get("backbone", {})),
         )
         training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
         pictures = TrainingFrames(capture, cameras, self.settings.device)
         return backbone.Trainer(model, pictures, training, self._attach if attach and self.uses_prior else None)
-
-    def _background(self) -> dict[str, Any]:
-        """The backbone's setting where the scene needs it: one of somebody else's may not know the name."""
-        return {"background": True} if self._sees_far() else {}
-
-    def _sees_far(self) -> bool:
-        """Whether the depth prior, where there is one, found far pixels: only then a background pays."""
-        if not (self.priors / "store.json").is_file():
-            return False
-        store = PriorStore.open(self.priors)
-        cameras = [camera for camera in self.scene.train_cameras if camera in store.cameras]
-        keys = ((camera, frame) for camera in cameras for frame in self.scene.capture.frames)
-        records = [record for key in keys if (record := store.record(*key)) is not None]
-        return bool(records) and sum(r["shares"].get("far", 0.0) for r in records) / len(records) > FAR_SHARE
 
     def _trained(self) -> Any:
         """The trainer at the last checkpoint, without hooks or a look at the prior: the checkpoint says it all."""
