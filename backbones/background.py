@@ -1,5 +1,6 @@
-"""What lies behind all Gaussians: a colour at infinity that depends on the direction alone, for skies.
+"""What lies behind all Gaussians: a colour at infinity that depends on the direction alone.
 
+For skies, and for what no training camera has seen: there a held-out camera would look through into black.
 Spherical harmonics of the viewing direction, so a held-out camera sees the same sky, and too smooth to stand in for a
 surface. Composited with what the Gaussians leave of a ray: color + (1 - alpha) background. That smooth a colour needs
 no evaluation at each pixel: it is computed at a few directions and interpolated.
@@ -7,7 +8,7 @@ no evaluation at each pixel: it is computed at a few directions and interpolated
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -23,6 +24,10 @@ RATE = 1e-2
 """Learning rate of the constant term; the others learn at a fifth of it."""
 NODES = 40
 """Directions across the picture at which the colour is computed; smaller pictures have one at each pixel."""
+STARTING_PICTURES = 32
+"""Pictures that its first colours are fitted to."""
+RIDGE = 1e-3
+"""Weight of the squared coefficients, times the square of their degree, beside the mean squared error."""
 KEPT_CAMERAS = 256
 """Cameras whose harmonics are kept."""
 
@@ -36,6 +41,29 @@ class Background:
         groups = [{"params": [self.constant], "lr": RATE}, {"params": [self.harmonics], "lr": RATE / 5}]
         self.optimizer = torch.optim.Adam(groups, eps=1e-15)
         self._bases: dict[tuple[Any, ...], Tensor] = {}
+
+    @torch.no_grad()
+    def start_from(self, views: Sequence[View], pictures: Callable[[int], Tensor]) -> None:
+        """Begin with what the pictures show in each direction, as if all of it were at infinity.
+
+        Least squares over the nodes of at most `STARTING_PICTURES` views, spread evenly. A ridge that grows with the
+        degree keeps directions that no camera sees near the mean colour.
+
+        Args:
+            views: the training views.
+            pictures: the picture [H, W, 3] in 0..1 of each, by its index in `views`.
+        """
+        if not views:
+            return
+        chosen = sorted({round(index) for index in torch.linspace(0, len(views) - 1, STARTING_PICTURES).tolist()})
+        seen = [self._seen(views[index], pictures(index)) for index in chosen]
+        values = torch.cat([harmonics for harmonics, _ in seen]).double()
+        colors = torch.cat([color for _, color in seen]).double() - 0.5
+        degrees = torch.tensor([degree for degree in range(DEGREE + 1) for _ in range(2 * degree + 1)])
+        ridge = (RIDGE * len(colors) * degrees.square()).to(values)
+        solved = torch.linalg.solve(values.T @ values + torch.diag(ridge), values.T @ colors)
+        self.constant.copy_(solved[:1])
+        self.harmonics.copy_(solved[1:])
 
     def behind(self, render: Render, view: View) -> Render:
         """The render with the background where the Gaussians leave some of a ray."""
@@ -51,6 +79,15 @@ class Background:
         """One optimizer step, gradients cleared."""
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
+
+    def _seen(self, view: View, picture: Tensor) -> tuple[Tensor, Tensor]:
+        """Harmonics [nodes, (DEGREE + 1)^2] and colours [nodes, 3] at those nodes of a view inside of its picture."""
+        rows, columns, stride = _nodes(view)
+        row = stride * torch.arange(rows, device=picture.device)
+        column = stride * torch.arange(columns, device=picture.device)
+        row, column = row[row < view.height], column[column < view.width]
+        harmonics = self._basis(view).view(rows, columns, -1)[: len(row), : len(column)]
+        return harmonics.flatten(0, 1), picture[row][:, column].flatten(0, 1).to(self.constant)
 
     def _basis(self, view: View) -> Tensor:
         """Harmonics of the nodes' directions [nodes, (DEGREE + 1)^2]; kept, since cameras mostly stand still."""

@@ -41,8 +41,9 @@ class D2Config(_HookTables):
 
     prior: str | None = None
     """Folder of the depth prior, as `d2 priors` writes it."""
-    views_per_evaluation: AtLeastOne = 4
-    """Training views surveyed at each structure update, taken in turn over all cameras and frames."""
+    views_per_evaluation: AtLeastOne = 8
+    """Training views surveyed at each structure update, taken in turn over all cameras and frames; at the first one at
+    least one of each camera seen so far."""
     retire_after: Count = 5
     """A structure hook retires after this many evaluations in a row that change next to nothing; 0: never."""
     retire_below: Share = 1e-3

@@ -72,6 +72,7 @@ class D2Hooks:
         self.trace: deque[Trace] = deque(maxlen=1000)
         self.generator = torch.Generator().manual_seed(config.seed)
         self._sampler = ViewSampler()
+        self._evaluated = False
         self._count = len(backbone)
         self._warned = False
         self._idle = dict.fromkeys(self.hooks, 0)  # evaluations in a row that changed next to nothing
@@ -146,6 +147,7 @@ class D2Hooks:
         return {
             "hooks": {name: hook.state_dict() for name, hook in self.hooks.items()},
             "views": self._sampler.state_dict(),
+            "evaluated": self._evaluated,
             "generator": self.generator.get_state(),
             "idle": dict(self._idle),
             "retired": dict(self.retired),
@@ -163,6 +165,7 @@ class D2Hooks:
             hook.load_state_dict(state["hooks"][name])
         self._sampler.load_state_dict(state["views"])
         self.generator.set_state(state["generator"].cpu())
+        self._evaluated = bool(state.get("evaluated", True))
         self._idle, self.retired = dict(state["idle"]), dict(state["retired"])
         self._count = len(self.backbone)
 
@@ -181,7 +184,9 @@ class D2Hooks:
 
     def _context(self, step: int, views: Sequence) -> Context:
         def sample() -> Sequence:
-            return self._sampler.sample(self.config.views_per_evaluation, self.generator)
+            first = 0 if self._evaluated else self._sampler.cameras
+            self._evaluated = True
+            return self._sampler.sample(max(self.config.views_per_evaluation, first), self.generator)
 
         return Context(step, self.backbone, views, self._prior, self.generator, sample)
 

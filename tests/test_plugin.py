@@ -21,7 +21,7 @@ from d2_plugin.adapters.yang4d import Yang4DAdapter
 from d2_plugin.backbones import trainer as trainer_module
 from d2_plugin.backbones.trainer import Trainer
 from d2_plugin.config import DensifyConfig, PruneConfig, for_iterations
-from d2_plugin.hooks.densify import sample_pixels
+from d2_plugin.hooks.densify import shuffled_pixels
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Backbone, Points, Splats, View
 from d2_plugin.rasterizer import rasterize
@@ -111,9 +111,9 @@ def test_hooks_never_touch_the_global_random_state(monkeypatch: pytest.MonkeyPat
 
         def drawing(*arguments: object, draw: Callable[[], object] = draw) -> object:
             draw()
-            return sample_pixels(*arguments)
+            return shuffled_pixels(*arguments)
 
-        monkeypatch.setattr("d2_plugin.hooks.densify.sample_pixels", drawing)
+        monkeypatch.setattr("d2_plugin.hooks.densify.shuffled_pixels", drawing)
         make_trainer(ALL_HOOKS, iterations=6).run()
         assert random_states() != before, "a hook that draws is not noticed"
         before = random_states()

@@ -2,7 +2,8 @@
 
 The paper takes the mean over Omega^v. Here a pixel with relative standard deviation sigma counts by
 min(1, sigma_full / sigma), and its penalty is flat within sigma: epsilon^2 grows by sigma^2. With sigma 0 at verified
-pixels and infinite elsewhere that is the paper's. Far pixels are penalised only where the render is nearer than they.
+pixels and infinite elsewhere that is the paper's. Far pixels are penalised only where the render is nearer than they,
+near ones also for the light that they let through.
 """
 
 from __future__ import annotations
@@ -31,13 +32,13 @@ class DepthLossConfig(HookConfig):
     """First step at which it is added."""
     stop: Steps | None = None
     """First step at which it is no longer added; none: to the end."""
-    every: Every = 4
-    """Steps between additions: a depth changes slowly, and the loss costs time at each step that has it."""
-    weight: NotNegative = 0.8
-    """lambda_d of each addition; what matters is weight / every.
-    Studio, 2000 steps, 4 views per evaluation: 28.5 dB at 0.4 / 2, 28.6 at 0.8 / 4.
-    Studio, 1210 steps, an earlier version: 29.3 dB and depth AbsRel .086 at 0.2 / 1, 29.1 dB and .073 at 1 / 1, 0.4 dB
-    less without the loss."""
+    every: Every = 1
+    """Steps between additions."""
+    weight: NotNegative = 0.2
+    """lambda_d of each addition; what matters is weight / every."""
+    opaque: NotNegative = 0.05
+    """Beside lambda_d's 1, the weight of what known near pixels let through, mean of 1 - alpha; the paper has none. A
+    background of the same colour could else stand for a surface."""
     epsilon: Positive = 0.01
     """epsilon_rho of the Charbonnier penalty, on relative depth residuals."""
     tau_v: Share = 0.5
@@ -96,9 +97,10 @@ class _PixelDepthLoss(torch.autograd.Function):
         root = torch.hypot(residual, epsilon)
         total = weight.sum() + EPSILON
         slope = weight * (residual / root) / (target * opaque * total)  # d loss / d depth_sum
-        context.save_for_backward(pixels.index, slope, slope * depth)
+        near = (~pixels.far).to(a) * (config.opaque / max(int((~pixels.far).sum()), 1))
+        context.save_for_backward(pixels.index, slope, -slope * depth - near)
         context.shape = depth_sum.shape
-        return (weight * residual * (residual / (root + epsilon))).sum() / total
+        return (weight * residual * (residual / (root + epsilon))).sum() / total + (near * (1 - a)).sum()
 
     @staticmethod
     @once_differentiable
@@ -109,16 +111,17 @@ class _PixelDepthLoss(torch.autograd.Function):
             flat = values.new_zeros(context.shape.numel())
             return flat.index_copy_(0, index, values).view(context.shape)
 
-        return scattered(gradient * by_depth_sum), scattered(-gradient * by_alpha), None, None
+        return scattered(gradient * by_depth_sum), scattered(gradient * by_alpha), None, None
 
 
 def pixel_depth_loss(depth_sum: Tensor, alpha: Tensor, pixels: KnownPixels, config: DepthLossConfig) -> Tensor:
-    """L_depth of a render: `depth_loss` of `rendered_depth`, computed at the known pixels alone.
+    """L_depth of a render: `depth_loss` of `rendered_depth` plus `opaque` times the mean of 1 - alpha at near pixels,
+    computed at the known pixels alone.
 
     Args:
         depth_sum, alpha: sum of w z and of w, [H, W], differentiable once.
         pixels: where something is known of D*, and how much.
-        config: tau_v, epsilon and sigma_full.
+        config: tau_v, epsilon, sigma_full and opaque.
     """
     return _PixelDepthLoss.apply(depth_sum, alpha, pixels, config)
 

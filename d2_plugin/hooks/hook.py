@@ -22,7 +22,7 @@ FREE_SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class Window:
-    """The steps at which a hook is due: start <= step < stop, every so many steps."""
+    """The steps at which a hook is due: from start, every so many steps, up to but not including stop."""
 
     start: int = 0
     stop: int | None = None
@@ -30,7 +30,7 @@ class Window:
 
     def due(self, step: int) -> bool:
         """Whether the hook runs at `step` (1-based, as trainers count)."""
-        return self.start <= step and (self.stop is None or step < self.stop) and step % self.every == 0
+        return self.start <= step and (self.stop is None or step < self.stop) and (step - self.start) % self.every == 0
 
 
 @dataclass(frozen=True)

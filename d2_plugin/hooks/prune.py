@@ -35,7 +35,7 @@ class PruneConfig(HookConfig):
     """Weight of depth inconsistency; lambda_e + lambda_o = 1."""
     lambda_o: Share = 0.5
     """Weight of missing opacity contribution."""
-    patience: AtLeastOne = 3
+    patience: AtLeastOne = 5
     """Evaluations in a row, each with evidence, before a Gaussian is removed."""
     free_space: bool = True
     """Whether standing in space that the prior says is free counts as inconsistency too; the paper has no such term.

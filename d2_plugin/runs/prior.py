@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,23 +10,9 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.priors.build import PriorSummary, build_priors
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings, prior_settings
-
-FAR_SHARE = 0.005
-"""Mean share of far pixels in the prior above which the backbone gets a background."""
-
-
-def sees_far(folder: Path, cameras: Sequence[str], frames: Sequence[int]) -> bool:
-    """Whether the depth prior in `folder`, where there is one, found far pixels: only then a background pays."""
-    if not (folder / "store.json").is_file():
-        return False
-    store = PriorStore.open(folder)
-    keys = ((camera, frame) for camera in cameras if camera in store.cameras for frame in frames)
-    records = [record for key in keys if (record := store.record(*key)) is not None]
-    return bool(records) and sum(r["shares"].get("far", 0.0) for r in records) / len(records) > FAR_SHARE
 
 
 def build_priors_for(

@@ -16,8 +16,7 @@ from d2_plugin import registry
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
-from d2_plugin.runs.prior import FAR_SHARE as FAR_SHARE
-from d2_plugin.runs.prior import build_priors_for, sees_far
+from d2_plugin.runs.prior import build_priors_for
 from d2_plugin.runs.provenance import circumstances
 from d2_plugin.runs.scene import Guidance, Remembered, Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, claim, hook_config, stored, write_json
@@ -201,12 +200,7 @@ class Run:
 
     def _needed(self) -> dict[str, Any]:
         """The backbone's settings that the scene needs, those alone: one of somebody else's may not know the names."""
-        needed = {"background": self._sees_far(), "appearance": self.scene.plan.uses("appearance")}
-        return {name: True for name, needs in needed.items() if needs}
-
-    def _sees_far(self) -> bool:
-        """Whether the depth prior, where there is one, found far pixels: only then a background pays."""
-        return sees_far(self.priors, self.scene.train_cameras, self.scene.capture.frames)
+        return {"appearance": True} if self.scene.plan.uses("appearance") else {}
 
     def _trained(self) -> Any:
         """The trainer at the last checkpoint, without hooks or a look at the prior: the checkpoint says it all."""

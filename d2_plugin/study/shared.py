@@ -1,8 +1,4 @@
-"""What the runs of one comparison share: starting points, the full depth prior, and whether there is a background.
-
-All of it is made once and from the full prior, whatever a run then uses of it, so that runs differ by what they name
-alone: a prior of one source marks no sky, and without this its runs would lack the background that the others have.
-"""
+"""What the runs of one comparison share: starting points and the full depth prior, made once."""
 
 from __future__ import annotations
 
@@ -16,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.runs.prior import build_priors_for, sees_far
+from d2_plugin.runs.prior import build_priors_for
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, prior_settings, write_json
 from d2_plugin.runs.start import TimedPoints, triangulated_points
@@ -30,7 +26,6 @@ class Shared:
     """What lies in the folder of a comparison, and what it cost."""
 
     folder: Path
-    background: bool
     seconds: float | None
     """Wall time of points and full prior; None where a build was cut off, since its parts were not timed together."""
     cpu_seconds: float | None
@@ -73,19 +68,11 @@ def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None
     store = folder / "priors" / FULL
     whole = not (store / "store.json").is_file()
     build_priors_for(full, scene, TimedPoints.load(points).positions, store, cluster=cluster)
-    background = sees_far(store, scene.train_cameras, scene.capture.frames)
     used = time.process_time() - cpu if cluster is None else None
     took = (time.monotonic() - start, used) if whole else (None, None)
-    shared = Shared(folder, background, *took)
-    write_json(path, {"background": background, "seconds": took[0], "cpu_seconds": took[1]})
+    shared = Shared(folder, *took)
+    write_json(path, {"seconds": took[0], "cpu_seconds": took[1]})
     return shared
-
-
-def same_backbone(settings: RunSettings, shared: Shared) -> RunSettings:
-    """The settings with the background that the full prior asks for, unless the user's own table decides."""
-    if not shared.background or "background" in settings.overrides.get("backbone", {}):
-        return settings
-    return replace(settings, overrides=_with(settings.overrides, "backbone", background=True))
 
 
 def monocular_seconds(settings: RunSettings) -> float:

@@ -1,4 +1,4 @@
-"""The colour at infinity: off unless asked for, the same from every camera, saved with the model, no surface."""
+"""The colour at infinity: the same from every camera, begun with the pictures, saved with the model, no surface."""
 
 from __future__ import annotations
 
@@ -72,15 +72,15 @@ def turned(view: View, angle: float) -> View:
 
 
 class TestOff:
-    def test_it_is_off_unless_asked_for(self, backbone: str) -> None:
-        model = make_model(backbone=backbone)
-        assert not SplatSettings().background
+    def test_who_does_not_want_it_does_without(self, backbone: str) -> None:
+        model = make_model(backbone=backbone, background=False)
+        assert SplatSettings().background
         assert model.background is None
         state = model.state_dict()
         assert "background" not in state.get("gaussians", state)
 
     def test_off_is_what_the_rasterizer_returns(self, backbone: str) -> None:
-        model, view = make_model(backbone=backbone), make_views()[0]
+        model, view = make_model(backbone=backbone, background=False), make_views()[0]
         splats = model.slice_at(view)
         expected = rasterize(splats, model.colors(view, splats), view)
         for part, other in zip(model.render(view)[:3], expected[:3], strict=True):
@@ -272,3 +272,52 @@ def test_the_bare_trainer_takes_a_model_with_a_background() -> None:
     trainer = Trainer(make_model(background=True), TinyFrames(), TrainSettings(iterations=3, seed=0))
     trainer.run()
     assert trainer.model.background.constant.detach().any()
+
+
+class TestStart:
+    """It begins with what the pictures show, as if all were at infinity."""
+
+    @staticmethod
+    def started(pictures: list[Tensor], views: list[View]) -> Background:
+        sky = Background(torch.device("cpu"))
+        sky.start_from(views, lambda index: pictures[index])
+        return sky
+
+    @staticmethod
+    def flat(view: View, color: tuple[float, float, float]) -> Tensor:
+        return torch.tensor(color).expand(view.height, view.width, 3)
+
+    def test_pictures_of_one_colour_are_that_colour_also_where_no_camera_looks(self) -> None:
+        views, color = make_views()[:2], (0.2, 0.5, 0.9)
+        sky = self.started([self.flat(view, color) for view in views], views)
+        for angle in (0.0, 1.5, 3.0):
+            shown = sky_of(sky, turned(views[0], angle))
+            torch.testing.assert_close(shown, self.flat(views[0], color), atol=1e-4, rtol=0)
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_no_direction_is_brighter_or_darker_than_a_picture_can_be(self, seed: int) -> None:
+        views = make_views()[:2]
+        generator = torch.Generator().manual_seed(seed)
+        noise = [(torch.rand(view.height, view.width, 3, generator=generator) > 0.5).float() for view in views]
+        sky = self.started(noise, views)
+        for angle in torch.linspace(0, 6, 12).tolist():
+            shown = sky_of(sky, turned(views[0], angle))
+            assert (shown - 0.5).abs().max() < 0.4, "least squares ran away where no camera looks"
+
+    def test_left_and_right_are_told_apart(self) -> None:
+        view = make_views()[0]
+        picture = torch.zeros(view.height, view.width, 3)
+        picture[:, view.width // 2 :] = 1
+        shown = sky_of(self.started([picture], [view]), view)
+        assert shown[:, : view.width // 4].mean() < 0.35
+        assert shown[:, -view.width // 4 :].mean() > 0.65
+
+    def test_nothing_to_look_at_leaves_it_grey(self) -> None:
+        assert not self.started([], []).constant.any()
+
+    def test_a_checkpoint_wins_over_the_pictures(self, backbone: str) -> None:
+        first = make_trainer(iterations=4, backbone=backbone, background=True)
+        first.run()
+        second = make_trainer(iterations=4, backbone=backbone, background=True)
+        second.load_state_dict(first.state_dict())
+        assert same(first, second)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -11,7 +13,7 @@ from d2_plugin.hooks.depth_loss import DepthLossConfig, charbonnier, depth_loss,
 from d2_plugin.hooks.prior import KnownPixels
 from d2_plugin.hooks.rendered_depth import rendered_depth
 
-PAPER = DepthLossConfig(tau_v=0.5, epsilon=0.01)
+PAPER = DepthLossConfig(tau_v=0.5, epsilon=0.01, opaque=0)
 
 
 def tensor(*values: float) -> torch.Tensor:
@@ -113,6 +115,27 @@ class TestPixelDepthLoss:
             gradients.append((loss.detach(), z.grad, a.grad))
         for composed, closed in zip(*gradients, strict=True):
             torch.testing.assert_close(closed, composed, rtol=1e-7, atol=1e-12)
+
+    @pytest.mark.parametrize("opaque", [0.05, 3.0])
+    def test_what_near_pixels_let_through_is_added_with_its_gradient(self, opaque: float) -> None:
+        depth_sum, alpha, prior, verified = self.maps(2)
+        alpha = torch.where((alpha - 0.5).abs() < 0.01, 0.6, alpha)
+        pixels = known(prior, verified)
+        far = torch.arange(len(pixels.index)) % 3 == 0
+        pixels = replace(pixels, far=far)
+        config = replace(PAPER, opaque=opaque)
+        through = 1 - alpha.flatten()[pixels.index[~far]]
+        added = pixel_depth_loss(depth_sum, alpha, pixels, config) - pixel_depth_loss(depth_sum, alpha, pixels, PAPER)
+        torch.testing.assert_close(added, opaque * through.mean())
+        inputs = (depth_sum.requires_grad_(), alpha.requires_grad_())
+        assert torch.autograd.gradcheck(lambda z, a: pixel_depth_loss(z, a, pixels, config), inputs)
+
+    def test_where_all_is_far_nothing_is_let_through_wrongly(self) -> None:
+        depth_sum, alpha, prior, verified = self.maps(3)
+        pixels = known(prior, verified)
+        pixels = replace(pixels, far=torch.ones_like(pixels.far))
+        losses = [pixel_depth_loss(depth_sum, alpha, pixels, replace(PAPER, opaque=o)) for o in (0.0, 1.0)]
+        assert torch.equal(*losses)
 
     def test_gradcheck(self) -> None:
         depth_sum, alpha, prior, verified = self.maps(1)

@@ -14,7 +14,7 @@ from d2_plugin.hooks.densify import (
     back_project,
     first_of_each,
     frustum_cells,
-    sample_pixels,
+    shuffled_pixels,
     under_reconstructed,
 )
 from d2_plugin.hooks.prior import PriorLoader
@@ -129,13 +129,13 @@ class TestDensification:
         world = (in_camera - view.T_camera_world[:3, 3]) @ view.T_camera_world[:3, :3]
         torch.testing.assert_close(back_project(view, pixels, depth.flatten()), world)
 
-    def test_sampling_respects_budget_and_mask(self) -> None:
+    def test_shuffled_pixels_are_the_mask_each_once(self) -> None:
         mask = torch.rand(20, 30, generator=torch.Generator().manual_seed(0)) > 0.5
-        pixels = sample_pixels(mask, 50, torch.Generator().manual_seed(1))
-        assert len(pixels) == 50
-        assert len(torch.unique(pixels, dim=0)) == 50
+        pixels = shuffled_pixels(mask, torch.Generator().manual_seed(1))
+        assert len(torch.unique(pixels, dim=0)) == len(pixels) == int(mask.sum())
         assert mask[pixels[:, 1], pixels[:, 0]].all()
-        assert len(sample_pixels(mask, 10_000, torch.Generator())) == int(mask.sum())
+        assert not torch.equal(pixels, shuffled_pixels(mask, torch.Generator().manual_seed(2)))
+        assert shuffled_pixels(torch.zeros_like(mask), torch.Generator()).shape == (0, 2)
 
     def test_points_of_one_cell_share_a_key_and_distant_ones_do_not(self) -> None:
         view = a_view()

@@ -1,4 +1,4 @@
-"""`d2 train` gives the backbone a background exactly where the depth prior found far pixels."""
+"""A background stands behind all Gaussians of the bundled backbones, D2 or not, and a finished run keeps its own."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from tiny import make_model
 from d2_plugin.backbones import yang4d
 from d2_plugin.captures.export.folder import save_capture
 from d2_plugin.captures.synthetic.room import synthetic_capture
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
-from d2_plugin.runs.run import FAR_SHARE, Run
+from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TimedPoints
 
@@ -54,51 +53,26 @@ def trainer_of(run: Run) -> object:
     return run._trainer(NO_POINTS)
 
 
-@pytest.mark.parametrize(
-    ("far", "expected"),
-    [
-        ({"train0": 0, "train1": 0}, False),
-        ({"train0": int(FAR_SHARE * PIXELS), "train1": int(FAR_SHARE * PIXELS)}, False),
-        ({"train0": int(2.1 * FAR_SHARE * PIXELS) + 1, "train1": 0}, True),
-        ({"train0": PIXELS, "train1": PIXELS}, True),
-    ],
-    ids=["no sky", "too little", "one camera sees it", "nothing else"],
-)
-def test_the_mean_share_of_far_pixels_decides(scene: Path, tmp_path: Path, far: dict[str, int], expected: bool) -> None:
-    run = run_of(scene, tmp_path / "run", store(tmp_path / "priors", far))
-    assert run._sees_far() is expected
-    assert (trainer_of(run).model.background is not None) is expected
+@pytest.mark.parametrize("hooks", [(), ("prior", "depth_loss")], ids=["bare", "with D2"])
+def test_there_is_one_with_and_without_d2_so_that_runs_compare(
+    scene: Path, tmp_path: Path, hooks: tuple[str, ...]
+) -> None:
+    run = run_of(scene, tmp_path / "run", store(tmp_path / "priors", dict.fromkeys(CAMERAS, 0)), hooks=hooks)
+    assert trainer_of(run).model.background is not None
 
 
-def test_only_training_cameras_count(scene: Path, tmp_path: Path) -> None:
-    priors = store(tmp_path / "priors", {"train0": 0, "train1": 0, "test0": PIXELS})
-    assert not run_of(scene, tmp_path / "run", priors)._sees_far()
-
-
-def test_frames_without_a_prior_are_no_evidence(scene: Path, tmp_path: Path) -> None:
-    priors = store(tmp_path / "priors", dict.fromkeys(CAMERAS, PIXELS // 100), frames=(1,))
-    assert run_of(scene, tmp_path / "run", priors)._sees_far()
-    nothing = store(tmp_path / "empty", dict.fromkeys(CAMERAS, PIXELS), frames=())
-    assert not run_of(scene, tmp_path / "other", nothing)._sees_far()
-
-
-def test_cameras_that_the_prior_does_not_know_are_no_evidence(scene: Path, tmp_path: Path) -> None:
-    priors = store(tmp_path / "priors", {"train0": PIXELS})
-    assert run_of(scene, tmp_path / "run", priors)._sees_far()
-
-
-def test_without_a_prior_there_is_none(scene: Path, tmp_path: Path) -> None:
+def test_it_begins_with_the_colours_of_the_pictures(scene: Path, tmp_path: Path) -> None:
     run = run_of(scene, tmp_path / "run", None, hooks=())
-    assert not run._sees_far()
-    assert trainer_of(run).model.background is None
+    model, capture = trainer_of(run).model, run.scene.capture
+    for camera in CAMERAS:
+        shown = run._renderer(model)(camera, 0)[0]
+        mean = torch.from_numpy(capture.image(camera, 0)).float().mean((0, 1)) / 255
+        torch.testing.assert_close(shown.mean((0, 1)), mean, atol=0.1, rtol=0)
 
 
 def test_a_user_decides_otherwise(scene: Path, tmp_path: Path) -> None:
-    sky = store(tmp_path / "sky", dict.fromkeys(CAMERAS, PIXELS))
-    off = run_of(scene, tmp_path / "off", sky, overrides={"backbone": {"background": False}})
-    on = run_of(scene, tmp_path / "on", None, hooks=(), overrides={"backbone": {"background": True}})
+    off = run_of(scene, tmp_path / "off", None, hooks=(), overrides={"backbone": {"background": False}})
     assert trainer_of(off).model.background is None
-    assert trainer_of(on).model.background is not None
 
 
 def test_a_backbone_of_somebody_else_is_not_asked_for_what_it_need_not_know(
@@ -124,8 +98,6 @@ class TestAFinishedRun:
         return Run.load(run.folder)
 
     def test_the_checkpoint_says_whether_there_is_a_background(self, trained: Run) -> None:
-        with pytest.raises(D2Error, match="has format 0"):
-            trained._sees_far()
         model = trained._trained().model
         assert model.background is not None
         assert trained.evaluate(pictures=False)["background"] is True

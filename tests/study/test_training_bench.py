@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from concurrent.futures import Future
@@ -14,16 +13,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.study.ablation.job import Job
 from d2_plugin.study.ablation.presets import PRESETS
-from d2_plugin.study.report.quality import quality
-from d2_plugin.study.rows import Row, make_row, read_rows
-from d2_plugin.study.shared import Shared, same_backbone
+from d2_plugin.study.rows import Row, make_row
+from d2_plugin.study.shared import Shared
 from d2_plugin.study.training.bench import TrainingBench, _line, _targets
 from d2_plugin.study.training.budget import PILOT, TOLERANCE, fits, nearest, next_steps
 from d2_plugin.study.training.cases import Case, case_of
@@ -101,7 +97,7 @@ def now(work: Work) -> Future[Row]:
 def bench(known: Sequence[Row], methods: Sequence[str] = ("backbone", "full"), **more: Any) -> list[Row]:
     """The rows that one call writes, given what lies there already."""
     settings = TrainingBench(("room@a+b",), **more)
-    case, shared = Case("room, 2 views", "room", SETTINGS), Shared(Path("/out/room"), False, 3.0, 3.0)
+    case, shared = Case("room, 2 views", "room", SETTINGS), Shared(Path("/out/room"), 3.0, 3.0)
     lines = [_line(settings, case, shared, PRESETS[name], known) for name in methods]
     rows: list[Row] = []
     follow(lines, now, rows.append)
@@ -151,73 +147,9 @@ class TestPlan:
         line = _line(
             TrainingBench(("room@a",), steps=(5,)),
             Case("room", "room", SETTINGS),
-            Shared(Path("/out"), False, None, None),
+            Shared(Path("/out"), None, None),
             PRESETS["backbone"],
             [],
         )
         with pytest.raises(MemoryError):
             follow([line], broken, lambda row: None)
-
-
-class TestSameBackbone:
-    def test_the_full_prior_decides_for_every_row_unless_the_user_does(self) -> None:
-        far, near = (Shared(Path("x"), background, None, None) for background in (True, False))
-        assert same_backbone(SETTINGS, far).overrides == {"backbone": {"background": True}}
-        assert same_backbone(SETTINGS, near) == SETTINGS
-        mine = replace(SETTINGS, overrides={"backbone": {"background": False, "sh_degree": 1}})
-        assert same_backbone(mine, far) == mine
-
-
-class TestReport:
-    def test_three_metrics_two_kinds_of_minutes_and_a_verdict_at_each_time(self) -> None:
-        section = quality(bench([], seconds=(10, 30)))
-        assert set(section.figures) == {"quality", "quality-with-prior", "quality-time"}
-        for name in ("PSNR, dB", "SSIM1", "depth AbsRel"):
-            assert name in section.figures["quality"]
-        tables = dict(section.tables)
-        verdicts = tables["Is D² above the others?"]
-        assert [row[0] for row in verdicts.rows] == ["room, 2 views, 10 s", "room, 2 views, 30 s"]
-        assert all("holds (+1.00 ± 0.01 dB)" in row[2] for row in verdicts.rows)
-
-    def test_one_seed_is_printed_so(self) -> None:
-        section = quality(bench([], seconds=(10,), seeds=(0,)))
-        table = section.tables[0][1]
-        assert {row[2] for row in table.rows} == {"one seed"}
-        assert "one seed: no verdict" in str(dict(section.tables)["Is D² above the others?"].rows)
-
-    def test_a_try_that_became_a_run_counts_once(self) -> None:
-        rows = bench([], seconds=(10,), seeds=(0,))
-        assert len({row["fingerprint"] for row in rows}) < len(rows)
-        notes = quality(rows).figures["quality"].count("yang4d full, 10 s: PSNR")
-        assert notes == 1
-
-    def test_the_minutes_of_the_prior_move_only_who_needs_it(self) -> None:
-        section = quality(bench([], steps=(100,)))
-        full, alone = "yang4d full, 100 steps: PSNR 25.62 ± 0.01", "yang4d backbone, 100 steps: PSNR 24.62 ± 0.01"
-        assert f"{full} (3 seeds), 0.13 min" in section.figures["quality-with-prior"]
-        assert f"{full} (3 seeds), 0.08 min" in section.figures["quality"]
-        assert f"{alone} (3 seeds), 0.08 min" in section.figures["quality-with-prior"]
-
-    def test_a_run_that_failed_is_listed_with_its_reason(self) -> None:
-        rows = bench([], steps=(100,))
-        lost = {**rows[0], "failed": "no stereo", "error": None, "seconds": None, "scores": None, "fingerprint": "x"}
-        assert "no stereo" in str(dict(quality([*rows, lost]).tables)["Runs that failed"].rows)
-
-
-def test_the_command_measures_resumes_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
-    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-    room = save_capture(synthetic_capture(cameras=2, held_out=1, frames=1, width=96, height=54), tmp_path / "room")
-    output = tmp_path / "out"
-    command = ["bench", "training", f"{room}@train0+train1", "--methods", "backbone,dense_start,full", "--seeds", "0"]
-    command += ["--steps", "12", "--jobs", "1", "--output", str(output)]
-    assert main(command) == 0
-    rows = read_rows([output / "training.jsonl"])
-    assert [row["method"] for row in rows] == ["yang4d backbone", "yang4d full", "yang4d dense_start"]
-    assert all(row["seconds"] > 0 and row["scores"]["psnr"] > 5 and not row["failed"] for row in rows)
-    assert str(tmp_path) not in json.dumps(rows)
-    assert not list(output.rglob("checkpoint.pt"))
-    assert main(command) == 0
-    assert read_rows([output / "training.jsonl"]) == rows
-    assert main(["report", str(output / "training.jsonl"), "--output", str(tmp_path / "report")]) == 0
-    assert "one seed" in (tmp_path / "report" / "report.md").read_text()

@@ -16,7 +16,7 @@ from d2_plugin.study.ablation.job import Job, Metrics
 from d2_plugin.study.ablation.presets import Preset
 from d2_plugin.study.ablation.tables import report
 from d2_plugin.study.rows import Row, append_rows, make_row
-from d2_plugin.study.shared import same_backbone, share
+from d2_plugin.study.shared import share
 
 
 def jobs(
@@ -32,7 +32,8 @@ def jobs(
         output: folder of the ablation.
     """
     output, made = output.absolute(), []
-    shared = share(base, output) if any(preset.hooks or preset.rival for preset in presets) else None
+    if any(preset.hooks or preset.rival for preset in presets):
+        share(base, output)
     for backbone in backbones:
         for preset in presets:
             for seed in seeds:
@@ -40,7 +41,6 @@ def jobs(
                     base, backbone=backbone, hooks=preset.hooks, seed=seed, overrides=preset.merged(base.overrides)
                 )
                 settings = replace(settings, priors=str(output / "priors" / prior_settings(settings).variant))
-                settings = settings if shared is None else same_backbone(settings, shared)
                 folder = output / backbone / preset.name / f"seed{seed}"
                 made.append(Job(preset.name, backbone, seed, settings, folder, preset.rival))
     return made

@@ -26,7 +26,7 @@ from d2_plugin.study.ablation.presets import Preset, rows_named
 from d2_plugin.study.command_line import command_line
 from d2_plugin.study.rivals.table import RIVALS
 from d2_plugin.study.rows import Row, append_rows, read_rows
-from d2_plugin.study.shared import Shared, monocular_seconds, same_backbone, share
+from d2_plugin.study.shared import Shared, monocular_seconds, share
 
 from .budget import TRIES, Timed, fits, nearest, next_steps
 from .cases import Case, case_of
@@ -169,7 +169,7 @@ class _Template:
         run = replace(run, overrides=self.preset.merged(base.overrides))
         name = self.preset.name + (f"_{self.settings.label}".replace(" ", "_") if self.settings.label else "")
         folder = self.shared.folder / "runs" / self.settings.backbone / name / f"{steps}steps" / f"seed{seed}"
-        job = Job(self.preset.name, base.backbone, seed, same_backbone(run, self.shared), folder, self.preset.rival)
+        job = Job(self.preset.name, base.backbone, seed, run, folder, self.preset.rival)
         about = {"prior_seconds": self.prior_seconds, "protocol": base.protocol}
         return Work(job, self.shared, self.case.name, self.method, self.command, target, about)
 
