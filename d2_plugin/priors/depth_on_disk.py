@@ -29,7 +29,7 @@ from d2_plugin.priors.stereo.filter import GeometricDepth, filter_depths, remove
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
 
-FILTER_VERSION = 2  # raise it when the filter changes what it returns, so that caches are not trusted
+FILTER_VERSION = 3  # raise it when the filter changes what it returns, so that caches are not trusted
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """Metres per unit."""

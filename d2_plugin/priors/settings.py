@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 from d2_plugin.captures.capture import MonoKind
@@ -80,8 +80,9 @@ class PriorSettings(Settings):
     @classmethod
     def paper(cls, **changes: Any) -> PriorSettings:
         """The paper's construction and nothing else: absolute residuals, one scale and shift, blurred edges kept,
-        each camera for itself."""
+        each camera for itself, depth read at pixels."""
         align = AlignSettings(residual="absolute", epsilon=0.01, local_scales=())
+        changes["stereo"] = replace(changes.get("stereo", StereoSettings()), between_pixels=False)
         return cls(uncertainty=False, hanging_limit=0.0, agreement=0.0, far=False, align=align, **changes)
 
     @classmethod

@@ -10,7 +10,7 @@ picture to picture; that one number, the scale, is measured in each picture.
 
 with d the distance to the nearest anchor (picture widths), g = |log(D / D of that anchor)|, e and e' the span of log D
 within 0.5 % and 2 % of the width, r = log(D / median anchor) where it is positive. A pixel without an anchor is harder
-than an anchor that was left out (no texture, an edge, seen once): K = 1.25 on all recordings with truth.
+than an anchor that was left out (no texture, an edge, seen once): K = 1.3 on all recordings with truth.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ from d2_plugin.priors.settings import AlignSettings
 
 FLOOR, DISTANCE, GAP, EDGE, WIDE_EDGE, BEYOND = 0.051, 1.19, 0.79, 2.76, 0.16, 0.086
 """f0 and fd (of d itself) to fr; fitted once to the true errors of studio, plaza and a rendered room together."""
-HARDER = 1.25
-"""K."""
+HARDER = 1.3
+"""K of a pixel without an anchor."""
+AT_ANCHORS = 1.25
+"""K of a pixel that is compared with its anchor."""
 NEXT = 0.003
 """How far the next anchor lies where a pixel's own is left out, picture widths."""
 WIDTH = 160
@@ -85,8 +87,9 @@ def monocular_uncertainty(aligned: np.ndarray, geometric: np.ndarray, settings: 
     if not np.isfinite(skill.scale):
         return Uncertainty(unknown, unknown, skill)
     corrected = corrected_depth(small, anchors, settings)
-    shapes = error_shape(corrected, anchors), error_shape(corrected, anchors, left_out=True)
-    sigma, at_anchors = (_enlarged(HARDER * skill.scale * shape, aligned.shape) for shape in shapes)
+    sigma = _enlarged(HARDER * skill.scale * error_shape(corrected, anchors), aligned.shape)
+    left_out = error_shape(corrected, anchors, left_out=True)
+    at_anchors = _enlarged(AT_ANCHORS * skill.scale * left_out, aligned.shape)
     sigma = np.where((aligned > 0) & (sigma < HOPELESS), sigma, np.float32(np.inf))
     return Uncertainty(sigma, at_anchors, skill)
 
