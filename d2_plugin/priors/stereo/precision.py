@@ -27,7 +27,7 @@ GRAY_NOISE = 1.25e-3
 """Error of the grey values (0..1) that a match compares: noise, exposure, resampling."""
 PER_INCOHERENCE = 1.5
 """Further error where none of the neighbours lies on the same surface, pixels."""
-OF_SCATTER = 1.8
+OF_SCATTER = 2.0
 """Times the scatter about the local plane: planes are averaged over neighbours, which hides most of their scatter."""
 OF_SPREAD = 0.42
 """Share of the difference to the sources' own depths."""
