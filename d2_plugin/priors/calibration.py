@@ -98,8 +98,8 @@ def frames_with_truth(capture: Capture, cameras: Sequence[str], most: int | None
 def held_against_truth(store: PriorStore, capture: Capture, frames: Sequence[int] | None = None) -> Calibration | None:
     """Compare D* with the true depth of the capture, None where it has none.
 
-    Pixels at which nothing tells sigma, so that it is infinite, promise nothing and are left out. Where the truth itself
-    is rounded, what rounding may do to it is added to sigma (see `truth_rounding`).
+    Pixels at which nothing tells sigma, so that it is infinite, promise nothing and are left out. Where the truth
+    itself is rounded, what rounding may do to it is added to sigma (see `truth_rounding`).
 
     Args:
         store: the priors.

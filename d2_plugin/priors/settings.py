@@ -29,6 +29,10 @@ Preprocessing = Literal["auto", "depth_anything_v2", "unit"]
 """How a picture becomes a network's input."""
 
 
+Along = Literal["z", "ray"]
+"""What a stored depth is measured along."""
+
+
 @dataclass(frozen=True)
 class PriorSettings(Settings):
     """Everything that decides what D* of a capture is."""
@@ -62,6 +66,8 @@ class PriorSettings(Settings):
     """Path of a monocular ONNX network; the capture's own maps on disk where None."""
     mono_kind: MonoKind | None = None
     """What the network predicts: `relative` (inverse depth) or `metric`; required with `mono_onnx`."""
+    mono_along: Along = "z"
+    """What metric monocular maps measure: planar depth `z`, or the distance from the camera along the `ray`."""
     mono_preprocessing: Preprocessing = "auto"
     """Of the network's input: `depth_anything_v2`, `unit`, or `auto`."""
     mono_threads: Annotated[int, Range(0, unit="threads")] = 1
