@@ -14,7 +14,8 @@ from d2_plugin.captures.capture import Capture
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.construct import CONSTRUCTION_VERSION, Construction
 from d2_plugin.priors.depth_on_disk import FilteredDepthOnDisk, find_depth_on_disk
-from d2_plugin.priors.frame import Frame, describe_camera, hash_of
+from d2_plugin.priors.disk.confidence import OF_DEPTH, OF_MONO, ConfidenceMaps
+from d2_plugin.priors.frame import Frame, describe_camera, digest, hash_of
 from d2_plugin.priors.monocular.maps import mono_source
 from d2_plugin.priors.settings import PriorSettings, Variant
 from d2_plugin.priors.stereo.cache import DepthCache, GeometricSource
@@ -87,7 +88,8 @@ class _Builder:
         self.source = self._geometric_source(points, cache / "matches")
         geometric = None if self.source is None else DepthCache(self.source, cache / "stereo")
         possible = replace(settings, variant=self._variant())
-        self.construction = Construction(self.cameras, self.mono, geometric, possible)
+        self.confidence = ConfidenceMaps.beside(capture.path if settings.uncertainty else None, OF_MONO, names)
+        self.construction = Construction(self.cameras, self.mono, geometric, possible, self.confidence)
         self.store = PriorStore.create(output, names, capture.frames, {"capture": capture.name})
 
     def _geometric_source(self, points: np.ndarray | None, matches: Path) -> GeometricSource | None:
@@ -97,7 +99,8 @@ class _Builder:
         if found is not None:
             self.notes.append(f"geometric depth: {found.about}")
             self.bounds = _chosen_bounds(self.settings)
-            return FilteredDepthOnDisk(found, cameras, self.bounds, stereo)
+            confidence = ConfidenceMaps.beside(self.capture.path, OF_DEPTH, self.names)
+            return FilteredDepthOnDisk(found, cameras, self.bounds, stereo, confidence)
         if len(cameras) == 1 or stereo.matcher == NO_MATCHER:
             return None
         self.bounds = _chosen_bounds(self.settings) or _rounded(depth_bounds(cameras, points, stereo.max_angle))
@@ -154,16 +157,22 @@ class _Builder:
             "image": frame.hashes[name],
         }
 
+    def _mono_key(self, name: str, frame: Frame) -> str:
+        """Hash of a monocular map and of what it says of itself."""
+        sure = self.confidence.of(self.cameras[name], frame.number)
+        key = "none" if self.mono is None else self.mono.key(name, frame)
+        return key if sure is None else hash_of(key, digest(sure))
+
     def _keys(self, frame: Frame) -> dict[str, str]:
         """Per camera, the hash of everything that its prior depends on."""
         settings = self.construction.settings
         geometric = None if self.source is None else self.source.key(frame)
-        maps = {} if self.mono is None else {name: self.mono.key(name, frame) for name in self.names}
+        maps = {} if self.mono is None else {name: self._mono_key(name, frame) for name in self.names}
         common = (
             CONSTRUCTION_VERSION,
             settings.variant,
             [settings.uncertainty, settings.conflict_sigmas, settings.tau_c],
-            [settings.z_far_factor, settings.hanging_limit, settings.far],
+            [settings.z_far_factor, settings.hanging_limit, settings.far, settings.mono_along],
             asdict(settings.align),
             geometric,
             [settings.agreement, *maps.values()] if self.construction.agrees else None,

@@ -26,6 +26,10 @@ BINS_PER_DECADE = 4
 LEAST_SHARE, LEAST_PIXELS = 0.01, 30
 """A bin counts where it holds this share of the label's pixels, and this many: fewer say nothing about a quantile."""
 
+LEAST_VALUES, COME_BACK, NEARLY_WHOLE = 20, 30, 0.05
+"""A true depth map is rounded where it has this many values, each comes back so many times, and so near to whole steps
+lie between nearly all of them."""
+
 
 class CurvePoint(NamedTuple):
     """One bin of the reliability curve; on the diagonal, error = sigma, it is calibrated."""
@@ -94,7 +98,8 @@ def frames_with_truth(capture: Capture, cameras: Sequence[str], most: int | None
 def held_against_truth(store: PriorStore, capture: Capture, frames: Sequence[int] | None = None) -> Calibration | None:
     """Compare D* with the true depth of the capture, None where it has none.
 
-    Pixels at which nothing tells sigma, so that it is infinite, promise nothing and are left out.
+    Pixels at which nothing tells sigma, so that it is infinite, promise nothing and are left out. Where the truth
+    itself is rounded, what rounding may do to it is added to sigma (see `truth_rounding`).
 
     Args:
         store: the priors.
@@ -111,12 +116,13 @@ def held_against_truth(store: PriorStore, capture: Capture, frames: Sequence[int
                 continue
             depth, labels, sigma = prior.depth.numpy(), prior.labels.numpy(), prior.sigma.numpy()
             known, far = np.isfinite(truth) & (truth > 0), labels == Label.FAR
+            rounding = truth_rounding(truth)
             views, pixels, sky = views + 1, pixels + truth.size, sky + int((~known).sum())
             sky_far, surface_far = sky_far + int((far & ~known).sum()), surface_far + int((far & known).sum())
             for label, found in collected.items():
                 mask = known & (labels == label) & np.isfinite(sigma)
                 error = np.abs(np.log(depth[mask] / truth[mask].astype(np.float64)))
-                found.append(np.stack([error, sigma[mask]]))
+                found.append(np.stack([error, np.hypot(sigma[mask], rounding[mask])]))
     if not views:
         return None
     held = {label: _held(np.concatenate(found, axis=1), pixels) for label, found in collected.items()}
@@ -126,6 +132,25 @@ def held_against_truth(store: PriorStore, capture: Capture, frames: Sequence[int
         sky_far / sky if sky else float("nan"),
         surface_far / max(pixels - sky, 1),
     )
+
+
+def truth_rounding(truth: np.ndarray) -> np.ndarray:
+    """Relative standard deviation of a true depth map [H, W] from the steps it is stored in; 0 where it is unknown.
+
+    A disparity that was rounded to a third of a pixel, as in Middlebury's maps, puts the depth off by .1 % where
+    matching is as exact as that. Rounding shows: a few values of inverse depth come back many times, and whole
+    multiples of one step lie between them. Its errors are uniform, so their standard deviation is step / sqrt(12).
+    """
+    known = np.isfinite(truth) & (truth > 0)
+    values = np.unique(1 / truth[known].astype(np.float64))
+    rounding = np.zeros(truth.shape)
+    if values.size < LEAST_VALUES or known.sum() < COME_BACK * values.size:
+        return rounding
+    step = float(np.median(np.diff(values)))
+    multiples = np.diff(values) / step
+    if np.mean(np.abs(multiples - np.rint(multiples)) < NEARLY_WHOLE) > 1 - NEARLY_WHOLE:
+        rounding[known] = truth[known] * step / np.sqrt(12)
+    return rounding
 
 
 def reliability_curve(error: np.ndarray, sigma: np.ndarray) -> tuple[CurvePoint, ...]:

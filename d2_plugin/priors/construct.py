@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from d2_plugin.captures.capture import Camera, MonoKind
+from d2_plugin.priors.disk.confidence import ConfidenceMaps
+from d2_plugin.priors.disk.stored import planar
 from d2_plugin.priors.evidence import with_evidence
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.fuse import FusedPrior, empty_prior, fuse, hanging_pixels
@@ -25,7 +28,7 @@ from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.cache import DepthCache, StoredDepth
 from d2_plugin.protocol import Label
 
-CONSTRUCTION_VERSION = 5  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 7  # raise it when alignment or fusion change what they return
 
 NO_GEOMETRY = "no geometric depth survived the filter"
 NO_MAP = "there is no monocular map of this frame"
@@ -78,6 +81,7 @@ class Construction:
         mono: the monocular maps, None where there are none.
         geometric: geometric depth, None where there is none.
         settings: of the construction; `variant` is one that the sources allow.
+        confidence: what the monocular maps say of themselves; nothing where None.
     """
 
     def __init__(
@@ -86,7 +90,9 @@ class Construction:
         mono: MonoSource | None,
         geometric: DepthCache | None,
         settings: PriorSettings,
+        confidence: ConfidenceMaps | None = None,
     ) -> None:
+        self.confidence = ConfidenceMaps(Path(), ()) if confidence is None else confidence
         self.cameras, self.mono, self.geometric, self.settings = cameras, mono, geometric, settings
         several = geometric is not None and len(cameras) > 1
         self.agrees = settings.agreement > 0 and settings.variant == "dual" and several
@@ -148,6 +154,11 @@ class Construction:
         prediction = self.mono.map(name, frame)
         if prediction is None:
             return AlignedMap(nothing, refused=NO_MAP)
+        if self.settings.mono_along == "ray":
+            prediction = planar(prediction, self.cameras[name])
+        sure = self.confidence.of(self.cameras[name], frame.number)
+        if sure is not None:
+            prediction = np.where(sure > 0, prediction, np.float32(np.nan))
         if self.geometric is None and self.mono.kind == "relative":
             return AlignedMap(nothing, refused=SCALE_UNKNOWN)
         alignment = self._fit(prediction, geometric, self.mono.kind)
@@ -160,7 +171,7 @@ class Construction:
             return AlignedMap(aligned, alignment)
         depth = corrected_depth(aligned, geometric, self.settings.align)
         known = self.settings.uncertainty and anchors.size > 0
-        uncertainty = monocular_uncertainty(aligned, geometric, self.settings.align) if known else None
+        uncertainty = monocular_uncertainty(aligned, geometric, self.settings.align, sure) if known else None
         return AlignedMap(depth, alignment, "", uncertainty, aligned_inverse(prediction, alignment))
 
     def _fit(self, prediction: np.ndarray, geometric: np.ndarray, kind: MonoKind) -> Alignment:

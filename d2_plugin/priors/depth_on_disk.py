@@ -1,9 +1,10 @@
 """Geometric depth that lies on disk: what a sensor measured, or what COLMAP computed in a workspace of the user's.
 
-Sensor maps of planar depth lie beside the pictures as depth/CAMERA/FRAME.npy or .png, with depth/depth.json: {"scale":
-world units per stored number}, or {"unit": "m" | "cm" | "mm"} where the calibration is in metres. 0, NaN and infinity
-are no depth. True depth for evaluation (depth/CAMERA/FRAME.npz) is never read here. Workspaces are read by
-`d2_plugin.priors.colmap.workspace`.
+Sensor maps lie beside the pictures as depth/CAMERA/FRAME.npy or .png, with depth/depth.json: {"scale": world units per
+stored number}, or {"unit": "m" | "cm" | "mm"} where the calibration is in metres. They hold planar depth, or with
+{"along": "ray"} distances from the camera's centre. 0, NaN and infinity are no depth. Confidence maps may lie beside
+them (`d2_plugin.priors.disk.confidence`). True depth for evaluation (depth/CAMERA/FRAME.npz) is never read here.
+Workspaces are read by `d2_plugin.priors.colmap.workspace`.
 """
 
 from __future__ import annotations
@@ -19,23 +20,23 @@ import numpy as np
 
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import FrameFiles, numbered_files
-from d2_plugin.captures.pictures import shrink_depth
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.colmap.workspace import WorkspaceDepth
-from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.disk.confidence import ConfidenceMaps, divided
+from d2_plugin.priors.disk.stored import SUFFIXES, at_picture_size, planar, stored_numbers
 from d2_plugin.priors.frame import Frame, describe_camera, digest, hash_of
 from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filter import GeometricDepth, filter_depths, remove_speckles
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
 
-FILTER_VERSION = 2  # raise it when the filter changes what it returns, so that caches are not trusted
+FILTER_VERSION = 3  # raise it when the filter changes what it returns, so that caches are not trusted
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """Metres per unit."""
 
-ASPECT = 0.01
-"""Sensor and picture may differ by this share in their ratio of width to height: a pixel or two of rounding."""
+ALONG = ("z", "ray")
+"""What a sensor's numbers are measured along: planar depth, or the distance from the camera's centre."""
 
 NEIGHBOURS = 2
 """Half the side of the window whose pixels a sensor's depth is compared with, pixels."""
@@ -64,9 +65,9 @@ class SensorDepth:
     name: ClassVar[str] = "sensor"
 
     def __init__(self, folder: Path, cameras: Sequence[str]) -> None:
-        self.scale = _scale(folder / "depth.json")
+        self.scale, self.along_ray = _scale(folder / "depth.json"), _along_ray(folder / "depth.json")
         self.files: dict[str, FrameFiles] = {
-            name: numbered_files(folder / name, (".npy", ".png")) for name in cameras if (folder / name).is_dir()
+            name: numbered_files(folder / name, SUFFIXES) for name in cameras if (folder / name).is_dir()
         }
         self.about = f"sensor depth of {', '.join(self.files) or 'no camera'} in {folder.name}/"
 
@@ -75,9 +76,10 @@ class SensorDepth:
         path = self.files.get(camera.name, {}).get(frame)
         if path is None:
             return None
-        stored = _stored_numbers(path).astype(np.float32)
+        stored = stored_numbers(path).astype(np.float32)
         known = np.isfinite(stored) & (stored > 0)
-        return _at_picture_size(np.where(known, stored * np.float32(self.scale), 0), camera, path)
+        depth = at_picture_size(np.where(known, stored * np.float32(self.scale), 0), camera, path)
+        return planar(depth, camera) if self.along_ray else depth
 
 
 def find_depth_on_disk(capture: Capture, cameras: Sequence[str], settings: StereoSettings) -> DepthOnDisk | None:
@@ -123,13 +125,20 @@ class FilteredDepthOnDisk:
         cameras: whose maps are read.
         bounds: what lies outside of them is dropped; nothing where None.
         settings: of the filter.
+        confidence: what the maps say of themselves; nothing where None.
     """
 
     matched_share = 1.0  # nothing is carried over
 
     def __init__(
-        self, found: DepthOnDisk, cameras: Sequence[Camera], bounds: DepthBounds | None, settings: StereoSettings
+        self,
+        found: DepthOnDisk,
+        cameras: Sequence[Camera],
+        bounds: DepthBounds | None,
+        settings: StereoSettings,
+        confidence: ConfidenceMaps | None = None,
     ) -> None:
+        self.confidence = ConfidenceMaps(Path(), ()) if confidence is None else confidence
         self.found, self.cameras, self.bounds = found, list(cameras), bounds
         self.matcher, self.settings = found.name, replace(settings, reuse_static=False)
         self._keys: dict[int, str] = {}
@@ -146,17 +155,27 @@ class FilteredDepthOnDisk:
                 [describe_camera(camera) for camera in self.cameras],
                 [frame.hashes[camera.name] for camera in self.cameras],
                 [digest(depth) for depth in self._maps(frame.number)],
+                [None if sure is None else digest(sure) for sure in self._confidences(frame.number)],
             )
         return self._keys[frame.number]
 
     def depths(self, frame: Frame) -> list[GeometricDepth]:
         """D^g per camera at one frame."""
-        maps = self._maps(frame.number)
+        confidences = self._confidences(frame.number)
+        sure = [True if values is None else values > 0 for values in confidences]
+        maps = [np.where(where, depth, np.float32(0)) for where, depth in zip(sure, self._maps(frame.number))]
+        found = self._filtered(frame, maps)
+        return [replace(depth, sigma=divided(depth.sigma, c)) for depth, c in zip(found, confidences)]
+
+    def _filtered(self, frame: Frame, maps: list[np.ndarray]) -> list[GeometricDepth]:
         if self.matcher == SensorDepth.name:
             return [filter_sensor(depth, self.settings) for depth in maps]
         grays = [gray(frame.images[camera.name]) for camera in self.cameras]
         costs = [np.zeros(depth.shape, np.float32) for depth in maps]
         return filter_depths(grays, self.cameras, maps, costs, self.settings)
+
+    def _confidences(self, number: int) -> list[np.ndarray | None]:
+        return [self.confidence.of(camera, number) for camera in self.cameras]
 
     def _maps(self, number: int) -> list[np.ndarray]:
         """The maps of one frame, float32 [H, W] per camera, 0 where unknown or out of range; the last are kept."""
@@ -198,12 +217,26 @@ def flying_pixels(depth: np.ndarray) -> np.ndarray:
     return (depth > 0) & (2 * (agreeing - 1) < len(steps) ** 2 - 1)
 
 
-def _scale(path: Path) -> float:
-    """World units per stored number."""
+def _described(path: Path) -> Any:
+    """What depth.json holds."""
     try:
-        content: Any = json.loads(path.read_text())
+        return json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise D2Error(f"{path} cannot be read as JSON ({error}): write a scale or a unit into it") from None
+
+
+def _along_ray(path: Path) -> bool:
+    """Whether the maps hold distances along the ray."""
+    content = _described(path)
+    along = content.get("along", ALONG[0]) if isinstance(content, dict) else ALONG[0]
+    if along not in ALONG:
+        raise unknown_name(f"along in {path}", str(along), ALONG)
+    return along == "ray"
+
+
+def _scale(path: Path) -> float:
+    """World units per stored number."""
+    content = _described(path)
     table = content if isinstance(content, dict) else {}
     if ("unit" in table) == ("scale" in table):
         raise D2Error(f"{path} must have either scale (world units per stored number) or unit, got {content!r}")
@@ -215,40 +248,3 @@ def _scale(path: Path) -> float:
     if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale < float("inf"):
         raise D2Error(f"{path} says scale {scale!r}, expected world units per stored number above 0: correct it")
     return float(scale)
-
-
-def _stored_numbers(path: Path) -> np.ndarray:
-    """A map as it is stored, [h, w]."""
-    if path.suffix == ".npy":
-        try:
-            values = np.load(path)
-        except (OSError, ValueError, EOFError) as error:
-            raise D2Error(f"cannot read {path} ({error}): replace the file or remove it") from None
-    else:
-        cv2 = opencv("reading sensor depth")
-        values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if path.stat().st_size else None
-        if values is None or values.dtype != np.uint16:
-            found = "no readable PNG" if values is None else f"{values.dtype} with shape {values.shape}"
-            raise D2Error(f"{path} is {found}: sensor depth needs a PNG of 16 bits and one channel, or .npy")
-    if values.ndim != 2:
-        raise D2Error(f"{path} has shape {values.shape}, expected [height, width]: write one number per pixel")
-    return values
-
-
-def _at_picture_size(depth: np.ndarray, camera: Camera, path: Path) -> np.ndarray:
-    """The map at the camera's size: blocks where the picture was made smaller by a whole number, else nearest pixels.
-
-    Nearest on purpose: a depth interpolated across an edge belongs to no surface.
-    """
-    height, width = depth.shape
-    factor = width // camera.width
-    if factor >= 1 and width - factor * camera.width < factor and 0 <= height - factor * camera.height < factor:
-        return shrink_depth(depth, factor) if factor > 1 else depth.astype(np.float32)
-    if abs(width * camera.height / (height * camera.width) - 1) > ASPECT:
-        raise D2Error(
-            f"{path} is {width}x{height} but its picture {camera.width}x{camera.height}: register the depth map to the "
-            "picture of its camera first"
-        )
-    rows = ((np.arange(camera.height) + 0.5) * (height / camera.height)).astype(np.int64)
-    columns = ((np.arange(camera.width) + 0.5) * (width / camera.width)).astype(np.int64)
-    return np.ascontiguousarray(depth[rows][:, columns], dtype=np.float32)

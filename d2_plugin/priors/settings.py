@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 from d2_plugin.captures.capture import MonoKind
@@ -27,6 +27,10 @@ verified, since the paper runs "identical densification, pruning, and RGB-D opti
 
 Preprocessing = Literal["auto", "depth_anything_v2", "unit"]
 """How a picture becomes a network's input."""
+
+
+Along = Literal["z", "ray"]
+"""What a stored depth is measured along."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,8 @@ class PriorSettings(Settings):
     """Path of a monocular ONNX network; the capture's own maps on disk where None."""
     mono_kind: MonoKind | None = None
     """What the network predicts: `relative` (inverse depth) or `metric`; required with `mono_onnx`."""
+    mono_along: Along = "z"
+    """What metric monocular maps measure: planar depth `z`, or the distance from the camera along the `ray`."""
     mono_preprocessing: Preprocessing = "auto"
     """Of the network's input: `depth_anything_v2`, `unit`, or `auto`."""
     mono_threads: Annotated[int, Range(0, unit="threads")] = 1
@@ -80,8 +86,9 @@ class PriorSettings(Settings):
     @classmethod
     def paper(cls, **changes: Any) -> PriorSettings:
         """The paper's construction and nothing else: absolute residuals, one scale and shift, blurred edges kept,
-        each camera for itself."""
+        each camera for itself, depth read at pixels."""
         align = AlignSettings(residual="absolute", epsilon=0.01, local_scales=())
+        changes["stereo"] = replace(changes.get("stereo", StereoSettings()), between_pixels=False)
         return cls(uncertainty=False, hanging_limit=0.0, agreement=0.0, far=False, align=align, **changes)
 
     @classmethod

@@ -13,7 +13,7 @@ from d2_plugin.captures import open_capture
 from d2_plugin.captures.capture import Capture
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.calibration import Calibration, held_against_truth
+from d2_plugin.priors.calibration import Calibration, held_against_truth, truth_rounding
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.store import PriorStore
@@ -123,6 +123,20 @@ def test_the_summary_shows_median_sigma_and_parts_add_up() -> None:
     paper = PriorSummary()
     paper.add("a", 0, record(0.0, None), True)
     assert "sigma" not in str(paper)
+
+
+def test_a_rounded_truth_is_told_by_its_steps_and_an_exact_one_is_not() -> None:
+    rows, columns = np.mgrid[:120, :160]
+    disparity = 40 + 0.1 * columns + 0.05 * rows
+    exact, rounded = (1000 / values for values in (disparity, np.rint(3 * disparity) / 3))
+    found = truth_rounding(rounded.astype(np.float32))
+    np.testing.assert_allclose(found, (1 / 3) / np.sqrt(12) / disparity, rtol=0.02)
+    true_spread = np.std(np.log(rounded / exact) * disparity)
+    assert np.median(found * disparity) == pytest.approx(true_spread, rel=0.03)
+    random = np.random.default_rng(0)
+    for plain in (exact, exact * (1 + 1e-4 * random.standard_normal(exact.shape)), np.where(columns < 80, 2.0, 5.0)):
+        assert (truth_rounding(plain.astype(np.float32)) == 0).all()
+    assert (truth_rounding(np.zeros((4, 4))) == 0).all()
 
 
 def measured(capture: Capture, names: list[str], path: Path) -> Calibration:

@@ -11,7 +11,7 @@ import torch
 from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.evidence import AGREED, ALONE, BESIDE, NEAR, WITHIN, with_evidence
+from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, BESIDE, NEAR, WITHIN, with_evidence
 from d2_plugin.priors.fuse import FusedPrior, empty_prior
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.store import PriorStore
@@ -60,7 +60,7 @@ def test_maps_that_put_a_wall_at_one_place_agree_where_both_cameras_see_it() -> 
     for prior in agreed.values():
         assert share(prior, Label.AGREED) == pytest.approx(1 - shift / WIDTH, abs=1 / WIDTH)
         both = prior.labels == Label.AGREED
-        np.testing.assert_allclose(prior.sigma[both], AGREED * SIGMA, rtol=1e-6)
+        np.testing.assert_allclose(prior.sigma[both], np.hypot(AGREED * SIGMA, AT_BEST), rtol=1e-6)
         np.testing.assert_allclose(prior.sigma[~both], SIGMA, rtol=1e-6)
         np.testing.assert_array_equal(prior.depth, np.float32(WALL))
     assert (agreed["left"].labels[:, : int(shift)] == Label.MONO).all(), "what one camera alone sees stays mono-only"

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from d2_plugin.priors.stereo.precision import FLOOR, MATCHING, WINDOW, geometric_sigma, plane_scatter
+from d2_plugin.priors.stereo.precision import (
+    FLOOR,
+    GRAY_NOISE,
+    MATCHING,
+    WINDOW,
+    geometric_sigma,
+    grey_gradient,
+    plane_scatter,
+)
 
 pytest.importorskip("cv2")
 
@@ -17,8 +25,8 @@ def plane(height: int, width: int, unit: float = 1.0) -> np.ndarray:
 
 
 def sigma_of(depth: np.ndarray, **changes: np.ndarray | float) -> np.ndarray:
-    """Sigma with no cost, full coherence, no spread and a parallax of 100 pixels, but for `changes`."""
-    values = {"cost": 0.0, "coherence": 1.0, "parallax": 100.0, "spread": 0.0} | changes
+    """Sigma with full coherence, no spread, a textured picture and a parallax of 100 pixels, but for `changes`."""
+    values = {"coherence": 1.0, "parallax": 100.0, "spread": 0.0, "gradient": 0.05} | changes
     return geometric_sigma(depth, **{name: np.broadcast_to(value, depth.shape) for name, value in values.items()})
 
 
@@ -42,14 +50,14 @@ def test_sigma_is_the_matching_error_over_the_parallax_and_falls_with_it() -> No
     depth = plane(40, 60)
     found = [float(np.median(sigma_of(depth, parallax=parallax))) for parallax in (1.0, 10.0, 100.0, 1e4, 1e9)]
     assert found == sorted(found, reverse=True)
-    assert found[0] == pytest.approx(np.hypot(MATCHING, FLOOR), rel=1e-3)
+    assert found[0] == pytest.approx(np.hypot(MATCHING + GRAY_NOISE / 0.05, FLOOR), rel=1e-3)
     assert found[-1] == pytest.approx(FLOOR, rel=1e-3)
 
 
-def test_cost_incoherence_and_spread_all_make_it_less_sure() -> None:
+def test_flat_pictures_incoherence_and_spread_all_make_it_less_sure() -> None:
     depth = plane(40, 60)
     best = np.median(sigma_of(depth, parallax=20.0))
-    for worse in ({"cost": 0.5}, {"coherence": 0.5}, {"spread": 0.05}):
+    for worse in ({"gradient": 0.01}, {"coherence": 0.5}, {"spread": 0.05}):
         assert np.median(sigma_of(depth, parallax=20.0, **worse)) > 1.02 * best
 
 
@@ -57,9 +65,9 @@ def test_where_anything_is_unknown_sigma_is_infinite_and_never_nan() -> None:
     depth = plane(40, 60)
     for row, value in enumerate((0.0, -1.0, np.nan, np.inf)):
         depth[row] = value
-    unknown = {"parallax": (4, 0.0), "cost": (5, np.nan), "coherence": (6, np.nan), "spread": (7, np.nan)}
-    maps = {name: np.full(depth.shape, default) for name, default in (("parallax", 50.0), ("coherence", 1.0))}
-    maps |= {name: np.zeros(depth.shape) for name in ("cost", "spread")}
+    unknown = {"parallax": (4, 0.0), "gradient": (5, np.nan), "coherence": (6, np.nan), "spread": (7, np.nan)}
+    defaults = {"parallax": 50.0, "coherence": 1.0, "gradient": 0.05, "spread": 0.0}
+    maps = {name: np.full(depth.shape, default) for name, default in defaults.items()}
     for name, (row, value) in unknown.items():
         maps[name][row] = value
     sigma = geometric_sigma(depth, **maps)
@@ -73,7 +81,7 @@ def test_values_outside_of_their_range_count_as_its_ends() -> None:
     depth = plane(20, 30)
     np.testing.assert_array_equal(sigma_of(depth, coherence=7.0), sigma_of(depth, coherence=1.0))
     np.testing.assert_array_equal(sigma_of(depth, coherence=-7.0), sigma_of(depth, coherence=0.0))
-    np.testing.assert_array_equal(sigma_of(depth, cost=-1.0), sigma_of(depth, cost=0.0))
+    np.testing.assert_array_equal(sigma_of(depth, gradient=0.0), sigma_of(depth, gradient=-1.0))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (2, 2), (7, 5)])
@@ -88,3 +96,13 @@ def test_depths_from_a_millimetre_to_a_thousand_kilometres_in_one_map() -> None:
     sigma = sigma_of(depth)
     assert not np.isnan(sigma).any()
     assert (sigma >= FLOOR * 0.999).all()
+
+
+def test_the_gradient_is_that_of_the_grey_value_whatever_its_direction() -> None:
+    rows, columns = np.mgrid[:40, :60]
+    ramp = (20 + 2 * columns + rows).astype(np.uint8)
+    inside = np.s_[8:-8, 8:-8]
+    expected = np.hypot(2, 1) / 255
+    np.testing.assert_allclose(grey_gradient(ramp)[inside], expected, rtol=0.02)
+    np.testing.assert_allclose(grey_gradient(np.ascontiguousarray(ramp.T)).T[inside], expected, rtol=0.02)
+    assert grey_gradient(np.full((9, 9), 7, np.uint8)).max() < 1e-6

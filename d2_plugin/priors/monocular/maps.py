@@ -76,8 +76,19 @@ def mono_source(capture: Capture, settings: PriorSettings, cache: Path) -> MonoS
     """The monocular source that settings and capture name, or None where there is none.
 
     Raises:
-        D2Error: a network without a declared kind, or a declared kind that contradicts the capture's.
+        D2Error: a network without a declared kind, a declared kind that contradicts the capture's, or relative maps
+            along the ray.
     """
+    source = _named_source(capture, settings, cache)
+    if source is not None and source.kind == "relative" and settings.mono_along == "ray":
+        raise D2Error(
+            "mono_along = ray needs metric maps but these are relative, whose shift is that of planar inverse depth: "
+            "leave mono_along out"
+        )
+    return source
+
+
+def _named_source(capture: Capture, settings: PriorSettings, cache: Path) -> MonoSource | None:
     if settings.mono_onnx:
         if settings.mono_kind is None:
             raise D2Error(

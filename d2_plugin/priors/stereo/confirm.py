@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
-from d2_plugin.priors.geometry import Projection, pixel_grid, triangulation_angle, view_pair
+from d2_plugin.priors.geometry import Projection, interpolated_surface, pixel_grid, triangulation_angle, view_pair
 from d2_plugin.priors.stereo.settings import StereoSettings
 
 NUDGE = 1e-3
@@ -31,7 +31,7 @@ def confirm(
 ) -> Confirmation:
     """Ask every other view about the depths of view `index`.
 
-    A source confirms when its own depth, read at the pixel on which ours lands, takes us back to within
+    A source confirms when its own depth, read where ours lands, takes us back to within
     `reprojection_max` pixels (COLMAP's geometric consistency), agrees to `relative_depth_max` in our view, and the two
     rays meet at an angle between `min_angle` and `max_angle`.
     """
@@ -44,7 +44,7 @@ def confirm(
             continue
         pair = view_pair(reference, source)
         forth = pair.project(u, v, depth)
-        seen = sample_nearest(depths[other], forth)
+        seen = (sample_surface if settings.between_pixels else sample_nearest)(depths[other], forth)
         back = view_pair(source, reference).project(forth.x, forth.y, seen)
         with np.errstate(invalid="ignore", over="ignore"):
             near_pixel = np.hypot(back.x - u, back.y - v) < settings.reprojection_max
@@ -74,3 +74,13 @@ def sample_nearest(depth: np.ndarray, at: Projection) -> np.ndarray:
     column = np.rint(np.where(inside, at.x, 0)).astype(np.int32)
     row = np.rint(np.where(inside, at.y, 0)).astype(np.int32)
     return np.where(inside, depth[row, column], 0)
+
+
+def sample_surface(depth: np.ndarray, at: Projection) -> np.ndarray:
+    """`depth` between the pixels around `at` where they are one surface, that of the nearest pixel elsewhere.
+
+    On a ground that is seen at a grazing angle, depth changes by more than 1 % from one pixel to the next.
+    """
+    inside = at.z > 0
+    known, between = interpolated_surface(depth, np.where(inside, at.x, -9), np.where(inside, at.y, -9))
+    return np.where(known, between, sample_nearest(depth, at)).astype(np.float32)

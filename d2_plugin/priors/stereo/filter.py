@@ -19,7 +19,7 @@ from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.stereo.coherence import surface_coherence
 from d2_plugin.priors.stereo.confirm import confirm
-from d2_plugin.priors.stereo.precision import geometric_sigma
+from d2_plugin.priors.stereo.precision import geometric_sigma, grey_gradient
 from d2_plugin.priors.stereo.settings import StereoSettings
 
 
@@ -84,7 +84,8 @@ def filter_depths(
             "confirmed": int(np.count_nonzero(confirmed)),
             "kept": int(np.count_nonzero(final)),
         }
-        sigma = geometric_sigma(final, cost, coherent[index], confirmation.parallax, confirmation.spread)
+        evidence = (coherent[index], confirmation.parallax, confirmation.spread, grey_gradient(gray))
+        sigma = geometric_sigma(final, *evidence)
         results.append(GeometricDepth(final, np.asarray(cost, np.float32), confirmation.sources, survivors, sigma))
     return results
 

@@ -1,14 +1,16 @@
 """How precise a geometric depth is: matching precision through the parallax, and what neighbours and sources say.
 
 A match that is off by e pixels puts the depth off by e / P, where P is the parallax: by how many pixels the match moves
-in the confirming sources when the depth changes by its own size. That alone is the textbook's answer; two things that a
-map knows about itself tell where it is too good: how far depths scatter about the plane of their neighbours, and how
-far the depth of a confirming source lies from ours.
+in the confirming sources when the depth changes by its own size. The match itself is as sharp as the picture is: grey
+values that are off by n put it off by n / g where they change by g per pixel. Two things that a map knows about itself
+tell where that is too good: how far depths scatter about the plane of their neighbours, and how far the depth of a
+confirming source lies from ours.
 
-    sigma^2 = ((m + c cost + k (1 - coherence)) / P)^2 + (r scatter)^2 + (s spread)^2 + floor^2
+    sigma^2 = ((m + n / g + k (1 - coherence)) / P)^2 + (r scatter)^2 + (s spread)^2 + floor^2
 
-The six numbers are the same for every capture. They are a fit to studio and plaza (4 and 2 views), a rendered room and
-the Middlebury pairs: of the depths that pass the filter, 70 to 86 % lie within sigma and 89 to 96 % within two.
+What the match cost says is in the other terms already: a fit gives it no weight. The numbers are the same for every
+capture. They are a fit to studio and plaza (4 and 2 views), rendered rooms and Middlebury pairs (art, motorcycle,
+teddy): the table of docs/priors.md says what share of the errors they hold.
 """
 
 from __future__ import annotations
@@ -19,24 +21,32 @@ import numpy as np
 
 from d2_plugin.priors.extras import opencv
 
-MATCHING = 0.12
+MATCHING = 0.038
 """Error of the best match, pixels."""
-PER_COST = 0.02
-"""Further error per unit of matching cost 1 - NCC, pixels."""
-PER_INCOHERENCE = 2.5
+GRAY_NOISE = 1.25e-3
+"""Error of the grey values (0..1) that a match compares: noise, exposure, resampling."""
+PER_INCOHERENCE = 1.5
 """Further error where none of the neighbours lies on the same surface, pixels."""
-OF_SCATTER = 0.13
-"""Share of the scatter about the local plane."""
-OF_SPREAD = 0.06
+OF_SCATTER = 2.0
+"""Times the scatter about the local plane: planes are averaged over neighbours, which hides most of their scatter."""
+OF_SPREAD = 0.42
 """Share of the difference to the sources' own depths."""
-FLOOR = 9.5e-4
+FLOOR = 6e-4
 """What no map is better than: calibration, resampling, the nearest pixel of a source."""
+FLATTEST = 3e-3
+"""Gradients of the grey value are not told from noise below this, per pixel."""
+BLUR, AROUND = 0.7, 9
+"""Blur before the gradient is taken, pixels, and side of the window over which it is averaged."""
 WINDOW = 7
 """Side of the window of the local plane, pixels."""
 
 
 def geometric_sigma(
-    depth: np.ndarray, cost: np.ndarray, coherence: np.ndarray, parallax: np.ndarray, spread: np.ndarray
+    depth: np.ndarray,
+    coherence: np.ndarray,
+    parallax: np.ndarray,
+    spread: np.ndarray,
+    gradient: np.ndarray,
 ) -> np.ndarray:
     """Relative standard deviation of D^g, float32 [H, W]; infinite where there is no depth or no parallax.
 
@@ -44,19 +54,28 @@ def geometric_sigma(
 
     Args:
         depth: D^g [H, W], 0 where there is none.
-        cost: matching cost 1 - NCC [H, W], 0 where it is not known.
         coherence: share of the neighbours on the tangent plane [H, W], 0..1.
         parallax: root of the sum over confirming sources of P^2 [H, W], pixels per unit of log depth.
         spread: root mean square relative difference to the depths of the confirming sources [H, W].
+        gradient: change of the grey value around the pixel [H, W], 0..1 per pixel (see `grey_gradient`).
     """
-    known = (depth > 0) & (parallax > 0) & np.isfinite(depth) & ~np.isnan(cost) & ~np.isnan(coherence)
-    known &= np.isfinite(spread)
-    cost, coherence, spread = (np.where(known, map_, 0) for map_ in (cost, coherence, spread))
-    pixels = MATCHING + PER_COST * np.maximum(cost, 0) + PER_INCOHERENCE * (1 - np.clip(coherence, 0, 1))
+    known = (depth > 0) & (parallax > 0) & np.isfinite(depth) & ~np.isnan(coherence)
+    known &= np.isfinite(spread) & ~np.isnan(gradient)
+    coherence, spread = (np.where(known, map_, 0) for map_ in (coherence, spread))
+    pixels = MATCHING + GRAY_NOISE / np.where(known, np.maximum(gradient, FLATTEST), 1)
+    pixels = pixels + PER_INCOHERENCE * (1 - np.clip(coherence, 0, 1))
     matching = pixels / np.where(known, parallax, 1)
     scatter = OF_SCATTER * plane_scatter(np.where(np.isfinite(depth), depth, 0))
     variance = matching**2 + scatter**2 + (OF_SPREAD * spread) ** 2 + FLOOR**2
     return np.where(known, np.sqrt(variance), np.inf).astype(np.float32)
+
+
+def grey_gradient(gray: np.ndarray) -> np.ndarray:
+    """Root mean square change of the grey value around each pixel of uint8 [H, W], float32 [H, W], 0..1 per pixel."""
+    cv2: Any = opencv("the precision of geometric depth")
+    smooth = cv2.GaussianBlur(gray.astype(np.float32) / 255, (0, 0), BLUR)
+    across, down = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    return np.sqrt(cv2.blur(across * across + down * down, (AROUND, AROUND)))
 
 
 def plane_scatter(depth: np.ndarray, window: int = WINDOW) -> np.ndarray:

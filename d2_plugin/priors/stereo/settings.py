@@ -79,6 +79,10 @@ class StereoSettings(Settings):
     """Neighbours whose grey value differs by more than this (0..1) have little say in coherence."""
     reprojection_max: Annotated[float, Range(0, unit="pixels", open_low=True)] = 1.0
     """Forward-backward reprojection error of a confirming source must be below this, as in COLMAP."""
+    between_pixels: bool = True
+    """Read a source's depth between its pixels where they are one surface; off, that of the nearest one. Measured:
+    plaza's verified share grows from 19.3 to 25.6 % (4 views) and 1.7 to 2.3 % (2 views), off by more than 1 % are .57
+    instead of .65 % and 4.3 instead of 6.8 %; other recordings gain up to .6 % of their pixels."""
     relative_depth_max: Positive = 0.01
     """Relative depth difference to a confirming source must be below this."""
     min_sources: Count = 1
