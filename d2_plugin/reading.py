@@ -57,7 +57,7 @@ def opened(path: Path | str, remedy: str = RESTORE) -> Iterator[BinaryIO]:
     except D2Error:
         raise
     except FileNotFoundError:
-        raise NoSuchFile(f"{shown_path(path)} is not there: {remedy}") from None
+        raise NoSuchFile(f"cannot read {shown_path(path)} (there is no such file): {remedy}") from None
     except (OSError, ValueError) as failure:  # ValueError: a zero byte, or letters that no file name has
         raise Unreadable(f"cannot read {shown_path(path)} ({said(failure)}): {remedy}") from None
     with os.fdopen(handle, "rb") as file:
@@ -211,7 +211,7 @@ def _kind_of(content: Any) -> str:
 
 
 def _no_constant(name: str) -> NoReturn:
-    raise ValueError(f"it has {name}, which is no number of JSON")
+    raise ValueError(f"it has {name}, which is not finite and no number of JSON")
 
 
 def _finite(text: str) -> float:

@@ -41,7 +41,7 @@ def refusal(call: Any, *given: Any, **more: Any) -> str:
 
 class TestOpening:
     def test_what_is_not_there_is_also_a_file_not_found(self, tmp_path: Path) -> None:
-        with pytest.raises(FileNotFoundError, match="is not there: write it first") as caught:
+        with pytest.raises(FileNotFoundError, match="there is no such file.: write it first") as caught:
             read_text(tmp_path / "gone", "write it first")
         assert isinstance(caught.value, NoSuchFile)
         assert isinstance(caught.value, D2Error)
@@ -90,8 +90,8 @@ class TestText:
         ("text", "says"),
         [
             ("", "is not JSON"),
-            ('{"a": NaN}', "NaN, which is no number of JSON"),
-            ('{"a": [-Infinity]}', "-Infinity, which is no number"),
+            ('{"a": NaN}', "NaN, which is not finite and no number of JSON"),
+            ('{"a": [-Infinity]}', "-Infinity, which is not finite"),
             ('{"a": 1e999}', "1e999 is beyond every number"),
             ('{"a": ' + "9" * 400 + "}", "400 digits"),
             ('{"a": 1, "a": 2}', "the name 'a' stands twice"),

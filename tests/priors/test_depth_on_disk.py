@@ -93,9 +93,7 @@ def workspace(capture: Capture, place: str = "") -> WorkspaceDepth:
     ("description", "step", "suffix"),
     [({"unit": "mm"}, 1e-3, ".png"), ({"scale": 0.0005}, 5e-4, ".png"), ({"unit": "m"}, 1.0, ".npy")],
 )
-def test_sensor_depth_comes_in_world_units(
-    capture: Capture, description: dict, step: float, suffix: str
-) -> None:
+def test_sensor_depth_comes_in_world_units(capture: Capture, description: dict, step: float, suffix: str) -> None:
     write_sensor(capture, description, step, suffix)
     found = find_depth_on_disk(capture, NAMES, SENSOR)
     assert found.name == "sensor"
