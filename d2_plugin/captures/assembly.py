@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import cast, get_args
 
 import numpy as np
 
@@ -132,7 +132,7 @@ def _mono_description(path: Path) -> tuple[MonoKind, bool, tuple[str, ...]]:
     """(kind, emulated, notes) of the maps in mono/."""
     declared = path / "mono" / "mono.json"
     content = read_json(declared, CORRECT) if declared.exists() else {}
-    kind: Any = content.get("kind", "relative")
+    kind = content.get("kind", "relative")
     if "emulated" not in content:
         emulated, notes = _emulated_by_text(path)
     else:
@@ -142,7 +142,7 @@ def _mono_description(path: Path) -> tuple[MonoKind, bool, tuple[str, ...]]:
             f"{declared} says kind {shown(kind)} and emulated {shown(emulated)}: "
             "expected 'relative' or 'metric', and true or false"
         )
-    return kind, emulated, notes if emulated else ()
+    return cast(MonoKind, kind), emulated, notes if emulated else ()
 
 
 def _emulated_by_text(path: Path) -> tuple[bool, tuple[str, ...]]:

@@ -43,17 +43,17 @@ def read_picture(path: Path) -> np.ndarray:
     A transparent PNG, as Blender scenes have, is laid over black.
     """
     cv2 = opencv("reading pictures")
-    encoded = read_bytes(path, _REMEDY)
-    _size(path, encoded)
-    _check_whole(path, encoded)
+    encoded = _whole(path)
     transparent = encoded.startswith(_PNG_SIGNATURE) and len(encoded) > 25 and encoded[25] == _PNG_RGBA
     # The calibration belongs to the stored pixels: EXIF's orientation is ignored, as IMREAD_UNCHANGED does too.
     flags = cv2.IMREAD_UNCHANGED if transparent else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    with parsing(f"picture {shown_path(path)}", _REMEDY):
-        picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), flags)
-    if picture is None:
-        raise _unreadable(path)
+    picture = _decoded(path, encoded, flags)
     return _over_black(picture) if transparent else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def read_numbers(path: Path) -> np.ndarray:
+    """A picture as it is stored, of any depth and number of channels: [H, W] or [H, W, C]."""
+    return _decoded(path, _whole(path), opencv("reading pictures").IMREAD_UNCHANGED)
 
 
 def picture_size(path: Path) -> tuple[int, int]:
@@ -106,6 +106,22 @@ def _blocks(array: np.ndarray, factor: int) -> np.ndarray:
     """View of [H, W, ...] as [H // factor, factor, W // factor, factor, ...]."""
     rows, columns = array.shape[0] // factor, array.shape[1] // factor
     return array[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor, *array.shape[2:])
+
+
+def _whole(path: Path) -> bytes:
+    """The bytes of a picture that says a possible size and was not cut off."""
+    encoded = read_bytes(path, _REMEDY)
+    _size(path, encoded)
+    _check_whole(path, encoded)
+    return encoded
+
+
+def _decoded(path: Path, encoded: bytes, flags: int) -> np.ndarray:
+    with parsing(f"picture {shown_path(path)}", _REMEDY):
+        picture = opencv("reading pictures").imdecode(np.frombuffer(encoded, np.uint8), flags)
+    if picture is None:
+        raise _unreadable(path)
+    return picture
 
 
 def _size(path: Path, data: bytes) -> tuple[int, int]:

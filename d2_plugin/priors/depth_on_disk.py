@@ -9,17 +9,17 @@ are no depth. True depth for evaluation (depth/CAMERA/FRAME.npz) is never read h
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
+from d2_plugin.arrays import read_array
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import FrameFiles, numbered_files
-from d2_plugin.captures.pictures import shrink_depth
+from d2_plugin.captures.pictures import read_numbers, shrink_depth
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.colmap.workspace import WorkspaceDepth
 from d2_plugin.priors.extras import opencv
@@ -28,11 +28,16 @@ from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filter import GeometricDepth, filter_depths, remove_speckles
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.reading import read_json
+from d2_plugin.values import shown
 
 FILTER_VERSION = 2  # raise it when the filter changes what it returns, so that caches are not trusted
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """Metres per unit."""
+
+SCALES = (1e-9, 1e9)
+"""World units per stored number that depth.json may say."""
 
 ASPECT = 0.01
 """Sensor and picture may differ by this share in their ratio of width to height: a pixel or two of rounding."""
@@ -75,9 +80,9 @@ class SensorDepth:
         path = self.files.get(camera.name, {}).get(frame)
         if path is None:
             return None
-        stored = _stored_numbers(path).astype(np.float32)
-        known = np.isfinite(stored) & (stored > 0)
-        return _at_picture_size(np.where(known, stored * np.float32(self.scale), 0), camera, path)
+        with np.errstate(over="ignore", invalid="ignore"):  # numbers beyond float32 are no depth
+            depth = _stored_numbers(path).astype(np.float32) * np.float32(self.scale)
+        return _at_picture_size(np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0)), camera, path)
 
 
 def find_depth_on_disk(capture: Capture, cameras: Sequence[str], settings: StereoSettings) -> DepthOnDisk | None:
@@ -200,37 +205,30 @@ def flying_pixels(depth: np.ndarray) -> np.ndarray:
 
 def _scale(path: Path) -> float:
     """World units per stored number."""
-    try:
-        content: Any = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise D2Error(f"{path} cannot be read as JSON ({error}): write a scale or a unit into it") from None
-    table = content if isinstance(content, dict) else {}
+    table = read_json(path, "write a scale or a unit into it")
     if ("unit" in table) == ("scale" in table):
-        raise D2Error(f"{path} must have either scale (world units per stored number) or unit, got {content!r}")
+        raise D2Error(f"{path} must have either scale (world units per stored number) or unit, got {shown(table)}")
     if "unit" in table:
-        if table["unit"] not in UNITS:
-            raise unknown_name(f"unit in {path}", str(table["unit"]), UNITS)
+        if not isinstance(table["unit"], str) or table["unit"] not in UNITS:
+            raise unknown_name(f"unit in {path}", str(table["unit"])[:40], UNITS)
         return UNITS[table["unit"]]
     scale = table["scale"]
-    if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale < float("inf"):
-        raise D2Error(f"{path} says scale {scale!r}, expected world units per stored number above 0: correct it")
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not SCALES[0] <= scale <= SCALES[1]:
+        raise D2Error(f"{path} says scale {shown(scale)}, expected world units per stored number above 0: correct it")
     return float(scale)
 
 
 def _stored_numbers(path: Path) -> np.ndarray:
     """A map as it is stored, [h, w]."""
     if path.suffix == ".npy":
-        try:
-            values = np.load(path)
-        except (OSError, ValueError, EOFError) as error:
-            raise D2Error(f"cannot read {path} ({error}): replace the file or remove it") from None
+        values = read_array(path, "replace the file or remove it")
     else:
-        cv2 = opencv("reading sensor depth")
-        values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if path.stat().st_size else None
-        if values is None or values.dtype != np.uint16:
-            found = "no readable PNG" if values is None else f"{values.dtype} with shape {values.shape}"
+        opencv("reading sensor depth")
+        values = read_numbers(path)
+        if values.dtype != np.uint16:
+            found = f"{values.dtype} with shape {values.shape}"
             raise D2Error(f"{path} is {found}: sensor depth needs a PNG of 16 bits and one channel, or .npy")
-    if values.ndim != 2:
+    if values.ndim != 2 or values.size == 0:
         raise D2Error(f"{path} has shape {values.shape}, expected [height, width]: write one number per pixel")
     return values
 
