@@ -32,7 +32,7 @@ GRID = 12
 ONE_COLOUR = 2
 """A picture whose channels vary by no more levels of 255 than this shows nothing."""
 
-LOOKED_AT = 1 << 26
+LOOKED_AT = 1 << 25
 """Pixels that are read, at most: all pictures of a small recording, some of each camera of a large one."""
 
 LONG_SIDE = 640

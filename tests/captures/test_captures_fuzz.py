@@ -11,6 +11,7 @@ from small_layouts import write_layout
 
 from d2_plugin.captures import Capture, open_capture
 from d2_plugin.captures.readers.colmap_model import find_model, read_points
+from d2_plugin.errors import D2Error
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
@@ -62,3 +63,12 @@ def test_a_damaged_recording_is_valid_or_one_sentence(layout: str, tmp_path: Pat
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_two_thousand_damaged_recordings(layout: str, tmp_path: Path) -> None:
     fuzz(layout, tmp_path / "capture", MANY, seed=1)
+
+
+def test_a_pose_beyond_every_number_is_named(tmp_path: Path) -> None:
+    path = write_layout("colmap_text", tmp_path / "capture")
+    images = path / "sparse" / "0" / "images.txt"
+    words = images.read_text().split(" ")
+    images.write_text(" ".join([*words[:6], "1e200", *words[7:]]))
+    with pytest.raises(D2Error, match=r"images.txt is damaged or no COLMAP model \(a picture stands at .*1e\+200"):
+        open_capture(path)

@@ -228,4 +228,6 @@ def _content(lines: list[str]) -> Iterator[str]:
 
 def _transform(pose: list[float]) -> np.ndarray:
     """T [4, 4] of qw qx qy qz tx ty tz."""
+    if not all(abs(number) <= LARGEST_NUMBER for number in pose[4:7]):
+        raise ValueError(f"a picture stands at {pose[4]:g} {pose[5]:g} {pose[6]:g}")
     return rigid(rotation_of_quaternion(np.array(pose[:4])), np.array(pose[4:7]))

@@ -127,10 +127,14 @@ class MonocularModel:
         if self.input.height and self.input.width:
             return self.input.height, self.input.width
         enlarge = SHORT_SIDE / min(height, width)
-        return (
-            self.input.height or _multiple_of_patch(height * enlarge),
-            self.input.width or _multiple_of_patch(width * enlarge),
-        )
+        rows = self.input.height or _multiple_of_patch(height * enlarge)
+        columns = self.input.width or _multiple_of_patch(width * enlarge)
+        if max(rows, columns) > LARGEST_INPUT:
+            raise D2Error(
+                f"a picture of {width}x{height} would enter {self.path} as {columns}x{rows}, at most {LARGEST_INPUT} a "
+                "side: give a network of fixed size, or pictures that are less long"
+            )
+        return rows, columns
 
     def fingerprint(self) -> str:
         """What the prediction depends on besides the picture: file, provider and preprocessing."""
