@@ -11,9 +11,6 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from d2_plugin.errors import D2Error, unknown_name
 
-LARGEST = 1e18
-"""Numbers that declare no upper bound stay below this in size: in float32 the square of a larger one is infinite."""
-
 
 @dataclass(frozen=True)
 class Range:
@@ -145,8 +142,6 @@ def _as_number(kind: type, limits: Range, value: Any, name: str) -> int | float:
         number = kind(value)
     except OverflowError:
         raise OutOfRange(str(_wrong(name, "must be a number below 1.8e308 in size", value))) from None
-    if abs(number) > LARGEST and limits.high is None and not (limits.infinite and math.isinf(number)):
-        raise OutOfRange(str(_wrong(name, f"must be at most {LARGEST:g} in size", value)))
     if not limits.holds(number):
         unit = f" {limits.unit}" if limits.unit else ""
         raise OutOfRange(str(_wrong(name, f"must be {limits}{unit}", value)))

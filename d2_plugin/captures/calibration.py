@@ -56,6 +56,11 @@ def resized(K: np.ndarray, calibrated: tuple[int, int], pictures: tuple[int, int
             f"camera {name} in {where} has the size {shown(calibrated[0])} x {shown(calibrated[1])}, expected 1 to "
             f"{LARGEST_SIDE} pixels: correct the calibration"
         )
+    if not (np.abs(K) <= LARGEST_NUMBER).all():
+        raise D2Error(
+            f"camera {name} in {where} has a K with a number that is not finite or larger than {LARGEST_NUMBER:g}: "
+            "correct the calibration"
+        )
     scale = np.array(pictures) / calibrated
     if abs(scale[1] - scale[0]) > ASPECT_TOLERANCE * scale[0]:
         raise D2Error(

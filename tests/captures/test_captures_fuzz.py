@@ -72,3 +72,14 @@ def test_a_pose_beyond_every_number_is_named(tmp_path: Path) -> None:
     images.write_text(" ".join([*words[:6], "1e200", *words[7:]]))
     with pytest.raises(D2Error, match=r"images.txt is damaged or no COLMAP model \(a picture stands at .*1e\+200"):
         open_capture(path)
+
+
+@pytest.mark.parametrize("number", ["inf", "nan", "1e300"])
+def test_a_focal_length_without_end_is_named(number: str, tmp_path: Path) -> None:
+    path = write_layout("colmap_text", tmp_path / "capture")
+    cameras = path / "sparse" / "0" / "cameras.txt"
+    comment, first, *rest = cameras.read_text().splitlines()
+    words = first.split()
+    cameras.write_text("\n".join([comment, " ".join([*words[:4], number, *words[5:]]), *rest]))
+    with pytest.raises(D2Error, match=r"camera .* has a K with a number that is not finite or larger than 1e\+09"):
+        open_capture(path)

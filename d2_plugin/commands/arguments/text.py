@@ -113,7 +113,7 @@ def _numbers(pieces: Sequence[str], said: str) -> tuple[int, ...]:
             found += numbers
         except (ValueError, TypeError):
             raise D2Error(
-                f"{said} is '{piece[:80]}': give whole numbers up to {MOST_NUMBERS} joined by commas, or first:last or "
-                "first:last:step"
+                f"{said} is '{piece[:80]}': give whole numbers joined by commas, or first:last or first:last:step, of "
+                f"at most {MOST_NUMBERS}"
             ) from None
     return tuple(found)
