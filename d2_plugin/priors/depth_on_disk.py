@@ -205,7 +205,7 @@ def flying_pixels(depth: np.ndarray) -> np.ndarray:
 
 def _scale(path: Path) -> float:
     """World units per stored number."""
-    table = read_json(path, "write a scale or a unit into it")
+    table = read_json(path, "write either scale (world units per stored number) or unit into it")
     if ("unit" in table) == ("scale" in table):
         raise D2Error(f"{path} must have either scale (world units per stored number) or unit, got {shown(table)}")
     if "unit" in table:

@@ -396,3 +396,13 @@ def test_depth_that_is_asked_for_and_absent_is_told(capture: Capture, matcher: s
     with pytest.raises(D2Error, match=message):
         build_priors(capture, NAMES, capture.path / "p", PriorSettings(stereo=StereoSettings(matcher=matcher)))
     assert not (capture.path / "p").exists()
+
+
+@pytest.mark.parametrize(
+    "place", ["{frame:99999999999d}", "{frame.__class__}", "{frame:.99999999999f}", "{frame", "{}"]
+)
+def test_braces_never_fill_the_memory_or_look_things_up(place: str, tmp_path: Path) -> None:
+    camera = Camera("a", 8, 6, np.eye(3), np.eye(4))
+    source = WorkspaceDepth(tmp_path, place, StereoSettings(), [camera], [0])
+    with pytest.raises(D2Error, match="braces around other than frame"):
+        source.has_maps(0)
