@@ -29,7 +29,7 @@ from d2_plugin.study.report.report import collect, make_report
 
 cv2 = pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
-FEW, MANY = 60, 2000
+FEW, MANY = 50, 2000
 MAP = np.linspace(0.5, 3, 48 * 32, dtype=np.float32).reshape(32, 48)
 PICTURE = (np.stack([MAP, MAP[::-1], MAP * 0.3], axis=-1) * 80).astype(np.uint8)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from d2_plugin.arrays import map_array, read_array
-from d2_plugin.errors import D2Error
+from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import (
     NoSuchFile,
     Unreadable,
@@ -219,6 +219,12 @@ class TestArrays:
         with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("depth.npy", header + bytes(10**6))
         assert "more than 1000" in refusal(read_array, tmp_path / "a.npz", key="depth", most=1000)
+
+
+def test_an_unknown_name_is_repeated_up_to_a_hundred_letters_on_one_line() -> None:
+    text = str(unknown_name("setting", "a\nb" + "1" * 5000, ["ab"]))
+    assert len(text) < 200
+    assert "\n" not in text
 
 
 def test_an_unreadable_file_is_an_error_of_ours() -> None:

@@ -92,11 +92,11 @@ def checked_camera(
         raise refuse(f"has the size {shown(size[0])}x{shown(size[1])}, expected at most {LARGEST_SIDE} pixels a side")
     if K[0, 0] <= 0 or K[1, 1] <= 0:
         raise refuse(f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}, expected positive pixels")
-    if not 1 / FOCAL_RATIO < K[0, 0] / K[1, 1] < FOCAL_RATIO:
-        raise refuse(f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}, expected nearly the same")
     largest = max(np.abs(K[:2]).max(), np.abs(T_camera_world).max())
     if largest > LARGEST_NUMBER:
         raise refuse(f"has the number {largest:g}, expected pixels and positions of at most {LARGEST_NUMBER:g} in size")
+    if max(K[0, 0], K[1, 1]) > FOCAL_RATIO * min(K[0, 0], K[1, 1]):
+        raise refuse(f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}, expected nearly the same")
     across, down = field_of_view(K, size)
     if max(across, down) < FIELD_OF_VIEW[0] or max(across, down) > FIELD_OF_VIEW[1]:
         raise refuse(

@@ -17,7 +17,7 @@ pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
 LAYOUTS = ("folder", "n3dv", "videos", "technicolor", "enerf", "transforms", "colmap", "colmap_text")
 PICTURES = (".png", ".mp4")
-FEW, MANY = 60, 2000
+FEW, MANY = 50, 2000
 
 
 def look_at(path: Path) -> Capture:
@@ -82,4 +82,14 @@ def test_a_focal_length_without_end_is_named(number: str, tmp_path: Path) -> Non
     words = first.split()
     cameras.write_text("\n".join([comment, " ".join([*words[:4], number, *words[5:]]), *rest]))
     with pytest.raises(D2Error, match=r"camera .* has a K with a number that is not finite or larger than 1e\+09"):
+        open_capture(path)
+
+
+def test_focal_lengths_of_another_order_are_named(tmp_path: Path) -> None:
+    path = write_layout("colmap_text", tmp_path / "capture")
+    cameras = path / "sparse" / "0" / "cameras.txt"
+    comment, first, *rest = cameras.read_text().splitlines()
+    words = first.split()
+    cameras.write_text("\n".join([comment, " ".join([*words[:5], "1e-305", *words[6:]]), *rest]))
+    with pytest.raises(D2Error, match=r"camera .* has focal lengths .* and 1e-305, expected nearly the same"):
         open_capture(path)

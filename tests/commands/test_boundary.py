@@ -22,7 +22,7 @@ from d2_plugin.errors import D2Error
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
-FEW, MANY = 80, 2000
+FEW, MANY = 60, 2000
 Refused = Callable[..., str]
 
 

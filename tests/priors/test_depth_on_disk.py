@@ -161,7 +161,7 @@ def test_a_map_that_is_no_depth_is_named(capture: Capture) -> None:
     with pytest.raises(D2Error, match=r"00000.png is uint8 .* 16 bits"):
         sensor.depth(camera, 0)
     path.write_bytes(b"")
-    with pytest.raises(D2Error, match="no readable PNG"):
+    with pytest.raises(D2Error, match="not a readable PNG"):
         sensor.depth(camera, 0)
     assert cv2.imwrite(str(path), np.zeros((90, 90), np.uint16))
     with pytest.raises(D2Error, match="90x90 but its picture 160x90: register"):
