@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 import types
 from collections.abc import Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from d2_plugin.errors import D2Error, unknown_name
+
+FAR = (1e4, 1e15)
+"""An upper bound within these is named only where it was crossed."""
 
 
 @dataclass(frozen=True)
@@ -144,6 +147,8 @@ def _as_number(kind: type, limits: Range, value: Any, name: str) -> int | float:
         raise OutOfRange(str(_wrong(name, "must be a number below 1.8e308 in size", value))) from None
     if not limits.holds(number):
         unit = f" {limits.unit}" if limits.unit else ""
+        if limits.high is not None and FAR[0] <= limits.high <= FAR[1] and number <= limits.high:
+            limits = replace(limits, high=None)  # a bound that nobody came near is no news
         raise OutOfRange(str(_wrong(name, f"must be {limits}{unit}", value)))
     return number
 

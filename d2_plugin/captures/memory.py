@@ -12,7 +12,10 @@ from d2_plugin.captures.capture import Capture
 from d2_plugin.errors import D2Error
 
 BYTES_PER_PIXEL = 110
-"""Of every training camera, at the peak of building its prior or of rendering it."""
+"""Of every training camera, at the peak of building its prior or of rendering it.
+
+Peak of the process of `d2 priors` with two cameras, measured and estimated: 643 and 705 MiB at 1280x720, 956 and 947
+at 1920x1080; two of 8000x4500 took 7.4 GiB, estimated 7.9."""
 
 BASE_BYTES = 1 << 29
 """What Python, torch and the Gaussians take whatever the size of the pictures."""
