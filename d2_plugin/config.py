@@ -8,7 +8,6 @@ own choices, set by measurement. "Studio" in a docstring means the rendered stud
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, make_dataclass, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from d2_plugin.hooks.densify import DensifyConfig
 from d2_plugin.hooks.depth_loss import DepthLossConfig
 from d2_plugin.hooks.prune import PruneConfig
 from d2_plugin.hooks.table import HOOKS
+from d2_plugin.reading import NoSuchFile, read_toml
 from d2_plugin.settings import FORMAT, NONE, AtLeastOne, Count, Seed, Settings, Share, of_this_format
 
 __all__ = ["D2Config", "DensifyConfig", "DepthLossConfig", "PruneConfig", "for_iterations"]
@@ -65,11 +65,9 @@ class D2Config(_HookTables):
         """From a TOML file: `prior = "..."` and one table per hook, empty for its defaults."""
         path = Path(path)
         try:
-            table = tomllib.loads(path.read_text())
-        except FileNotFoundError:
+            table = read_toml(path, "correct the configuration")
+        except NoSuchFile:
             raise D2Error(f"no configuration at {path}: write one, or pass the settings as a dict") from None
-        except tomllib.TOMLDecodeError as error:
-            raise D2Error(f"{path} is not valid TOML: {error}") from None
         config = cls.from_dict(of_this_format(table, str(path)))
         if config.prior is not None and not Path(config.prior).is_absolute():
             config = replace(config, prior=str(path.parent / config.prior))

@@ -5,6 +5,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+LONGEST_NAME = 100
+"""Letters of an unknown name that an error repeats."""
+
 
 class D2Error(ValueError):
     """A mistake in input or configuration, in one sentence: what, expected and got, what to do.
@@ -25,6 +28,7 @@ def missing_extra(package: str, extra: str, purpose: str) -> MissingExtra:
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> D2Error:
     """The error for a name that is not among `known`, with the nearest one suggested."""
     have = sorted(known)
-    near = difflib.get_close_matches(name, have, n=1)
+    near = difflib.get_close_matches(name[:LONGEST_NAME], have, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else ""
-    return D2Error(f"unknown {kind} '{name}': have {', '.join(have) or 'none'}{hint}")
+    asked = " ".join((name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]} ...").splitlines())
+    return D2Error(f"unknown {kind} '{asked}': have {', '.join(have) or 'none'}{hint}")

@@ -21,10 +21,12 @@ from torch import Tensor
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, PriorLoader
+from d2_plugin.hooks.expected import check_backbone, check_state, converted
 from d2_plugin.hooks.prior import Store
 from d2_plugin.hooks.table import HOOKS
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Backbone, Edit, Points
+from d2_plugin.reading import said
 from d2_plugin.registry import ADAPTERS, load
 
 _log = logging.getLogger(__name__)
@@ -66,6 +68,7 @@ class D2Hooks:
 
         `hooks` are more of them by name, as objects: somebody's own, or what D2 is compared with.
         """
+        check_backbone(backbone)
         self.config, self.backbone = config, backbone
         self.hooks: dict[str, Hook] = {name: HOOKS[name].hook(getattr(config, name)) for name in config.hooks}
         self.hooks |= _of_other_names(hooks or {})
@@ -105,7 +108,18 @@ class D2Hooks:
 
         The first of the three lines where there is an adapter: `d2 = D2Hooks.attach("d2.toml", "fudan", gaussians)`.
         """
-        return cls.from_config(config, load(ADAPTERS, adapter)(*model, **options))
+        build = load(ADAPTERS, adapter)
+        try:
+            backbone = build(*model, **options)
+        except D2Error:
+            raise
+        except (AttributeError, KeyError, TypeError, ValueError) as failure:
+            given = ", ".join(type(part).__name__ for part in (*model, *options.values())) or "nothing"
+            raise D2Error(
+                f"the adapter '{adapter}' cannot take {given} ({said(failure)}): give the trainer's own objects, as "
+                f"the docstring of {getattr(build, '__name__', adapter)} says"
+            ) from failure
+        return cls.from_config(config, backbone)
 
     def loss(self, step: int, views: object) -> Tensor | float:
         """The hooks' share of this step's loss: a scalar on the backbone's device, or 0.0 when there is none.
@@ -116,9 +130,9 @@ class D2Hooks:
             return 0.0
         self._begin(step)
         batch = views if isinstance(views, (list, tuple)) else [views]
-        converted = [self.backbone.view(camera) for camera in batch]
-        self._sampler.add(converted)
-        context = self._context(step, converted)
+        shown = [converted(self.backbone, camera) for camera in batch]
+        self._sampler.add(shown)
+        context = self._context(step, shown)
         total: Tensor | float = 0.0
         for name, hook in self._due(step):
             term = hook.loss(context)
@@ -155,12 +169,7 @@ class D2Hooks:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`, once the backbone is restored; refuses the state of other hooks than these."""
-        saved = set(state["hooks"])
-        if saved != set(self.hooks):
-            raise D2Error(
-                f"the checkpoint was made with hooks {sorted(saved) or 'none'} but this run has "
-                f"{sorted(self.hooks) or 'none'}: resume with the same hooks"
-            )
+        check_state(state, self.hooks, len(self.backbone))
         for name, hook in self.hooks.items():
             hook.load_state_dict(state["hooks"][name])
         self._sampler.load_state_dict(state["views"])

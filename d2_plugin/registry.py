@@ -5,7 +5,8 @@ from __future__ import annotations
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from d2_plugin.errors import unknown_name
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import said
 
 BACKBONES = "d2_plugin.backbones"
 """Entry-point group of modules with create, settings_from, Trainer and TrainSettings (see backbones/yang4d.py)."""
@@ -24,7 +25,15 @@ def load(group: str, name: str) -> Any:
     points = _points(group)
     if name not in points:
         raise unknown_name(group.rsplit(".", 1)[1].removesuffix("s"), name, points)
-    return points[name].load()
+    try:
+        return points[name].load()
+    except D2Error:
+        raise
+    except Exception as failure:  # whatever somebody else's module does when it is imported
+        raise D2Error(
+            f"{group.rsplit('.', 1)[1].removesuffix('s')} '{name}' ({points[name].value}) cannot be loaded "
+            f"({said(failure)}): mend or remove the package that brings it"
+        ) from failure
 
 
 def _points(group: str) -> dict[str, EntryPoint]:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 import types
 from collections.abc import Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from d2_plugin.errors import D2Error, unknown_name
+
+FAR = (1e4, 1e15)
+"""An upper bound within these is named only where it was crossed."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,15 @@ def checked(kind: Any, limits: Range, value: Any, name: str) -> Any:
 
     `kind` and `limits` are what `Declared.kind` and `Declared.range` hold.
     """
+    return _checked(kind, limits, value, f"setting {name}")
+
+
+def fitting(kind: Any, value: Any, name: str) -> Any:
+    """`value` as `kind`, an annotation with or without a range, or a D2Error that calls it by `name`."""
+    return _checked(*bare_and_range(kind), value, name)
+
+
+def _checked(kind: Any, limits: Range, value: Any, name: str) -> Any:
     options = options_of(kind)
     if value is None and type(None) in options:
         return None
@@ -121,7 +133,7 @@ def _as_choice(kind: Any, value: Any, name: str) -> Any:
     if any(type(value) is type(choice) and value == choice for choice in choices):
         return value
     if isinstance(value, str) and all(isinstance(choice, str) for choice in choices):
-        raise unknown_name(name, value, choices)
+        raise unknown_name(name.removeprefix("setting "), value, choices)
     raise _wrong(name, f"must be {_noun(kind)}", value)
 
 
@@ -135,6 +147,8 @@ def _as_number(kind: type, limits: Range, value: Any, name: str) -> int | float:
         raise OutOfRange(str(_wrong(name, "must be a number below 1.8e308 in size", value))) from None
     if not limits.holds(number):
         unit = f" {limits.unit}" if limits.unit else ""
+        if limits.high is not None and FAR[0] <= limits.high <= FAR[1] and number <= limits.high:
+            limits = replace(limits, high=None)  # a bound that nobody came near is no news
         raise OutOfRange(str(_wrong(name, f"must be {limits}{unit}", value)))
     return number
 
@@ -147,7 +161,7 @@ def _as_tuple(kinds: Sequence[Any], limits: Range, value: Any, name: str) -> tup
         raise _wrong(name, f"must be a list of {len(kinds)} values", value)
     each = [kinds[0]] * len(value) if endless else kinds
     pairs = zip(each, value, strict=True)
-    return tuple(checked(*_inner(kind, limits), item, f"{name}[{i}]") for i, (kind, item) in enumerate(pairs))
+    return tuple(_checked(*_inner(kind, limits), item, f"{name}[{i}]") for i, (kind, item) in enumerate(pairs))
 
 
 def _inner(kind: Any, limits: Range) -> tuple[Any, Range]:
@@ -177,7 +191,7 @@ def _noun(kind: Any) -> str:
 
 
 def _wrong(name: str, must: str, value: Any) -> D2Error:
-    return D2Error(f"setting {name} {must}, got {shown(value)}")
+    return D2Error(f"{name} {must}, got {shown(value)}")
 
 
 def shown(value: Any) -> str:

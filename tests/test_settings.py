@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
+import pkgutil
 import sys
+from collections.abc import Iterator
 from dataclasses import MISSING, asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import d2_plugin
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import (
     FORMAT,
@@ -30,6 +34,7 @@ from d2_plugin.settings import (
     declared,
     of_this_format,
 )
+from d2_plugin.values import bare_and_range
 
 
 @dataclass(frozen=True)
@@ -248,3 +253,49 @@ def test_a_file_of_another_version_is_named(version: object) -> None:
 
 def test_a_file_without_a_version_is_of_the_first() -> None:
     assert of_this_format({"prior": "x"}, "d2.toml") == of_this_format({"prior": "x", "version": 1}, "d2.toml")
+
+
+def every_settings_class() -> list[type[Settings]]:
+    """All classes of settings of the package, the bundled backbones' too."""
+    packages = [d2_plugin, importlib.import_module("d2_plugin.backbones")]
+    for package in packages:
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if not module.name.endswith(("__main__", "mvs_process")):
+                importlib.import_module(module.name)
+    found, left = [], [Settings]
+    while left:
+        left += (kinds := left.pop().__subclasses__())
+        found += [kind for kind in kinds if kind.__module__.startswith("d2_plugin")]
+    return found
+
+
+def numbers_in(kind: Any, limits: Range) -> Iterator[tuple[Any, Range]]:
+    """The numbers that a declared kind holds, with the range of each."""
+    bare, own = bare_and_range(kind)
+    limits = limits if own == Range() else own
+    if bare in (int, float):
+        yield bare, limits
+    if get_origin(bare) is not Literal:
+        for inner in get_args(bare):
+            yield from numbers_in(inner, limits)
+
+
+def test_every_number_among_the_settings_has_a_range() -> None:
+    classes = every_settings_class()
+    assert len(classes) > 20
+    without = [
+        f"{kind.__module__}.{kind.__name__}.{setting.name}"
+        for kind in classes
+        for setting in declared(kind)
+        for _, limits in numbers_in(setting.kind, setting.range)
+        if limits.low is None
+    ]
+    assert without == []
+
+
+def test_no_setting_takes_what_is_no_number() -> None:
+    for kind in every_settings_class():
+        for setting in declared(kind):
+            for number, limits in numbers_in(setting.kind, setting.range):
+                assert not limits.holds(math.nan), (kind, setting.name)
+                assert limits.infinite or number is int or not limits.holds(math.inf), (kind, setting.name)

@@ -10,7 +10,13 @@ INT, INTS = 2, 7  # AttributeProto.AttributeType
 
 
 def mean_network(
-    path: Path, height: int | str, width: int | str, channels: int = 3, dtype: int = FLOAT, outputs: int = 1
+    path: Path,
+    height: int | str,
+    width: int | str,
+    channels: int = 3,
+    dtype: int = FLOAT,
+    outputs: int = 1,
+    batch: int = 1,
 ) -> Path:
     """A network whose output [N, outputs, H, W] is the mean of its input channels; a size given as text is dynamic."""
     steps = [_node("ReduceMean", ["picture"], ["mean"], axes=[1], keepdims=1)]
@@ -19,8 +25,8 @@ def mean_network(
     else:
         steps.append(_node("Concat", ["mean"] * outputs, ["disparity"], axis=1))
     graph = b"".join(_message(1, step) for step in steps) + _text(2, "mean")
-    graph += _message(11, _value("picture", dtype, [1, channels, height, width]))
-    graph += _message(12, _value("disparity", dtype, [1, outputs, height, width]))
+    graph += _message(11, _value("picture", dtype, [batch, channels, height, width]))
+    graph += _message(12, _value("disparity", dtype, [batch, outputs, height, width]))
     opset = _text(1, "") + _varint(2, 13)
     path.write_bytes(_varint(1, 8) + _message(7, graph) + _message(8, opset))
     return path

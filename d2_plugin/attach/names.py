@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from d2_plugin.captures.export.export import EXPORT_FILE
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import unknown_name
 from d2_plugin.protocol import DepthPrior
+from d2_plugin.reading import field, parsing, read_json
+from d2_plugin.values import fitting
+
+GIVE = "give the folder that `d2 export-capture` wrote"
 
 
 class RenamedStore:
@@ -22,12 +25,12 @@ class RenamedStore:
     def of_export(cls, store: Any, folder: Path) -> RenamedStore:
         """The priors under the names of an exported folder; names that the source uses itself are kept."""
         path = folder / EXPORT_FILE
-        try:
-            described = json.loads(path.read_text())
-        except (OSError, json.JSONDecodeError) as failure:
-            raise D2Error(f"cannot read {path} ({failure}): give the folder that `d2 export-capture` wrote") from None
-        cameras = {exported: source for source, exported in described["cameras"].items()}
-        frames = {int(exported): int(source) for source, exported in described["frames"].items()}
+        described = read_json(path, GIVE)
+        names = field(described, "cameras", dict, str(path), GIVE)
+        numbers = field(described, "frames", dict, str(path), GIVE)
+        cameras = {fitting(str, exported, f"a camera in {path}"): source for source, exported in names.items()}
+        with parsing(f"the frames in {path}", GIVE):
+            frames = {int(exported): int(source) for source, exported in numbers.items()}
         return cls(store, cameras, frames)
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None:

@@ -7,28 +7,34 @@ mono/mono.json says otherwise with {"kind": "metric" | "relative", "emulated": b
 
 from __future__ import annotations
 
-import json
 import logging
 import re
-import zipfile
-import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import cast, get_args
 
 import numpy as np
 
+from d2_plugin.arrays import read_array
 from d2_plugin.captures.capture import Camera, Capture, MonoKind, Source
 from d2_plugin.captures.files import FrameFiles, numbered_files
 from d2_plugin.captures.lens import Lens, UndistortedSource, black_share
 from d2_plugin.captures.pictures import read_picture
 from d2_plugin.errors import D2Error
+from d2_plugin.reading import read_bytes, read_json
+from d2_plugin.values import shown
 
 log = logging.getLogger(__name__)
 
 BLACK_NOTED = 1e-3
 """Black share of an undistorted picture above which a note reports it."""
+
+LARGEST_COEFFICIENT = 1e4
+"""Distortion coefficients beyond this are a damaged file: those of real lenses are below 100."""
+
+CORRECT = "correct the file, see docs/captures.md"
+REPLACE = "replace the file or remove it"
 
 
 @dataclass(frozen=True)
@@ -51,13 +57,13 @@ class FolderSource:
         path = self.depths.get(camera, {}).get(frame)
         if path is None:
             return None
-        depth = _load_array(path, "depth").astype(np.float32)
+        depth = _map(path, "depth")
         return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
         """Monocular map float32 [h, w] exactly as stored (holes and NaN included), or None."""
         path = self.monos.get(camera, {}).get(frame)
-        return None if path is None else _load_array(path, None).astype(np.float32)
+        return None if path is None else _map(path, None)
 
 
 def assembled(
@@ -76,6 +82,8 @@ def assembled(
     kind, emulated, mono_notes = _mono_description(path)
     monos = _maps(path / "mono", list(cameras), ".npy")
     source: Source = FolderSource(dict(images), _maps(path / "depth", list(cameras), ".npz"), monos)
+    for name, lens in (lenses or {}).items():
+        _check_lens(lens, name, path)
     bent = {name: lens for name, lens in (lenses or {}).items() if name in cameras and lens.bends}
     if bent:
         source = UndistortedSource(source, bent, {name: (cameras[name].width, cameras[name].height) for name in bent})
@@ -106,15 +114,14 @@ def _lens_notes(bent: Mapping[str, Lens], cameras: Mapping[str, Camera]) -> tupl
     return (note,)
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """The object in a JSON file, or one sentence that says what is wrong with it."""
-    try:
-        content = json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as failure:
-        raise D2Error(f"{path} is not JSON ({failure}): correct the file") from None
-    if not isinstance(content, dict):
-        raise D2Error(f"{path} holds a {type(content).__name__}, expected an object: see docs/captures.md")
-    return content
+def _check_lens(lens: Lens, name: str, path: Path) -> None:
+    numbers = np.array([*lens.K.ravel(), *lens.radial, *lens.tangential])
+    coefficients = numbers[lens.K.size :]
+    if not np.isfinite(numbers).all() or np.abs(coefficients).max(initial=0) > LARGEST_COEFFICIENT:
+        raise D2Error(
+            f"camera {name} of {path} has distortion coefficients {shown(coefficients.tolist())}, expected numbers of "
+            f"at most {LARGEST_COEFFICIENT:g} in size: correct the calibration"
+        )
 
 
 def _maps(folder: Path, names: list[str], suffix: str) -> dict[str, FrameFiles]:
@@ -124,18 +131,18 @@ def _maps(folder: Path, names: list[str], suffix: str) -> dict[str, FrameFiles]:
 def _mono_description(path: Path) -> tuple[MonoKind, bool, tuple[str, ...]]:
     """(kind, emulated, notes) of the maps in mono/."""
     declared = path / "mono" / "mono.json"
-    content = read_json(declared) if declared.exists() else {}
+    content = read_json(declared, CORRECT) if declared.exists() else {}
     kind = content.get("kind", "relative")
     if "emulated" not in content:
         emulated, notes = _emulated_by_text(path)
     else:
         emulated, notes = content["emulated"], ("monocular maps are emulated, not predicted",)
-    if kind not in get_args(MonoKind) or not isinstance(emulated, bool):
+    if not isinstance(kind, str) or kind not in get_args(MonoKind) or not isinstance(emulated, bool):
         raise D2Error(
-            f"{declared} says kind {kind!r} and emulated {emulated!r}: "
+            f"{declared} says kind {shown(kind)} and emulated {shown(emulated)}: "
             "expected 'relative' or 'metric', and true or false"
         )
-    return kind, emulated, notes if emulated else ()
+    return cast(MonoKind, kind), emulated, notes if emulated else ()
 
 
 def _emulated_by_text(path: Path) -> tuple[bool, tuple[str, ...]]:
@@ -155,28 +162,23 @@ _EMULATED = re.compile(r"(?<!\bnot )\bemulated\b", re.IGNORECASE)
 def _words_of_source(path: Path) -> list[str]:
     """What follows the word `mono` in each line of SOURCE.txt."""
     source = path / "SOURCE.txt"
-    text = source.read_text(errors="replace") if source.is_file() else ""
+    text = read_bytes(source, REPLACE).decode(errors="replace") if source.is_file() else ""
     return re.findall(r"\bmono\b(.*)", text, re.IGNORECASE)
 
 
 def _words_of_calibration(path: Path) -> list[str]:
     """`mono` in cameras.json, where there is such a file; a file of that name from another program counts as none."""
     try:
-        content = json.loads((path / "cameras.json").read_text())
-    except (OSError, ValueError):
+        said = read_json(path / "cameras.json").get("mono")
+    except D2Error:
         return []
-    said = content.get("mono") if isinstance(content, dict) else None
     return [said] if isinstance(said, str) else []
 
 
-def _load_array(path: Path, key: str | None) -> np.ndarray:
-    """A 2D array from .npy, or from .npz under `key`."""
-    try:
-        with open(path, "rb") as file:  # np.load leaves a damaged file open
-            loaded = np.load(file)
-            array = loaded if key is None else loaded[key]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as failure:
-        raise D2Error(f"cannot read {path} ({failure}): replace the file or remove it") from None
-    if array.ndim != 2:
-        raise D2Error(f"{path} has shape {array.shape}, expected [height, width]: write one number per pixel")
-    return array
+def _map(path: Path, key: str | None) -> np.ndarray:
+    """A map float32 [h, w] from .npy, or from .npz under `key`; numbers beyond float32 become infinite."""
+    stored = read_array(path, REPLACE, key=key)
+    if stored.ndim != 2 or stored.size == 0:
+        raise D2Error(f"{path} has shape {stored.shape}, expected [height, width]: {REPLACE}")
+    with np.errstate(over="ignore"):
+        return stored.astype(np.float32)

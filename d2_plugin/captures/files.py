@@ -8,8 +8,12 @@ from pathlib import Path
 
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import shown_path
 
 FrameFiles = dict[int, Path]
+
+MOST_DIGITS = 9
+"""Of a frame number."""
 
 _LAST_NUMBER = re.compile(r"(\d+)\D*$")
 
@@ -30,11 +34,18 @@ def collect(paths: Iterable[Path]) -> FrameFiles:
         number = _LAST_NUMBER.search(path.stem)
         if number is None:
             raise D2Error(f"{path} has no frame number in its name: name it like 00012{path.suffix}")
-        frame = int(number.group(1))
+        frame = frame_number(number.group(1), path)
         if frame in found:
             raise D2Error(f"{found[frame].name} and {path.name} in {path.parent} are both frame {frame}: remove one")
         found[frame] = path
     return found
+
+
+def frame_number(digits: str, path: Path | str) -> int:
+    """The frame that digits in the name of a picture say."""
+    if len(digits) > MOST_DIGITS:
+        raise D2Error(f"{shown_path(path)} has a number of {len(digits)} digits, at most {MOST_DIGITS}: rename it")
+    return int(digits)
 
 
 def common_frames(files: Mapping[str, Iterable[int]], where: Path) -> tuple[tuple[int, ...], tuple[str, ...]]:

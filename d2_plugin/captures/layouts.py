@@ -17,6 +17,7 @@ from d2_plugin.captures.readers.transforms_json import is_transforms, open_trans
 from d2_plugin.captures.selection import downscale as downscaled
 from d2_plugin.captures.selection import select_frames
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import reaching
 
 Reader = Callable[[Path, tuple[str, ...] | None, bool], Capture]
 """(folder, cameras to read or None, whether to leave out cameras without counterpart) -> capture."""
@@ -67,11 +68,13 @@ def open_capture(
     folder = Path(path)
     if layout is not None and layout not in LAYOUTS:
         raise unknown_name("layout", layout, LAYOUTS)
-    layout = layout or _recognised(folder)
+    with reaching(folder, "make the folder readable"):
+        layout = layout or _recognised(folder)
     names = None if cameras is None else tuple(cameras)
     if names is not None and len(set(names)) < max(len(names), 1):
         raise D2Error(f"camera names '{', '.join(names)}' are empty or repeated: name each camera once")
-    capture = replace(LAYOUTS[layout].open(folder, names, intersect), layout=layout)
+    with reaching(folder, "make the folder readable"):
+        capture = replace(LAYOUTS[layout].open(folder, names, intersect), layout=layout)
     if frames is not None:
         capture = select_frames(capture, frames)
     return downscaled(capture, downscale)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from d2_plugin.captures.files import FrameFiles
+from d2_plugin.captures.files import FrameFiles, frame_number
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES
 from d2_plugin.errors import D2Error
 
@@ -37,14 +37,14 @@ def in_folders(name: str) -> Shot | None:
     *folders, stem = _parts(name)
     number = _FRAME.search(stem)
     if folders:
-        return Shot("_".join(folders), int(number[1])) if number else None
+        return Shot("_".join(folders), frame_number(number[1], name)) if number else None
     return by_prefix(name)
 
 
 def by_prefix(name: str) -> Shot | None:
     """train/cam00_0012.png as camera cam00 at frame 12, whatever the folder says."""
     match = _PREFIXED.match(_parts(name)[-1])
-    return Shot(match["camera"], int(match["frame"])) if match else None
+    return Shot(match["camera"], frame_number(match["frame"], name)) if match else None
 
 
 def arrange(names: Iterable[str], still: Callable[[list[str]], bool]) -> tuple[dict[str, Shot], Reading | None]:

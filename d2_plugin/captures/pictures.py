@@ -10,11 +10,17 @@ from types import ModuleType
 import numpy as np
 
 from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.reading import opened, parsing, read_bytes, shown_path
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
+MOST_PIXELS = 1 << 28
+"""Larger pictures are refused before anything is decoded: 16384 x 16384."""
+
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_RGBA = 6  # colour type in the header's byte 25
+_HEAD = 1 << 22  # bytes in which the size of a picture stands; profiles of a JPEG may come before it
+_REMEDY = "replace the file or leave this frame out"
 _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0..15 without DHT, JPG, DAC
 
 
@@ -37,24 +43,23 @@ def read_picture(path: Path) -> np.ndarray:
     A transparent PNG, as Blender scenes have, is laid over black.
     """
     cv2 = opencv("reading pictures")
-    encoded = _bytes_of(path)
+    encoded = _whole(path)
     transparent = encoded.startswith(_PNG_SIGNATURE) and len(encoded) > 25 and encoded[25] == _PNG_RGBA
     # The calibration belongs to the stored pixels: EXIF's orientation is ignored, as IMREAD_UNCHANGED does too.
     flags = cv2.IMREAD_UNCHANGED if transparent else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    picture = cv2.imdecode(np.frombuffer(encoded, np.uint8), flags) if encoded else None
-    if picture is None:
-        raise _unreadable(path)
+    picture = _decoded(path, encoded, flags)
     return _over_black(picture) if transparent else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def read_numbers(path: Path) -> np.ndarray:
+    """A picture as it is stored, of any depth and number of channels: [H, W] or [H, W, C]."""
+    return _decoded(path, _whole(path), opencv("reading pictures").IMREAD_UNCHANGED)
 
 
 def picture_size(path: Path) -> tuple[int, int]:
     """(width, height) in pixels from the header of a PNG or JPEG file; nothing is decoded."""
-    data = _bytes_of(path)
-    if data.startswith(_PNG_SIGNATURE) and len(data) >= 24:
-        return struct.unpack(">II", data[16:24])
-    if data.startswith(b"\xff\xd8"):
-        return _jpeg_size(path, data)
-    raise _unreadable(path)
+    with opened(path, _REMEDY) as file:
+        return _size(path, file.read(_HEAD))
 
 
 def write_png(path: Path, picture: np.ndarray) -> None:
@@ -103,11 +108,56 @@ def _blocks(array: np.ndarray, factor: int) -> np.ndarray:
     return array[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor, *array.shape[2:])
 
 
-def _bytes_of(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as failure:
-        raise D2Error(f"cannot read picture {path}: {failure.strerror}; put the file back or drop the frame") from None
+def _whole(path: Path) -> bytes:
+    """The bytes of a picture that says a possible size and was not cut off."""
+    encoded = read_bytes(path, _REMEDY)
+    _size(path, encoded)
+    _check_whole(path, encoded)
+    return encoded
+
+
+def _decoded(path: Path, encoded: bytes, flags: int) -> np.ndarray:
+    with parsing(f"picture {shown_path(path)}", _REMEDY):
+        picture = opencv("reading pictures").imdecode(np.frombuffer(encoded, np.uint8), flags)
+    if picture is None:
+        raise _unreadable(path)
+    return picture
+
+
+def _size(path: Path, data: bytes) -> tuple[int, int]:
+    """(width, height) in the header of a picture."""
+    if data.startswith(_PNG_SIGNATURE) and len(data) >= 24:
+        width, height = struct.unpack(">II", data[16:24])
+    elif data.startswith(b"\xff\xd8"):
+        width, height = _jpeg_size(path, data)
+    else:
+        raise _unreadable(path)
+    if not 0 < width * height <= MOST_PIXELS:
+        raise D2Error(f"picture {shown_path(path)} says {width}x{height} pixels, at most {MOST_PIXELS}: {_REMEDY}")
+    return width, height
+
+
+def _check_whole(path: Path, data: bytes) -> None:
+    """Refuse a file that was cut off or changed: decoders fill in what is missing, without a word."""
+    if data.startswith(_PNG_SIGNATURE):
+        if not _png_is_whole(data):
+            raise _unreadable(path, " (cut off, or its checksums are wrong)")
+    elif b"\xff\xd9" not in data[-(1 << 16) :]:
+        raise _unreadable(path, " (cut off: its end marker is missing)")
+
+
+def _png_is_whole(data: bytes) -> bool:
+    """Whether all chunks of a PNG up to its last one are there with the right checksums."""
+    place = len(_PNG_SIGNATURE)
+    while place + 12 <= len(data):
+        (length,) = struct.unpack(">I", data[place : place + 4])
+        end = place + 8 + length
+        if data[end : end + 4] != struct.pack(">I", zlib.crc32(memoryview(data)[place + 4 : end])):
+            return False
+        if data[place + 4 : place + 8] == b"IEND":
+            return True
+        place = end + 4
+    return False
 
 
 def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
@@ -135,5 +185,5 @@ def _png_chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
-def _unreadable(path: Path) -> D2Error:
-    return D2Error(f"picture {path} is not a readable PNG or JPEG: replace the file or leave this frame out")
+def _unreadable(path: Path, why: str = "") -> D2Error:
+    return D2Error(f"picture {shown_path(path)} is not a readable PNG or JPEG{why}: {_REMEDY}")

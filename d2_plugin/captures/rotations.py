@@ -7,9 +7,12 @@ import numpy as np
 
 def rotation_of_quaternion(quaternion: np.ndarray) -> np.ndarray:
     """Rotation [3, 3] of a quaternion [4], w first, of any length but zero."""
-    length = np.linalg.norm(quaternion)
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = np.linalg.norm(quaternion)
     if not length > 0:
         raise ValueError("a quaternion has length zero")
+    if not length < np.inf:
+        raise ValueError("a quaternion has a number without end")
     w, x, y, z = quaternion / length
     return np.array(
         [

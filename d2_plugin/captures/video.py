@@ -8,11 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.pictures import opencv
+from d2_plugin.captures.pictures import MOST_PIXELS, opencv
 from d2_plugin.errors import D2Error
+from d2_plugin.reading import opened, parsing, shown_path
 
 SKIP_LIMIT = 32
 """A frame at most this far ahead is reached by decoding on; any other by a seek, which starts at a key frame."""
+
+
+MOST_FRAMES = 10_000_000
+"""A video that says more is damaged: this many are four days at 30 per second."""
 
 
 class VideoHeader(NamedTuple):
@@ -79,13 +84,22 @@ def video_header(path: Path) -> VideoHeader:
     try:
         size = (int(video.get(cv2.CAP_PROP_FRAME_WIDTH)), int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)))
         fps = max(float(video.get(cv2.CAP_PROP_FPS)), 0.0)
-        return VideoHeader(int(video.get(cv2.CAP_PROP_FRAME_COUNT)), fps, size)
+        frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        if frames > MOST_FRAMES or not 0 < size[0] * size[1] <= MOST_PIXELS:
+            raise D2Error(
+                f"video {shown_path(path)} says {frames} frames of {size[0]}x{size[1]} pixels, at most {MOST_FRAMES} "
+                f"of {MOST_PIXELS}: replace the file or leave its camera out"
+            )
+        return VideoHeader(frames, fps, size)
     finally:
         video.release()
 
 
 def _open_video(path: Path) -> Any:
-    video = opencv("reading videos").VideoCapture(str(path))
+    with opened(path, "replace the file or leave its camera out"):
+        pass  # a pipe or a device would block
+    with parsing(f"video {shown_path(path)}", "replace the file or leave its camera out"):
+        video = opencv("reading videos").VideoCapture(str(path))
     if not video.isOpened():
         raise D2Error(f"video {path} cannot be opened: replace the file or leave its camera out")
     return video

@@ -12,6 +12,7 @@ from torch import Tensor
 from d2_plugin.protocol import DepthPrior, Edit, Label, Points, Splats, View
 from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
 
+from .expected import check_splats
 from .hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
 from .rendered_depth import relative_discrepancy, rendered_depth
 
@@ -131,6 +132,7 @@ class Densify(Hook):
     def _propose(self, surveyed: Surveyed, earlier: list[Points], budget: int, generator: torch.Generator) -> Points:
         """New points of one view that no existing Gaussian and no point of an earlier view already stands for."""
         config, view, prior = self.config, surveyed.view, surveyed.prior
+        check_splats(surveyed.splats, len(surveyed.splats.means), inserting=True)
         depth, valid = rendered_depth(surveyed.survey.depth_sum, surveyed.survey.alpha, config.tau_v)
         region = under_reconstructed(depth, valid, prior.depth, prior.support, self._tau_u(prior))
         pixels = shuffled_pixels(region, generator)

@@ -9,7 +9,7 @@ near ones also for the light that they let through.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from d2_plugin.protocol import View
 from d2_plugin.rasterizer import rasterize
-from d2_plugin.settings import Every, NotNegative, Positive, Share, Steps
+from d2_plugin.settings import Every, Positive, Range, Share, Steps
 
 from .hook import Context, Hook, HookConfig
 from .prior import KnownPixels
@@ -34,9 +34,9 @@ class DepthLossConfig(HookConfig):
     """First step at which it is no longer added; none: to the end."""
     every: Every = 1
     """Steps between additions."""
-    weight: NotNegative = 0.2
+    weight: Annotated[float, Range(0, 1e6)] = 0.2
     """lambda_d of each addition; what matters is weight / every."""
-    opaque: NotNegative = 0.05
+    opaque: Annotated[float, Range(0, 1e6)] = 0.05
     """Beside lambda_d's 1, the weight of what known near pixels let through, mean of 1 - alpha; the paper has none. A
     background of the same colour could else stand for a surface."""
     epsilon: Positive = 0.01

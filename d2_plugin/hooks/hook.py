@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
+from d2_plugin.hooks.expected import check_splats
 from d2_plugin.protocol import Backbone, DepthPrior, Edit, Splats, Survey, View
 from d2_plugin.rasterizer import survey
 from d2_plugin.settings import Every, Settings, Steps
@@ -93,6 +94,7 @@ class Context:
         if prior is None:
             return None
         splats = self.backbone.slice_at(view)
+        check_splats(splats, len(self.backbone), inserting=False)
         near_edge = prior.near_edge(FREE_SIGMAS) if prior.measured else None
         return Surveyed(view, splats, prior, survey(splats, view, prior, self.backbone.settings, near_edge=near_edge))
 

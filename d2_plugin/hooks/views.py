@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from d2_plugin.hooks.expected import check_view
 from d2_plugin.protocol import View
 
 
@@ -24,7 +25,9 @@ class ViewSampler:
     def add(self, views: Iterable[View]) -> None:
         """Remember views; one that is known already changes nothing."""
         for view in views:
-            self._views.setdefault((view.camera, view.frame), view)
+            if (view.camera, view.frame) not in self._views:
+                check_view(view)
+                self._views[view.camera, view.frame] = view
 
     @property
     def cameras(self) -> int:

@@ -10,7 +10,6 @@ Workspaces are read by `d2_plugin.priors.colmap.workspace`.
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -29,6 +28,8 @@ from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filter import GeometricDepth, filter_depths, remove_speckles
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.reading import read_json
+from d2_plugin.values import shown
 
 FILTER_VERSION = 3  # raise it when the filter changes what it returns, so that caches are not trusted
 
@@ -37,6 +38,8 @@ UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 ALONG = ("z", "ray")
 """What a sensor's numbers are measured along: planar depth, or the distance from the camera's centre."""
+SCALES = (1e-9, 1e9)
+"""World units per stored number that depth.json may say."""
 
 NEIGHBOURS = 2
 """Half the side of the window whose pixels a sensor's depth is compared with, pixels."""
@@ -76,9 +79,10 @@ class SensorDepth:
         path = self.files.get(camera.name, {}).get(frame)
         if path is None:
             return None
-        stored = stored_numbers(path).astype(np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):  # numbers beyond float32 are no depth
+            stored = stored_numbers(path).astype(np.float32) * np.float32(self.scale)
         known = np.isfinite(stored) & (stored > 0)
-        depth = at_picture_size(np.where(known, stored * np.float32(self.scale), 0), camera, path)
+        depth = at_picture_size(np.where(known, stored, np.float32(0)), camera, path)
         return planar(depth, camera) if self.along_ray else depth
 
 
@@ -217,34 +221,30 @@ def flying_pixels(depth: np.ndarray) -> np.ndarray:
     return (depth > 0) & (2 * (agreeing - 1) < len(steps) ** 2 - 1)
 
 
-def _described(path: Path) -> Any:
+def _described(path: Path) -> dict[str, Any]:
     """What depth.json holds."""
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise D2Error(f"{path} cannot be read as JSON ({error}): write a scale or a unit into it") from None
+    return read_json(path, "write either scale (world units per stored number) or unit into it")
 
 
 def _along_ray(path: Path) -> bool:
     """Whether the maps hold distances along the ray."""
-    content = _described(path)
-    along = content.get("along", ALONG[0]) if isinstance(content, dict) else ALONG[0]
+    table = _described(path)
+    along = table.get("along", ALONG[0])
     if along not in ALONG:
-        raise unknown_name(f"along in {path}", str(along), ALONG)
-    return along == "ray"
+        raise unknown_name(f"along in {path}", str(along)[:40], ALONG)
+    return bool(along == "ray")
 
 
 def _scale(path: Path) -> float:
     """World units per stored number."""
-    content = _described(path)
-    table = content if isinstance(content, dict) else {}
+    table = _described(path)
     if ("unit" in table) == ("scale" in table):
-        raise D2Error(f"{path} must have either scale (world units per stored number) or unit, got {content!r}")
+        raise D2Error(f"{path} must have either scale (world units per stored number) or unit, got {shown(table)}")
     if "unit" in table:
-        if table["unit"] not in UNITS:
-            raise unknown_name(f"unit in {path}", str(table["unit"]), UNITS)
+        if not isinstance(table["unit"], str) or table["unit"] not in UNITS:
+            raise unknown_name(f"unit in {path}", str(table["unit"])[:40], UNITS)
         return UNITS[table["unit"]]
     scale = table["scale"]
-    if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale < float("inf"):
-        raise D2Error(f"{path} says scale {scale!r}, expected world units per stored number above 0: correct it")
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not SCALES[0] <= scale <= SCALES[1]:
+        raise D2Error(f"{path} says scale {shown(scale)}, expected world units per stored number above 0: correct it")
     return float(scale)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import importlib.util
 import logging
-import pickle
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import opened, parsing
 
 log = logging.getLogger(__name__)
 
@@ -115,10 +115,8 @@ def _usual_places() -> Iterator[Path]:
 
 
 def _load(path: Path) -> dict[str, Tensor]:
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, ValueError, EOFError, KeyError, pickle.UnpicklingError) as failure:
-        raise D2Error(f"cannot read LPIPS weights {path} ({type(failure).__name__}): replace the file") from None
+    with opened(path, "replace the file") as file, parsing(f"LPIPS weights {path}", "replace the file"):
+        return torch.load(file, map_location="cpu", weights_only=True)
 
 
 def _alexnet() -> nn.Sequential:

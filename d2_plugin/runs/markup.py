@@ -21,7 +21,7 @@ def markdown(table: Table, padded: bool = False) -> str:
     rows = [
         [_markdown_cell(cell, (i, k) in table.best) for k, cell in enumerate(row)] for i, row in enumerate(table.rows)
     ]
-    lines = [list(table.header), ["---"] * len(table.header), *rows]
+    lines = [[_markdown_cell(title, False) for title in table.header], ["---"] * len(table.header), *rows]
     if padded:
         widths = [max(len(line[column]) for line in lines) for column in range(len(table.header))]
         lines = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
@@ -54,5 +54,5 @@ def escaped(text: str) -> str:
 
 
 def _markdown_cell(cell: str, best: bool) -> str:
-    text = cell.replace("|", "\\|")
+    text = " ".join(cell.splitlines()).replace("|", "\\|").replace("<", "&lt;")  # no tag in a page made of it
     return f"**{text}**" if best else text

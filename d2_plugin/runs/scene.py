@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from d2_plugin.captures import Capture, open_capture
+from d2_plugin.captures.check import check_capture
+from d2_plugin.captures.memory import check_memory
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks import Hook
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
@@ -35,6 +37,8 @@ class Scene:
         named = None if test is None else dict.fromkeys((*settings.train_cameras, *test))
         capture = open_capture(settings.capture, cameras=named, frames=settings.frames, downscale=settings.downscale)
         train, test = _split(capture, settings)
+        check_memory(capture, train)
+        capture = replace(capture, notes=(*capture.notes, *check_capture(capture, (*train, *test), scored=test)))
         plan = plan_scene(capture, train, _mono_source(capture, settings), prior_settings(settings))
         return cls(capture, train, test, plan.override(**settings.overrides.get("plan", {})))
 

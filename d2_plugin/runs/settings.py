@@ -14,7 +14,9 @@ from d2_plugin.config import D2Config, for_iterations
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks.table import HOOKS
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.settings import FORMAT, AtLeastOne, Count, Positional, Range, Seed, Settings, declared, of_this_format
+from d2_plugin.reading import said, shown_path
+from d2_plugin.settings import FORMAT, Count, Positional, Range, Seed, Settings, declared, of_this_format
+from d2_plugin.values import shown
 
 HOOK_NAMES = ("prior", *HOOKS)
 """What `--hooks` may name; "prior" alone builds the depth prior and trains without it."""
@@ -47,13 +49,13 @@ class RunSettings(Settings):
     """Cameras to train with, as the capture names them."""
     backbone: str = "yang4d"
     """Name of a registered backbone."""
-    iterations: Annotated[int, Range(1, unit="steps")] = 3000
+    iterations: Annotated[int, Range(1, 10**9, unit="steps")] = 3000
     """Steps to train."""
     hooks: tuple[str, ...] = HOOK_NAMES
     """Parts of the method that are used."""
     seed: Seed = 0
     """Seed of everything that is drawn at random."""
-    downscale: AtLeastOne = 1
+    downscale: Annotated[int, Range(1, 65_535)] = 1
     """Make pictures this many times smaller along each side."""
     frames: tuple[Count, ...] | None = None
     """Numbers of the frames to use; all if not given."""
@@ -94,8 +96,15 @@ def check(settings: RunSettings) -> RunSettings:
     _check_device(settings.device)
     _check_overrides(settings)
     paths = ("capture", "mono_onnx", "priors")
-    absolute = {name: str(Path(path).resolve()) for name in paths if (path := getattr(settings, name)) is not None}
+    absolute = {name: _absolute(path, name) for name in paths if (path := getattr(settings, name)) is not None}
     return replace(settings, **absolute)  # type: ignore[arg-type]  # a run is found again from any folder
+
+
+def _absolute(path: str, name: str) -> str:
+    try:
+        return str(Path(path).resolve())
+    except (OSError, ValueError, RuntimeError) as failure:  # a zero byte, a name too long, links in a circle
+        raise D2Error(f"{name} is {shown_path(path)[:200]}, which is no path ({said(failure)}): correct it") from None
 
 
 def _check_device(name: str) -> None:
@@ -119,13 +128,13 @@ def _check_overrides(settings: RunSettings) -> None:
     for name in set(HOOKS) & set(settings.overrides):  # those of hooks that are off as well
         HOOKS[name].config.from_dict(settings.overrides[name], name)
     backbone = registry.load(registry.BACKBONES, settings.backbone)
-    backbone.settings_from(settings.overrides.get("backbone", {}))
+    backbone.settings_from(_over({}, settings.overrides.get("backbone", {}), "backbone"))
 
 
 def prior_settings(settings: RunSettings) -> PriorSettings:
     """Settings of the prior builder: defaults, the monocular source of the run, the user's table over them."""
     source = {"mono_onnx": settings.mono_onnx, "mono_kind": settings.mono_kind}
-    return PriorSettings.from_dict(source | settings.overrides.get("priors", {}))
+    return PriorSettings.from_dict(_over(source, settings.overrides.get("priors", {}), "priors"))
 
 
 def hook_config(settings: RunSettings, priors: Path) -> D2Config:
@@ -140,7 +149,7 @@ def hook_config(settings: RunSettings, priors: Path) -> D2Config:
 def _over(defaults: Mapping[str, Any], table: Any, name: str) -> dict[str, Any]:
     """The defaults with the user's table over them."""
     if not isinstance(table, Mapping):
-        raise D2Error(f"{name} must be a table of settings, got {table!r}: write [{name}] above them")
+        raise D2Error(f"{name} must be a table of settings, got {shown(table)}: write [{name}] above them")
     return {**defaults, **table}
 
 

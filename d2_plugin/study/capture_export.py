@@ -28,7 +28,7 @@ class CaptureExport(Settings):
     """Names of the cameras to train with, joined by commas; if left out, all that are not held out."""
     test_cameras: tuple[str, ...] = ()
     """Names of the cameras that are held out, joined by commas."""
-    frames: tuple[int, ...] | None = None
+    frames: tuple[Count, ...] | None = None
     """first:last or first:last:step, the last one included; if left out, all frames."""
     downscale: Annotated[int, Range(1)] = 1
     """Make pictures this many times smaller along each side."""

@@ -22,7 +22,7 @@ from d2_plugin.captures.presets import resolve_cameras
 from d2_plugin.runs.markup import markdown
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check
-from d2_plugin.settings import Positional, Range, Seed, Settings
+from d2_plugin.settings import Count, Positional, Range, Seed, Settings
 from d2_plugin.study.bench.memory import Measured, in_fresh_process
 from d2_plugin.study.command_line import command_line
 from d2_plugin.study.report.limits import plan as plan_section
@@ -41,7 +41,7 @@ class PlanVerification(Settings):
     """Folder of the recording."""
     train_cameras: tuple[str, ...]
     """Names of the cameras that train; or preset:2, preset:3, preset:4 for a known data set."""
-    frames: tuple[int, ...] | None = None
+    frames: tuple[Count, ...] | None = None
     """Numbers of the frames to use; all if not given."""
     downscale: Annotated[int, Range(1)] = 1
     """Make pictures this many times smaller."""

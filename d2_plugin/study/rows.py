@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import field, parse_json, read_text
 from d2_plugin.runs.provenance import circumstances
 
 Row = dict[str, Any]
@@ -36,6 +37,13 @@ KINDS = {
 
 MEASURED = ("kind", "case", "method", "setting", "error", "seconds", "failed")
 REQUIRED = (*MEASURED, "device", "threads", "version", "commit", "torch", "command")
+FORM = {
+    **dict.fromkeys(("kind", "case", "method", "setting", "command"), str),
+    **dict.fromkeys(("failed", "device", "version", "commit", "torch"), str | None),
+    **dict.fromkeys(("error", "seconds"), float | None),
+    "threads": int | None,
+}
+"""What each of them is."""
 
 
 def make_row(
@@ -90,21 +98,17 @@ def read_rows(paths: Sequence[Path]) -> list[Row]:
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    try:
-        text = path.read_text()
-    except OSError as error:
-        raise D2Error(f"{path} cannot be read ({error.strerror}): give a file that a `d2` command wrote") from None
+    text = read_text(path, "give a file that a `d2` command wrote")
     return [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
 
 
 def _checked(line: str, where: str) -> Row:
-    try:
-        row = json.loads(line)
-    except json.JSONDecodeError:
-        raise D2Error(f"{where} is not JSON: restore the file, or remove that line") from None
+    row = parse_json(line, where, "restore the file, or remove that line")
     missing = [name for name in REQUIRED if name not in row] if isinstance(row, dict) else list(REQUIRED)
     if missing:
         raise D2Error(f"{where} has no {', '.join(missing)}: measure it again, its form is not that of this version")
+    for name, kind in FORM.items():
+        field(row, name, kind, where, "measure it again, its form is not that of this version")
     if row["kind"] not in KINDS:
         raise unknown_name(f"kind of row ({where})", row["kind"], KINDS)
     return row

@@ -178,4 +178,4 @@ def test_files_that_cannot_be_are_refused(tmp_path: Path) -> None:
     (path / "extri.yml").write_text(whole.replace("rows: 3\n  cols: 1", "rows: 1\n  cols: 3"))
     assert list(open_capture(path).cameras) == ["00", "11"]  # a row serves as well as a column
     (path / "extri.yml").unlink()
-    refused(path, r"extri\.yml is missing or not a YAML file")
+    refused(path, r"extri\.yml \(there is no such file\)")

@@ -222,8 +222,8 @@ def test_images_of_two_sizes_are_refused_when_read(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fx": float("nan")}, "camera train0 .* not finite"),
-        ({"t": [0, float("inf"), 0]}, "camera train0 .* not finite"),
+        ({"fx": float("nan")}, "cameras.json is not JSON .*NaN, which is not finite"),
+        ({"t": [0, float("inf"), 0]}, "cameras.json is not JSON .*Infinity, which is not finite"),
         ({"fy": -3.0}, "focal lengths"),
         ({"R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "no rotation"),
         ({"R": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "no rotation"),
@@ -246,7 +246,7 @@ def test_broken_descriptions_are_refused(folder: Path) -> None:
     content = json.loads(path.read_text())
     del content["cameras"][0]["cx"]
     path.write_text(json.dumps(content))
-    refused(folder, "camera train0 .* has no 'cx'")
+    refused(folder, "camera train0 .* has no cx")
     path.write_text('{"cameras": []}')
     refused(folder, "no list 'cameras'")
     path.write_text("{")

@@ -170,7 +170,7 @@ def test_missing_pictures_are_named_and_left_out_only_when_asked(tmp_path: Path)
         ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "not finite"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "no rotation"),
         ({"time": None}, "cannot be understood"),
-        ({"fl_x": "long"}, "are no numbers"),
+        ({"fl_x": "long"}, "fl_x of camera a .* must be a number, got 'long'"),
         ({"fl_x": -3}, "focal lengths"),
     ],
 )

@@ -93,9 +93,7 @@ def workspace(capture: Capture, place: str = "") -> WorkspaceDepth:
     ("description", "step", "suffix"),
     [({"unit": "mm"}, 1e-3, ".png"), ({"scale": 0.0005}, 5e-4, ".png"), ({"unit": "m"}, 1.0, ".npy")],
 )
-def test_sensor_depth_comes_in_world_units(
-    capture: Capture, description: dict, step: float, suffix: str
-) -> None:
+def test_sensor_depth_comes_in_world_units(capture: Capture, description: dict, step: float, suffix: str) -> None:
     write_sensor(capture, description, step, suffix)
     found = find_depth_on_disk(capture, NAMES, SENSOR)
     assert found.name == "sensor"
@@ -163,7 +161,7 @@ def test_a_map_that_is_no_depth_is_named(capture: Capture) -> None:
     with pytest.raises(D2Error, match=r"00000.png is uint8 .* 16 bits"):
         sensor.depth(camera, 0)
     path.write_bytes(b"")
-    with pytest.raises(D2Error, match="no readable PNG"):
+    with pytest.raises(D2Error, match="not a readable PNG"):
         sensor.depth(camera, 0)
     assert cv2.imwrite(str(path), np.zeros((90, 90), np.uint16))
     with pytest.raises(D2Error, match="90x90 but its picture 160x90: register"):
@@ -398,3 +396,13 @@ def test_depth_that_is_asked_for_and_absent_is_told(capture: Capture, matcher: s
     with pytest.raises(D2Error, match=message):
         build_priors(capture, NAMES, capture.path / "p", PriorSettings(stereo=StereoSettings(matcher=matcher)))
     assert not (capture.path / "p").exists()
+
+
+@pytest.mark.parametrize(
+    "place", ["{frame:99999999999d}", "{frame.__class__}", "{frame:.99999999999f}", "{frame", "{}"]
+)
+def test_braces_never_fill_the_memory_or_look_things_up(place: str, tmp_path: Path) -> None:
+    camera = Camera("a", 8, 6, np.eye(3), np.eye(4))
+    source = WorkspaceDepth(tmp_path, place, StereoSettings(), [camera], [0])
+    with pytest.raises(D2Error, match="braces around other than frame"):
+        source.has_maps(0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -133,3 +134,20 @@ def test_a_real_network_sees_the_nearer_thing_as_nearer(shared_data: Callable[[s
     aligned = aligned_depth(model(capture.image("train0", 0)), alignment, 30.0)
     spread = np.median(np.abs(depth - np.median(depth)) / depth)
     assert np.median(np.abs(aligned - depth) / depth) < 0.8 * spread  # better than one depth for all
+
+
+def test_a_batch_of_four_and_an_input_that_fills_the_memory_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(D2Error, match="takes 4 pictures at once: export it with a batch of 1"):
+        MonocularModel(tiny_onnx.mean_network(tmp_path / "four.onnx", 32, 48, batch=4), "relative")
+    with pytest.raises(D2Error, match="takes pictures of 200000x200000, expected at most 8192 a side"):
+        MonocularModel(tiny_onnx.mean_network(tmp_path / "large.onnx", 200_000, 200_000), "relative")
+    free = MonocularModel(tiny_onnx.mean_network(tmp_path / "free.onnx", "h", "w"), "relative")
+    with pytest.raises(D2Error, match="a picture of 60000x10 would enter .* at most 8192 a side"):
+        free.input_size(10, 60_000)
+
+
+def test_a_network_that_fails_on_a_picture_names_itself(tmp_path: Path) -> None:
+    model = MonocularModel(tiny_onnx.mean_network(tmp_path / "net.onnx", 32, 48), "relative")
+    model.input = replace(model.input, height=16)  # as a file that does not keep what it says
+    with pytest.raises(D2Error, match=r"cannot read what .*net.onnx makes of a picture of 48x16"):
+        model.predict(np.zeros((32, 48, 3), np.uint8))

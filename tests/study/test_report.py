@@ -255,7 +255,7 @@ def test_a_line_that_is_no_row_is_named(tmp_path: Path, line: str, message: str)
 def test_an_unknown_kind_and_an_absent_file_are_told(tmp_path: Path) -> None:
     with pytest.raises(D2Error, match="unknown kind of row 'rastr'.*did you mean 'raster'"):
         make_row("rastr", "room", "d2", error=None, seconds=None)
-    with pytest.raises(D2Error, match="cannot be read"):
+    with pytest.raises(D2Error, match="cannot read .*there is no such file"):
         read_rows([tmp_path / "absent.jsonl"])
 
 

@@ -7,17 +7,18 @@ rest of the plugin.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.calibration import pinhole, rigid
+from d2_plugin.captures.calibration import LARGEST_NUMBER, pinhole, rigid
 from d2_plugin.captures.lens import Lens
 from d2_plugin.captures.rotations import rotation_of_quaternion
 from d2_plugin.errors import D2Error
+from d2_plugin.reading import read_bytes, read_text, said
 
 MODELS = (
     *(("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8)),
@@ -94,8 +95,8 @@ def find_model(path: Path) -> Path | None:
 def read_model(folder: Path) -> ColmapModel:
     """Cameras and images of the model in `folder`; binary files are preferred, as COLMAP does."""
     cameras_file, images_file = _file(folder, "cameras"), _file(folder, "images")
-    cameras = dict(_parse(cameras_file, _binary_cameras, _text_cameras))
-    images = dict(_parse(images_file, _binary_images, _text_images))
+    cameras = _by_number(cameras_file, _parse(cameras_file, _binary_cameras, _text_cameras))
+    images = _by_number(images_file, _parse(images_file, _binary_images, _text_images))
     if not images:
         raise D2Error(f"{images_file} registers no picture: run COLMAP's mapper or point triangulator again")
     for image in images.values():
@@ -111,7 +112,20 @@ def read_points(folder: Path) -> ColmapPoints:
     else:
         rows = list(_parse(_file(folder, "points3D"), _binary_points, _text_points))
     table = np.array(rows, np.float64).reshape(-1, 7)
+    if not np.isfinite(table).all() or np.abs(table).max(initial=0) > LARGEST_NUMBER:
+        raise D2Error(f"{folder} has points with numbers that are not finite or too large: export the model again")
+    table[:, 3:6] = table[:, 3:6].clip(0, 255)
     return ColmapPoints(table[:, :3], table[:, 3:6].astype(np.uint8), table[:, 6])
+
+
+def _by_number(path: Path, pairs: Iterable[tuple[int, Any]]) -> dict[int, Any]:
+    """Entries by their number, which no two share."""
+    found: dict[int, Any] = {}
+    for number, entry in pairs:
+        if number in found:
+            raise D2Error(f"{path} has two entries with number {number}: export the model again")
+        found[number] = entry
+    return found
 
 
 _SUFFIXES = (".bin", ".txt")
@@ -127,13 +141,13 @@ def _file(folder: Path, part: str) -> Path:
 def _parse(path: Path, binary: Any, text: Any) -> Iterator[Any]:
     try:
         if path.suffix == ".bin":
-            yield from binary(_Cursor(path.read_bytes()))
+            yield from binary(_Cursor(read_bytes(path, "export the model again")))
         else:
-            yield from text(path.read_text().splitlines())
-    except (struct.error, ValueError, IndexError, OSError) as failure:
-        if isinstance(failure, D2Error):
-            raise
-        raise D2Error(f"{path} is damaged or no COLMAP model ({failure}): export the model again") from None
+            yield from text(read_text(path, "export the model again").splitlines())
+    except D2Error:
+        raise
+    except (struct.error, ValueError, IndexError, OverflowError) as failure:
+        raise D2Error(f"{path} is damaged or no COLMAP model ({said(failure)}): export the model again") from None
 
 
 class _Cursor:
@@ -202,7 +216,10 @@ def _text_images(lines: list[str]) -> Iterator[tuple[int, ColmapImage]]:
 
 def _text_points(lines: list[str]) -> Iterator[tuple[float, ...]]:
     for line in _content(lines):
-        yield tuple(float(value) for value in line.split()[1:8])
+        numbers = tuple(float(value) for value in line.split()[1:8])
+        if len(numbers) < 7:
+            raise ValueError(f"a point has {len(numbers)} numbers behind its own, expected at least 7")
+        yield numbers
 
 
 def _content(lines: list[str]) -> Iterator[str]:
@@ -211,4 +228,6 @@ def _content(lines: list[str]) -> Iterator[str]:
 
 def _transform(pose: list[float]) -> np.ndarray:
     """T [4, 4] of qw qx qy qz tx ty tz."""
+    if not all(abs(number) <= LARGEST_NUMBER for number in pose[4:7]):
+        raise ValueError(f"a picture stands at {pose[4]:g} {pose[5]:g} {pose[6]:g}")
     return rigid(rotation_of_quaternion(np.array(pose[:4])), np.array(pose[4:7]))

@@ -13,13 +13,17 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.captures.assembly import assembled
-from d2_plugin.captures.calibration import checked_camera, resized, rigid
+from d2_plugin.captures.calibration import LARGEST_NUMBER, checked_camera, resized, rigid
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import FrameFiles, common_frames, numbered_files
 from d2_plugin.captures.lens import Lens, opencv_lens
 from d2_plugin.captures.pictures import opencv, picture_size
 from d2_plugin.captures.rotations import rotation_of_vector
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import parsing, read_text
+
+LARGEST_MATRIX = 64
+"""Rows and columns of a calibration's matrices, at most."""
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 
@@ -36,34 +40,57 @@ class OpencvYaml:
     def __init__(self, path: Path) -> None:
         self.path = path
         cv2 = opencv("reading OpenCV's YAML files")
-        try:
-            storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-            self._storage, opened = storage, storage.isOpened()  # the nodes live as long as their storage
-        except cv2.error:
-            opened = False
-        if not opened:
-            raise D2Error(f"{path} is missing or not a YAML file of OpenCV's: restore the file")
+        flags = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
+        text = read_text(path)
+        if "\0" in text or not text.startswith("%YAML"):
+            raise D2Error(f"{path} is not a YAML file of OpenCV's, which begins with %YAML: restore the file")
+        with parsing(f"{path}, which is not a YAML file of OpenCV's"):
+            self._storage = cv2.FileStorage(text, flags)  # the nodes live as long as their storage
+        if not self._storage.isOpened():
+            raise D2Error(f"{path} is not a YAML file of OpenCV's: restore the file")
 
     def names(self) -> list[str]:
         """The list `names`, empty where there is none."""
-        node = self._storage.getNode("names")
-        return [_text(node.at(i)) for i in range(node.size())] if node.isSeq() else []
+        with parsing(f"names in {self.path}"):
+            node = self._storage.getNode("names")
+            return [_text(node.at(i)) for i in range(node.size())] if node.isSeq() else []
 
     def matrix(self, *keys: str) -> np.ndarray | None:
         """The matrix under the first of `keys` that is there, float64, or None."""
         for key in keys:
-            node = self._storage.getNode(key)
-            if not node.empty():
-                matrix = node.mat() if node.isMap() else None
-                if matrix is None:
-                    raise D2Error(f"{key} in {self.path} is no matrix: write it as !!opencv-matrix")
-                return np.asarray(matrix, np.float64)
+            with parsing(f"{key} in {self.path}"):
+                node = self._storage.getNode(key)
+                if node.empty():
+                    continue
+                matrix = self._small_matrix(node)
+            if matrix is None:
+                raise D2Error(f"{key} in {self.path} is no matrix of numbers: write it as !!opencv-matrix")
+            if not np.isfinite(matrix).all() or np.abs(matrix).max(initial=0) > LARGEST_NUMBER:
+                raise D2Error(f"{key} in {self.path} has a number that is not finite or too large: correct it")
+            return matrix
         return None
+
+    @staticmethod
+    def _small_matrix(node: Any) -> np.ndarray | None:
+        """The numbers of a matrix node, or None: a size is looked at before OpenCV takes memory for it."""
+        if not node.isMap():
+            return None
+        sizes = node.getNode("sizes")  # of matrices with one axis, or more than two
+        many = [sizes.at(i) for i in range(min(sizes.size(), 3))] if sizes.isSeq() else []
+        sides = many or [node.getNode(name) for name in ("rows", "cols")]
+        if len(sides) > 2 or not all(side.isInt() and 0 < side.real() <= LARGEST_MATRIX for side in sides):
+            return None
+        matrix = node.mat()
+        return None if matrix is None else np.asarray(matrix, np.float64)
 
     def number(self, key: str) -> float | None:
         """The number under `key`, or None."""
-        node = self._storage.getNode(key)
-        return float(node.real()) if node.isReal() or node.isInt() else None
+        with parsing(f"{key} in {self.path}"):
+            node = self._storage.getNode(key)
+            number = float(node.real()) if node.isReal() or node.isInt() else None
+        if number is not None and not abs(number) <= LARGEST_NUMBER:
+            raise D2Error(f"{key} in {self.path} is {number:g}: correct the calibration")
+        return number
 
 
 def is_enerf(path: Path) -> bool:

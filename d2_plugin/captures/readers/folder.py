@@ -10,16 +10,18 @@ monocular prediction: affine-invariant inverse depth, unless mono/mono.json says
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from d2_plugin.captures.assembly import assembled, read_json
-from d2_plugin.captures.calibration import checked_camera, pinhole, rigid
+from d2_plugin.captures.assembly import CORRECT, assembled
+from d2_plugin.captures.calibration import LARGEST_NUMBER, checked_camera, checked_rate, pinhole, rigid
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import common_frames, numbered_files
 from d2_plugin.captures.pictures import picture_size
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import field, read_json, said
+from d2_plugin.values import Range, shown
 
 CALIBRATION = "cameras.json"
 
@@ -38,7 +40,7 @@ def open_folder(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
     `cameras` restricts everything, checks included, to the named ones; `intersect` leaves out, with a note, cameras
     that have pictures without calibration or calibration without pictures, which are otherwise refused by name.
     """
-    description = read_json(path / CALIBRATION)
+    description = read_json(path / CALIBRATION, CORRECT)
     calibrated = _calibrations(description, path / CALIBRATION)
     pictured = {folder.name: folder for folder in sorted((path / "images").iterdir()) if folder.is_dir()}
     names, notes = _agreed(list(calibrated), list(pictured), cameras, intersect, path)
@@ -56,7 +58,7 @@ def _calibrations(description: dict[str, Any], path: Path) -> dict[str, Camera]:
     entries = description.get("cameras")
     if not isinstance(entries, list) or not entries:
         raise D2Error(f"{path} has no list 'cameras': write one entry per camera")
-    bounds = description.get("bounds", {})
+    bounds = field(description, "bounds", dict, str(path), CORRECT, default={})
     found: dict[str, Camera] = {}
     for entry in entries:
         camera = _calibration(entry, bounds, path)
@@ -66,20 +68,31 @@ def _calibrations(description: dict[str, Any], path: Path) -> dict[str, Camera]:
     return found
 
 
-def _calibration(entry: dict[str, Any], bounds: dict[str, Any], path: Path) -> Camera:
-    try:
-        name = str(entry["name"])
-        K = pinhole(*(float(entry[key]) for key in ("fx", "fy", "cx", "cy")))
-        rotation = np.array(entry["R"], np.float64).reshape(3, 3)
-        T = rigid(rotation, np.array(entry["t"], np.float64).reshape(3))
-        size = (int(entry["width"]), int(entry["height"]))
-        near_far = (float(bounds[name][0]), float(bounds[name][1])) if name in bounds else None
-    except KeyError as missing:
-        label = entry.get("name", "without a name") if isinstance(entry, dict) else entry
-        raise D2Error(f"camera {label} in {path} has no {missing}: add the number") from None
-    except (TypeError, ValueError, IndexError) as failure:
-        raise D2Error(f"a camera in {path} cannot be understood ({failure}): see the folder layout") from None
+def _calibration(entry: Any, bounds: dict[str, Any], path: Path) -> Camera:
+    if not isinstance(entry, dict):
+        raise D2Error(f"a camera in {path} cannot be understood ({shown(entry)} is no object): {CORRECT}")
+    name = str(field(entry, "name", str | int, f"a camera in {path}", CORRECT))
+    where = f"camera {name} in {path}"
+    K = pinhole(*(field(entry, key, _NUMBER, where, CORRECT) for key in ("fx", "fy", "cx", "cy")))
+    T = rigid(_numbers(entry, "R", (3, 3), where), _numbers(entry, "t", (3,), where))
+    size = (field(entry, "width", int, where, CORRECT), field(entry, "height", int, where, CORRECT))
+    near_far = field(bounds, name, tuple[_NUMBER, _NUMBER] | None, f"bounds in {path}", CORRECT, default=None)
     return checked_camera(name, size, K, T, near_far, str(path))
+
+
+_NUMBER = Annotated[float, Range(-LARGEST_NUMBER, LARGEST_NUMBER)]
+
+
+def _numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """An array of a given shape, nested in lists or not."""
+    value = field(entry, key, list, where, CORRECT)
+    try:
+        array = np.array(value, np.float64).reshape(shape)
+    except (TypeError, ValueError, OverflowError) as failure:
+        raise D2Error(f"{where} cannot be understood ({key}: {said(failure)}): {CORRECT}") from None
+    if not np.abs(array).max() <= LARGEST_NUMBER:
+        raise D2Error(f"{key} of {where} has a number that is not finite or too large: {CORRECT}")
+    return array
 
 
 def _agreed(
@@ -120,7 +133,5 @@ def _check_size(camera: Camera, first: Path) -> None:
 def _frame_rate(description: dict[str, Any], path: Path, frames: int) -> tuple[float, tuple[str, ...]]:
     if "fps" not in description:
         return DEFAULT_FPS, (f"cameras.json names no fps: {DEFAULT_FPS:g} taken",) if frames > 1 else ()
-    fps = description["fps"]
-    if not isinstance(fps, int | float) or not 0 < fps < float("inf"):
-        raise D2Error(f"{path / 'cameras.json'} says fps {fps!r}, expected frames per second above 0: correct it")
-    return float(fps), ()
+    where = str(path / CALIBRATION)
+    return checked_rate(field(description, "fps", float, where, CORRECT), where), ()

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from d2_plugin.arrays import read_array
 from d2_plugin.captures.assembly import assembled
-from d2_plugin.captures.calibration import checked_camera, pinhole, rigid
+from d2_plugin.captures.calibration import LARGEST_NUMBER, checked_camera, checked_rate, pinhole, rigid
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import FrameFiles, cameras_with_pictures, collect, common_frames, numbered_files
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES, picture_size
@@ -94,6 +95,11 @@ def camera_from_row(row: np.ndarray, name: str, size: tuple[int, int] | None, wh
             f"the row of camera {name} in {where} has a number that is not finite or a size below one pixel: "
             "correct the calibration"
         )
+    if np.abs(row).max() > LARGEST_NUMBER:
+        raise D2Error(
+            f"the row of camera {name} in {where} has the number {np.abs(row).max():g}, expected at most "
+            f"{LARGEST_NUMBER:g} in size: correct the calibration"
+        )
     size = size or (round(width), round(height))
     scale = size[0] / width
     if abs(size[1] / height - scale) > 0.01 * scale:
@@ -109,10 +115,7 @@ def camera_from_row(row: np.ndarray, name: str, size: tuple[int, int] | None, wh
 
 
 def _rows(path: Path) -> np.ndarray:
-    try:
-        rows = np.load(path)
-    except (OSError, ValueError, EOFError) as failure:
-        raise D2Error(f"cannot read {path} ({failure}): replace the file") from None
+    rows = read_array(path, "replace the file")
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise D2Error(f"{path} has shape {rows.shape}, expected [cameras, 17]: see the LLFF format")
     return rows.astype(np.float64)
@@ -128,7 +131,7 @@ def _from_videos(
         name=path.resolve().name,
         cameras={name: camera_from_row(rows[name], name, found[name].size, where) for name in names},
         frames=frames,
-        fps=found[names[0]].fps or N3DV_FPS,
+        fps=checked_rate(found[names[0]].fps or N3DV_FPS, str(videos[names[0]])),
         source=VideoSource({name: videos[name] for name in names}),
         path=path,
         notes=(*notes, *frame_notes, *_known_flaws(path, names)),

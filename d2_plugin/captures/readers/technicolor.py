@@ -17,14 +17,15 @@ from pathlib import Path
 import numpy as np
 
 from d2_plugin.captures.assembly import assembled
-from d2_plugin.captures.calibration import checked_camera, pinhole, rigid
+from d2_plugin.captures.calibration import LARGEST_NUMBER, checked_camera, pinhole, rigid
 from d2_plugin.captures.capture import Camera, Capture
-from d2_plugin.captures.files import FrameFiles, cameras_with_pictures, common_frames
+from d2_plugin.captures.files import FrameFiles, cameras_with_pictures, common_frames, frame_number
 from d2_plugin.captures.lens import Lens
 from d2_plugin.captures.naming import Shot, by_camera
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES, picture_size
 from d2_plugin.captures.rotations import rotation_of_quaternion
 from d2_plugin.errors import D2Error
+from d2_plugin.reading import read_text, said
 
 PARAMETERS = "cameras_parameters.txt"
 UNDISTORTED, DISTORTED = 12, 14
@@ -80,10 +81,14 @@ def open_technicolor(path: Path, cameras: tuple[str, ...] | None = None, interse
 def _rows(path: Path) -> dict[str, np.ndarray]:
     """Numbers of each camera by its name."""
     try:
-        lines = [line.split() for line in path.read_text().splitlines()[1:] if line.strip()]
+        lines = [line.split() for line in read_text(path).splitlines()[1:] if line.strip()]
         rows = [np.array([float(field) for field in line]) for line in lines]
-    except (OSError, ValueError) as failure:
-        raise D2Error(f"cannot read {path} ({failure}): expected a header and one line of numbers per camera") from None
+    except D2Error:
+        raise
+    except ValueError as failure:
+        raise D2Error(
+            f"cannot read {path} ({said(failure)}): expected a header and one line of numbers per camera"
+        ) from None
     for number, row in enumerate(rows):
         if row.size not in (UNDISTORTED, DISTORTED):
             raise D2Error(
@@ -104,7 +109,8 @@ def _pictures(path: Path) -> tuple[dict[str, FrameFiles], str]:
     for file in sorted(folder.iterdir()):
         match = _NAME.match(file.stem) if file.suffix.lower() in PICTURE_SUFFIXES else None
         if match:
-            shots[file.name], files[file.name] = Shot(f"{int(match['camera']):02d}", int(match["frame"])), file
+            camera, frame = (frame_number(match[part], file) for part in ("camera", "frame"))
+            shots[file.name], files[file.name] = Shot(f"{camera:02d}", frame), file
             scenes.add(match["scene"].lower())
     if not files:
         raise D2Error(f"no pictures in {folder}: expected names like Birthday_undist_00151_00.png")
@@ -133,6 +139,8 @@ def _camera(name: str, row: np.ndarray, picture: Path, scene: str, path: Path) -
     where = str(path / PARAMETERS)
     focal, cu, cv, aspect, skew = row[:5]
     distortion = tuple(row[5:-7].tolist()) if "undist" not in picture.stem.lower() else ()
+    if not np.abs(row).max() <= LARGEST_NUMBER:
+        raise D2Error(f"camera {name} in {where} has a number beyond {LARGEST_NUMBER:g}: correct the calibration")
     K = pinhole(focal, aspect * focal, cu, cv)
     K[0, 1] = skew
     try:

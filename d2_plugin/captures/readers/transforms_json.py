@@ -11,18 +11,28 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from d2_plugin.captures.assembly import assembled, read_json
-from d2_plugin.captures.calibration import OPENGL_TO_OPENCV, checked_camera, pinhole, resized
+from d2_plugin.captures.assembly import CORRECT, assembled
+from d2_plugin.captures.calibration import (
+    LARGEST_NUMBER,
+    OPENGL_TO_OPENCV,
+    check_name,
+    checked_camera,
+    checked_rate,
+    pinhole,
+    resized,
+)
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import common_frames
 from d2_plugin.captures.lens import Lens, opencv_lens
 from d2_plugin.captures.naming import Shot, arrange, by_camera
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES, picture_size
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import field, read_json, said
+from d2_plugin.values import Range
 
 FILES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
 """All that are there are read; their pictures are joined."""
@@ -86,7 +96,7 @@ def open_transforms(path: Path, cameras: tuple[str, ...] | None = None, intersec
 def _entries(path: Path) -> dict[str, _Entry]:
     found: dict[str, _Entry] = {}
     for listed_in in (path / name for name in FILES if (path / name).is_file()):
-        content = read_json(listed_in)
+        content = read_json(listed_in, CORRECT)
         frames = content.get("frames")
         if not isinstance(frames, list):
             raise D2Error(f"{listed_in} has no list 'frames': write one entry per picture")
@@ -105,13 +115,15 @@ def _entry(frame: Any, common: Mapping[str, Any], listed_in: Path) -> _Entry:
         matrix = np.array(frame["transform_matrix"], np.float64)
         matrix = np.vstack([matrix, [0, 0, 0, 1]]) if matrix.shape == (3, 4) else matrix.reshape(4, 4)
         time = round(float(frame["time"]), TIME_DIGITS) if "time" in frame else None
+        file = _picture_file(listed_in.parent / name)
     except KeyError as missing:
         raise D2Error(f"a picture in {listed_in} has no {missing}: add it") from None
-    except (TypeError, ValueError) as failure:
-        raise D2Error(f"a picture in {listed_in} cannot be understood ({failure}): see docs/captures.md") from None
+    except (TypeError, ValueError, OverflowError) as failure:
+        raise D2Error(f"a picture in {listed_in} cannot be understood ({said(failure)}): {CORRECT}") from None
     if not np.isfinite(matrix).all() or (time is not None and not math.isfinite(time)):
         raise D2Error(f"{name} in {listed_in} has a number that is not finite: correct the file")
-    file = _picture_file(listed_in.parent / name)
+    if np.abs(matrix).max() > LARGEST_NUMBER:
+        raise D2Error(f"{name} in {listed_in} has a matrix with {np.abs(matrix).max():g} in it: correct the file")
     return _Entry(name.removeprefix("./"), file, matrix, time, {**common, **frame}, listed_in)
 
 
@@ -136,7 +148,7 @@ def _present(entries: dict[str, _Entry], intersect: bool) -> tuple[dict[str, _En
 
 def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], float]:
     """Camera and frame of every picture, and frames per unit of time."""
-    declared = _rate(next(iter(entries.values())).intrinsics.get("fps"))
+    declared = _rate(next(iter(entries.values())), path)
     shots, _ = arrange(entries, lambda group: _still([entries[name] for name in group]))
     times = {name: entry.time for name, entry in entries.items() if entry.time is not None}
     instants = set(times.values())
@@ -150,12 +162,14 @@ def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], flo
             "have no number in their names: expected cameras that stand still, and names like CAMERA_FRAME.png"
         )
     shots, rate = _timed(shots, times)
+    checked_rate(rate, f"the times in {path}")
     return shots, declared if declared and math.isclose(declared, rate, rel_tol=1e-6) else rate
 
 
-def _rate(value: Any) -> float | None:
-    """The frame rate that a file declares, or None where it declares nothing usable."""
-    return value if isinstance(value, int | float) and 0 < value < math.inf else None
+def _rate(entry: _Entry, path: Path) -> float | None:
+    """The frame rate that a file declares, or None."""
+    rate = field(entry.intrinsics, "fps", float | None, str(entry.listed_in), CORRECT, default=None)
+    return checked_rate(rate, str(path)) if rate else None  # 0 is how some programs say that there is none
 
 
 def _timed(shots: dict[str, Shot], times: dict[str, float]) -> tuple[dict[str, Shot], float]:
@@ -177,12 +191,9 @@ def _still(group: list[_Entry]) -> bool:
 def _camera(name: str, entry: _Entry) -> tuple[Camera, Lens]:
     """The pinhole camera of the undistorted pictures, and the lens of the recorded ones."""
     size, where = picture_size(entry.file), str(entry.listed_in)
-    try:
-        given = {key: float(entry.intrinsics[key]) for key in _NUMBERS if key in entry.intrinsics}
-    except (TypeError, ValueError) as failure:
-        raise D2Error(
-            f"camera {name} in {where} has intrinsics that are no numbers ({failure}): correct them"
-        ) from None
+    check_name(name, where)
+    said_by = f"camera {name} in {where}"
+    given = {key: field(entry.intrinsics, key, _SIZED, said_by, CORRECT) for key in _NUMBERS if key in entry.intrinsics}
     calibrated = (round(given.get("w", size[0])), round(given.get("h", size[1])))
     focal = _focal_lengths(given, calibrated, name, where)
     centre = given.get("cx", calibrated[0] / 2), given.get("cy", calibrated[1] / 2)
@@ -195,6 +206,7 @@ def _camera(name: str, entry: _Entry) -> tuple[Camera, Lens]:
     return checked_camera(name, size, lens.pinhole, T_camera_world, None, where), lens
 
 
+_SIZED = Annotated[float, Range(-LARGEST_NUMBER, LARGEST_NUMBER)]
 _NUMBERS = (
     *("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"),
     *("k1", "k2", "k3", "k4", "p1", "p2"),
@@ -208,7 +220,12 @@ def _focal_lengths(given: dict[str, float], size: tuple[int, int], name: str, wh
         if f"fl_{axis}" in given:
             focal[axis] = given[f"fl_{axis}"]
         elif f"camera_angle_{axis}" in given:
-            focal[axis] = length / (2 * math.tan(given[f"camera_angle_{axis}"] / 2))
+            angle = given[f"camera_angle_{axis}"]
+            if not 0 < angle < math.pi:
+                raise D2Error(
+                    f"camera {name} in {where} has camera_angle_{axis} {angle:g}, expected radians: {CORRECT}"
+                )
+            focal[axis] = length / (2 * math.tan(angle / 2))
     if not focal:
         raise D2Error(f"camera {name} in {where} has neither fl_x nor camera_angle_x: add its focal length in pixels")
     return focal.get("x", focal.get("y", 0.0)), focal.get("y", focal.get("x", 0.0))

@@ -6,7 +6,6 @@ Defaults come first, the tables of a --config file over them, and flags over bot
 from __future__ import annotations
 
 import sys
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
@@ -14,6 +13,8 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from d2_plugin.commands.arguments.form import Form, Given, Group
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import NoSuchFile, shown_path
+from d2_plugin.reading import read_toml as tables_of_toml
 from d2_plugin.settings import Declared, Settings, declared
 
 if TYPE_CHECKING:
@@ -112,7 +113,11 @@ def hook_names(text: str) -> tuple[str, ...]:
     if text in ("all", "none"):
         return HOOK_NAMES if text == "all" else ()
     names = tuple(name.strip() for name in text.split(",") if name.strip())
+    if not names:
+        raise D2Error("--hooks names no hook: write none to train without any, or leave it out for all")
     for name in names:
+        if name in ("all", "none"):
+            raise D2Error(f"--hooks says '{text}': {name} stands alone, or name the hooks, joined by commas")
         if name not in HOOK_NAMES:
             raise unknown_name("hook", name, [*HOOK_NAMES, "all", "none"])
     return names
@@ -123,11 +128,9 @@ def read_toml(path: Path | None) -> dict[str, Any]:
     if path is None:
         return {}
     try:
-        return tomllib.loads(path.read_text())
-    except FileNotFoundError:
-        raise D2Error(f"no configuration at {path}: write one, or leave out --config") from None
-    except tomllib.TOMLDecodeError as error:
-        raise D2Error(f"{path} is not valid TOML: {error}") from None
+        return tables_of_toml(path, "correct the configuration")
+    except NoSuchFile:
+        raise D2Error(f"no configuration at {shown_path(path)}: write one, or leave out --config") from None
 
 
 def say(*lines: str) -> None:

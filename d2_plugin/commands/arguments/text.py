@@ -11,6 +11,9 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Declared, Range, checked
 
+MOST_NUMBERS = 10_000_000
+"""The largest number in a list: a range of more would fill the memory."""
+
 
 def flag_of(name: str) -> str:
     """The flag of a setting: `priors.stereo.min_angle` is `--priors.stereo.min-angle`."""
@@ -104,9 +107,13 @@ def _numbers(pieces: Sequence[str], said: str) -> tuple[int, ...]:
     for piece in pieces:
         try:
             first, *last = (int(part) for part in piece.split(":"))
-            found += range(first, last[0] + 1, *last[1:]) if last else [first]
+            numbers = range(first, last[0] + 1, *last[1:]) if last else [first]
+            if max(abs(number) for number in (first, *last)) > MOST_NUMBERS or not len(numbers):
+                raise ValueError(piece)
+            found += numbers
         except (ValueError, TypeError):
             raise D2Error(
-                f"{said} is '{piece}': give whole numbers joined by commas, or first:last or first:last:step"
+                f"{said} is '{piece[:80]}': give whole numbers joined by commas, or first:last or first:last:step, of "
+                f"at most {MOST_NUMBERS}"
             ) from None
     return tuple(found)

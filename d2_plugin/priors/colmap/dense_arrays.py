@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from d2_plugin.errors import D2Error
+from d2_plugin.reading import read_bytes
 
 _HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,2})&")
 _HEADER_LENGTH = 64  # bytes, more than any header has
@@ -24,14 +25,13 @@ def read_dense_array(path: Path) -> np.ndarray:
     Raises:
         D2Error: there is no such file, it has no header, or more or fewer numbers than the header says.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise D2Error(f"cannot read {path} ({error.strerror}): let COLMAP compute the map again") from None
+    data = read_bytes(path, "let COLMAP compute the map again")
     header = _HEADER.match(data[:_HEADER_LENGTH])
     if header is None:
         raise D2Error(f"{path} does not begin with width&height&channels& as COLMAP's maps do: compute it again")
     width, height, channels = (int(number) for number in header.groups())
+    if width * height * channels == 0:
+        raise D2Error(f"{path} is a map of {width}x{height}x{channels}, without a pixel: compute it again")
     found, expected = len(data) - header.end(), 4 * width * height * channels
     if found != expected:
         raise D2Error(

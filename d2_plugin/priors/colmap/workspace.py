@@ -35,6 +35,10 @@ TRANSLATION = 0.03
 logger = logging.getLogger(__name__)
 
 
+FRAME_IN_BRACES = re.compile(r"\{frame(?::0?[0-9]{1,2}d?)?\}")
+"""Where stereo.folder has the number of a frame."""
+
+
 class WorkspaceDepth:
     """Depth maps of one workspace for all frames, or of one per frame.
 
@@ -111,10 +115,14 @@ class WorkspaceDepth:
         return seen_by(camera, depth, _intrinsics(model, image, depth.shape)) * np.float32(self._scale)
 
     def _folder(self, frame: int) -> Path:
-        try:
-            return self.root / self.place.format(frame=frame)
-        except (KeyError, IndexError, ValueError) as error:
-            raise D2Error(f"stereo.folder {self.place} has braces around other than frame ({error}): mend it") from None
+        # Only these two forms: a width in braces could be any, and what stands behind a dot is looked up.
+        rest = FRAME_IN_BRACES.sub("", self.place)
+        if "{" in rest or "}" in rest:
+            raise D2Error(
+                f"stereo.folder {self.place} has braces around other than frame: write {{frame}}, or {{frame:05d}} for "
+                "numbers with zeros in front"
+            )
+        return self.root / self.place.format(frame=frame)
 
     def _read_model(self, folder: Path) -> ColmapModel:
         """The cameras and pictures of a workspace; the one that was read last is kept."""

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from d2_plugin.arrays import read_array
 from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.pictures import shrink_depth
+from d2_plugin.captures.pictures import read_numbers, shrink_depth
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import viewing_rays
@@ -22,17 +23,14 @@ ASPECT = 0.01
 def stored_numbers(path: Path) -> np.ndarray:
     """A map as it is stored, [h, w]."""
     if path.suffix == ".npy":
-        try:
-            values = np.load(path)
-        except (OSError, ValueError, EOFError) as error:
-            raise D2Error(f"cannot read {path} ({error}): replace the file or remove it") from None
+        values = read_array(path, "replace the file or remove it")
     else:
-        cv2 = opencv("reading sensor depth")
-        values = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if path.stat().st_size else None
-        if values is None or values.dtype != np.uint16:
-            found = "no readable PNG" if values is None else f"{values.dtype} with shape {values.shape}"
+        opencv("reading sensor depth")
+        values = read_numbers(path)
+        if values.dtype != np.uint16:
+            found = f"{values.dtype} with shape {values.shape}"
             raise D2Error(f"{path} is {found}: sensor depth needs a PNG of 16 bits and one channel, or .npy")
-    if values.ndim != 2:
+    if values.ndim != 2 or values.size == 0:
         raise D2Error(f"{path} has shape {values.shape}, expected [height, width]: write one number per pixel")
     return values
 

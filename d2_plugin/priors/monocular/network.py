@@ -19,9 +19,12 @@ from d2_plugin.errors import D2Error, missing_extra, unknown_name
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.monocular.align import KINDS
 from d2_plugin.priors.settings import Preprocessing
+from d2_plugin.reading import parsing, said
+from d2_plugin.values import shown
 
 PREPROCESSINGS: tuple[Preprocessing, ...] = get_args(Preprocessing)
 PATCH = 14  # side of a ViT patch: Depth Anything V2 takes sizes that are multiples of it
+LARGEST_INPUT = 8192  # pixels: a network that was exported for more fills the memory
 SHORT_SIDE = 518  # Depth Anything V2's lower bound of the shorter side, pixels
 IMAGENET_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 IMAGENET_STD = np.array([0.229, 0.224, 0.225], np.float32)
@@ -50,9 +53,16 @@ class NetworkInput:
             raise D2Error(f"{path} has {len(inputs)} inputs: export a network with one picture input [1, 3, H, W]")
         shape, dtypes = inputs[0].shape, {"tensor(float)": np.float32, "tensor(float16)": np.float16}
         if len(shape) != 4 or (shape[1] not in (3, None) and isinstance(shape[1], int)):
-            raise D2Error(f"{path} takes {shape}: export a network whose input is [1, 3, H, W]")
+            raise D2Error(f"{path} takes {shown(shape)}: export a network whose input is [1, 3, H, W]")
+        if isinstance(shape[0], int) and shape[0] > 1:
+            raise D2Error(f"{path} takes {shape[0]} pictures at once: export it with a batch of 1, or of free size")
         if inputs[0].type not in dtypes:
             raise D2Error(f"{path} takes {inputs[0].type}: export a network that takes float32 or float16")
+        if max((size for size in shape[2:] if isinstance(size, int)), default=0) > LARGEST_INPUT:
+            raise D2Error(
+                f"{path} takes pictures of {shape[3]}x{shape[2]}, expected at most {LARGEST_INPUT} a side: export it "
+                "for a smaller input, or a free one"
+            )
         height, width = (size if isinstance(size, int) and size > 0 else None for size in shape[2:])
         return cls(inputs[0].name, height, width, dtypes[inputs[0].type])
 
@@ -92,9 +102,11 @@ class MonocularModel:
     def predict(self, image: np.ndarray) -> np.ndarray:
         """The prediction float32 [h, w] at the size the network returns."""
         tensor = self.prepare(image)
-        output = np.asarray(self.session.run(None, {self.input.name: tensor})[0], np.float32)
-        prediction = np.squeeze(output)
-        if prediction.ndim != 2:
+        height, width = tensor.shape[2:]
+        with parsing(f"what {self.path} makes of a picture of {width}x{height}", "export the network for this size"):
+            output = np.asarray(self.session.run(None, {self.input.name: tensor})[0], np.float32)
+        prediction = np.squeeze(output, axis=tuple(axis for axis in range(output.ndim - 2) if output.shape[axis] == 1))
+        if prediction.ndim != 2 or min(prediction.shape) < 2:
             raise D2Error(f"{self.path} returns {output.shape}: expected one map [1, H, W] or [1, 1, H, W]")
         return prediction
 
@@ -115,10 +127,14 @@ class MonocularModel:
         if self.input.height and self.input.width:
             return self.input.height, self.input.width
         enlarge = SHORT_SIDE / min(height, width)
-        return (
-            self.input.height or _multiple_of_patch(height * enlarge),
-            self.input.width or _multiple_of_patch(width * enlarge),
-        )
+        rows = self.input.height or _multiple_of_patch(height * enlarge)
+        columns = self.input.width or _multiple_of_patch(width * enlarge)
+        if max(rows, columns) > LARGEST_INPUT:
+            raise D2Error(
+                f"a picture of {width}x{height} would enter {self.path} as {columns}x{rows}, at most {LARGEST_INPUT} a "
+                "side: give a network of fixed size, or pictures that are less long"
+            )
+        return rows, columns
 
     def fingerprint(self) -> str:
         """What the prediction depends on besides the picture: file, provider and preprocessing."""
@@ -177,4 +193,4 @@ def _session(path: Path, threads: int) -> Any:
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:  # onnxruntime's exceptions have no common base class
-        raise D2Error(f"{path} is not an ONNX network that onnxruntime can run: {error}") from None
+        raise D2Error(f"{path} is not an ONNX network that onnxruntime can run: {said(error)}") from None

@@ -5,6 +5,7 @@ Both are seeded and independent of the image size up to the camera, so that time
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error
 from d2_plugin.rasterizer import Splats, View
 
@@ -88,10 +90,10 @@ def synthetic_scene(count: int, width: int, height: int, seed: int = 0) -> Scene
 
 def garden_scene(path: Path, width: int, height: int) -> Scene:
     """The garden's structure-from-motion points, with random shapes and opacities (seed 0), from its first camera."""
-    with np.load(path) as data:
-        means, colors = data["means3d"].astype(np.float64), data["colors"] / 255.0
-        T_camera_world, K = data["viewmats"][0], data["Ks"][0]
-        original_width, original_height = int(data["width"]), int(data["height"])
+    read = partial(read_array, path, "give gsplat's test_garden.npz")
+    means, colors = read(key="means3d", ndim=2).astype(np.float64), read(key="colors", ndim=2) / 255.0
+    T_camera_world, K = read(key="viewmats", ndim=3)[0], read(key="Ks", ndim=3)[0]
+    original_width, original_height = int(read(key="width")), int(read(key="height"))
     inside = (np.abs(means) <= GARDEN_CROP).all(1)
     means, colors = means[inside], colors[inside]
     random = np.random.default_rng(0)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from d2_plugin.errors import D2Error
+from d2_plugin.reading import parsing
 from d2_plugin.runs.tables import read_metrics
 from d2_plugin.settings import Positional, Settings
 from d2_plugin.study.rows import Row, read_rows
@@ -70,11 +71,8 @@ def make_report(rows: Sequence[Row], output: Path, pictures: Sequence[Picture] =
     """
     if not rows:
         raise D2Error("there is nothing to report: give a runs.jsonl with rows in it, or the folder of a finished run")
-    sections = [
-        build([row for row in rows if row["kind"] == kind])
-        for kind, build in BUILDERS.items()
-        if any(row["kind"] == kind for row in rows)
-    ]
+    by_kind = {kind: [row for row in rows if row["kind"] == kind] for kind in BUILDERS}
+    sections = [_built(kind, mine) for kind, mine in by_kind.items() if mine]
     compared = versions(rows)
     sections += [] if compared is None else [compared]
     output.mkdir(parents=True, exist_ok=True)
@@ -83,6 +81,12 @@ def make_report(rows: Sequence[Row], output: Path, pictures: Sequence[Picture] =
     for name, content in texts.items():
         (output / name).write_text(content)
     return [output / name for name in texts]
+
+
+def _built(kind: str, rows: Sequence[Row]) -> Section:
+    """The section of one kind of row; each reads what else its rows hold, which only it knows."""
+    with parsing(f"the rows of kind {kind}", "measure them again, their form is not that of this version"):
+        return BUILDERS[kind](rows)
 
 
 def collect(sources: Sequence[Path]) -> tuple[list[Row], list[Picture]]:

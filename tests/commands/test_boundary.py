@@ -1,0 +1,244 @@
+"""What the command line makes of mistakes, faults and Ctrl-C: one sentence, an exit code, no traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from small_layouts import write_layout
+
+from d2_plugin.captures.pictures import write_png
+from d2_plugin.commands import boundary, cli
+from d2_plugin.commands.boundary import one_line, sentence
+from d2_plugin.commands.cli import main
+from d2_plugin.errors import D2Error
+
+pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+
+Refused = Callable[..., str]
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
+    """The sentence with which a command line is refused."""
+
+    def run(*words: str) -> str:
+        assert main(words) == 2
+        return told(capsys)
+
+    return run
+
+
+def told(capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line on stderr, which is no fault of ours."""
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("[")]  # ffmpeg's own
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("d2: "), lines
+    assert "unexpected" not in lines[0], lines
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_layout("folder", tmp_path_factory.mktemp("recording") / "small")
+
+
+@pytest.fixture
+def copy(capture: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(capture, tmp_path / "copy"))
+
+
+class TestTheBoundary:
+    """An exception becomes a sentence and an exit code."""
+
+    @pytest.fixture
+    def failing(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]:
+        def fail_with(failure: BaseException) -> None:
+            def answer(words: list[str]) -> str:
+                raise failure
+
+            monkeypatch.setattr(cli, "_answer", answer)
+
+        return fail_with
+
+    def test_a_fault_asks_for_a_report(self, failing: Callable, capsys: pytest.CaptureFixture[str]) -> None:
+        failing(KeyError("depth"))
+        assert main(["train"]) == 2
+        error = capsys.readouterr().err
+        assert error == (
+            "d2: unexpected KeyError ('depth'), a fault of d2-4dgs: run the same command with --debug and report what "
+            "it prints\n"
+        )
+
+    def test_debug_shows_where_it_arose(self, failing: Callable, capsys: pytest.CaptureFixture[str]) -> None:
+        failing(D2Error("no such thing: write it"))
+        assert main(["train", "--debug"]) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert lines[0].startswith("Traceback")
+        assert lines[-1] == "d2: no such thing: write it"
+
+    def test_ctrl_c_says_how_to_go_on(self, failing: Callable, capsys: pytest.CaptureFixture[str]) -> None:
+        failing(KeyboardInterrupt())
+        assert main(["train"]) == 130
+        assert capsys.readouterr().err == "d2: stopped: continue with the same command\n"
+
+    def test_a_full_disk_names_the_file(self, failing: Callable, capsys: pytest.CaptureFixture[str]) -> None:
+        failing(OSError(28, "No space left on device", "/out/checkpoint.tmp"))
+        assert main(["train"]) == 2
+        assert "cannot use /out/checkpoint.tmp (No space left on device)" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(
+        "failure",
+        [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes")],
+    )
+    def test_too_little_memory_proposes_a_scale(
+        self, failing: Callable, failure: Exception, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        failing(failure)
+        assert main(["train"]) == 2
+        assert "--downscale 2" in capsys.readouterr().err
+
+    def test_a_reader_that_goes_away_is_no_error(self, failing: Callable, capsys: pytest.CaptureFixture[str]) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(boundary.os, "dup2", lambda *_: None)
+            failing(BrokenPipeError())
+            assert main(["doctor"]) == 141
+        assert capsys.readouterr().err == ""
+
+    def test_sentences_have_one_line_and_no_control_characters(self) -> None:
+        assert one_line("a\nb\x1b[31m\ud800") == "a b\\x1b[31m\\ud800"
+        assert "\n" not in sentence(ValueError("one\ntwo"))
+
+
+class TestWords:
+    """What people mistype."""
+
+    @pytest.mark.parametrize(
+        ("words", "says"),
+        [
+            (["--seed", "-1"], "--seed must be at least 0"),
+            (["--seed", str(2**64)], "--seed must be at least 0 and at most"),
+            (["--seed", "9" * 5000], "--seed must be"),
+            (["--frames", "0:3000000000"], "of at most 10000000"),
+            (["--frames", "0:10:0"], "give whole numbers"),
+            (["--frames", "5:1"], "give whole numbers"),
+            (["--hooks", "all,none"], "--hooks says 'all,none': all stands alone"),
+            (["--hooks", ","], "--hooks names no hook"),
+            (["--downscale", "1e30"], "--downscale must be a whole number"),
+            (["--downscale", "60000"], "leaves no pixel"),
+            (["--iterations", "9" * 30], "--iterations must be at least 1 and at most 1e+09"),
+            (["--priors.lambda-p", "nan"], "unknown flag"),
+            (["--prune.lambda-e", "nan"], "--prune.lambda-e must be"),
+            (["--densify.budget-per-view", "-5"], "--densify.budget-per-view must be at least"),
+            (["--densify.scale", "-1"], "--densify.scale must be above 0"),
+            (["--densify.opacity", "2"], "--densify.opacity must be"),
+            (["--densify.cell", "0"], "--densify.cell must be"),
+            (["--densify.tau-v", "nan"], "--densify.tau-v must be"),
+            (["--d2.views-per-evaluation", "-3"], "--d2.views-per-evaluation must be at least 1"),
+            (["--plan.temporal", "maybe"], "--plan.temporal must be"),
+            (["--priors.depth-range", "1,2,3"], "--priors.depth-range must be a list of 2"),
+            (["--depth-loss.weight", "1e308"], "--depth-loss.weight must be"),
+            (["--depth-loss.weight", "inf"], "--depth-loss.weight must be"),
+        ],
+    )
+    def test_values_that_cannot_be(
+        self, capture: Path, tmp_path: Path, refused: Refused, words: list[str], says: str
+    ) -> None:
+        fixed = ["train", str(capture), "--train-cameras", "cam00", "--output", str(tmp_path / "x")]
+        assert says in refused(*fixed, *words)
+        assert not (tmp_path / "x").exists()
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "priors = 5", "backbone = []", "[[densify]]\ncell = 1", "plan = 'x'", "[priors]\nstereo = 3",
+            "d2 = 2026-01-01", "[densify]\ncell = 2026-01-01T00:00:00", "[backbone]\nsh_degree = inf",
+            "x = " + "[" * 3000, "= 1", "\x00", "[plan]\ntemporal = \"maybe\"", "[priors]\ndepth_range = [1, 2, 3]",
+        ],
+    )  # fmt: skip
+    def test_configurations_that_cannot_be(self, capture: Path, tmp_path: Path, refused: Refused, text: str) -> None:
+        (tmp_path / "d2.toml").write_text(text)
+        refused("plan", str(capture), "--train-cameras", "cam00", "--config", str(tmp_path / "d2.toml"))
+
+
+class TestPlaces:
+    """Files, folders and other things where the other is expected."""
+
+    def test_a_configuration_that_is_a_pipe_or_a_folder(self, capture: Path, tmp_path: Path, refused: Refused) -> None:
+        os.mkfifo(tmp_path / "pipe.toml")
+        plan = ["plan", str(capture), "--train-cameras", "cam00", "--config"]
+        assert "is a pipe, expected a file" in refused(*plan, str(tmp_path / "pipe.toml"))
+        assert "is a folder, expected a file" in refused(*plan, str(tmp_path))
+        assert "no configuration at" in refused(*plan, str(tmp_path / "none.toml"))
+
+    @pytest.mark.parametrize("output", ["file", "file/below", "x" * 300, "a/" + "y" * 5000])
+    def test_an_output_that_cannot_be(self, capture: Path, tmp_path: Path, refused: Refused, output: str) -> None:
+        (tmp_path / "file").write_text("mine")
+        words = ["train", str(capture), "--train-cameras", "cam00", "--hooks", "none", "--iterations", "1"]
+        refused(*words, "--output", str(tmp_path / output))
+        assert (tmp_path / "file").read_text() == "mine"
+
+    def test_a_picture_that_is_a_pipe(self, copy: Path, refused: Refused) -> None:
+        picture = copy / "images" / "cam00" / "00000.png"
+        picture.unlink()
+        os.mkfifo(picture)
+        assert "is a pipe, expected a file" in refused("plan", str(copy), "--train-cameras", "cam00,cam01")
+
+    def test_a_picture_that_claims_to_be_huge(self, copy: Path, refused: Refused) -> None:
+        picture = copy / "images" / "cam01" / "00001.png"
+        data = bytearray(picture.read_bytes())
+        data[16:24] = (100_000).to_bytes(4, "big") * 2
+        picture.write_bytes(data)
+        assert "says 100000x100000 pixels" in refused("plan", str(copy), "--train-cameras", "cam00,cam01")
+
+    @pytest.mark.parametrize("name", ["a,b", "../x", "a/b", " a", "", "x" * 300, "a\nb"])
+    def test_a_camera_whose_name_cannot_be_used(self, copy: Path, refused: Refused, name: str) -> None:
+        described = json.loads((copy / "cameras.json").read_text())
+        described["cameras"][0]["name"] = name
+        (copy / "cameras.json").write_text(json.dumps(described))
+        assert "rename it" in refused("plan", str(copy), "--train-cameras", "cam01")
+
+    @pytest.mark.parametrize(
+        ("key", "value"), [("fx", 1e-30), ("fx", 1e30), ("t", [1e30, 0, 0]), ("cx", 1e30), ("width", 10**9)]
+    )
+    def test_a_calibration_that_cannot_be(self, copy: Path, refused: Refused, key: str, value: object) -> None:
+        described = json.loads((copy / "cameras.json").read_text())
+        described["cameras"][0][key] = value
+        (copy / "cameras.json").write_text(json.dumps(described))
+        assert "cam00" in refused("plan", str(copy), "--train-cameras", "cam00,cam01")
+
+    @pytest.mark.parametrize("fps", [1e-300, 1e300, 0, -1, "30", None])
+    def test_a_frame_rate_that_cannot_be(self, copy: Path, refused: Refused, fps: object) -> None:
+        described = json.loads((copy / "cameras.json").read_text())
+        (copy / "cameras.json").write_text(json.dumps(described | {"fps": fps}))
+        assert "fps" in refused("plan", str(copy), "--train-cameras", "cam00,cam01")
+
+    def test_a_depth_map_that_only_evaluation_reads_is_named_before_training(
+        self, copy: Path, tmp_path: Path, refused: Refused
+    ) -> None:
+        (copy / "depth" / "cam01" / "00001.npz").write_bytes(b"PK\x03\x04 no archive")
+        words = ["train", str(copy), "--train-cameras", "cam00", "--hooks", "none", "--output", str(tmp_path / "x")]
+        assert "00001.npz" in refused(*words)
+        assert not (tmp_path / "x").exists()
+
+    def test_rows_that_are_no_rows(self, tmp_path: Path, refused: Refused) -> None:
+        rows = tmp_path / "runs.jsonl"
+        for text in ("[]", "{", '{"kind": []}', '{"kind": "training", "error": NaN}', "\x00", "[" * 5000):
+            rows.write_text(text)
+            assert "runs.jsonl" in refused("report", str(rows), "--output", str(tmp_path / "report"))
+
+    def test_black_pictures_and_absurd_views_are_named(self, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        import numpy as np
+
+        write_png(copy / "images" / "cam01" / "00001.png", np.zeros((32, 48, 3), np.uint8))
+        described = json.loads((copy / "cameras.json").read_text())
+        described["cameras"][0] |= {"fx": 2000.0, "fy": 2000.0}
+        (copy / "cameras.json").write_text(json.dumps(described))
+        assert main(["plan", str(copy), "--train-cameras", "cam00,cam01"]) == 0
+        out = capsys.readouterr().out
+        assert "camera cam01 is black at frame 1" in out
+        assert "camera cam00 sees 1.38 x 0.917 degrees, expected 5 to 170" in out

@@ -1,0 +1,141 @@
+"""Every file format that is read, damaged at random: valid content or one sentence, in bounded time and memory."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from fuzzing import bounded_memory, expect_result_or_sentence, mutate_file
+from small_layouts import small_capture
+from tiny_onnx import mean_network
+
+from d2_plugin.arrays import map_array, read_array
+from d2_plugin.attach.names import RenamedStore
+from d2_plugin.captures.capture import Camera
+from d2_plugin.captures.export.export import EXPORT_FILE, export_capture
+from d2_plugin.captures.pictures import picture_size, read_picture, write_png
+from d2_plugin.captures.video import VideoSource, video_header
+from d2_plugin.config import D2Config, for_iterations
+from d2_plugin.priors.colmap.dense_arrays import read_dense_array, write_dense_array
+from d2_plugin.priors.depth_on_disk import SensorDepth
+from d2_plugin.priors.monocular.network import MonocularModel
+from d2_plugin.reading import read_json
+from d2_plugin.study.report.report import collect, make_report
+
+cv2 = pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+
+FEW, MANY = 50, 2000
+MAP = np.linspace(0.5, 3, 48 * 32, dtype=np.float32).reshape(32, 48)
+PICTURE = (np.stack([MAP, MAP[::-1], MAP * 0.3], axis=-1) * 80).astype(np.uint8)
+
+
+class Case(NamedTuple):
+    """A file, how it is written and how it is read."""
+
+    file: str
+    write: Callable[[Path], object]
+    read: Callable[[Path], Any]
+
+
+def sensor(path: Path) -> np.ndarray | None:
+    camera = Camera("cam00", 48, 32, np.diag([40.0, 40, 1]), np.eye(4))
+    return SensorDepth(path.parent if path.name == "depth.json" else path.parent.parent, ["cam00"]).depth(camera, 0)
+
+
+def write_sensor(path: Path) -> None:
+    folder = path.parent if path.name == "depth.json" else path.parent.parent
+    (folder / "cam00").mkdir(parents=True, exist_ok=True)
+    (folder / "depth.json").write_text('{"unit": "mm"}')
+    if path.suffix == ".npy":
+        np.save(path, MAP * 1000)
+    else:
+        cv2.imwrite(str(folder / "cam00" / "0.png"), (MAP * 1000).astype(np.uint16))
+
+
+def report(path: Path) -> object:
+    rows, pictures = collect([path])
+    return make_report(rows, path.parent / "report", pictures)
+
+
+def network(path: Path) -> np.ndarray:
+    return MonocularModel(path, "relative")(PICTURE)
+
+
+def video(path: Path) -> np.ndarray:
+    video_header(path)
+    return VideoSource({"a": path}).image("a", 1)
+
+
+def write_video(path: Path) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 24, (48, 32))
+    for _ in range(3):
+        writer.write(PICTURE)
+    writer.release()
+
+
+CASES = {
+    "json": Case("a.json", lambda p: p.write_text(json.dumps({"a": [1, {"b": 2.5}], "c": "d"})), read_json),
+    "toml": Case(
+        "d2.toml",
+        lambda p: p.write_text(for_iterations(("densify", "prune", "depth_loss"), 100).to_toml()),
+        D2Config.from_toml,
+    ),
+    "npy": Case("a.npy", lambda p: np.save(p, MAP), read_array),
+    "npy mapped": Case("a.npy", lambda p: np.save(p, MAP), map_array),
+    "npz": Case("a.npz", lambda p: np.savez_compressed(p, depth=MAP), lambda p: read_array(p, key="depth", ndim=2)),
+    "png": Case("a.png", lambda p: write_png(p, PICTURE), lambda p: (picture_size(p), read_picture(p))),
+    "jpeg": Case("a.jpg", lambda p: cv2.imwrite(str(p), PICTURE), lambda p: (picture_size(p), read_picture(p))),
+    "video": Case("a.mp4", write_video, video),
+    "dense": Case("a.bin", lambda p: write_dense_array(p, MAP), read_dense_array),
+    "sensor json": Case("depth.json", write_sensor, sensor),
+    "sensor npy": Case("depth/cam00/0.npy", write_sensor, sensor),
+    "sensor png": Case("depth/cam00/0.png", write_sensor, sensor),
+    "rows": Case(
+        "runs.jsonl",
+        lambda p: p.write_text((Path(__file__).parent / "data" / "runs.jsonl").read_text()),
+        report,
+    ),
+    "export": Case(
+        f"export/{EXPORT_FILE}",
+        lambda p: export_capture(small_capture(), "transforms", p.parent),
+        lambda p: RenamedStore.of_export(None, p.parent),
+    ),
+    "onnx": Case("net.onnx", lambda p: mean_network(p, 32, 48), network),
+}
+
+
+def fuzz(case: Case, folder: Path, count: int, seed: int) -> int:
+    path = folder / case.file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if case.file.startswith("export"):
+        path.parent.rmdir()
+    case.write(path)
+    assert expect_result_or_sentence(lambda: case.read(path), "none"), "the file itself is valid"
+    before, valid = path.read_bytes(), 0
+    with bounded_memory():
+        for number in range(count):
+            mutate_file(path, random.Random(f"{case.file} {seed} {number}"))
+            valid += expect_result_or_sentence(lambda: case.read(path), f"{case.file} {seed} {number}")
+            path.write_bytes(before)
+    return valid
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_damaged_file_is_valid_or_one_sentence(name: str, tmp_path: Path) -> None:
+    if name == "onnx":
+        pytest.importorskip("onnxruntime", reason="onnxruntime is in the `mono` extra")
+    count = 10 if name == "rows" else FEW  # a report takes a while
+    assert fuzz(CASES[name], tmp_path, count, 0) < count, "no mutation did any harm: the test would not notice"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_two_thousand_damaged_files(name: str, tmp_path: Path) -> None:
+    if name == "onnx":
+        pytest.importorskip("onnxruntime", reason="onnxruntime is in the `mono` extra")
+    fuzz(CASES[name], tmp_path, MANY, 1)
