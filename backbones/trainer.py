@@ -70,6 +70,8 @@ class Trainer:
     ) -> None:
         self.model, self.frames, self.settings = model, frames, settings
         self.step = 0
+        self.loss: Tensor | None = None
+        """The last step's loss with all its terms, for whoever watches that it stays finite."""
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
         self.d2 = attach(model) if attach else None  # D2, line 1: after the optimizer exists
@@ -87,6 +89,7 @@ class Trainer:
             loss = loss + model.regularization()
             if d2 is not None:
                 loss = loss + d2.loss(self.step, [view])  # D2, line 2: before backward, never +=
+            self.loss = loss.detach()
             loss.backward()
             model.accumulate(view)
             model.optimize(self.step, iterations)

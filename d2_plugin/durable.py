@@ -78,8 +78,11 @@ def make_folder(path: Path) -> Path:
     return path
 
 
-def write(path: Path, *parts: bytes | memoryview) -> None:
+def write(path: Path, *parts: bytes | memoryview, synced: bool = True) -> None:
     """Make `path` hold the parts one after the other; its folder is made where it is missing.
+
+    `synced` waits for the disk, so that a power cut leaves the old file or the new one as well; what nobody reads back
+    need not wait.
 
     Raises:
         CannotWrite: the disk is full, broken or not ours; what was there before is there still.
@@ -88,7 +91,7 @@ def write(path: Path, *parts: bytes | memoryview) -> None:
     temporary = path.with_name(f".{secrets.token_hex(8)}{LEFTOVER}")
     with writing(path):
         try:
-            _write_new(temporary, parts)
+            _write_new(temporary, parts, synced)
             os.replace(temporary, path)
         except BaseException:
             with contextlib.suppress(OSError):
@@ -101,22 +104,40 @@ def write_text(path: Path, text: str) -> None:
     write(path, text.encode())
 
 
-def _write_new(path: Path, parts: tuple[bytes | memoryview, ...]) -> None:
+def append(path: Path, text: str) -> None:
+    """Add whole lines at the end of a file, which is made where it is missing: all of them, or none if that fails."""
+    make_folder(path.parent)
+    with writing(path), path.open("ab+", buffering=0) as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - 1, 0))
+        cut_off = size > 0 and file.read(1) != b"\n"  # somebody was killed in the middle of a line
+        rest = memoryview((("\n" if cut_off else "") + text).encode())
+        try:
+            while rest:
+                rest = rest[file.write(rest) :]
+        except BaseException:
+            file.truncate(size)
+            raise
+
+
+def _write_new(path: Path, parts: tuple[bytes | memoryview, ...], synced: bool) -> None:
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
     descriptor = os.open(path, flags, 0o666)
     try:
         for part in parts:
-            rest = memoryview(part).cast("B")
+            rest = memoryview(part).cast("B") if memoryview(part).nbytes else memoryview(b"")
             while rest:
                 rest = rest[os.write(descriptor, rest) :]
-        os.fsync(descriptor)  # before the rename, or a power cut may leave the new name with nothing in it
+        if synced:
+            os.fsync(descriptor)  # before the rename, or a power cut may leave the new name with nothing in it
     finally:
         os.close(descriptor)
 
 
-def remove_leftovers(folder: Path) -> None:
-    """Delete what killed writers left in a folder and below; only while no other process writes there."""
-    for path in folder.rglob(f".*{LEFTOVER}"):
+def remove_leftovers(folder: Path, below: bool = True) -> None:
+    """Delete what killed writers left in a folder, and below it; only while no other process writes there."""
+    pattern = f".*{LEFTOVER}"
+    for path in folder.rglob(pattern) if below else folder.glob(pattern):
         with contextlib.suppress(OSError):
             path.unlink()
 

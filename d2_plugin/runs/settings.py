@@ -62,6 +62,8 @@ class RunSettings(Settings):
     """What the model returns: relative (inverse depth up to scale and shift) or metric (depth)."""
     priors: str | None = None
     """Folder of a finished depth prior; without it the run builds its own."""
+    accept_empty_prior: bool = False
+    """Train with hooks even where no view has a usable prior, as the backbone alone would."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the trainer runs."""
     overrides: Mapping[str, Any] = field(default_factory=dict)

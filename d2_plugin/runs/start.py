@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import io
 import warnings
 import zipfile
 from collections import OrderedDict
@@ -15,9 +15,13 @@ import torch
 from torch import Tensor
 
 from d2_plugin.captures import Camera, Capture
+from d2_plugin.durable import archive_problem, write
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.colmap.points import triangulate_frames
 from d2_plugin.protocol import View
+
+POINTS_FORMAT = 1
+"""Of points.npz."""
 
 MIN_POINTS = 1000
 """Fewer triangulated points than this are filled up with random ones.
@@ -46,9 +50,9 @@ class TimedPoints:
 
     def save(self, path: Path) -> None:
         """Write an .npz with one array per attribute; an existing file is replaced in one step."""
-        temporary = path.with_suffix(".tmp.npz")
-        np.savez(temporary, positions=self.positions, colors=self.colors, times=self.times)
-        os.replace(temporary, path)
+        content = io.BytesIO()
+        np.savez(content, positions=self.positions, colors=self.colors, times=self.times, format=POINTS_FORMAT)
+        write(path, content.getbuffer())
 
     @classmethod
     def load(cls, path: Path) -> TimedPoints:
@@ -57,13 +61,27 @@ class TimedPoints:
         Raises:
             D2Error: the file is damaged or that of another version.
         """
-        try:
-            with np.load(path) as stored:
-                return cls(stored["positions"], stored["colors"], stored["times"])
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as failure:
-            raise D2Error(
-                f"cannot read points from {path} ({failure}): delete the file, it will be made again"
-            ) from None
+        problem = archive_problem(path)
+        if not problem:
+            try:
+                with np.load(path) as stored:
+                    found = stored["format"].tolist() if "format" in stored else None
+                    points = cls(stored["positions"], stored["colors"], stored["times"])
+                problem = points.problem() if found == POINTS_FORMAT else f"format {found}, expected {POINTS_FORMAT}"
+            except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile) as failure:
+                problem = str(failure)
+        if problem:
+            raise D2Error(f"cannot read points from {path} ({problem}): delete the file, it will be made again")
+        return points
+
+    def problem(self) -> str:
+        """What is wrong with the arrays, or nothing."""
+        count = len(self.times) if self.times.ndim == 1 else -1
+        if self.positions.shape != (count, 3) or self.colors.shape != (count, 3):
+            shapes = [array.shape for array in (self.positions, self.colors, self.times)]
+            return f"shapes {shapes}, expected [(N, 3), (N, 3), (N,)]"
+        arrays = (self.positions, self.colors, self.times)
+        return "" if all(np.isfinite(array).all() for array in arrays) else "numbers that are not finite"
 
     def tensors(self, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor, Tensor]:
         """Positions, colours and times in float32."""
