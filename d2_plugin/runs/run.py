@@ -51,6 +51,7 @@ class Run:
 
     def __init__(self, settings: RunSettings, folder: Path) -> None:
         self.settings, self.folder = check(settings), folder
+        self._checkpoint = folder / "checkpoint.pt"
         self.scene = Scene.open(self.settings)
         claim(folder, self.settings)
         self.seconds = {"priors": 0.0, "train": 0.0, "eval": 0.0}
@@ -192,10 +193,6 @@ class Run:
     def priors(self) -> Path:
         """Folder of the depth prior that was built from the training cameras."""
         return PriorStore.located(self.settings.priors or self.folder / "priors", self.scene.train_cameras)
-
-    @property
-    def _checkpoint(self) -> Path:
-        return self.folder / "checkpoint.pt"
 
     def _points(self) -> TimedPoints:
         """The triangulated points, kept in points.npz."""

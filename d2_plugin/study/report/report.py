@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from d2_plugin.durable import write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.tables import read_metrics
 from d2_plugin.settings import Positional, Settings
@@ -72,11 +73,10 @@ def make_report(rows: Sequence[Row], output: Path, pictures: Sequence[Picture] =
         for kind, build in BUILDERS.items()
         if any(row["kind"] == kind for row in rows)
     ]
-    output.mkdir(parents=True, exist_ok=True)
     texts = {"report.html": html(sections, pictures, LEAD), "report.md": markdown(sections, LEAD)}
     texts |= {f"{name}.svg": svg for section in sections for name, svg in section.figures.items()}
     for name, content in texts.items():
-        (output / name).write_text(content)
+        write_text(output / name, content)
     return [output / name for name in texts]
 
 
