@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import mmap
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -138,17 +139,18 @@ def external_weights(path: Path) -> list[Path]:
     A tensor names its file in an entry of protobuf with key `location` (onnx.proto, TensorProto.external_data): field 1
     is the key, field 2 the name, each behind its length.
     """
-    entry, content = b"\x0a\x08location\x12", path.read_bytes()
-    names, place = set(), content.find(entry)
-    while place >= 0:
-        length, start = _varint(content, place + len(entry))
-        names.add(content[start : start + length])
-        place = content.find(entry, start)
+    entry, names = b"\x0a\x08location\x12", set()
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        place = content.find(entry)
+        while place >= 0:
+            length, start = _varint(content, place + len(entry))
+            names.add(content[start : start + length])
+            place = content.find(entry, start)
     files = (path.parent / os.fsdecode(name) for name in sorted(names) if name and b"\0" not in name)
     return [file for file in files if file.is_file()]
 
 
-def _varint(content: bytes, place: int) -> tuple[int, int]:
+def _varint(content: mmap.mmap, place: int) -> tuple[int, int]:
     """The number that protobuf wrote at a place, seven bits a byte, and the place behind it."""
     value, shift = 0, 0
     while place < len(content) and shift < 63:
