@@ -28,7 +28,13 @@ import torch
 
 SOURCE = Path(__file__).parent / "trust" / "faults.c"
 COUNT, FAIL_ONCE, FAIL_FROM, KILL_BEFORE_RENAME, KILL_AFTER_RENAME = range(5)
-PRELOADED = ["torch", "cv2", "pycolmap", "d2_plugin.runs.run", "d2_plugin.commands.cli", "trust_commands"]
+PRELOADED = [
+    *("torch", "torch._dynamo", "torch.onnx", "sympy", "cv2", "pycolmap"),
+    *("d2_plugin.commands.cli", "d2_plugin.runs.run", "d2_plugin.runs.evaluation", "d2_plugin.priors.build"),
+    *("d2_plugin.backbones.yang4d", "d2_plugin.adapters.yang4d", "d2_plugin.study.capture_export"),
+    *("d2_plugin.study.report.report", "trust_commands"),
+]
+"""What the commands import, some of it late."""
 
 
 @dataclass(frozen=True)

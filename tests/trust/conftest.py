@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,10 +28,14 @@ class Work:
 
     def anew(self) -> None:
         """As before the first command."""
-        shutil.rmtree(self.output, ignore_errors=True)
-        for left in self.output.parent.glob(f".{self.output.name}*"):
-            shutil.rmtree(left)
+        shutil.rmtree(self.folder)
+        self.folder.mkdir()
         self.begin()
+
+    @property
+    def folder(self) -> Path:
+        """The folder that the output appears in, and where nothing else is."""
+        return self.output.parent
 
 
 @dataclass(frozen=True)
@@ -49,14 +53,14 @@ class Workplace:
 
 
 @pytest.fixture(scope="session")
-def commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Commands]:
+def commands(tmp_path_factory: pytest.TempPathFactory) -> Commands:
     pytest.importorskip("cv2")
     pytest.importorskip("pycolmap")
     folder = tmp_path_factory.mktemp("faults")
     library = compiled_faults(folder)
     if library is None:
         pytest.skip("no C compiler, or no Linux: faults are preloaded")
-    yield Commands(library, folder)
+    return Commands(library, folder)
 
 
 @pytest.fixture(scope="session")
@@ -70,7 +74,8 @@ def workplace(commands: Commands, recording: Path) -> Workplace:
     from trust_commands import Fault, measured
 
     folder = recording.parent
-    priors, run, out = folder / "priors", folder / "run", folder / "out"
+    priors, run, out = folder / "priors", folder / "run", folder / "written" / "out"
+    out.parent.mkdir()
     train = ["train", str(recording), *TRAINED, "--iterations", "5", "--priors", str(priors), "--export-ply"]
     for words in (["priors", str(recording), *TRAINED, "--output", str(priors)], [*train, "--output", str(run)]):
         ended = commands.run(words)
@@ -92,8 +97,9 @@ def workplace(commands: Commands, recording: Path) -> Workplace:
     for name, one in work.items():
         one.anew()
         with measured() as took:
-            ended = commands.run(one.words, Fault(out))
+            ended = commands.run(one.words, Fault(one.folder))
         assert ended.code == 0, ended.said
+        assert [path.name for path in one.folder.iterdir()] == ["out"]
         whole[name], operations[name], renames[name] = contents(out), ended.operations, ended.renames
         seconds[name] = took[0]
     return Workplace(folder, recording, commands, work, whole, operations, renames, seconds)

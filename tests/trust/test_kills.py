@@ -21,7 +21,7 @@ def killed_at_random(place: Any, name: str, draw: random.Random, times: int) -> 
     ended = place.commands.run(work.words)
     already = "already exists and is not empty" in ended.said  # an export that was whole before the kill
     assert ended.code == 0 or already, ended.said
-    assert contents(work.output) == place.whole[name]
+    assert contents(work.folder) == {f"out/{path}": content for path, content in place.whole[name].items()}
     return hits
 
 
