@@ -47,7 +47,7 @@ class D2Config(_HookTables):
     """A structure hook retires after this many evaluations in a row that change next to nothing; 0: never."""
     retire_below: Share = 1e-3
     """An evaluation that changes a smaller share of the Gaussians than this has changed next to nothing."""
-    remove_at_most: Annotated[float, Range(0, 1, open_low=True)] = 0.5
+    remove_at_most: Annotated[float, Range(0, 1, open_low=True)] = 0.9
     """Largest share of the Gaussians that all hooks together remove in one step; what is more waits for the next
     evaluation, where it must be asked for again. 1 sets no limit, as the paper."""
     seed: Seed = 0

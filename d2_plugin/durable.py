@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 import secrets
+import stat
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -180,8 +181,15 @@ def read_table(path: Path, kind: Kind) -> dict[str, Any]:
     return table
 
 
+def refuse_no_file(path: Path) -> None:
+    """Raise `OSError` where something else than a plain file lies: opening a pipe would wait for ever."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "it is no plain file")
+
+
 def _parsed(path: Path, kind: Kind) -> dict[str, Any]:
     try:
+        refuse_no_file(path)
         table = json.loads(path.read_bytes())
     except FileNotFoundError:
         raise
@@ -208,6 +216,7 @@ def archive_problem(path: Path) -> str:
     The readers of numpy and torch compare them in part or not at all.
     """
     try:
+        refuse_no_file(path)
         with zipfile.ZipFile(path) as archive:
             bad = archive.testzip()
     except (OSError, ValueError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile) as error:

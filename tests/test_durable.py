@@ -71,9 +71,12 @@ def test_what_is_no_table_is_one_sentence(tmp_path: Path, content: bytes) -> Non
     assert len(str(told.value)) < 400
 
 
-def test_a_folder_in_the_place_of_a_table_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(Damaged, match="directory"):
-        read_table(tmp_path, KIND)
+def test_a_folder_or_a_pipe_in_the_place_of_a_file_is_one_sentence(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path, tmp_path / "pipe"):
+        with pytest.raises(Damaged, match="it is no plain file"):
+            read_table(path, KIND)
+        assert "it is no plain file" in archive_problem(path)
 
 
 def test_another_version_is_named_before_anything_else(tmp_path: Path) -> None:

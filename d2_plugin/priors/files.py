@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.durable import Kind, read_table, write, write_table
+from d2_plugin.durable import Kind, read_table, refuse_no_file, write, write_table
 from d2_plugin.errors import D2Error
 
 logger = logging.getLogger(__name__)
@@ -133,6 +133,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
 def _mapped(path: Path) -> np.ndarray:
     """The array of an .npy file, memory-mapped; unlike `np.load` it takes the file for nothing else."""
+    refuse_no_file(path)
     return np.lib.format.open_memmap(path, mode="r")
 
 

@@ -68,7 +68,7 @@ class TimedPoints:
                     found = stored["format"].tolist() if "format" in stored else None
                     points = cls(stored["positions"], stored["colors"], stored["times"])
                 problem = points.problem() if found == POINTS_FORMAT else f"format {found}, expected {POINTS_FORMAT}"
-            except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile) as failure:
+            except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, zipfile.BadZipFile) as failure:
                 problem = str(failure)
         if problem:
             raise D2Error(f"cannot read points from {path} ({problem}): delete the file, it will be made again")

@@ -145,6 +145,11 @@ class TestADamagedFile:
             points.save(path)
             with pytest.raises(D2Error, match=f"{reason}.*: delete the file, it will be made again"):
                 TimedPoints.load(path)
+        for kind in ("U3", "O"):
+            words = np.zeros((2, 3), kind)
+            np.savez(path, positions=words, colors=words, times=np.zeros(2), format=1)
+            with pytest.raises(D2Error, match="cannot read points from .*: delete the file"):
+                TimedPoints.load(path)
         np.savez(path, positions=np.zeros((0, 3)), colors=np.zeros((0, 3)), times=np.zeros(0))
         with pytest.raises(D2Error, match="format None, expected 1"):
             TimedPoints.load(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -102,6 +103,8 @@ def workplace(commands: Commands, recording: Path) -> Workplace:
         assert [path.name for path in one.folder.iterdir()] == ["out"]
         whole[name], operations[name], renames[name] = contents(out), ended.operations, ended.renames
         seconds[name] = took[0]
+        counts = (name, ended.operations, ended.renames, took[0])
+        logging.getLogger(__name__).info("%s: %d operations, %d renames, %.1f s", *counts)
     return Workplace(folder, recording, commands, work, whole, operations, renames, seconds)
 
 

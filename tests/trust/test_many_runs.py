@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import random
 import shutil
 import time
@@ -105,13 +106,12 @@ def lives_through(place: Any, runs: int, checked: int) -> Day:
 
 
 def test_a_few_runs_side_by_side_are_all_whole(workplace: Any) -> None:
-    lives_through(workplace, 3, 1)
+    lives_through(workplace, 2, 1)
 
 
 @pytest.mark.slow
-def test_two_hundred_runs_started_killed_and_continued_by_three_processes(
-    workplace: Any, record_property: Any
-) -> None:
+def test_two_hundred_runs_started_killed_and_continued_by_three_processes(workplace: Any) -> None:
     day = lives_through(workplace, SEEDS, 20)
-    record_property("day", f"{day.kills} kills, {day.refusals} second writers refused, {day.builds} builds beside")
+    told = (day.kills, day.refusals, day.builds)
+    logging.getLogger(__name__).info("%d kills, %d second writers refused, %d builds beside the runs", *told)
     assert day.kills > SEEDS // 5
