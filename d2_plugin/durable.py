@@ -26,6 +26,9 @@ from d2_plugin.errors import D2Error
 LEFTOVER = ".part"
 """How the temporary names end; what a killed process left behind is found by it."""
 
+SEALED = "\n"
+"""How sealed tables begin: one whose seal was overwritten is not taken for one from before there were seals."""
+
 FULL = (errno.ENOSPC, errno.EDQUOT)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -155,7 +158,7 @@ def write_table(path: Path, values: Mapping[str, Any], kind: Kind) -> None:
     """
     sealed = {**values, "format": kind.format}
     sealed["seal"] = _seal(sealed)
-    write_text(path, json.dumps(sealed, indent=1, allow_nan=False, sort_keys=True))
+    write_text(path, SEALED + json.dumps(sealed, indent=1, allow_nan=False, sort_keys=True))
 
 
 def read_table(path: Path, kind: Kind) -> dict[str, Any]:
@@ -166,8 +169,8 @@ def read_table(path: Path, kind: Kind) -> dict[str, Any]:
         OtherFormat: another version wrote it.
         Damaged: it cannot be read, is no table, or its content is not what was written.
     """
-    table = _parsed(path, kind)
-    if not kind.since_seals and "format" not in table and "seal" not in table:
+    table, marked = _parsed(path, kind)
+    if not kind.since_seals and not marked and "format" not in table and "seal" not in table:
         return table
     found = table.get("format")
     if found != kind.format:
@@ -187,17 +190,19 @@ def refuse_no_file(path: Path) -> None:
         raise OSError(errno.EINVAL, "it is no plain file")
 
 
-def _parsed(path: Path, kind: Kind) -> dict[str, Any]:
+def _parsed(path: Path, kind: Kind) -> tuple[dict[str, Any], bool]:
+    """The table, and whether its file begins as sealed ones do."""
     try:
         refuse_no_file(path)
-        table = json.loads(path.read_bytes())
+        content = path.read_bytes()
+        table = json.loads(content)
     except FileNotFoundError:
         raise
     except (OSError, ValueError, RecursionError) as error:
         raise _damaged(path, kind, str(error)) from None
     if not isinstance(table, dict):
         raise _damaged(path, kind, "it is no table")
-    return table
+    return table, content.startswith(SEALED.encode())
 
 
 def _damaged(path: Path, kind: Kind, reason: str) -> Damaged:

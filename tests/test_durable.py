@@ -93,6 +93,11 @@ def test_tables_from_before_there_were_seals_are_read_where_the_kind_has_such(tm
     (tmp_path / "t.json").write_text('{"a": 1, "format": 3}')  # one that lost its seal is none of them
     with pytest.raises(Damaged):
         read_table(tmp_path / "t.json", KIND._replace(since_seals=False))
+    write_table(tmp_path / "t.json", {"a": 1}, KIND)
+    blank = (tmp_path / "t.json").read_text().replace('"format": 3', '"furmat": 3').replace('"seal"', '"soul"')
+    (tmp_path / "t.json").write_text(blank)  # nor one that lost both in one block
+    with pytest.raises(OtherFormat):
+        read_table(tmp_path / "t.json", KIND._replace(since_seals=False))
 
 
 @pytest.mark.parametrize("name", ["write", "fsync", "replace"])
