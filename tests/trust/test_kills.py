@@ -34,8 +34,8 @@ def test_a_killed_command_goes_on_to_the_same_end(workplace: Any, name: str) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WORK)
 def test_twenty_kills_at_random_moments(workplace: Any, name: str) -> None:
-    draw, hits = random.Random(f"{name} 20"), 0
-    for _ in range(20):
-        hits += killed_at_random(workplace, name, draw, 1)
-    logging.getLogger(__name__).info("%s: %d of 20 kills came before the end", name, hits)
-    assert hits >= 5
+    draw, hits, tries = random.Random(f"{name} 20"), 0, 0
+    while hits < 20 and tries < 200:  # one that came after the end, as on a machine that is quicker now, is no kill
+        hits, tries = hits + killed_at_random(workplace, name, draw, 1), tries + 1
+    logging.getLogger(__name__).info("%s: 20 kills in %d tries", name, tries)
+    assert hits >= 20
