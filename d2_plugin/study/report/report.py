@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from d2_plugin.durable import write_text
+from d2_plugin.durable import make_folder, remove_leftovers, write_text
 from d2_plugin.errors import D2Error
+from d2_plugin.locks import only_writer
 from d2_plugin.runs.tables import read_metrics
 from d2_plugin.settings import Positional, Settings
 from d2_plugin.study.rows import Row, read_rows
@@ -75,8 +76,10 @@ def make_report(rows: Sequence[Row], output: Path, pictures: Sequence[Picture] =
     ]
     texts = {"report.html": html(sections, pictures, LEAD), "report.md": markdown(sections, LEAD)}
     texts |= {f"{name}.svg": svg for section in sections for name, svg in section.figures.items()}
-    for name, content in texts.items():
-        write_text(output / name, content)
+    with only_writer(make_folder(output)):
+        remove_leftovers(output, below=False)  # of a report that was killed
+        for name, content in texts.items():
+            write_text(output / name, content)
     return [output / name for name in texts]
 
 
