@@ -84,6 +84,8 @@ class Trainer:
         self.step = 0
         self.early_stop = EarlyStop(model.settings.early_stop, settings.seed)
         model.look_at(frames.views, frames.image)
+        self.loss: Tensor | None = None
+        """The last step's loss with all its terms, for whoever watches that it stays finite."""
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
         self.d2 = attach(model) if attach else None  # D2, line 1: after the optimizer exists
@@ -107,6 +109,7 @@ class Trainer:
             loss = loss + model.regularization()
             if d2 is not None:
                 loss = loss + d2.loss(self.step, [view])  # D2, line 2: before backward, never +=
+            self.loss = loss.detach()
             loss.backward()
             model.accumulate(view)
             model.optimize(self.step, iterations)

@@ -8,12 +8,11 @@ and the instruction sets among it), so that a home folder shared by different ma
 Environment:
     CXX            the compiler to use (with arguments if needed); otherwise c++, g++ or clang++
     D2_CXXFLAGS    flags added last, e.g. ``-march=x86-64-v3`` to leave AVX-512 out
-    D2_CACHE       the cache folder; otherwise ``$XDG_CACHE_HOME/d2-4dgs`` or ``~/.cache/d2-4dgs``
+    D2_CACHE       the cache folder, see `d2_plugin.cache`: one that others may write is refused
 """
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import functools
 import hashlib
@@ -25,10 +24,14 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
+from .cache import cache_folder, cache_lock, check_private, is_trusted, private_cache
+from .durable import write_text
 from .errors import D2Error
+
+__all__ = ["CompileError", "NoCompiler", "cache_folder", "find_compiler", "load_library"]
 
 logger = logging.getLogger(__name__)
 
@@ -53,14 +56,6 @@ class CompileError(D2Error):
     """The compiler refused a source of this package; the message carries the compiler's own words."""
 
 
-def cache_folder() -> Path:
-    """Where compiled libraries are kept (not created here)."""
-    if chosen := os.environ.get("D2_CACHE"):
-        return Path(chosen).expanduser()
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "d2-4dgs"
-
-
 def find_compiler() -> list[str]:
     """The command of the C++ compiler: ``CXX`` alone where it is set, else the first of c++, g++, clang++.
 
@@ -71,7 +66,7 @@ def find_compiler() -> list[str]:
         raise NoCompiler("compiled kernels run on Linux and macOS: on Windows use the Linux subsystem (WSL)")
     chosen = os.environ.get("CXX", "").strip()
     if chosen:
-        command = shlex.split(chosen)
+        command = _words("CXX", chosen)
         if shutil.which(command[0]) is None:
             raise NoCompiler(f"CXX names '{command[0]}', which is not on the path: correct CXX or unset it")
         return command
@@ -79,6 +74,14 @@ def find_compiler() -> list[str]:
         if shutil.which(name):
             return [name]
     raise NoCompiler("no C++ compiler found (looked for CXX, c++, g++, clang++): install g++ or clang++")
+
+
+def _words(variable: str, text: str) -> list[str]:
+    """The words of an environment variable, as a shell reads them."""
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise NoCompiler(f"{variable} is {text!r}, which no shell reads ({error}): correct or unset it") from None
 
 
 def load_library(
@@ -95,7 +98,7 @@ def load_library(
     Raises:
         NoCompiler: there is no C++17 compiler.
         CompileError: the compiler refused the sources.
-        D2Error: the cache folder cannot be written.
+        D2Error: the cache folder cannot be written, or others may write it.
     """
     compiler = find_compiler()
     command = [*compiler, *_flags(compiler, (*sources, *headers), flags)]
@@ -103,13 +106,14 @@ def load_library(
     library = cache_folder() / f"{name}-{key}.so"
     with _guard:
         if library not in _loaded:
+            check_private(library.parent)
             _loaded[library] = _open(library) or _build(library, command, sources)
         return _loaded[library]
 
 
 def _flags(compiler: Sequence[str], files: Sequence[Path], extra: Sequence[str]) -> list[str]:
     includes = dict.fromkeys(f"-I{file.parent}" for file in files)
-    user = shlex.split(os.environ.get("D2_CXXFLAGS", ""))
+    user = _words("D2_CXXFLAGS", os.environ.get("D2_CXXFLAGS", ""))
     return [*BASE_FLAGS, *_native_flags(tuple(compiler)), *extra, *includes, *user]
 
 
@@ -141,9 +145,11 @@ def _open(library: Path) -> ctypes.CDLL | None:
     """The cached library, or None where it is absent or damaged.
 
     The checksum comes first because the dynamic loader answers a truncated file with a bus error, not an exception.
+    It is a guard against damage; against other people stands that nobody else can have written either file.
     """
+    recorded = library.with_suffix(".sha256")
     try:
-        if library.with_suffix(".sha256").read_text() != _checksum(library):
+        if not is_trusted(library) or not is_trusted(recorded) or recorded.read_text() != _checksum(library):
             return None
         return ctypes.CDLL(str(library))
     except (OSError, UnicodeDecodeError):
@@ -152,8 +158,8 @@ def _open(library: Path) -> ctypes.CDLL | None:
 
 def _build(library: Path, command: Sequence[str], sources: Sequence[Path]) -> ctypes.CDLL:
     try:
-        library.parent.mkdir(parents=True, exist_ok=True)
-        with _locked(library.with_suffix(".lock")):
+        private_cache()
+        with cache_lock(library.with_suffix(".lock")):
             # Another process may have built it while this one waited for the lock.
             return _open(library) or _compile(library, command, sources)
     except OSError as error:
@@ -170,11 +176,17 @@ def _compile(library: Path, command: Sequence[str], sources: Sequence[Path]) -> 
                 f"compiling {', '.join(source.name for source in sources)} failed; please report the command "
                 f"`{shlex.join(command)}` and what it said:\n{result.stderr.strip()[:MESSAGE_LIMIT]}"
             )
+        if not built.is_file():
+            raise CompileError(
+                f"the compiler ended without an error and without a library (`{shlex.join(command)}`): set CXX to a "
+                "g++ or clang++ that works"
+            )
+        built.chmod(0o700)  # whatever the umask: what others may write is not trusted afterwards
         checksum = _checksum(built)
         built.replace(library)
-    written = library.with_suffix(f".{os.getpid()}")
-    written.write_text(checksum)
-    written.replace(library.with_suffix(".sha256"))
+    recorded = library.with_suffix(".sha256")
+    write_text(recorded, checksum)
+    recorded.chmod(0o600)
     logger.info("compiled %s in %.1f s", library.name, time.perf_counter() - start)
     return ctypes.CDLL(str(library))
 
@@ -190,13 +202,3 @@ def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
         return subprocess.run(command, input="", capture_output=True, text=True, env=environment, check=False)
     except OSError as error:
         raise NoCompiler(f"the compiler '{command[0]}' cannot be run ({error}): install g++ or clang++") from error
-
-
-@contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    """Hold an exclusive lock on `path` between processes; the system releases it if the process dies."""
-    import fcntl
-
-    with path.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield

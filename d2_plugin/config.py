@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, make_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks.densify import DensifyConfig
@@ -19,7 +19,7 @@ from d2_plugin.hooks.depth_loss import DepthLossConfig
 from d2_plugin.hooks.prune import PruneConfig
 from d2_plugin.hooks.table import HOOKS
 from d2_plugin.reading import NoSuchFile, read_toml
-from d2_plugin.settings import FORMAT, NONE, AtLeastOne, Count, Seed, Settings, Share, of_this_format
+from d2_plugin.settings import FORMAT, NONE, AtLeastOne, Count, Range, Seed, Settings, Share, of_this_format
 
 __all__ = ["D2Config", "DensifyConfig", "DepthLossConfig", "PruneConfig", "for_iterations"]
 
@@ -48,6 +48,9 @@ class D2Config(_HookTables):
     """A structure hook retires after this many evaluations in a row that change next to nothing; 0: never."""
     retire_below: Share = 1e-3
     """An evaluation that changes a smaller share of the Gaussians than this has changed next to nothing."""
+    remove_at_most: Annotated[float, Range(0, 1, open_low=True)] = 0.9
+    """Largest share of the Gaussians that all hooks together remove in one step; what is more waits for the next
+    evaluation, where it must be asked for again. 1 sets no limit, as the paper."""
     seed: Seed = 0
     """Seed of D2's own random generator."""
 

@@ -215,10 +215,21 @@ class D2Hooks:
         masks = [(name, edit.remove) for name, edit in edits if edit.remove is not None]
         if not masks:
             return 0
-        self.trace.extend(Trace(step, name, "remove", int(mask.sum())) for name, mask in masks)
-        union = torch.stack([mask for _, mask in masks]).any(0)
+        union = self._limited(step, torch.stack([mask for _, mask in masks]).any(0))
+        self.trace.extend(Trace(step, name, "remove", int((mask & union).sum())) for name, mask in masks)
         self.backbone.remove(union)
         return int(union.sum())
+
+    def _limited(self, step: int, mask: Tensor) -> Tensor:
+        """At most the share of rows that may go in one step, spread evenly over those that were asked for."""
+        asked, most = int(mask.sum()), int(self.config.remove_at_most * len(self.backbone))
+        if asked <= most:
+            return mask
+        message = "step %d: the hooks would remove %d of %d Gaussians, and at most %d go in one step (remove_at_most)"
+        _log.warning(message, step, asked, len(self.backbone), most)
+        rows = torch.nonzero(mask).squeeze(1)
+        chosen = torch.arange(most, device=mask.device) * asked // max(most, 1)
+        return torch.zeros_like(mask).index_fill(0, rows[chosen], True)
 
     def _insert(self, step: int, edits: Sequence[tuple[str, Edit]]) -> int:
         proposals = [(name, edit.insert) for name, edit in edits if edit.insert is not None]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 FLOAT, FLOAT16, UINT8 = 1, 10, 2  # TensorProto.DataType
 INT, INTS = 2, 7  # AttributeProto.AttributeType
+EXTERNAL = 1  # TensorProto.DataLocation
 
 
 def mean_network(
@@ -27,6 +28,22 @@ def mean_network(
     graph = b"".join(_message(1, step) for step in steps) + _text(2, "mean")
     graph += _message(11, _value("picture", dtype, [batch, channels, height, width]))
     graph += _message(12, _value("disparity", dtype, [batch, outputs, height, width]))
+    opset = _text(1, "") + _varint(2, 13)
+    path.write_bytes(_varint(1, 8) + _message(7, graph) + _message(8, opset))
+    return path
+
+
+def scaled_network(path: Path, weights: str) -> Path:
+    """A network whose output [1, 3, 6, 8] is the picture times a number that lies in the file `weights` beside it."""
+    entry = b"".join(
+        _message(13, _text(1, key) + _text(2, value)) for key, value in (("location", weights), ("length", "4"))
+    )
+    tensor = _varint(1, 1) + _varint(2, FLOAT) + _text(8, "factor") + entry + _varint(14, EXTERNAL)
+    product = _node("Mul", ["picture", "factor"], ["scaled"])
+    mean = _node("ReduceMean", ["scaled"], ["disparity"], axes=[1], keepdims=1)
+    graph = _message(1, product) + _message(1, mean) + _text(2, "scaled") + _message(5, tensor)
+    graph += _message(11, _value("picture", FLOAT, [1, 3, 6, 8]))
+    graph += _message(12, _value("disparity", FLOAT, [1, 1, 6, 8]))
     opset = _text(1, "") + _varint(2, 13)
     path.write_bytes(_varint(1, 8) + _message(7, graph) + _message(8, opset))
     return path

@@ -9,6 +9,7 @@ from types import ModuleType
 
 import numpy as np
 
+from d2_plugin.durable import write
 from d2_plugin.errors import D2Error, missing_extra
 from d2_plugin.reading import opened, parsing, read_bytes, shown_path
 
@@ -72,7 +73,7 @@ def write_png(path: Path, picture: np.ndarray) -> None:
     rows[:, 4:] = flat[:, 3:] - flat[:, :-3]
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes(), 3)), (b"IEND", b""))
-    path.write_bytes(_PNG_SIGNATURE + b"".join(_png_chunk(kind, body) for kind, body in chunks))
+    write(path, _PNG_SIGNATURE, *(_png_chunk(kind, body) for kind, body in chunks), synced=False)
 
 
 def shrink_picture(picture: np.ndarray, factor: int) -> np.ndarray:

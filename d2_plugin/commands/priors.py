@@ -36,6 +36,8 @@ def form(words: list[str]) -> Form:
 
 def run(given: Given) -> str:
     """Build what is missing; returns a summary of the frames."""
+    from d2_plugin.durable import CannotWrite
+    from d2_plugin.locks import in_turn
     from d2_plugin.priors.calibration import frames_with_truth, held_against_truth
     from d2_plugin.priors.sheet import contact_sheet
     from d2_plugin.priors.store import PriorStore
@@ -51,15 +53,25 @@ def run(given: Given) -> str:
     say_notes(scene.capture.notes)
     say_plan(scene.plan)
     points = triangulated_points(scene.capture, scene.train_cameras).positions
-    say(str(build_priors_for(settings, scene, points, options.output, shard=shard, cluster=cluster)))
+    summary = build_priors_for(settings, scene, points, options.output, shard=shard, cluster=cluster)
+    say(str(summary), summary.headline())
+    folder = summary.folder or options.output
+    if folder != options.output:
+        say_notes([f"{options.output} holds the priors of other cameras, which stay; those of these are in {folder}"])
     if shard is not None:
-        return f"part {options.shard} of the prior is in {options.output}"
-    store, sheet = PriorStore.open(options.output), options.output / "contact_sheet.png"
+        return f"part {options.shard} of the prior is in {folder}"
+    store, sheet = PriorStore.open(folder), folder / "contact_sheet.png"
     frames = frames_with_truth(scene.capture, scene.train_cameras, HELD_FRAMES)
     calibration = held_against_truth(store, scene.capture, frames)
     if calibration is not None:
         say(str(calibration))
-    contact_sheet(store, scene.capture, sheet)
+    try:
+        with in_turn(options.output):
+            contact_sheet(store, scene.capture, sheet)
+    except CannotWrite as error:
+        if summary.built:
+            raise
+        return f"all was there already; {error}"  # a finished prior may lie where nobody can write
     return f"look at {sheet}"
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from d2_plugin.commands.arguments.form import Form, Given
 from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
 
-OF_THE_RUN = ("test_cameras", "backbone", "iterations", "hooks", "priors", "seed", "device")
+OF_THE_RUN = ("test_cameras", "backbone", "iterations", "hooks", "priors", "accept_empty_prior", "seed", "device")
 TABLES = ("densify", "prune", "depth_loss", "d2", "priors", "backbone", "plan")
 
 
@@ -36,7 +36,7 @@ def run(given: Given) -> str:
     run = Run(run_settings(given), options.output)
     say_notes(run.scene.capture.notes)
     say_plan(run.scene.plan)
-    run.train()
+    run.train(told=lambda summary: say(str(summary)))
     say_notes([f"{name} retired at step {step}: it changed next to nothing" for name, step in run.retired.items()])
     metrics = run.evaluate()
     if metrics["background"]:
@@ -44,4 +44,5 @@ def run(given: Given) -> str:
     if options.export_ply:
         say(f"{len(run.export_ply())} PLY files in {options.output / 'ply'}")
     table = metrics_table({options.output.name: metrics})
-    return f"{table}\nmetrics in {options.output / 'metrics.json'}, pictures in {options.output / 'pictures'}"
+    where = f"metrics in {options.output / 'metrics.json'}, pictures in {options.output / 'pictures'}"
+    return "\n".join([table, where, *([] if run.prior is None else [run.prior["headline"]])])

@@ -15,7 +15,7 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.construct import CONSTRUCTION_VERSION, Construction
 from d2_plugin.priors.depth_on_disk import FilteredDepthOnDisk, find_depth_on_disk
 from d2_plugin.priors.disk.confidence import OF_DEPTH, OF_MONO, ConfidenceMaps
-from d2_plugin.priors.frame import Frame, describe_camera, digest, hash_of
+from d2_plugin.priors.frame import Frame, describe_camera, describe_capture, digest, hash_of, not_of
 from d2_plugin.priors.monocular.maps import mono_source
 from d2_plugin.priors.settings import PriorSettings, Variant
 from d2_plugin.priors.stereo.cache import DepthCache, GeometricSource
@@ -26,6 +26,9 @@ from d2_plugin.priors.store import PriorStore
 from d2_plugin.priors.summary import PriorSummary
 
 __all__ = ["PriorSettings", "PriorSummary", "build_priors"]
+
+COMPARED = 12
+"""At most about so many pictures are read to tell whether a store belongs to a capture; the first equal one decides."""
 
 Progress = Callable[[int, int, str], None]
 """(pictures done, pictures in all, what was just done)."""
@@ -57,18 +60,21 @@ def build_priors(
             any order into one folder, make the store that a single build makes.
 
     Raises:
-        D2Error: unknown cameras, no depth source at all, or a folder that holds something else.
+        D2Error: unknown cameras, no depth source at all, a folder that holds something else or the priors of another
+            capture, or a disk that is full, broken or not ours.
     """
     frames = _shard(capture.frames, settings, shard)
     builder = _Builder(capture, list(cameras), Path(output), settings, sparse_points)
-    summary = PriorSummary(notes=builder.notes)
+    summary = PriorSummary(notes=builder.notes, folder=builder.store.path)
     total, done = len(frames) * len(builder.names), 0
-    for number in frames:
-        for camera, record, built in builder.build(number):
-            summary.add(camera, number, record, built)
-            done += 1
-            if progress is not None:
-                progress(done, total, f"camera {camera}, frame {number}: {record['shares']['verified']:.0%} verified")
+    with builder.store.building(Path(output)):
+        for number in frames:
+            for camera, record, built in builder.build(number):
+                summary.add(camera, number, record, built)
+                done += 1
+                if progress is not None:
+                    share = f"{record['shares']['verified']:.0%} verified"
+                    progress(done, total, f"camera {camera}, frame {number}: {share}")
     return summary
 
 
@@ -79,18 +85,20 @@ class _Builder:
         self, capture: Capture, names: list[str], output: Path, settings: PriorSettings, points: np.ndarray | None
     ) -> None:
         _check(capture, names)
-        self.capture, self.names, self.settings = capture, names, settings
+        _refuse_other_pictures(capture, names, output)
+        self.capture, self.names, self.settings = capture, _ordered(names, output), settings
         self.notes: list[str] = []
-        self.cameras = {name: capture.cameras[name] for name in names}
+        self.cameras = {name: capture.cameras[name] for name in self.names}
         self.bounds: DepthBounds | None = None
-        cache = output / "cache"
-        self.mono = None if settings.variant == "mvs" else mono_source(capture, settings, cache / "mono")
+        maps = output / "cache" / "mono"  # one for all sets of cameras: a map depends on its own picture alone
+        self.mono = None if settings.variant == "mvs" else mono_source(capture, settings, maps)
+        cache = PriorStore.place(output, self.names) / "cache"
         self.source = self._geometric_source(points, cache / "matches")
-        geometric = None if self.source is None else DepthCache(self.source, cache / "stereo")
         possible = replace(settings, variant=self._variant())
-        self.confidence = ConfidenceMaps.beside(capture.path if settings.uncertainty else None, OF_MONO, names)
+        self.confidence = ConfidenceMaps.beside(capture.path if settings.uncertainty else None, OF_MONO, self.names)
+        self.store = PriorStore.create(output, self.names, capture.frames, describe_capture(capture))
+        geometric = None if self.source is None else DepthCache(self.source, cache / "stereo")
         self.construction = Construction(self.cameras, self.mono, geometric, possible, self.confidence)
-        self.store = PriorStore.create(output, names, capture.frames, {"capture": capture.name})
 
     def _geometric_source(self, points: np.ndarray | None, matches: Path) -> GeometricSource | None:
         """Depth on disk where there is any, else matching, or None where nothing is matched; sets the depth range."""
@@ -178,6 +186,36 @@ class _Builder:
             [settings.agreement, *maps.values()] if self.construction.agrees else None,
         )
         return {name: hash_of(*common, maps.get(name)) for name in self.names}
+
+
+def _ordered(names: list[str], output: Path) -> list[str]:
+    """The cameras in the order in which their store has them already, if it does: a prior may depend on the order."""
+    place = PriorStore.place(output, names)
+    return list(PriorStore.described(place).cameras) if (place / "store.json").is_file() else names
+
+
+def _refuse_other_pictures(capture: Capture, names: list[str], output: Path) -> None:
+    """Refuse a store none of whose pictures are those of this capture; where some are, the others were changed since.
+
+    Reads one picture where all is well: the first that is recorded and the same.
+    """
+    if not (output / "store.json").is_file():
+        return
+    store = PriorStore.described(output)
+    shared = [number for number in capture.frames if number in set(store.frames)]
+    views = [(name, number) for number in shared for name in names if name in store.cameras]
+    recorded = [(view, record) for view in views if (record := _recorded(store, *view)) is not None]
+    compared = recorded[:: max(len(recorded) // COMPARED, 1)]
+    if compared and not any(digest(capture.image(*view)) == record.get("image") for view, record in compared):
+        raise not_of(output, store.about, describe_capture(capture), "their pictures differ")
+
+
+def _recorded(store: PriorStore, name: str, number: int) -> dict[str, Any] | None:
+    """The record of a prior, None where it has none or a damaged one, which is built again."""
+    try:
+        return store.record(name, number)
+    except D2Error:
+        return None
 
 
 def _chosen_bounds(settings: PriorSettings) -> DepthBounds | None:

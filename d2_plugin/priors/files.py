@@ -1,10 +1,13 @@
-"""Arrays with a JSON record beside them, written so that a kill at any moment leaves either the old or the new one."""
+"""Arrays with a JSON record beside them, written so that a kill at any moment leaves either the old or the new one.
+
+The record is sealed (`d2_plugin.durable`) and holds the checksum of the array: what is read is what was written.
+"""
 
 from __future__ import annotations
 
-import json
+import io
 import logging
-import secrets
+import tokenize
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +15,16 @@ from typing import Any
 
 import numpy as np
 
+from d2_plugin.durable import Kind, read_table, refuse_no_file, write, write_table
 from d2_plugin.errors import D2Error
 
 logger = logging.getLogger(__name__)
+
+RECORD = Kind("record", 2, "delete it and build again")
+"""The tables beside the arrays."""
+
+UNREADABLE = (OSError, ValueError, EOFError, TypeError, SyntaxError, tokenize.TokenError, OverflowError, MemoryError)
+"""What numpy raises for the header of a file that is no array, or that claims to be one larger than the file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,22 +43,22 @@ class Entry:
         problem = self.problem(dtype) or self.checksum_problem()
         if problem:
             raise D2Error(f"{self.path} is damaged ({problem}): delete it and build again")
-        return np.load(self.path, mmap_mode="r")
+        return _mapped(self.path)
 
     def problem(self, dtype: np.dtype | None = None) -> str:
         """What is wrong with the file as far as its header tells, or an empty string; reads no pixels."""
         try:
-            mapped = np.load(self.path, mmap_mode="r")
-        except (OSError, ValueError, EOFError) as error:
+            mapped = _mapped(self.path)
+        except UNREADABLE as error:
             return f"cannot be read: {error}"
-        expected = tuple(self.record.get("shape", ()))
-        if mapped.shape != expected or (dtype is not None and mapped.dtype != dtype):
-            return f"holds {mapped.dtype} {mapped.shape}, the record says {dtype or mapped.dtype} {expected}"
+        expected, kind = tuple(self.record.get("shape", ())), str(dtype or self.record.get("dtype"))
+        if mapped.shape != expected or str(mapped.dtype) != kind:
+            return f"holds {mapped.dtype} {mapped.shape}, the record says {kind} {expected}"
         return ""
 
     def checksum_problem(self) -> str:
         """Empty where the bytes match the record's checksum."""
-        found = checksum(np.load(self.path, mmap_mode="r"))
+        found = checksum(_mapped(self.path))
         return "" if found == self.record.get("checksum") else "its checksum differs from the one recorded"
 
 
@@ -66,11 +76,11 @@ class EntryFolder:
         """The entry, or None where it was never finished; its array is not looked at.
 
         Raises:
-            D2Error: its record is damaged.
+            D2Error: its record is damaged, or that of another version.
         """
         path = self.location(camera, frame)
         try:
-            return Entry(path, read_json(path.with_suffix(".json")))
+            return Entry(path, read_record(path))
         except FileNotFoundError:
             return None
 
@@ -97,41 +107,36 @@ class EntryFolder:
 
 
 def write_entry(path: Path, array: np.ndarray, record: dict[str, Any]) -> None:
-    """Array first, record second, each under a temporary name: a record vouches for the array beside it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = _temporary(path)
-    with temporary.open("wb") as file:
-        np.save(file, array)
-    temporary.replace(path)
-    write_json(path.with_suffix(".json"), {**record, "shape": list(array.shape), "checksum": checksum(array)})
+    """Array first, record second, each written whole: a record vouches for the array beside it.
+
+    Raises:
+        CannotWrite: the disk is full, broken or not ours.
+    """
+    plain = np.ascontiguousarray(array)
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(plain))
+    pixels = plain.reshape(-1).view(np.uint8)
+    write(path, header.getvalue(), pixels.data)
+    described = {"shape": list(array.shape), "dtype": str(array.dtype), "checksum": zlib.crc32(pixels.data)}
+    write_table(path.with_suffix(".json"), {**record, **described}, RECORD)
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The record of the array at `path`.
+
+    Raises:
+        FileNotFoundError: it was never finished.
+        D2Error: it is damaged, or that of another version.
+    """
+    return read_table(path.with_suffix(".json"), RECORD)
+
+
+def _mapped(path: Path) -> np.ndarray:
+    """The array of an .npy file, memory-mapped; unlike `np.load` it takes the file for nothing else."""
+    refuse_no_file(path)
+    return np.lib.format.open_memmap(path, mode="r")
 
 
 def checksum(array: np.ndarray) -> int:
     """CRC-32 of an array's bytes."""
     return zlib.crc32(np.ascontiguousarray(array).view(np.uint8).data)
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object.
-
-    Raises:
-        FileNotFoundError: no such file.
-        D2Error: the file is not valid JSON.
-    """
-    try:
-        return json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise D2Error(f"{path} is damaged ({error}): delete it and build again") from None
-
-
-def write_json(path: Path, values: dict[str, Any]) -> None:
-    """Write under a temporary name and rename; NaN and infinity are refused, since JSON has neither."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = _temporary(path)
-    temporary.write_text(json.dumps(values, indent=1, allow_nan=False, sort_keys=True))
-    temporary.replace(path)
-
-
-def _temporary(path: Path) -> Path:
-    """A name that no other writer uses: several threads, processes and machines may write one folder."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(6)}")

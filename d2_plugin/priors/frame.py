@@ -1,4 +1,4 @@
-"""The pictures of one timestamp, and hashes of everything that a depth depends on."""
+"""The pictures of one timestamp, hashes of everything that a depth depends on, and how a capture is known again."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.errors import D2Error
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +38,43 @@ def describe_camera(camera: Camera) -> dict[str, Any]:
         "K": np.asarray(camera.K, float).tolist(),
         "T_camera_world": np.asarray(camera.T_camera_world, float).tolist(),
     }
+
+
+def describe_capture(capture: Capture) -> dict[str, Any]:
+    """What a store says of the capture that it belongs to: the name for people, the calibrations of all its cameras."""
+    cameras = {name: describe_camera(camera) for name, camera in capture.cameras.items()}
+    return {"capture": capture.name, "calibrations": cameras}
+
+
+def other_capture(found: dict[str, Any], given: dict[str, Any]) -> str | None:
+    """Why two descriptions (`describe_capture`) are of different captures; None if of one.
+
+    The name decides only where one of them holds no calibration.
+    """
+    ours, theirs = given.get("calibrations"), found.get("calibrations")
+    if not ours or not theirs:
+        return None if found == given else ""
+    shared = sorted(ours.keys() & theirs.keys())
+    if not shared:
+        return "they have no camera in common"
+    moved = [name for name in shared if not _same_camera(ours[name], theirs[name])]
+    return f"camera {moved[0]} has another size, lens or pose" if moved else None
+
+
+def not_of(path: Path, found: dict[str, Any], given: dict[str, Any], reason: str) -> D2Error:
+    """The error for a store that belongs to another capture."""
+    why = f" ({reason})" if reason else ""
+    return D2Error(
+        f"{path} holds the priors of {found.get('capture')}, not of {given.get('capture')}{why}: "
+        "choose another output folder"
+    )
+
+
+def _same_camera(ours: dict[str, Any], theirs: dict[str, Any]) -> bool:
+    """Whether two calibrations are one, up to the last digits, which differ from machine to machine."""
+    if ours["size"] != theirs["size"]:
+        return False
+    return all(np.allclose(ours[key], theirs[key], rtol=1e-6, atol=1e-9) for key in ("K", "T_camera_world"))
 
 
 def digest(array: np.ndarray) -> str:

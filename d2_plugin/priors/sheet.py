@@ -9,6 +9,7 @@ from types import ModuleType
 import numpy as np
 
 from d2_plugin.captures.capture import Capture
+from d2_plugin.captures.pictures import write_png
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.store import PriorStore
@@ -59,7 +60,8 @@ def contact_sheet(
         D2Error: the store has no prior at any of the frames.
     """
     cv2 = opencv("the contact sheet")
-    chosen = _spread(store.frames, 3) if frames is None else list(frames)
+    shared = [frame for frame in store.frames if frame in capture.frames]
+    chosen = _spread(shared, 3) if frames is None else list(frames)
     rows = [
         _row(cv2, capture.image(camera, frame), prior, _caption(store, camera, frame), width)
         for frame in chosen
@@ -70,9 +72,7 @@ def contact_sheet(
         raise D2Error(f"{store.path} has no prior at frames {', '.join(map(str, chosen))}: build them first")
     titles = np.concatenate([_line(cv2, title, width, 0.32) for title in TITLES], axis=1)
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), np.concatenate([titles, *rows])[..., ::-1]):
-        raise D2Error(f"the contact sheet could not be written to {path}: choose a name that ends in .png")
+    write_png(path, np.concatenate([titles, *rows]))
     return path
 
 

@@ -1,21 +1,28 @@
 """Depth priors on disk: one memory-mapped array and one record per camera and frame.
 
-    STORE/store.json                     format, and what the store was built for
+    STORE/store.json                     format, and what the store was built for: cameras, frames, the capture
     STORE/priors/CAMERA/FRAME.npy        structured [H, W]: depth uint16 (logarithmic, 0 = empty), label,
                                          sigma uint8 (logarithmic, 0 = 0, 255 = infinite), RGB uint8
     STORE/priors/CAMERA/FRAME.json       record: a, b, gap, status, shares, settings, hashes, depth range, checksum
     STORE/cache/...                      stereo and monocular maps, so that other fusion settings cost seconds
+    STORE/cameras/NAME+NAME/...          a store of its own for the priors of other cameras of the same capture
 
 Logarithmic depth in 16 bits is exact to 1e-5 in a room and to 1.6e-4 from 1e-3 to 1e6; sigma in 8 bits is exact to 2 %.
 The picture lies beside them, at 7 bytes per pixel in all: inserted Gaussians take its colours, and training need not
 open the capture for them. Every file is written under a temporary name and renamed, the array before its record: a
 record therefore vouches for its array, a build that is killed loses the frame in work, and readers never see half a
-file.
+file. Every record is sealed and holds the checksum of its array (`d2_plugin.priors.files`).
+
+A store belongs to one capture, known by its calibrations and pictures and not by its folder's name, and to one set of
+cameras, because a prior is what these cameras saw together. Nothing but other settings, a changed picture or damage
+ever replaces a file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,13 +30,22 @@ from typing import Any
 import numpy as np
 import torch
 
+from d2_plugin.durable import Kind, is_leftover, make_folder, read_table, remove_leftovers, write_table
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.priors.files import Entry, EntryFolder, read_json, write_json
+from d2_plugin.locks import in_turn, one_of_many
+from d2_plugin.priors.files import Entry, EntryFolder
+from d2_plugin.priors.frame import hash_of, not_of, other_capture
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import CameraRecord, DepthPrior, Label
 
-FORMAT = 3
+FORMAT = 4
 """Of store.json and of the arrays; raise it when either changes."""
+
+STORE = Kind("prior store", FORMAT, "build the priors anew in another folder")
+"""The table store.json."""
+
+OTHERS = "cameras"
+"""Folder of a store that holds the stores of other sets of cameras."""
 
 PRIOR_DTYPE = np.dtype([("depth", "<u2"), ("label", "u1"), ("sigma", "u1"), ("color", "u1", (3,))])
 """The maps of a `FusedPrior` as they are stored, pixel by pixel."""
@@ -96,7 +112,7 @@ class PriorStore:
         Raises:
             D2Error: no store there, another format, or a damaged entry, which is named.
         """
-        store = cls._described(Path(path))
+        store = cls.described(Path(path))
         for camera in store.cameras:
             for frame in store.frames:
                 entry = store.entries.find(camera, frame)
@@ -113,37 +129,65 @@ class PriorStore:
     ) -> PriorStore:
         """Open the store at `path` for building, or begin one; `about` says which capture it belongs to.
 
-        Frames that were built for the same cameras before stay part of the store.
+        Frames that were built for the same cameras before stay part of the store, and so does the order of its
+        cameras. Other cameras of the same capture get a store of their own within it, see `located`. Where nothing has
+        to be added nothing is written: a finished store may lie where nobody can write.
 
         Raises:
             D2Error: the folder holds something else, or the priors of another capture.
+            CannotWrite: the disk is full, broken or not ours.
         """
-        path, cameras, frames = Path(path), tuple(cameras), tuple(frames)
-        if (path / "store.json").is_file():
-            found = cls._described(path)
-            if found.about != about:
-                raise D2Error(
-                    f"{path} holds the priors of {found.about.get('capture')}, not of {about.get('capture')}: "
-                    "choose another output folder"
-                )
-            if found.cameras == cameras:
-                frames = tuple(sorted({*found.frames, *frames}))
-        elif path.exists() and any(path.iterdir()):
-            raise D2Error(f"{path} is not empty and holds no prior store: choose another output folder")
-        write_json(path / "store.json", {"format": FORMAT, "cameras": cameras, "frames": frames, "about": about})
-        return cls(path, cameras, frames, about)
+        root = Path(path)
+        if root.exists() and not root.is_dir():
+            raise D2Error(f"{root} is a file, and the priors need a folder: choose another output folder")
+        with in_turn(make_folder(root)):
+            found = cls._found(root, about)
+            place = cls.place(root, cameras)
+            if place != root:
+                found = cls._found(make_folder(place), about)
+            if found is None:
+                store = cls(place, cameras, frames, about)
+            else:
+                store = cls(place, found.cameras, sorted({*found.frames, *frames}), found.about)
+            if found is None or store.frames != found.frames:
+                described = {"cameras": store.cameras, "frames": store.frames, "about": store.about}
+                write_table(place / "store.json", described, STORE)
+        return store
 
     @classmethod
-    def _described(cls, path: Path) -> PriorStore:
+    def place(cls, path: Path | str, cameras: Sequence[str]) -> Path:
+        """Where priors of exactly these cameras belong: `path`, or a folder within it where the store is of others."""
+        root = Path(path)
+        if not (root / "store.json").is_file() or set(cls.described(root).cameras) == set(cameras):
+            return root
+        return root / OTHERS / _joined(cameras)
+
+    @classmethod
+    def located(cls, path: Path | str, cameras: Sequence[str]) -> Path:
+        """The folder below `path` whose priors were built from exactly these cameras; `path` where there is none."""
+        place = cls.place(path, cameras)
+        return place if (place / "store.json").is_file() else Path(path)
+
+    @classmethod
+    def _found(cls, path: Path, about: dict[str, Any]) -> PriorStore | None:
+        """The store at `path` as it stands, None where the folder is empty or absent; another capture's is refused."""
+        if (path / "store.json").is_file():
+            found = cls.described(path)
+            reason = other_capture(found.about, about)
+            if reason is not None:
+                raise not_of(path, found.about, about, reason)
+            return found
+        if path.exists() and not all(is_leftover(inside) for inside in path.iterdir()):
+            raise D2Error(f"{path} is not empty and holds no prior store: choose another output folder")
+        return None
+
+    @classmethod
+    def described(cls, path: Path) -> PriorStore:
+        """The store at `path` by its description alone; no record is looked at."""
         if not (path / "store.json").is_file():
             raise D2Error(f"no depth priors at {path}: build them with `d2 priors CAPTURE --output {path}`")
-        described = read_json(path / "store.json")
-        if described.get("format") != FORMAT:
-            raise D2Error(
-                f"the prior store {path} has format {described.get('format')} but this version reads format {FORMAT}: "
-                "build the priors anew in another folder"
-            )
-        return cls(path, described["cameras"], described["frames"], described["about"])
+        table = read_table(path / "store.json", STORE)
+        return cls(path, table["cameras"], table["frames"], table["about"])
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None:
         """D* of one view as tensors on the CPU, or None where the store has none.
@@ -191,10 +235,31 @@ class PriorStore:
         codes["sigma"] = encode_sigma(prior.sigma)
         self.entries.write(camera, frame, codes, {**record, "depth_range": [depth_range.near, depth_range.far]})
 
+    @contextmanager
+    def building(self, root: Path) -> Iterator[None]:
+        """Write priors beside other processes that do; `root` is the folder that `create` was given.
+
+        Whoever finds nobody else there removes what killed builds left.
+        """
+
+        def tidy() -> None:
+            with in_turn(root):
+                remove_leftovers(root)
+
+        with one_of_many(make_folder(root / "priors"), tidy):
+            yield
+
     def _entry(self, camera: str, frame: int) -> Entry | None:
         if camera not in self.cameras:
             raise unknown_name("camera of the prior store", camera, self.cameras)
         return self.entries.find(camera, frame)
+
+
+def _joined(cameras: Sequence[str]) -> str:
+    """A folder's name for a set of cameras."""
+    names = "+".join(sorted(cameras))
+    plain = re.fullmatch(r"[\w.+-]{1,80}", names) and set(names) != {"."}
+    return names if plain else hash_of(sorted(cameras))
 
 
 _REBUILD = "run `d2 priors` again with the same output folder, which rebuilds what is damaged"

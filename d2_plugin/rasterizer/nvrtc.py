@@ -20,7 +20,8 @@ from typing import NamedTuple
 
 import torch
 
-from d2_plugin.compiler import CompileError, cache_folder
+from d2_plugin.cache import cache_folder, check_private, is_trusted, private_cache
+from d2_plugin.compiler import CompileError
 from d2_plugin.errors import D2Error
 
 from .cuda_frame import HEADERS, SOURCE, Frame
@@ -152,7 +153,14 @@ def build(capability: int, channels: int) -> Binary:
 
 
 def _read_entry(entry: Path) -> bytes | None:
-    """What `_write_entry` wrote, or None where it is absent or damaged."""
+    """What `_write_entry` wrote, or None where it is absent or damaged.
+
+    Raises:
+        Untrusted: others may write the cache.
+    """
+    check_private(entry.parent)
+    if not is_trusted(entry):
+        return None
     try:
         content = entry.read_bytes()
     except OSError:
@@ -165,8 +173,9 @@ def _write_entry(entry: Path, code: bytes) -> None:
     """The checksum, then the code; renamed into place, so that processes which start together need no lock."""
     written = entry.with_suffix(f".{os.getpid()}-{threading.get_ident()}")
     try:
-        entry.parent.mkdir(parents=True, exist_ok=True)
+        private_cache()
         written.write_bytes(hashlib.sha256(code).digest() + code)
+        written.chmod(0o600)
         written.replace(entry)
     except OSError as error:
         logger.warning("cannot use the cache %s (%s): kernels are compiled in every process", entry.parent, error)

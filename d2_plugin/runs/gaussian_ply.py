@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from d2_plugin.durable import write
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
 
@@ -70,7 +71,7 @@ def write_ply(path: Path, means: Tensor, covariances: Tensor, colors: Tensor, op
         quaternions,
     ]
     rows = torch.cat(columns, dim=1).float().numpy().astype("<f4")
-    path.write_bytes(_header(len(rows)) + np.ascontiguousarray(rows).tobytes())
+    write(path, _header(len(rows)), np.ascontiguousarray(rows).tobytes(), synced=False)
     return len(rows)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSummary, build_priors
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.scene import Scene
@@ -45,3 +46,13 @@ def build_priors_for(
             sparse_points=points,
             progress=report,
         )
+
+
+def refuse_unusable(summary: PriorSummary, accepted: bool) -> None:
+    """Refuse to train with hooks that have nothing to go by, unless the settings ask for it."""
+    if summary.usable or accepted:
+        return
+    raise D2Error(
+        f"no view has a usable prior ({summary.reasons() or 'no depth anywhere'}): look at the depth maps and the "
+        "calibration with `d2 priors`, or train without it by --hooks none, or with it as it is by --accept-empty-prior"
+    )

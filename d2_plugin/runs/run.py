@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,24 +12,30 @@ import torch
 from torch import Tensor
 
 from d2_plugin import registry
+from d2_plugin.durable import remove_leftovers, write_table, write_text
 from d2_plugin.errors import D2Error
+from d2_plugin.locks import only_writer
 from d2_plugin.plugin import D2Hooks
+from d2_plugin.priors.store import PriorStore
+from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
-from d2_plugin.runs.prior import build_priors_for
+from d2_plugin.runs.prior import build_priors_for, refuse_unusable
 from d2_plugin.runs.provenance import circumstances
+from d2_plugin.runs.saved.checkpoint import fitting, load_checkpoint, save_checkpoint
+from d2_plugin.runs.saved.claim import claim
+from d2_plugin.runs.saved.finite import watched, what_diverged
+from d2_plugin.runs.saved.kinds import METRICS, read_run
 from d2_plugin.runs.scene import Guidance, Remembered, Scene
-from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, claim, hook_config, stored, write_json
+from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config
 from d2_plugin.runs.start import (
     TimedPoints,
     TrainingFrames,
     initial_points,
     make_view,
+    renderer,
     scene_extent,
     triangulated_points,
 )
-
-RENDERED_ALPHA = 0.5
-"""A rendered depth is reported where the accumulated alpha exceeds this."""
 
 CHECKPOINTS = 10
 """How often a run is saved. One that was cut off continues from its last checkpoint, bitwise."""
@@ -41,6 +46,7 @@ class Run:
 
     def __init__(self, settings: RunSettings, folder: Path, guidance: Guidance | None = None) -> None:
         self.settings, self.folder, self.guidance = check(settings), folder, guidance
+        self._checkpoint = folder / "checkpoint.pt"
         self.scene = Scene.open(self.settings)
         claim(folder, self._identity())
         self.seconds = {"priors": 0.0, "train": 0.0, "eval": 0.0}
@@ -48,14 +54,16 @@ class Run:
         """The same in CPU time of this process, which other work on the machine does not change."""
         self.retired: dict[str, int] = {}
         """Hooks that stopped because they changed next to nothing, and at which step."""
+        self.prior: dict[str, Any] | None = None
+        """What the depth prior became, as `PriorSummary.as_dict` has it; None without one."""
+        self._writes = False
 
     @classmethod
     def load(cls, folder: Path) -> Run:
         """The run that lies in `folder`."""
-        path = folder / "run.json"
-        if not path.is_file():
-            raise D2Error(f"{folder} holds no run: expected run.json; give the --output folder of `d2 train`")
-        settings, guidance = stored(path)
+        table = read_run(folder)
+        guidance = table.pop("guidance", None)
+        settings = RunSettings.from_table(table, str(folder / "run.json"))
         return cls(settings, folder, None if guidance is None else Remembered(guidance))
 
     @property
@@ -63,27 +71,44 @@ class Run:
         """Whether anything that guides this run needs the depth prior."""
         return self.guidance is not None or any(name in self.settings.hooks for name in HOOK_NAMES[1:])
 
-    def prepare(self, priors: bool = True) -> TimedPoints:
-        """Triangulate the sparse points and build the depth prior where they are missing; returns the points."""
-        with self._timed("priors"):
+    def prepare(self, priors: bool = True, told: Callable[[PriorSummary], None] | None = None) -> TimedPoints:
+        """Triangulate the sparse points and build the depth prior where they are missing; returns the points.
+
+        `told` is called with what the prior became.
+
+        Raises:
+            D2Error: no view has a usable prior, and the settings do not allow that.
+        """
+        with self._writing(), self._timed("priors"):
             points = self._points()
             if priors and self.uses_prior:
-                build_priors_for(self.settings, self.scene, points.positions, self.priors)
+                root = Path(self.settings.priors or self.folder / "priors")
+                summary = build_priors_for(self.settings, self.scene, points.positions, root)
+                if told is not None:
+                    told(summary)
+                refuse_unusable(summary, self.settings.accept_empty_prior)
+                self.prior = summary.as_dict()
         return points
 
-    def train(self) -> None:
-        """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one."""
-        trainer = self._trainer(self.prepare())
-        self._restore(trainer)
-        iterations = self.settings.iterations
-        chunk = max(iterations // CHECKPOINTS, 1)
-        with progress_bar("train", iterations) as bar:
-            while trainer.step < iterations and not getattr(trainer, "stopped", False):
-                until = min((trainer.step // chunk + 1) * chunk, iterations)
-                with self._timed("train"):
-                    trainer.run(until, lambda step, loss: bar.update(step, f"loss {loss:.4f}"))
-                self._save(trainer)
-        self.retired = {} if trainer.d2 is None else dict(trainer.d2.retired)
+    def train(self, told: Callable[[PriorSummary], None] | None = None) -> None:
+        """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one.
+
+        Raises:
+            D2Error: what `prepare` refuses, another process that writes this run, a damaged file, a disk that is full.
+            Diverged: the loss or a parameter is no finite number any more.
+        """
+        with self._writing():
+            trainer = self._trainer(self.prepare(told=told))
+            self._restore(trainer)
+            iterations = self.settings.iterations
+            chunk = max(iterations // CHECKPOINTS, 1)
+            with progress_bar("train", iterations) as bar:
+                while trainer.step < iterations and not getattr(trainer, "stopped", False):
+                    until = min((trainer.step // chunk + 1) * chunk, iterations)
+                    with self._timed("train"), watched(trainer, self._checkpoint) as watch:
+                        trainer.run(until, watch(lambda step, loss: bar.update(step, f"loss {loss:.4f}")))
+                    self._save(trainer)
+            self.retired = {} if trainer.d2 is None else dict(trainer.d2.retired)
 
     def evaluate(self, pictures: bool = True) -> dict[str, Any]:
         """Score every held-out camera at every frame; returns the metrics.
@@ -93,12 +118,13 @@ class Run:
         """
         from d2_plugin.runs.tables import write_tables
 
-        trainer = self._trained()
-        with self._timed("eval"):
-            scores = self._scores(trainer.model, self.folder / "pictures" if pictures else None)
-        metrics = scores | self._about(trainer)
-        write_json(self.folder / "metrics.json", metrics)
-        write_tables(metrics, self.folder)
+        with self._writing():
+            trainer = self._trained()
+            with self._timed("eval"):
+                scores = self._scores(trainer.model, self.folder / "pictures" if pictures else None)
+            metrics = scores | self._about(trainer)
+            write_tables(metrics, self.folder)
+            write_table(self.folder / "metrics.json", metrics, METRICS)
         return metrics
 
     def _scores(self, model: Any, pictures: Path | None) -> dict[str, Any]:
@@ -140,6 +166,7 @@ class Run:
             "retired": self.retired,
             "background": getattr(trainer.model, "background", None) is not None,
             "appearance": getattr(trainer.model, "appearance", None) is not None,
+            "prior": self.prior,
             "plan": scene.plan.as_dict(),
             "capture": scene.capture.name,
             "mono_emulated": scene.capture.mono_emulated,
@@ -154,22 +181,22 @@ class Run:
         """
         from d2_plugin.runs.gaussian_ply import write_ply
 
-        trainer = self._trained()
-        paths = []
-        for frame in self.scene.capture.frames:
-            view = make_view(self.scene.capture, self.scene.train_cameras[0], frame, self.settings.device)
-            with torch.no_grad():
-                splats = trainer.model.slice_at(view)
-                colors = trainer.model.colors(view, splats)
-            paths.append(self.folder / "ply" / f"frame_{frame:05d}.ply")
-            paths[-1].parent.mkdir(exist_ok=True)
-            write_ply(paths[-1], splats.means, splats.covariances, colors, splats.opacities)
+        with self._writing():
+            trainer = self._trained()
+            paths = []
+            for frame in self.scene.capture.frames:
+                view = make_view(self.scene.capture, self.scene.train_cameras[0], frame, self.settings.device)
+                with torch.no_grad():
+                    splats = trainer.model.slice_at(view)
+                    colors = trainer.model.colors(view, splats)
+                paths.append(self.folder / "ply" / f"frame_{frame:05d}.ply")
+                write_ply(paths[-1], splats.means, splats.covariances, colors, splats.opacities)
         return paths
 
     @property
     def priors(self) -> Path:
-        """Folder of the depth prior."""
-        return Path(self.settings.priors) if self.settings.priors else self.folder / "priors"
+        """Folder of the depth prior that was built from the training cameras."""
+        return PriorStore.located(self.settings.priors or self.folder / "priors", self.scene.train_cameras)
 
     def _points(self) -> TimedPoints:
         """The triangulated points, kept in points.npz."""
@@ -212,7 +239,7 @@ class Run:
     def _attach(self, model: object) -> D2Hooks:
         adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
         config = hook_config(self.settings, self.priors)
-        (self.folder / "d2.toml").write_text(config.to_toml())
+        write_text(self.folder / "d2.toml", config.to_toml())
         guidance, priors = self.guidance, self.priors
         others = {} if guidance is None else guidance.hooks(self.scene, self._points(), priors)
         return D2Hooks.from_config(config, backbone=adapter(model), hooks=others)
@@ -223,35 +250,44 @@ class Run:
         return self.settings.as_table() | guidance
 
     def _renderer(self, model: Any) -> Callable[[str, int], tuple[Tensor, Tensor]]:
-        @torch.no_grad()
-        def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
-            view = make_view(self.scene.capture, camera, frame, self.settings.device)
-            color, depth_sum, alpha = (part.cpu() for part in model.render(view)[:3])
-            solid = alpha > RENDERED_ALPHA
-            depth = torch.where(solid, depth_sum / alpha.clamp(min=RENDERED_ALPHA), torch.zeros_like(alpha))
-            return color.clamp(0, 1), depth
-
-        return render
+        return renderer(model, self.scene.capture, self.settings.device)
 
     def _save(self, trainer: Any) -> None:
-        state = trainer.state_dict() | {"seconds": dict(self.seconds), "cpu_seconds": dict(self.cpu_seconds)}
-        temporary = self.folder / "checkpoint.tmp"
-        torch.save(state, temporary)
-        os.replace(temporary, self.folder / "checkpoint.pt")
+        used = {"seconds": dict(self.seconds), "cpu_seconds": dict(self.cpu_seconds), "prior": self.prior}
+        save_checkpoint(self._checkpoint, trainer.state_dict() | used)
 
     def _restore(self, trainer: Any) -> bool:
-        path = self.folder / "checkpoint.pt"
-        if not path.is_file():
+        state = load_checkpoint(self._checkpoint, self.settings.device)
+        if state is None:
             return False
-        state = torch.load(path, map_location=self.settings.device, weights_only=True)
-        self.retired = dict(state["d2"]["retired"]) if state["d2"] else {}
-        if trainer.d2 is None:
-            state["d2"] = None
-        trainer.load_state_dict(state)
-        self.seconds = {name: max(value, self.seconds[name]) for name, value in state["seconds"].items()}
-        before = state.get("cpu_seconds", {})  # 0.1.0 kept none
-        self.cpu_seconds = {name: max(value, before.get(name, 0.0)) for name, value in self.cpu_seconds.items()}
+        with fitting(self._checkpoint):
+            self.retired = dict(state["d2"]["retired"]) if state["d2"] else {}
+            if trainer.d2 is None:
+                state["d2"] = None
+            trainer.load_state_dict(state)
+            self.seconds = {name: max(value, self.seconds[name]) for name, value in state["seconds"].items()}
+            before = state.get("cpu_seconds", {})  # 0.1.0 kept none
+            self.cpu_seconds = {name: max(value, before.get(name, 0.0)) for name, value in self.cpu_seconds.items()}
+            self.prior = self.prior or state["prior"]
+        wrong = what_diverged(trainer.model)
+        if wrong:
+            raise D2Error(f"the model in {self._checkpoint} diverged before step {trainer.step} ({wrong}): train anew")
         return True
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Be the only process that writes this run; within it, once more changes nothing."""
+        if self._writes:
+            yield
+            return
+        with only_writer(self.folder):
+            for folder in (self.folder, self.folder / "pictures", self.folder / "ply"):
+                remove_leftovers(folder, below=False)
+            self._writes = True
+            try:
+                yield
+            finally:
+                self._writes = False
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:

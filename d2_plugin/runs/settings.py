@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -67,6 +66,8 @@ class RunSettings(Settings):
     """What the model returns: relative (inverse depth up to scale and shift) or metric (depth)."""
     priors: str | None = None
     """Folder of a finished depth prior; without it the run builds its own."""
+    accept_empty_prior: bool = False
+    """Train with hooks even where no view has a usable prior, as the backbone alone would."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the trainer runs."""
     protocol: str | None = None
@@ -151,36 +152,3 @@ def _over(defaults: Mapping[str, Any], table: Any, name: str) -> dict[str, Any]:
     if not isinstance(table, Mapping):
         raise D2Error(f"{name} must be a table of settings, got {shown(table)}: write [{name}] above them")
     return {**defaults, **table}
-
-
-def stored(path: Path) -> tuple[RunSettings, Any]:
-    """Settings and guidance of a run.json."""
-    table = json.loads(path.read_text())
-    guidance = table.pop("guidance", None)
-    return RunSettings.from_table(table, str(path)), guidance
-
-
-def claim(folder: Path, identity: Mapping[str, Any]) -> None:
-    """Take the folder, or find this very run in it; anything else is refused and nothing is written."""
-    path = folder / "run.json"
-    if path.is_file():
-        settings, guidance = stored(path)
-        found = settings.as_table() | ({} if guidance is None else {"guidance": guidance})
-        changed = sorted(k for k in identity.keys() | found.keys() if identity.get(k) != found.get(k))
-        if changed:
-            raise D2Error(
-                f"{folder} holds another run, made with other settings of {', '.join(changed)}: "
-                "give another --output, or remove that folder"
-            )
-        return
-    if folder.is_dir() and any(folder.iterdir()):
-        raise D2Error(f"{folder} is not empty and holds no run of ours: give another --output")
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(path, identity)
-
-
-def write_json(path: Path, table: Mapping[str, Any]) -> None:
-    """Write a table; who reads the file meanwhile finds the old one or the new one, whole."""
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(table, indent=1))
-    os.replace(temporary, path)

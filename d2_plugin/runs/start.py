@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-import os
+import io
 import warnings
 import zipfile
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from d2_plugin.captures import Camera, Capture
+from d2_plugin.durable import archive_problem, write
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.colmap.points import triangulate_frames
 from d2_plugin.protocol import View
+
+POINTS_FORMAT = 1
+"""Of points.npz."""
 
 MIN_POINTS = 1000
 """Fewer triangulated points than this are filled up with random ones.
@@ -46,9 +51,9 @@ class TimedPoints:
 
     def save(self, path: Path) -> None:
         """Write an .npz with one array per attribute; an existing file is replaced in one step."""
-        temporary = path.with_suffix(".tmp.npz")
-        np.savez(temporary, positions=self.positions, colors=self.colors, times=self.times)
-        os.replace(temporary, path)
+        content = io.BytesIO()
+        np.savez(content, positions=self.positions, colors=self.colors, times=self.times, format=POINTS_FORMAT)
+        write(path, content.getbuffer())
 
     @classmethod
     def load(cls, path: Path) -> TimedPoints:
@@ -57,13 +62,27 @@ class TimedPoints:
         Raises:
             D2Error: the file is damaged or that of another version.
         """
-        try:
-            with np.load(path) as stored:
-                return cls(stored["positions"], stored["colors"], stored["times"])
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as failure:
-            raise D2Error(
-                f"cannot read points from {path} ({failure}): delete the file, it will be made again"
-            ) from None
+        problem = archive_problem(path)
+        if not problem:
+            try:
+                with np.load(path) as stored:
+                    found = stored["format"].tolist() if "format" in stored else None
+                    points = cls(stored["positions"], stored["colors"], stored["times"])
+                problem = points.problem() if found == POINTS_FORMAT else f"format {found}, expected {POINTS_FORMAT}"
+            except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, zipfile.BadZipFile) as failure:
+                problem = str(failure)
+        if problem:
+            raise D2Error(f"cannot read points from {path} ({problem}): delete the file, it will be made again")
+        return points
+
+    def problem(self) -> str:
+        """What is wrong with the arrays, or nothing."""
+        count = len(self.times) if self.times.ndim == 1 else -1
+        if self.positions.shape != (count, 3) or self.colors.shape != (count, 3):
+            shapes = [array.shape for array in (self.positions, self.colors, self.times)]
+            return f"shapes {shapes}, expected [(N, 3), (N, 3), (N,)]"
+        arrays = (self.positions, self.colors, self.times)
+        return "" if all(np.isfinite(array).all() for array in arrays) else "numbers that are not finite"
 
     def tensors(self, device: torch.device | str = "cpu") -> tuple[Tensor, Tensor, Tensor]:
         """Positions, colours and times in float32."""
@@ -79,6 +98,24 @@ def make_view(capture: Capture, camera: str, frame: int, device: torch.device | 
     intrinsics = torch.tensor(calibration.K, dtype=torch.float32, device=device)
     time = capture.seconds(frame)
     return View(camera, frame, time, pose, intrinsics, calibration.width, calibration.height)
+
+
+RENDERED_ALPHA = 0.5
+"""A rendered depth is reported where the accumulated alpha exceeds this."""
+
+
+def renderer(model: Any, capture: Capture, device: torch.device | str) -> Callable[[str, int], tuple[Tensor, Tensor]]:
+    """A function (camera, frame) -> colour [H, W, 3] and depth [H, W], 0 where too little is opaque, on the CPU."""
+
+    @torch.no_grad()
+    def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
+        view = make_view(capture, camera, frame, device)
+        color, depth_sum, alpha = (part.cpu() for part in model.render(view)[:3])
+        solid = alpha > RENDERED_ALPHA
+        depth = torch.where(solid, depth_sum / alpha.clamp(min=RENDERED_ALPHA), torch.zeros_like(alpha))
+        return color.clamp(0, 1), depth
+
+    return render
 
 
 class TrainingFrames:

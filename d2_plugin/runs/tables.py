@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from d2_plugin.errors import D2Error
+from d2_plugin.durable import write_text
 from d2_plugin.runs.markup import Table, escaped, latex, markdown
+from d2_plugin.runs.saved.kinds import read_metrics
+
+__all__ = ["latex_table", "metrics_table", "read_metrics", "view_tables", "write_tables"]
 
 Metrics = Mapping[str, Any]
 
@@ -103,27 +105,9 @@ def view_tables(metrics: Metrics) -> str:
 
 def write_tables(metrics: Metrics, folder: Path) -> None:
     """metrics.md (`view_tables`) and metrics.tex (`latex_table` with one row) beside metrics.json in `folder`."""
-    (folder / "metrics.md").write_text(view_tables(metrics))
+    write_text(folder / "metrics.md", view_tables(metrics))
     name = f"{metrics['backbone']} {'+'.join(metrics['hooks']) or 'alone'}"
-    (folder / "metrics.tex").write_text(latex_table({name: metrics}) + "\n")
-
-
-def read_metrics(folder: Path) -> dict[str, Any]:
-    """The metrics.json of a run folder.
-
-    Raises:
-        D2Error: there is none, or it is damaged.
-    """
-    path = folder / "metrics.json"
-    try:
-        table = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise D2Error(f"{folder} has no metrics.json: finish `d2 train` there, or run `d2 eval`") from None
-    except ValueError as error:
-        raise D2Error(f"{path} is damaged ({error}): run `d2 eval` on that folder") from None
-    if not isinstance(table, dict):
-        raise D2Error(f"{path} is damaged (no table of scores): run `d2 eval` on that folder")
-    return table
+    write_text(folder / "metrics.tex", latex_table({name: metrics}) + "\n")
 
 
 def _columns(scored: Sequence[Mapping[str, Any]]) -> list[Column]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -73,11 +71,7 @@ def run(settings: Demo) -> str:
 def _recording(path: Path) -> Path:
     """The recording at `path`: what stands there is whole, because it is written beside and renamed."""
     if not path.is_dir():
-        unfinished = path.with_name(f"{path.name}.unfinished")
-        if unfinished.is_dir():
-            shutil.rmtree(unfinished)
-        save_capture(synthetic_capture(), unfinished)
-        os.replace(unfinished, path)
+        save_capture(synthetic_capture(), path)
     return path
 
 

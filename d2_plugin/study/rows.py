@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from d2_plugin.durable import append
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import field, parse_json, read_text
 from d2_plugin.runs.provenance import circumstances
@@ -83,9 +84,12 @@ def make_row(
 
 def append_rows(path: Path, rows: Iterable[Row]) -> None:
     """Add rows to the end of a file, which is created where absent."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
-        file.writelines(json.dumps(_plain(row), allow_nan=False) + "\n" for row in rows)
+    append(path, "".join(as_line(row) for row in rows))
+
+
+def as_line(row: Row) -> str:
+    """A row as one line of JSON."""
+    return json.dumps(_plain(row), allow_nan=False) + "\n"
 
 
 def read_rows(paths: Sequence[Path]) -> list[Row]:

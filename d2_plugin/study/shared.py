@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections.abc import Mapping
@@ -12,10 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from d2_plugin.durable import Kind, read_table, write_table
 from d2_plugin.runs.prior import build_priors_for
 from d2_plugin.runs.scene import Scene
-from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, prior_settings, write_json
+from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, prior_settings
 from d2_plugin.runs.start import TimedPoints, triangulated_points
+
+SHARED = Kind("time of a shared prior", 1, "delete it")
+"""shared.json."""
 
 FULL = "dual"
 """The variant of the prior that decides."""
@@ -57,7 +60,7 @@ def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None
     """
     path = folder / "shared.json"
     if path.is_file():
-        return Shared(folder, **json.loads(path.read_text()))
+        return Shared(folder, **read_table(path, SHARED))
     folder.mkdir(parents=True, exist_ok=True)
     full = check(replace(settings, hooks=HOOK_NAMES, overrides=_with(settings.overrides, "priors", variant=FULL)))
     start, cpu = time.monotonic(), time.process_time()
@@ -71,7 +74,7 @@ def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None
     used = time.process_time() - cpu if cluster is None else None
     took = (time.monotonic() - start, used) if whole else (None, None)
     shared = Shared(folder, *took)
-    write_json(path, {"seconds": took[0], "cpu_seconds": took[1]})
+    write_table(path, {"seconds": took[0], "cpu_seconds": took[1]}, SHARED)
     return shared
 
 

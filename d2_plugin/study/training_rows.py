@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,8 +11,8 @@ from typing import Any
 from d2_plugin.captures.pictures import opencv, read_picture, shrink_picture
 from d2_plugin.errors import MissingExtra
 from d2_plugin.runs.provenance import circumstances
+from d2_plugin.runs.saved.kinds import read_metrics, read_run
 from d2_plugin.runs.settings import HOOK_NAMES
-from d2_plugin.runs.tables import read_metrics
 
 from .rows import Row, make_row
 
@@ -35,7 +34,7 @@ def training_rows(folders: Sequence[Path]) -> list[Row]:
 
 def _row(folder: Path) -> Row:
     metrics = read_metrics(folder)
-    settings = json.loads((folder / "run.json").read_text()) if (folder / "run.json").is_file() else {}
+    settings = read_run(folder) if (folder / "run.json").is_file() else {}
     scores = metrics.get("test") or {}
     seconds = metrics["seconds"]
     made = metrics.get("made")

@@ -12,11 +12,19 @@ import numpy as np
 import pytest
 import tiny_onnx
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.monocular.align import align, aligned_depth
-from d2_plugin.priors.monocular.network import IMAGENET_MEAN, IMAGENET_STD, MonocularModel, upsample
+from d2_plugin.priors.monocular.network import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    MonocularModel,
+    external_weights,
+    upsample,
+)
 from d2_plugin.priors.settings import AlignSettings
 
 pytest.importorskip("onnxruntime")
@@ -151,3 +159,29 @@ def test_a_network_that_fails_on_a_picture_names_itself(tmp_path: Path) -> None:
     model.input = replace(model.input, height=16)  # as a file that does not keep what it says
     with pytest.raises(D2Error, match=r"cannot read what .*net.onnx makes of a picture of 48x16"):
         model.predict(np.zeros((32, 48, 3), np.uint8))
+
+
+@pytest.mark.parametrize("place", ["weights.bin", "below/weights.bin", "w" * 150])
+def test_weights_that_lie_beside_the_network_belong_to_it(tmp_path: Path, place: str) -> None:
+    """Networks above 2 GB keep them so: with other weights the file is the same and the maps are not."""
+    weights = tmp_path / place
+    weights.parent.mkdir(exist_ok=True)
+    found = {}
+    for factor in (1.0, 2.0):
+        weights.write_bytes(np.float32(factor).tobytes())
+        path = tiny_onnx.scaled_network(tmp_path / "network.onnx", place)
+        assert external_weights(path) == [weights]
+        model = MonocularModel(path, "relative", preprocessing="unit")
+        prediction = model.predict(np.full((6, 8, 3), 51, np.uint8))
+        np.testing.assert_allclose(prediction, factor * 0.2, rtol=1e-6)
+        found[factor] = model.fingerprint()
+    assert found[1.0] != found[2.0]
+
+
+@given(st.binary(max_size=60), st.integers(0, 4))
+def test_a_file_that_only_looks_like_a_network_names_no_weights(
+    tmp_path_factory: pytest.TempPathFactory, noise: bytes, copies: int
+) -> None:
+    path = tmp_path_factory.mktemp("noise") / "network.onnx"
+    path.write_bytes(noise + copies * (b"\x0a\x08location\x12" + noise) + b"end")
+    assert external_weights(path) in ([], [path])

@@ -218,6 +218,13 @@ def test_a_headline_of_too_few_seeds_has_no_verdict(report: Path) -> None:
     assert re.search(r"yang4d \+ D2 PSNR [\d.]+ dB in [\d.]+ min \(2 seeds: no verdict\)", top)
 
 
+def test_what_a_killed_report_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    (tmp_path / ".0123456789abcdef.part").write_text("half a page")
+    make_report(read_rows([RUNS]), tmp_path)
+    assert (tmp_path / "report.html").is_file()
+    assert not list(tmp_path.glob(".*"))
+
+
 def test_nothing_to_report_is_told(tmp_path: Path) -> None:
     (tmp_path / "empty.jsonl").write_text("")
     with pytest.raises(D2Error, match="there is nothing to report"):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +13,9 @@ from typing import NamedTuple
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.export.ply import PointCloud
 from d2_plugin.captures.pictures import write_png
+from d2_plugin.durable import LEFTOVER, make_folder, writing
 from d2_plugin.errors import D2Error
+from d2_plugin.locks import only_writer
 
 Names = dict[str, str]
 """Camera of the source -> camera of the export."""
@@ -71,10 +76,30 @@ def refuse_skew(camera: Camera) -> None:
         raise D2Error(f"camera {camera.name} has skew {camera.K[0, 1]:g}, which no layout holds: undistort it first")
 
 
-def empty_folder(path: Path | str) -> Path:
-    """The folder at `path`, made where it is missing; one that holds something is refused."""
-    folder = Path(path)
+@contextmanager
+def whole_folder(path: Path | str) -> Iterator[Path]:
+    """Within it, a folder to write to, which takes the place of `path` at the end: there is all of it, or nothing.
+
+    What a killed export left is removed by the next. Where `path` is the current folder or a disk of its own, it is
+    written directly, since no other folder can take its place.
+
+    Raises:
+        D2Error: `path` holds something, somebody else is writing it, or the disk is full, broken or not ours.
+    """
+    folder = Path(path).resolve()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise D2Error(f"{folder} already exists and is not empty: choose another folder, nothing was written")
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+        raise D2Error(f"{path} already exists and is not empty: choose another folder, nothing was written")
+    if folder == Path.cwd() or folder.is_mount():
+        with only_writer(folder), writing(folder):
+            yield folder
+        return
+    unfinished = make_folder(folder.with_name(f".{folder.name}{LEFTOVER}"))
+    with only_writer(unfinished), writing(folder):
+        for left in unfinished.iterdir():
+            shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()
+        try:
+            yield unfinished
+            os.replace(unfinished, folder)
+        except BaseException:
+            shutil.rmtree(unfinished, ignore_errors=True)
+            raise

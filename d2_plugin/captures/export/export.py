@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.export.base import Export, Written, empty_folder, refuse_skew
+from d2_plugin.captures.export.base import Export, Written, refuse_skew, whole_folder
 from d2_plugin.captures.export.colmap import write_colmap, write_multipleview
 from d2_plugin.captures.export.n3dv import write_n3dv
 from d2_plugin.captures.export.ply import PointCloud
@@ -62,11 +62,11 @@ def export_capture(
     held_out = _known(capture, test_cameras)
     for camera in capture.cameras.values():
         refuse_skew(camera)
-    folder = empty_folder(path)
-    written = WRITERS[layout](Export(capture, held_out, cloud, folder))
-    described = json.dumps(_description(capture, layout, written, held_out), indent=1)
-    (folder / EXPORT_FILE).write_text(described + "\n")
-    return folder
+    with whole_folder(path) as folder:
+        written = WRITERS[layout](Export(capture, held_out, cloud, folder))
+        described = json.dumps(_description(capture, layout, written, held_out), indent=1)
+        (folder / EXPORT_FILE).write_text(described + "\n")
+    return Path(path)
 
 
 def _description(capture: Capture, layout: str, written: Written, held_out: tuple[str, ...]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.captures.capture import Camera, Capture
-from d2_plugin.captures.export.base import empty_folder, refuse_skew
+from d2_plugin.captures.export.base import refuse_skew, whole_folder
 from d2_plugin.captures.pictures import write_png
 
 
@@ -18,16 +18,16 @@ def save_capture(capture: Capture, path: Path | str) -> Path:
 
     Pictures are lossless PNG; maps are float32. Raises `D2Error` where `path` already holds something.
     """
-    folder = empty_folder(path)
     description = json.dumps(_description(capture), indent=1)
-    for camera in capture.cameras:
-        for frame in capture.frames:
-            _save_frame(capture, folder, camera, frame)
-    if capture.mono_kind is not None:
-        declared = {"kind": capture.mono_kind, "emulated": capture.mono_emulated}
-        (folder / "mono" / "mono.json").write_text(json.dumps(declared) + "\n")
-    (folder / "cameras.json").write_text(description + "\n")  # last: without it a half-written folder is no capture
-    return folder
+    with whole_folder(path) as folder:
+        for camera in capture.cameras:
+            for frame in capture.frames:
+                _save_frame(capture, folder, camera, frame)
+        if capture.mono_kind is not None:
+            declared = {"kind": capture.mono_kind, "emulated": capture.mono_emulated}
+            (folder / "mono" / "mono.json").write_text(json.dumps(declared) + "\n")
+        (folder / "cameras.json").write_text(description + "\n")  # last: a folder without it is no capture
+    return Path(path)
 
 
 def _save_frame(capture: Capture, folder: Path, camera: str, frame: int) -> None:

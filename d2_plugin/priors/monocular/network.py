@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import mmap
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -137,13 +139,42 @@ class MonocularModel:
         return rows, columns
 
     def fingerprint(self) -> str:
-        """What the prediction depends on besides the picture: file, provider and preprocessing."""
+        """What the prediction depends on besides the picture: files, provider and preprocessing."""
         digest = hashlib.sha256()
-        with self.path.open("rb") as file:
-            while chunk := file.read(1 << 22):
-                digest.update(chunk)
+        for path in (self.path, *external_weights(self.path)):
+            with path.open("rb") as file:
+                while chunk := file.read(1 << 22):
+                    digest.update(chunk)
         digest.update(f"{self.provider} {self.preprocessing}".encode())
         return digest.hexdigest()[:32]
+
+
+def external_weights(path: Path) -> list[Path]:
+    """The files beside an ONNX file that hold weights of it, as networks above 2 GB keep them.
+
+    A tensor names its file in an entry of protobuf with key `location` (onnx.proto, TensorProto.external_data): field 1
+    is the key, field 2 the name, each behind its length.
+    """
+    entry, names = b"\x0a\x08location\x12", set()
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        place = content.find(entry)
+        while place >= 0:
+            length, start = _varint(content, place + len(entry))
+            names.add(content[start : start + length])
+            place = content.find(entry, start)
+    files = (path.parent / os.fsdecode(name) for name in sorted(names) if name and b"\0" not in name)
+    return [file for file in files if file.is_file()]
+
+
+def _varint(content: mmap.mmap, place: int) -> tuple[int, int]:
+    """The number that protobuf wrote at a place, seven bits a byte, and the place behind it."""
+    value, shift = 0, 0
+    while place < len(content) and shift < 63:
+        byte = content[place]
+        value, place, shift = value | (byte & 127) << shift, place + 1, shift + 7
+        if byte < 128:
+            break
+    return value, place
 
 
 def upsample(prediction: np.ndarray, height: int, width: int) -> np.ndarray:

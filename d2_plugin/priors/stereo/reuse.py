@@ -24,7 +24,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.files import Entry, read_json, write_entry
+from d2_plugin.priors.files import Entry, read_record, write_entry
 from d2_plugin.priors.stereo.settings import StereoSettings
 
 SMOOTHING = 3  # side of the box over which a change is averaged, pixels: noise cancels, moving things do not
@@ -74,7 +74,7 @@ class MatchMemory:
         for index in range(count):
             path = folder / f"{index}.npy"
             try:
-                entry = Entry(path, read_json(path.with_suffix(".json")))
+                entry = Entry(path, read_record(path))
                 if entry.record.get("key") != key:
                     return None
                 views.append(np.array(entry.array(MEMORY_DTYPE)))

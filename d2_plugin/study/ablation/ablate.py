@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
+from d2_plugin import durable
+from d2_plugin.durable import Kind, read_table, write_table, write_text
 from d2_plugin.progress import be_silent, progress_bar
+from d2_plugin.runs.saved.kinds import read_metrics
 from d2_plugin.runs.settings import RunSettings, prior_settings
 from d2_plugin.study.ablation.job import Job, Metrics
 from d2_plugin.study.ablation.presets import Preset
 from d2_plugin.study.ablation.tables import report
-from d2_plugin.study.rows import Row, append_rows, make_row
+from d2_plugin.study.rows import Row, as_line, make_row
 from d2_plugin.study.shared import share
+
+PRIOR_SECONDS = Kind("time of a prior", 1, "delete it")
+"""PRIORS.seconds.json, beside each prior that runs share."""
 
 
 def jobs(
@@ -75,8 +79,8 @@ def _finished(job: Job) -> Metrics | None:
     path = job.folder / "metrics.json"
     if not path.is_file():
         return None
-    job.run()
-    metrics = json.loads(path.read_text())
+    job.run()  # refuses a folder of other settings, with one sentence
+    metrics = read_metrics(job.folder)
     return metrics if metrics["iterations"] == job.settings.iterations else None
 
 
@@ -92,14 +96,15 @@ def _share(work: Sequence[Job]) -> None:
             run.prepare(priors=False)
             points = run.folder / "points.npz"
         elif not (run.folder / "points.npz").is_file():
-            shutil.copyfile(points, run.folder / "points.npz")
+            durable.write(run.folder / "points.npz", points.read_bytes())
         if run.uses_prior and job.settings.priors not in built:
             run.prepare()
             built.add(job.settings.priors)
             measured = _prior_seconds_file(job.settings)
             if not measured.exists():  # a build that was cut off and continues would time its second part alone
                 whole = shared is not None and Path(str(job.settings.priors)) == shared.priors
-                measured.write_text(json.dumps(shared.seconds if shared and whole else run.seconds["priors"]))
+                seconds = shared.seconds if shared and whole else run.seconds["priors"]
+                write_table(measured, {"seconds": seconds}, PRIOR_SECONDS)
 
 
 def _prior_seconds_file(settings: RunSettings) -> Path:
@@ -111,7 +116,7 @@ def _prior_seconds(job: Job) -> float | None:
     if not job.settings.hooks and job.rival is None:
         return 0.0
     measured = _prior_seconds_file(job.settings)
-    return json.loads(measured.read_text()) if measured.exists() else None
+    return read_table(measured, PRIOR_SECONDS)["seconds"] if measured.exists() else None
 
 
 def _prepare_worker() -> None:
@@ -130,11 +135,10 @@ def _run(job: Job) -> Metrics:
 def write(results: Mapping[Job, Metrics], presets: Sequence[Preset], output: Path, command: str) -> str:
     """ablation.md, ablation.tex and one row per run in runs.jsonl under `output`; returns the Markdown."""
     text = report(results, presets)
-    (output / "ablation.md").write_text(text)
-    (output / "ablation.tex").write_text(report(results, presets, as_latex=True))
-    rows = output / "runs.jsonl"
-    rows.unlink(missing_ok=True)
-    append_rows(rows, (_row(job, metrics, command) for job, metrics in results.items()))
+    write_text(output / "ablation.md", text)
+    write_text(output / "ablation.tex", report(results, presets, as_latex=True))
+    rows = "".join(as_line(_row(job, metrics, command)) for job, metrics in results.items())
+    write_text(output / "runs.jsonl", rows)
     return text
 
 

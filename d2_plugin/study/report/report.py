@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from d2_plugin.durable import make_folder, remove_leftovers, write_text
 from d2_plugin.errors import D2Error
+from d2_plugin.locks import only_writer
 from d2_plugin.reading import parsing
 from d2_plugin.runs.tables import read_metrics
 from d2_plugin.settings import Positional, Settings
@@ -75,11 +77,12 @@ def make_report(rows: Sequence[Row], output: Path, pictures: Sequence[Picture] =
     sections = [_built(kind, mine) for kind, mine in by_kind.items() if mine]
     compared = versions(rows)
     sections += [] if compared is None else [compared]
-    output.mkdir(parents=True, exist_ok=True)
     texts = {"report.html": html(sections, pictures, LEAD), "report.md": markdown(sections, LEAD)}
     texts |= {f"{name}.svg": svg for section in sections for name, svg in section.figures.items()}
-    for name, content in texts.items():
-        (output / name).write_text(content)
+    with only_writer(make_folder(output)):
+        remove_leftovers(output, below=False)  # of a report that was killed
+        for name, content in texts.items():
+            write_text(output / name, content)
     return [output / name for name in texts]
 
 

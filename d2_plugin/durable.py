@@ -1,0 +1,229 @@
+"""Files that are kept: written whole or not at all, and known again when they are read back.
+
+    write(path, ...)         under a temporary name, synchronised, renamed: a kill or a full disk leaves the old file
+    write_table, read_table  a JSON object that names its format and carries a checksum of everything else in it
+    archive_problem          the same question for files that are zip archives (.npz, .pt): zip has its own checksums
+
+Whatever the operating system refuses becomes one sentence that names the file, the reason and what to do.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import json
+import os
+import secrets
+import stat
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from d2_plugin.errors import D2Error
+
+LEFTOVER = ".part"
+"""How the temporary names end; what a killed process left behind is found by it."""
+
+SEALED = "\n"
+"""How sealed tables begin: one whose seal was overwritten is not taken for one from before there were seals."""
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
+
+
+class CannotWrite(D2Error):
+    """The operating system refused to write; nothing that was there before was changed."""
+
+
+class Damaged(D2Error):
+    """A file that was kept is not what was written."""
+
+
+class OtherFormat(D2Error):
+    """A file that was kept by another version of this package."""
+
+
+class Kind(NamedTuple):
+    """A kind of table that is kept: what it is called, the version of its format, what to do about a damaged one."""
+
+    name: str
+    format: int
+    remedy: str
+    since_seals: bool = True
+    """Whether every table of this kind was ever written with a checksum; if not, those without one are read as well."""
+
+
+def cannot_write(path: Path, error: OSError) -> CannotWrite:
+    """The sentence for a write that failed."""
+    advice = "check the disk"
+    if error.errno in FULL:
+        advice = "make room"
+    elif error.errno in FORBIDDEN:
+        advice = "choose a folder that you may write"
+    reason = error.strerror or str(error)
+    return CannotWrite(f"cannot write {path} ({reason}): {advice} and give the same command again, which goes on")
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Within it, an `OSError` is the sentence that `path` cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise cannot_write(path, error) from None
+
+
+def make_folder(path: Path) -> Path:
+    """The folder at `path`, made with those above it where they are missing."""
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def write(path: Path, *parts: bytes | memoryview, synced: bool = True) -> None:
+    """Make `path` hold the parts one after the other; its folder is made where it is missing.
+
+    `synced` waits for the disk, so that a power cut leaves the old file or the new one as well; what nobody reads back
+    need not wait.
+
+    Raises:
+        CannotWrite: the disk is full, broken or not ours; what was there before is there still.
+    """
+    make_folder(path.parent)
+    temporary = path.with_name(f".{secrets.token_hex(8)}{LEFTOVER}")
+    with writing(path):
+        try:
+            _write_new(temporary, parts, synced)
+            os.replace(temporary, path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """`write` for text, in UTF-8."""
+    write(path, text.encode())
+
+
+def append(path: Path, text: str) -> None:
+    """Add whole lines at the end of a file, which is made where it is missing: all of them, or none if that fails."""
+    make_folder(path.parent)
+    with writing(path), path.open("ab+", buffering=0) as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - 1, 0))
+        cut_off = size > 0 and file.read(1) != b"\n"  # somebody was killed in the middle of a line
+        rest = memoryview((("\n" if cut_off else "") + text).encode())
+        try:
+            while rest:
+                rest = rest[file.write(rest) :]
+        except BaseException:
+            file.truncate(size)
+            raise
+
+
+def _write_new(path: Path, parts: tuple[bytes | memoryview, ...], synced: bool) -> None:
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+    descriptor = os.open(path, flags, 0o666)
+    try:
+        for part in parts:
+            rest = memoryview(part).cast("B") if memoryview(part).nbytes else memoryview(b"")
+            while rest:
+                rest = rest[os.write(descriptor, rest) :]
+        if synced:
+            os.fsync(descriptor)  # before the rename, or a power cut may leave the new name with nothing in it
+    finally:
+        os.close(descriptor)
+
+
+def remove_leftovers(folder: Path, below: bool = True) -> None:
+    """Delete what killed writers left in a folder, and below it; only while no other process writes there."""
+    pattern = f".*{LEFTOVER}"
+    for path in folder.rglob(pattern) if below else folder.glob(pattern):
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+def is_leftover(path: Path) -> bool:
+    """Whether a killed writer left this file behind."""
+    return path.name.startswith(".") and path.name.endswith(LEFTOVER)
+
+
+def write_table(path: Path, values: Mapping[str, Any], kind: Kind) -> None:
+    """Write a JSON object with the version of its format and its checksum.
+
+    NaN and infinity are refused (`ValueError`), since JSON has neither.
+    """
+    sealed = {**values, "format": kind.format}
+    sealed["seal"] = _seal(sealed)
+    write_text(path, SEALED + json.dumps(sealed, indent=1, allow_nan=False, sort_keys=True))
+
+
+def read_table(path: Path, kind: Kind) -> dict[str, Any]:
+    """What `write_table` wrote, without version and checksum.
+
+    Raises:
+        FileNotFoundError: no such file.
+        OtherFormat: another version wrote it.
+        Damaged: it cannot be read, is no table, or its content is not what was written.
+    """
+    table, marked = _parsed(path, kind)
+    if not kind.since_seals and not marked and "format" not in table and "seal" not in table:
+        return table
+    found = table.get("format")
+    if found != kind.format:
+        raise OtherFormat(
+            f"the {kind.name} {path} has format {found} but this version reads format {kind.format}: {kind.remedy}"
+        )
+    seal = table.pop("seal", None)
+    if seal != _seal(table):
+        raise _damaged(path, kind, "its content differs from its checksum")
+    del table["format"]
+    return table
+
+
+def refuse_no_file(path: Path) -> None:
+    """Raise `OSError` where something else than a plain file lies: opening a pipe would wait for ever."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "it is no plain file")
+
+
+def _parsed(path: Path, kind: Kind) -> tuple[dict[str, Any], bool]:
+    """The table, and whether its file begins as sealed ones do."""
+    try:
+        refuse_no_file(path)
+        content = path.read_bytes()
+        table = json.loads(content)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError, RecursionError) as error:
+        raise _damaged(path, kind, str(error)) from None
+    if not isinstance(table, dict):
+        raise _damaged(path, kind, "it is no table")
+    return table, content.startswith(SEALED.encode())
+
+
+def _damaged(path: Path, kind: Kind, reason: str) -> Damaged:
+    return Damaged(f"the {kind.name} {path} is damaged ({reason}): {kind.remedy}")
+
+
+def _seal(table: Mapping[str, Any]) -> str:
+    """SHA-256 of the values, whatever the order and the spaces of the file."""
+    plain = json.dumps(table, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(plain.encode()).hexdigest()
+
+
+def archive_problem(path: Path) -> str:
+    """What is wrong with a zip archive (.npz, or what `torch.save` writes), or nothing: its checksums are compared.
+
+    The readers of numpy and torch compare them in part or not at all.
+    """
+    try:
+        refuse_no_file(path)
+        with zipfile.ZipFile(path) as archive:
+            bad = archive.testzip()
+    except (OSError, ValueError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile) as error:
+        return str(error) or type(error).__name__
+    return "" if bad is None else f"the checksum of its part {bad} differs"

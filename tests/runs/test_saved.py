@@ -1,0 +1,317 @@
+"""What a run keeps: a damaged file is one sentence, a run that diverged stops, a second writer is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny import ALL_HOOKS, make_model, make_trainer
+
+from d2_plugin.captures.export.folder import save_capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.commands.cli import main
+from d2_plugin.durable import write_table
+from d2_plugin.errors import D2Error
+from d2_plugin.locks import only_writer
+from d2_plugin.runs import run as run_module
+from d2_plugin.runs.run import Run
+from d2_plugin.runs.saved.checkpoint import load_checkpoint, save_checkpoint
+from d2_plugin.runs.saved.finite import Diverged, all_finite, parameters_of, watched, what_diverged
+from d2_plugin.runs.saved.kinds import METRICS, read_metrics
+from d2_plugin.runs.settings import RunSettings
+from d2_plugin.runs.start import TimedPoints
+
+pytest.importorskip("cv2")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    capture = synthetic_capture(cameras=2, frames=2, width=48, height=27)
+    return save_capture(capture, tmp_path_factory.mktemp("scene") / "room")
+
+
+def bare(scene: Path, folder: Path, **changes: Any) -> Run:
+    """A run of the backbone alone that takes a second."""
+    run = Run(RunSettings(str(scene), ("train0", "train1"), **({"iterations": 4, "hooks": ()} | changes)), folder)
+    if not (folder / "points.npz").exists():
+        TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)).save(folder / "points.npz")
+    return run
+
+
+@pytest.fixture(scope="module")
+def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = bare(scene, tmp_path_factory.mktemp("runs") / "bare")
+    run.train()
+    run.evaluate(pictures=False)
+    return run.folder
+
+
+@pytest.fixture
+def copied(finished: Path, tmp_path: Path) -> Path:
+    """A finished run that a test may damage."""
+    for path in finished.iterdir():
+        if path.is_file():
+            (tmp_path / path.name).write_bytes(path.read_bytes())
+    return tmp_path
+
+
+BROKEN: dict[str, Callable[[bytes], bytes]] = {
+    "empty": lambda whole: b"",
+    "cut off": lambda whole: whole[: len(whole) // 2],
+    "another shape": lambda whole: b"[1, 2]",
+    "noise": lambda whole: random.Random(0).randbytes(len(whole)),
+}
+
+
+class TestADamagedFile:
+    @pytest.mark.parametrize("how", BROKEN)
+    @pytest.mark.parametrize("name", ["checkpoint.pt", "run.json", "points.npz"])
+    def test_is_one_sentence(self, copied: Path, capsys: pytest.CaptureFixture[str], name: str, how: str) -> None:
+        (copied / name).write_bytes(BROKEN[how]((copied / name).read_bytes()))
+        assert main(["eval", str(copied), "--no-pictures"]) == 2
+        told = capsys.readouterr().err
+        assert name in told
+        assert len(told.splitlines()) == 1
+
+    @pytest.mark.parametrize("how", BROKEN)
+    def test_scores_too(self, copied: Path, capsys: pytest.CaptureFixture[str], how: str) -> None:
+        (copied / "metrics.json").write_bytes(BROKEN[how]((copied / "metrics.json").read_bytes()))
+        assert main(["compare", str(copied)]) == 2
+        assert "metrics.json is damaged" in capsys.readouterr().err
+        assert main(["report", str(copied), "--output", str(copied / "report")]) == 2
+
+    @pytest.mark.parametrize("table", [{}, {"test": {}}, {"test": 3}, {"seconds": {"train": 1}}])
+    def test_scores_of_another_shape_are_told(self, copied: Path, table: dict[str, Any]) -> None:
+        write_table(copied / "metrics.json", table, METRICS)
+        with pytest.raises(D2Error, match=r"is damaged \(no .* in it\): run `d2 eval`"):
+            read_metrics(copied)
+
+    def test_a_changed_score_is_found(self, copied: Path) -> None:
+        table = json.loads((copied / "metrics.json").read_text())
+        table["test"]["psnr"] += 1
+        (copied / "metrics.json").write_text(json.dumps(table))
+        with pytest.raises(D2Error, match="its content differs from its checksum"):
+            read_metrics(copied)
+
+    def test_changed_settings_are_found(self, copied: Path) -> None:
+        text = (copied / "run.json").read_text()
+        (copied / "run.json").write_text(text.replace('"seed": 0', '"seed": 1'))
+        with pytest.raises(D2Error, match="its content differs from its checksum"):
+            Run.load(copied)
+
+    @pytest.mark.parametrize("seed", range(40))
+    def test_every_flipped_bit_of_a_checkpoint_is_found_or_means_nothing(self, copied: Path, seed: int) -> None:
+        path = copied / "checkpoint.pt"
+        before, damaged = load_checkpoint(path, "cpu"), bytearray(path.read_bytes())
+        draw = random.Random(seed)
+        damaged[draw.randrange(len(damaged))] ^= 1 << draw.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            after = load_checkpoint(path, "cpu")
+        except D2Error:
+            return
+        assert flat(after) == flat(before)
+
+    def test_a_checkpoint_of_another_version_is_named(self, copied: Path) -> None:
+        path = copied / "checkpoint.pt"
+        torch.save({"step": 4}, path)
+        with pytest.raises(D2Error, match="has format None but this version reads format 1"):
+            Run.load(copied).evaluate(pictures=False)
+        torch.save({"format": 9}, path)
+        with pytest.raises(D2Error, match="has format 9"):
+            load_checkpoint(path, "cpu")
+
+    @pytest.mark.parametrize("state", [{}, {"d2": None}, {"d2": 3, "step": "a"}, {"d2": None, "model": {}, "step": 1}])
+    def test_a_checkpoint_of_another_shape_is_told(self, copied: Path, state: dict[str, Any]) -> None:
+        save_checkpoint(copied / "checkpoint.pt", state)
+        with pytest.raises(D2Error, match="is not one of this run"):
+            Run.load(copied).evaluate(pictures=False)
+
+    def test_points_of_another_shape_version_or_with_nan_are_told(self, tmp_path: Path) -> None:
+        path = tmp_path / "points.npz"
+        wrong = {
+            "shapes": TimedPoints(np.zeros((3, 2)), np.zeros((3, 3)), np.zeros(3)),
+            "not finite": TimedPoints(np.full((3, 3), np.nan), np.zeros((3, 3)), np.zeros(3)),
+        }
+        for reason, points in wrong.items():
+            points.save(path)
+            with pytest.raises(D2Error, match=f"{reason}.*: delete the file, it will be made again"):
+                TimedPoints.load(path)
+        for kind in ("U3", "O"):
+            words = np.zeros((2, 3), kind)
+            np.savez(path, positions=words, colors=words, times=np.zeros(2), format=1)
+            with pytest.raises(D2Error, match="cannot read points from .*: delete the file"):
+                TimedPoints.load(path)
+        np.savez(path, positions=np.zeros((0, 3)), colors=np.zeros((0, 3)), times=np.zeros(0))
+        with pytest.raises(D2Error, match="format None, expected 1"):
+            TimedPoints.load(path)
+
+
+def flat(state: Any) -> list[Any]:
+    """The leaves of a state."""
+    if isinstance(state, dict):
+        return [leaf for name in sorted(state, key=str) for leaf in (name, *flat(state[name]))]
+    if isinstance(state, list | tuple):
+        return [leaf for value in state for leaf in flat(value)]
+    return state.flatten().tolist() if isinstance(state, torch.Tensor) else [state]
+
+
+class TestARunThatDiverges:
+    def test_every_parameter_is_watched(self) -> None:
+        for backbone in ("yang4d", "mlp", "hexplane"):
+            model = make_model(backbone=backbone, background=True)
+            names = [name for name, _ in parameters_of(model)]
+            expected = sum(p.numel() for group in model.gaussians.optimizer.param_groups for p in group["params"])
+            assert {"positions", "background.constant", "background.harmonics"} <= set(names)
+            assert sum(value.numel() for _, value in parameters_of(model)) > expected
+            assert any(name.startswith("field") for name in names) is (backbone != "yang4d")
+            for name, value in parameters_of(model):
+                kept = value.detach().flatten()[0].clone()
+                value.data.view(-1)[0] = math.nan
+                assert not all_finite(model)
+                assert what_diverged(model).endswith(f"of {name} is NaN or infinite")
+                value.data.view(-1)[0] = kept
+            assert all_finite(model)
+
+    def test_large_finite_numbers_are_no_divergence(self) -> None:
+        model = make_model()
+        model.gaussians["positions"].data.fill_(3e38)
+        assert all_finite(model)
+        assert not all_finite(model, torch.tensor(math.inf))
+        assert what_diverged(model, torch.tensor(math.nan)) == "the loss is nan"
+
+    def test_stops_at_the_step_with_the_parameter_and_the_checkpoint(self, tmp_path: Path) -> None:
+        trainer = make_trainer(ALL_HOOKS)
+
+        def poison(step: int, loss: float) -> None:
+            if step == 4:
+                trainer.model.gaussians["opacity_logits"].data[3] = math.nan
+
+        trainer.run(2)
+        kept = r"checkpoint.pt, step 2; lower"
+        def trained() -> None:
+            with watched(trainer, tmp_path / "checkpoint.pt") as watch:
+                inner = watch(lambda step, loss: None)
+                trainer.run(20, lambda step, loss: (inner(step, loss), poison(step, loss)))
+
+        with pytest.raises(Diverged, match=rf"diverged at step 5 \(.* of \S+ is NaN or infinite\): .*{kept}"):
+            trained()
+
+    def test_an_error_that_comes_of_it_is_reported_as_it(self, tmp_path: Path) -> None:
+        def fails(trainer: SimpleNamespace, message: str) -> None:
+            with watched(trainer, tmp_path / "checkpoint.pt"):
+                raise RuntimeError(message)
+
+        trainer = SimpleNamespace(model=make_model(), step=0)
+        with pytest.raises(RuntimeError, match="out of memory"):
+            fails(trainer, "out of memory")
+        trainer.model.gaussians["positions"].data.fill_(math.nan)
+        with pytest.raises(Diverged, match="diverged at step 0 .*there is no checkpoint yet"):
+            fails(trainer, "probability tensor contains nan")
+
+    def test_exits_with_one_sentence_and_is_not_saved(
+        self, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        words = ["train", str(scene), "--train-cameras", "train0,train1", "--hooks", "none", "--iterations", "20"]
+        broken = ["--backbone.position_rate", "1e38", "--output", str(tmp_path / "run")]
+        assert main([*words, *broken]) == 2
+        told = capsys.readouterr().err.splitlines()[-1]
+        assert told.startswith("d2: training diverged at step ")
+        assert not (tmp_path / "run" / "metrics.json").exists()
+        state = load_checkpoint(tmp_path / "run" / "checkpoint.pt", "cpu")
+        assert state is None or all(value.isfinite().all() for value in state["model"]["parameters"].values())
+
+    def test_is_not_scored(self, copied: Path) -> None:
+        state = load_checkpoint(copied / "checkpoint.pt", "cpu")
+        state["model"]["parameters"]["positions"][1:] = math.nan
+        save_checkpoint(copied / "checkpoint.pt", state)
+        with pytest.raises(D2Error, match=r"diverged before step 4 \(99.* of positions is NaN or infinite\)"):
+            Run.load(copied).evaluate(pictures=False)
+
+
+class TestOneWriter:
+    def test_a_second_trainer_is_refused(self, scene: Path, tmp_path: Path) -> None:
+        run = bare(scene, tmp_path / "run")
+        with only_writer(run.folder):
+            for second in (bare(scene, tmp_path / "run"), Run.load(run.folder)):
+                with pytest.raises(D2Error, match="another process is writing .*: wait until it has ended"):
+                    second.train()
+                with pytest.raises(D2Error, match="another process is writing"):
+                    second.evaluate()
+        run.train()
+        run.train()
+
+    def test_of_two_that_begin_at_once_one_is_refused(self, scene: Path, tmp_path: Path) -> None:
+        (tmp_path / "run").mkdir()
+        with only_writer(tmp_path / "run"), pytest.raises(D2Error, match="another process is writing"):
+            bare(scene, tmp_path / "run")
+
+    def test_what_a_kill_left_of_the_first_file_blocks_nobody(self, scene: Path, tmp_path: Path) -> None:
+        (tmp_path / "run").mkdir()
+        (tmp_path / "run" / ".0123456789abcdef.part").write_bytes(b'{"iter')
+        bare(scene, tmp_path / "run").train()
+        assert not list((tmp_path / "run").glob(".*.part"))
+
+    def test_a_file_in_the_place_of_the_folder_is_told(self, scene: Path, tmp_path: Path) -> None:
+        (tmp_path / "run").write_text("mine")
+        with pytest.raises(D2Error, match="is a file, and a run needs a folder"):
+            bare(scene, tmp_path / "run")
+
+
+class TestThePriorOfARun:
+    """A relative map and one camera: nothing gives its scale, so no view has a prior."""
+
+    ONE = ("--train-cameras", "train0", "--iterations", "4", "--downscale", "1")
+
+    def words(self, scene: Path, output: Path, *more: str) -> list[str]:
+        return ["train", str(scene), *self.ONE, "--output", str(output), *more]
+
+    def test_none_at_all_is_an_error(self, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(self.words(scene, tmp_path / "run")) == 2
+        captured = capsys.readouterr()
+        assert "d2: no view has a usable prior (2x " in captured.err
+        assert "--accept-empty-prior" in captured.err
+        assert "0 priors built" not in captured.out
+        assert "2 priors built, 0 kept\ncamera " in captured.out, "what the prior became is said before"
+        assert not (tmp_path / "run" / "checkpoint.pt").exists()
+
+    def test_unless_it_is_asked_for(self, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(self.words(scene, tmp_path / "run", "--accept-empty-prior")) == 0
+        out = capsys.readouterr().out
+        last = out.splitlines()[-1]
+        assert last.startswith("prior: 0 of 2 views are usable; none of camera train0; maps refused 2x ")
+        prior = read_metrics(tmp_path / "run")["prior"]
+        assert prior["headline"] == last
+        assert [refusal["frame"] for refusal in prior["refused"]] == [0, 1]
+        assert main(["eval", str(tmp_path / "run"), "--no-pictures"]) == 0
+        assert read_metrics(tmp_path / "run")["prior"] == prior
+
+    def test_without_hooks_none_is_needed(self, scene: Path, tmp_path: Path) -> None:
+        assert main(self.words(scene, tmp_path / "run", "--hooks", "none")) == 0
+        assert read_metrics(tmp_path / "run")["prior"] is None
+
+
+def test_the_checkpoint_before_is_there_when_the_next_cannot_be_written(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = bare(scene, tmp_path / "run", iterations=6)
+    save, saved = run_module.save_checkpoint, []
+
+    def full(path: Path, state: Any) -> None:
+        if len(saved) == 3:
+            raise D2Error("cannot write")
+        saved.append(state["step"])
+        save(path, state)
+
+    monkeypatch.setattr(run_module, "save_checkpoint", full)
+    with pytest.raises(D2Error, match="cannot write"):
+        run.train()
+    assert load_checkpoint(run.folder / "checkpoint.pt", "cpu")["step"] == 3

@@ -1,0 +1,173 @@
+"""Files that are kept: whole or not there, and known again."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import random
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from d2_plugin import durable
+from d2_plugin.durable import (
+    CannotWrite,
+    Damaged,
+    Kind,
+    OtherFormat,
+    append,
+    archive_problem,
+    read_table,
+    remove_leftovers,
+    write,
+    write_table,
+)
+from d2_plugin.errors import D2Error
+
+KIND = Kind("table", 3, "make it anew")
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@given(st.dictionaries(st.text().filter(lambda name: name not in ("format", "seal")), JSON, max_size=5))
+def test_what_is_read_is_what_was_written(tmp_path_factory: pytest.TempPathFactory, values: dict[str, Any]) -> None:
+    path = tmp_path_factory.mktemp("table") / "table.json"
+    write_table(path, values, KIND)
+    assert read_table(path, KIND) == values
+    path.write_text(json.dumps(json.loads(path.read_text())))  # spaces and the order of names are nobody's content
+    assert read_table(path, KIND) == values
+
+
+def test_every_flipped_bit_of_a_table_is_found_or_means_the_same(tmp_path: Path) -> None:
+    path, values = tmp_path / "table.json", {"near": 1.5, "names": ["a", "b"], "far": -2.5e3, "on": True}
+    write_table(path, values, KIND)
+    whole = path.read_bytes()
+    for place in range(8 * len(whole)):
+        damaged = bytearray(whole)
+        damaged[place // 8] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        with contextlib.suppress(Damaged, OtherFormat):
+            assert read_table(path, KIND) == values, place
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"[1]", b"3", b"\xff\xfe\x00", b"[" * 200_000, b'{"a": ' + b"9" * 5000 + b"}", b'{"format": 3}'],
+    ids=["empty", "cut off", "a list", "a number", "no text", "too deep", "too long", "no seal"],
+)
+def test_what_is_no_table_is_one_sentence(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "table.json").write_bytes(content)
+    with pytest.raises(D2Error, match=r"the table .*table.json is damaged \(.*\): make it anew") as told:
+        read_table(tmp_path / "table.json", KIND)
+    assert len(str(told.value)) < 400
+
+
+def test_a_folder_or_a_pipe_in_the_place_of_a_file_is_one_sentence(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path, tmp_path / "pipe"):
+        with pytest.raises(Damaged, match="it is no plain file"):
+            read_table(path, KIND)
+        assert "it is no plain file" in archive_problem(path)
+
+
+def test_another_version_is_named_before_anything_else(tmp_path: Path) -> None:
+    write_table(tmp_path / "t.json", {"a": 1}, KIND._replace(format=7))
+    with pytest.raises(OtherFormat, match="has format 7 but this version reads format 3: make it anew"):
+        read_table(tmp_path / "t.json", KIND)
+
+
+def test_tables_from_before_there_were_seals_are_read_where_the_kind_has_such(tmp_path: Path) -> None:
+    (tmp_path / "t.json").write_text('{"a": 1}')
+    assert read_table(tmp_path / "t.json", KIND._replace(since_seals=False)) == {"a": 1}
+    with pytest.raises(OtherFormat, match="has format None"):
+        read_table(tmp_path / "t.json", KIND)
+    (tmp_path / "t.json").write_text('{"a": 1, "format": 3}')  # one that lost its seal is none of them
+    with pytest.raises(Damaged):
+        read_table(tmp_path / "t.json", KIND._replace(since_seals=False))
+    write_table(tmp_path / "t.json", {"a": 1}, KIND)
+    blank = (tmp_path / "t.json").read_text().replace('"format": 3', '"furmat": 3').replace('"seal"', '"soul"')
+    (tmp_path / "t.json").write_text(blank)  # nor one that lost both in one block
+    with pytest.raises(OtherFormat):
+        read_table(tmp_path / "t.json", KIND._replace(since_seals=False))
+
+
+@pytest.mark.parametrize("name", ["write", "fsync", "replace"])
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO, errno.EACCES])
+def test_a_write_that_fails_changes_nothing_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, number: int
+) -> None:
+    write(tmp_path / "kept", b"before")
+
+    def fail(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(durable.os, name, fail)
+    with pytest.raises(CannotWrite, match=rf"cannot write .*kept \({os.strerror(number)}\): .*the same command again"):
+        write(tmp_path / "kept", b"after")
+    monkeypatch.undo()
+    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
+    assert (tmp_path / "kept").read_bytes() == b"before"
+
+
+def test_a_file_where_a_folder_belongs_and_a_folder_where_a_file_belongs(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path / "file" / "below", tmp_path, tmp_path / ("x" * 300)):
+        with pytest.raises(CannotWrite, match="cannot write"):
+            write(path, b"content")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_link_in_the_place_of_a_file_is_replaced_and_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("mine")
+    (tmp_path / "file").symlink_to(tmp_path / "precious")
+    write(tmp_path / "file", b"new")
+    assert (tmp_path / "precious").read_text() == "mine"
+    assert not (tmp_path / "file").is_symlink()
+
+
+def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "below").mkdir()
+    for name in (".0123.part", "below/.4567.part", "below/part", ".hidden", "a.part"):
+        (tmp_path / name).write_text("")
+    remove_leftovers(tmp_path)
+    assert {path.name for path in tmp_path.rglob("*")} == {"below", "part", ".hidden", "a.part"}
+
+
+def test_lines_are_added_whole_and_a_line_that_was_cut_off_stays_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "rows.jsonl"
+    append(path, "1\n2\n")
+    path.write_text("1\n2\n3")
+    append(path, "4\n")
+    assert path.read_text() == "1\n2\n3\n4\n"
+    with pytest.raises(CannotWrite):
+        append(tmp_path, "5\n")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_flipped_bit_of_an_archive_is_found_or_changes_no_array(tmp_path: Path, seed: int) -> None:
+    arrays = {"a": np.arange(40.0), "b": np.arange(9, dtype=np.uint8)}
+    np.savez(tmp_path / "whole.npz", **arrays)
+    whole, draw, found = (tmp_path / "whole.npz").read_bytes(), random.Random(seed), 0
+    for _ in range(150):
+        damaged = bytearray(whole)
+        place = draw.randrange(8 * len(whole))
+        damaged[place // 8] ^= 1 << place % 8
+        (tmp_path / "damaged.npz").write_bytes(damaged)
+        if archive_problem(tmp_path / "damaged.npz"):
+            found += 1
+            continue
+        with np.load(tmp_path / "damaged.npz") as loaded:
+            for name in set(loaded.files) & set(arrays):
+                np.testing.assert_array_equal(loaded[name], arrays[name])
+    assert found > 75

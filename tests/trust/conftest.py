@@ -1,0 +1,110 @@
+"""A recording small enough for hundreds of runs, and what was made of it without any mishap."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from trust_commands import Commands, compiled_faults, contents
+
+from d2_plugin.captures.export.folder import save_capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+
+ROWS = Path(__file__).parents[1] / "data" / "runs.jsonl"
+TRAINED = ["--train-cameras", "train0,train1", "--priors.stereo.matcher", "sweep"]
+
+
+@dataclass(frozen=True)
+class Work:
+    """A command whose output can be made again: what it needs first, its words, and where it writes."""
+
+    words: list[str]
+    output: Path
+    begin: Callable[[], None]
+
+    def anew(self) -> None:
+        """As before the first command."""
+        shutil.rmtree(self.folder)
+        self.folder.mkdir()
+        self.begin()
+
+    @property
+    def folder(self) -> Path:
+        """The folder that the output appears in, and where nothing else is."""
+        return self.output.parent
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """The work by its name, and what each leaves when nothing goes wrong."""
+
+    folder: Path
+    capture: Path
+    commands: Commands
+    work: dict[str, Work]
+    whole: dict[str, dict[str, Any]]
+    operations: dict[str, int]
+    renames: dict[str, int]
+    seconds: dict[str, float]
+
+
+@pytest.fixture(scope="session")
+def commands(tmp_path_factory: pytest.TempPathFactory) -> Commands:
+    pytest.importorskip("cv2")
+    pytest.importorskip("pycolmap")
+    folder = tmp_path_factory.mktemp("faults")
+    library = compiled_faults(folder)
+    if library is None:
+        pytest.skip("no C compiler, or no Linux: faults are preloaded")
+    return Commands(library, folder)
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    capture = synthetic_capture(cameras=2, held_out=1, frames=2, width=96, height=54, arc_degrees=15)
+    return save_capture(capture, tmp_path_factory.mktemp("trust") / "room")
+
+
+@pytest.fixture(scope="session")
+def workplace(commands: Commands, recording: Path) -> Workplace:
+    from trust_commands import Fault, measured
+
+    folder = recording.parent
+    priors, run, out = folder / "priors", folder / "run", folder / "written" / "out"
+    out.parent.mkdir()
+    train = ["train", str(recording), *TRAINED, "--iterations", "5", "--priors", str(priors), "--export-ply"]
+    for words in (["priors", str(recording), *TRAINED, "--output", str(priors)], [*train, "--output", str(run)]):
+        ended = commands.run(words)
+        assert ended.code == 0, ended.said
+
+    def trained() -> None:
+        shutil.copytree(run, out)
+        (out / "metrics.json").unlink()
+
+    export = ["export-capture", str(recording), "--format", "transforms", "--points", "50", "--output"]
+    work = {
+        "priors": Work(["priors", str(recording), *TRAINED, "--output", str(out)], out, lambda: None),
+        "train": Work([*train, "--output", str(out)], out, lambda: None),
+        "eval": Work(["eval", str(out)], out, trained),
+        "export": Work([*export, str(out)], out, lambda: None),
+        "report": Work(["report", str(ROWS), "--output", str(out)], out, lambda: None),
+    }
+    whole, operations, renames, seconds = {}, {}, {}, {}
+    for name, one in work.items():
+        one.anew()
+        with measured() as took:
+            ended = commands.run(one.words, Fault(one.folder))
+        assert ended.code == 0, ended.said
+        assert [path.name for path in one.folder.iterdir()] == ["out"]
+        whole[name], operations[name], renames[name] = contents(out), ended.operations, ended.renames
+        seconds[name] = took[0]
+        counts = (name, ended.operations, ended.renames, took[0])
+        logging.getLogger(__name__).info("%s: %d operations, %d renames, %.1f s", *counts)
+    return Workplace(folder, recording, commands, work, whole, operations, renames, seconds)
+
+

@@ -1,0 +1,209 @@
+"""`d2` commands in processes of their own that can be killed, and whose disk can be made to fail.
+
+They are forked from one process that has imported everything, so that one costs what the command costs. `faults.c`,
+preloaded there, makes the operating system fail; nothing of the package is patched.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import json
+import multiprocessing
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+import torch
+
+SOURCE = Path(__file__).parent / "trust" / "faults.c"
+COUNT, FAIL_ONCE, FAIL_FROM, KILL_BEFORE_RENAME, KILL_AFTER_RENAME = range(5)
+PRELOADED = [
+    *("torch", "torch._dynamo", "torch.onnx", "sympy", "cv2", "pycolmap"),
+    *("d2_plugin.commands.cli", "d2_plugin.runs.run", "d2_plugin.runs.evaluation", "d2_plugin.priors.build"),
+    *("d2_plugin.backbones.yang4d", "d2_plugin.adapters.yang4d", "d2_plugin.study.capture_export"),
+    *("d2_plugin.study.report.report", "trust_commands"),
+]
+"""What the commands import, some of it late."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What goes wrong with files below a folder: at the operation or rename of this number, with this error."""
+
+    folder: Path
+    how: int = COUNT
+    at: int = 0
+    error: int = 0
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended."""
+
+    code: int | None
+    said: str
+    operations: int = 0
+    renames: int = 0
+
+    @property
+    def refusal(self) -> str:
+        """The one sentence of a command that was refused; fails where it ended in any other way."""
+        assert self.code == 2, f"exit code {self.code}:\n{self.said[-2000:]}"
+        assert "Traceback" not in self.said, self.said
+        told = [line for line in self.said.splitlines() if line.startswith("d2: ")]
+        assert len(told) == 1, self.said
+        return told[0]
+
+
+def compiled_faults(folder: Path) -> Path | None:
+    """The library to preload, None where nothing compiles C."""
+    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None or not sys.platform.startswith("linux"):
+        return None
+    library = folder / "faults.so"
+    subprocess.run([compiler, "-shared", "-fPIC", "-O1", str(SOURCE), "-o", str(library), "-ldl"], check=True)
+    return library
+
+
+class Commands:
+    """Starts commands; `library` is what `compiled_faults` made, or None where none shall fail."""
+
+    def __init__(self, library: Path | None, logs: Path) -> None:
+        self.logs, self._count = logs, 0
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload(PRELOADED)
+        changed = {"OMP_NUM_THREADS": "1", "LD_PRELOAD": "" if library is None else str(library)}
+        before = {name: os.environ.get(name) for name in changed}
+        os.environ.update(changed)
+        try:
+            first = self._context.Process(target=_nothing)  # starts the process that the others are forked from
+            first.start()
+            first.join()
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+    def start(self, words: list[str], fault: Fault | None = None) -> Started:
+        """A command that runs while this one goes on."""
+        self._count += 1
+        log = self.logs / f"{os.getpid()}-{self._count}.log"
+        armed = None if fault is None else (str(fault.folder), fault.how, fault.at, fault.error)
+        process = self._context.Process(target=_command, args=(words, str(log), armed))
+        process.start()
+        return Started(process, log)
+
+    def run(self, words: list[str], fault: Fault | None = None, limit: float = 300) -> Ended:
+        """A command, run to its end."""
+        return self.start(words, fault).end(limit)
+
+    def kill_after(self, words: list[str], seconds: float) -> Ended:
+        """A command that is killed (SIGKILL) after so many seconds, unless it ended before."""
+        started = self.start(words)
+        started.process.join(seconds)
+        started.process.kill()
+        return started.end()
+
+
+@dataclass(frozen=True)
+class Started:
+    """A command that runs."""
+
+    process: BaseProcess
+    log: Path
+
+    def end(self, limit: float = 300) -> Ended:
+        """Wait for it; one that takes longer is killed and reported."""
+        self.process.join(limit)
+        if self.process.is_alive():
+            self.process.kill()
+            raise AssertionError(f"did not end within {limit} s: {self.log.read_text()[-2000:]}")
+        said = self.log.read_text(errors="replace") if self.log.exists() else ""
+        counted = re.search(r"^counted (\d+) (\d+)$", said, re.MULTILINE)
+        operations, renames = (int(n) for n in counted.groups()) if counted else (0, 0)
+        return Ended(self.process.exitcode, said, operations, renames)
+
+
+def killed(ended: Ended) -> bool:
+    """Whether it ended by SIGKILL."""
+    return ended.code == -signal.SIGKILL
+
+
+def _nothing() -> None:
+    return
+
+
+def _command(words: list[str], log: str, fault: tuple[str, int, int, int] | None) -> None:
+    """What the new process does."""
+    descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(descriptor, 1)
+    os.dup2(descriptor, 2)
+    sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
+    torch.set_num_threads(1)
+    from d2_plugin.commands.cli import main
+    from d2_plugin.progress import be_silent
+
+    be_silent()
+    shim = ctypes.CDLL(None)
+    if fault is not None:
+        folder, how, at, error = fault
+        shim.d2_fault_arm(folder.encode(), ctypes.c_int(how), ctypes.c_long(at), ctypes.c_int(error))
+    code = main(words)
+    if fault is not None:
+        sys.stderr.write(f"counted {shim.d2_fault_operations()} {shim.d2_fault_renames()}\n")
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def contents(folder: Path) -> dict[str, Any]:
+    """Everything below a folder by relative name, without what tells the time: hashes of files, and tables and
+    checkpoints without seconds and circumstances."""
+    found: dict[str, Any] = {}
+    for path in sorted(folder.rglob("*")):
+        name = str(path.relative_to(folder))
+        if path.is_symlink():
+            found[name] = f"link to {os.readlink(path)}"
+        elif path.is_file():
+            found[name] = _content(path)
+    return found
+
+
+def _content(path: Path) -> Any:
+    if path.name == "metrics.json":
+        table = json.loads(path.read_text())
+        return {name: value for name, value in table.items() if name not in ("seconds", "made", "seal")}
+    if path.name == "checkpoint.pt":
+        state = torch.load(path, weights_only=True)
+        del state["seconds"]
+        return _digest(state)
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _digest(state: Any) -> Any:
+    if isinstance(state, torch.Tensor):
+        return hashlib.sha256(state.numpy().tobytes()).hexdigest()
+    if isinstance(state, dict):
+        return {str(name): _digest(value) for name, value in state.items()}
+    return [_digest(value) for value in state] if isinstance(state, list | tuple) else state
+
+
+@contextmanager
+def measured() -> Iterator[list[float]]:
+    """The seconds that something took, in a list of one."""
+    seconds = [0.0]
+    start = time.monotonic()
+    try:
+        yield seconds
+    finally:
+        seconds[0] = time.monotonic() - start
