@@ -95,7 +95,7 @@ class Run:
         """
         from d2_plugin.runs.tables import write_tables
 
-        trainer = self._trained()
+        trainer = self.trained()
         with self._timed("eval"):
             scores = self._scores(trainer.model, self.folder / "pictures" if pictures else None)
         metrics = scores | self._about(trainer)
@@ -152,7 +152,7 @@ class Run:
         """
         from d2_plugin.runs.gaussian_ply import write_ply
 
-        trainer = self._trained()
+        trainer = self.trained()
         paths = []
         for frame in self.scene.capture.frames:
             view = make_view(self.scene.capture, self.scene.train_cameras[0], frame, self.settings.device)
@@ -207,7 +207,7 @@ class Run:
         records = [record for key in keys if (record := store.record(*key)) is not None]
         return bool(records) and sum(r["shares"].get("far", 0.0) for r in records) / len(records) > FAR_SHARE
 
-    def _trained(self) -> Any:
+    def trained(self) -> Any:
         """The trainer at the last checkpoint, without hooks or a look at the prior: the checkpoint says it all."""
         trainer = self._trainer(self._points(), attach=False)
         if not self._restore(trainer):
