@@ -24,6 +24,7 @@ COMMANDS = (
     "bench",
     "stability",
     "report",
+    "export",
     "export-capture",
     "doctor",
 )

@@ -8,6 +8,7 @@ With mean (m, mu_t) and covariance S = [[S_xx, S_xt], [S_tx, S_tt]] a 4D Gaussia
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -42,10 +43,15 @@ class Harmonics(NamedTuple):
     degree: int
     time_degree: int = 0
 
-    def at_mean_times(self) -> Tensor:
-        """Coefficients [N, (degree + 1)^2, 3] at t = mu_t, where every cosine is 1: for formats without cosines."""
-        count = (self.degree + 1) ** 2
-        return self.coefficients.unflatten(1, (self.time_degree + 1, count)).sum(1)
+    def without_time(self, phase: Tensor | None = None) -> Tensor:
+        """Coefficients [N, (degree + 1)^2, 3] at `phase` [N], (t - mu_t) / duration; at t = mu_t if not given.
+
+        For formats without cosines in time."""
+        parts = self.coefficients.unflatten(1, (self.time_degree + 1, (self.degree + 1) ** 2))
+        if phase is None:
+            return parts.sum(1)
+        orders = torch.arange(self.time_degree + 1).to(phase)
+        return (parts * torch.cos(2 * math.pi * phase[:, None] * orders)[..., None, None]).sum(1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
 
 from .codes import Coded, decode, encode, morton_order
-from .keys import ALPHA_MIN, Keys, State, cholesky
+from .keys import ALPHA_MIN, Keys, Offset, State, cholesky
 
 MARGINAL_REACH = math.sqrt(-2 * math.log(MARGINAL_CUT))
 """Standard deviations from mu_t at which a Gaussian is cut off: F = `MARGINAL_CUT`."""
@@ -44,7 +44,7 @@ class CodedScene:
 
 def code_lines(gaussians: MovingGaussians, duration: float) -> CodedScene:
     """Gaussians on straight lines, or standing still; those that are never seen in the clip are left out."""
-    rows = _seen(gaussians, duration)
+    rows = seen_rows(gaussians, duration)
     rows = rows[torch.from_numpy(morton_order(gaussians.positions[rows].numpy()))]
     chosen = gaussians.select(rows)
     arrays, positions = [], chosen.positions
@@ -80,8 +80,6 @@ def read_state(arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any], durat
     if facts["motion"] == "none":
         return start
     if facts["motion"] == "keys":
-        from .keys import Offset
-
         told = facts["keys"]
         states = tuple(_read_key(arrays, i, start) for i in range(len(told["times"])))
         rows = torch.arange(len(start.positions))
@@ -120,7 +118,7 @@ def _read_key(arrays: Mapping[str, np.ndarray], i: int, start: State) -> State:
     return State(_tensor(arrays[f"positions_{i}"]), factors_of(arrays[f"shapes_{i}"]), opacities)
 
 
-def _seen(gaussians: MovingGaussians, duration: float) -> Tensor:
+def seen_rows(gaussians: MovingGaussians, duration: float) -> Tensor:
     """Rows that are finite and reach an opacity of 1/255 at some time of the clip."""
     parts = [gaussians.positions, gaussians.covariances, gaussians.harmonics.coefficients.flatten(1)]
     strongest = gaussians.opacities

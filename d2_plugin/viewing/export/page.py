@@ -23,8 +23,9 @@ from d2_plugin.runs.drawing import color_scale
 
 from .codes import BLOCK, packed, to_json, unpacked
 from .coded_scene import MARGINAL_REACH, CodedScene, code_keys, code_lines, read_harmonics, read_state
-from .keys import ALPHA_MIN, Keys, Offset, State, bake, distance, state_at
+from .keys import Keys, Offset, State, bake
 from .outlook import look_around
+from .rounding import rounding, states_of
 from .scene import ExportScene
 
 VERSION = 1
@@ -102,22 +103,10 @@ def _coded(scene: ExportScene, megabytes: float) -> tuple[CodedScene, Keys | Non
 
 
 def _rounding(scene: ExportScene, coded: CodedScene, keys: Keys | None) -> Offset:
-    """How far the codes put a Gaussian off, in pixels: the file read back against what went in, over five instants."""
     arrays = unpacked(*packed(coded.arrays))
-    duration, worst = scene.clip.duration, torch.zeros(len(coded.rows)).double()
-    before = None
-    for time in sorted({duration * i / 4 for i in range(5)}):
-        read = read_state(arrays, coded.facts, duration, time)
-        if keys is not None:
-            true = keys.at(time)
-        else:
-            assert scene.moving is not None
-            moving = scene.moving
-            true = before = state_at(moving.at, len(moving), time, before)
-            true = true.select(coded.rows)
-        pixels = distance(torch.cat(true[:2], 1), torch.cat(read[:2], 1)) * scene.pixels_per_unit(true.positions)
-        worst = torch.maximum(worst, torch.where(true.opacities >= ALPHA_MIN, pixels, 0))
-    return Offset.of(worst)
+    assert scene.moving is not None or keys is not None
+    true_at = keys.at if keys is not None else states_of(scene.moving.select(coded.rows))
+    return rounding(scene, true_at, lambda time: read_state(arrays, coded.facts, scene.clip.duration, time))
 
 
 def _about(scene: ExportScene, coded: CodedScene, keys: Keys | None, rounding: Offset) -> list[str]:

@@ -65,6 +65,18 @@ class ExportScene:
             largest = torch.maximum(largest, torch.where(seen, intrinsics[0, 0] / depth, 0))
         return largest
 
+    def still_at(self, time: float) -> MovingGaussians:
+        """The Gaussians of one instant, with the colours of that instant."""
+        splats = self.splats_at(time)
+        rows = splats.rows.cpu()
+        own = self.harmonics._replace(coefficients=self.harmonics.coefficients[rows])
+        phase = None
+        if self.moving is not None and self.moving.motion is not None and own.time_degree:
+            phase = (time - self.moving.motion.times[rows]) / max(self.clip.duration, 1e-12)
+        still = Harmonics(own.without_time(phase), own.degree)
+        parts = (splats.means, splats.covariances, splats.opacities)
+        return MovingGaussians(*(part.double() for part in parts), still)
+
     def restricted(self, frames: Sequence[int]) -> Clip:
         """The clip's frames with these numbers."""
         for frame in frames:
