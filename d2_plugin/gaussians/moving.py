@@ -82,9 +82,7 @@ class MovingGaussians:
         """The Gaussians `rows`, an index or a mask, in its order."""
         motion = None if self.motion is None else LinearMotion(*(part[rows] for part in self.motion))
         harmonics = self.harmonics._replace(coefficients=self.harmonics.coefficients[rows])
-        return MovingGaussians(
-            self.positions[rows], self.covariances[rows], self.opacities[rows], harmonics, motion
-        )
+        return MovingGaussians(self.positions[rows], self.covariances[rows], self.opacities[rows], harmonics, motion)
 
 
 @torch.no_grad()

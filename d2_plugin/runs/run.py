@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -241,7 +242,11 @@ class Run:
         path = self.folder / "checkpoint.pt"
         if not path.is_file():
             return False
-        state = torch.load(path, map_location=self.settings.device, weights_only=True)
+        try:
+            state = torch.load(path, map_location=self.settings.device, weights_only=True)
+        except (RuntimeError, EOFError, OSError, pickle.UnpicklingError) as failure:
+            why = str(failure).partition("\n")[0]
+            raise D2Error(f"cannot read {path} ({why}): delete it, and `d2 train` begins the run anew") from None
         self.retired = dict(state["d2"]["retired"]) if state["d2"] else {}
         if trainer.d2 is None:
             state["d2"] = None

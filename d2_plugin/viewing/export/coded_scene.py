@@ -169,5 +169,3 @@ def _facts(count: int, motion: str, harmonics: Harmonics, keys: dict[str, Any] |
 
 def _tensor(values: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(values, np.float64))
-
-

@@ -34,7 +34,8 @@ class Coded:
 
 def encode(name: str, values: np.ndarray, bits: int = 16) -> Coded:
     """Code `values` [N, C] (or [N]); all finite."""
-    values = np.asarray(values, np.float64).reshape(len(values), -1)
+    values = np.asarray(values, np.float64)
+    values = values[:, None] if values.ndim == 1 else values
     rows, columns = values.shape
     blocks = -(-rows // BLOCK)
     padded = np.concatenate([values, np.repeat(values[-1:], blocks * BLOCK - rows, axis=0)])

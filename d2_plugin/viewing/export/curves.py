@@ -54,5 +54,3 @@ def fit_curves(scene: ExportScene) -> Curves:
     harmonics = scene.harmonics._replace(coefficients=scene.harmonics.coefficients[kept])
     shown = MovingGaussians(fitted[0], covariances_of(factors), opacities[:, kept].mean(0), harmonics, motion)
     return Curves(shown, fitted[2:].transpose(0, 1).contiguous(), Offset.of(off))
-
-

@@ -59,7 +59,9 @@ def run(settings: Export) -> str:
     """Write the export; returns what was written, how large it is, and how far off."""
     scene = scene_of(Run.load(settings.run_folder), settings.unfinished)
     if settings.frames is not None and settings.format not in FRAME_FORMATS:
-        raise D2Error(f"--frames is for {' and '.join(FRAME_FORMATS)}: {settings.format} holds the whole clip, leave it out")
+        raise D2Error(
+            f"--frames is for {' and '.join(FRAME_FORMATS)}: {settings.format} holds the whole clip, leave it out"
+        )
     made = export_scene(scene, settings, settings.output or settings.run_folder / "export")
     what = str(made.paths[0]) if len(made.paths) == 1 else f"{len(made.paths)} files in {made.paths[0].parent}"
     return "\n".join([f"{what} ({made.size / 1e6:.1f} MB)", *made.notes])
@@ -71,7 +73,9 @@ def export_scene(scene: ExportScene, settings: Export, folder: Path) -> Made:
     made = FORMATS[settings.format](scene, settings, folder)
     if scene.background is None or settings.format == "html":
         return made
-    return made._replace(notes=(*made.notes, "the sky behind the Gaussians is not in it: the format has no place for it"))
+    return made._replace(
+        notes=(*made.notes, "the sky behind the Gaussians is not in it: the format has no place for it")
+    )
 
 
 def _html(scene: ExportScene, settings: Export, folder: Path) -> Made:
@@ -85,7 +89,9 @@ def _splatv(scene: ExportScene, settings: Export, folder: Path) -> Made:
         shown = _shown(scene)
         write_splatv(path, shown, duration, cameras)
         read = read_splatv(path, duration)
-        return Made((path,), (f"16-bit floats: off by {rounding(scene, states_of(shown), states_of(read))}", *_colors(shown)))
+        return Made(
+            (path,), (f"16-bit floats: off by {rounding(scene, states_of(shown), states_of(read))}", *_colors(shown))
+        )
     curves = fit_curves(scene)
     write_splatv(path, curves.gaussians, duration, cameras, curves.bends)
     return Made((path,), (f"one cubic curve for each Gaussian: off by {curves.offset}", *_colors(curves.gaussians)))

@@ -8,6 +8,7 @@ or the size is used up. A Gaussian that never leaves its first key by more than 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -26,7 +27,7 @@ GOOD = 0.1
 """Pixels that one Gaussian in a hundred may be off between keys where the size allows it."""
 SAMPLE = 20_000
 """Gaussians by which keys are chosen; the error that is told is that of all."""
-MANY = 30
+MANY = 10
 """Frames of which each one may be a key, and nothing between them."""
 MOST_CHECKS = 24
 """Instants at which the error is measured at most: a large field takes seconds for each."""
@@ -175,7 +176,7 @@ class _Travel(NamedTuple):
 
 
 def _middles(times: Sequence[float]) -> list[float]:
-    return [(a + b) / 2 for a, b in zip(times, times[1:])]
+    return [(a + b) / 2 for a, b in itertools.pairwise(times)]
 
 
 def _travel(

@@ -1,8 +1,8 @@
 """Gaussians on straight lines in the formats of existing players: `.splatv` and `.ftgs.ply`.
 
 Both take time as 0..1 of the clip, so with a clip of T seconds: mu' = mu / T, sigma' = sigma / T, v' = v T.
-`.splatv` (antimatter15/splaTV, gsplat.js): F = exp(-(dt / s)^2), s = sqrt(2) sigma', positions in 32-bit and all else in
-16-bit floats, one colour for every direction. `.ftgs.ply`: 3DGS columns with time, ln sigma' and v', all 32-bit floats.
+`.splatv` (antimatter15/splaTV, gsplat.js): F = exp(-(dt / s)^2), s = sqrt(2) sigma', positions in 32-bit, all else in 16-bit
+floats, one colour for every direction. `.ftgs.ply`: 3DGS columns with time, ln sigma' and v', all 32-bit floats.
 Neither knows colours that change in time: each Gaussian gets that of its mean time.
 """
 
@@ -28,7 +28,7 @@ from .ply_files import covariances_from, read_columns, still_gaussians
 SPLATV_MAGIC, SPLATV_WIDTH = 0x674B, 4096
 FTGS_NAMES = ("time", "log_duration", "velocity_0", "velocity_1", "velocity_2")
 FOREVER = 1e4
-"""sigma' of a Gaussian that stands still and never fades: F differs from 1 by less than 1e-8, and it is a half float."""
+"""sigma' of a Gaussian that stands still and never fades: F differs from 1 by less than 1e-8; a half float holds it."""
 SPLATV_ROW = np.dtype(
     [
         ("position", "<f4", 3),
@@ -82,7 +82,7 @@ def read_splatv(path: Path, duration: float) -> MovingGaussians:
     rows = _rows(words)
     rows = rows[rows["color"][:, 3] > 0]
     span = duration or 1.0
-    parts = {name: torch.from_numpy(rows[name].astype(np.float64)) for name in rows.dtype.names}
+    parts = {name: torch.from_numpy(rows[name].astype(np.float64)) for name in rows.dtype.names or ()}
     times, widths = parts["fading"].unbind(-1)
     motion = LinearMotion(parts["motion"][:, :3] / span, times * span, widths * span / math.sqrt(2))
     coefficients = ((parts["color"][:, None, :3] / 255) - 0.5) / SH_C0
@@ -123,7 +123,9 @@ def _motion(gaussians: MovingGaussians) -> LinearMotion:
     if gaussians.motion is not None:
         return gaussians.motion
     count = len(gaussians)
-    return LinearMotion(torch.zeros(count, 3).double(), torch.zeros(count).double(), torch.full((count,), FOREVER).double())
+    return LinearMotion(
+        torch.zeros(count, 3).double(), torch.zeros(count).double(), torch.full((count,), FOREVER).double()
+    )
 
 
 def _half(values: np.ndarray) -> np.ndarray:

@@ -21,8 +21,8 @@ from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
 from d2_plugin.runs.drawing import color_scale
 
-from .codes import BLOCK, packed, to_json, unpacked
 from .coded_scene import MARGINAL_REACH, CodedScene, code_keys, code_lines, read_harmonics, read_state
+from .codes import BLOCK, packed, to_json, unpacked
 from .keys import Keys, Offset, State, bake
 from .outlook import look_around
 from .rounding import rounding, states_of
@@ -104,15 +104,19 @@ def _coded(scene: ExportScene, megabytes: float) -> tuple[CodedScene, Keys | Non
 
 def _rounding(scene: ExportScene, coded: CodedScene, keys: Keys | None) -> Offset:
     arrays = unpacked(*packed(coded.arrays))
-    assert scene.moving is not None or keys is not None
-    true_at = keys.at if keys is not None else states_of(scene.moving.select(coded.rows))
+    if keys is None:
+        assert scene.moving is not None
+        true_at = states_of(scene.moving.select(coded.rows))
+    else:
+        true_at = keys.at
     return rounding(scene, true_at, lambda time: read_state(arrays, coded.facts, scene.clip.duration, time))
 
 
 def _about(scene: ExportScene, coded: CodedScene, keys: Keys | None, rounding: Offset) -> list[str]:
     frames = len(scene.clip.frames)
+    plural = "s" if frames > 1 else ""
     lines = [
-        f"{coded.facts['count']:,} Gaussians, {frames} frame{'s' if frames > 1 else ''} at {scene.clip.fps:g} per second",
+        f"{coded.facts['count']:,} Gaussians, {frames} frame{plural} at {scene.clip.fps:g} per second",
         f"16-bit codes: off by {rounding}",
     ]
     if keys is not None:
@@ -147,9 +151,7 @@ def _header(scene: ExportScene, coded: CodedScene) -> dict[str, Any]:
             "alpha_min": raster.alpha_min,
             "fov_clamp": min(raster.fov_clamp, 1e6),
         },
-        "cameras": [
-            _camera(camera, camera.name in held_out) for camera in (*scene.train_cameras, *scene.test_cameras)
-        ],
+        "cameras": [_camera(camera, camera.name in held_out) for camera in (*scene.train_cameras, *scene.test_cameras)],
         "background": None if scene.background is None else scene.background.tolist(),
         "palette": color_scale("viridis").tobytes().hex(),
         "depth_range": list(outlook.depth_range),

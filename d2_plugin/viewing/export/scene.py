@@ -74,8 +74,8 @@ class ExportScene:
         if self.moving is not None and self.moving.motion is not None and own.time_degree:
             phase = (time - self.moving.motion.times[rows]) / max(self.clip.duration, 1e-12)
         still = Harmonics(own.without_time(phase), own.degree)
-        parts = (splats.means, splats.covariances, splats.opacities)
-        return MovingGaussians(*(part.double() for part in parts), still)
+        means, covariances, opacities = (part.double() for part in splats[:3])
+        return MovingGaussians(means, covariances, opacities, still)
 
     def restricted(self, frames: Sequence[int]) -> Clip:
         """The clip's frames with these numbers."""
@@ -109,7 +109,9 @@ def scene_of(run: Run, unfinished: bool = False) -> ExportScene:
 def scene_of_model(model: Any, run: Run) -> ExportScene:
     """A model of the run's backbone with the cameras and the clip of the run."""
     capture = run.scene.capture
-    train, test = ([capture.cameras[name] for name in names] for names in (run.scene.train_cameras, run.scene.test_cameras))
+    train, test = (
+        [capture.cameras[name] for name in names] for names in (run.scene.train_cameras, run.scene.test_cameras)
+    )
     clip = Clip(capture.frames, tuple(capture.seconds(frame) for frame in capture.frames), capture.fps)
     view = make_view(capture, train[0].name, capture.frames[0], run.settings.device)
     raster = getattr(getattr(model, "settings", None), "raster", RasterSettings())

@@ -67,7 +67,9 @@ def read_spz(path: Path) -> MovingGaussians:
     sizes = {"position": 9, "opacity": 1, "color": 3, "scale": 3, "rotation": 4, "harmonics": 3 * terms}
     columns, offset = {}, HEADER.itemsize
     for name, size in sizes.items():
-        columns[name] = np.frombuffer(raw[offset : offset + size * count], np.uint8).reshape(count, size).astype(np.int64)
+        columns[name] = (
+            np.frombuffer(raw[offset : offset + size * count], np.uint8).reshape(count, size).astype(np.int64)
+        )
         offset += size * count
     low, middle, high = columns["position"].reshape(count, 3, 3).transpose(2, 0, 1)
     fixed = low | middle << 8 | high << 16

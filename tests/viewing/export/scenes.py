@@ -32,9 +32,11 @@ def sharp_model(backbone: str, count: int = 400, **options: object) -> SplatMode
         if "right" in rows:
             rows["right"].copy_(rows["left"] + 0.05 * torch.randn(count, 4, generator=generator))
             rows["log_time_scales"] += 0.5 * torch.randn(count, generator=generator)
-        if backbone == "mlp":
+        if backbone == "hexplane":
             model.deforms = True
-            model.field.heads.weight.normal_(0, 0.004, generator=generator)
+            for plane in model.field.time:
+                plane += 0.3 * torch.randn(plane.shape, generator=generator)
+            model.field.heads.weight.normal_(0, 0.2, generator=generator)
     return model
 
 
@@ -46,7 +48,9 @@ def larger(view: View) -> View:
     return View(view.camera, view.frame, view.time, view.T_camera_world, intrinsics, WIDTH, HEIGHT)
 
 
-def make_scene(model: SplatModel, name: str = "tiny", cameras: tuple[str, ...] = ("left", "middle", "right")) -> ExportScene:
+def make_scene(
+    model: SplatModel, name: str = "tiny", cameras: tuple[str, ...] = ("left", "middle", "right")
+) -> ExportScene:
     """The model seen by three cameras over a clip of twelve frames; the last camera is held out."""
     views = [larger(view) for view in make_views()[:3]]
     made = [

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from scenes import DURATION, NASTY, make_scene, psnr, rasterized, sharp_model
+import torch
+from viewing.chromium import Page, browser, executable, picture
+from viewing.export.scenes import DURATION, NASTY, make_scene, psnr, rasterized, sharp_model
 
-from chromium import Page, browser, executable, picture
 from d2_plugin.backbones.model import SplatModel
-from d2_plugin.viewing.export.page import write_page
+from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
+from d2_plugin.runs.drawing import color_scale, colorize
+from d2_plugin.viewing.export.page import read_page, write_page
 
 pytestmark = pytest.mark.browser
 
@@ -48,7 +52,7 @@ def models() -> dict[str, tuple[SplatModel, float]]:
     """Models by name with the least agreement in dB: a baked field is straight between its keys."""
     return {
         "4D Gaussians": (sharp_model("yang4d"), 30.0),
-        "deformation field": (sharp_model("mlp"), 28.0),
+        "deformation field": (sharp_model("hexplane"), 28.0),
         "one instant": (sharp_model("yang4d", temporal=False), 30.0),
     }
 
@@ -76,10 +80,6 @@ def test_pictures_of_other_times_and_cameras_would_not_pass(new_page: Any, tmp_p
 
 
 def test_harmonics_and_cosines_in_time_and_a_sky_are_drawn(new_page: Any, tmp_path: Path) -> None:
-    import torch
-
-    from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
-
     plain = sharp_model("yang4d")
     rows = {name: value.detach() for name, value in plain.gaussians.parameters.items()}
     generator = torch.Generator().manual_seed(3)
@@ -89,8 +89,6 @@ def test_harmonics_and_cosines_in_time_and_a_sky_are_drawn(new_page: Any, tmp_pa
     with torch.no_grad():
         model.background.harmonics.normal_(0, 0.2, generator=generator)
     scene_background = torch.cat([model.background.constant, model.background.harmonics]).detach().double()
-    from dataclasses import replace
-
     path = tmp_path / "scene.html"
     write_page(replace(make_scene(model, "sky", CAMERAS), background=scene_background), path)
     page = new_page().open(path)
@@ -99,9 +97,6 @@ def test_harmonics_and_cosines_in_time_and_a_sky_are_drawn(new_page: Any, tmp_pa
 
 
 def test_the_depth_view_is_the_expected_depth_on_its_scale(new_page: Any, tmp_path: Path) -> None:
-    from d2_plugin.runs.drawing import color_scale, colorize
-    from d2_plugin.viewing.export.page import read_page
-
     model = sharp_model("yang4d")
     page = opened(new_page, model, tmp_path / "scene.html")
     true = rasterized(model, 1, TIMES[1])
@@ -113,8 +108,11 @@ def test_the_depth_view_is_the_expected_depth_on_its_scale(new_page: Any, tmp_pa
 def test_the_slider_and_the_play_button_move_time(new_page: Any, tmp_path: Path) -> None:
     page = opened(new_page, sharp_model("yang4d"), tmp_path / "scene.html")
     canvas = page.page.locator("#picture")
-    screen = "async () => { const p = await d2; while (p.busy || !p.drawnSharp) await new Promise((r) => setTimeout(r, 20)); \
-        return document.getElementById('picture').toDataURL('image/png'); }"
+    screen = """async () => {
+        const p = await d2;
+        while (p.busy || !p.drawnSharp) await new Promise((resolve) => setTimeout(resolve, 20));
+        return document.getElementById('picture').toDataURL('image/png');
+    }"""
     before = picture(page.run(screen))
     page.page.locator("#time").fill("0.4")
     assert page.run("d2.then((player) => player.time)") == pytest.approx(0.4)
