@@ -1,9 +1,9 @@
 """Gaussians on straight lines in the formats of existing players: `.splatv` and `.ftgs.ply`.
 
 Both take time as 0..1 of the clip, so with a clip of T seconds: mu' = mu / T, sigma' = sigma / T, v' = v T.
-`.splatv` (antimatter15/splaTV, gsplat.js): F = exp(-(dt / s)^2), s = sqrt(2) sigma', positions in 32-bit, all else in 16-bit
-floats, one colour for every direction. `.ftgs.ply`: 3DGS columns with time, ln sigma' and v', all 32-bit floats.
-Neither knows colours that change in time: each Gaussian gets that of its mean time.
+`.splatv` (antimatter15/splaTV, gsplat.js): F = exp(-(dt / s)^2), s = sqrt(2) sigma', positions in 32-bit floats,
+all else in 16-bit floats, one colour for every direction. `.ftgs.ply`: 3DGS columns with time, ln sigma' and v', all in
+32-bit floats. Neither knows colours that change in time: each Gaussian gets that of its mean time.
 """
 
 from __future__ import annotations

@@ -274,12 +274,12 @@ class TestStills:
         assert (count, degree) == (len(ours), 3)
         positions, scales, rotations, alphas, colors, harmonics = (np.array(c).reshape(count, -1) for c in columns)
         np.testing.assert_allclose(positions * (1, -1, -1), ours.positions.numpy(), atol=1e-5)
-        np.testing.assert_allclose(1 / (1 + np.exp(-alphas[:, 0])), ours.opacities.numpy(), atol=1e-4)
-        np.testing.assert_allclose(colors, ours.harmonics.coefficients[:, 0].numpy(), atol=1e-4)
+        np.testing.assert_allclose(alphas[:, 0], ours.opacities.numpy(), atol=1e-4)
+        np.testing.assert_allclose(colors, (0.5 + SH_C0 * ours.harmonics.coefficients[:, 0]).numpy(), atol=1e-3)
         theirs = (harmonics.reshape(count, 15, 3) * FLIPS[:, None]).astype(float)
         np.testing.assert_allclose(theirs, ours.harmonics.coefficients[:, 1:].numpy(), atol=1e-4)
         wxyz = torch.from_numpy((rotations * (1, -1, -1, 1))[:, [3, 0, 1, 2]].astype(float))
-        covariances = covariances_from(torch.from_numpy(np.exp(scales)), wxyz)
+        covariances = covariances_from(torch.from_numpy(scales.astype(float)), wxyz)
         torch.testing.assert_close(covariances, ours.covariances, rtol=1e-3, atol=1e-6)
 
 

@@ -27,6 +27,7 @@ const float LN_2 = 0.693147180559945, HALF_EXPONENT = 0.849321800288019;
 vec4 texel(sampler2D source, int index) { return texelFetch(source, ivec2(index & 4095, index >> 12), 0); }
 
 vec3 harmonics(vec3 d, int first, float phase) {
+  if (degree == 0 && timeDegree == 0) return max(0.5 + 0.28209479177387814 * texel(colors, first).rgb, 0.);
   float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
   float values[16];
   values[0] = 0.28209479177387814;
