@@ -29,8 +29,10 @@ SAMPLE = 20_000
 """Gaussians by which keys are chosen; the error that is told is that of all."""
 MANY = 10
 """Frames of which each one may be a key, and nothing between them."""
-MOST_CHECKS = 24
+MOST_CHECKS = 8
 """Instants at which the error is measured at most: a large field takes seconds for each."""
+MOST_STATES = 8_000_000
+"""Gaussians times instants that are evaluated and kept, 40 bytes each: of 300,000 Gaussians, 26 instants."""
 ALPHA_MIN = 1 / 255
 """Gaussians that stay below this are never drawn."""
 
@@ -144,6 +146,8 @@ def bake(
         most_keys: how many keys there may be, from the numbers of Gaussians that move and that change their shape.
     """
     times = list(frames) if len(frames) > MANY else sorted({*frames, *_middles(frames)})
+    most = int(np.clip(MOST_STATES // max(count, 1), 12, len(times)))
+    times = [times[i] for i in np.unique(np.linspace(0, len(times) - 1, most).round().astype(int))]
     travel = _travel(splats_at, count, times, pixels_per_unit)
     first, scale = travel.first, travel.scale
     rank = torch.where(travel.changes, 0, torch.where(travel.moves, 1, 2))
@@ -152,10 +156,9 @@ def bake(
     rows = order[torch.sort(rank[order], stable=True).indices]
     changing, moving = int((rank[rows] == 0).sum()), int((rank[rows] < 2).sum())
     chosen = _choose_keys(times, travel, most_keys(moving, changing))
-    states, before = [], first
+    states = []
     for time in chosen:
-        before = state_at(splats_at, count, time, before)
-        now = before.select(rows)
+        now = State(*(part[rows].double() for part in travel.states[times.index(time)]))
         states.append(State(now.positions[:moving], now.factors[:changing], now.opacities[:changing]))
     keys = Keys(tuple(chosen), first.select(rows), rows, moving, changing, tuple(states), Offset(0, 0, 0))
     between = [time for time in sorted({*times, *_middles(chosen)}) if time not in set(chosen)]
@@ -172,7 +175,7 @@ class _Travel(NamedTuple):
     changes: Tensor  # [N] bool, shape or opacity
     shown: Tensor  # [N] bool, drawn at some time
     sample: Tensor  # rows by which keys are chosen
-    path: list[Tensor]  # at each time, position and factor of the sample [S, 9]
+    states: list[State]  # at each time, float32
 
 
 def _middles(times: Sequence[float]) -> list[float]:
@@ -185,7 +188,7 @@ def _travel(
     state = first = state_at(splats_at, count, times[0])
     far, changed, faded = (torch.zeros(count).double() for _ in range(3))
     scale, strongest = torch.zeros(count).double(), first.opacities
-    sample, path = torch.arange(0, count, 1 + count // SAMPLE), []
+    sample, states = torch.arange(0, count, 1 + count // SAMPLE), []
     for time in times:
         state = state_at(splats_at, count, time, state)
         scale = torch.maximum(scale, pixels_per_unit(state.positions))
@@ -193,18 +196,19 @@ def _travel(
         changed = torch.maximum(changed, (state.factors - first.factors).norm(dim=-1))
         faded = torch.maximum(faded, (state.opacities - first.opacities).abs())
         strongest = torch.maximum(strongest, state.opacities)
-        path.append(torch.cat([state.positions, state.factors], 1)[sample].float())
+        states.append(State(*(part.float() for part in state)))
     # Outside every picture a moving Gaussian is held to what the others are held to.
     scale = torch.where(scale > 0, scale, scale[scale > 0].median() if bool((scale > 0).any()) else 1.0)
     changes = (changed * scale > STILL) | (faded > 1 / 510)
-    return _Travel(first, scale, far * scale > STILL, changes, strongest >= ALPHA_MIN, sample, path)
+    return _Travel(first, scale, far * scale > STILL, changes, strongest >= ALPHA_MIN, sample, states)
 
 
 def _choose_keys(times: Sequence[float], travel: _Travel, most: int) -> list[float]:
     """The first and the last time, then one after the other the time at which the straight lines are worst."""
     last, chosen = len(times) - 1, sorted({0, len(times) - 1})
     counts = (travel.shown & (travel.moves | travel.changes))[travel.sample]
-    path, sizes = [part[counts] for part in travel.path], travel.scale[travel.sample][counts].float()
+    path = [torch.cat(state.select(travel.sample)[:2], 1)[counts] for state in travel.states]
+    sizes = travel.scale[travel.sample][counts].float()
     errors = [0.0] * len(times)
 
     def measure(left: int, right: int) -> None:
