@@ -16,6 +16,8 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.moving import MovingGaussians, moving_gaussians
+from d2_plugin.gaussians.native_slice import STATIC
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d
 from d2_plugin.gaussians.slicing import slice_gaussians, unit_quaternions
 from d2_plugin.rasterizer import Splats, View
@@ -93,15 +95,23 @@ class Deform(SplatModel):
         """
         if self.field is not None and math.isnan(view.time):
             raise D2Error(f"the time of camera '{view.camera}', frame {view.frame} is NaN: give every view a time")
-        g = self.gaussians
-        raw = {name: g[name] for name in ("positions", "log_scales", "opacity_logits")} | {"left": g["rotations"]}
+        raw = self._canonical()
         noise = self._noise if torch.is_grad_enabled() else 0.0
-        offsets = self.offsets(g["positions"], view.time + noise)
+        offsets = self.offsets(raw["positions"], view.time + noise)
         if offsets is not None:
             raw["positions"] = raw["positions"] + offsets.positions
             raw["log_scales"] = raw["log_scales"] + offsets.log_scales
             raw["left"] = raw["left"] + offsets.rotations
         return slice_gaussians(raw)
+
+    def _canonical(self) -> dict[str, Tensor]:
+        g = self.gaussians
+        return {name: g["rotations" if name == "left" else name] for name in STATIC}
+
+    def moving(self) -> MovingGaussians | None:
+        """See `SplatModel.moving`: only while nothing is deformed."""
+        still = self.field is None or not self.deforms
+        return moving_gaussians(self._canonical(), self.harmonics()) if still else None
 
     def offsets(self, positions: Tensor, time: float) -> Offsets | None:
         """What the field adds at canonical `positions` [K, 3]; None where nothing is deformed (warm-up, no time)."""

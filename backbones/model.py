@@ -13,6 +13,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians import spherical_harmonics as sh
+from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 from d2_plugin.settings import NotNegative, Positive, Range, Settings
 
@@ -124,13 +125,22 @@ class SplatModel(ABC):
 
     def harmonic_colors(self, view: View, splats: Splats, phase: Tensor | None = None, time_degree: int = 0) -> Tensor:
         """Spherical harmonics in the direction of view, with `phase` [M] (fraction of the duration) also in time."""
-        coefficients = self.gaussians["base_colors"]
-        if "harmonics" in self.gaussians.parameters:
-            coefficients = torch.cat([coefficients, self.gaussians["harmonics"]], 1)
+        coefficients = self.harmonics().coefficients
         if len(splats.rows) < len(self):
             coefficients = coefficients.index_select(0, splats.rows)
         centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
         return sh.colors(coefficients, splats.means - centre, phase, self.settings.sh_degree, time_degree)
+
+    def harmonics(self) -> Harmonics:
+        """The colours of all Gaussians, differentiable."""
+        coefficients = self.gaussians["base_colors"]
+        if "harmonics" in self.gaussians.parameters:
+            coefficients = torch.cat([coefficients, self.gaussians["harmonics"]], 1)
+        return Harmonics(coefficients, self.settings.sh_degree)
+
+    def moving(self) -> MovingGaussians | None:
+        """The Gaussians as straight lines that fade in time, exactly; None where the model is not of that form."""
+        return None
 
     def render(self, view: View, background: Tensor | None = None) -> Render:
         """Colour, depth sum and alpha of one view, differentiable; remembers what `accumulate` needs afterwards.

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.moving import Harmonics, MovingGaussians, moving_gaussians
 from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, rotation_matrices_4d
 from d2_plugin.gaussians.slicing import slice_gaussians, unit_quaternions
@@ -78,10 +79,13 @@ class Yang4D(SplatModel):
         """
         if self.settings.temporal and math.isnan(view.time):
             raise D2Error(f"the time of camera '{view.camera}', frame {view.frame} is NaN: give every view a time")
+        return slice_gaussians(self._raw(), view.time)
+
+    def _raw(self) -> dict[str, Tensor]:
         parameters = self.gaussians.parameters
         names = TEMPORAL if self.settings.temporal else STATIC
         # Equal quaternions leave the time axis where it is: space turns, nothing moves.
-        return slice_gaussians({name: parameters.get(name, parameters["left"]) for name in names}, view.time)
+        return {name: parameters.get(name, parameters["left"]) for name in names}
 
     def rotations(self, rows: Mapping[str, Tensor]) -> Tensor:
         """Rotation matrices of raw rows, [4, 4, K] or without time [3, 3, K]."""
@@ -95,6 +99,14 @@ class Yang4D(SplatModel):
         degree = _time_degree(self.settings)
         phase = (view.time - self.gaussians["times"][splats.rows]) / self.duration if degree else None
         return self.harmonic_colors(view, splats, phase, degree)
+
+    def harmonics(self) -> Harmonics:
+        """See `SplatModel.harmonics`; with the cosines in time."""
+        return super().harmonics()._replace(time_degree=_time_degree(self.settings))
+
+    def moving(self) -> MovingGaussians:
+        """See `SplatModel.moving`: every Gaussian of this model is of that form."""
+        return moving_gaussians(self._raw(), self.harmonics())
 
 
 def initial_rows(

@@ -25,6 +25,7 @@ COMMANDS = (
     "bench",
     "stability",
     "report",
+    "export",
     "export-capture",
     "doctor",
 )

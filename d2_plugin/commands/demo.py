@@ -1,4 +1,4 @@
-"""A synthetic recording, trained by the backbone alone and with D2: a table and a picture."""
+"""A synthetic recording, trained by the backbone alone and with D2: a table, a picture and a player."""
 
 from __future__ import annotations
 

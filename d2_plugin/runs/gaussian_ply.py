@@ -6,6 +6,7 @@ zip of them does in Brush.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,8 +36,17 @@ ATTRIBUTES = (
 """Order of the Inria code base; all float32, little endian."""
 
 
-def write_ply(path: Path, means: Tensor, covariances: Tensor, colors: Tensor, opacities: Tensor) -> int:
-    """Write Gaussians without view-dependent colour; returns how many were written.
+def write_ply(
+    path: Path,
+    means: Tensor,
+    covariances: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    harmonics: Tensor | None = None,
+    moving: Mapping[str, Tensor] | None = None,
+    comments: Sequence[str] = ("SplatRenderMode: default",),
+) -> int:
+    """Write Gaussians as one row of float32 each; returns how many were written.
 
     Args:
         path: the file, which is replaced if it exists.
@@ -44,6 +54,9 @@ def write_ply(path: Path, means: Tensor, covariances: Tensor, colors: Tensor, op
         covariances: [M, 6] xx xy xz yy yz zz, world.
         colors: [M, 3] in 0..1, as seen at this instant.
         opacities: [M] in 0..1 with the temporal factor F(t) included: it belongs inside the logit, not on top of it.
+        harmonics: [M, C, 3] coefficients of the view-dependent colour without the constant one, C = 3, 8 or 15.
+        moving: further columns [M] by name, for formats that are a PLY with more.
+        comments: of the header.
 
     Gaussians below an opacity of 1/255 and those that are not finite are left out.
     """
@@ -59,19 +72,25 @@ def write_ply(path: Path, means: Tensor, covariances: Tensor, colors: Tensor, op
     means, covariances, colors, opacities = (
         values.detach().double().cpu() for values in (means, covariances, colors, opacities)
     )
-    finite = torch.isfinite(torch.cat([means, covariances, colors, opacities[:, None]], dim=1)).all(dim=1)
+    rest = means.new_zeros(count, 0, 3) if harmonics is None else harmonics.detach().double().cpu()
+    more = dict(moving or {})
+    added = [rest.transpose(1, 2).flatten(1), *(values.detach().double().cpu()[:, None] for values in more.values())]
+    finite = torch.isfinite(torch.cat([means, covariances, colors, opacities[:, None], *added], dim=1)).all(dim=1)
     kept = finite & (opacities >= ALPHA_MIN)
     scales, quaternions = scales_and_rotations(covariances[kept])
     columns = [
         means[kept],
         torch.zeros_like(means[kept]),  # normals, which readers expect and ignore
         (colors[kept] - 0.5) / SH_C0,
+        added[0][kept],  # all of red, all of green, all of blue
         torch.logit(opacities[kept].clamp(max=ALPHA_MAX))[:, None],
         scales.log(),
         quaternions,
+        *(values[kept] for values in added[1:]),
     ]
+    names = [*ATTRIBUTES[:9], *(f"f_rest_{i}" for i in range(3 * rest.shape[1])), *ATTRIBUTES[9:], *more]
     rows = torch.cat(columns, dim=1).float().numpy().astype("<f4")
-    write(path, _header(len(rows)), np.ascontiguousarray(rows).tobytes(), synced=False)
+    write(path, _header(len(rows), names, comments), np.ascontiguousarray(rows).tobytes(), synced=False)
     return len(rows)
 
 
@@ -110,7 +129,7 @@ def _quaternions(rotations: Tensor) -> Tensor:
     return chosen / chosen.norm(dim=-1, keepdim=True)
 
 
-def _header(count: int) -> bytes:
-    lines = ["ply", "format binary_little_endian 1.0", "comment SplatRenderMode: default", f"element vertex {count}"]
-    lines += [f"property float {name}" for name in ATTRIBUTES]
+def _header(count: int, names: Sequence[str], comments: Sequence[str]) -> bytes:
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    lines += [f"element vertex {count}", *(f"property float {name}" for name in names)]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")

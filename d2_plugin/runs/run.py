@@ -119,7 +119,7 @@ class Run:
         from d2_plugin.runs.tables import write_tables
 
         with self._writing():
-            trainer = self._trained()
+            trainer = self.trained()
             with self._timed("eval"):
                 scores = self._scores(trainer.model, self.folder / "pictures" if pictures else None)
             metrics = scores | self._about(trainer)
@@ -182,7 +182,7 @@ class Run:
         from d2_plugin.runs.gaussian_ply import write_ply
 
         with self._writing():
-            trainer = self._trained()
+            trainer = self.trained()
             paths = []
             for frame in self.scene.capture.frames:
                 view = make_view(self.scene.capture, self.scene.train_cameras[0], frame, self.settings.device)
@@ -229,7 +229,7 @@ class Run:
         """The backbone's settings that the scene needs, those alone: one of somebody else's may not know the names."""
         return {"appearance": True} if self.scene.plan.uses("appearance") else {}
 
-    def _trained(self) -> Any:
+    def trained(self) -> Any:
         """The trainer at the last checkpoint, without hooks or a look at the prior: the checkpoint says it all."""
         trainer = self._trainer(self._points(), attach=False)
         if not self._restore(trainer):

@@ -1,4 +1,4 @@
-"""`d2 demo`: a synthetic recording, the backbone alone and with D2, a table and a picture."""
+"""`d2 demo`: a synthetic recording, the backbone alone and with D2, a table, a picture and a player."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings
 from d2_plugin.runs.tables import metrics_table
 from d2_plugin.settings import Range, Settings
+from d2_plugin.viewing.export.page import write_page
+from d2_plugin.viewing.export.scene import scene_of
 
 LARGER_BUDGET = {"d2": {"views_per_evaluation": 8}, "densify": {"budget_per_view": 500}}
 """Eight times the samples in twice the views. The defaults cost little time; this buys more quality with more time."""
@@ -29,6 +31,9 @@ VARIANTS = {
     "D2, larger budget": (HOOK_NAMES, LARGER_BUDGET),
 }
 """Name -> hooks and settings over the defaults."""
+
+PLAYED = "D2, larger budget"
+"""The variant that the demo's player shows."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,7 @@ class Demo(Settings):
 
 
 def run(settings: Demo) -> str:
-    """Write the recording, three runs and comparison.png; returns the table to print.
+    """Write the recording, three runs, comparison.png and player.html; returns the table to print.
 
     All runs start from the same points and take the same number of iterations; a demo that was cut off goes on.
     """
@@ -65,7 +70,12 @@ def run(settings: Demo) -> str:
     picture = folder / "comparison.png"
     _compare({name: run.folder for name, (run, _) in runs.items()}, held_out[len(held_out) // 2], picture)
     table = metrics_table({name: metrics for name, (_, metrics) in runs.items()})
-    return f"{table}\nThe recording is rendered and its monocular depth is emulated.\nPicture: {picture}"
+    page = folder / "player.html"
+    write_page(scene_of(runs[PLAYED][0]), page)
+    return (
+        f"{table}\nThe recording is rendered and its monocular depth is emulated.\nPicture: {picture}\n"
+        f"Player: {page} (open it in a browser; it plays '{PLAYED}' without a network)"
+    )
 
 
 def _recording(path: Path) -> Path:

@@ -13,6 +13,7 @@ from d2_plugin.commands.cli import main
 from d2_plugin.gaussians import native_slice, native_ssim
 from d2_plugin.rasterizer import native
 from d2_plugin.study import demo
+from d2_plugin.viewing.export.page import read_page
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
@@ -49,6 +50,8 @@ def test_a_demo_cut_off_while_it_writes_its_recording_goes_on(
     out = capsys.readouterr().out
     assert all(f"| {name}" in out for name in demo.VARIANTS)
     assert (tmp_path / "demo" / "comparison.png").is_file()
+    assert f"Player: {tmp_path / 'demo' / 'player.html'}" in out
+    assert read_page(tmp_path / "demo" / "player.html").header["name"] == "capture"
     assert len(open_capture(tmp_path / "demo" / "capture").frames) == 2
     assert not list((tmp_path / "demo").glob("*unfinished*"))
 

@@ -1,0 +1,194 @@
+"""One HTML file that plays the moving scene without a network: data, player and worker stand in it as text."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+import d2_plugin
+from d2_plugin.captures import Camera
+from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.slicing import MARGINAL_CUT
+from d2_plugin.runs.drawing import color_scale
+
+from .coded_scene import MARGINAL_REACH, CodedScene, code_keys, code_lines, read_harmonics, read_state
+from .codes import BLOCK, packed, to_json, unpacked
+from .keys import Keys, Offset, State, bake
+from .outlook import look_around
+from .rounding import rounding, states_of
+from .scene import ExportScene
+
+VERSION = 1
+TEXT_PER_BYTE = 4 / 3
+"""Base64."""
+BYTES_AT_REST, BYTES_OF_POSITION, BYTES_OF_SHAPE = 28, 6, 16
+"""Per Gaussian, with 16-bit codes and before compression, without harmonics."""
+PAGE_SCRIPTS = ("scene.js", "shaders.js", "renderer.js", "controls.js", "player.js")
+WORKER_SCRIPTS = ("scene.js", "sorter.js")
+
+
+class Page(NamedTuple):
+    """What was written, and what it says of itself."""
+
+    size: int
+    about: tuple[str, ...]
+
+
+def write_page(scene: ExportScene, path: Path, megabytes: float = 40.0) -> Page:
+    """Write the page; a scene that is no set of straight lines is baked at as many key times as `megabytes` allow."""
+    coded, keys = _coded(scene, megabytes)
+    contents, data = packed(coded.arrays)
+    about = _about(scene, coded, keys, _rounding(scene, coded, keys))
+    header = _header(scene, coded) | {"arrays": contents, "about": about}
+    path.write_text(_assembled(scene.name, header, data), encoding="utf-8")
+    return Page(path.stat().st_size, tuple(about))
+
+
+class ReadPage(NamedTuple):
+    """The scene of a page, read back."""
+
+    header: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+    def at(self, time: float) -> State:
+        """The Gaussians that the player draws at `time`, opacity 0 for those that it does not draw."""
+        return read_state(self.arrays, self.header, self.header["duration"], time)
+
+    @property
+    def coefficients(self) -> torch.Tensor:
+        """Of the colours, [N, C, 3]."""
+        return read_harmonics(self.arrays, self.header).coefficients
+
+
+def read_page(path: Path) -> ReadPage:
+    """Read what `write_page` wrote.
+
+    Raises:
+        D2Error: the file is no such page, or one of another version.
+    """
+    text = path.read_text(encoding="utf-8")
+    found = [re.search(rf'<script id="{name}" type="[^"]*">(.*?)</script>', text, re.S) for name in ("header", "data")]
+    if found[0] is None or found[1] is None:
+        raise D2Error(f"{path} is no page of `d2 export --format html`: it holds no scene")
+    header = json.loads(found[0].group(1))
+    if header.get("version") != VERSION:
+        raise D2Error(
+            f"{path} is a page of version {header.get('version')}, and this d2-4dgs reads {VERSION}: export it anew"
+        )
+    return ReadPage(header, unpacked(header["arrays"], base64.b64decode(found[1].group(1))))
+
+
+def _coded(scene: ExportScene, megabytes: float) -> tuple[CodedScene, Keys | None]:
+    if scene.moving is not None:
+        return code_lines(scene.moving, scene.clip.duration), None
+    count = len(scene.harmonics.coefficients)
+    at_rest = count * (BYTES_AT_REST + 3 * (scene.harmonics.coefficients.shape[1] - 1))
+
+    def most_keys(moving: int, changing: int) -> int:
+        each = moving * BYTES_OF_POSITION + changing * BYTES_OF_SHAPE
+        return max(int((megabytes * 1e6 / TEXT_PER_BYTE - at_rest) / max(1.05 * each, 1)), 2)
+
+    keys = bake(scene.splats_at, count, scene.clip.seconds, scene.pixels_per_unit, most_keys)
+    return code_keys(keys, scene.harmonics), keys
+
+
+def _rounding(scene: ExportScene, coded: CodedScene, keys: Keys | None) -> Offset:
+    arrays = unpacked(*packed(coded.arrays))
+    if keys is None:
+        assert scene.moving is not None
+        true_at = states_of(scene.moving.select(coded.rows))
+    else:
+        true_at = keys.at
+    return rounding(scene, true_at, lambda time: read_state(arrays, coded.facts, scene.clip.duration, time))
+
+
+def _about(scene: ExportScene, coded: CodedScene, keys: Keys | None, rounding: Offset) -> list[str]:
+    frames = len(scene.clip.frames)
+    plural = "s" if frames > 1 else ""
+    lines = [
+        f"{coded.facts['count']:,} Gaussians, {frames} frame{plural} at {scene.clip.fps:g} per second",
+        f"16-bit codes: off by {rounding}",
+    ]
+    if keys is not None:
+        times, moving, changing = len(keys.times), keys.moving, keys.changing
+        lines.append(
+            f"a deformation field at {times} key times, straight in between: off by {keys.offset}; "
+            f"{moving:,} Gaussians move, {changing:,} of them change their shape"
+        )
+    elif coded.facts["motion"] == "lines":
+        lines.append("every Gaussian moves on a straight line and fades in time, exactly as it was trained")
+    return [*lines, f"made by d2-4dgs {d2_plugin.__version__}; no network is used"]
+
+
+def _header(scene: ExportScene, coded: CodedScene) -> dict[str, Any]:
+    outlook = look_around(scene)
+    held_out = {camera.name for camera in scene.test_cameras}
+    raster = scene.raster
+    return coded.facts | {
+        "version": VERSION,
+        "name": scene.name,
+        "block": BLOCK,
+        "frames": list(scene.clip.frames),
+        "seconds": list(scene.clip.seconds),
+        "duration": scene.clip.duration,
+        "fps": scene.clip.fps,
+        "marginal_cut": MARGINAL_CUT,
+        "marginal_reach": MARGINAL_REACH,
+        "raster": {
+            "near": raster.near,
+            "blur": raster.blur,
+            "alpha_max": raster.alpha_max,
+            "alpha_min": raster.alpha_min,
+            "fov_clamp": min(raster.fov_clamp, 1e6),
+        },
+        "cameras": [_camera(camera, camera.name in held_out) for camera in (*scene.train_cameras, *scene.test_cameras)],
+        "background": None if scene.background is None else scene.background.tolist(),
+        "palette": color_scale("viridis").tobytes().hex(),
+        "depth_range": list(outlook.depth_range),
+        "focus": outlook.focus,
+        "up": outlook.up,
+    }
+
+
+def _camera(camera: Camera, held_out: bool) -> dict[str, Any]:
+    pose, K = np.asarray(camera.T_camera_world, float), np.asarray(camera.K, float)
+    return {
+        "name": camera.name,
+        "held_out": held_out,
+        "width": camera.width,
+        "height": camera.height,
+        "focal": [K[0, 0], K[1, 1]],
+        "principal": [K[0, 2], K[1, 2]],
+        "rotation": pose[:3, :3].flatten().tolist(),
+        "translation": pose[:3, 3].tolist(),
+    }
+
+
+def _assembled(name: str, header: dict[str, Any], data: bytes) -> str:
+    return Template(_asset("page.html")).substitute(
+        title=html.escape(name),
+        generator=html.escape(f"d2-4dgs {d2_plugin.__version__}"),
+        style=_asset("style.css"),
+        header=to_json(header),
+        data=base64.b64encode(data).decode("ascii"),
+        worker=_scripts(WORKER_SCRIPTS),
+        script=_scripts(PAGE_SCRIPTS),
+    )
+
+
+def _scripts(names: Sequence[str]) -> str:
+    return "\n".join(_asset(name) for name in names)
+
+
+def _asset(name: str) -> str:
+    return (files(__package__) / "player" / name).read_text(encoding="utf-8")

@@ -1,0 +1,90 @@
+"""Small moving scenes for tests of exports, made from the bundled backbones without training them."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from tiny import make_model, make_views
+
+from d2_plugin.backbones.model import SplatModel
+from d2_plugin.captures import Camera
+from d2_plugin.protocol import View
+from d2_plugin.viewing.export.scene import Clip, ExportScene, slicer
+
+NASTY = '</script><script>alert(1)</script> & "tiny"'
+WIDTH, HEIGHT = 160, 120
+FRAMES = 12
+DURATION = 0.5
+
+
+def sharp_model(backbone: str, count: int = 400, **options: object) -> SplatModel:
+    """Gaussians of a few pixels, of all shapes and colours, that move; `backbone` is one of `tiny.BACKBONES`."""
+    generator = torch.Generator().manual_seed(1)
+    model = make_model(count, backbone=backbone, **options)
+    with torch.no_grad():
+        rows = model.gaussians.parameters
+        rows["log_scales"] += -1.4 + 0.7 * torch.randn(count, 3, generator=generator)
+        rows["opacity_logits"] += 3 * torch.randn(count, generator=generator)
+        for name in ("left", "right", "rotations"):
+            if name in rows:
+                # Turned a little in time, so that Gaussians move by parts of the scene and not beyond it.
+                rows[name] += (0.05 if name == "right" else 0.3) * torch.randn(count, 4, generator=generator)
+        if "right" in rows:
+            rows["right"].copy_(rows["left"] + 0.05 * torch.randn(count, 4, generator=generator))
+            rows["log_time_scales"] += 0.5 * torch.randn(count, generator=generator)
+        if backbone == "hexplane":
+            model.deforms = True
+            for plane in model.field.time:
+                plane += 0.3 * torch.randn(plane.shape, generator=generator)
+            model.field.heads.weight.normal_(0, 0.2, generator=generator)
+    return model
+
+
+def larger(view: View) -> View:
+    """The tiny view in pictures of 160 x 120, off centre so that the principal point matters."""
+    scale = torch.tensor([[WIDTH / view.width], [HEIGHT / view.height], [1.0]])
+    intrinsics = view.K * scale
+    intrinsics[:2, 2] += torch.tensor([5.0, -3.0])
+    return View(view.camera, view.frame, view.time, view.T_camera_world, intrinsics, WIDTH, HEIGHT)
+
+
+def make_scene(
+    model: SplatModel, name: str = "tiny", cameras: tuple[str, ...] = ("left", "middle", "right")
+) -> ExportScene:
+    """The model seen by three cameras over a clip of twelve frames; the last camera is held out."""
+    views = [larger(view) for view in make_views()[:3]]
+    made = [
+        Camera(name, WIDTH, HEIGHT, np.asarray(view.K.double()), np.asarray(view.T_camera_world.double()))
+        for name, view in zip(cameras, views, strict=True)
+    ]
+    seconds = tuple(DURATION * i / (FRAMES - 1) for i in range(FRAMES))
+    clip = Clip(tuple(range(FRAMES)), seconds, (FRAMES - 1) / DURATION)
+    harmonics = model.harmonics()
+    return ExportScene(
+        name,
+        clip,
+        tuple(made[:2]),
+        tuple(made[2:]),
+        model.settings.raster,
+        harmonics._replace(coefficients=harmonics.coefficients.detach().double()),
+        slicer(model, views[0]),
+        model.moving(),
+    )
+
+
+def rasterized(model: SplatModel, camera: int, time: float) -> dict[str, np.ndarray]:
+    """What our rasterizer draws: color [H, W, 3] in 0..1, expected depth and alpha [H, W]."""
+    view = larger(make_views()[camera])
+    with torch.no_grad():
+        render = model.render(View(view.camera, 0, time, view.T_camera_world, view.K, WIDTH, HEIGHT))
+    depth = render.depth_sum / render.alpha.clamp(min=1e-4)
+    return {
+        "color": render.color.clamp(0, 1).numpy(),
+        "depth": depth.numpy(),
+        "opacity": render.alpha.numpy(),
+    }
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    """Of pictures in 0..1."""
+    return float(-10 * np.log10(np.mean((np.asarray(a, float) - b) ** 2)))
