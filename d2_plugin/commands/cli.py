@@ -19,6 +19,8 @@ COMMANDS = (
     "priors",
     "train",
     "eval",
+    "render",
+    "view",
     "compare",
     "ablate",
     "bench",

@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from d2_plugin import registry
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.priors.store import PriorStore
-from d2_plugin.progress import progress_bar
+from d2_plugin.progress import Bar, progress_bar
 from d2_plugin.runs.prior import build_priors_for
 from d2_plugin.runs.provenance import circumstances
 from d2_plugin.runs.scene import Scene
@@ -39,6 +40,11 @@ FAR_SHARE = 0.005
 
 CHECKPOINTS = 10
 """How often a run is saved. One that was cut off continues from its last checkpoint, bitwise."""
+
+
+OnStep = Callable[[int, float], None]
+"""Called with the number of a training step and its loss."""
+Watch = Callable[[Any], OnStep]
 
 
 class Run:
@@ -73,17 +79,21 @@ class Run:
                 build_priors_for(self.settings, self.scene, points.positions, self.priors)
         return points
 
-    def train(self) -> None:
-        """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one."""
+    def train(self, watch: Watch | None = None) -> None:
+        """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one.
+
+        `watch` gets the trainer and returns what is called with step and loss after every step.
+        """
         trainer = self._trainer(self.prepare())
         self._restore(trainer)
+        watching = None if watch is None else watch(trainer)
         iterations = self.settings.iterations
         chunk = max(iterations // CHECKPOINTS, 1)
         with progress_bar("train", iterations) as bar:
             while trainer.step < iterations:
                 until = min((trainer.step // chunk + 1) * chunk, iterations)
                 with self._timed("train"):
-                    trainer.run(until, lambda step, loss: bar.update(step, f"loss {loss:.4f}"))
+                    trainer.run(until, partial(_told, bar, watching))
                 self._save(trainer)
         self.retired = {} if trainer.d2 is None else dict(trainer.d2.retired)
 
@@ -95,7 +105,7 @@ class Run:
         """
         from d2_plugin.runs.tables import write_tables
 
-        trainer = self._trained()
+        trainer = self.trained()
         with self._timed("eval"):
             scores = self._scores(trainer.model, self.folder / "pictures" if pictures else None)
         metrics = scores | self._about(trainer)
@@ -152,7 +162,7 @@ class Run:
         """
         from d2_plugin.runs.gaussian_ply import write_ply
 
-        trainer = self._trained()
+        trainer = self.trained()
         paths = []
         for frame in self.scene.capture.frames:
             view = make_view(self.scene.capture, self.scene.train_cameras[0], frame, self.settings.device)
@@ -207,7 +217,7 @@ class Run:
         records = [record for key in keys if (record := store.record(*key)) is not None]
         return bool(records) and sum(r["shares"].get("far", 0.0) for r in records) / len(records) > FAR_SHARE
 
-    def _trained(self) -> Any:
+    def trained(self) -> Any:
         """The trainer at the last checkpoint, without hooks or a look at the prior: the checkpoint says it all."""
         trainer = self._trainer(self._points(), attach=False)
         if not self._restore(trainer):
@@ -256,6 +266,12 @@ class Run:
             yield
         finally:
             self.seconds[name] += time.monotonic() - start
+
+
+def _told(bar: Bar, watching: OnStep | None, step: int, loss: float) -> None:
+    bar.update(step, f"loss {loss:.4f}")
+    if watching is not None:
+        watching(step, loss)
 
 
 def _claim(folder: Path, settings: RunSettings) -> None:

@@ -126,7 +126,7 @@ class TestAFinishedRun:
     def test_the_checkpoint_says_whether_there_is_a_background(self, trained: Run) -> None:
         with pytest.raises(D2Error, match="has format 0"):
             trained._sees_far()
-        model = trained._trained().model
+        model = trained.trained().model
         assert model.background is not None
         assert trained.evaluate(pictures=False)["background"] is True
         assert model.background.constant.detach().any()
@@ -134,12 +134,12 @@ class TestAFinishedRun:
     def test_the_exported_files_hold_the_gaussians_alone(self, trained: Run) -> None:
         paths = trained.export_ply()
         assert [path.name for path in paths] == ["frame_00000.ply", "frame_00001.ply"]
-        count = len(trained._trained().model)
+        count = len(trained.trained().model)
         assert all(b"element vertex" in path.read_bytes()[:200] for path in paths)
         assert all(path.stat().st_size < 17 * 4 * count + 1000 for path in paths)
 
     def test_a_held_out_camera_is_rendered_with_it(self, trained: Run) -> None:
-        model = trained._trained().model
+        model = trained.trained().model
         color, depth = trained._renderer(model)("test0", 0)
         model.background = None
         without, same_depth = trained._renderer(model)("test0", 0)

@@ -1,0 +1,3 @@
+"""x."""
+from d2_plugin.commands.arguments.form import Form
+def form(words: list[str]) -> Form: ...
