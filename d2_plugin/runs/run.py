@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from d2_plugin import registry
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.priors.store import PriorStore
-from d2_plugin.progress import Bar, progress_bar
+from d2_plugin.progress import progress_bar
 from d2_plugin.runs.prior import build_priors_for
 from d2_plugin.runs.provenance import circumstances
 from d2_plugin.runs.scene import Scene
@@ -86,14 +85,19 @@ class Run:
         """
         trainer = self._trainer(self.prepare())
         self._restore(trainer)
-        watching = None if watch is None else watch(trainer)
+        watching = watch(trainer) if watch else lambda step, loss: None
         iterations = self.settings.iterations
         chunk = max(iterations // CHECKPOINTS, 1)
         with progress_bar("train", iterations) as bar:
+
+            def on_step(step: int, loss: float) -> None:
+                bar.update(step, f"loss {loss:.4f}")
+                watching(step, loss)
+
             while trainer.step < iterations:
                 until = min((trainer.step // chunk + 1) * chunk, iterations)
                 with self._timed("train"):
-                    trainer.run(until, partial(_told, bar, watching))
+                    trainer.run(until, on_step)
                 self._save(trainer)
         self.retired = {} if trainer.d2 is None else dict(trainer.d2.retired)
 
@@ -266,12 +270,6 @@ class Run:
             yield
         finally:
             self.seconds[name] += time.monotonic() - start
-
-
-def _told(bar: Bar, watching: OnStep | None, step: int, loss: float) -> None:
-    bar.update(step, f"loss {loss:.4f}")
-    if watching is not None:
-        watching(step, loss)
 
 
 def _claim(folder: Path, settings: RunSettings) -> None:

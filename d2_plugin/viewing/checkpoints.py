@@ -93,7 +93,9 @@ def _loaded(path: Path, capture: Capture) -> tuple[Any, float, str]:
 
 def _torch_file(path: Path) -> Any:
     """Tensors and plain values only: a checkpoint from elsewhere runs no code."""
-    scalars: list[Any] = [np._core.multiarray.scalar, np.dtype, np.dtypes.Float32DType, np.dtypes.Float64DType]
+    # scene.cameras_extent is a number of numpy's
+    scalar = np.float32(0).__reduce__()[0]
+    scalars: list[Any] = [scalar, np.dtype, np.dtypes.Float32DType, np.dtypes.Float64DType]
     try:
         with torch.serialization.safe_globals(scalars):
             return torch.load(path, map_location="cpu", weights_only=True)

@@ -125,7 +125,7 @@ def labels(shot: Shot) -> Panel:
     """What the prior knows about each pixel."""
     picture = _of_prior(shot, lambda found: label_colors(found.labels.numpy()))
     shown = (Label.VERIFIED, Label.AGREED, Label.MONO, Label.FAR, Label.CONFLICT, Label.EMPTY)
-    bar = np.array([LABEL_COLORS[label] for label in shown], np.uint8)
+    bar = np.array([LABEL_COLORS[label] for label in shown], np.uint8).repeat(64, axis=0)
     return Panel("verified agreed mono far conflict empty", picture, bar)
 
 

@@ -50,7 +50,9 @@ def pose_of(camera: Camera) -> Pose:
     return Pose(camera.T_camera_world, Lens(camera.K, camera.width, camera.height))
 
 
-def orbit(cameras: Sequence[Camera], count: int, degrees: float | None = None, depth: float | None = None) -> list[Pose]:
+def orbit(
+    cameras: Sequence[Camera], count: int, degrees: float | None = None, depth: float | None = None
+) -> list[Pose]:
     """A swing around the point that the cameras look at, from its middle to both ends and back; a whole turn for 360.
 
     Args:

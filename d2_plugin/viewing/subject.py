@@ -40,6 +40,8 @@ class Subject:
     """What a person should know about it, in one sentence."""
     time_scale: float = 1.0
     """The trainer's unit of time, per second."""
+    time_offset: float = 0.0
+    """The trainer's time at the first frame."""
 
     @property
     def training(self) -> list[Camera]:
@@ -60,7 +62,7 @@ class Subject:
         lens = pose.lens.fitted(*size)
         T = torch.tensor(pose.T_camera_world, dtype=torch.float32, device=self.device)
         K = torch.tensor(lens.K, dtype=torch.float32, device=self.device)
-        return View(camera, self.frame_at(time), time * self.time_scale, T, K, *size)
+        return View(camera, self.frame_at(time), self.time_offset + time * self.time_scale, T, K, *size)
 
     @property
     def depth(self) -> float | None:

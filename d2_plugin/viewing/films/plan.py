@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.viewing.path_file import read_camera_path
+from d2_plugin.viewing.films.path_file import read_camera_path
 from d2_plugin.viewing.paths import Pose, orbit, pose_of, spiral, through
 from d2_plugin.viewing.subject import Subject
 

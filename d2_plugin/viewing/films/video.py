@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -82,7 +82,7 @@ class _Encoded:
     """One stream in one container."""
 
     codec, pixels = "", "yuv420p"
-    container_options: dict[str, str] = {}
+    container_options: ClassVar[dict[str, str]] = {}
 
     def __init__(self, path: Path, rate: Fraction, quality: int) -> None:
         self.av, self.rate, self.quality, self.count = pyav(), rate, quality, 0
@@ -136,7 +136,7 @@ class _Encoded:
 
 class _Mp4(_Encoded):
     codec = "libx264"
-    container_options = {"movflags": "+faststart"}
+    container_options: ClassVar = {"movflags": "+faststart"}
 
     def _shaped(self, picture: np.ndarray) -> np.ndarray:
         rows, columns = picture.shape[0] % 2, picture.shape[1] % 2
@@ -163,7 +163,7 @@ class _Mp4(_Encoded):
 
 class _WebP(_Encoded):
     codec = "libwebp_anim"
-    container_options = {"loop": "0"}
+    container_options: ClassVar = {"loop": "0"}
 
     def _tune(self) -> None:
         self.stream.options = {"quality": str(max(100 - 2 * self.quality, 0)), "compression_level": "6"}
@@ -171,7 +171,7 @@ class _WebP(_Encoded):
 
 class _Gif(_Encoded):
     codec, pixels = "gif", "pal8"
-    container_options = {"loop": "0"}
+    container_options: ClassVar = {"loop": "0"}
     graph: Any = None
 
     def _take(self, frame: Any) -> None:
@@ -208,4 +208,5 @@ class _Gif(_Encoded):
 def _rate(fps: float) -> Fraction:
     """Pictures per second as a ratio that containers keep: 29.97 is 30000/1001."""
     ntsc = Fraction(round(fps * 1.001) * 1000, 1001)
-    return ntsc if abs(float(ntsc) - fps) < 2e-3 and abs(fps - round(fps)) > 1e-3 else Fraction(fps).limit_denominator(1000)
+    is_ntsc = abs(float(ntsc) - fps) < 2e-3 and abs(fps - round(fps)) > 1e-3
+    return ntsc if is_ntsc else Fraction(fps).limit_denominator(1000)

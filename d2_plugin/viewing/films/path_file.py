@@ -46,7 +46,7 @@ def read_camera_path(path: Path) -> CameraPath:
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         if isinstance(error, D2Error):
             raise
-        raise D2Error(f"{path} is no camera_path.json of nerfstudio ({error!r}): export the camera path again") from None
+        raise D2Error(f"{path} is no camera_path.json of nerfstudio ({error!r}): export it again") from None
 
 
 def _read(table: dict[str, Any], undone: tuple[np.ndarray, float]) -> CameraPath:

@@ -14,10 +14,11 @@ from d2_plugin.progress import progress_bar
 from d2_plugin.runs.drawing import GAP, Panel, side_by_side
 from d2_plugin.settings import AtLeastOne, Positional, Positive, Range, Settings
 from d2_plugin.viewing.checkpoints import open_subject
+from d2_plugin.viewing.films.plan import Plan, Stop, Wishes, plan_film
+from d2_plugin.viewing.films.video import Format, pyav, write_film
+from d2_plugin.viewing.look import look
 from d2_plugin.viewing.panels import KINDS, Scale, Shot, depth_scale
-from d2_plugin.viewing.plan import Plan, Stop, Wishes, plan_film
 from d2_plugin.viewing.subject import Subject, size_of
-from d2_plugin.viewing.video import Format, pyav, write_film
 
 SAMPLED = 5
 """Pictures of a film from which the range of depths is taken."""
@@ -137,7 +138,8 @@ def _pictures(
     captions: bool,
 ) -> Iterator[np.ndarray]:
     for stop in plan.stops:
-        yield arranged([_panels(subject, stop, size, show, depths, len(subjects) > 1) for subject in subjects], captions)
+        named = len(subjects) > 1
+        yield arranged([_panels(subject, stop, size, show, depths, named) for subject in subjects], captions)
 
 
 def _panels(
@@ -186,9 +188,11 @@ def _depths(subjects: Sequence[Subject], plan: Plan, size: tuple[int, int], show
     if not {"depth", "true-depth", "prior"} & set(show):
         return 0.0, 1.0
     chosen = np.unique(np.linspace(0, len(plan.stops) - 1, SAMPLED).round().astype(int))
-    small = tuple(max(side // 2, 1) for side in size)
-    stops = [plan.stops[i] for i in chosen]
-    views = [(subject, subject.view(stop.pose, stop.time, (small[0], small[1]))) for subject in subjects for stop in stops]
-    return depth_scale([Shot(subject, view, (0, 1)).look.depth.numpy() for subject, view in views])
+    small = max(size[0] // 2, 1), max(size[1] // 2, 1)
+    found = []
+    for subject in subjects:
+        views = [subject.view(plan.stops[i].pose, plan.stops[i].time, small) for i in chosen]
+        found += [look(subject.backbone, view).depth.numpy() for view in views]
+    return depth_scale(found)
 
 
