@@ -68,10 +68,13 @@ def _pose(entry: dict[str, Any], size: tuple[int, int], undone: tuple[np.ndarray
     T_world_camera = np.array(entry["camera_to_world"], np.float64).reshape(4, 4)
     T_world_camera[:3, 3] /= scale
     T = np.linalg.inv(to_recording @ T_world_camera @ OPENGL)
-    focal = size[1] / 2 / np.tan(np.radians(float(entry["fov"])) / 2)
+    angle = float(entry["fov"])
+    if not 0 < angle < 180:
+        raise ValueError(f"a field of view of {angle:g} degrees")
+    focal = size[1] / 2 / np.tan(np.radians(angle) / 2)
     K = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
-    if not (np.isfinite(T).all() and np.isfinite(focal) and focal > 0):
-        raise ValueError("a pose or a field of view is not a number that a camera can have")
+    if not np.isfinite(T).all():
+        raise ValueError("a pose that is not finite")
     return Pose(T, Lens(K, *size))
 
 

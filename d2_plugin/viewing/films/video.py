@@ -182,7 +182,8 @@ class _Gif(_Encoded):
 
     def _plan(self, frame: Any) -> None:
         self.graph = graph = self.av.filter.Graph()
-        self.source = graph.add_buffer(frame.width, frame.height, frame.format, time_base=frame.time_base)
+        size = {"width": frame.width, "height": frame.height}
+        self.source = graph.add_buffer(**size, format=frame.format, time_base=frame.time_base)
         split, palette, use = graph.add("split"), graph.add("palettegen"), graph.add("paletteuse", "dither=bayer")
         self.sink = graph.add("buffersink")
         self.source.link_to(split)

@@ -120,7 +120,8 @@ class Viewer:
         """Take the page away and let go of the trainer."""
         if self._followed is not None:
             self._followed.let_go()
-        self._server.stop()
+        with redirect_stdout(io.StringIO()):
+            self._server.stop()
 
     def aim(self) -> None:
         """Let new clients begin where the first training camera stands."""
