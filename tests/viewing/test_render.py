@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mimics import fudan
+from mimics import fudan, spacetime
 
 from d2_plugin.captures import open_capture
 from d2_plugin.commands.cli import main
@@ -226,6 +226,51 @@ class TestOfficialTrainers:
         assert torch.equal(look(found.backbone, view).color, look(FudanAdapter(model), view).color)
         with pytest.raises(D2Error, match="name its recording with --capture"):
             open_subject(tmp_path / "chkpnt30000.pth")
+
+    def test_a_checkpoint_of_gsplat_stands_still(self, room: Path, tmp_path: Path) -> None:
+        count = 20
+        splats = {
+            "means": torch.randn(count, 3),
+            "scales": torch.full((count, 3), -1.0),
+            "quats": torch.randn(count, 4),
+            "opacities": torch.zeros(count),
+            "sh0": torch.rand(count, 1, 3),
+            "shN": torch.zeros(count, 15, 3),
+        }
+        torch.save({"step": 6999, "splats": splats}, tmp_path / "ckpt_6999_rank0.pt")
+        found = open_subject(tmp_path / "ckpt_6999_rank0.pt", room)
+        view = found.view(pose_of(found.capture.cameras["train0"]), 0.1, (96, 54))
+        drawn = found.backbone.slice_at(view)
+        assert torch.equal(drawn.means, splats["means"])
+        assert torch.allclose(found.backbone.colors(view, drawn), 0.5 + 0.2820948 * splats["sh0"][:, 0], atol=1e-5)
+
+    def test_a_point_cloud_of_spacetime_gaussians_moves_with_the_recording(self, room: Path, tmp_path: Path) -> None:
+        from d2_plugin.adapters.spacetime import SpacetimeAdapter
+
+        gaussians = spacetime.make()[0]
+        generator = torch.Generator().manual_seed(4)
+        gaussians._motion = 0.2 * torch.randn(gaussians._motion.shape, generator=generator)
+        columns = {
+            **{axis: gaussians._xyz[:, i] for i, axis in enumerate("xyz")},
+            "trbf_center": gaussians._trbf_center[:, 0],
+            "trbf_scale": gaussians._trbf_scale[:, 0],
+            "opacity": gaussians._opacity[:, 0],
+        }
+        many = {"motion": gaussians._motion, "f_dc": gaussians._features_dc[:, :3], "omega": gaussians._omega}
+        for name, values in (many | {"scale": gaussians._scaling, "rot": gaussians._rotation}).items():
+            columns |= {f"{name}_{i}": values[:, i] for i in range(values.shape[1])}
+        head = [f"property float {name}" for name in columns]
+        begin = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians._xyz)}"]
+        head = [*begin, *head, "end_header\n"]
+        rows = torch.stack([value.detach() for value in columns.values()], 1).numpy().astype("<f4")
+        (tmp_path / "point_cloud.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
+        found = open_subject(tmp_path / "point_cloud.ply", room)
+        # Frame 2 of 4 is at the trainer's time 0.5.
+        view = found.view(pose_of(found.capture.cameras["train0"]), found.capture.seconds(2), (96, 54))
+        assert view.time == pytest.approx(0.5)
+        expected = SpacetimeAdapter(gaussians, 4).slice_at(view)
+        assert torch.allclose(found.backbone.slice_at(view).means, expected.means, atol=1e-6)
+        assert torch.allclose(found.backbone.slice_at(view).opacities, expected.opacities, atol=1e-6)
 
     def test_a_point_cloud_is_shown_as_the_run_that_wrote_it(
         self, trained: Path, room: Path, subject: Subject

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -132,7 +133,7 @@ def test_d2_knows_which_gaussians_it_inserted_across_all_edits_and_a_resume() ->
     assert set(marks.unique().tolist()) <= {0, 5, 10}
     assert 0 < int((marks > 0).sum()) <= sum(map(len, inserted))
     resumed = make_trainer(ALL_HOOKS)
-    resumed.load_state_dict(trainer.state_dict())
+    resumed.load_state_dict(copy.deepcopy(trainer.state_dict()))
     assert torch.equal(resumed.d2.inserted_at, marks)
     trainer.run()
     resumed.run()
