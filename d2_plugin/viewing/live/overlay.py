@@ -102,9 +102,18 @@ def frustum_size(subject: Subject) -> float:
     """A tenth of the way from the cameras to what they look at, or less where cameras stand close together."""
     centres = np.stack([camera.centre for camera in subject.capture.cameras.values()])
     gaps = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
-    nearest = gaps[gaps > 0].min() if (gaps > 0).any() else math.inf
-    size = min((subject.depth or math.inf) / 10, 0.4 * float(nearest))
+    gaps[gaps == 0] = math.inf
+    # The usual gap: a held-out camera that nearly touches another must not make all of them too small to see.
+    usual = float(np.median(gaps.min(axis=1)))
+    size = min((subject.depth or math.inf) / 10, 0.5 * usual)
     return size if math.isfinite(size) else 0.2
+
+
+def rig_of(subject: Subject) -> tuple[np.ndarray, float]:
+    """Where the cameras' middle is, [3], and how far one has to be from it to see all of them."""
+    centres = np.stack([camera.centre for camera in subject.capture.cameras.values()])
+    middle = centres.mean(axis=0)
+    return middle, max(float(np.linalg.norm(centres - middle, axis=1).max()), 3 * frustum_size(subject))
 
 
 def _thumbnail(subject: Subject, name: str, frame: int) -> np.ndarray:

@@ -92,7 +92,8 @@ class Page:
                 self._picture_controls()
         with gui.add_folder("Recording"):
             self._recording_controls()
-        self._text("size", "picture size", "")
+        if subject.backbone is not None:
+            self._text("size", "picture size", "")
         for control in self.controls.values():
             if hasattr(control, "on_update"):
                 control.on_update(lambda _: self.wake())

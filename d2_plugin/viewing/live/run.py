@@ -20,7 +20,7 @@ from d2_plugin.viewing.look import look
 from d2_plugin.viewing.paths import pose_of
 from d2_plugin.viewing.subject import Subject
 
-SCORED = 0.03
+SCORED = 0.02
 """Share of a training's time that its score so far may take, while somebody looks."""
 AVERAGED = 16
 """The score so far is the mean over this many of the last views."""

@@ -23,12 +23,12 @@ from d2_plugin.errors import D2Error, missing_extra
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.viewing.live.draw import Drawer
 from d2_plugin.viewing.live.follow import Follower
-from d2_plugin.viewing.live.overlay import Overlay, frustum_size
+from d2_plugin.viewing.live.overlay import Overlay, frustum_size, rig_of
 from d2_plugin.viewing.live.pace import Share
 from d2_plugin.viewing.live.page import Page, Training
 from d2_plugin.viewing.subject import Subject
 
-WATCHED, MOVED = 0.08, 0.5
+WATCHED, MOVED = 0.05, 0.5
 """Share of a training's time that pictures may take: for somebody who only looks, and while somebody moves."""
 MOVING_SECONDS = 0.06
 """A picture while something moves may take this long."""
@@ -124,14 +124,18 @@ class Viewer:
             self._server.stop()
 
     def aim(self) -> None:
-        """Let new clients begin where the first training camera stands."""
+        """Let new clients begin where the first training camera stands; behind all cameras where they are the show."""
         subject = self.subject
         if subject is None:
             return
         camera = subject.training[0] if subject.train_cameras else next(iter(subject.capture.cameras.values()))
         T, initial = camera.T_camera_world, self._server.initial_camera
-        initial.position, initial.up = camera.centre, -T[1, :3]
-        initial.look_at = camera.centre + (subject.depth or 3.0) * T[2, :3]
+        eye, up, ahead = camera.centre, -T[1, :3], T[2, :3]
+        target = eye + (subject.depth or 3.0) * ahead
+        if subject.backbone is None:
+            middle, reach = rig_of(subject)
+            target, eye = middle + reach * ahead, middle - 1.1 * reach * ahead + 0.5 * reach * up
+        initial.position, initial.look_at, initial.up = eye, target, up
         initial.fov = 2 * math.atan(camera.height / 2 / camera.K[1, 1])
 
     def _connected(self, client: Any) -> None:
