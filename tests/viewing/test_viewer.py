@@ -254,3 +254,16 @@ class TestSentences:
         monkeypatch.setitem(__import__("sys").modules, "viser", None)
         with pytest.raises(MissingExtra, match=r"pip install 'd2-4dgs\[view\]'"):
             Viewer(subject=subject)
+
+
+def test_d2_train_says_where_to_watch_and_ends_where_nobody_looks(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", str(room), "--train-cameras", "train0,train1", "--iterations", "3", "--hooks", "none", "--view"]
+    assert main([*words, "--output", str(tmp_path / "run")]) == 0
+    assert "watch it train at http://localhost:" in capsys.readouterr().out
+    again = tmp_path / "bare"
+    assert main([*words[:-1], "--output", str(again)]) == 0
+    ends = [torch.load(folder / "checkpoint.pt", weights_only=True)["model"] for folder in (tmp_path / "run", again)]
+    for name, value in ends[0]["parameters"].items():
+        assert torch.equal(value, ends[1]["parameters"][name]), "a watched run is bitwise the one that is not"
