@@ -81,6 +81,11 @@ class Ex4DGSAdapter(InriaAdapter):
         compensation = self._compensation(camera[rows], covariances[rows], view)
         return Splats(means[rows], covariances[rows], opacities[rows] * compensation, rows)
 
+    def _coefficients(self) -> Tensor:
+        model = self.gaussians
+        static = torch.cat([model._features_dc, model._features_rest], 1)
+        return torch.cat([static, torch.cat([model._features_dc_motion, model._features_rest_motion], 1)])
+
     def _in_frustum(self, camera: Tensor, view: View) -> Tensor:
         """Which centres [N, 3] in camera axes the rasterizer draws."""
         z = camera[:, 2]

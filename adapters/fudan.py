@@ -99,6 +99,14 @@ class FudanAdapter(InriaAdapter):
             return slice_gaussians(raw | time | {"right": model._rotation_r}, view.time)
         return self._slice_rotated(view.time) if model.rot_4d else self._slice_unrotated(view.time)
 
+    def colors(self, view: View, splats: Splats) -> Tensor:
+        """RGB [M, 3]; 4D spherical harmonics where the model has them (sh_utils.py:117)."""
+        model, degree = self.gaussians, int(getattr(self.gaussians, "active_sh_degree_t", 0))
+        if not degree or model.gaussian_dim == 3 or getattr(model, "force_sh_3d", False):
+            return self._harmonics(view, splats)
+        duration = model.time_duration[1] - model.time_duration[0]
+        return self._harmonics(view, splats, (view.time - model._t[splats.rows, 0]) / duration, degree)
+
     def _slice_rotated(self, time: float) -> Splats:
         """With `prefilter_var` added to the temporal variance, in the marginal alone (gaussian_model.py:244)."""
         model = self.gaussians

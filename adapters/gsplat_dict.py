@@ -23,6 +23,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
 from d2_plugin.gaussians.slicing import unit_quaternions
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
+from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
 
 ROWS = "d2_rows"
@@ -94,6 +95,16 @@ class GsplatAdapter:
         factors = rotation_matrices_3d(unit_quaternions(p["quats"])) * p["scales"].T.exp()
         rows = torch.arange(self._count, device=p["means"].device)
         return Splats(p["means"], covariances_from_factors(factors), torch.sigmoid(p["opacities"]), rows)
+
+    def colors(self, view: View, splats: Splats) -> Tensor:
+        """RGB [M, 3] from sh0 and shN, or from `colors` (logit)."""
+        p = self.parameters
+        if "sh0" not in p:
+            return torch.sigmoid(p["colors"][splats.rows, :3])
+        coefficients = torch.cat([p["sh0"], p["shN"]], 1) if "shN" in p else p["sh0"]
+        degree = round(coefficients.shape[1] ** 0.5) - 1
+        centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
+        return harmonic_colors(coefficients[splats.rows], splats.means - centre, None, degree, 0)
 
     @torch.no_grad()
     def insert(self, points: Points) -> int:

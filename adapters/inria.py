@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.spherical_harmonics import SH_C0
+from d2_plugin.gaussians.spherical_harmonics import SH_C0, channel_count
+from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
 from d2_plugin.rasterizer import rasterize
 
@@ -106,6 +107,22 @@ class InriaAdapter(ABC):
     @abstractmethod
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable."""
+
+    def colors(self, view: View, splats: Splats) -> Tensor:
+        """RGB [M, 3] of the sliced Gaussians as seen in `view`, from the spherical harmonics."""
+        return self._harmonics(view, splats)
+
+    def _coefficients(self) -> Tensor:
+        """Spherical harmonics [N, C, 3] of all rows."""
+        rest = getattr(self.gaussians, "_features_rest", None)
+        constant = self.gaussians._features_dc
+        return constant if rest is None else torch.cat([constant, rest], 1)
+
+    def _harmonics(self, view: View, splats: Splats, phase: Tensor | None = None, time_degree: int = 0) -> Tensor:
+        degree = int(getattr(self.gaussians, "active_sh_degree", 0))
+        coefficients = self._coefficients()[splats.rows, : channel_count(degree, time_degree)]
+        centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
+        return harmonic_colors(coefficients, splats.means - centre, phase, degree, time_degree)
 
     @torch.no_grad()
     def insert(self, points: Points) -> int:

@@ -65,6 +65,10 @@ class SpacetimeAdapter(InriaAdapter):
         factors = rotation_matrices_3d(rotations) * model._scaling[rows].T.exp()
         return Splats(means, covariances_from_factors(factors), self._opacities(view.time, rows), rows)
 
+    def colors(self, view: View, splats: Splats) -> torch.Tensor:
+        """RGB [M, 3] as stored, which is the lite model's; the full model's decoder is left out."""
+        return self.gaussians._features_dc[splats.rows, :3].clamp(min=0)
+
     def _opacities(self, time: float, rows: torch.Tensor) -> torch.Tensor:
         model = self.gaussians
         distance = (time - model._trbf_center[rows, 0]) / model._trbf_scale[rows, 0].exp()

@@ -43,6 +43,14 @@ class WatchedModel(Observer, Generic[Model]):
         """The 3D Gaussians at `view.time`, differentiable."""
         return self.model.slice_at(view)
 
+    def colors(self, view: View, splats: Splats) -> Tensor:
+        """RGB [M, 3] of the sliced Gaussians as seen in `view`."""
+        return self.model.colors(view, splats)
+
+    def behind(self, render: Render, view: View) -> Render:
+        """The render with the model's background, if it has one."""
+        return render if self.model.background is None else self.model.background.behind(render, view)
+
     def remove(self, mask: Tensor) -> None:
         """Delete the rows where `mask` [N] is True."""
         self.model.select(torch.nonzero(~mask).squeeze(-1))

@@ -78,6 +78,9 @@ class D2Hooks:
         self._evaluated = False
         self._count = len(backbone)
         self._warned = False
+        self._inserting = 0  # the step while the backbone inserts for us, else 0
+        self.inserted_at = torch.zeros(self._count, dtype=torch.int32)
+        """Per Gaussian [N], the step at which D2 inserted it; 0 for the backbone's own."""
         self._idle = dict.fromkeys(self.hooks, 0)  # evaluations in a row that changed next to nothing
         self.retired: dict[str, int] = {}
         """Hooks that stopped because their last evaluations changed next to nothing, and the step of the last one."""
@@ -163,6 +166,7 @@ class D2Hooks:
             "views": self._sampler.state_dict(),
             "evaluated": self._evaluated,
             "generator": self.generator.get_state(),
+            "inserted_at": self.inserted_at.clone(),
             "idle": dict(self._idle),
             "retired": dict(self.retired),
         }
@@ -177,6 +181,8 @@ class D2Hooks:
         self._evaluated = bool(state.get("evaluated", True))
         self._idle, self.retired = dict(state["idle"]), dict(state["retired"])
         self._count = len(self.backbone)
+        # A checkpoint from before 2026-11 does not say; nothing that trains depends on it.
+        self.inserted_at = state.get("inserted_at", torch.zeros(self._count, dtype=torch.int32)).cpu()
 
     def _begin(self, step: int) -> None:
         """Tell the backbone the step, if it has `begin_step`, and notice changes that nobody reported."""
@@ -236,7 +242,11 @@ class D2Hooks:
         if not proposals:
             return 0
         points = Points(*(torch.cat(values) for values in zip(*(p for _, p in proposals), strict=True)))
-        inserted = self.backbone.insert(points)
+        self._inserting = step
+        try:
+            inserted = self.backbone.insert(points)
+        finally:
+            self._inserting = 0
         self.trace.append(Trace(step, proposals[0][0], "insert", inserted))
         return inserted
 
@@ -244,6 +254,11 @@ class D2Hooks:
         for hook in self.hooks.values():
             hook.follow(index)
         self._count = len(index)
+        old = index.cpu()
+        # Rows that nobody reported (a model resumed without our state) count as the backbone's own.
+        count = max(len(self.inserted_at), int(old.max()) + 1 if len(old) else 0)
+        before = torch.nn.functional.pad(self.inserted_at, (0, count - len(self.inserted_at)))
+        self.inserted_at = torch.where(old < 0, self._inserting, before[old.clamp(min=0)] if count else 0).int()
 
     def _check_count(self) -> None:
         """The safety net of the contract: a change of N that nobody reported resets per-Gaussian state."""
@@ -259,6 +274,7 @@ class D2Hooks:
             )
             self._warned = True
         self._count = len(self.backbone)
+        self.inserted_at = torch.zeros(self._count, dtype=torch.int32)
 
 
 def _of_other_names(hooks: Mapping[str, Hook]) -> dict[str, Hook]:

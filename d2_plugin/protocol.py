@@ -206,6 +206,10 @@ class Backbone(Protocol):
         called with the number of the training step before anything else is asked in it.
     ``active(step) -> bool``
         False while the hooks must wait (stages, warm-up); a question, which changes nothing.
+    ``colors(view, splats) -> Tensor``
+        RGB [M, 3], 0 or more, of what `slice_at(view)` returned: the live viewer shows them, and grey without.
+    ``behind(render, view) -> Render``
+        the render with the backbone's own background where the Gaussians leave some of a ray.
     """
 
     settings: RasterSettings

@@ -20,6 +20,8 @@ COMMANDS = (
     "priors",
     "train",
     "eval",
+    "render",
+    "view",
     "compare",
     "ablate",
     "bench",

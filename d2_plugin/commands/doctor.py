@@ -15,6 +15,8 @@ OPTIONAL = {
     "pycolmap": ("stereo", "sparse points from known cameras"),
     "cv2": ("image", "pictures, videos, the OpenCV stereo sweep"),
     "kornia": ("test", "image operations that tests compare with"),
+    "av": ("video", "videos of a run"),
+    "viser": ("view", "the page that shows a run, and one that trains"),
     "rich": ("cli", "progress bars"),
     "distributed": ("cluster", "priors built by several processes or machines"),
 }

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from d2_plugin.commands.arguments.form import Form, Given
 from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
+
+if TYPE_CHECKING:
+    from d2_plugin.runs.run import Run
+    from d2_plugin.viewing.live.run import LiveRun
 
 OF_THE_RUN = ("test_cameras", "backbone", "iterations", "hooks", "priors", "accept_empty_prior", "seed", "device")
 TABLES = ("densify", "prune", "depth_loss", "d2", "priors", "backbone", "plan")
@@ -18,6 +23,8 @@ class TrainOptions(ConfigFile):
 
     output: Path
     """Folder of the run; an unfinished run in it is continued."""
+    view: bool = False
+    """Watch it train on a page in the browser."""
     export_ply: bool = False
     """Also write one 3DGS PLY per frame."""
 
@@ -36,13 +43,25 @@ def run(given: Given) -> str:
     run = Run(run_settings(given), options.output)
     say_notes(run.scene.capture.notes)
     say_plan(run.scene.plan)
-    run.train(told=lambda summary: say(str(summary)))
+    live = _live(run) if options.view else None
+    run.train(told=lambda summary: say(str(summary)), watch=None if live is None else live.watch)
     say_notes([f"{name} retired at step {step}: it changed next to nothing" for name, step in run.retired.items()])
     metrics = run.evaluate()
     if metrics["background"]:
         say("background: the prior found sky, so directions have a colour of their own at infinity")
     if options.export_ply:
         say(f"{len(run.export_ply())} PLY files in {options.output / 'ply'}")
+    if live is not None:
+        live.stay()
     table = metrics_table({options.output.name: metrics})
     where = f"metrics in {options.output / 'metrics.json'}, pictures in {options.output / 'pictures'}"
     return "\n".join([table, where, *([] if run.prior is None else [run.prior["headline"]])])
+
+
+def _live(run: Run) -> LiveRun:
+    """The page of a run; its package is asked for before anything is computed."""
+    from d2_plugin.viewing.live.run import LiveRun
+    from d2_plugin.viewing.live.viewer import viser
+
+    viser()
+    return LiveRun(run)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from torch import Tensor
 from d2_plugin.durable import write
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
+from d2_plugin.protocol import View
 
 ALPHA_MIN = 1 / 255
 """Gaussians that never reach this opacity are not drawn by any rasterizer and are left out."""
@@ -133,3 +135,15 @@ def _header(count: int, names: Sequence[str], comments: Sequence[str]) -> bytes:
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     lines += [f"element vertex {count}", *(f"property float {name}" for name in names)]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
+
+
+def write_frames(model: Any, views: Sequence[View], folder: Path) -> list[Path]:
+    """One file per view, frame_00000.ply and so on: the Gaussians of a bundled backbone at that instant."""
+    paths = []
+    for view in views:
+        with torch.no_grad():
+            splats = model.slice_at(view)
+            colors = model.colors(view, splats)
+        paths.append(folder / f"frame_{view.frame:05d}.ply")
+        write_ply(paths[-1], splats.means, splats.covariances, colors, splats.opacities)
+    return paths

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from d2_plugin import registry
@@ -23,7 +22,7 @@ from d2_plugin.runs.prior import build_priors_for, refuse_unusable
 from d2_plugin.runs.provenance import circumstances
 from d2_plugin.runs.saved.checkpoint import fitting, load_checkpoint, save_checkpoint
 from d2_plugin.runs.saved.claim import claim
-from d2_plugin.runs.saved.finite import watched, what_diverged
+from d2_plugin.runs.saved.finite import Watch, watched, what_diverged
 from d2_plugin.runs.saved.kinds import METRICS, read_run
 from d2_plugin.runs.scene import Guidance, Remembered, Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config
@@ -90,8 +89,10 @@ class Run:
                 self.prior = summary.as_dict()
         return points
 
-    def train(self, told: Callable[[PriorSummary], None] | None = None) -> None:
+    def train(self, told: Callable[[PriorSummary], None] | None = None, watch: Watch | None = None) -> None:
         """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one.
+
+        `watch` gets the trainer and returns what is called with step and loss after every step.
 
         Raises:
             D2Error: what `prepare` refuses, another process that writes this run, a damaged file, a disk that is full.
@@ -100,13 +101,19 @@ class Run:
         with self._writing():
             trainer = self._trainer(self.prepare(told=told))
             self._restore(trainer)
+            watching = watch(trainer) if watch else lambda step, loss: None
             iterations = self.settings.iterations
             chunk = max(iterations // CHECKPOINTS, 1)
             with progress_bar("train", iterations) as bar:
+
+                def on_step(step: int, loss: float) -> None:
+                    bar.update(step, f"loss {loss:.4f}")
+                    watching(step, loss)
+
                 while trainer.step < iterations and not getattr(trainer, "stopped", False):
                     until = min((trainer.step // chunk + 1) * chunk, iterations)
-                    with self._timed("train"), watched(trainer, self._checkpoint) as watch:
-                        trainer.run(until, watch(lambda step, loss: bar.update(step, f"loss {loss:.4f}")))
+                    with self._timed("train"), watched(trainer, self._checkpoint) as finite:
+                        trainer.run(until, finite(on_step))
                     self._save(trainer)
             self.retired = {} if trainer.d2 is None else dict(trainer.d2.retired)
 
@@ -179,19 +186,12 @@ class Run:
 
         A background is not among them, since the format has no place for it: what it showed is black in a viewer.
         """
-        from d2_plugin.runs.gaussian_ply import write_ply
+        from d2_plugin.runs.gaussian_ply import write_frames
 
+        capture, camera = self.scene.capture, self.scene.train_cameras[0]
+        views = [make_view(capture, camera, frame, self.settings.device) for frame in capture.frames]
         with self._writing():
-            trainer = self.trained()
-            paths = []
-            for frame in self.scene.capture.frames:
-                view = make_view(self.scene.capture, self.scene.train_cameras[0], frame, self.settings.device)
-                with torch.no_grad():
-                    splats = trainer.model.slice_at(view)
-                    colors = trainer.model.colors(view, splats)
-                paths.append(self.folder / "ply" / f"frame_{frame:05d}.ply")
-                write_ply(paths[-1], splats.means, splats.covariances, colors, splats.opacities)
-        return paths
+            return write_frames(self.trained().model, views, self.folder / "ply")
 
     @property
     def priors(self) -> Path:

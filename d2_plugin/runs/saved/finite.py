@@ -12,6 +12,11 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 
+OnStep = Callable[[int, float], None]
+"""Called with the number of a training step and its loss."""
+Watch = Callable[[Any], OnStep]
+"""From a trainer to what is called after each of its steps."""
+
 
 class Diverged(D2Error):
     """The loss or a parameter is no finite number."""

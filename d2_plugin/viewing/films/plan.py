@@ -1,0 +1,140 @@
+"""A film before it is drawn: where the camera stands at each picture, and which instant it shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.viewing.films.path_file import read_camera_path
+from d2_plugin.viewing.paths import Pose, orbit, pose_of, spiral, through
+from d2_plugin.viewing.subject import Subject
+
+STANDING = ("held-out", "training")
+MOVING = ("orbit", "spiral", "through")
+"""Paths by name; anything else is the path of a file."""
+MOVING_SECONDS = 6.0
+"""Length of a film whose camera moves, where the recording is shorter."""
+
+
+class Stop(NamedTuple):
+    """One picture of a film."""
+
+    pose: Pose
+    time: float
+    """Seconds since the first frame."""
+    camera: str = ""
+    """The camera of the recording that stands there, if one does."""
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What a film should show; None is the default of the path."""
+
+    path: str = "held-out"
+    cameras: tuple[str, ...] | None = None
+    at: float | None = None
+    speed: float = 1.0
+    seconds: float | None = None
+    fps: float | None = None
+    degrees: float | None = None
+    recorded_instants: bool = False
+    """Show the recorded instant that is nearest to each: where pictures are held against the truth."""
+
+
+class Plan(NamedTuple):
+    """All pictures of a film, in order."""
+
+    stops: list[Stop]
+    fps: float
+
+
+def plan_film(subject: Subject, wishes: Wishes) -> Plan:
+    """Lay out a film.
+
+    Time runs forward at `speed` and bounces at the ends of the recording where the film is longer; `at` freezes it.
+
+    Raises:
+        D2Error: an unknown path or camera, no camera to stand at, or an instant outside the recording.
+    """
+    if wishes.at is not None and not 0 <= wishes.at <= subject.duration + 1e-9:
+        raise D2Error(f"--at {wishes.at:g} s lies outside the recording, which lasts {subject.duration:g} s")
+    fps = wishes.fps or subject.capture.fps
+    if wishes.path in STANDING:
+        stops = _standing(subject, wishes, fps)
+    elif wishes.path in MOVING:
+        stops = _moving(subject, wishes, fps)
+    else:
+        stops, fps = _from_file(subject, wishes)
+    if wishes.recorded_instants:
+        capture = subject.capture
+        stops = [stop._replace(time=capture.seconds(subject.frame_at(stop.time))) for stop in stops]
+    return Plan(stops, fps)
+
+
+def instants(subject: Subject, wishes: Wishes, count: int, fps: float) -> list[float]:
+    """Seconds of `count` pictures: frozen, or forward and back again."""
+    if wishes.at is not None:
+        return [wishes.at] * count
+    duration = subject.duration
+    if duration == 0:
+        return [0.0] * count
+    run = np.arange(count) * wishes.speed / fps
+    bounced = duration - np.abs(np.mod(run, 2 * duration) - duration)
+    # The last picture of a film as long as the recording shows its last frame, not a rounding error after it.
+    return [float(np.clip(time, 0, duration)) for time in bounced]
+
+
+def _standing(subject: Subject, wishes: Wishes, fps: float) -> list[Stop]:
+    """Each of the cameras in turn, the whole recording at each."""
+    of_path = subject.test_cameras if wishes.path == "held-out" else subject.train_cameras
+    names = wishes.cameras or of_path
+    if not names:
+        raise D2Error(f"{subject.name} has no held-out camera: choose --path training, through, orbit or spiral")
+    known = _known(subject, names)
+    seconds = wishes.seconds
+    if seconds is None:
+        moves = wishes.at is None and subject.duration > 0
+        count = math.floor(subject.duration / wishes.speed * fps + 1e-6) + 1 if moves else max(round(fps), 1)
+    else:
+        count = max(round(seconds * fps), 1)
+    times = instants(subject, wishes, count, fps)
+    return [Stop(pose_of(subject.capture.cameras[name]), time, name) for name in known for time in times]
+
+
+def _moving(subject: Subject, wishes: Wishes, fps: float) -> list[Stop]:
+    names = _known(subject, wishes.cameras or subject.train_cameras)
+    cameras = [subject.capture.cameras[name] for name in names]
+    seconds = wishes.seconds or max(MOVING_SECONDS, 0 if wishes.at is not None else subject.duration / wishes.speed)
+    count = max(round(seconds * fps), 2)
+    if wishes.path == "orbit":
+        poses = orbit(cameras, count, wishes.degrees, subject.depth)
+    elif wishes.path == "spiral":
+        poses = spiral(cameras, count, subject.depth)
+    else:
+        poses = through(cameras, count)
+    return [Stop(pose, time) for pose, time in zip(poses, instants(subject, wishes, count, fps), strict=True)]
+
+
+def _from_file(subject: Subject, wishes: Wishes) -> tuple[list[Stop], float]:
+    if not wishes.path.endswith(".json"):
+        raise unknown_name("camera path", wishes.path, [*STANDING, *MOVING, "FILE.json"])
+    found = read_camera_path(Path(wishes.path))
+    fps = wishes.fps or found.fps
+    if found.shares is not None and wishes.at is None:
+        times = [share * subject.duration for share in found.shares]
+    else:
+        times = instants(subject, wishes, len(found.poses), fps)
+    return [Stop(pose, time) for pose, time in zip(found.poses, times, strict=True)], fps
+
+
+def _known(subject: Subject, names: Sequence[str]) -> Sequence[str]:
+    for name in names:
+        if name not in subject.capture.cameras:
+            raise unknown_name("camera", name, subject.capture.cameras)
+    return names

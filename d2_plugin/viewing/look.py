@@ -1,0 +1,104 @@
+"""What a camera sees of a backbone: colour, depth, alpha, and how many Gaussians each pixel has to do with.
+
+Everything here goes through the contract (`slice_at`, and `colors` where there is one), so any trainer with an adapter
+can be looked at. Nothing is changed: the trainer's own `render` would forget what it keeps between two of its lines.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from d2_plugin.protocol import RasterSettings, Splats, View
+from d2_plugin.rasterizer import rasterize
+
+SOLID = 0.5
+"""A rendered depth is shown where the accumulated alpha exceeds this."""
+GREY = 0.6
+"""Brightness of Gaussians whose adapter knows no colours."""
+MARKED = (1.0, 0.45, 0.0)
+"""RGB of Gaussians that are pointed out; the others fade."""
+FADED = 0.3
+"""Share of its own brightness that a Gaussian keeps beside those that are pointed out."""
+
+
+class Look(NamedTuple):
+    """One view of a backbone, on the CPU."""
+
+    color: Tensor  # [H, W, 3] in 0..1
+    depth: Tensor  # [H, W] planar z, 0 where alpha is too low to have one
+    alpha: Tensor  # [H, W] in 0..1
+    splats: Splats
+    """What was drawn, on the backbone's device."""
+
+
+@torch.no_grad()
+def look(backbone: Any, view: View, min_opacity: float = 0.0, marked: Tensor | None = None) -> Look:
+    """Draw one view.
+
+    Args:
+        backbone: a `d2_plugin.protocol.Backbone`.
+        view: camera and time; any size.
+        min_opacity: Gaussians whose opacity at that time is lower are left out.
+        marked: rows to be pointed out, bool [N]; None shows the colours as they are.
+    """
+    splats = backbone.slice_at(view)
+    colors = _colors(backbone, view, splats)
+    if min_opacity > 0:
+        kept = torch.nonzero(splats.opacities >= min_opacity).squeeze(-1)
+        splats, colors = Splats(*(part[kept] for part in splats)), colors[kept]
+    if marked is not None:
+        chosen = marked.to(splats.rows.device)[splats.rows][:, None]
+        colors = torch.where(chosen, colors.new_tensor(MARKED), FADED * colors.mean(-1, keepdim=True))
+    render = rasterize(splats, colors.contiguous(), view, backbone.settings)
+    behind = getattr(backbone, "behind", None)
+    if behind is not None and marked is None:
+        render = behind(render, view)
+    color, depth_sum, alpha = (part.cpu() for part in render[:3])
+    depth = torch.where(alpha > SOLID, depth_sum / alpha.clamp(min=SOLID), torch.zeros_like(alpha))
+    return Look(color.clamp(0, 1), depth, alpha, splats)
+
+
+def _colors(backbone: Any, view: View, splats: Splats) -> Tensor:
+    colors = getattr(backbone, "colors", None)
+    return splats.means.new_full((len(splats.means), 3), GREY) if colors is None else colors(view, splats)
+
+
+@torch.no_grad()
+def gaussians_per_pixel(splats: Splats, view: View, settings: RasterSettings) -> Tensor:
+    """In how many Gaussians' footprints each pixel lies, [H, W] float.
+
+    A footprint is the axis-parallel box around the ellipse where alpha is at least `settings.alpha_min`: what a
+    rasterizer has to walk through, whether or not something in front has used up the light.
+    """
+    T, K = view.T_camera_world.to(splats.means), view.K.to(splats.means)
+    in_camera = splats.means @ T[:3, :3].T + T[:3, 3]
+    drawn = (in_camera[:, 2] > settings.near) & (splats.opacities >= settings.alpha_min)
+    x, y, z = in_camera[drawn].unbind(-1)
+    zero = torch.zeros_like(z)
+    slopes = torch.stack([K[0, 0] / z, zero, -K[0, 0] * x / z**2, zero, K[1, 1] / z, -K[1, 1] * y / z**2], -1)
+    A = slopes.view(-1, 2, 3) @ T[:3, :3]
+    whole = splats.covariances[drawn][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3)
+    variances = (A @ whole @ A.transpose(1, 2)).diagonal(dim1=1, dim2=2) + settings.blur
+    reach = (2 * torch.log(splats.opacities[drawn] / settings.alpha_min)).clamp(min=0)[:, None]
+    half = (reach * variances).sqrt()
+    centre = torch.stack([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]], -1)
+    return _boxes_over_pixels(centre - half, centre + half, view.width, view.height)
+
+
+def _boxes_over_pixels(low: Tensor, high: Tensor, width: int, height: int) -> Tensor:
+    """How many of the boxes [M, 2] hold each pixel's centre: corners are counted, then summed along both axes."""
+    size = low.new_tensor([width, height])
+    fine = torch.isfinite(low).all(-1) & torch.isfinite(high).all(-1)
+    first = (low[fine] - 0.5).ceil().clamp(min=0).minimum(size).long()
+    last = (high[fine] + 0.5).floor().clamp(min=0).minimum(size).long()  # one beyond the last pixel inside
+    last = torch.maximum(first, last)
+    count = low.new_zeros((height + 1) * (width + 1))
+    for corner, sign in ((first, 1.0), (last, 1.0)):
+        count.index_add_(0, corner[:, 1] * (width + 1) + corner[:, 0], count.new_full((len(corner),), sign))
+    for x, y in ((first, last), (last, first)):
+        place = y[:, 1] * (width + 1) + x[:, 0]
+        count.index_add_(0, place, count.new_full((len(place),), -1.0))
+    return count.view(height + 1, width + 1).cumsum(0).cumsum(1)[:height, :width].cpu()

@@ -1,0 +1,198 @@
+"""Camera paths: a camera's pose and lens for each picture of a film, made from the cameras of a recording.
+
+All poses are `T_camera_world` [4, 4] float64 in OpenCV axes. Two to four cameras cover a small part of the sphere
+around a scene, and what they did not see cannot be shown: orbit and spiral stay inside the angle that they span.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from d2_plugin.captures import Camera
+from d2_plugin.captures.rotations import quaternion_of_rotation, rotation_of_quaternion, rotation_of_vector
+
+ALL_AROUND = 270.0
+"""Cameras that span more than this many degrees stand all around: an orbit is then a whole turn."""
+LEAST_SWING = 12.0
+"""Degrees that an orbit swings at least, where cameras stand close together."""
+
+
+class Lens(NamedTuple):
+    """Intrinsics and the size they belong to."""
+
+    K: np.ndarray  # [3, 3]
+    width: int
+    height: int
+
+    def fitted(self, width: int, height: int) -> Lens:
+        """The lens for pictures of another size: scaled to fill them, cut alike on both sides, never stretched."""
+        if (width, height) == (self.width, self.height):
+            return self
+        scale = max(width / self.width, height / self.height)
+        K = self.K.copy()
+        K[:2, :2] *= scale
+        K[:2, 2] = (K[:2, 2] - np.array([self.width, self.height]) / 2) * scale + np.array([width, height]) / 2
+        return Lens(K, width, height)
+
+
+class Pose(NamedTuple):
+    """One camera of a path."""
+
+    T_camera_world: np.ndarray
+    lens: Lens
+
+
+def pose_of(camera: Camera) -> Pose:
+    """Where a camera of a recording stands."""
+    return Pose(camera.T_camera_world, Lens(camera.K, camera.width, camera.height))
+
+
+def orbit(
+    cameras: Sequence[Camera], count: int, degrees: float | None = None, depth: float | None = None
+) -> list[Pose]:
+    """A swing around the point that the cameras look at, from its middle to both ends and back; a whole turn for 360.
+
+    Args:
+        cameras: those of the recording.
+        count: of poses.
+        degrees: angle of the swing; by default the angle that the cameras span, or a whole turn where they stand all
+            around.
+        depth: of what is looked at, in front of the cameras, where their axes do not meet.
+    """
+    rig = _Rig.of(cameras, depth)
+    span = rig.span if degrees is None else degrees
+    if degrees is None:
+        span = 360.0 if span > ALL_AROUND else max(span, LEAST_SWING)
+    share = np.arange(count) / max(count, 1)
+    angles = 360 * share if span >= 360 else span / 2 * np.sin(2 * np.pi * share)
+    start = rig.middle - rig.focus
+    around = [rotation_of_vector(np.radians(angle) * rig.up) @ start for angle in angles]
+    return [Pose(look_at(rig.focus + offset, rig.focus, rig.up), rig.lens) for offset in around]
+
+
+def spiral(cameras: Sequence[Camera], count: int, depth: float | None = None, turns: int = 2) -> list[Pose]:
+    """LLFF's spiral about the mean camera, looking at the point that the cameras look at.
+
+    Its radii are half of the 90th percentile of the cameras' distances from their mean, along each axis: the whole
+    of it would leave what an arc of few cameras has seen.
+    """
+    rig = _Rig.of(cameras, depth)
+    axes = look_at(rig.middle, rig.focus, rig.up)[:3, :3]
+    offsets = np.abs((np.stack([camera.centre for camera in cameras]) - rig.middle) @ axes.T)
+    radii = 0.5 * np.percentile(offsets, 90, axis=0)
+    radii = np.maximum(radii, 0.02 * np.linalg.norm(rig.focus - rig.middle) * np.array([1, 1, 0]))
+    angle = 2 * np.pi * turns * np.arange(count) / max(count, 1)
+    local = np.stack([np.sin(angle), np.cos(angle) - 1, np.sin(angle / turns)], -1) * radii
+    return [Pose(look_at(rig.middle + offset @ axes, rig.focus, rig.up), rig.lens) for offset in local]
+
+
+def through(cameras: Sequence[Camera], count: int) -> list[Pose]:
+    """From camera to camera, each the nearest that is left: the first pose is the first camera, the last the last.
+
+    Positions, rotations and lenses are interpolated; the path rests at each camera for a moment.
+    """
+    chain = _chained(cameras)
+    places = np.linspace(0, len(chain) - 1, count) if count > 1 else np.zeros(1)
+    return [_between(chain, place) for place in places]
+
+
+def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """T_camera_world [4, 4] of a camera at `position` that looks at `target`, upright."""
+    forward = _unit(target - position)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-9:  # straight up or down: any side will do
+        right = np.cross(forward, np.roll(up, 1))
+    right = _unit(right)
+    R = np.stack([right, np.cross(forward, right), forward])
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, -R @ position
+    return T
+
+
+class _Rig(NamedTuple):
+    """What the cameras have in common."""
+
+    focus: np.ndarray  # [3], what they look at
+    middle: np.ndarray  # [3], where a camera between them stands
+    up: np.ndarray  # [3], unit
+    span: float  # degrees
+    lens: Lens
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], depth: float | None) -> _Rig:
+        centres = np.stack([camera.centre for camera in cameras])
+        forwards = np.stack([camera.T_camera_world[2, :3] for camera in cameras])
+        up = _unit(-np.mean([camera.T_camera_world[1, :3] for camera in cameras], axis=0))
+        focus = focus_of(centres, forwards, depth)
+        offsets = centres - focus
+        flat = offsets - np.outer(offsets @ up, up)
+        azimuth, span = _arc(flat, up)
+        radius, height = np.linalg.norm(flat, axis=1).mean(), (offsets @ up).mean()
+        towards = rotation_of_vector(np.radians(azimuth) * up) @ _unit(flat[0])
+        first = cameras[0]
+        return cls(focus, focus + radius * towards + height * up, up, span, Lens(first.K, first.width, first.height))
+
+
+def focus_of(centres: np.ndarray, forwards: np.ndarray, depth: float | None = None) -> np.ndarray:
+    """The point nearest to all optical axes; `depth` in front of the mean camera where they do not meet before them."""
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # projections across each axis
+    normal, right = across.sum(axis=0), (across @ centres[:, :, None]).sum(axis=0)[:, 0]
+    eigenvalues = np.linalg.eigvalsh(normal)
+    if eigenvalues[0] > 1e-4 * len(centres):
+        point = np.linalg.solve(normal, right)
+        if ((point - centres) * forwards).sum(axis=1).min() > 0:
+            return point
+    spread = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
+    far = depth if depth is not None else max(4 * spread, 1.0)
+    return centres.mean(axis=0) + far * _unit(forwards.mean(axis=0))
+
+
+def _arc(flat: np.ndarray, up: np.ndarray) -> tuple[float, float]:
+    """Middle and width, in degrees, of the arc about `up` on which the cameras stand; 0 degrees is the first camera.
+
+    It is the circle without the widest gap between two neighbours.
+    """
+    ahead = _unit(flat[0])
+    angles = np.sort(np.degrees(np.arctan2(flat @ np.cross(up, ahead), flat @ ahead)))
+    gaps = np.diff(angles, append=angles[0] + 360)
+    begin = int(gaps.argmax()) + 1
+    span = 360 - float(gaps.max())
+    return float(angles[begin % len(angles)]) + span / 2, span
+
+
+def _chained(cameras: Sequence[Camera]) -> list[Camera]:
+    """The cameras in an order of small steps, begun at an end of the rig: the camera farthest from their mean."""
+    centres = np.stack([camera.centre for camera in cameras])
+    at = int(np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmax())
+    order, left = [at], set(range(len(cameras))) - {at}
+    while left:
+        at = min(left, key=lambda i: float(np.linalg.norm(centres[i] - centres[order[-1]])))
+        order.append(at)
+        left.remove(at)
+    return [cameras[i] for i in order]
+
+
+def _between(chain: Sequence[Camera], place: float) -> Pose:
+    """The pose at `place` of a chain: whole numbers are its cameras."""
+    first = min(int(place), len(chain) - 1)
+    share = place - first
+    if share == 0:
+        return pose_of(chain[first])
+    share = share * share * (3 - 2 * share)  # slow at both ends
+    a, b = chain[first], chain[first + 1]
+    p, q = (quaternion_of_rotation(camera.T_camera_world[:3, :3]) for camera in (a, b))
+    q = q if p @ q >= 0 else -q
+    angle = np.arccos(np.clip(p @ q, -1, 1))
+    weights = (1 - share, share) if angle < 1e-6 else np.sin([(1 - share) * angle, share * angle]) / np.sin(angle)
+    T = np.eye(4)
+    T[:3, :3] = rotation_of_quaternion(weights[0] * p + weights[1] * q)
+    T[:3, 3] = -T[:3, :3] @ ((1 - share) * a.centre + share * b.centre)
+    end = Lens(b.K, b.width, b.height).fitted(a.width, a.height)
+    return Pose(T, Lens((1 - share) * a.K + share * end.K, a.width, a.height))
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(np.linalg.norm(vector), 1e-12)

@@ -1,0 +1,38 @@
+"""A small run with all hooks, trained once for the tests of this folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from d2_plugin.captures.export.folder import save_capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.runs.run import Run
+from d2_plugin.runs.settings import RunSettings
+from d2_plugin.viewing.subject import Subject, subject_of_run
+
+CAMERAS = ("train0", "train1", "train2")
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of three cameras and a held-out one, four frames of 96x54 at 12 per second."""
+    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+    path = tmp_path_factory.mktemp("recording") / "room"
+    return save_capture(synthetic_capture(cameras=3, held_out=1, frames=4, width=96, height=54), path)
+
+
+@pytest.fixture(scope="session")
+def trained(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a finished run with all hooks."""
+    pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
+    folder = tmp_path_factory.mktemp("runs") / "full"
+    Run(RunSettings(str(room), CAMERAS, iterations=80), folder).train()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def subject(trained: Path) -> Subject:
+    """The same run, opened."""
+    return subject_of_run(trained)

@@ -1,0 +1,139 @@
+"""Looking: the same picture as the backbone's own render, and nothing of the trainer is touched."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from mimics import deformable3d, fudan, spacetime
+from tiny import ALL_HOOKS, BACKBONES, make_adapter, make_model, make_trainer, make_views, parameters, same
+
+from d2_plugin.adapters.deformable3d import Deformable3DAdapter
+from d2_plugin.adapters.fudan import FudanAdapter
+from d2_plugin.adapters.gsplat_dict import GsplatAdapter
+from d2_plugin.adapters.spacetime import SpacetimeAdapter
+from d2_plugin.gaussians.spherical_harmonics import SH_C0
+from d2_plugin.protocol import RasterSettings, Splats
+from d2_plugin.viewing.look import MARKED, gaussians_per_pixel, look
+
+VIEW = make_views()[4]
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+@pytest.mark.parametrize("background", [False, True])
+def test_a_look_is_the_backbones_own_render(backbone: str, background: bool) -> None:
+    model = make_model(backbone=backbone, background=background)
+    if background:
+        model.background.constant.data.fill_(0.8)
+    with torch.no_grad():
+        render = model.render(VIEW)
+    seen = look(make_adapter(model), VIEW)
+    assert torch.equal(seen.color, render.color.clamp(0, 1))
+    assert torch.equal(seen.alpha, render.alpha)
+    solid = render.alpha > 0.5
+    assert solid.any()
+    assert torch.allclose(seen.depth[solid], (render.depth_sum / render.alpha)[solid])
+    assert not seen.depth[~solid].any()
+
+
+def test_looking_between_two_steps_leaves_training_bitwise_as_it_is() -> None:
+    alone, watched = make_trainer(ALL_HOOKS), make_trainer(ALL_HOOKS)
+    alone.run()
+    state = torch.random.get_rng_state()
+
+    def on_step(step: int, loss: float) -> None:
+        look(watched.d2.backbone, replace(VIEW, time=0.01 * step), 0.1, watched.d2.inserted_at > 0)
+
+    watched.run(on_step=on_step)
+    assert same(parameters(alone), parameters(watched))
+    assert torch.equal(state, torch.random.get_rng_state())
+
+
+@pytest.mark.parametrize("maker", [fudan, deformable3d, spacetime], ids=["fudan", "deformable3d", "spacetime"])
+def test_the_colours_of_official_trainers_are_those_they_render(maker) -> None:
+    if maker is spacetime:
+        gaussians = spacetime.make()[0]
+        adapter = SpacetimeAdapter(gaussians, 10)
+    elif maker is fudan:
+        gaussians = fudan.make()[0]
+        adapter = FudanAdapter(gaussians)
+    else:
+        gaussians, deform = deformable3d.make()[:2]
+        adapter = Deformable3DAdapter(gaussians, deform)
+    splats = adapter.slice_at(VIEW)
+    assert torch.allclose(adapter.colors(VIEW, splats), gaussians.rgb[splats.rows].clamp(min=0), atol=1e-6)
+
+
+def test_harmonics_of_gsplat_depend_on_the_direction() -> None:
+    parameters = {
+        "means": torch.tensor([[0.0, 0, 3], [0.5, 0, 3]]),
+        "scales": torch.full((2, 3), -2.0),
+        "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1),
+        "opacities": torch.zeros(2),
+        "sh0": torch.full((2, 1, 3), 0.25 / SH_C0),
+        "shN": torch.zeros(2, 3, 3),
+    }
+    adapter = GsplatAdapter(parameters, {})
+    splats = adapter.slice_at(VIEW)
+    assert torch.allclose(adapter.colors(VIEW, splats), torch.full((2, 3), 0.75))
+    parameters["shN"][:, 1] = 0.5
+    centre = -VIEW.T_camera_world[:3, 3]
+    z = torch.nn.functional.normalize(splats.means - centre, dim=-1)[:, 2:]
+    assert torch.allclose(adapter.colors(VIEW, splats), (0.75 + 0.5 * 0.4886025 * z).expand(2, 3), atol=1e-5)
+
+
+def test_an_adapter_without_colours_is_shown_in_grey() -> None:
+    adapter = make_adapter(make_model())
+
+    class Bare:
+        settings, slice_at = adapter.settings, staticmethod(adapter.slice_at)
+
+    seen = look(Bare(), VIEW)
+    covered = seen.alpha > 0.9
+    assert covered.any()
+    assert torch.allclose(seen.color[covered], 0.6 * seen.alpha[covered][:, None], atol=1e-5)
+
+
+def test_faint_gaussians_are_clipped_and_others_stay() -> None:
+    adapter = make_adapter(make_model())
+    every, clipped = look(adapter, VIEW), look(adapter, VIEW, min_opacity=0.3)
+    assert 0 < len(clipped.splats.rows) < len(every.splats.rows)
+    assert clipped.splats.opacities.min() >= 0.3
+    assert not len(look(adapter, VIEW, min_opacity=1.0).splats.rows)
+
+
+def test_those_that_d2_inserted_are_pointed_out() -> None:
+    adapter = make_adapter(make_model())
+    marked = torch.ones(len(adapter), dtype=torch.bool)
+    seen = look(adapter, VIEW, marked=marked)
+    assert torch.allclose(seen.color, seen.alpha[..., None] * torch.tensor(MARKED), atol=1e-4)
+    faded = look(adapter, VIEW, marked=~marked).color
+    assert torch.allclose(faded[..., 0], faded[..., 2], atol=1e-6)  # grey
+
+
+def test_the_number_of_gaussians_is_that_of_the_boxes_over_each_pixel() -> None:
+    generator = torch.Generator().manual_seed(2)
+    count, settings = 40, RasterSettings()
+    means = torch.rand(count, 3, generator=generator) * torch.tensor([3.0, 2, 3]) + torch.tensor([-1.5, -1, 0.1])
+    variances = 0.02 * torch.rand(count, 3, generator=generator) + 1e-4
+    covariances = torch.zeros(count, 6)
+    covariances[:, [0, 3, 5]] = variances
+    opacities = torch.rand(count, generator=generator)
+    found = gaussians_per_pixel(Splats(means, covariances, opacities, torch.arange(count)), VIEW, settings)
+    expected = np.zeros((VIEW.height, VIEW.width))
+    K, T = VIEW.K.numpy(), VIEW.T_camera_world.numpy()
+    for mean, variance, opacity in zip(means.numpy(), variances.numpy(), opacities.numpy(), strict=True):
+        x, y, z = T[:3, :3] @ mean + T[:3, 3]
+        if z <= settings.near or opacity < settings.alpha_min:
+            continue
+        J = np.array([[K[0, 0] / z, 0, -K[0, 0] * x / z**2], [0, K[1, 1] / z, -K[1, 1] * y / z**2]]) @ T[:3, :3]
+        C = J @ np.diag(variance) @ J.T + settings.blur * np.eye(2)
+        half = np.sqrt(2 * np.log(opacity / settings.alpha_min) * np.diag(C))
+        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        inside_x = np.abs(np.arange(VIEW.width) + 0.5 - u) <= half[0]
+        inside_y = np.abs(np.arange(VIEW.height) + 0.5 - v) <= half[1]
+        expected += inside_y[:, None] & inside_x[None]
+    assert expected.max() > 3
+    assert np.array_equal(found.numpy(), expected)

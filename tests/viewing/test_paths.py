@@ -1,0 +1,171 @@
+"""Camera paths: they begin and end where they say, look where the cameras look, and stay where the cameras saw."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from d2_plugin.captures import Camera
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.errors import D2Error
+from d2_plugin.viewing.films.path_file import OPENGL, read_camera_path
+from d2_plugin.viewing.paths import Lens, Pose, focus_of, look_at, orbit, pose_of, spiral, through
+
+ARC = list(synthetic_capture(cameras=4, held_out=0, frames=1, width=96, height=54).cameras.values())
+
+
+def ring(count: int, radius: float = 3.0) -> list[Camera]:
+    """Cameras all around the origin, upright, y down."""
+    angles = 2 * np.pi * np.arange(count) / count
+    centres = radius * np.stack([np.sin(angles), np.zeros(count), np.cos(angles)], -1)
+    poses = [look_at(centre, np.zeros(3), np.array([0.0, -1, 0])) for centre in centres]
+    return [replace(ARC[0], name=f"{i}", T_camera_world=pose) for i, pose in enumerate(poses)]
+
+
+def centre(pose: Pose) -> np.ndarray:
+    R, t = pose.T_camera_world[:3, :3], pose.T_camera_world[:3, 3]
+    return -R.T @ t
+
+
+def focus(cameras: list[Camera]) -> np.ndarray:
+    return focus_of(np.stack([c.centre for c in cameras]), np.stack([c.T_camera_world[2, :3] for c in cameras]))
+
+
+def is_rotation(R: np.ndarray) -> bool:
+    return np.allclose(R @ R.T, np.eye(3), atol=1e-9) and np.linalg.det(R) > 0
+
+
+@pytest.mark.parametrize("path", [orbit, spiral, through])
+@pytest.mark.parametrize("cameras", [ARC, ARC[:2], ARC[:1], ring(8)], ids=["arc", "two", "one", "ring"])
+def test_every_pose_is_a_camera_pose(path, cameras: list[Camera]) -> None:
+    poses = path(cameras, 17)
+    assert len(poses) == 17
+    for pose in poses:
+        assert np.isfinite(pose.T_camera_world).all()
+        assert is_rotation(pose.T_camera_world[:3, :3])
+
+
+def test_a_path_through_the_cameras_begins_and_ends_at_one_and_visits_all() -> None:
+    poses = through(ARC, 31)
+    ends = {tuple(np.round(centre(pose), 9)) for pose in (poses[0], poses[-1])}
+    assert ends <= {tuple(np.round(camera.centre, 9)) for camera in ARC}
+    assert len(ends) == 2
+    for camera in ARC:
+        assert min(np.abs(pose.T_camera_world - camera.T_camera_world).max() for pose in poses) < 1e-9
+
+
+def test_an_orbit_looks_at_the_focus_from_one_distance_and_stays_inside_the_cameras() -> None:
+    point, poses = focus(ARC), orbit(ARC, 40)
+    distances = [np.linalg.norm(centre(pose) - point) for pose in poses]
+    assert np.ptp(distances) < 1e-9
+    for pose in poses:
+        ahead = pose.T_camera_world[:3, :3] @ point + pose.T_camera_world[:3, 3]
+        assert np.allclose(ahead[:2], 0, atol=1e-9)
+        assert ahead[2] > 0
+    widest = max(np.linalg.norm(a.centre - b.centre) for a in ARC for b in ARC)
+    swung = max(np.linalg.norm(centre(a) - centre(b)) for a in poses for b in poses)
+    assert 0.7 * widest < swung < 1.1 * widest
+
+
+def test_cameras_all_around_are_orbited_by_a_whole_turn() -> None:
+    places = np.stack([centre(pose) for pose in orbit(ring(8), 36)])
+    assert np.allclose(np.linalg.norm(places, axis=1), 3)
+    assert np.allclose(places.mean(axis=0), 0, atol=1e-9)
+    half = np.stack([centre(pose) for pose in orbit(ring(8), 36, degrees=90)])
+    assert np.linalg.norm(half.mean(axis=0)) > 1
+
+
+def test_a_spiral_stays_close_to_the_mean_camera() -> None:
+    middle, reach = np.mean([c.centre for c in ARC], axis=0), max(np.linalg.norm(c.centre - ARC[0].centre) for c in ARC)
+    assert max(np.linalg.norm(centre(pose) - middle) for pose in spiral(ARC, 60)) < reach
+
+
+def test_parallel_cameras_have_a_focus_in_front_of_them() -> None:
+    forwards = np.tile([0.0, 0, 1], (2, 1))
+    found = focus_of(np.array([[0.0, 0, 0], [1, 0, 0]]), forwards, depth=5.0)
+    assert np.allclose(found, [0.5, 0, 5])
+
+
+@given(st.floats(-3, 3), st.floats(-3, 3), st.floats(-3, 3))
+def test_look_at_is_upright_and_looks_there(x: float, y: float, z: float) -> None:
+    position, target = np.array([x, y, z]), np.array([4.0, 0, 0])
+    T = look_at(position, target, np.array([0.0, -1, 0]))
+    assert is_rotation(T[:3, :3])
+    assert np.allclose((T[:3, :3] @ target + T[:3, 3])[:2], 0, atol=1e-6)
+    assert T[1, 1] >= -1e-9  # the picture's y axis does not point up
+
+
+@pytest.mark.parametrize("size", [(192, 108), (48, 27), (100, 54), (54, 96)])
+def test_a_lens_of_another_size_keeps_its_shape_and_its_middle(size: tuple[int, int]) -> None:
+    lens = Lens(np.array([[90.0, 0, 50], [0, 90.0, 25], [0, 0, 1]]), 96, 54)
+    other = lens.fitted(*size)
+    scale = max(size[0] / 96, size[1] / 54)
+    assert np.isclose(other.K[0, 0], other.K[1, 1])
+    assert np.isclose(other.K[0, 0], 90 * scale)
+    assert np.allclose(other.K[:2, 2] - np.array(size) / 2, (np.array([50, 25]) - np.array([48, 27])) * scale)
+
+
+class TestCameraPathFiles:
+    def write(self, folder: Path, camera: Camera, **more: object) -> Path:
+        opengl = np.linalg.inv(camera.T_camera_world) @ OPENGL
+        fov = float(np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1])))
+        entry = {"camera_to_world": opengl.flatten().tolist(), "fov": fov, "aspect": 1.0}
+        table = {"render_width": 96, "render_height": 54, "fps": 24, "camera_path": [entry, entry]} | more
+        path = folder / "camera_path.json"
+        path.write_text(json.dumps(table))
+        return path
+
+    def test_a_pose_comes_back_in_our_axes(self, tmp_path: Path) -> None:
+        found = read_camera_path(self.write(tmp_path, ARC[1]))
+        assert len(found.poses) == 2
+        assert found.fps == 24
+        assert found.shares is None
+        pose = pose_of(ARC[1])
+        assert np.allclose(found.poses[0].T_camera_world, pose.T_camera_world)
+        assert np.allclose(found.poses[0].lens.K[1, 1], pose.lens.K[1, 1])
+
+    def test_what_nerfstudio_did_to_the_world_is_undone(self, tmp_path: Path) -> None:
+        turn = np.array([[0.0, -1, 0, 0.5], [1, 0, 0, -2], [0, 0, 1, 0.25]])
+        (tmp_path / "dataparser_transforms.json").write_text(json.dumps({"transform": turn.tolist(), "scale": 0.1}))
+        whole = np.vstack([turn, [0, 0, 0, 1]])
+        moved = whole @ np.linalg.inv(ARC[1].T_camera_world)
+        moved[:3, 3] *= 0.1
+        there = replace(ARC[1], T_camera_world=np.linalg.inv(moved))
+        found = read_camera_path(self.write(tmp_path, there))
+        assert np.allclose(found.poses[0].T_camera_world, ARC[1].T_camera_world)
+
+    def test_times_count_only_where_all_have_one(self, tmp_path: Path) -> None:
+        path = self.write(tmp_path, ARC[0])
+        table = json.loads(path.read_text())
+        table["camera_path"][0]["render_time"] = 0.25
+        path.write_text(json.dumps(table))
+        assert read_camera_path(path).shares is None
+        table["camera_path"][1]["render_time"] = 2.0
+        path.write_text(json.dumps(table))
+        assert read_camera_path(path).shares == [0.25, 1.0]
+
+    @pytest.mark.parametrize(
+        ("change", "said"),
+        [
+            ({"camera_type": "fisheye"}, "of type 'fisheye', expected perspective"),
+            ({"camera_path": []}, "has no camera"),
+            ({"camera_path": [{"fov": 50}]}, "is no camera_path.json of nerfstudio"),
+            ({"camera_path": [{"fov": 0, "camera_to_world": list(np.eye(4).flatten())}]}, "is no camera_path.json"),
+        ],
+    )
+    def test_another_file_is_refused_in_a_sentence(self, tmp_path: Path, change: dict, said: str) -> None:
+        with pytest.raises(D2Error, match=said):
+            read_camera_path(self.write(tmp_path, ARC[0], **change))
+
+    def test_a_file_that_is_not_there_or_no_json(self, tmp_path: Path) -> None:
+        with pytest.raises(D2Error, match="no camera path at"):
+            read_camera_path(tmp_path / "none.json")
+        (tmp_path / "text.json").write_text("{")
+        with pytest.raises(D2Error, match="is no JSON"):
+            read_camera_path(tmp_path / "text.json")

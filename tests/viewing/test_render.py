@@ -1,0 +1,306 @@
+"""`d2 render`: films of a run that agree with its model, and one sentence for what cannot be shown."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from mimics import fudan, spacetime
+
+from d2_plugin.captures import open_capture
+from d2_plugin.commands.cli import main
+from d2_plugin.errors import D2Error
+from d2_plugin.runs.run import Run
+from d2_plugin.runs.settings import RunSettings
+from d2_plugin.runs.start import make_view
+from d2_plugin.viewing.checkpoints import FUDAN, open_subject, read_ply
+from d2_plugin.viewing.films.film import RenderSettings, run
+from d2_plugin.viewing.films.plan import Wishes, plan_film
+from d2_plugin.viewing.look import look
+from d2_plugin.viewing.panels import KINDS, Shot
+from d2_plugin.viewing.paths import pose_of
+from d2_plugin.viewing.subject import Subject
+
+av = pytest.importorskip("av", reason="PyAV is in the `video` extra")
+
+
+def film_of(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def decibels(a: np.ndarray, b: np.ndarray) -> float:
+    return -10 * np.log10(np.mean((a.astype(float) / 255 - b) ** 2) + 1e-12)
+
+
+@pytest.fixture(scope="module")
+def rendered(trained: Path) -> Callable[[str, int], np.ndarray]:
+    """The backbone's own render at a camera of the recording, through the rasterizer, [H, W, 3] in 0..1."""
+    opened = Run.load(trained)
+    model, capture = opened.trained().model, opened.scene.capture
+
+    def at(camera: str, frame: int) -> np.ndarray:
+        with torch.no_grad():
+            return model.render(make_view(capture, camera, frame)).color.clamp(0, 1).numpy()
+
+    return at
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    capsys.readouterr()
+    assert main(["render", *map(str, words)]) == 2
+    message = capsys.readouterr().err.strip()
+    assert len(message.splitlines()) == 1
+    return message
+
+
+def test_a_held_out_camera_plays_the_whole_recording_as_the_rasterizer_draws_it(
+    trained: Path, tmp_path: Path, rendered: Callable[[str, int], np.ndarray]
+) -> None:
+    said = run(RenderSettings((trained,), output=tmp_path / "a.mp4", quality=10))
+    assert "4 pictures of 96x54, 12 per second" in said
+    found = film_of(tmp_path / "a.mp4")
+    assert len(found) == 4
+    assert found[0].shape == (54, 96, 3)
+    assert decibels(found[0], rendered("test0", 0)) >= 35
+    assert decibels(found[-1], rendered("test0", 3)) >= 35
+    assert decibels(found[0], rendered("train0", 0)) < 30, "another camera is another picture"
+
+
+def test_a_path_through_the_training_cameras_begins_and_ends_as_the_rasterizer_draws_them(
+    trained: Path, tmp_path: Path, rendered: Callable[[str, int], np.ndarray], subject: Subject
+) -> None:
+    words = ["render", str(trained), "--path", "through", "--at", "0", "--seconds", "1", "--quality", "10"]
+    assert main([*words, "--output", str(tmp_path / "a.mp4")]) == 0
+    found = film_of(tmp_path / "a.mp4")
+    assert len(found) == 12
+    stops = plan_film(subject, Wishes("through", at=0.0, seconds=1.0)).stops
+    cameras = subject.capture.cameras
+    ends = [next(n for n in cameras if cameras[n].T_camera_world is stop.pose.T_camera_world) for stop in stops[::11]]
+    assert decibels(found[0], rendered(ends[0], 0)) >= 35
+    assert decibels(found[-1], rendered(ends[1], 0)) >= 35
+
+
+@pytest.mark.parametrize("path", ["orbit", "spiral"])
+def test_moving_paths_have_the_asked_length_rate_and_odd_size(trained: Path, tmp_path: Path, path: str) -> None:
+    settings = RenderSettings(
+        (trained,), output=tmp_path / "a.mp4", path=path, seconds=0.5, fps=20, width=63, height=35, speed=0.25
+    )
+    assert "the file has 64x36" in run(settings)
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        stream = container.streams.video[0]
+        assert (stream.width, stream.height, stream.frames, stream.average_rate) == (64, 36, 10, 20)
+
+
+def test_a_camera_path_of_nerfstudio_is_followed(
+    trained: Path, tmp_path: Path, subject: Subject, rendered: Callable[[str, int], np.ndarray]
+) -> None:
+    camera = subject.capture.cameras["train1"]
+    opengl = np.linalg.inv(camera.T_camera_world) @ np.diag([1.0, -1, -1, 1])
+    fov = float(np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1])))
+    entry = {"camera_to_world": opengl.flatten().tolist(), "fov": fov, "aspect": 16 / 9}
+    path = tmp_path / "camera_path.json"
+    entries = [entry | {"render_time": 0.0}, entry | {"render_time": 1.0}]
+    path.write_text(json.dumps({"render_width": 96, "render_height": 54, "fps": 5, "camera_path": entries}))
+    run(RenderSettings((trained,), output=tmp_path / "png", path=str(path), format="png"))
+    from d2_plugin.captures.pictures import read_picture
+
+    found = [read_picture(tmp_path / "png" / name) for name in ("00000.png", "00001.png")]
+    assert decibels(found[0], rendered("train1", 0)) > 45
+    assert decibels(found[1], rendered("train1", 3)) > 45
+
+
+def test_time_plays_bounces_slows_and_freezes(subject: Subject) -> None:
+    def times(**wishes: object) -> list[float]:
+        return [round(12 * stop.time, 6) for stop in plan_film(subject, Wishes(**wishes)).stops]
+
+    assert times() == [0, 1, 2, 3]
+    assert times(speed=0.5) == [0, 0.5, 1, 1.5, 2, 2.5, 3]
+    assert times(seconds=8 / 12) == [0, 1, 2, 3, 2, 1, 0, 1]
+    assert times(path="orbit", at=0.1, seconds=0.5) == [1.2] * 6
+    nearest = times(speed=0.5, recorded_instants=True)
+    assert {*nearest} == {0, 1, 2, 3}
+    assert max(abs(time - 0.5 * i) for i, time in enumerate(nearest)) <= 0.5
+    assert len(times(path="training")) == 3 * 4
+    with pytest.raises(D2Error, match="lies outside the recording, which lasts 0.25 s"):
+        plan_film(subject, Wishes(at=3.0))
+
+
+def test_every_kind_of_picture_stands_beside_the_others_and_runs_below(trained: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again"
+    shutil.copytree(trained, again)
+    show = tuple(KINDS)
+    settings = RenderSettings(
+        (trained, again), output=tmp_path / "a.mp4", path="training", cameras=("train1",), show=show, seconds=0.1
+    )
+    run(settings)
+    [picture] = film_of(tmp_path / "a.mp4")
+    width = len(show) * 96 + (len(show) - 1) * 4
+    assert picture.shape == (2 * (54 + 20) + 4, width, 3)
+    assert min(panel.std() for panel in np.array_split(picture[24:74], len(show), axis=1)) > 3, "no panel is empty"
+
+
+def test_panels_show_what_they_say(subject: Subject) -> None:
+    camera = subject.capture.cameras["train1"]
+    shot = Shot(subject, subject.view(pose_of(camera), 0.0, (96, 54), "train1"), (1.0, 9.0))
+    assert np.array_equal(KINDS["truth"].draw(shot).picture, subject.capture.image("train1", 0))
+    difference = np.abs(shot.look.color.numpy() - subject.capture.image("train1", 0) / np.float32(255))
+    expected = -10 * np.log10(np.mean(difference**2))
+    assert f"{expected:.1f} dB" in KINDS["error"].draw(shot).caption
+    depth = KINDS["true-depth"].draw(shot)
+    assert "1..9" in depth.caption
+    assert depth.bar is not None
+    half = Shot(subject, subject.view(pose_of(camera), 0.0, (48, 27), "train1"), (1.0, 9.0))
+    assert KINDS["labels"].draw(half).picture.shape == (27, 48, 3)
+
+
+class TestSentences:
+    def test_what_is_no_run(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "holds no run" in refused(capsys, tmp_path)
+        assert "no run at" in refused(capsys, tmp_path / "none")
+        assert "d2 render needs RUN" in refused(capsys)
+
+    def test_an_unknown_path_picture_or_camera(self, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "did you mean 'orbit'?" in refused(capsys, trained, "--path", "orbti")
+        assert "did you mean 'depth'?" in refused(capsys, trained, "--show", "rgb,deph")
+        assert "did you mean 'test0'?" in refused(capsys, trained, "--cameras", "test")
+        assert "at the recording's cameras only" in refused(capsys, trained, "--path", "orbit", "--show", "error")
+        assert "there is no depth prior of camera test0" in refused(capsys, trained, "--show", "sigma")
+
+    def test_a_run_that_still_trains(self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        copy = tmp_path / "<script>alert(1)</script>".replace("/", "_")
+        shutil.copytree(trained, copy)
+        state = torch.load(copy / "checkpoint.pt", weights_only=True)
+        torch.save(state | {"step": 33}, copy / "checkpoint.pt")
+        assert main(["render", str(copy), "--output", str(tmp_path / "a.mp4")]) == 0
+        assert f"{copy.name} still trains: this is step 33 of 80" in capsys.readouterr().out
+        (copy / "checkpoint.pt").unlink()
+        assert "holds no checkpoint yet" in refused(capsys, copy)
+
+    def test_a_run_without_a_prior(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        folder = tmp_path / "bare"
+        Run(RunSettings(str(room), ("train0", "train1"), iterations=2, hooks=()), folder).train()
+        assert main(["render", str(folder), "--output", str(tmp_path / "a.gif"), "--format", "gif"]) == 0
+        assert "no depth prior" in refused(capsys, folder, "--path", "training", "--show", "rgb,labels")
+
+    def test_an_empty_run_and_one_of_another_version(
+        self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        copy = tmp_path / "copy"
+        shutil.copytree(trained, copy)
+        state = torch.load(copy / "checkpoint.pt", weights_only=True)
+        state["model"] = {
+            "parameters": {name: value[:0] for name, value in state["model"]["parameters"].items()},
+            "statistics": {name: value[:0] for name, value in state["model"]["statistics"].items()},
+            "optimizer": state["model"]["optimizer"] | {"state": {}},
+        }
+        torch.save(state, copy / "checkpoint.pt")
+        assert "has no Gaussian left at step 80" in refused(capsys, copy)
+        table = json.loads((copy / "run.json").read_text())
+        (copy / "run.json").write_text(json.dumps(table | {"version": 99}))
+        assert "version 99" in refused(capsys, copy)
+
+
+class TestOfficialTrainers:
+    @staticmethod
+    def checkpoint(path: Path) -> fudan.GaussianModel:
+        """A checkpoint as fudan saves it, its extent a number of numpy's."""
+        model, _ = fudan.make()
+        values = {name: getattr(model, name, None) for name in FUDAN} | {"active_sh_degree": 0, "active_sh_degree_t": 0}
+        values |= {"spatial_lr_scale": np.float32(2.0), "optimizer": {"state": {}, "param_groups": []}, "rot_4d": True}
+        torch.save((tuple(values.values()), 30000), path)
+        return model
+
+    def test_a_checkpoint_of_fudan_is_shown_as_its_adapter_slices_it(self, room: Path, tmp_path: Path) -> None:
+        from d2_plugin.adapters.fudan import FudanAdapter
+
+        model = self.checkpoint(tmp_path / "chkpnt30000.pth")
+        found = open_subject(tmp_path / "chkpnt30000.pth", room, ["train0", "train1"])
+        assert found.test_cameras == ("train2", "test0")
+        view = found.view(pose_of(found.capture.cameras["train0"]), 0.1, (96, 54))
+        assert torch.equal(look(found.backbone, view).color, look(FudanAdapter(model), view).color)
+        with pytest.raises(D2Error, match="name its recording with --capture"):
+            open_subject(tmp_path / "chkpnt30000.pth")
+
+    def test_a_checkpoint_of_gsplat_stands_still(self, room: Path, tmp_path: Path) -> None:
+        count = 20
+        splats = {
+            "means": torch.randn(count, 3),
+            "scales": torch.full((count, 3), -1.0),
+            "quats": torch.randn(count, 4),
+            "opacities": torch.zeros(count),
+            "sh0": torch.rand(count, 1, 3),
+            "shN": torch.zeros(count, 15, 3),
+        }
+        torch.save({"step": 6999, "splats": splats}, tmp_path / "ckpt_6999_rank0.pt")
+        found = open_subject(tmp_path / "ckpt_6999_rank0.pt", room)
+        view = found.view(pose_of(found.capture.cameras["train0"]), 0.1, (96, 54))
+        drawn = found.backbone.slice_at(view)
+        assert torch.equal(drawn.means, splats["means"])
+        assert torch.allclose(found.backbone.colors(view, drawn), 0.5 + 0.2820948 * splats["sh0"][:, 0], atol=1e-5)
+
+    def test_a_point_cloud_of_spacetime_gaussians_moves_with_the_recording(self, room: Path, tmp_path: Path) -> None:
+        from d2_plugin.adapters.spacetime import SpacetimeAdapter
+
+        gaussians = spacetime.make()[0]
+        generator = torch.Generator().manual_seed(4)
+        gaussians._motion = 0.2 * torch.randn(gaussians._motion.shape, generator=generator)
+        columns = {
+            **{axis: gaussians._xyz[:, i] for i, axis in enumerate("xyz")},
+            "trbf_center": gaussians._trbf_center[:, 0],
+            "trbf_scale": gaussians._trbf_scale[:, 0],
+            "opacity": gaussians._opacity[:, 0],
+        }
+        many = {"motion": gaussians._motion, "f_dc": gaussians._features_dc[:, :3], "omega": gaussians._omega}
+        for name, values in (many | {"scale": gaussians._scaling, "rot": gaussians._rotation}).items():
+            columns |= {f"{name}_{i}": values[:, i] for i in range(values.shape[1])}
+        head = [f"property float {name}" for name in columns]
+        begin = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians._xyz)}"]
+        head = [*begin, *head, "end_header\n"]
+        rows = torch.stack([value.detach() for value in columns.values()], 1).numpy().astype("<f4")
+        (tmp_path / "point_cloud.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
+        found = open_subject(tmp_path / "point_cloud.ply", room)
+        # Frame 2 of 4 is at the trainer's time 0.5.
+        view = found.view(pose_of(found.capture.cameras["train0"]), found.capture.seconds(2), (96, 54))
+        assert view.time == pytest.approx(0.5)
+        expected = SpacetimeAdapter(gaussians, 4).slice_at(view)
+        assert torch.allclose(found.backbone.slice_at(view).means, expected.means, atol=1e-6)
+        assert torch.allclose(found.backbone.slice_at(view).opacities, expected.opacities, atol=1e-6)
+
+    def test_a_point_cloud_is_shown_as_the_run_that_wrote_it(
+        self, trained: Path, room: Path, subject: Subject
+    ) -> None:
+        [first, *_] = Run.load(trained).export_ply()
+        found = open_subject(first, room)
+        view = subject.view(pose_of(subject.capture.cameras["train1"]), 0.0, (96, 54))
+        difference = (look(found.backbone, view).color - look(subject.backbone, view).color).abs()
+        assert difference.max() < 0.02
+        assert {"x", "opacity", "rot_3"} <= set(read_ply(first))
+
+    def test_what_only_their_own_code_can_read_is_refused_by_name(self, room: Path, tmp_path: Path) -> None:
+        (tmp_path / "deform").mkdir()
+        with pytest.raises(D2Error, match="Deformable-3D-Gaussians, whose motion lies in a network"):
+            open_subject(tmp_path, room)
+        cloud = tmp_path / "point_cloud" / "iteration_7" / "point_cloud.ply"
+        cloud.parent.mkdir(parents=True)
+        cloud.write_bytes(b"ply\n")
+        with pytest.raises(D2Error, match="show it from inside its train.py"):
+            open_subject(cloud, room)
+
+    def test_a_file_that_is_no_checkpoint(self, room: Path, tmp_path: Path) -> None:
+        path = tmp_path / "a.pth"
+        path.write_bytes(b"nothing")
+        with pytest.raises(D2Error, match="cannot be read as a checkpoint"):
+            open_subject(path, room)
+        torch.save({"weights": torch.zeros(3)}, path)
+        with pytest.raises(D2Error, match="is no checkpoint that can be shown"):
+            open_subject(path, room)
+        (tmp_path / "a.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
+        with pytest.raises(D2Error, match="no readable point cloud"):
+            open_subject(tmp_path / "a.ply", room)
+        assert open_capture(room).frames == (0, 1, 2, 3)

@@ -1,0 +1,132 @@
+"""Videos: the right number of pictures at the right rate and size, which others decode to what was given."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from d2_plugin.captures.pictures import read_picture
+from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.viewing.films.video import write_film
+
+av = pytest.importorskip("av", reason="PyAV is in the `video` extra")
+
+
+def soft(count: int, width: int, height: int) -> list[np.ndarray]:
+    """Smooth colours with a bar that moves."""
+    y, x = np.mgrid[:height, :width]
+    base = np.stack([255 * x / width, 255 * y / height, np.full_like(x, 90)], -1)
+    pictures = []
+    for i in range(count):
+        bar = np.exp(-(((x - width * i / count) / (width / 12)) ** 2))[..., None]
+        pictures.append(np.clip(base * (1 - bar) + 230 * bar, 0, 255).astype(np.uint8))
+    return pictures
+
+
+def decoded(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def write(path: Path, pictures: list[np.ndarray]) -> None:
+    with write_film(path, "mp4", 30) as film:
+        for picture in pictures:
+            film.add(picture)
+
+
+def decibels(a: np.ndarray, b: np.ndarray) -> float:
+    return -10 * np.log10(np.mean((a.astype(float) - b.astype(float)) ** 2) / 255**2 + 1e-12)
+
+
+@pytest.mark.parametrize(("width", "height"), [(64, 48), (63, 48), (64, 47), (61, 43)])
+def test_every_picture_comes_back_and_odd_sides_gain_one(tmp_path: Path, width: int, height: int) -> None:
+    pictures, path = soft(9, width, height), tmp_path / "film.mp4"
+    with write_film(path, "mp4", 24) as film:
+        for picture in pictures:
+            film.add(picture)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert stream.codec_context.name == "h264"
+        assert stream.codec_context.pix_fmt == "yuv420p"
+        assert (stream.width, stream.height) == (width + width % 2, height + height % 2)
+        assert stream.average_rate == 24
+        assert stream.frames == 9
+        assert float(stream.duration * stream.time_base) == pytest.approx(9 / 24)
+    found = decoded(path)
+    assert len(found) == 9
+    for picture, given in zip(found, pictures, strict=True):
+        assert decibels(picture[:height, :width], given) > 35
+
+
+def test_a_browser_can_begin_before_it_has_the_whole_file(tmp_path: Path) -> None:
+    path = tmp_path / "film.mp4"
+    with write_film(path, "mp4", 30) as film:
+        film.add(soft(1, 32, 32)[0])
+    data = path.read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat")
+
+
+RATES = [(29.97, Fraction(30000, 1001)), (23.976, Fraction(24000, 1001)), (12.5, Fraction(25, 2))]
+
+
+@pytest.mark.parametrize(("fps", "rate"), RATES)
+def test_the_rate_is_that_of_the_recording(tmp_path: Path, fps: float, rate: Fraction) -> None:
+    with write_film(tmp_path / "film.mp4", "mp4", fps) as film:
+        for picture in soft(4, 32, 32):
+            film.add(picture)
+    with av.open(str(tmp_path / "film.mp4")) as container:
+        assert container.streams.video[0].average_rate == rate
+
+
+@pytest.mark.parametrize("form", ["webp", "gif"])
+def test_animated_pictures_keep_number_and_odd_size(tmp_path: Path, form: str) -> None:
+    path = tmp_path / f"film.{form}"
+    with write_film(path, form, 10) as film:
+        for picture in soft(5, 61, 43):
+            film.add(picture)
+    if form == "webp":  # ffmpeg decodes no animated WebP: its frames are counted in the file
+        data = path.read_bytes()
+        assert data[:4] == b"RIFF"
+        assert data[8:12] == b"WEBP"
+        assert data.count(b"ANMF") == 5
+        at = data.index(b"VP8X") + 12
+        assert [int.from_bytes(data[at + i : at + i + 3], "little") for i in (0, 3)] == [60, 42]
+    else:
+        found = decoded(path)
+        assert len(found) == 5
+        assert found[0].shape == (43, 61, 3)
+        assert decibels(found[0], soft(5, 61, 43)[0]) > 25
+
+
+def test_pngs_are_exact(tmp_path: Path) -> None:
+    pictures = soft(3, 31, 17)
+    with write_film(tmp_path / "film", "png", 30) as film:
+        for picture in pictures:
+            film.add(picture)
+    names = sorted(path.name for path in (tmp_path / "film").iterdir())
+    assert names == ["00000.png", "00001.png", "00002.png"]
+    for name, picture in zip(names, pictures, strict=True):
+        assert np.array_equal(read_picture(tmp_path / "film" / name), picture)
+
+
+def test_a_film_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "film.mp4"
+    path.write_bytes(b"earlier")
+    with pytest.raises(D2Error, match="32x32 pixels got"):
+        write(path, [*soft(1, 32, 32), *soft(1, 34, 32)])
+    assert path.read_bytes() == b"earlier"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_a_film_without_a_picture_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(D2Error, match="without a picture"):
+        write(tmp_path / "film.mp4", [])
+
+
+def test_without_pyav_one_sentence_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "av", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'd2-4dgs\[video\]'"):
+        write(tmp_path / "a.mp4", [])

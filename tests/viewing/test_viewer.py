@@ -1,0 +1,269 @@
+"""The viewer without a browser: training stays bitwise what it is, pictures keep to their share, names stay names."""
+
+from __future__ import annotations
+
+import copy
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny import ALL_HOOKS, make_trainer, parameters, same
+
+from d2_plugin.commands.cli import main
+from d2_plugin.config import D2Config
+from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.viewing.live import Viewer
+from d2_plugin.viewing.live.cloud import cloud_of
+from d2_plugin.viewing.live.pace import Resolution, Share
+from d2_plugin.viewing.live.page import Page, Wanted
+from d2_plugin.viewing.live.show import ViewSettings, said_of, subject_at
+from d2_plugin.viewing.paths import pose_of
+from d2_plugin.viewing.stand_in import subject_of_store
+from d2_plugin.viewing.subject import Subject
+
+pytest.importorskip("viser", reason="viser is in the `view` extra")
+
+
+class Gui:
+    """Controls that remember, in the place of a browser's."""
+
+    def __getattr__(self, name: str) -> Any:
+        def add(label: str, *values: Any, **named: Any) -> Any:
+            given = {"add_slider": 3, "add_checkbox": 0, "add_text": 0}.get(name)
+            value = named.get("initial_value", values[given] if given is not None else None)
+            handle = SimpleNamespace(value=value, label=label, max=values[1] if name == "add_slider" else None)
+            handle.on_update = handle.on_click = lambda react: setattr(handle, "react", react)
+            handle.__dict__["__enter__"] = None
+            return Folder() if name == "add_folder" else handle
+
+        return add
+
+
+class Folder:
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+class Scene:
+    def __init__(self) -> None:
+        self.pictures: list[np.ndarray | None] = []
+
+    def set_background_image(self, image: np.ndarray | None, **_: Any) -> None:
+        self.pictures.append(image)
+
+    def __getattr__(self, name: str) -> Any:
+        nothing = {"on_click": lambda react: None, "remove": lambda: None}
+        return lambda *_, **named: SimpleNamespace(visible=True, **nothing, **named)
+
+
+def looker(number: int = 1) -> Any:
+    """A client that stands still three units before the plane of the tiny scene."""
+    place = {"position": np.zeros(3), "wxyz": np.array([1.0, 0, 0, 0]), "fov": 0.8, "aspect": 4 / 3}
+    camera = SimpleNamespace(**place, image_height=48, update_timestamp=1.0)
+    camera.on_update = lambda react: None
+    return SimpleNamespace(client_id=number, gui=Gui(), scene=Scene(), camera=camera)
+
+
+@pytest.fixture
+def port() -> int:
+    return 18190
+
+
+@pytest.mark.parametrize("config", [ALL_HOOKS, D2Config()], ids=["all hooks", "no hook"])
+def test_one_line_shows_any_trainer_and_training_stays_bitwise_the_same(config: D2Config, port: int) -> None:
+    alone, watched = make_trainer(config), make_trainer(config)
+    alone.run()
+    viewer, client = Viewer(watched.d2, port=port, height=48), looker()
+    try:
+        viewer._connected(client)
+        watched.run()
+        assert len(client.scene.pictures) >= 1
+        assert client.scene.pictures[-1].std() > 5
+        assert set(viewer.subject.capture.cameras) == {"cam0", "cam1", "cam2"}
+        assert viewer.subject.duration == 0.5
+    finally:
+        viewer.close()
+    assert same(parameters(alone), parameters(watched))
+    step = watched.d2.step
+    assert step.__func__ is type(watched.d2).step, "closed, it lets go of the trainer"
+
+
+def test_who_only_looks_takes_no_more_than_the_share_of_the_time(port: int) -> None:
+    trainer = make_trainer(ALL_HOOKS, iterations=60)
+    viewer, client, spent = Viewer(trainer.d2, port=port, height=48), looker(), []
+    after_step = viewer.after_step
+
+    def timed(step: int, loss: float | None = None) -> None:
+        begun = time.perf_counter()
+        after_step(step, loss)
+        spent.append(time.perf_counter() - begun)
+
+    viewer.after_step = timed
+    try:
+        viewer._connected(client)
+        begun = time.perf_counter()
+        trainer.run()
+        total = time.perf_counter() - begun
+        # The first pictures are drawn at once and then paid off; most steps cost no more than a look at the clock.
+        assert np.median(spent) < 0.05 * total / len(spent)
+    finally:
+        viewer.close()
+
+
+def test_d2_knows_which_gaussians_it_inserted_across_all_edits_and_a_resume() -> None:
+    trainer = make_trainer(ALL_HOOKS)
+    inserted, insert = [], trainer.d2.backbone.insert
+
+    def noting(points: Any) -> int:
+        before = len(trainer.model)
+        count = insert(points)
+        inserted.append(trainer.model.gaussians["positions"][before:].detach().clone())
+        return count
+
+    trainer.d2.backbone.insert = noting
+    trainer.run(12)
+    marks = trainer.d2.inserted_at
+    assert len(marks) == len(trainer.model)
+    assert inserted
+    assert set(marks.unique().tolist()) <= {0, 5, 10}
+    assert 0 < int((marks > 0).sum()) <= sum(map(len, inserted))
+    resumed = make_trainer(ALL_HOOKS)
+    resumed.load_state_dict(copy.deepcopy(trainer.state_dict()))
+    assert torch.equal(resumed.d2.inserted_at, marks)
+    trainer.run()
+    resumed.run()
+    assert torch.equal(resumed.d2.inserted_at, trainer.d2.inserted_at)
+    assert len(trainer.d2.inserted_at) == len(trainer.model)
+
+
+def test_a_moving_picture_is_as_large_as_fits_its_time() -> None:
+    resolution = Resolution()
+    for _ in range(40):
+        resolution.drew(640 * 360, 0.2)
+    width, height = resolution.size(16 / 9, 360, 0.06)
+    assert 150 < height < 240
+    assert width == round(height * 16 / 9)
+    assert resolution.size(16 / 9, 360) == (640, 360)
+    for _ in range(40):
+        resolution.drew(1000, 60.0)
+    assert resolution.size(1.0, 360, 0.06) == (72, 72)
+
+
+def test_a_share_pays_off_what_was_spent_and_saves_little() -> None:
+    share = Share(0.1)
+    assert share.due
+    share.spend(1.0)
+    share.passes(9.0)
+    assert not share.due
+    share.passes(2.0)
+    assert share.due
+    share.passes(1e6)
+    share.spend(0.2)
+    assert not share.due, "an hour without pictures is not an hour of pictures"
+
+
+def test_the_browsers_camera_becomes_the_view_of_the_same_camera(subject: Subject) -> None:
+    from d2_plugin.captures.rotations import quaternion_of_rotation
+
+    camera = subject.capture.cameras["train1"]
+    q = quaternion_of_rotation(camera.T_camera_world[:3, :3].T)
+    fov = 2 * np.arctan(camera.height / 2 / camera.K[1, 1])
+    wanted = Wanted((*camera.centre, *q, fov), 96 / 54, 0.0, "rgb", 0.0, False, 54)
+    pose, expected = wanted.camera(96, 54), pose_of(camera)
+    assert np.allclose(pose.T_camera_world, expected.T_camera_world, atol=1e-9)
+    assert np.allclose(np.diag(pose.lens.K), np.diag(expected.lens.K), rtol=1e-6)
+
+
+def test_the_prior_as_points_lies_where_its_pixels_say(subject: Subject) -> None:
+    cloud = cloud_of(subject, 0, "label", most=500)
+    assert 50 < len(cloud.positions) <= 700
+    assert np.isfinite(cloud.positions).all()
+    exact = subject.capture.depth("train0", 0)
+    camera = subject.capture.cameras["train0"]
+    seen = cloud.positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    pixels = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
+    inside = (seen[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
+    truth = exact[tuple(np.floor(pixels[inside]).astype(int).T[::-1])]
+    off = np.abs(seen[inside, 2] / truth - 1)
+    assert np.median(off) < 0.1
+
+
+def test_controls_are_those_that_the_subject_has(subject: Subject) -> None:
+    page = Page(looker(), subject, None, 360, lambda: None)
+    page.build()
+    assert {"time", "show", "opacity", "marked", "cloud"} <= set(page.controls)
+    assert "pause" not in page.controls
+    bare = Page(looker(), subject_of_store(subject.store), None, 360, lambda: None)
+    bare.build()
+    assert "show" not in bare.controls
+    assert bare.value("cloud") == "picture"
+
+
+def test_play_goes_on_with_the_clock_and_begins_again(subject: Subject) -> None:
+    page = Page(looker(), subject, None, 360, lambda: None)
+    page.build()
+    page.controls["play"].value = True
+    page.play(10.0)
+    page.play(10.1)
+    assert page.controls["time"].value == pytest.approx(0.1)
+    page.controls["speed"].value = "0.5"
+    page.play(10.2)
+    assert page.controls["time"].value == pytest.approx(0.15)
+    page.play(10.7)
+    assert page.controls["time"].value == pytest.approx((0.15 + 0.25) % (0.25 + 1 / 12))
+
+
+class TestSentences:
+    def refused(self, capsys: pytest.CaptureFixture[str], *words: object) -> str:
+        assert main(["view", *map(str, words)]) == 2
+        message = capsys.readouterr().err.strip()
+        assert len(message.splitlines()) == 1
+        return message
+
+    def test_what_cannot_be_shown(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "is empty: give the folder of a run" in self.refused(capsys, tmp_path)
+        assert "no such capture" in self.refused(capsys, tmp_path / "none")
+        (tmp_path / "store.json").write_text('{"format": 1}')
+        assert "has format 1 but this version reads format" in self.refused(capsys, tmp_path)
+
+    def test_a_prior_of_another_recording(self, trained: Path, tmp_path: Path, room: Path) -> None:
+        found = subject_at(ViewSettings(trained / "priors", capture=room))
+        assert found.train_cameras == ("train0", "train1", "train2")
+        assert found.backbone is None
+        alone = subject_at(ViewSettings(trained / "priors"))
+        assert np.array_equal(alone.capture.image("train0", 0), found.capture.image("train0", 0))
+        assert np.allclose(alone.capture.cameras["train0"].K, found.capture.cameras["train0"].K)
+
+    def test_who_may_look_is_said(self, subject: Subject, port: int) -> None:
+        viewer = Viewer(subject=subject, port=port)
+        try:
+            assert viewer._server.get_host() == "127.0.0.1"
+            assert said_of(viewer, "127.0.0.1").endswith("(Ctrl-C ends)")
+            assert "everybody who reaches this machine" in said_of(viewer, "0.0.0.0")
+        finally:
+            viewer.close()
+
+    def test_nothing_to_show_and_no_viser(self, subject: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
+        with pytest.raises(D2Error, match="needs something to show"):
+            Viewer()
+        monkeypatch.setitem(__import__("sys").modules, "viser", None)
+        with pytest.raises(MissingExtra, match=r"pip install 'd2-4dgs\[view\]'"):
+            Viewer(subject=subject)
+
+
+def test_d2_train_says_where_to_watch_and_ends_where_nobody_looks(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["train", str(room), "--train-cameras", "train0,train1", "--iterations", "3", "--hooks", "none", "--view"]
+    assert main([*words, "--output", str(tmp_path / "run")]) == 0
+    assert "watch it train at http://localhost:" in capsys.readouterr().out
+    again = tmp_path / "bare"
+    assert main([*words[:-1], "--output", str(again)]) == 0
+    ends = [torch.load(folder / "checkpoint.pt", weights_only=True)["model"] for folder in (tmp_path / "run", again)]
+    for name, value in ends[0]["parameters"].items():
+        assert torch.equal(value, ends[1]["parameters"][name]), "a watched run is bitwise the one that is not"
