@@ -57,10 +57,6 @@ def what_diverged(model: Any, loss: Tensor | None = None) -> str:
     return "" if loss is None or bool(loss.isfinite()) else f"the loss is {float(loss):g}"
 
 
-OnStep = Callable[[int, float], None]
-"""Told the step and its loss, after each step."""
-
-
 @contextmanager
 def watched(trainer: Any, checkpoint: Path) -> Iterator[Callable[[OnStep], OnStep]]:
     """Within it, training stops at the step at which a loss or a parameter is no finite number any more.

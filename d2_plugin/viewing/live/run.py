@@ -12,7 +12,8 @@ import torch
 from d2_plugin import registry
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.runs.metrics import psnr
-from d2_plugin.runs.saved.finite import OnStep, Run
+from d2_plugin.runs.run import Run
+from d2_plugin.runs.saved.finite import OnStep
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.viewing.live.pace import Share
 from d2_plugin.viewing.live.viewer import Viewer
