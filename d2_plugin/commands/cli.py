@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from types import ModuleType
 
 from d2_plugin import __version__
+from d2_plugin.commands.arguments.boundary import DEBUG, guarded
 from d2_plugin.commands.arguments.form import HELP
 from d2_plugin.commands.arguments.help import entry, help_text
-from d2_plugin.commands.boundary import DEBUG, guarded
 from d2_plugin.errors import D2Error, unknown_name
 
 COMMANDS = (
@@ -31,7 +31,10 @@ COMMANDS = (
     "export-capture",
     "doctor",
 )
-"""One module of this folder each, with `-` as `_`: its docstring is the help, its `form(words)` what it takes."""
+"""One module each, with `-` as `_`: its docstring is the help, its `form(words)` what it takes."""
+
+STUDY = ("ablate", "bench", "stability", "report")
+"""Those in the folder `study`, which compare; the others lie beside this file."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -68,7 +71,8 @@ def _overview() -> str:
 
 
 def _module(command: str) -> ModuleType:
-    return importlib.import_module(f"d2_plugin.commands.{command.replace('-', '_')}")
+    room = "study." if command in STUDY else ""
+    return importlib.import_module(f"d2_plugin.commands.{room}{command.replace('-', '_')}")
 
 
 if __name__ == "__main__":

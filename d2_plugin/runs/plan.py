@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from d2_plugin.captures import Capture, MonoKind
-from d2_plugin.captures.exposure import FEWEST, relative_exposures
+from d2_plugin.captures.checks.exposure import FEWEST, relative_exposures
 from d2_plugin.captures.readers.colmap_model import find_model, read_points
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.depth_on_disk import SensorDepth, find_depth_on_disk

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from d2_plugin.captures import Capture, open_capture
-from d2_plugin.captures.check import check_capture
-from d2_plugin.captures.memory import check_memory
+from d2_plugin.captures.checks.calibrated import check_capture
+from d2_plugin.captures.checks.memory import check_memory
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks import Hook
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene

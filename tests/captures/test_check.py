@@ -11,8 +11,8 @@ import pytest
 
 from d2_plugin.captures import Capture, open_capture, select_cameras
 from d2_plugin.captures import memory as memory_module
-from d2_plugin.captures.check import check_capture
-from d2_plugin.captures.memory import available_bytes, check_memory, needed_bytes
+from d2_plugin.captures.checks.calibrated import check_capture
+from d2_plugin.captures.checks.memory import available_bytes, check_memory, needed_bytes
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 

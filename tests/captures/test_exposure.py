@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.exposure import relative_exposures
+from d2_plugin.captures.checks.exposure import relative_exposures
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.runs.plan import appearance_decision, plan_scene
 

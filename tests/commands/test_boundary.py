@@ -13,7 +13,7 @@ from small_layouts import write_layout
 
 from d2_plugin.captures.pictures import write_png
 from d2_plugin.commands import boundary, cli
-from d2_plugin.commands.boundary import one_line, sentence
+from d2_plugin.commands.arguments.boundary import one_line, sentence
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 

@@ -11,7 +11,7 @@ import pytest
 
 from d2_plugin.captures.export.folder import save_capture
 from d2_plugin.captures.synthetic.room import synthetic_capture
-from d2_plugin.commands.bench import form
+from d2_plugin.commands.study.bench import form
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.calibration import NORMAL_SHARE, Calibration, frames_with_truth, reliability_curve
 from d2_plugin.study.bench.priors import Case, PriorsBench, cases, rows_of, run

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .capture import Camera, Capture
+from d2_plugin.captures.capture import Camera, Capture
 
 DARK, BRIGHT = 10, 245
 """Values of a pixel, of 255, beyond which a channel says nothing about gain: noise, or clipped."""

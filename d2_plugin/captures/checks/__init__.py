@@ -1,0 +1,1 @@
+"""What a capture is checked for before work begins: calibration, memory, exposure."""

@@ -1,0 +1,1 @@
+"""The commands that compare: ablations, benchmarks, stability, and their report."""
