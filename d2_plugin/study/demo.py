@@ -22,17 +22,10 @@ from d2_plugin.settings import Range, Settings
 from d2_plugin.viewing.export.page import write_page
 from d2_plugin.viewing.export.scene import scene_of
 
-LARGER_BUDGET = {"d2": {"views_per_evaluation": 8}, "densify": {"budget_per_view": 500}}
-"""Eight times the samples in twice the views. The defaults cost little time; this buys more quality with more time."""
+VARIANTS = {"backbone": (), "backbone + D2": HOOK_NAMES}
+"""Name -> hooks."""
 
-VARIANTS = {
-    "backbone": ((), {}),
-    "backbone + D2": (HOOK_NAMES, {}),
-    "D2, larger budget": (HOOK_NAMES, LARGER_BUDGET),
-}
-"""Name -> hooks and settings over the defaults."""
-
-PLAYED = "D2, larger budget"
+PLAYED = "backbone + D2"
 """The variant that the demo's player shows."""
 
 
@@ -43,11 +36,11 @@ class Demo(Settings):
     output: Path = Path("d2-demo")
     """Folder of the recording, the runs and the picture."""
     iterations: Annotated[int, Range(1, unit="steps")] = 1000
-    """Optimizer steps of each of the three runs."""
+    """Optimizer steps of each of the two runs."""
 
 
 def run(settings: Demo) -> str:
-    """Write the recording, three runs, comparison.png and player.html; returns the table to print.
+    """Write the recording, two runs, comparison.png and player.html; returns the table to print.
 
     All runs start from the same points and take the same number of iterations; a demo that was cut off goes on.
     """
@@ -56,15 +49,14 @@ def run(settings: Demo) -> str:
     _compile_kernels()
     train, held_out = split(open_capture(path))
     runs = {}
-    for name, (hooks, overrides) in VARIANTS.items():
+    for name, hooks in VARIANTS.items():
         chosen = RunSettings(
             *(str(path), tuple(train)),
             iterations=settings.iterations,
             hooks=hooks,
-            overrides=overrides,
             priors=str(folder / "priors") if hooks else None,
         )
-        run = Run(chosen, folder / name.replace(" + ", "_").replace(", ", "_").replace(" ", "_").lower())
+        run = Run(chosen, folder / name.replace(" + ", "_").lower())
         run.train()
         runs[name] = (run, run.evaluate())
     picture = folder / "comparison.png"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from d2_plugin.captures import Capture, open_capture, select_cameras
-from d2_plugin.captures import memory as memory_module
+from d2_plugin.captures.checks import memory as memory_module
 from d2_plugin.captures.checks.calibrated import check_capture
 from d2_plugin.captures.checks.memory import available_bytes, check_memory, needed_bytes
 from d2_plugin.captures.synthetic.room import synthetic_capture

@@ -12,7 +12,8 @@ import pytest
 from small_layouts import write_layout
 
 from d2_plugin.captures.pictures import write_png
-from d2_plugin.commands import boundary, cli
+from d2_plugin.commands import cli
+from d2_plugin.commands.arguments import boundary
 from d2_plugin.commands.arguments.boundary import one_line, sentence
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
