@@ -168,7 +168,7 @@ class TestDensityControl:
     def test_a_run_survives_losing_every_gaussian(self) -> None:
         model = make_model()
         model.select(torch.zeros(0, dtype=torch.int64))
-        render = model.render(make_views()[0])
+        render = model.render(make_views()[0], background=torch.zeros(3))
         assert (render.color == 0).all()
         assert (render.alpha == 0).all()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import shutil
 import subprocess
@@ -15,6 +14,7 @@ import pytest
 
 from d2_plugin.captures.export.folder import save_capture
 from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.commands import cli
 from d2_plugin.commands.arguments.form import Form, Given
 from d2_plugin.commands.arguments.recording import all_tables
 from d2_plugin.commands.cli import COMMANDS, main
@@ -36,7 +36,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def form_of(command: str, words: list[str]) -> Form:
-    return importlib.import_module(f"d2_plugin.commands.{command.replace('-', '_')}").form(words)
+    return cli._module(command).form(words)
 
 
 def parsed(command: str, *words: str) -> Given:

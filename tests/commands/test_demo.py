@@ -19,7 +19,7 @@ pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
 
-class Stopped(Exception):
+class Stopped(BaseException):
     """Raised where a test ends the demo."""
 
 

@@ -18,7 +18,7 @@ from d2_plugin.hooks.prior import JUDGES, KnownPixels, PriorLoader
 from d2_plugin.hooks.rendered_depth import rendered_depth
 from d2_plugin.protocol import DepthPrior, Label, View
 
-CONFIG = DepthLossConfig(tau_v=0.5, epsilon=0.01, sigma_full=0.05)
+CONFIG = DepthLossConfig(tau_v=0.5, epsilon=0.01, sigma_full=0.05, opaque=0)
 SHAPE = (7, 9)
 seeds = st.integers(0, 10_000)
 
