@@ -136,7 +136,8 @@ def test_every_trusted_pixel_supervises_and_judges(model: SplatModel, label: Lab
 def test_case_25_where_nothing_is_rendered_the_depth_loss_is_zero_with_zero_gradients(model: SplatModel) -> None:
     with torch.no_grad():
         model.gaussians["opacity_logits"].fill_(-8)  # visible, and nowhere alpha > tau_v
-    d2 = D2Hooks(DEPTH_LOSS, make_adapter(model), unlabelled(Label.VERIFIED))
+    papers = replace(DEPTH_LOSS, depth_loss=replace(DEPTH_LOSS.depth_loss, opaque=0))
+    d2 = D2Hooks(papers, make_adapter(model), unlabelled(Label.VERIFIED))
     view = make_views()[0]
     model.render(view)
     loss = d2.loss(1, view)

@@ -22,6 +22,7 @@ from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
 from d2_plugin.runs.run import Run
+from d2_plugin.runs.saved.kinds import read_run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.study.rivals.dense_start import back_projected
 from d2_plugin.study.rivals.inputs import expected_depth
@@ -296,7 +297,7 @@ class TestOnARecording:
     def test_a_resumed_rival_is_bitwise_the_uninterrupted_one(self, ablation: Path, tmp_path: Path) -> None:
         """patch_norm draws at random: its draws come from the run's own generator, which is saved."""
         whole = ablation / "yang4d" / "patch_norm" / "seed0"
-        stored = json.loads((whole / "run.json").read_text())
+        stored = read_run(whole)
         guidance = rival(stored.pop("guidance")["name"], 24)
         settings = RunSettings.from_table(stored, "run.json")
         run = Run(settings, tmp_path / "cut", guidance)

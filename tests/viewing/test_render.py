@@ -202,7 +202,8 @@ class TestSentences:
         torch.save(state, copy / "checkpoint.pt")
         assert "has no Gaussian left at step 80" in refused(capsys, copy)
         table = json.loads((copy / "run.json").read_text())
-        (copy / "run.json").write_text(json.dumps(table | {"version": 99}))
+        plain = {name: value for name, value in table.items() if name not in ("format", "seal")}
+        (copy / "run.json").write_text(json.dumps(plain | {"version": 99}))
         assert "version 99" in refused(capsys, copy)
 
 
@@ -273,8 +274,9 @@ class TestOfficialTrainers:
         assert torch.allclose(found.backbone.slice_at(view).opacities, expected.opacities, atol=1e-6)
 
     def test_a_point_cloud_is_shown_as_the_run_that_wrote_it(
-        self, trained: Path, room: Path, subject: Subject
+        self, trained: Path, room: Path, subject: Subject, monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        monkeypatch.setattr(subject.backbone.model, "background", None)  # a point cloud has none
         [first, *_] = Run.load(trained).export_ply()
         found = open_subject(first, room)
         view = subject.view(pose_of(subject.capture.cameras["train1"]), 0.0, (96, 54))

@@ -13,7 +13,7 @@ from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.gaussian_ply import write_ply
 from d2_plugin.runs.run import Run
-from d2_plugin.settings import Positional, Positive, Settings
+from d2_plugin.settings import Count, Positional, Positive, Settings
 
 from .coded_scene import seen_rows
 from .curves import fit_curves
@@ -35,7 +35,7 @@ class Export(Settings):
     for splaTV and gsplat.js. ftgs: the same without loss, as .ftgs.ply; 4D Gaussians only."""
     output: Path | None = None
     """Folder to write into; `export` inside the run's folder if not given."""
-    frames: tuple[int, ...] | None = None
+    frames: tuple[Count, ...] | None = None
     """first:last or first:last:step, the last one included, of ply and spz; all frames if not given."""
     megabytes: Positive = 40.0
     """Size that the key times of a deformation field may bring an html page to."""

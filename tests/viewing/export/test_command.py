@@ -85,12 +85,13 @@ class TestOneSentence:
     def test_a_damaged_checkpoint(self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         copy = Path(shutil.copytree(trained / "yang4d", tmp_path / "run"))
         (copy / "checkpoint.pt").write_bytes((copy / "checkpoint.pt").read_bytes()[:1000])
-        assert "cannot read" in complaint(capsys, str(copy))
+        assert "is damaged" in complaint(capsys, str(copy))
 
     def test_a_run_of_another_version(self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         copy = Path(shutil.copytree(trained / "yang4d", tmp_path / "run"))
         table = json.loads((copy / "run.json").read_text())
-        (copy / "run.json").write_text(json.dumps(table | {"version": 99}))
+        plain = {name: value for name, value in table.items() if name not in ("format", "seal")}
+        (copy / "run.json").write_text(json.dumps(plain | {"version": 99}))
         assert "version 99" in complaint(capsys, str(copy))
 
     def test_a_run_without_gaussians(self, trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
