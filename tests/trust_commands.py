@@ -182,10 +182,10 @@ def contents(folder: Path) -> dict[str, Any]:
 def _content(path: Path) -> Any:
     if path.name == "metrics.json":
         table = json.loads(path.read_text())
-        return {name: value for name, value in table.items() if name not in ("seconds", "made", "seal")}
+        return {name: value for name, value in table.items() if name not in ("seconds", "cpu_seconds", "made", "seal")}
     if path.name == "checkpoint.pt":
         state = torch.load(path, weights_only=True)
-        del state["seconds"]
+        del state["seconds"], state["cpu_seconds"]
         return _digest(state)
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
