@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from d2_plugin.gaussians.spherical_harmonics import basis
@@ -68,10 +67,11 @@ class Background:
     def behind(self, render: Render, view: View) -> Render:
         """The render with the background where the Gaussians leave some of a ray."""
         rows, columns, stride = _nodes(view)
-        coarse = (self._basis(view) @ torch.cat([self.constant, self.harmonics]) + 0.5).clamp(0, 1)
-        nodes = coarse.view(rows, columns, 3).permute(2, 0, 1)[None]
-        size = (stride * (rows - 1) + 1, stride * (columns - 1) + 1)
-        fine = F.interpolate(nodes, size, mode="bilinear", align_corners=True)[0]
+        # Not a matrix product: BLAS sums in an order that depends on the number of threads.
+        summands = self._basis(view)[..., None] * torch.cat([self.constant, self.harmonics])
+        coarse = (summands.sum(1) + 0.5).clamp(0, 1)
+        nodes = coarse.view(rows, columns, 3).permute(2, 0, 1)
+        fine = _refined(_refined(nodes, stride).transpose(1, 2), stride).transpose(1, 2)
         colors = fine[:, : view.height, : view.width].permute(1, 2, 0)
         return render._replace(color=render.color + (1 - render.alpha)[..., None] * colors)
 
@@ -120,6 +120,15 @@ def _nodes(view: View) -> tuple[int, int, int]:
     """Rows and columns of nodes and the pixels between them; the last ones lie beyond the picture."""
     stride = max(1, view.width // NODES)
     return (view.height - 1) // stride + 2, (view.width - 1) // stride + 2, stride
+
+
+def _refined(nodes: Tensor, stride: int) -> Tensor:
+    """Linear interpolation along the middle axis: [C, N, M] -> [C, (N - 1) stride, M].
+
+    `F.interpolate` rounds otherwise with one thread than with two, and a run must not.
+    """
+    share = (torch.arange(stride, dtype=nodes.dtype, device=nodes.device) / stride)[:, None]
+    return ((1 - share) * nodes[:, :-1, None] + share * nodes[:, 1:, None]).flatten(1, 2)
 
 
 def _directions(view: View) -> Tensor:

@@ -6,9 +6,13 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch is imported; see d2_plugin.commands.cli.main
+
+hypothesis.settings.register_profile("no clock", deadline=None)  # two cores are shared by the workers
+hypothesis.settings.load_profile("no clock")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -14,27 +14,24 @@ from d2_plugin.commands.arguments.form import HELP
 from d2_plugin.commands.arguments.help import entry, help_text
 from d2_plugin.errors import D2Error, unknown_name
 
-COMMANDS = (
-    "demo",
-    "plan",
-    "priors",
-    "train",
-    "eval",
-    "render",
-    "view",
-    "compare",
-    "ablate",
-    "bench",
-    "stability",
-    "report",
-    "export",
-    "export-capture",
-    "doctor",
-)
-"""One module each, with `-` as `_`: its docstring is the help, its `form(words)` what it takes."""
-
-STUDY = ("ablate", "bench", "stability", "report")
-"""Those in the folder `study`, which compare; the others lie beside this file."""
+COMMANDS = {
+    "demo": "demo",
+    "plan": "plan",
+    "priors": "priors",
+    "train": "train",
+    "eval": "eval",
+    "render": "render",
+    "view": "view",
+    "compare": "compare",
+    "ablate": "study.ablate",
+    "bench": "study.bench",
+    "stability": "study.stability",
+    "report": "study.report",
+    "export": "export",
+    "export-capture": "export_capture",
+    "doctor": "doctor",
+}
+"""Name -> module beside this file: its docstring is the help, its `form(words)` what it takes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -71,8 +68,7 @@ def _overview() -> str:
 
 
 def _module(command: str) -> ModuleType:
-    room = "study." if command in STUDY else ""
-    return importlib.import_module(f"d2_plugin.commands.{room}{command.replace('-', '_')}")
+    return importlib.import_module(f"d2_plugin.commands.{COMMANDS[command]}")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from d2_plugin.runs import metrics
 from d2_plugin.runs.drawing import Panel, color_scale, colorize, side_by_side
 from d2_plugin.runs.lpips import Lpips
 from d2_plugin.runs.plan import CHANGED, MOVING_SHARE
+from d2_plugin.runs.start import make_view
 
 RenderView = Callable[[str, int], tuple[Tensor, Tensor | None]]
 """(camera name, frame) -> (RGB [H, W, 3] in 0..1, planar depth [H, W] or None).
@@ -30,6 +31,24 @@ Progress = Callable[[int, int], None]
 
 ERROR_SHOWN = 0.25
 """Absolute colour error, mean over channels, at the bright end of the error picture's scale."""
+
+
+RENDERED_ALPHA = 0.5
+"""A rendered depth is reported where the accumulated alpha exceeds this."""
+
+
+def renderer(model: Any, capture: Capture, device: torch.device | str) -> RenderView:
+    """Colour [H, W, 3] and depth [H, W] of a model, 0 where too little is opaque, on the CPU."""
+
+    @torch.no_grad()
+    def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
+        view = make_view(capture, camera, frame, device)
+        color, depth_sum, alpha = (part.cpu() for part in model.render(view)[:3])
+        solid = alpha > RENDERED_ALPHA
+        depth = torch.where(solid, depth_sum / alpha.clamp(min=RENDERED_ALPHA), torch.zeros_like(alpha))
+        return color.clamp(0, 1), depth
+
+    return render
 
 
 def evaluate(

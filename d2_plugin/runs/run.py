@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from d2_plugin import registry
 from d2_plugin.durable import remove_leftovers, write_table, write_text
 from d2_plugin.errors import D2Error
@@ -31,7 +29,6 @@ from d2_plugin.runs.start import (
     TrainingFrames,
     initial_points,
     make_view,
-    renderer,
     scene_extent,
     triangulated_points,
 )
@@ -136,14 +133,14 @@ class Run:
 
     def _scores(self, model: Any, pictures: Path | None) -> dict[str, Any]:
         """What `evaluate` finds; under `train` instead of `test` where no camera was held out."""
-        from d2_plugin.runs.evaluation import evaluate
+        from d2_plugin.runs.evaluation import evaluate, renderer
         from d2_plugin.runs.lpips import find_lpips
 
         scene = self.scene
         cameras = scene.test_cameras or scene.train_cameras
         with progress_bar("evaluate", len(cameras) * len(scene.capture.frames)) as bar:
             scores = evaluate(
-                self._renderer(model),
+                renderer(model, scene.capture, self.settings.device),
                 scene.capture,
                 cameras,
                 scene.capture.frames,
@@ -248,9 +245,6 @@ class Run:
         """What makes two runs the same run, as run.json has it."""
         guidance = {} if self.guidance is None else {"guidance": dict(self.guidance.identity())}
         return self.settings.as_table() | guidance
-
-    def _renderer(self, model: Any) -> Callable[[str, int], tuple[Tensor, Tensor]]:
-        return renderer(model, self.scene.capture, self.settings.device)
 
     def _save(self, trainer: Any) -> None:
         used = {"seconds": dict(self.seconds), "cpu_seconds": dict(self.cpu_seconds), "prior": self.prior}

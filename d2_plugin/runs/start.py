@@ -6,10 +6,9 @@ import io
 import warnings
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -98,24 +97,6 @@ def make_view(capture: Capture, camera: str, frame: int, device: torch.device | 
     intrinsics = torch.tensor(calibration.K, dtype=torch.float32, device=device)
     time = capture.seconds(frame)
     return View(camera, frame, time, pose, intrinsics, calibration.width, calibration.height)
-
-
-RENDERED_ALPHA = 0.5
-"""A rendered depth is reported where the accumulated alpha exceeds this."""
-
-
-def renderer(model: Any, capture: Capture, device: torch.device | str) -> Callable[[str, int], tuple[Tensor, Tensor]]:
-    """A function (camera, frame) -> colour [H, W, 3] and depth [H, W], 0 where too little is opaque, on the CPU."""
-
-    @torch.no_grad()
-    def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
-        view = make_view(capture, camera, frame, device)
-        color, depth_sum, alpha = (part.cpu() for part in model.render(view)[:3])
-        solid = alpha > RENDERED_ALPHA
-        depth = torch.where(solid, depth_sum / alpha.clamp(min=RENDERED_ALPHA), torch.zeros_like(alpha))
-        return color.clamp(0, 1), depth
-
-    return render
 
 
 class TrainingFrames:

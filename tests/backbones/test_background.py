@@ -321,3 +321,29 @@ class TestStart:
         second = make_trainer(iterations=4, backbone=backbone, background=True)
         second.load_state_dict(first.state_dict())
         assert same(first, second)
+
+
+@pytest.mark.parametrize(("width", "height"), [(96, 54), (320, 180), (41, 23)])
+def test_the_number_of_threads_changes_no_bit(width: int, height: int) -> None:
+    """Forward and backward: a run on two cores is the run on one."""
+    view = replace(make_views()[0], width=width, height=height)
+
+    def drawn(threads: int) -> list[Tensor]:
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            numbers = torch.Generator().manual_seed(0)
+            background = Background(torch.device("cpu"))
+            with torch.no_grad():
+                background.constant.uniform_(-0.3, 0.3, generator=numbers)
+                background.harmonics.uniform_(-0.1, 0.1, generator=numbers)
+            alpha = torch.rand(height, width, generator=numbers).requires_grad_()
+            nothing = torch.zeros(height, width)
+            render = Render(torch.zeros(height, width, 3), nothing, alpha)
+            color = background.behind(render, view).color
+            color.backward(torch.rand(height, width, 3, generator=numbers))
+            return [color.detach(), *(part.grad for part in (alpha, background.constant, background.harmonics))]
+        finally:
+            torch.set_num_threads(before)
+
+    assert all(torch.equal(one, two) for one, two in zip(drawn(1), drawn(2), strict=True))

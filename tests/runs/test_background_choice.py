@@ -15,6 +15,7 @@ from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
+from d2_plugin.runs.evaluation import renderer
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TimedPoints
@@ -65,7 +66,7 @@ def test_it_begins_with_the_colours_of_the_pictures(scene: Path, tmp_path: Path)
     run = run_of(scene, tmp_path / "run", None, hooks=())
     model, capture = trainer_of(run).model, run.scene.capture
     for camera in CAMERAS:
-        shown = run._renderer(model)(camera, 0)[0]
+        shown = renderer(model, capture, "cpu")(camera, 0)[0]
         mean = torch.from_numpy(capture.image(camera, 0)).float().mean((0, 1)) / 255
         torch.testing.assert_close(shown.mean((0, 1)), mean, atol=0.1, rtol=0)
 
@@ -112,8 +113,9 @@ class TestAFinishedRun:
 
     def test_a_held_out_camera_is_rendered_with_it(self, trained: Run) -> None:
         model = trained.trained().model
-        color, depth = trained._renderer(model)("test0", 0)
+        render = renderer(model, trained.scene.capture, "cpu")
+        color, depth = render("test0", 0)
         model.background = None
-        without, same_depth = trained._renderer(model)("test0", 0)
+        without, same_depth = render("test0", 0)
         assert not torch.equal(color, without)
         assert torch.equal(depth, same_depth)

@@ -129,7 +129,7 @@ class TestPlan:
         def job(settings: RunSettings, rival: str | None = None) -> str:
             return fingerprint(Job("full", "yang4d", 0, settings, Path("x"), rival))
 
-        elsewhere = replace(SETTINGS, capture="/elsewhere/room", priors="/tmp/dual")
+        elsewhere = replace(SETTINGS, capture="/elsewhere/room", priors="/elsewhere/dual")
         assert job(elsewhere) == job(replace(SETTINGS, capture="room", priors="dual"))
         others = [replace(SETTINGS, seed=1), replace(SETTINGS, iterations=5), replace(SETTINGS, downscale=2)]
         assert len({job(SETTINGS), *map(job, others), job(SETTINGS, "pearson"), job(SETTINGS, "patch_norm")}) == 6

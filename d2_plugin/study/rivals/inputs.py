@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from d2_plugin.hooks import Context
-from d2_plugin.hooks.depth_loss import depth_and_alpha
+from d2_plugin.hooks import Context, Hook, HookConfig
 from d2_plugin.priors.files import EntryFolder
 from d2_plugin.priors.monocular.network import upsample
 from d2_plugin.priors.stereo.cache import stored_depth
@@ -72,17 +72,28 @@ def expected_depth(depth_sum: Tensor, alpha: Tensor, least: float = 0.5) -> tupl
     return torch.where(valid, depth_sum / torch.where(valid, alpha, 1), 0), valid
 
 
-def mean_over(terms: list[Tensor]) -> Tensor | None:
-    """The mean of the terms of a batch, None where no view has one."""
-    return torch.stack(terms).mean() if terms else None
-
-
-def rendered(context: Context, view: View) -> tuple[Tensor, Tensor]:
-    """Differentiable sum of w z and of w, [H, W], as the trainer rendered them in this step."""
-    return depth_and_alpha(context, view)
-
-
 def rendered_again(context: Context, view: View, splats: Splats) -> Tensor:
     """Differentiable sum of w z [H, W] of other splats than the trainer's."""
     colors = splats.means.new_zeros(len(splats.means), 1)
     return rasterize(splats, colors, view, context.backbone.settings).depth_sum
+
+
+class RivalLoss(Hook):
+    """A rival that adds a loss: the weighted mean of its `term` over the views of the present step that have one."""
+
+    def __init__(self, config: HookConfig, inputs: Inputs) -> None:
+        super().__init__(config)
+        self.inputs = inputs
+
+    def loss(self, context: Context) -> Tensor | None:
+        """A scalar, None where no view has a term."""
+        terms = [term for view in context.views if (term := self.term(context, view)) is not None]
+        return self.weight(context.step) * torch.stack(terms).mean() if terms else None
+
+    @abstractmethod
+    def term(self, context: Context, view: View) -> Tensor | None:
+        """The loss of one view, unweighted; None where it has no depth to compare with."""
+
+    def weight(self, step: int) -> float:
+        """Of the loss at this step."""
+        return self.config.weight

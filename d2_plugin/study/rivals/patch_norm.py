@@ -23,11 +23,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from d2_plugin.hooks import Context, Hook, HookConfig
+from d2_plugin.hooks import Context, HookConfig
 from d2_plugin.protocol import View
 from d2_plugin.settings import NotNegative, Range, Steps
 
-from .inputs import Inputs, mean_over, rendered_again
+from .inputs import RivalLoss, rendered_again
 
 GUARD = 0.01
 """Share of the whole map's deviation that keeps flat patches from dividing by 0, as published."""
@@ -97,21 +97,13 @@ def _deviation(values: Tensor, dim: int | None = None) -> Tensor:
     return torch.where(positive, torch.where(positive, variance, 1).sqrt(), 0)
 
 
-class PatchNorm(Hook):
+class PatchNorm(RivalLoss):
     """Adds the losses of hard and soft depth for the views of the present step."""
 
     config: PatchNormConfig
 
-    def __init__(self, config: PatchNormConfig, inputs: Inputs) -> None:
-        super().__init__(config)
-        self.inputs = inputs
-
-    def loss(self, context: Context) -> Tensor | None:
-        """The weighted mean over the views that have a map."""
-        found = mean_over([term for view in context.views if (term := self._term(context, view)) is not None])
-        return None if found is None else self.config.weight * found
-
-    def _term(self, context: Context, view: View) -> Tensor | None:
+    def term(self, context: Context, view: View) -> Tensor | None:
+        """The loss of one view, None where it has no map."""
         inverse = self.inputs.inverse_depth(view)
         if inverse is None:
             return None

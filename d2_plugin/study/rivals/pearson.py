@@ -18,11 +18,12 @@ from typing import Annotated, Self
 import torch
 from torch import Tensor
 
-from d2_plugin.hooks import Context, Hook, HookConfig
+from d2_plugin.hooks import Context, HookConfig
+from d2_plugin.hooks.depth_loss import depth_and_alpha
 from d2_plugin.protocol import View
 from d2_plugin.settings import NotNegative, Positive, Range, Steps
 
-from .inputs import Inputs, mean_over, rendered
+from .inputs import RivalLoss
 
 FLAT = 1e-10
 """A map whose variance is a smaller share of its mean square is constant: rounding alone varies it."""
@@ -82,23 +83,18 @@ def pearson_depth_loss(depth: Tensor, inverse_depth: Tensor, span: float = 2000.
     return 1 - torch.maximum(pearson_correlation(-m, d), pearson_correlation(1 / (m + offset), d))
 
 
-class Pearson(Hook):
+class Pearson(RivalLoss):
     """Adds the loss of the views of the present step."""
 
     config: PearsonConfig
 
-    def __init__(self, config: PearsonConfig, inputs: Inputs) -> None:
-        super().__init__(config)
-        self.inputs = inputs
+    def weight(self, step: int) -> float:
+        """As published, another one late in the run."""
+        return self.config.weight if step < self.config.late else self.config.late_weight
 
-    def loss(self, context: Context) -> Tensor | None:
-        """The weighted mean over the views that have a map."""
-        found = mean_over([term for view in context.views if (term := self._term(context, view)) is not None])
-        weight = self.config.weight if context.step < self.config.late else self.config.late_weight
-        return None if found is None else weight * found
-
-    def _term(self, context: Context, view: View) -> Tensor | None:
+    def term(self, context: Context, view: View) -> Tensor | None:
+        """The loss of one view, None where it has no map."""
         inverse = self.inputs.inverse_depth(view)
         if inverse is None:
             return None
-        return pearson_depth_loss(rendered(context, view)[0], inverse, self.config.span, self.config.offset)
+        return pearson_depth_loss(depth_and_alpha(context, view)[0], inverse, self.config.span, self.config.offset)

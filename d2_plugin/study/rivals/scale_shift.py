@@ -17,11 +17,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from d2_plugin.hooks import Context, Hook, HookConfig
+from d2_plugin.hooks import Context, HookConfig
+from d2_plugin.hooks.depth_loss import depth_and_alpha
 from d2_plugin.protocol import View
 from d2_plugin.settings import AtLeastOne, NotNegative, Share
 
-from .inputs import Inputs, expected_depth, mean_over, rendered
+from .inputs import RivalLoss, expected_depth
 from .pearson import FLAT
 
 
@@ -85,25 +86,17 @@ def in_unit_range(values: Tensor, mask: Tensor) -> Tensor:
     return (values - low) / torch.where(high > low, high - low, 1)
 
 
-class ScaleShift(Hook):
+class ScaleShift(RivalLoss):
     """Adds the loss of the views of the present step."""
 
     config: ScaleShiftConfig
 
-    def __init__(self, config: ScaleShiftConfig, inputs: Inputs) -> None:
-        super().__init__(config)
-        self.inputs = inputs
-
-    def loss(self, context: Context) -> Tensor | None:
-        """The weighted mean over the views that have a map."""
-        found = mean_over([term for view in context.views if (term := self._term(context, view)) is not None])
-        return None if found is None else self.config.weight * found
-
-    def _term(self, context: Context, view: View) -> Tensor | None:
+    def term(self, context: Context, view: View) -> Tensor | None:
+        """The loss of one view, None where it has no map."""
         inverse = self.inputs.inverse_depth(view)
         if inverse is None:
             return None
-        depth, valid = expected_depth(*rendered(context, view), self.config.tau_v)
+        depth, valid = expected_depth(*depth_and_alpha(context, view), self.config.tau_v)
         known = inverse.isfinite()
         x = torch.where(valid, 1 / torch.where(valid, depth, 1), 0)
         y = in_unit_range(torch.where(known, inverse, 0), known)

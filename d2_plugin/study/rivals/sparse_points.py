@@ -21,12 +21,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from d2_plugin.hooks import Context, Hook, HookConfig
+from d2_plugin.hooks import Context, HookConfig
+from d2_plugin.hooks.depth_loss import depth_and_alpha
 from d2_plugin.protocol import View
 from d2_plugin.runs.start import scene_extent
 from d2_plugin.settings import NotNegative, Share
 
-from .inputs import Inputs, expected_depth, mean_over, rendered
+from .inputs import Inputs, RivalLoss, expected_depth
 
 
 @dataclass(frozen=True)
@@ -69,24 +70,23 @@ def at_pixels(values: Tensor, pixels: Tensor) -> Tensor:
     return F.grid_sample(values[None, None], grid, align_corners=False, padding_mode="border")[0, 0, 0]
 
 
-class SparsePointDepth(Hook):
+class SparsePointDepth(RivalLoss):
     """Adds the loss of the views of the present step."""
 
     config: SparsePointsConfig
 
     def __init__(self, config: SparsePointsConfig, inputs: Inputs) -> None:
-        super().__init__(config)
-        self.inputs, self._seen = inputs, dict[tuple[str, int], Seen]()
+        super().__init__(config, inputs)
+        self._seen: dict[tuple[str, int], Seen] = {}
         scene, positions = inputs.scene, inputs.points.positions
         self.scale = scene_extent(scene.capture, scene.train_cameras, positions).radius
 
-    def loss(self, context: Context) -> Tensor | None:
-        """The weighted mean over the views that see a point."""
-        pairs = [(view, seen) for view in context.views if len((seen := self.seen(view)).depths)]
-        found = mean_over(
-            [sparse_point_loss(expected_depth(*rendered(context, v), 0)[0], s, self.scale) for v, s in pairs]
-        )
-        return None if found is None else self.config.weight * found
+    def term(self, context: Context, view: View) -> Tensor | None:
+        """The loss of one view, None where it sees no point."""
+        seen = self.seen(view)
+        if not len(seen.depths):
+            return None
+        return sparse_point_loss(expected_depth(*depth_and_alpha(context, view), 0)[0], seen, self.scale)
 
     def seen(self, view: View) -> Seen:
         """The points that a view sees."""
