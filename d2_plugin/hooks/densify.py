@@ -48,8 +48,9 @@ class DensifyConfig(HookConfig):
     """Opacity of a new Gaussian. A faint one cannot spoil what stands; training makes it opaque where it is right."""
     cell: Positive = 1.0
     """Side of the frustum cells that keep duplicates out, in units of the distance between samples."""
-    occupied_opacity: Share = 0.1
-    """An existing Gaussian that is more opaque than this occupies its cell."""
+    occupied_opacity: Share = 0.08
+    """An existing Gaussian that is more opaque than this occupies its cell: one that was inserted and has not faded since.
+    From .05 to .15 the scores stay within .2 dB (studio, plaza, 500 steps, three seeds); more means more Gaussians."""
 
     @classmethod
     def for_iterations(cls, iterations: int) -> Self:
