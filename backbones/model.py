@@ -62,7 +62,8 @@ class SplatSettings(Settings):
     At 0.2, 500 steps, one seed: studio +.26 dB with D2 and -1.29 without, plaza -.57 and +.58."""
     background: bool = True
     """Whether directions have a colour of their own at infinity, behind all Gaussians: for skies, and for what no
-    training camera has seen, which is black without it."""
+    training camera has seen, which is black without it. 500 steps with D2, seed 0: studio 25.95 dB without, 30.73 with;
+    plaza 19.97 and 21.84."""
     appearance: bool = False
     """Whether each training camera has an affine change of colour of its own. `d2 train` switches it on where the
     cameras' exposures differ.
