@@ -37,24 +37,24 @@ class DensifyConfig(HookConfig):
     """The threshold of pixels without a finite sigma: they may propose and no more."""
     spacing: Annotated[float, Range(1, unit="pixels")] = 4.0
     """Distance between samples: one new Gaussian per square of this side where a surface is missing.
-    The first evaluation so covers what the prior knows; later ones repair. 500 steps, seed 0, studio and plaza: 3 px gives
-    30.4 and 21.9 dB with 23,000 and 31,000 Gaussians, 4 px 30.7 and 21.8 with 14,000 and 18,000, 6 px 30.3 and 21.7 with
-    8,000 and 10,000, and SSIM1 on plaza .718, .702, .669."""
+    The first evaluation so covers what the prior knows; later ones repair. 500 steps, seed 0, studio and plaza: 3 px
+    gives 30.4 and 21.9 dB with 23,000 and 31,000 Gaussians, 4 px 30.7 and 21.8 with 14,000 and 18,000, 6 px 30.3 and
+    21.7 with 8,000 and 10,000; SSIM1 on plaza .718, .702, .669."""
     budget_per_view: Count = 20_000
     """No more samples than this in one view and evaluation: they lie further apart instead."""
     max_gaussians: Count = 1_000_000
     """No insertion beyond this number of Gaussians."""
     scale: Positive = 0.7
-    """Standard deviation of a new Gaussian in units of the distance between samples. As above: .5 gives 30.2 and 21.9 dB,
-    .7 30.7 and 21.8, 1.0 30.2 and 21.7."""
+    """Standard deviation of a new Gaussian in units of the distance between samples. As above: .5 gives 30.2 and
+    21.9 dB, .7 30.7 and 21.8, 1.0 30.2 and 21.7."""
     opacity: Annotated[float, Range(0, 1, open_low=True)] = 0.1
-    """Opacity of a new Gaussian. A faint one cannot spoil what stands; training makes it opaque where it is right. As above:
-    .05 gives 30.7 and 21.9 dB with a third more Gaussians, .1 30.7 and 21.8, .3 30.1 and 21.6."""
+    """Opacity of a new Gaussian. A faint one cannot spoil what stands; training makes it opaque where it is right. As
+    above: .05 gives 30.7 and 21.9 dB with a third more Gaussians, .1 30.7 and 21.8, .3 30.1 and 21.6."""
     cell: Positive = 1.0
     """Side of the frustum cells that keep duplicates out, in units of the distance between samples."""
     occupied_opacity: Share = 0.08
-    """An existing Gaussian that is more opaque than this occupies its cell: one that was inserted and has not faded since.
-    From .05 to .15 the scores stay within .2 dB (studio, plaza, 500 steps, three seeds); more means more Gaussians."""
+    """An existing Gaussian that is more opaque than this occupies its cell: one that was inserted and has not faded.
+    From .05 to .15 scores stay within .2 dB (studio, plaza, 500 steps, three seeds); more means more Gaussians."""
 
     @classmethod
     def for_iterations(cls, iterations: int) -> Self:

@@ -38,8 +38,8 @@ class DepthLossConfig(HookConfig):
     """lambda_d of each addition; what matters is weight / every."""
     opaque: Annotated[float, Range(0, 1e6)] = 0.05
     """Beside lambda_d's 1, the weight of what known near pixels let through, mean of 1 - alpha; the paper has none. A
-    background of the same colour could else stand for a surface: 500 steps, seed 0, studio 29.9 dB and depth AbsRel .071
-    without, 30.7 and .032 with; plaza, where the sky is one, 22.0 and .123, 21.8 and .122."""
+    background of the same colour could else stand for a surface: 500 steps, seed 0, studio 29.9 dB and depth AbsRel
+    .071 without, 30.7 and .032 with; plaza, where the sky is one, 22.0 and .123, 21.8 and .122."""
     epsilon: Positive = 0.01
     """epsilon_rho of the Charbonnier penalty, on relative depth residuals."""
     tau_v: Share = 0.5
