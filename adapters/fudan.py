@@ -140,14 +140,18 @@ class FudanAdapter(InriaAdapter):
         return torch.nonzero(marginal > MARGINAL_CUT).squeeze(-1)
 
     def _append(self, points: Points) -> None:
-        """New Gaussians live around the time of their frame with the width that the repository starts with:
-        a variance of a fifth of the duration (gaussian_model.py:280)."""
+        """New Gaussians live around the time of their frame with the width that the repository starts with, a variance
+        of a fifth of the duration (gaussian_model.py:280), or with their lifetime where that is shorter.
+
+        Without 4D rotation `_scaling_t` is read as the log of the variance."""
         model, rows = self.gaussians, self._raw_rows(points)
         times = scales = right = None
         if model.gaussian_dim == 4:
             duration = model.time_duration[1] - model.time_duration[0]
             times = points.times[:, None]
             scales = torch.full_like(times, 0.5 * math.log(duration / 5))
+            if points.lifetimes is not None:
+                scales = torch.minimum(scales, points.lifetimes.log()[:, None] * (1 if model.rot_4d else 2))
             right = rows.rotation.clone() if model.rot_4d else None
         model.densification_postfix(*rows, times, scales, right)
 

@@ -114,7 +114,7 @@ class GsplatAdapter:
         """
         self._report_changes()
         finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
-        points = Points(*(value[finite] for value in points))
+        points = points.select(finite)
         rows, count = self._rows(points), len(points.positions)
         index = torch.arange(self._count + count, device=points.positions.device)
         index[self._count :] = -1

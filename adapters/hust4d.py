@@ -123,7 +123,7 @@ class Hust4DAdapter(InriaAdapter):
         corners = torch.stack([torch.as_tensor(corner).to(points.positions) for corner in self._box()])
         low, high = corners.amin(0), corners.amax(0)
         inside = ((points.positions >= low) & (points.positions <= high)).all(-1)
-        return Points(*(value[inside] for value in points))
+        return points.select(inside)
 
     def _box(self) -> tuple[Tensor, Tensor]:
         box = self.gaussians._deformation.get_aabb

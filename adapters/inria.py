@@ -134,7 +134,7 @@ class InriaAdapter(ABC):
         finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
         before = len(self)
         with self._evidence_kept():
-            self._append(Points(*(value[finite] for value in points)))
+            self._append(points.select(finite))
         return len(self) - before
 
     @torch.no_grad()

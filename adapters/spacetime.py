@@ -9,6 +9,7 @@ Line 2 runs once per view; gradients are averaged over the batch afterwards (`se
 
 from __future__ import annotations
 
+import math
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -82,11 +83,16 @@ class SpacetimeAdapter(InriaAdapter):
     def _append(self, points: Points) -> None:
         """Gaussians that do not move, centred on the time of their frame, as wide in time as the initial ones.
 
+        Where a lifetime is shorter, it counts: exp(-(dt / e^s)^2) has the standard deviation e^s / sqrt(2).
+
         Colours are stored as they are, twice in the full model, whose second half and `_features_t` feed its decoder.
         """
         model, rows, count = self.gaussians, self._raw_rows(points), len(points.positions)
         zeros = points.positions.new_zeros
         width = getattr(model, "trbfslinit", None)
+        widths = points.positions.new_full((count, 1), 1.0 if width is None else float(width))
+        if points.lifetimes is not None:
+            widths = torch.minimum(widths, (points.lifetimes * math.sqrt(2)).log()[:, None])
         model.densification_postfix(
             rows.xyz,
             points.colors.repeat(1, model._features_dc.shape[1] // 3),
@@ -94,7 +100,7 @@ class SpacetimeAdapter(InriaAdapter):
             rows.scaling,
             rows.rotation,
             points.times[:, None],
-            points.positions.new_full((count, 1), 1.0 if width is None else float(width)),
+            widths,
             zeros(count, 9),
             zeros(count, 4),
             zeros(count, 3),

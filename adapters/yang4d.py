@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import torch
+
 from d2_plugin.backbones.yang4d import Yang4D, initial_rows
 from d2_plugin.protocol import Points
 
@@ -13,5 +15,8 @@ class Yang4DAdapter(WatchedModel[Yang4D]):
 
     def insert(self, points: Points) -> int:
         """Isotropic Gaussians at the points, living around the time of their frame; returns their number."""
-        self.model.append(initial_rows(*points, self.model.settings, self.model.duration))
+        rows = initial_rows(*points[:5], self.model.settings, self.model.duration)
+        if points.lifetimes is not None and "log_time_scales" in rows:
+            rows["log_time_scales"] = torch.minimum(rows["log_time_scales"], points.lifetimes.log())
+        self.model.append(rows)
         return len(points.positions)

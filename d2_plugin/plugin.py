@@ -203,7 +203,7 @@ class D2Hooks:
             self._evaluated = True
             return self._sampler.sample(max(self.config.views_per_evaluation, first), self.generator)
 
-        return Context(step, self.backbone, views, self._prior, self.generator, sample)
+        return Context(step, self.backbone, views, self._prior, self.generator, sample, self._sampler.instants)
 
     def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
         """Retire a structure hook whose last evaluations changed next to nothing, because its surveys cost time."""
@@ -241,7 +241,7 @@ class D2Hooks:
         proposals = [(name, edit.insert) for name, edit in edits if edit.insert is not None]
         if not proposals:
             return 0
-        points = Points(*(torch.cat(values) for values in zip(*(p for _, p in proposals), strict=True)))
+        points = Points.joined([points for _, points in proposals])
         self._inserting = step
         try:
             inserted = self.backbone.insert(points)

@@ -7,7 +7,7 @@ backbone's own unit; covariances are stored as xx, xy, xz, yy, yz, zz.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
@@ -66,6 +66,21 @@ class Points(NamedTuple):
     times: Tensor  # [K] in the backbone's unit
     scales: Tensor  # [K] isotropic standard deviation in world units
     opacities: Tensor  # [K] in 0..1
+    lifetimes: Tensor | None = None  # [K] standard deviation in time; infinite, or None: as the backbone begins
+
+    def select(self, which: Tensor) -> Points:
+        """Those of a mask bool [K], or of indices."""
+        lifetimes = None if self.lifetimes is None else self.lifetimes[which]
+        return self._replace(lifetimes=lifetimes, **{name: getattr(self, name)[which] for name in self._fields[:5]})
+
+    @classmethod
+    def joined(cls, parts: Sequence[Points]) -> Points:
+        """All points of at least one part, in their order."""
+        known = [torch.cat(values) for values in zip(*(part[:5] for part in parts), strict=True)]
+        if all(part.lifetimes is None for part in parts):
+            return cls._make([*known, None])
+        given = [torch.full_like(p.times, torch.inf) if p.lifetimes is None else p.lifetimes for p in parts]
+        return cls._make([*known, torch.cat(given)])
 
 
 class Edit(NamedTuple):

@@ -14,6 +14,7 @@ from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
 
 from .expected import check_splats
 from .hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
+from .motion import Motion
 from .rendered_depth import relative_discrepancy, rendered_depth
 
 
@@ -50,6 +51,9 @@ class DensifyConfig(HookConfig):
     opacity: Annotated[float, Range(0, 1, open_low=True)] = 0.1
     """Opacity of a new Gaussian. A faint one cannot spoil what stands; training makes it opaque where it is right. As
     above: .05 gives 30.7 and 21.9 dB with a third more Gaussians, .1 30.7 and 21.8, .3 30.1 and 21.6."""
+    lifetime: Positive | None = 1.0
+    """Standard deviation in time of a new Gaussian where the picture moves, in intervals from instant to instant, in a
+    backbone that has one; none: as it begins there."""
     cell: Positive = 1.0
     """Side of the frustum cells that keep duplicates out, in units of the distance between samples."""
     occupied_opacity: Share = 0.08
@@ -121,6 +125,10 @@ class Densify(Hook):
 
     config: DensifyConfig
 
+    def __init__(self, config: DensifyConfig) -> None:
+        super().__init__(config)
+        self._motion = Motion()
+
     def edit(self, context: Context) -> Edit | None:
         """Points from the under-reconstructed pixels of the evaluated views, within the budget."""
         room = self.config.max_gaussians - len(context.backbone)
@@ -128,19 +136,19 @@ class Densify(Hook):
         for surveyed in context.evaluation:
             budget = min(self.config.budget_per_view, room - sum(len(p.positions) for p in inserted))
             if budget > 0:
-                points = self._propose(surveyed, inserted, budget, context.generator)
+                points = self._propose(surveyed, inserted, budget, context)
                 inserted += [points] if len(points.positions) else []
         if not inserted:
             return None
-        return Edit(insert=Points(*(torch.cat(values) for values in zip(*inserted, strict=True))))
+        return Edit(insert=Points.joined(inserted))
 
-    def _propose(self, surveyed: Surveyed, earlier: list[Points], budget: int, generator: torch.Generator) -> Points:
+    def _propose(self, surveyed: Surveyed, earlier: list[Points], budget: int, context: Context) -> Points:
         """New points of one view that no existing Gaussian and no point of an earlier view already stands for."""
         config, view, prior = self.config, surveyed.view, surveyed.prior
         check_splats(surveyed.splats, len(surveyed.splats.means), inserting=True)
         depth, valid = rendered_depth(surveyed.survey.depth_sum, surveyed.survey.alpha, config.tau_v)
         region = under_reconstructed(depth, valid, prior.depth, prior.support, self._tau_u(prior))
-        pixels = shuffled_pixels(region, generator)
+        pixels = shuffled_pixels(region, context.generator)
         column, row = pixels.unbind(-1)
         target = prior.depth[row, column]
         positions = back_project(view, pixels, target)
@@ -151,13 +159,15 @@ class Densify(Hook):
         )
         focal = torch.sqrt(view.K[0, 0] * view.K[1, 1])
         scales = config.scale * spacing * target / focal
-        return Points(
-            positions[free],
-            colors[free],
-            torch.full_like(target, view.time)[free],
-            scales[free],
-            torch.full_like(target, config.opacity)[free],
-        )
+        times, opacities = torch.full_like(target, view.time), torch.full_like(target, config.opacity)
+        lifetimes = self._lifetimes(view, context)
+        lifetimes = None if lifetimes is None else lifetimes[row, column]
+        return Points(positions, colors, times, scales, opacities, lifetimes).select(free)
+
+    def _lifetimes(self, view: View, context: Context) -> Tensor | None:
+        """How long a new Gaussian may live at each pixel [H, W], infinite where nothing moves; None: not known."""
+        intervals = None if self.config.lifetime is None else self._motion.intervals(view, context)
+        return None if self.config.lifetime is None or intervals is None else self.config.lifetime * intervals
 
     def _tau_u(self, prior: DepthPrior) -> Tensor:
         """The relative depth error [H, W] that counts as under-reconstructed, by how exact each pixel is."""

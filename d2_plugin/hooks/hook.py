@@ -61,6 +61,10 @@ def steps_between_evaluations(iterations: int) -> int:
     return max(1, min(100, iterations // 20))
 
 
+def _none_known(_: str) -> Sequence[View]:
+    return ()
+
+
 class Surveyed(NamedTuple):
     """One view of an evaluation: its sliced Gaussians, its prior, and the compositing weights."""
 
@@ -82,6 +86,8 @@ class Context:
     generator: torch.Generator
     sample: Callable[[], Sequence[View]] = field(default=tuple)
     """The views to evaluate when structure is edited: a stratified sample of all training views."""
+    instants: Callable[[str], Sequence[View]] = _none_known
+    """The views of a camera that were trained on so far, in the order in which they were first seen."""
 
     @cached_property
     def evaluation(self) -> list[Surveyed]:

@@ -34,6 +34,10 @@ class ViewSampler:
         """How many cameras have been seen so far."""
         return len({camera for camera, _ in self._views})
 
+    def instants(self, camera: str) -> list[View]:
+        """The known views of one camera, in the order in which they were first seen."""
+        return [view for view in self._views.values() if view.camera == camera]
+
     def sample(self, count: int, generator: torch.Generator) -> Sequence[View]:
         """At most `count` different views; over several calls every known view comes once before any comes again."""
         cameras = sorted({camera for camera, _ in self._views})

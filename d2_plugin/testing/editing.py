@@ -123,7 +123,7 @@ def _placed(example: Example, view: View, points: Points, index: Tensor) -> Iter
 
 def _insert_nothing(example: Example) -> Iterator[str]:
     count = len(example.backbone)
-    nothing = Points(*(part[:0] for part in some_points(example, example.views[0])))
+    nothing = some_points(example, example.views[0]).select(torch.arange(0))
     if example.backbone.insert(nothing) != 0 or len(example.backbone) != count:
         yield "inserting no points must change nothing and return 0"
 

@@ -90,7 +90,7 @@ def test_the_first_evaluation_looks_through_every_camera_seen_so_far() -> None:
         d2.loss(step, views[(step - 1) % len(views)])
         looked.append(set())
         d2.step(step)
-    assert [len(cameras) for cameras in looked] == [0, 0, 0, 0, 0, 3, 0, 1]
+    assert looked[:6] == [set()] * 5 + [{"cam0", "cam1", "cam2"}]
 
 
 @given(start=st.integers(0, 50), every=st.integers(1, 20), length=st.integers(0, 60), steps=st.integers(1, 120))
