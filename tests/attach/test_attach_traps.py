@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -19,6 +20,7 @@ from d2_plugin.adapters.deformable3d import Deformable3DAdapter
 from d2_plugin.adapters.ex4dgs import Ex4DGSAdapter
 from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
+from d2_plugin.adapters.inria import InriaAdapter
 from d2_plugin.adapters.keys import PriorKey
 from d2_plugin.adapters.spacetime import SpacetimeAdapter
 from d2_plugin.config import DepthLossConfig
@@ -247,3 +249,41 @@ def test_points_inside_spacetime_have_its_own_start() -> None:
     assert model._trbf_scale[-1].item() == pytest.approx(model.trbfslinit)
     torch.testing.assert_close(model._features_dc[-2:, :3], some_points(2).colors)
     torch.testing.assert_close(model._features_dc[-2:, 3:], some_points(2).colors)
+
+
+def lasting(name: str) -> InriaAdapter:
+    """An adapter of a repository whose Gaussians have an extent in time."""
+    if name == "spacetime":
+        model, _ = spacetime.make()
+        model.training_setup(default_options())
+        return SpacetimeAdapter(model, 2)
+    model, _ = fudan.make()
+    model.training_setup(default_options())
+    return FudanAdapter(model)
+
+
+@pytest.mark.parametrize("name", ["fudan", "spacetime"])
+def test_a_lifetime_is_the_standard_deviation_in_time(name: str) -> None:
+    """One lifetime away from its instant exp(-1/2) of the opacity is left; a long one leaves the repository's start."""
+    adapter, brief = lasting(name), 0.02
+    count = len(adapter)
+    view = replace(make_views()[0], time=0.5)
+    adapter.insert(some_points(2)._replace(lifetimes=torch.tensor([brief, torch.inf])))
+
+    def left(time: float) -> torch.Tensor:
+        splats = adapter.slice_at(replace(view, time=time))
+        return torch.stack([splats.opacities[splats.rows == count + i].sum() for i in range(2)]).detach()
+
+    now, later = left(0.5), left(0.5 + brief)
+    assert (later / now)[0].item() == pytest.approx(math.exp(-0.5), abs=1e-3)
+    assert (later / now)[1].item() > 0.9
+
+
+def test_without_rotation_in_time_fudan_keeps_the_log_of_a_variance() -> None:
+    model, _ = fudan.make()
+    model.training_setup(default_options())
+    adapter, rows = FudanAdapter(model), []
+    model.rot_4d, model.densification_postfix = False, lambda *columns: rows.extend(columns)
+    adapter._append(some_points(1)._replace(lifetimes=torch.tensor([0.02])))
+    torch.testing.assert_close(rows[7].exp().sqrt(), torch.tensor([[0.02]]))
+    assert rows[8] is None
