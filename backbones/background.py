@@ -15,6 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from d2_plugin.gaussians.native_adam import Adam
+from d2_plugin.gaussians.native_picture import can_draw, composite_background
 from d2_plugin.gaussians.spherical_harmonics import basis
 from d2_plugin.rasterizer import Render, View
 
@@ -39,7 +41,7 @@ class Background:
         self.constant = nn.Parameter(torch.zeros(1, 3, device=device))
         self.harmonics = nn.Parameter(torch.zeros((DEGREE + 1) ** 2 - 1, 3, device=device))
         groups = [{"params": [self.constant], "lr": RATE}, {"params": [self.harmonics], "lr": RATE / 5}]
-        self.optimizer = torch.optim.Adam(groups, eps=1e-15)
+        self.optimizer = Adam(groups, eps=1e-15)
         self._bases: dict[tuple[Any, ...], Tensor] = {}
 
     @torch.no_grad()
@@ -67,13 +69,20 @@ class Background:
 
     def behind(self, render: Render, view: View) -> Render:
         """The render with the background where the Gaussians leave some of a ray."""
+        basis = self._basis(view)
+        if can_draw(render.color, basis):
+            parts = render.color, render.alpha, basis, self.constant, self.harmonics
+            return render._replace(color=composite_background(*parts, _nodes(view)))
+        return render._replace(color=render.color + (1 - render.alpha)[..., None] * self._interpolated(view, basis))
+
+    def _interpolated(self, view: View, basis: Tensor) -> Tensor:
+        """The background [H, W, 3] in torch: any dtype and device, and the oracle of the kernel."""
         rows, columns, stride = _nodes(view)
-        coarse = (self._basis(view) @ torch.cat([self.constant, self.harmonics]) + 0.5).clamp(0, 1)
+        coarse = (basis @ torch.cat([self.constant, self.harmonics]) + 0.5).clamp(0, 1)
         nodes = coarse.view(rows, columns, 3).permute(2, 0, 1)[None]
         size = (stride * (rows - 1) + 1, stride * (columns - 1) + 1)
         fine = F.interpolate(nodes, size, mode="bilinear", align_corners=True)[0]
-        colors = fine[:, : view.height, : view.width].permute(1, 2, 0)
-        return render._replace(color=render.color + (1 - render.alpha)[..., None] * colors)
+        return fine[:, : view.height, : view.width].permute(1, 2, 0)
 
     def optimize(self) -> None:
         """One optimizer step, gradients cleared."""
