@@ -46,107 +46,127 @@ static void node_colors(const Behind& b, float* raw) {
   }
 }
 
-static float limited(float value) { return std::min(std::max(value, 0.f), 1.f); }
-
-// A row of nodes, interpolated at each pixel of the picture's width.
+// A row of nodes, limited to 0..1 and interpolated at each pixel of the picture's width.
 static void spread_row(const Behind& b, const float* raw, float* line) {
   const float step = 1.f / float(b.stride);
   for (int column = 0, x = 0; x < b.width; column++) {
-    const float* left = raw + 3 * column;
+    float from[3], slope[3];
+    for (int c = 0; c < 3; c++) {
+      from[c] = std::min(std::max(raw[3 * column + c], 0.f), 1.f);
+      slope[c] = std::min(std::max(raw[3 * column + 3 + c], 0.f), 1.f) - from[c];
+    }
     for (int i = 0; i < b.stride && x < b.width; i++, x++)
-      for (int c = 0; c < 3; c++) {
-        const float from = limited(left[c]), to = i ? limited(left[3 + c]) : from;
-        line[3 * x + c] = from + float(i) * step * (to - from);
-      }
+      for (int c = 0; c < 3; c++) line[3 * x + c] = from[c] + float(i) * step * slope[c];
   }
 }
 
 // The transpose: what came to the pixels of a line, gathered at its nodes.
 static void gather_row(const Behind& b, const float* line, float* nodes) {
   const float step = 1.f / float(b.stride);
-  for (int column = 0, x = 0; x < b.width; column++)
+  for (int column = 0, x = 0; x < b.width; column++) {
+    float all[3] = {0, 0, 0}, right[3] = {0, 0, 0};
     for (int i = 0; i < b.stride && x < b.width; i++, x++)
       for (int c = 0; c < 3; c++) {
-        const float right = float(i) * step * line[3 * x + c];
-        nodes[3 * column + c] += line[3 * x + c] - right;
-        if (i) nodes[3 * column + 3 + c] += right;
+        all[c] += line[3 * x + c];
+        right[c] += float(i) * step * line[3 * x + c];
       }
+    for (int c = 0; c < 3; c++) {
+      nodes[3 * column + c] += all[c] - right[c];
+      nodes[3 * column + 3 + c] += right[c];
+    }
+  }
 }
 
-// The pixels between two rows of nodes: [rows of pixels], with the nodes' colours spread along them.
+// Lines of numbers, three a pixel, on which the loops below are flat: the compiler makes vectors of them.
+static void repeat(const float* __restrict alpha, int width, float* __restrict rest) {
+  for (int x = 0; x < width; x++) {
+    const float value = 1 - alpha[x];
+    rest[3 * x] = value, rest[3 * x + 1] = value, rest[3 * x + 2] = value;
+  }
+}
+
+static void composite(const float* __restrict upper, const float* __restrict lower, float low,
+                      const float* __restrict rest, const float* __restrict in, int64_t length, float* __restrict out) {
+  for (int64_t i = 0; i < length; i++) out[i] = in[i] + rest[i] * (upper[i] + low * (lower[i] - upper[i]));
+}
+
+// What goes to the two rows of nodes, and the gradient times the background in `products`.
+static void split(const float* __restrict upper, const float* __restrict lower, float low, const float* __restrict rest,
+                  const float* __restrict gradient, int64_t length, float* __restrict to_upper,
+                  float* __restrict to_lower, float* __restrict products) {
+  for (int64_t i = 0; i < length; i++) {
+    products[i] = gradient[i] * (upper[i] + low * (lower[i] - upper[i]));
+    const float part = rest[i] * gradient[i], down = low * part;
+    to_lower[i] += down;
+    to_upper[i] += part - down;
+  }
+}
+
+static void add_triples(const float* __restrict products, int width, float* __restrict on_alpha) {
+  for (int x = 0; x < width; x++) on_alpha[x] = -(products[3 * x] + products[3 * x + 1] + products[3 * x + 2]);
+}
+
+// The pixels between two rows of nodes, whose colours are spread along them.
 class Strip {
  public:
   Strip(const Behind& b, const std::vector<float>& raw, int row)
-      : b_(b), row_(row), begin_(row * b.stride), end_(std::min(b.height, (row + 1) * b.stride)),
-        upper_(b.length()), lower_(b.length()), colors_(b.length()) {
+      : b_(b), begin_(row * b.stride), end_(std::min(b.height, (row + 1) * b.stride)), upper_(b.length()),
+        lower_(b.length()), rest_(b.length()) {
     spread_row(b, raw.data() + int64_t(3) * b.columns * row, upper_.data());
     spread_row(b, raw.data() + int64_t(3) * b.columns * (row + 1), lower_.data());
   }
 
   void forward() {
     for (int y = begin_; y < end_; y++) {
-      const float* colors = row_colors(y);
-      const float *alpha = b_.alpha + int64_t(y) * b_.width, *in = b_.color + y * b_.length();
-      float* out = b_.out + y * b_.length();
-      for (int x = 0; x < b_.width; x++) {
-        const float rest = 1 - alpha[x];
-        for (int c = 0; c < 3; c++) out[3 * x + c] = in[3 * x + c] + rest * colors[3 * x + c];
-      }
+      const int64_t at = y * b_.length();
+      repeat(b_.alpha + int64_t(y) * b_.width, b_.width, rest_.data());
+      composite(upper_.data(), lower_.data(), low(y), rest_.data(), b_.color + at, b_.length(), b_.out + at);
     }
   }
 
   // Writes the gradient of alpha; adds to both rows of nodes, [columns, 3] each.
   void backward(float* on_upper, float* on_lower) {
-    std::vector<float> to_upper(b_.length(), 0.f), to_lower(b_.length(), 0.f);
+    std::vector<float> to_upper(b_.length(), 0.f), to_lower(b_.length(), 0.f), products(b_.length());
     for (int y = begin_; y < end_; y++) {
-      const float* colors = row_colors(y);
-      const float *alpha = b_.alpha + int64_t(y) * b_.width, *grad = b_.grad_out + y * b_.length();
-      float* on_alpha = b_.grad_alpha + int64_t(y) * b_.width;
-      const float low = float(y - begin_) / float(b_.stride), high = 1 - low;
-      for (int x = 0; x < b_.width; x++) {
-        const float* g = grad + 3 * x;
-        const float* color = colors + 3 * x;
-        on_alpha[x] = -(g[0] * color[0] + g[1] * color[1] + g[2] * color[2]);
-        const float rest = 1 - alpha[x];
-        for (int c = 0; c < 3; c++) {
-          const float part = rest * g[c];
-          to_upper[3 * x + c] += high * part;
-          to_lower[3 * x + c] += low * part;
-        }
-      }
+      repeat(b_.alpha + int64_t(y) * b_.width, b_.width, rest_.data());
+      split(upper_.data(), lower_.data(), low(y), rest_.data(), b_.grad_out + y * b_.length(), b_.length(),
+            to_upper.data(), to_lower.data(), products.data());
+      add_triples(products.data(), b_.width, b_.grad_alpha + int64_t(y) * b_.width);
     }
     gather_row(b_, to_upper.data(), on_upper);
     gather_row(b_, to_lower.data(), on_lower);
   }
 
  private:
-  const float* row_colors(int y) {
-    const float low = float(y - begin_) / float(b_.stride);
-    for (int64_t i = 0; i < b_.length(); i++) colors_[i] = upper_[i] + low * (lower_[i] - upper_[i]);
-    return colors_.data();
-  }
+  // How far row y lies from the upper towards the lower nodes.
+  float low(int y) const { return float(y - begin_) / float(b_.stride); }
 
   const Behind& b_;
-  const int row_, begin_, end_;
-  std::vector<float> upper_, lower_, colors_;
+  const int begin_, end_;
+  std::vector<float> upper_, lower_, rest_;
 };
 
 // Gradients of the coefficients from those of the nodes, given for the upper and the lower row of each strip.
 static void coefficient_gradients(const Behind& b, const std::vector<float>& raw, const std::vector<float>& strips) {
   std::vector<double> sums(size_t(3) * b.terms, 0.0);
   const int64_t row_length = int64_t(3) * b.columns;
-  for (int row = 0; row < b.rows; row++)
-    for (int64_t i = 0; i < row_length; i++) {
-      const float value = raw[row * row_length + i];
+  for (int64_t node = 0; node < b.nodes(); node++) {
+    const int64_t row = node / b.columns, at = 3 * (node % b.columns);
+    const float* y = b.basis + node * b.terms;
+    for (int c = 0; c < 3; c++) {
+      const float value = raw[3 * node + c];
       if (!(value >= 0 && value <= 1)) continue;  // limited: no gradient
       float g = 0;
-      if (row < b.rows - 1) g += strips[2 * row * row_length + i];
-      if (row > 0) g += strips[(2 * row - 1) * row_length + i];
-      const float* y = b.basis + (int64_t(row) * b.columns + i / 3) * b.terms;
-      for (int k = 0; k < b.terms; k++) sums[3 * k + i % 3] += double(y[k] * g);
+      if (row < b.rows - 1) g += strips[2 * row * row_length + at + c];
+      if (row > 0) g += strips[(2 * row - 1) * row_length + at + c];
+      double* __restrict to = sums.data() + int64_t(c) * b.terms;
+      for (int k = 0; k < b.terms; k++) to[k] += double(y[k]) * double(g);
     }
-  for (int c = 0; c < 3; c++) b.grad_constant[c] = float(sums[c]);
-  for (int i = 3; i < 3 * b.terms; i++) b.grad_harmonics[i - 3] = float(sums[i]);
+  }
+  for (int c = 0; c < 3; c++) {
+    b.grad_constant[c] = float(sums[int64_t(c) * b.terms]);
+    for (int k = 1; k < b.terms; k++) b.grad_harmonics[3 * (k - 1) + c] = float(sums[int64_t(c) * b.terms + k]);
+  }
 }
 
 }  // namespace d2
