@@ -14,6 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from d2_plugin.gaussians.native_adam import Adam
+from d2_plugin.gaussians.native_picture import can_draw, composite_background
 from d2_plugin.gaussians.spherical_harmonics import basis
 from d2_plugin.rasterizer import Render, View
 
@@ -38,7 +40,7 @@ class Background:
         self.constant = nn.Parameter(torch.zeros(1, 3, device=device))
         self.harmonics = nn.Parameter(torch.zeros((DEGREE + 1) ** 2 - 1, 3, device=device))
         groups = [{"params": [self.constant], "lr": RATE}, {"params": [self.harmonics], "lr": RATE / 5}]
-        self.optimizer = torch.optim.Adam(groups, eps=1e-15)
+        self.optimizer = Adam(groups, eps=1e-15)
         self._bases: dict[tuple[Any, ...], Tensor] = {}
 
     @torch.no_grad()
@@ -66,14 +68,21 @@ class Background:
 
     def behind(self, render: Render, view: View) -> Render:
         """The render with the background where the Gaussians leave some of a ray."""
+        basis = self._basis(view)
+        if can_draw(render.color, basis):
+            parts = render.color, render.alpha, basis, self.constant, self.harmonics
+            return render._replace(color=composite_background(*parts, _nodes(view)))
+        return render._replace(color=render.color + (1 - render.alpha)[..., None] * self._interpolated(view, basis))
+
+    def _interpolated(self, view: View, basis: Tensor) -> Tensor:
+        """The background [H, W, 3] in torch: any dtype and device, and the oracle of the kernel."""
         rows, columns, stride = _nodes(view)
         # Not a matrix product: BLAS sums in an order that depends on the number of threads.
-        summands = self._basis(view)[..., None] * torch.cat([self.constant, self.harmonics])
+        summands = basis[..., None] * torch.cat([self.constant, self.harmonics])
         coarse = (summands.sum(1) + 0.5).clamp(0, 1)
         nodes = coarse.view(rows, columns, 3).permute(2, 0, 1)
         fine = _refined(_refined(nodes, stride).transpose(1, 2), stride).transpose(1, 2)
-        colors = fine[:, : view.height, : view.width].permute(1, 2, 0)
-        return render._replace(color=render.color + (1 - render.alpha)[..., None] * colors)
+        return fine[:, : view.height, : view.width].permute(1, 2, 0)
 
     def optimize(self) -> None:
         """One optimizer step, gradients cleared."""

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import MovingGaussians, moving_gaussians
+from d2_plugin.gaussians.native_adam import Adam
 from d2_plugin.gaussians.native_slice import STATIC
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d
 from d2_plugin.gaussians.slicing import slice_gaussians, unit_quaternions
@@ -72,7 +73,7 @@ class Deform(SplatModel):
         self._noise = 0.0
         if settings.temporal:
             self.field = make_field(settings, box, self._generator).to(rows["positions"])
-            self.field_optimizer = torch.optim.Adam(self.field.parameter_groups(), eps=1e-15, fused=True)
+            self.field_optimizer = Adam(self.field.parameter_groups(), eps=1e-15, fused=True)
             self.deforms = settings.warm_up <= 0
 
     @classmethod

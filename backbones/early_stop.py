@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from d2_plugin.gaussians.photometric import as_numbers
 from d2_plugin.settings import AtLeastOne, Range, Settings
 
 PATCHES = 16
@@ -44,9 +45,13 @@ class EarlyStop:
         return len(self.rounds) - 1 - best >= self.settings.patience
 
     def target(self, index: int, image: Tensor, rendered: Tensor) -> Tensor:
-        """The picture [H, W, 3] that the loss compares with: in its patches what was rendered, so nothing is learnt."""
+        """The picture [H, W, 3] that the loss compares with: in its patches what was rendered, so nothing is learnt.
+
+        `image` is in 0..1, or as bytes.
+        """
         if not self.settings.share:
             return image
+        image = as_numbers(image)
         mask = self.mask(index, *image.shape[:2]).to(image.device)
         rendered = rendered.detach()
         self._errors.append((rendered - image)[mask].square().mean().item() if mask.any() else 0.0)

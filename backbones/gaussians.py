@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from d2_plugin.gaussians.native_adam import Adam
+
 
 class Gaussians:
     """N Gaussians as named tensors with one row each, and one Adam with a parameter group per name.
@@ -22,7 +24,7 @@ class Gaussians:
         self.parameters = {name: nn.Parameter(value.detach().clone()) for name, value in rows.items()}
         self.statistics: dict[str, Tensor] = {}
         groups = [{"params": [p], "lr": learning_rates[name], "name": name} for name, p in self.parameters.items()]
-        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
+        self.optimizer = Adam(groups, lr=0.0, eps=1e-15, fused=True)
 
     def __len__(self) -> int:
         return len(next(iter(self.parameters.values())))

@@ -14,6 +14,7 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
+from d2_plugin.gaussians.native_picture import add_screen_gradients, can_draw, constant_colors
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 from d2_plugin.settings import NotNegative, Positive, Range, Settings
 
@@ -126,6 +127,9 @@ class SplatModel(ABC):
 
     def harmonic_colors(self, view: View, splats: Splats, phase: Tensor | None = None, time_degree: int = 0) -> Tensor:
         """Spherical harmonics in the direction of view, with `phase` [M] (fraction of the duration) also in time."""
+        base = self.gaussians["base_colors"]
+        if not (self.settings.sh_degree or time_degree) and can_draw(base):
+            return constant_colors(base, splats.rows if len(splats.rows) < len(self) else None)
         coefficients = self.harmonics().coefficients
         if len(splats.rows) < len(self):
             coefficients = coefficients.index_select(0, splats.rows)
@@ -185,10 +189,13 @@ class SplatModel(ABC):
         """After backward: add the last render's screen-space gradient, in units of half the image, per Gaussian."""
         if self.screen_offsets is None or self.screen_offsets.grad is None or self._drawn is None:
             raise D2Error("there is no screen-space gradient yet: render a view and go backward before accumulate")
-        gradient = self.screen_offsets.grad
+        gradient, statistics = self.screen_offsets.grad, self.gaussians.statistics
+        if can_draw(gradient, *statistics.values()):
+            sums = statistics["screen_gradient"], statistics["seen"]
+            add_screen_gradients(gradient, self._drawn, (view.width, view.height), *sums)
+            return
         half = gradient.new_tensor([view.width / 2, view.height / 2])
         length = (gradient * half).norm(dim=-1)
-        statistics = self.gaussians.statistics
         statistics["screen_gradient"].index_add_(0, self._drawn, length)
         statistics["seen"].index_add_(0, self._drawn, (length > 0).to(length))
 

@@ -51,7 +51,10 @@ class Hooks(Protocol):
 
 
 class Frames(Protocol):
-    """The training pictures: views, and the picture [H, W, 3] in 0..1 of each."""
+    """The training pictures: views, and the picture [H, W, 3] in 0..1 of each.
+
+    Where there is also `picture(index)`, the same as it is kept (uint8, 0..255), the loss is computed from that.
+    """
 
     views: Sequence[View]
 
@@ -88,6 +91,7 @@ class Trainer:
         """The last step's loss with all its terms, for whoever watches that it stays finite."""
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
+        self._picture = getattr(frames, "picture", frames.image)
         self.d2 = attach(model) if attach else None  # D2, line 1: after the optimizer exists
 
     @property
@@ -103,10 +107,12 @@ class Trainer:
             index = self._next_view()
             view = self.frames.views[index]
             render = model.render(view)
-            target = self.early_stop.target(index, self.frames.image(index), render.color)
+            target = self.early_stop.target(index, self._picture(index), render.color)
             loss = photometric_loss(render.color, target, self.settings.ssim_weight)
             logged = loss.item()
-            loss = loss + model.regularization()
+            regularization = model.regularization()
+            if not isinstance(regularization, float):
+                loss = loss + regularization
             if d2 is not None:
                 loss = loss + d2.loss(self.step, [view])  # D2, line 2: before backward, never +=
             self.loss = loss.detach()

@@ -25,7 +25,7 @@ class _Call(ctypes.Structure):
         *((name, ctypes.c_int32) for name in ("height", "width", "channels", "threads")),
         ("ssim_weight", ctypes.c_float),
         ("window", ctypes.c_float * 11),
-        *((name, ctypes.c_void_p) for name in ("image", "target", "gradient", "differences", "similarities")),
+        *((name, ctypes.c_void_p) for name in ("image", "target", "bytes", "gradient", "differences", "similarities")),
     )
 
 
@@ -56,8 +56,10 @@ def _kernel() -> ctypes.CDLL:
 
 
 def can_compare(image: Tensor, target: Tensor) -> bool:
-    """Whether the kernel takes these pictures: float32 on the CPU, a fixed target, and there is a compiler."""
-    fit = all(part.dtype == torch.float32 and part.device.type == "cpu" for part in (image, target))
+    """Whether the kernel takes these pictures: float32 on the CPU, a fixed target, which may be bytes, and there is a
+    compiler."""
+    fit = image.dtype == torch.float32 and target.dtype in (torch.float32, torch.uint8)
+    fit = fit and all(part.device.type == "cpu" for part in (image, target))
     same = image.ndim == 3 and image.shape == target.shape and image.numel() > 0
     return fit and same and not target.requires_grad and library() is not None
 
@@ -65,7 +67,7 @@ def can_compare(image: Tensor, target: Tensor) -> bool:
 def native_photometric_loss(image: Tensor, target: Tensor, window: Tensor, ssim_weight: float) -> Tensor:
     """`photometric.photometric_loss` of float32 pictures [H, W, C] on the CPU, differentiable once by `image`.
 
-    `window` [11] holds the weights of the blur, symmetric.
+    `window` [11] holds the weights of the blur, symmetric. A target of bytes stands for its numbers over 255.
     """
     if not torch.is_grad_enabled():
         image = image.detach()
@@ -80,7 +82,8 @@ class _Photometric(torch.autograd.Function):
         gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
         sums = torch.empty(2, height, dtype=torch.float64)
         call = _Call(height, width, channels, torch.get_num_threads(), ssim_weight, (ctypes.c_float * 11)(*window))
-        call.image, call.target = image.data_ptr(), target.data_ptr()
+        call.image = image.data_ptr()
+        setattr(call, "bytes" if target.dtype == torch.uint8 else "target", target.data_ptr())
         call.gradient = None if gradient is None else gradient.data_ptr()
         call.differences, call.similarities = sums[0].data_ptr(), sums[1].data_ptr()
         loss = _kernel().d2_photometric(call)

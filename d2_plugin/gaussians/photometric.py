@@ -41,11 +41,17 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
     """(1 - w) mean |image - target| + w (1 - SSIM) for images [H, W, 3] in 0..1.
 
-    float32 on the CPU with a fixed target runs in a kernel, where there is a compiler.
+    The target may be uint8, 0..255: a picture as it is kept. float32 on the CPU with a fixed target runs in a kernel,
+    where there is a compiler.
     """
     if ssim_weight and can_compare(image, target):
         return native_photometric_loss(image, target, _window(image.device, image.dtype), ssim_weight)
-    return reference_photometric_loss(image, target, ssim_weight)
+    return reference_photometric_loss(image, as_numbers(target).to(image.dtype), ssim_weight)
+
+
+def as_numbers(picture: Tensor) -> Tensor:
+    """A picture in 0..1: bytes divided by 255, in float32; what is numbers already stays as it is."""
+    return picture.float() / 255 if picture.dtype == torch.uint8 else picture
 
 
 def reference_photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:

@@ -7,10 +7,12 @@ them where it registers its kernels here; `d2_plugin.rasterizer` falls back to `
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
 
@@ -39,7 +41,8 @@ def rasterize(
     near_edge: Tensor | None = None,
 ) -> Render:
     """See `d2_plugin.rasterizer.rasterize`; float32."""
-    color, depth_sum, alpha, front, *_ = _rasterize(
+    run = _Rasterize.apply if _is_plain(splats.means) else _rasterize
+    color, depth_sum, alpha, front, *_ = run(
         *(part.contiguous() for part in splats[:3]),
         colors.contiguous(),
         None if background is None else background.contiguous(),
@@ -49,7 +52,7 @@ def rasterize(
         _map(near_edge, splats.means),
         view.width,
         view.height,
-        _constants(settings),
+        _constants(settings) if run is _rasterize else _known_constants(settings),
     )
     return Render(color, depth_sum, alpha, None if near_edge is None else front)
 
@@ -77,6 +80,9 @@ def _map(part: Tensor | None, like: Tensor) -> Tensor | None:
 def _constants(settings: RasterSettings) -> list[float]:
     """In the order of d2::Constants (kernels/splat.h), which is that of the dataclass."""
     return [float(value) for value in dataclasses.astuple(settings)]
+
+
+_known_constants = functools.lru_cache(maxsize=64)(_constants)
 
 
 _rasterize = torch.library.custom_op(
@@ -171,9 +177,36 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None
 def _backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
     inputs, outputs = ctx.saved_tensors[:INPUTS], ctx.saved_tensors[INPUTS:]
     upstream = [None if gradient is None else gradient.contiguous() for gradient in gradients[:4]]
-    found = _rasterize_backward(*upstream, *inputs, ctx.constants, *outputs)
+    run = _rasterize_backward
+    if _is_plain(outputs[0]):
+        run = cuda.backward if outputs[0].is_cuda else native.backward
+    found = run(*upstream, *inputs, ctx.constants, *outputs)
     wanted = (gradient if asked else None for gradient, asked in zip(found, ctx.needs_input_grad))
     return (*wanted, *(None for _ in range(len(ctx.needs_input_grad) - len(found))))
 
 
 _rasterize.register_autograd(_backward, setup_context=_save)
+
+
+class _Rasterize(torch.autograd.Function):
+    """The operator without the dispatcher, whose way from Python to Python costs more than small pictures do."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
+        kernels = cuda if inputs[0].is_cuda else native
+        outputs = kernels.rasterize(*inputs)
+        _save(ctx, inputs, outputs)
+        ctx.mark_non_differentiable(*outputs[4:])
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        return _backward(ctx, *gradients)
+
+
+def _is_plain(part: Tensor) -> bool:
+    """Whether nobody looks on who needs the operator: no compilation, no fake tensors, no transform of functions."""
+    if torch.compiler.is_compiling() or type(part) not in (Tensor, torch.nn.Parameter):
+        return False
+    return not (torch._C._are_functorch_transforms_active() or torch._C._len_torch_dispatch_stack())

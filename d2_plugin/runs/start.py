@@ -111,12 +111,18 @@ class TrainingFrames:
 
     def image(self, index: int) -> Tensor:
         """Picture [H, W, 3] in 0..1 of `views[index]`."""
+        return self.picture(index).float() / 255
+
+    def picture(self, index: int) -> Tensor:
+        """The same as it is kept: uint8, 0..255."""
         if index not in self._kept:
             view = self.views[index]
             self._kept[index] = self.capture.image(view.camera, view.frame)
             while len(self._kept) > 1 and sum(image.nbytes for image in self._kept.values()) > self.keep_bytes:
                 self._kept.popitem(last=False)
-        return torch.from_numpy(self._kept[index]).to(self.device).float() / 255
+        else:
+            self._kept.move_to_end(index)
+        return torch.from_numpy(self._kept[index]).to(self.device)
 
 
 @dataclass(frozen=True)
