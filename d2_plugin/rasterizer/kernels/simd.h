@@ -274,4 +274,92 @@ D2_INLINE void store_sums(const Floats* parts, float* out) {
 D2_INLINE void store_quad(const Floats* parts, float* out) { store_sums<4>(parts, out); }
 #endif
 
+// Lane i of a vector that is put together from others: lane from[i] % LANES of the vector from[i] / LANES.
+struct Choice {
+  alignas(64) int32_t from[LANES];
+};
+
+#if defined(D2_AVX512)
+D2_INLINE Floats pick(const Floats (&v)[2], const Choice& choice) {
+  return _mm512_permutex2var_ps(v[0].v, _mm512_load_si512(choice.from), v[1].v);
+}
+D2_INLINE Floats pick(const Floats (&v)[3], const Choice& choice) {
+  const __m512i from = _mm512_load_si512(choice.from);
+  const __mmask16 third = _mm512_test_epi32_mask(from, _mm512_set1_epi32(2 * LANES));
+  return _mm512_mask_permutexvar_ps(_mm512_permutex2var_ps(v[0].v, from, v[1].v), third, from, v[2].v);
+}
+#elif defined(D2_AVX2)
+D2_INLINE Floats pick(const Floats (&v)[2], const Choice& choice) {
+  const __m256i from = _mm256_load_si256(reinterpret_cast<const __m256i*>(choice.from));
+  const __m256 first = _mm256_permutevar8x32_ps(v[0].v, from), second = _mm256_permutevar8x32_ps(v[1].v, from);
+  return _mm256_blendv_ps(first, second, _mm256_castsi256_ps(_mm256_slli_epi32(from, 28)));  // by the bit of LANES
+}
+D2_INLINE Floats pick(const Floats (&v)[3], const Choice& choice) {
+  const __m256i from = _mm256_load_si256(reinterpret_cast<const __m256i*>(choice.from));
+  const Floats two = pick({v[0], v[1]}, choice), third = _mm256_permutevar8x32_ps(v[2].v, from);
+  return _mm256_blendv_ps(two.v, third.v, _mm256_castsi256_ps(_mm256_slli_epi32(from, 27)));
+}
+#else
+template <int N>
+D2_INLINE Floats pick(const Floats (&v)[N], const Choice& choice) {
+  Native out;
+  for (int i = 0; i < LANES; i++) out[i] = v[choice.from[i] / LANES].v[choice.from[i] % LANES];
+  return out;
+}
+#endif
+
+// N vectors of one quantity each to and from vectors as memory holds them, in which the N quantities of a pixel or of a
+// row follow each other: GROUP of them in one piece of memory, LANES / GROUP such pieces in one vector.
+template <int N, int GROUP>
+struct Woven {
+  Choice apart[N], together[N];
+  static constexpr int lane(int piece, int place) { return place / GROUP * LANES + piece * GROUP + place % GROUP; }
+  constexpr Woven() : apart(), together() {
+    for (int piece = 0; piece < LANES / GROUP; piece++)
+      for (int item = 0; item < GROUP; item++)
+        for (int n = 0; n < N; n++) {
+          const int place = item * N + n, here = lane(piece, place), there = piece * GROUP + item;
+          apart[n].from[there] = here;
+          together[here / LANES].from[here % LANES] = n * LANES + there;
+        }
+  }
+};
+template <int N, int GROUP>
+static constexpr Woven<N, GROUP> WOVEN = Woven<N, GROUP>();
+template <int GROUP, int N>
+D2_INLINE void unweave(const Floats (&woven)[N], Floats (&out)[N]) {
+  for (int n = 0; n < N; n++) out[n] = pick(woven, WOVEN<N, GROUP>.apart[n]);
+}
+template <int GROUP, int N>
+D2_INLINE void weave(const Floats (&parts)[N], Floats (&woven)[N]) {
+  for (int n = 0; n < N; n++) woven[n] = pick(parts, WOVEN<N, GROUP>.together[n]);
+}
+
+// A block of pixels from and to an image whose rows are `stride` floats apart.
+#if defined(D2_AVX512)
+D2_INLINE Floats load_block(const float* from, int64_t stride) {
+  const __m256 low = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(from)), _mm_loadu_ps(from + stride), 1);
+  const float* below = from + 2 * stride;
+  const __m256 high = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(below)), _mm_loadu_ps(below + stride), 1);
+  return _mm512_insertf32x8(_mm512_castps256_ps512(low), high, 1);
+}
+D2_INLINE void store_block(Floats block, float* to, int64_t stride) {
+  _mm_storeu_ps(to, _mm512_castps512_ps128(block.v));
+  _mm_storeu_ps(to + stride, _mm512_extractf32x4_ps(block.v, 1));
+  _mm_storeu_ps(to + 2 * stride, _mm512_extractf32x4_ps(block.v, 2));
+  _mm_storeu_ps(to + 3 * stride, _mm512_extractf32x4_ps(block.v, 3));
+}
+#else
+D2_INLINE Floats load_block(const float* from, int64_t stride) {
+  Floats out;
+  for (int y = 0; y < BLOCK_HEIGHT; y++)
+    std::memcpy(reinterpret_cast<char*>(&out.v) + 4 * y * BLOCK_WIDTH, from + y * stride, 4 * BLOCK_WIDTH);
+  return out;
+}
+D2_INLINE void store_block(Floats block, float* to, int64_t stride) {
+  for (int y = 0; y < BLOCK_HEIGHT; y++)
+    std::memcpy(to + y * stride, reinterpret_cast<const char*>(&block.v) + 4 * y * BLOCK_WIDTH, 4 * BLOCK_WIDTH);
+}
+#endif
+
 }  // namespace d2
