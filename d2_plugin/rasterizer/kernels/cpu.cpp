@@ -406,46 +406,58 @@ static void backward_tile(const Frame& f, int tile, const Sums& to) {
   }
 }
 
-// Adds up the slots of a Gaussian, in the order of tiles.
+// Adds up the slots of a Gaussian, in the order of tiles; false if it has none.
 D2_INLINE bool gather_moments(const Frame& f, const Sums& from, int64_t i, int64_t stride, float* total) {
   bool any_slot = false;
+  std::fill(total, total + stride, 0.f);
   for (int64_t slot = f.slots[i]; slot < f.slots[i + 1]; slot++) {
     if (!from.touched[slot]) continue;
     const float* part = from.moments + slot * stride;
-    for (int64_t k = 0; k < stride; k++) total[k] += part[k];
+    for (int64_t k = 0; k < stride; k += LANES) (Floats::load(total + k) + Floats::load(part + k)).store(total + k);
     any_slot = true;
   }
   return any_slot;
 }
 
-D2_INLINE void backward_group(const Frame& f, const Sums& from, int64_t i, int rows, float* totals) {
-  const int64_t stride = moment_stride(f.channels);
-  std::fill(totals, totals + LANES * stride, 0.f);
+template <int FIXED>
+static void backward_group(const Frame& f, const Sums& from, int64_t i, int rows, float* totals) {
+  const int channels = FIXED ? FIXED : f.channels;
+  const int64_t stride = moment_stride(channels);
   alignas(64) float drawn[LANES] = {};
   for (int lane = 0; lane < rows; lane++) drawn[lane] = gather_moments(f, from, i + lane, stride, totals + lane * stride);
+  if (rows < LANES) std::fill(totals + rows * stride, totals + LANES * stride, 0.f);
+#if defined(D2_AVX512)
+  Floats first[LANES];
+  for (int lane = 0; lane < LANES; lane++) first[lane] = Floats::load(totals + lane * stride);
+  transpose(first);
+  const auto column = [&](int k) { return k < LANES ? first[k] : load_column(totals, stride, k, rows); };
+#else
   const auto column = [&](int k) { return load_column(totals, stride, k, rows); };
+#endif
 
   // Only what `project_backward` reads: the rest of a footprint comes from the Gaussian itself.
-  Floats offset_x, offset_y;
-  load_extras(f, i, rows, offset_x, offset_y);
+  Floats offsets[2];
+  load_offsets(f, i, rows, offsets);
   const Gaussian<Floats> g = load_gaussians(f, i, rows);
-  const Projected<Floats> p = project(g, offset_x, offset_y, f.camera, f.constants);
+  const Projected<Floats> p = project(g, offsets[0], offsets[1], f.camera, f.constants);
   const Moments<Floats> m = {column(0), column(1), column(2), column(3), column(4), column(5), column(6)};
   Gaussian<Floats> out;
-  Floats center_x, center_y;
-  project_backward(g, p.footprint, m, f.camera, f.constants, out, center_x, center_y);
+  Floats center[2];
+  project_backward(g, p.footprint, m, f.camera, f.constants, out, center[0], center[1]);
 
   // A Gaussian that was not drawn may hold anything, NaN included.
   const Mask mask = Floats::load(drawn) > Floats(0.f);
-  for (int k = 0; k < 3; k++) store_column(where(mask, out.mean[k]), f.grad_means + 3 * i, 3, k, rows);
-  for (int k = 0; k < 6; k++) store_column(where(mask, out.covariance[k]), f.grad_covariances + 6 * i, 6, k, rows);
+  for (int k = 0; k < 3; k++) out.mean[k] = where(mask, out.mean[k]);
+  for (int k = 0; k < 6; k++) out.covariance[k] = where(mask, out.covariance[k]);
+  for (int k = 0; k < 2; k++) center[k] = where(mask, center[k]);
+  store_columns(out.mean, f.grad_means + 3 * i, rows);
+  store_columns(out.covariance, f.grad_covariances + 6 * i, rows);
   store_column(where(mask, out.opacity), f.grad_opacities + i, 1, 0, rows);
-  for (int c = 0; c < f.channels; c++)
-    store_column(column(7 + c), f.grad_colors + i * f.channels, f.channels, c, rows);
-  if (f.grad_screen_offsets) {
-    store_column(where(mask, center_x), f.grad_screen_offsets + 2 * i, 2, 0, rows);
-    store_column(where(mask, center_y), f.grad_screen_offsets + 2 * i, 2, 1, rows);
-  }
+  if (f.grad_screen_offsets) store_columns(center, f.grad_screen_offsets + 2 * i, rows);
+  if (FIXED == 3)
+    store_columns({column(7), column(8), column(9)}, f.grad_colors + 3 * i, rows);
+  else
+    for (int c = 0; c < channels; c++) store_column(column(7 + c), f.grad_colors + i * channels, channels, c, rows);
 }
 
 // ---------------------------------------------------------------------------------------------------- survey
@@ -572,8 +584,8 @@ static void backward(const Frame& f, int64_t pairs) {
     float* totals = scratch().state.reserve(size_t(LANES) * stride);
     const int64_t end = f.chunk_begin(chunk + 1);
     int64_t i = f.chunk_begin(chunk);
-    for (; i + LANES <= end; i += LANES) backward_group(f, sums, i, LANES, totals);
-    if (i < end) backward_group(f, sums, i, int(end - i), totals);
+    const auto group_any = f.channels == 3 ? backward_group<3> : backward_group<0>;
+    for (; i < end; i += LANES) group_any(f, sums, i, int(std::min<int64_t>(LANES, end - i)), totals);
   });
 }
 

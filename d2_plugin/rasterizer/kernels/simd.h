@@ -335,6 +335,74 @@ D2_INLINE void weave(const Floats (&parts)[N], Floats (&woven)[N]) {
   for (int n = 0; n < N; n++) woven[n] = pick(parts, WOVEN<N, GROUP>.together[n]);
 }
 
+// LANES rows of N floats each, as N vectors: vector n holds number n of every row.
+template <int N>
+D2_INLINE void load_rows(const float* rows, Floats (&out)[N]) {
+  Floats woven[N];
+  for (int n = 0; n < N; n++) woven[n] = Floats::load(rows + n * LANES);
+  if constexpr (N == 1) {
+    out[0] = woven[0];
+  } else if constexpr (N < 4) {
+    unweave<LANES>(woven, out);
+  } else {
+    static_assert(N == 6, "2, 3 or twice 3 are unwoven");
+    Floats even[3], odd[3], half[3];
+    for (int n = 0; n < 3; n++) {
+      const Floats both[2] = {woven[2 * n], woven[2 * n + 1]};
+      even[n] = pick(both, WOVEN<2, LANES>.apart[0]), odd[n] = pick(both, WOVEN<2, LANES>.apart[1]);
+    }
+    unweave<LANES>(even, half);
+    for (int n = 0; n < 3; n++) out[2 * n] = half[n];
+    unweave<LANES>(odd, half);
+    for (int n = 0; n < 3; n++) out[2 * n + 1] = half[n];
+  }
+}
+template <int N>
+D2_INLINE void store_rows(const Floats (&parts)[N], float* rows) {
+  Floats woven[N];
+  if constexpr (N == 1) {
+    woven[0] = parts[0];
+  } else if constexpr (N < 4) {
+    weave<LANES>(parts, woven);
+  } else {
+    static_assert(N == 6, "2, 3 or twice 3 are woven");
+    Floats even[3], odd[3];
+    weave<LANES>({parts[0], parts[2], parts[4]}, even);
+    weave<LANES>({parts[1], parts[3], parts[5]}, odd);
+    for (int n = 0; n < 3; n++) {
+      const Floats both[2] = {even[n], odd[n]};
+      woven[2 * n] = pick(both, WOVEN<2, LANES>.together[0]);
+      woven[2 * n + 1] = pick(both, WOVEN<2, LANES>.together[1]);
+    }
+  }
+  for (int n = 0; n < N; n++) woven[n].store(rows + n * LANES);
+}
+
+// Rows of LANES floats, `stride` apart, to and from LANES vectors: lane i of vector n is number n of row i.
+#if defined(D2_AVX512)
+D2_INLINE void transpose(Floats (&m)[LANES]) {
+  __m512 a[16], b[16];
+  for (int i = 0; i < 16; i += 2) {
+    a[i] = _mm512_unpacklo_ps(m[i].v, m[i + 1].v);
+    a[i + 1] = _mm512_unpackhi_ps(m[i].v, m[i + 1].v);
+  }
+  for (int i = 0; i < 16; i += 4)
+    for (int k = 0; k < 2; k++) {
+      const __m512d x = _mm512_castps_pd(a[i + k]), y = _mm512_castps_pd(a[i + k + 2]);
+      b[i + 2 * k] = _mm512_castpd_ps(_mm512_unpacklo_pd(x, y));
+      b[i + 2 * k + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(x, y));
+    }
+  // b[4 q + k]: quarter p holds number 4 p + k of rows 4 q..4 q + 3.
+  for (int k = 0; k < 4; k++) {
+    const __m512 even_low = _mm512_shuffle_f32x4(b[k], b[4 + k], 0x88), odd_low = _mm512_shuffle_f32x4(b[k], b[4 + k], 0xdd);
+    const __m512 even_high = _mm512_shuffle_f32x4(b[8 + k], b[12 + k], 0x88);
+    const __m512 odd_high = _mm512_shuffle_f32x4(b[8 + k], b[12 + k], 0xdd);
+    m[k] = _mm512_shuffle_f32x4(even_low, even_high, 0x88), m[8 + k] = _mm512_shuffle_f32x4(even_low, even_high, 0xdd);
+    m[4 + k] = _mm512_shuffle_f32x4(odd_low, odd_high, 0x88), m[12 + k] = _mm512_shuffle_f32x4(odd_low, odd_high, 0xdd);
+  }
+}
+#endif
+
 // A block of pixels from and to an image whose rows are `stride` floats apart.
 #if defined(D2_AVX512)
 D2_INLINE Floats load_block(const float* from, int64_t stride) {
