@@ -19,68 +19,98 @@ D2_INLINE void for_each_tile(const Box& b, int tiles_x, Visit visit) {
     for (int x = b.first_x / TILE_BLOCKS; x <= b.last_x / TILE_BLOCKS; x++) visit(y * tiles_x + x);
 }
 
-// First and last block along one axis whose pixel centres lie within `reach` of `center`; empty: last < first.
-D2_INLINE void block_range(Floats center, Floats reach, int size, float block, float* first, float* last) {
+// First and last block along one axis whose pixel centres lie within `reach` of `center`, and whether there are any.
+D2_INLINE Mask block_range(Floats center, Floats reach, int size, float block, float* first, float* last) {
   const Floats margin = fma(reach, Floats(1e-5f), Floats(1e-4f));  // rounding of the bound must not cut a fragment
   const Floats low = max(-floor(-(center - reach - margin - Floats(0.5f))), Floats(0.f));
   const Floats high = min(floor(center + reach + margin - Floats(0.5f)), Floats(float(size - 1)));
   const Mask some = high >= low;
-  select(some, floor(low * Floats(1 / block)), Floats(1.f)).store(first);
-  select(some, floor(high * Floats(1 / block)), Floats(0.f)).store(last);
+  where(some, floor(low * Floats(1 / block))).store(first);
+  where(some, floor(high * Floats(1 / block))).store(last);
+  return some;
 }
 
 D2_INLINE Gaussian<Floats> load_gaussians(const Frame& f, int64_t i, int rows) {
   Gaussian<Floats> g;
-  for (int k = 0; k < 3; k++) g.mean[k] = load_column(f.means + 3 * i, 3, k, rows);
-  for (int k = 0; k < 6; k++) g.covariance[k] = load_column(f.covariances + 6 * i, 6, k, rows);
+  load_columns(f.means + 3 * i, rows, g.mean);
+  load_columns(f.covariances + 6 * i, rows, g.covariance);
   g.opacity = load_column(f.opacities + i, 1, 0, rows);
   return g;
 }
 
-// Screen offsets and whether everything besides the geometry is finite.
-D2_INLINE Mask load_extras(const Frame& f, int64_t i, int rows, Floats& offset_x, Floats& offset_y) {
-  offset_x = offset_y = Floats(0.f);
-  if (f.screen_offsets) {
-    offset_x = load_column(f.screen_offsets + 2 * i, 2, 0, rows);
-    offset_y = load_column(f.screen_offsets + 2 * i, 2, 1, rows);
-  }
+// Screen offsets.
+D2_INLINE void load_offsets(const Frame& f, int64_t i, int rows, Floats (&offsets)[2]) {
+  offsets[0] = offsets[1] = Floats(0.f);
+  if (f.screen_offsets) load_columns(f.screen_offsets + 2 * i, rows, offsets);
+}
+
+// The colors that a record has room for, and whether all are finite.
+D2_INLINE Mask load_colors(const Frame& f, int64_t i, int rows, Floats (&colors)[3]) {
   Floats zero = 0.f;
-  if (f.colors)
-    for (int c = 0; c < f.channels; c++) {
-      const Floats color = load_column(f.colors + i * f.channels, f.channels, c, rows);
-      zero = zero + color * Floats(0.f);
-    }
+  for (int c = 0; c < 3; c++) colors[c] = Floats(0.f);
+  if (f.colors && f.channels == 3) {
+    load_columns(f.colors + 3 * i, rows, colors);
+    for (int c = 0; c < 3; c++) zero = zero + colors[c] * Floats(0.f);
+  } else if (f.colors) {
+    for (int c = 0; c < f.channels; c++)
+      zero = zero + load_column(f.colors + i * f.channels, f.channels, c, rows) * Floats(0.f);
+  }
   return zero >= Floats(0.f);
 }
 
+// Puts a group of Gaussians into records, those that are not `drawn` as 0.
+D2_INLINE void store_records(const Footprint<Floats>& s, const Floats (&colors)[3], const float (&box)[4][LANES],
+                             unsigned drawn, int rows, Record* records) {
+  alignas(64) uint32_t packed[2][LANES];  // first and last block, as in Record
+  for (int lane = 0; lane < LANES; lane++) {
+    packed[0][lane] = uint32_t(box[0][lane]) | uint32_t(box[1][lane]) << 16;
+    packed[1][lane] = uint32_t(box[2][lane]) | uint32_t(box[3][lane]) << 16;
+  }
+#if defined(D2_AVX512)
+  Floats m[LANES] = {s.x, s.y, s.ux, s.uy, s.vy, s.log2_opacity, s.depth};
+  for (int k = 0; k < 2; k++) m[7 + k] = Floats::load(reinterpret_cast<const float*>(packed[k]));
+  for (int c = 0; c < 7; c++) m[9 + c] = c < 3 ? colors[c] : Floats(0.f);
+  transpose(m);
+  for (int lane = 0; lane < rows; lane++)
+    (drawn >> lane & 1 ? m[lane] : Floats(0.f)).store(reinterpret_cast<float*>(records + lane));
+#else
+  alignas(64) float fields[10][LANES];
+  const Floats* parts[10] = {&s.x, &s.y, &s.ux, &s.uy, &s.vy, &s.log2_opacity, &s.depth, colors, colors + 1, colors + 2};
+  for (int k = 0; k < 10; k++) parts[k]->store(fields[k]);
+  for (int lane = 0; lane < rows; lane++) {
+    Record& r = records[lane];
+    r = {};
+    if (!(drawn >> lane & 1)) continue;
+    float* number = reinterpret_cast<float*>(&r);
+    for (int k = 0; k < 7; k++) number[k] = fields[k][lane];
+    std::memcpy(&r.first_x, &packed[0][lane], 4), std::memcpy(&r.last_x, &packed[1][lane], 4);
+    for (int c = 0; c < 3; c++) r.color[c] = fields[7 + c][lane];
+  }
+#endif
+}
+
 D2_INLINE void project_group(const Frame& f, int64_t i, int rows, Box* boxes, int32_t* counts) {
-  Floats offset_x, offset_y;
-  const Mask finite = load_extras(f, i, rows, offset_x, offset_y);
-  const Projected<Floats> p = project(load_gaussians(f, i, rows), offset_x, offset_y, f.camera, f.constants);
-  alignas(64) float fields[7][LANES], first_x[LANES], last_x[LANES], first_y[LANES], last_y[LANES];
+  Floats offsets[2], colors[3];
+  load_offsets(f, i, rows, offsets);
+  const Mask finite = load_colors(f, i, rows, colors);
+  const Projected<Floats> p = project(load_gaussians(f, i, rows), offsets[0], offsets[1], f.camera, f.constants);
   const Footprint<Floats>& s = p.footprint;
-  const Floats* parts[7] = {&s.x, &s.y, &s.ux, &s.uy, &s.vy, &s.log2_opacity, &s.depth};
-  for (int k = 0; k < 7; k++) parts[k]->store(fields[k]);
-  block_range(s.x, p.reach.x, f.width, BLOCK_WIDTH, first_x, last_x);
-  block_range(s.y, p.reach.y, f.height, BLOCK_HEIGHT, first_y, last_y);
-  const unsigned visible = lanes(p.visible & finite);
+  alignas(64) float box[4][LANES], depth[LANES];  // first_x, first_y, last_x, last_y
+  const Mask across = block_range(s.x, p.reach.x, f.width, BLOCK_WIDTH, box[0], box[2]);
+  const Mask down = block_range(s.y, p.reach.y, f.height, BLOCK_HEIGHT, box[1], box[3]);
+  s.depth.store(depth);
+  const unsigned drawn = lanes(p.visible & finite & across & down);
+  store_records(s, colors, box, drawn, rows, f.records + i);
   const int tiles_x = f.tiles_x();
   for (int lane = 0; lane < rows; lane++) {
-    Box& box = boxes[i + lane];
-    if (!(visible >> lane & 1) || last_x[lane] < first_x[lane] || last_y[lane] < first_y[lane]) {
-      box = {1, 1, 0, 0, 0.f};
-      f.records[i + lane] = {};
+    if (!(drawn >> lane & 1)) {
+      boxes[i + lane] = {1, 1, 0, 0, 0.f};
       continue;
     }
-    box = {uint16_t(first_x[lane]), uint16_t(first_y[lane]), uint16_t(last_x[lane]), uint16_t(last_y[lane]),
-           fields[6][lane]};
-    Record& r = f.records[i + lane];
-    r = {{fields[0][lane], fields[1][lane], fields[2][lane], fields[3][lane],
-          fields[4][lane], fields[5][lane], fields[6][lane]},
-         box.first_x, box.first_y, box.last_x, box.last_y, {}};
-    if (f.colors)
-      for (int c = 0; c < f.channels && c < 3; c++) r.color[c] = f.colors[(i + lane) * f.channels + c];
-    for_each_tile(box, tiles_x, [&](int tile) { counts[tile]++; });
+    const Box here = {uint16_t(box[0][lane]), uint16_t(box[1][lane]), uint16_t(box[2][lane]), uint16_t(box[3][lane]),
+                      depth[lane]};
+    boxes[i + lane] = here;
+    for_each_tile(here, tiles_x, [&](int tile) { counts[tile]++; });
   }
 }
 

@@ -17,27 +17,85 @@ D2_INLINE Corner corner_of(const Frame& f, int tile) {
   return {tile % f.tiles_x() * TILE_WIDTH, tile / f.tiles_x() * TILE_HEIGHT};
 }
 
-// Pixels of an image row that lie in one block.
-struct Strip {
-  int64_t pixel;    // the first one
-  int block, lane;  // where it is in the tile
-  int count;        // at most BLOCK_WIDTH
+// The pixels of a block that lie inside the image.
+struct Patch {
+  int64_t pixel;      // the first one
+  int stride;         // of the image
+  int columns, rows;  // 1..BLOCK_WIDTH, 1..BLOCK_HEIGHT
+
+  D2_INLINE unsigned lanes() const {
+    unsigned row = (1u << columns) - 1, all = 0;
+    for (int y = 0; y < rows; y++) all |= row << y * BLOCK_WIDTH;
+    return all;
+  }
 };
 
-// Calls visit(strip, count) for the strips of a tile inside the image; `count` is a constant but at the right edge.
+// Calls visit(block, patch, whole) for the blocks of a tile that the image touches; `whole` is a constant, true where
+// all of the block's pixels are in the image.
 template <class Visit>
-D2_INLINE void for_each_strip(const Frame& f, int tile, Visit visit) {
+D2_INLINE void for_each_block(const Frame& f, int tile, Visit visit) {
   const Corner corner = corner_of(f, tile);
-  const int width = std::min(TILE_WIDTH, f.width - corner.x), height = std::min(TILE_HEIGHT, f.height - corner.y);
-  for (int y = 0; y < height; y++)
-    for (int x = 0; x < width; x += BLOCK_WIDTH) {
-      const int block = y / BLOCK_HEIGHT * TILE_BLOCKS + x / BLOCK_WIDTH, lane = y % BLOCK_HEIGHT * BLOCK_WIDTH;
-      const Strip strip = {int64_t(corner.y + y) * f.width + corner.x + x, block, lane, std::min(BLOCK_WIDTH, width - x)};
-      if (strip.count == BLOCK_WIDTH)
-        visit(strip, std::integral_constant<int, BLOCK_WIDTH>());
-      else
-        visit(strip, strip.count);
-    }
+  for (int block = 0; block < BLOCKS; block++) {
+    const int x = corner.x + block % TILE_BLOCKS * BLOCK_WIDTH, y = corner.y + block / TILE_BLOCKS * BLOCK_HEIGHT;
+    if (x >= f.width || y >= f.height) continue;
+    const Patch patch = {int64_t(y) * f.width + x, f.width, std::min(BLOCK_WIDTH, f.width - x),
+                         std::min(BLOCK_HEIGHT, f.height - y)};
+    if (patch.columns == BLOCK_WIDTH && patch.rows == BLOCK_HEIGHT)
+      visit(block, patch, std::true_type());
+    else
+      visit(block, patch, std::false_type());
+  }
+}
+
+// Number `channel` of `channels` per pixel, to and from a block; lanes outside of the image are 0 and are not written.
+D2_INLINE Floats load_part(const float* image, int channels, int channel, const Patch& p) {
+  alignas(64) float lane[LANES] = {};
+  for (int y = 0; y < p.rows; y++)
+    for (int x = 0; x < p.columns; x++)
+      lane[y * BLOCK_WIDTH + x] = image[(p.pixel + int64_t(y) * p.stride + x) * channels + channel];
+  return Floats::load(lane);
+}
+D2_INLINE void store_part(Floats values, float* image, int channels, int channel, const Patch& p) {
+  alignas(64) float lane[LANES];
+  values.store(lane);
+  for (int y = 0; y < p.rows; y++)
+    for (int x = 0; x < p.columns; x++)
+      image[(p.pixel + int64_t(y) * p.stride + x) * channels + channel] = lane[y * BLOCK_WIDTH + x];
+}
+
+// One number per pixel.
+template <bool WHOLE>
+D2_INLINE Floats load_plane(const float* plane, const Patch& p) {
+  return WHOLE ? load_block(plane + p.pixel, p.stride) : load_part(plane, 1, 0, p);
+}
+template <bool WHOLE>
+D2_INLINE void store_plane(Floats values, float* plane, const Patch& p) {
+  WHOLE ? store_block(values, plane + p.pixel, p.stride) : store_part(values, plane, 1, 0, p);
+}
+
+// Calls visit(channel, values) for the numbers of a pixel; three of them are unwoven together.
+template <int FIXED, bool WHOLE, class Visit>
+D2_INLINE void load_channels(const float* image, int channels, const Patch& p, Visit visit) {
+  if (FIXED == 3 && WHOLE) {
+    Floats woven[3], parts[3];
+    for (int k = 0; k < 3; k++) woven[k] = load_block(image + 3 * p.pixel + k * BLOCK_WIDTH, 3 * int64_t(p.stride));
+    unweave<BLOCK_WIDTH>(woven, parts);
+    for (int c = 0; c < 3; c++) visit(c, parts[c]);
+  } else {
+    for (int c = 0; c < channels; c++) visit(c, load_part(image, channels, c, p));
+  }
+}
+// The other way: `value(channel)` gives them.
+template <int FIXED, bool WHOLE, class Value>
+D2_INLINE void store_channels(float* image, int channels, const Patch& p, Value value) {
+  if (FIXED == 3 && WHOLE) {
+    Floats woven[3];
+    weave<BLOCK_WIDTH>({value(0), value(1), value(2)}, woven);
+    for (int k = 0; k < 3; k++)
+      store_block(woven[k], image + 3 * p.pixel + k * BLOCK_WIDTH, 3 * int64_t(p.stride));
+  } else {
+    for (int c = 0; c < channels; c++) store_part(value(c), image, channels, c, p);
+  }
 }
 
 // Where the blocks of a tile are, in pixels from its corner: first pixel centre of each.
@@ -142,9 +200,9 @@ struct Unfinished {
   unsigned lanes[BLOCKS] = {};  // one bit per pixel of a block
   uint64_t blocks = 0;          // one bit per block that has any
 
-  D2_INLINE void add(const Strip& strip) {
-    lanes[strip.block] |= ((1u << strip.count) - 1) << strip.lane;
-    blocks |= uint64_t(1) << strip.block;
+  D2_INLINE void add(int block, const Patch& patch) {
+    lanes[block] = patch.lanes();
+    blocks |= uint64_t(1) << block;
   }
   D2_INLINE Floats advance(const Step<Floats>& step, Floats transmittance, int block, float* last) {
     const unsigned open = d2::lanes(step.open);
@@ -160,28 +218,19 @@ struct Unfinished {
 // Fields `near` and `scale` of a block's state, one after the other.
 D2_INLINE FreeSpace<Floats> load_space(const float* near) { return {Floats::load(near), Floats::load(near + LANES)}; }
 
-// Puts the free space of a strip there; `scale`, if not null, multiplies its own.
-template <class Count>
-D2_INLINE void store_space(const Frame& f, const Strip& strip, Count count, const float* scale, float* near) {
-  for (int i = 0; i < count; i++) {
-    const FreeSpace<float> space = free_space(f.near_edge[strip.pixel + i]);
-    near[i] = space.near, near[LANES + i] = scale ? space.scale * scale[i] : space.scale;
-  }
-}
-
 // State of a block in the forward pass: transmittance, that of finished pixels, depth sum, colors; with FRONT the near
 // edge and the sum of w max(0, D_near - z).
 template <int FIXED, bool FRONT>
 static void render_tile(const Frame& f, int tile) {
   const int channels = FIXED ? FIXED : f.channels, edge = 3 + channels, fields = edge + (FRONT ? 2 : 0);
   float* state = scratch().state.reserve(size_t(BLOCKS) * fields * LANES);
-  std::fill(state, state + BLOCKS * fields * LANES, 0.f);
   Unfinished unfinished;
-  for_each_strip(f, tile, [&](const Strip& strip, auto count) {
-    float* field = state + strip.block * fields * LANES + strip.lane;
-    for (int i = 0; i < count; i++) field[i] = 1.f;
-    for (int i = 0; FRONT && i < count; i++) field[edge * LANES + i] = free_space(f.near_edge[strip.pixel + i]).near;
-    unfinished.add(strip);
+  for_each_block(f, tile, [&](int block, const Patch& patch, auto whole) {
+    float* field = state + block * fields * LANES;
+    Floats(1.f).store(field);
+    for (int k = 1; k < fields; k++) Floats(0.f).store(field + k * LANES);
+    if (FRONT) free_space(load_plane<whole>(f.near_edge, patch)).near.store(field + edge * LANES);
+    unfinished.add(block, patch);
   });
 
   const Corner corner = corner_of(f, tile);
@@ -212,18 +261,18 @@ static void render_tile(const Frame& f, int tile) {
   f.tiles[tile].live = live - begin;
   std::fill(f.ids + live, f.ids + begin + pairs, -1);
 
-  for_each_strip(f, tile, [&](const Strip& strip, auto count) {
-    const float* field = state + strip.block * fields * LANES + strip.lane;
-    float transmittance[BLOCK_WIDTH];
-    for (int i = 0; i < count; i++) transmittance[i] = max(field[i], field[LANES + i]);
-    for (int i = 0; i < count; i++) f.alpha[strip.pixel + i] = 1.f - transmittance[i];
-    for (int i = 0; i < count; i++) f.depth_sum[strip.pixel + i] = field[2 * LANES + i];
-    for (int i = 0; FRONT && i < count; i++)
-      f.front[strip.pixel + i] = field[(edge + 1) * LANES + i] * free_space(field[edge * LANES + i]).scale;
-    float* color = f.color + strip.pixel * channels;
-    for (int i = 0; i < count; i++)
-      for (int c = 0; c < channels; c++)
-        color[i * channels + c] = fma(transmittance[i], f.background[c], field[(3 + c) * LANES + i]);
+  for_each_block(f, tile, [&](int block, const Patch& patch, auto whole) {
+    const float* field = state + block * fields * LANES;
+    const auto part = [&](int k) { return Floats::load(field + k * LANES); };
+    const Floats transmittance = max(part(0), part(1));
+    store_plane<whole>(Floats(1.f) - transmittance, f.alpha, patch);
+    store_plane<whole>(part(2), f.depth_sum, patch);
+    if (FRONT) {
+      const Floats scale = free_space(load_plane<whole>(f.near_edge, patch)).scale;
+      store_plane<whole>(part(edge + 1) * scale, f.front, patch);
+    }
+    store_channels<FIXED, whole>(f.color, channels, patch,
+                                 [&](int c) { return fma(transmittance, Floats(f.background[c]), part(3 + c)); });
   });
 }
 
@@ -234,48 +283,52 @@ static void render_tile(const Frame& f, int tile) {
 template <int FIXED, bool FRONT>
 static void load_gradients(const Frame& f, int tile, float* state, float* background) {
   const int channels = FIXED ? FIXED : f.channels, space = 4 + channels, fields = space + (FRONT ? 2 : 0);
-  std::fill(state, state + BLOCKS * fields * LANES, 0.f);
+  Floats background_sums[FIXED ? FIXED : 1];
+  for (int c = 0; c < FIXED; c++) background_sums[c] = Floats(0.f);
   if (background) std::fill(background, background + channels, 0.f);
-  for_each_strip(f, tile, [&](const Strip& strip, auto count) {
-    float* field = state + strip.block * fields * LANES + strip.lane;
-    const float* alpha = f.alpha + strip.pixel;
-    float on_alpha[BLOCK_WIDTH] = {}, on_depth[BLOCK_WIDTH] = {}, total[BLOCK_WIDTH];
+  for_each_block(f, tile, [&](int block, const Patch& patch, auto whole) {
+    float* field = state + block * fields * LANES;
+    const Floats alpha = load_plane<whole>(f.alpha, patch);
     // Where nobody contributes nothing comes back: a loss that divides by alpha sends NaN there, which 0 times a weight
     // would not silence.
-    if (f.grad_alpha)
-      for (int i = 0; i < count; i++) on_alpha[i] = alpha[i] > 0.f ? f.grad_alpha[strip.pixel + i] : 0.f;
-    if (f.grad_depth_sum)
-      for (int i = 0; i < count; i++) on_depth[i] = alpha[i] > 0.f ? f.grad_depth_sum[strip.pixel + i] : 0.f;
-    for (int i = 0; i < count; i++) total[i] = fma(on_alpha[i], alpha[i], on_depth[i] * f.depth_sum[strip.pixel + i]);
+    const Mask drawn = alpha > Floats(0.f);
+    const auto upstream = [&](const float* plane) {
+      return plane ? where(drawn, load_plane<whole>(plane, patch)) : Floats(0.f);
+    };
+    Floats on_alpha = upstream(f.grad_alpha);
+    const Floats on_depth = upstream(f.grad_depth_sum);
+    Floats total = fma(on_alpha, alpha, on_depth * load_plane<whole>(f.depth_sum, patch));
     if (FRONT) {
       // Nothing comes back either where no space is known to be free.
-      float on_front[BLOCK_WIDTH], *near = field + space * LANES;
-      for (int i = 0; i < count; i++) {
-        const bool known = alpha[i] > 0.f && free_space(f.near_edge[strip.pixel + i]).scale > 0.f;
-        on_front[i] = known ? f.grad_front[strip.pixel + i] : 0.f;
-      }
-      store_space(f, strip, count, on_front, near);
-      for (int i = 0; i < count; i++) total[i] = fma(on_front[i], f.front[strip.pixel + i], total[i]);
+      const FreeSpace<Floats> known = free_space(load_plane<whole>(f.near_edge, patch));
+      const Floats on_front = where(known.scale > Floats(0.f), upstream(f.grad_front));
+      known.near.store(field + space * LANES);
+      (known.scale * on_front).store(field + (space + 1) * LANES);
+      total = fma(on_front, load_plane<whole>(f.front, patch), total);
     }
-    if (f.grad_color)
-      for (int c = 0; c < channels; c++) {
-        const float behind = f.background[c];
-        for (int i = 0; i < count; i++) {
-          const int64_t place = (strip.pixel + i) * channels + c;
-          const float on_color = alpha[i] > 0.f ? f.grad_color[place] : 0.f;
-          // The image holds (1 - A) background: part of the dependence on alpha, not of the sum over Gaussians.
-          total[i] = fma(on_color, f.color[place] - behind, total[i]);
-          on_alpha[i] = fma(-on_color, behind, on_alpha[i]);
-          field[(4 + c) * LANES + i] = on_color;
+    for (int c = 0; c < channels; c++) Floats(0.f).store(field + (4 + c) * LANES);
+    if (f.grad_color) {
+      load_channels<FIXED, whole>(f.grad_color, channels, patch, [&](int c, Floats given) {
+        const Floats on_color = where(drawn, given), behind = f.background[c];
+        on_color.store(field + (4 + c) * LANES);
+        // The image holds (1 - A) background: part of the dependence on alpha, not of the sum over Gaussians.
+        on_alpha = fnma(on_color, behind, on_alpha);
+        if (background) {
+          const Floats seen_behind = (Floats(1.f) - alpha) * given;
+          if (FIXED) background_sums[FIXED ? c : 0] = background_sums[FIXED ? c : 0] + seen_behind;
+          else background[c] += sum(seen_behind);
         }
-        for (int i = 0; background && i < count; i++)
-          background[c] += (1.f - alpha[i]) * f.grad_color[(strip.pixel + i) * channels + c];
-      }
-    for (int i = 0; i < count; i++) {
-      field[i] = 1.f, field[LANES + i] = total[i];
-      field[2 * LANES + i] = on_alpha[i], field[3 * LANES + i] = on_depth[i];
+      });
+      load_channels<FIXED, whole>(f.color, channels, patch, [&](int c, Floats color) {
+        total = fma(Floats::load(field + (4 + c) * LANES), color - Floats(f.background[c]), total);
+      });
     }
+    Floats(1.f).store(field);
+    total.store(field + LANES);
+    on_alpha.store(field + 2 * LANES);
+    on_depth.store(field + 3 * LANES);
   });
+  for (int c = 0; background && c < FIXED; c++) background[c] = sum(background_sums[c]);
 }
 
 // Where the tiles of one call put their sums: `Scratch` of the thread that calls.
@@ -353,46 +406,58 @@ static void backward_tile(const Frame& f, int tile, const Sums& to) {
   }
 }
 
-// Adds up the slots of a Gaussian, in the order of tiles.
+// Adds up the slots of a Gaussian, in the order of tiles; false if it has none.
 D2_INLINE bool gather_moments(const Frame& f, const Sums& from, int64_t i, int64_t stride, float* total) {
   bool any_slot = false;
+  std::fill(total, total + stride, 0.f);
   for (int64_t slot = f.slots[i]; slot < f.slots[i + 1]; slot++) {
     if (!from.touched[slot]) continue;
     const float* part = from.moments + slot * stride;
-    for (int64_t k = 0; k < stride; k++) total[k] += part[k];
+    for (int64_t k = 0; k < stride; k += LANES) (Floats::load(total + k) + Floats::load(part + k)).store(total + k);
     any_slot = true;
   }
   return any_slot;
 }
 
-D2_INLINE void backward_group(const Frame& f, const Sums& from, int64_t i, int rows, float* totals) {
-  const int64_t stride = moment_stride(f.channels);
-  std::fill(totals, totals + LANES * stride, 0.f);
+template <int FIXED>
+static void backward_group(const Frame& f, const Sums& from, int64_t i, int rows, float* totals) {
+  const int channels = FIXED ? FIXED : f.channels;
+  const int64_t stride = moment_stride(channels);
   alignas(64) float drawn[LANES] = {};
   for (int lane = 0; lane < rows; lane++) drawn[lane] = gather_moments(f, from, i + lane, stride, totals + lane * stride);
+  if (rows < LANES) std::fill(totals + rows * stride, totals + LANES * stride, 0.f);
+#if defined(D2_AVX512)
+  Floats first[LANES];
+  for (int lane = 0; lane < LANES; lane++) first[lane] = Floats::load(totals + lane * stride);
+  transpose(first);
+  const auto column = [&](int k) { return k < LANES ? first[k] : load_column(totals, stride, k, rows); };
+#else
   const auto column = [&](int k) { return load_column(totals, stride, k, rows); };
+#endif
 
   // Only what `project_backward` reads: the rest of a footprint comes from the Gaussian itself.
-  Floats offset_x, offset_y;
-  load_extras(f, i, rows, offset_x, offset_y);
+  Floats offsets[2];
+  load_offsets(f, i, rows, offsets);
   const Gaussian<Floats> g = load_gaussians(f, i, rows);
-  const Projected<Floats> p = project(g, offset_x, offset_y, f.camera, f.constants);
+  const Projected<Floats> p = project(g, offsets[0], offsets[1], f.camera, f.constants);
   const Moments<Floats> m = {column(0), column(1), column(2), column(3), column(4), column(5), column(6)};
   Gaussian<Floats> out;
-  Floats center_x, center_y;
-  project_backward(g, p.footprint, m, f.camera, f.constants, out, center_x, center_y);
+  Floats center[2];
+  project_backward(g, p.footprint, m, f.camera, f.constants, out, center[0], center[1]);
 
   // A Gaussian that was not drawn may hold anything, NaN included.
   const Mask mask = Floats::load(drawn) > Floats(0.f);
-  for (int k = 0; k < 3; k++) store_column(where(mask, out.mean[k]), f.grad_means + 3 * i, 3, k, rows);
-  for (int k = 0; k < 6; k++) store_column(where(mask, out.covariance[k]), f.grad_covariances + 6 * i, 6, k, rows);
+  for (int k = 0; k < 3; k++) out.mean[k] = where(mask, out.mean[k]);
+  for (int k = 0; k < 6; k++) out.covariance[k] = where(mask, out.covariance[k]);
+  for (int k = 0; k < 2; k++) center[k] = where(mask, center[k]);
+  store_columns(out.mean, f.grad_means + 3 * i, rows);
+  store_columns(out.covariance, f.grad_covariances + 6 * i, rows);
   store_column(where(mask, out.opacity), f.grad_opacities + i, 1, 0, rows);
-  for (int c = 0; c < f.channels; c++)
-    store_column(column(7 + c), f.grad_colors + i * f.channels, f.channels, c, rows);
-  if (f.grad_screen_offsets) {
-    store_column(where(mask, center_x), f.grad_screen_offsets + 2 * i, 2, 0, rows);
-    store_column(where(mask, center_y), f.grad_screen_offsets + 2 * i, 2, 1, rows);
-  }
+  if (f.grad_screen_offsets) store_columns(center, f.grad_screen_offsets + 2 * i, rows);
+  if (FIXED == 3)
+    store_columns({column(7), column(8), column(9)}, f.grad_colors + 3 * i, rows);
+  else
+    for (int c = 0; c < channels; c++) store_column(column(7 + c), f.grad_colors + i * channels, channels, c, rows);
 }
 
 // ---------------------------------------------------------------------------------------------------- survey
@@ -403,27 +468,25 @@ template <bool FRONT>
 static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* statistics) {
   constexpr int fields = FRONT ? 8 : 6;
   float* state = scratch().state.reserve(size_t(BLOCKS) * fields * LANES);
-  std::fill(state, state + BLOCKS * fields * LANES, 0.f);
   Unfinished unfinished;
-  for_each_strip(f, tile, [&](const Strip& strip, auto count) {
-    float* field = state + strip.block * fields * LANES + strip.lane;
-    unfinished.add(strip);
-    for (int i = 0; i < count; i++) {
-      field[i] = 1.f;
-      field[4 * LANES + i] = f.prior_depth[strip.pixel + i], field[5 * LANES + i] = f.reliability[strip.pixel + i];
-    }
-    if (FRONT) store_space(f, strip, count, nullptr, field + 6 * LANES);
-  });
   const Floats infinity = __builtin_inff();
-  for (int block = 0; block < BLOCKS; block++) {
+  for_each_block(f, tile, [&](int block, const Patch& patch, auto whole) {
     float* field = state + block * fields * LANES;
-    const Floats depth = Floats::load(field + 4 * LANES), reliability = Floats::load(field + 5 * LANES);
+    const Floats depth = load_plane<whole>(f.prior_depth, patch), reliability = load_plane<whole>(f.reliability, patch);
     const Mask usable = (reliability > Floats(0.f)) & (reliability < infinity) & (depth > Floats(0.f)) & (depth < infinity);
     const Floats scale = where(usable, Floats(1.f) / (depth + Floats(f.eps)) * reliability);
+    Floats(1.f).store(field);
+    for (int k = 1; k < 3; k++) Floats(0.f).store(field + k * LANES);
     scale.store(field + 3 * LANES);
     (where(usable, depth) * scale).store(field + 4 * LANES);
     where(usable, reliability).store(field + 5 * LANES);
-  }
+    if (FRONT) {
+      const FreeSpace<Floats> known = free_space(load_plane<whole>(f.near_edge, patch));
+      known.near.store(field + 6 * LANES);
+      known.scale.store(field + 7 * LANES);
+    }
+    unfinished.add(block, patch);
+  });
 
   const Corner corner = corner_of(f, tile);
   const Lattice lattice;
@@ -459,10 +522,11 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
     statistics[slot].max_weight = most;
   });
 
-  for_each_strip(f, tile, [&](const Strip& strip, auto count) {
-    const float* field = state + strip.block * fields * LANES + strip.lane;
-    for (int i = 0; i < count; i++) f.alpha[strip.pixel + i] = 1.f - max(field[i], field[LANES + i]);
-    for (int i = 0; i < count; i++) f.depth_sum[strip.pixel + i] = field[2 * LANES + i];
+  for_each_block(f, tile, [&](int block, const Patch& patch, auto whole) {
+    const float* field = state + block * fields * LANES;
+    const Floats transmittance = max(Floats::load(field), Floats::load(field + LANES));
+    store_plane<whole>(Floats(1.f) - transmittance, f.alpha, patch);
+    store_plane<whole>(Floats::load(field + 2 * LANES), f.depth_sum, patch);
   });
 }
 
@@ -520,8 +584,8 @@ static void backward(const Frame& f, int64_t pairs) {
     float* totals = scratch().state.reserve(size_t(LANES) * stride);
     const int64_t end = f.chunk_begin(chunk + 1);
     int64_t i = f.chunk_begin(chunk);
-    for (; i + LANES <= end; i += LANES) backward_group(f, sums, i, LANES, totals);
-    if (i < end) backward_group(f, sums, i, int(end - i), totals);
+    const auto group_any = f.channels == 3 ? backward_group<3> : backward_group<0>;
+    for (; i < end; i += LANES) group_any(f, sums, i, int(std::min<int64_t>(LANES, end - i)), totals);
   });
 }
 

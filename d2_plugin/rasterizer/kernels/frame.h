@@ -144,4 +144,16 @@ D2_INLINE void store_column(Floats values, float* row, int64_t stride, int colum
   for (int i = 0; i < rows; i++) row[i * stride + column] = lane[i];
 }
 
+// All N columns of up to LANES rows.
+template <int N>
+D2_INLINE void load_columns(const float* row, int rows, Floats (&out)[N]) {
+  if (rows == LANES) return load_rows(row, out);
+  for (int n = 0; n < N; n++) out[n] = load_column(row, N, n, rows);
+}
+template <int N>
+D2_INLINE void store_columns(const Floats (&columns)[N], float* row, int rows) {
+  if (rows == LANES) return store_rows(columns, row);
+  for (int n = 0; n < N; n++) store_column(columns[n], row, N, n, rows);
+}
+
 }  // namespace d2
