@@ -69,6 +69,22 @@ class _Answer(NamedTuple):
     """Whether another camera has a depth where the point lies in its picture."""
 
 
+class _View(NamedTuple):
+    """What one view tells the others; maps [H, W]."""
+
+    mono: np.ndarray
+    """Monocular depth, 0 elsewhere."""
+    surface: np.ndarray
+    """Depth that stereo verified, 0 elsewhere."""
+    sigma: np.ndarray
+
+    @classmethod
+    def of(cls, prior: FusedPrior) -> _View:
+        mono = (prior.labels == Label.MONO) | (prior.labels == Label.AGREED)
+        verified = prior.labels == Label.VERIFIED
+        return cls(np.where(mono, prior.depth, 0), np.where(verified, prior.depth, 0), prior.sigma)
+
+
 def with_evidence(
     priors: Mapping[str, FusedPrior], cameras: Mapping[str, Camera], tolerance: float
 ) -> dict[str, FusedPrior]:
@@ -79,17 +95,17 @@ def with_evidence(
         cameras: their calibrations.
         tolerance: largest relative difference at which two monocular depths agree.
     """
-    return {name: _informed(name, priors, cameras, tolerance) for name in priors}
+    views = {name: _View.of(prior) for name, prior in priors.items()}
+    return {name: _informed(name, prior, views, cameras, tolerance) for name, prior in priors.items()}
 
 
 def _informed(
-    name: str, priors: Mapping[str, FusedPrior], cameras: Mapping[str, Camera], tolerance: float
+    name: str, prior: FusedPrior, views: Mapping[str, _View], cameras: Mapping[str, Camera], tolerance: float
 ) -> FusedPrior:
-    prior = priors[name]
     rows, columns = np.nonzero(prior.labels == Label.MONO)
     depth, sigma = (map_[rows, columns].astype(np.float64) for map_ in (prior.depth, prior.sigma))
     points = _Points(columns, rows, depth, sigma)
-    answer = _ask(points, name, priors, cameras)
+    answer = _ask(points, name, views, cameras)
     met, agreed = answer.depth > 0, answer.difference < tolerance
     factor = np.where(agreed, AGREED, np.where(answer.seen, ALONE, 1.0))
     labels, depths, sigmas = prior.labels.copy(), prior.depth.copy(), prior.sigma.copy()
@@ -100,45 +116,50 @@ def _informed(
 
 
 def _ask(
-    points: _Points, name: str, priors: Mapping[str, FusedPrior], cameras: Mapping[str, Camera]
+    points: _Points, name: str, views: Mapping[str, _View], cameras: Mapping[str, Camera]
 ) -> _Answer:
     count = len(points.depth)
     depth, sigma = np.zeros(count), np.full(count, np.inf)
     difference, seen = np.full(count, np.inf), np.zeros(count, bool)
-    for other, theirs in priors.items():
+    for other, theirs in views.items():
         if other == name or not count:
             continue
         pair = view_pair(cameras[name], cameras[other])
-        mono = np.where(np.isin(theirs.labels, (Label.MONO, Label.AGREED)), theirs.depth, 0)
-        apart = _apart_from_nearest(points, pair, mono)
-        np.minimum(difference, apart, out=difference)
-        seen |= np.isfinite(apart)
-        found, precision = _intersection(points, pair, theirs)
-        seen |= found > 0
-        better = precision < sigma
-        depth[better], sigma[better] = found[better], precision[better]
+        place, at, logs = _inside(points, pair, theirs.mono.shape)
+        apart = _apart(theirs.mono[at], logs)
+        difference[place] = np.minimum(difference[place], apart)
+        seen[place] |= np.isfinite(apart)
+        # Most rays start where nothing is verified; those whose first step leaves the allowed way several times over
+        # meet nothing either. Only the others are followed.
+        near = place[_apart(theirs.surface[at], logs) < MISSED]
+        found, precision = _intersection(_Points(*(values[near] for values in points)), pair, theirs)
+        seen[near] |= found > 0
+        better = precision < sigma[near]
+        depth[near[better]], sigma[near[better]] = found[better], precision[better]
     return _Answer(depth, sigma, difference, seen)
 
 
-def _apart_from_nearest(points: _Points, pair: ViewPair, depth: np.ndarray) -> np.ndarray:
-    """|log difference| [K] between the points and another view's map at the pixels they fall on; infinite off it."""
-    at = pair.project(points.columns, points.rows, points.depth)
-    height, width = depth.shape
-    inside = (at.z > 0) & (at.x > -0.5) & (at.x < width - 0.5) & (at.y > -0.5) & (at.y < height - 0.5)
-    column, row = (np.rint(np.where(inside, value, 0)).astype(np.int64) for value in (at.x, at.y))
-    known = np.where(inside, depth[row, column], 0)
-    both = known > 0
-    return np.where(both, np.abs(np.log(np.where(both, at.z, 1) / np.where(both, known, 1))), np.inf)
+def _inside(
+    points: _Points, pair: ViewPair, shape: tuple[int, ...]
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """(indices [I] of the points that fall into another view's picture, their nearest pixels there, log depth there)."""
+    x, y, z = pair.project(points.columns, points.rows, points.depth)
+    height, width = shape
+    place = np.flatnonzero((z > 0) & (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5))
+    row, column = (np.rint(values[place]).astype(np.int64) for values in (y, x))
+    return place, (row, column), np.log(z[place])
 
 
-def _intersection(points: _Points, pair: ViewPair, theirs: FusedPrior) -> tuple[np.ndarray, np.ndarray]:
+def _apart(there: np.ndarray, logs: np.ndarray) -> np.ndarray:
+    """|log difference| [I] of the points to the depths where they fall; infinite where there is none."""
+    known = there > 0
+    return np.where(known, np.abs(logs - np.log(np.where(known, there, 1))), np.inf)
+
+
+def _intersection(points: _Points, pair: ViewPair, theirs: _View) -> tuple[np.ndarray, np.ndarray]:
     """Where the points' rays meet the surface that another view verified: (depth [K], 0 where nowhere; sigma [K])."""
-    surface = np.where(theirs.labels == Label.VERIFIED, theirs.depth, 0)
+    surface, near = theirs.surface, np.arange(len(points.depth))
     depth, sigma = np.zeros_like(points.depth), np.full_like(points.depth, np.inf)
-    # Most rays start where nothing is verified; those whose first step leaves the allowed way several times over
-    # meet nothing either. Only the others are followed.
-    near = np.flatnonzero(_apart_from_nearest(points, pair, surface) < MISSED)
-    points = _Points(*(values[near] for values in points))
     miss, known = _miss(points, pair, surface, points.depth)
     near, miss, points = near[known], miss[known], _Points(*(values[known] for values in points))
     step = _step(points, pair, surface, points.depth, miss)
