@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
+from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.geometry import ViewPair, interpolated_surface, view_pair
 from d2_plugin.protocol import Label
@@ -37,6 +38,11 @@ NEAR = 0.1
 """And within this relative difference, whatever is declared."""
 BESIDE = 0.03
 """Share of the step to the surface that may remain as error."""
+LIKE = 0.04
+"""Largest difference of the colours (0..1, mean of 3x3 pixels) of one place in two pictures. A ray that passes a near
+thing which the map does not know meets the surface behind it. Measured on the surfaces that rays meet, those off by
+more than 5 %: studio 1.3 % and .4 % with this test, with a weak network (PyDNet) 48 and 13 %; plaza with it 1.5 and
+.1 %. It keeps 88 to 96 % of the right ones."""
 STEPS = 3
 """Secant steps along the ray."""
 MET = 3e-3
@@ -54,6 +60,11 @@ class _Points(NamedTuple):
     rows: np.ndarray
     depth: np.ndarray
     sigma: np.ndarray
+    colors: np.ndarray | None
+    """Mean of 3x3 pixels, uint8 [K, 3]; None where there is no picture."""
+
+    def only(self, chosen: np.ndarray) -> _Points:
+        return _Points(*(None if values is None else values[chosen] for values in self))
 
 
 class _Answer(NamedTuple):
@@ -77,12 +88,16 @@ class _View(NamedTuple):
     surface: np.ndarray
     """Depth that stereo verified, 0 elsewhere."""
     sigma: np.ndarray
+    colors: np.ndarray | None
+    """Mean of 3x3 pixels, uint8 [H, W, 3]; None where there is no picture."""
 
     @classmethod
     def of(cls, prior: FusedPrior) -> _View:
         mono = (prior.labels == Label.MONO) | (prior.labels == Label.AGREED)
         verified = prior.labels == Label.VERIFIED
-        return cls(np.where(mono, prior.depth, 0), np.where(verified, prior.depth, 0), prior.sigma)
+        depths = (np.where(labelled, prior.depth, 0) for labelled in (mono, verified))
+        colors = None if prior.colors is None else opencv("the evidence of other cameras").blur(prior.colors, (3, 3))
+        return cls(*depths, prior.sigma, colors)
 
 
 def with_evidence(
@@ -104,7 +119,8 @@ def _informed(
 ) -> FusedPrior:
     rows, columns = np.nonzero(prior.labels == Label.MONO)
     depth, sigma = (map_[rows, columns].astype(np.float64) for map_ in (prior.depth, prior.sigma))
-    points = _Points(columns, rows, depth, sigma)
+    colors = views[name].colors
+    points = _Points(columns, rows, depth, sigma, None if colors is None else colors[rows, columns])
     answer = _ask(points, name, views, cameras)
     met, agreed = answer.depth > 0, answer.difference < tolerance
     factor = np.where(agreed, AGREED, np.where(answer.seen, ALONE, 1.0))
@@ -132,7 +148,7 @@ def _ask(
         # Most rays start where nothing is verified; those whose first step leaves the allowed way several times over
         # meet nothing either. Only the others are followed.
         near = place[_apart(theirs.surface[at], logs) < MISSED]
-        found, precision = _intersection(_Points(*(values[near] for values in points)), pair, theirs)
+        found, precision = _intersection(points.only(near), pair, theirs)
         seen[near] |= found > 0
         better = precision < sigma[near]
         depth[near[better]], sigma[near[better]] = found[better], precision[better]
@@ -161,10 +177,10 @@ def _intersection(points: _Points, pair: ViewPair, theirs: _View) -> tuple[np.nd
     surface, near = theirs.surface, np.arange(len(points.depth))
     depth, sigma = np.zeros_like(points.depth), np.full_like(points.depth, np.inf)
     miss, known = _miss(points, pair, surface, points.depth)
-    near, miss, points = near[known], miss[known], _Points(*(values[known] for values in points))
+    near, miss, points = near[known], miss[known], points.only(known)
     step = _step(points, pair, surface, points.depth, miss)
     kept = np.abs(step) < OVERSHOT * _allowed(points)
-    near, step, points = near[kept], step[kept], _Points(*(values[kept] for values in points))
+    near, step, points = near[kept], step[kept], points.only(kept)
     along = points.depth * np.exp(step)
     for _ in range(STEPS - 1):
         miss, known = _miss(points, pair, surface, along)
@@ -176,9 +192,18 @@ def _intersection(points: _Points, pair: ViewPair, theirs: _View) -> tuple[np.nd
     height, width = surface.shape
     row = np.clip(np.rint(np.where(met, at.y, 0)), 0, height - 1).astype(np.int64)
     column = np.clip(np.rint(np.where(met, at.x, 0)), 0, width - 1).astype(np.int64)
+    met &= _alike(points, theirs, row, column)
     depth[near] = np.where(met, along, 0)
     sigma[near] = np.where(met, np.hypot(theirs.sigma[row, column], BESIDE * moved), np.inf)
     return depth, sigma
+
+
+def _alike(points: _Points, theirs: _View, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Whether the points [K] have the colour of another view's pixels; True where there is no picture."""
+    if points.colors is None or theirs.colors is None:
+        return np.ones(len(points.depth), bool)
+    apart = np.abs(points.colors.astype(np.int16) - theirs.colors[row, column])
+    return apart.max(axis=-1) < LIKE * 255
 
 
 def _allowed(points: _Points) -> np.ndarray:
