@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
+from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.geometry import ViewPair, interpolated_surface, view_pair
 from d2_plugin.protocol import Label
@@ -37,6 +38,11 @@ NEAR = 0.1
 """And within this relative difference, whatever is declared."""
 BESIDE = 0.03
 """Share of the step to the surface that may remain as error."""
+LIKE = 0.04
+"""Largest difference of the colours (0..1, mean of 3x3 pixels) of one place in two pictures. A ray that passes a near
+thing which the map does not know meets the surface behind it. Measured on the surfaces that rays meet, those off by
+more than 5 %: studio 1.3 % and .4 % with this test, with a weak network (PyDNet) 48 and 13 %; plaza with it 1.5 and
+.1 %. It keeps 88 to 96 % of the right ones."""
 STEPS = 3
 """Secant steps along the ray."""
 MET = 3e-3
@@ -54,6 +60,11 @@ class _Points(NamedTuple):
     rows: np.ndarray
     depth: np.ndarray
     sigma: np.ndarray
+    colors: np.ndarray | None
+    """Mean of 3x3 pixels, uint8 [K, 3]; None where there is no picture."""
+
+    def only(self, chosen: np.ndarray) -> _Points:
+        return _Points(*(None if values is None else values[chosen] for values in self))
 
 
 class _Answer(NamedTuple):
@@ -69,6 +80,26 @@ class _Answer(NamedTuple):
     """Whether another camera has a depth where the point lies in its picture."""
 
 
+class _View(NamedTuple):
+    """What one view tells the others; maps [H, W]."""
+
+    mono: np.ndarray
+    """Monocular depth, 0 elsewhere."""
+    surface: np.ndarray
+    """Depth that stereo verified, 0 elsewhere."""
+    sigma: np.ndarray
+    colors: np.ndarray | None
+    """Mean of 3x3 pixels, uint8 [H, W, 3]; None where there is no picture."""
+
+    @classmethod
+    def of(cls, prior: FusedPrior) -> _View:
+        mono = (prior.labels == Label.MONO) | (prior.labels == Label.AGREED)
+        verified = prior.labels == Label.VERIFIED
+        depths = (np.where(labelled, prior.depth, 0) for labelled in (mono, verified))
+        colors = None if prior.colors is None else opencv("the evidence of other cameras").blur(prior.colors, (3, 3))
+        return cls(*depths, prior.sigma, colors)
+
+
 def with_evidence(
     priors: Mapping[str, FusedPrior], cameras: Mapping[str, Camera], tolerance: float
 ) -> dict[str, FusedPrior]:
@@ -79,17 +110,18 @@ def with_evidence(
         cameras: their calibrations.
         tolerance: largest relative difference at which two monocular depths agree.
     """
-    return {name: _informed(name, priors, cameras, tolerance) for name in priors}
+    views = {name: _View.of(prior) for name, prior in priors.items()}
+    return {name: _informed(name, prior, views, cameras, tolerance) for name, prior in priors.items()}
 
 
 def _informed(
-    name: str, priors: Mapping[str, FusedPrior], cameras: Mapping[str, Camera], tolerance: float
+    name: str, prior: FusedPrior, views: Mapping[str, _View], cameras: Mapping[str, Camera], tolerance: float
 ) -> FusedPrior:
-    prior = priors[name]
     rows, columns = np.nonzero(prior.labels == Label.MONO)
     depth, sigma = (map_[rows, columns].astype(np.float64) for map_ in (prior.depth, prior.sigma))
-    points = _Points(columns, rows, depth, sigma)
-    answer = _ask(points, name, priors, cameras)
+    colors = views[name].colors
+    points = _Points(columns, rows, depth, sigma, None if colors is None else colors[rows, columns])
+    answer = _ask(points, name, views, cameras)
     met, agreed = answer.depth > 0, answer.difference < tolerance
     factor = np.where(agreed, AGREED, np.where(answer.seen, ALONE, 1.0))
     labels, depths, sigmas = prior.labels.copy(), prior.depth.copy(), prior.sigma.copy()
@@ -100,50 +132,55 @@ def _informed(
 
 
 def _ask(
-    points: _Points, name: str, priors: Mapping[str, FusedPrior], cameras: Mapping[str, Camera]
+    points: _Points, name: str, views: Mapping[str, _View], cameras: Mapping[str, Camera]
 ) -> _Answer:
     count = len(points.depth)
     depth, sigma = np.zeros(count), np.full(count, np.inf)
     difference, seen = np.full(count, np.inf), np.zeros(count, bool)
-    for other, theirs in priors.items():
+    for other, theirs in views.items():
         if other == name or not count:
             continue
         pair = view_pair(cameras[name], cameras[other])
-        mono = np.where(np.isin(theirs.labels, (Label.MONO, Label.AGREED)), theirs.depth, 0)
-        apart = _apart_from_nearest(points, pair, mono)
-        np.minimum(difference, apart, out=difference)
-        seen |= np.isfinite(apart)
-        found, precision = _intersection(points, pair, theirs)
-        seen |= found > 0
-        better = precision < sigma
-        depth[better], sigma[better] = found[better], precision[better]
+        place, at, logs = _inside(points, pair, theirs.mono.shape)
+        apart = _apart(theirs.mono[at], logs)
+        difference[place] = np.minimum(difference[place], apart)
+        seen[place] |= np.isfinite(apart)
+        # Most rays start where nothing is verified; those whose first step leaves the allowed way several times over
+        # meet nothing either. Only the others are followed.
+        near = place[_apart(theirs.surface[at], logs) < MISSED]
+        found, precision = _intersection(points.only(near), pair, theirs)
+        seen[near] |= found > 0
+        better = precision < sigma[near]
+        depth[near[better]], sigma[near[better]] = found[better], precision[better]
     return _Answer(depth, sigma, difference, seen)
 
 
-def _apart_from_nearest(points: _Points, pair: ViewPair, depth: np.ndarray) -> np.ndarray:
-    """|log difference| [K] between the points and another view's map at the pixels they fall on; infinite off it."""
-    at = pair.project(points.columns, points.rows, points.depth)
-    height, width = depth.shape
-    inside = (at.z > 0) & (at.x > -0.5) & (at.x < width - 0.5) & (at.y > -0.5) & (at.y < height - 0.5)
-    column, row = (np.rint(np.where(inside, value, 0)).astype(np.int64) for value in (at.x, at.y))
-    known = np.where(inside, depth[row, column], 0)
-    both = known > 0
-    return np.where(both, np.abs(np.log(np.where(both, at.z, 1) / np.where(both, known, 1))), np.inf)
+def _inside(
+    points: _Points, pair: ViewPair, shape: tuple[int, ...]
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """(indices [I] of the points that fall into another view's picture, their nearest pixels there, log depth there)."""
+    x, y, z = pair.project(points.columns, points.rows, points.depth)
+    height, width = shape
+    place = np.flatnonzero((z > 0) & (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5))
+    row, column = (np.rint(values[place]).astype(np.int64) for values in (y, x))
+    return place, (row, column), np.log(z[place])
 
 
-def _intersection(points: _Points, pair: ViewPair, theirs: FusedPrior) -> tuple[np.ndarray, np.ndarray]:
+def _apart(there: np.ndarray, logs: np.ndarray) -> np.ndarray:
+    """|log difference| [I] of the points to the depths where they fall; infinite where there is none."""
+    known = there > 0
+    return np.where(known, np.abs(logs - np.log(np.where(known, there, 1))), np.inf)
+
+
+def _intersection(points: _Points, pair: ViewPair, theirs: _View) -> tuple[np.ndarray, np.ndarray]:
     """Where the points' rays meet the surface that another view verified: (depth [K], 0 where nowhere; sigma [K])."""
-    surface = np.where(theirs.labels == Label.VERIFIED, theirs.depth, 0)
+    surface, near = theirs.surface, np.arange(len(points.depth))
     depth, sigma = np.zeros_like(points.depth), np.full_like(points.depth, np.inf)
-    # Most rays start where nothing is verified; those whose first step leaves the allowed way several times over
-    # meet nothing either. Only the others are followed.
-    near = np.flatnonzero(_apart_from_nearest(points, pair, surface) < MISSED)
-    points = _Points(*(values[near] for values in points))
     miss, known = _miss(points, pair, surface, points.depth)
-    near, miss, points = near[known], miss[known], _Points(*(values[known] for values in points))
+    near, miss, points = near[known], miss[known], points.only(known)
     step = _step(points, pair, surface, points.depth, miss)
     kept = np.abs(step) < OVERSHOT * _allowed(points)
-    near, step, points = near[kept], step[kept], _Points(*(values[kept] for values in points))
+    near, step, points = near[kept], step[kept], points.only(kept)
     along = points.depth * np.exp(step)
     for _ in range(STEPS - 1):
         miss, known = _miss(points, pair, surface, along)
@@ -155,9 +192,18 @@ def _intersection(points: _Points, pair: ViewPair, theirs: FusedPrior) -> tuple[
     height, width = surface.shape
     row = np.clip(np.rint(np.where(met, at.y, 0)), 0, height - 1).astype(np.int64)
     column = np.clip(np.rint(np.where(met, at.x, 0)), 0, width - 1).astype(np.int64)
+    met &= _alike(points, theirs, row, column)
     depth[near] = np.where(met, along, 0)
     sigma[near] = np.where(met, np.hypot(theirs.sigma[row, column], BESIDE * moved), np.inf)
     return depth, sigma
+
+
+def _alike(points: _Points, theirs: _View, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Whether the points [K] have the colour of another view's pixels; True where there is no picture."""
+    if points.colors is None or theirs.colors is None:
+        return np.ones(len(points.depth), bool)
+    apart = np.abs(points.colors.astype(np.int16) - theirs.colors[row, column])
+    return apart.max(axis=-1) < LIKE * 255
 
 
 def _allowed(points: _Points) -> np.ndarray:

@@ -93,11 +93,16 @@ def back_project(camera: Camera, depth: np.ndarray) -> np.ndarray:
 
 def triangulation_angle(camera: Camera, pair: ViewPair, depth: np.ndarray) -> np.ndarray:
     """Angle [H, W] in radians between the rays of both cameras at each pixel's 3D point; 0 for one centre."""
-    points = viewing_rays(camera) * depth[..., None]
+    return angle_of_rays(viewing_rays(camera) * depth[..., None], pair)
+
+
+def angle_of_rays(points: np.ndarray, pair: ViewPair) -> np.ndarray:
+    """Angle [...] in radians between the rays of both cameras at points [..., 3] in the reference camera's frame."""
     other = points - pair.direction.astype(np.float32)
-    cross = np.linalg.norm(np.cross(points, other), axis=-1)
+    (x, y, z), (u, v, w) = np.moveaxis(points, -1, 0), np.moveaxis(other, -1, 0)
+    cross = np.sqrt((y * w - z * v) ** 2 + (z * u - x * w) ** 2 + (x * v - y * u) ** 2)
     # atan2 of (|a x b|, a.b) keeps its digits at small angles, where arccos of float32 has none below .03 degrees.
-    return np.arctan2(cross, np.einsum("hwc,hwc->hw", points, other))
+    return np.arctan2(cross, x * u + y * v + z * w)
 
 
 def interpolated_surface(depth: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -64,15 +64,32 @@ def _smooth_field(bend: np.ndarray, known: np.ndarray, scales: Sequence[float], 
 
 def _robust_average(cv2: ModuleType, values: np.ndarray, share: np.ndarray, sigma: float, prior: float) -> np.ndarray:
     """Gaussian average weighted by how much of a cell is known, then by agreement with that average."""
+    down, across = (_blur_matrix(cv2, size, sigma) for size in values.shape)
 
-    def blur(cells: np.ndarray) -> np.ndarray:
-        return cv2.GaussianBlur(cells.astype(np.float32), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+    def average(weight: np.ndarray) -> np.ndarray:
+        total, weights = down @ np.stack([weight * values, weight]) @ across.T
+        return total / (weights + np.float32(prior))
 
     weight = share
     for _ in range(ROUNDS):
-        average = blur(weight * values) / (blur(weight) + prior)
-        weight = share * OUTLIER / np.sqrt((values - average) ** 2 + OUTLIER**2)
-    return blur(weight * values) / (blur(weight) + prior)
+        weight = share * np.float32(OUTLIER) / np.sqrt((values - average(weight)) ** 2 + np.float32(OUTLIER**2))
+    return average(weight)
+
+
+def _blur_matrix(cv2: ModuleType, size: int, sigma: float) -> np.ndarray:
+    """Gaussian blur of a row of `size` cells with nothing beyond its ends, float32 [size, size].
+
+    So few cells are blurred in a fifth of the time by a product of matrices; the numbers are OpenCV's own.
+    """
+    if (size, sigma) not in _BLURS:
+        kernel = cv2.getGaussianKernel(2 * round(4 * sigma) + 1, sigma, cv2.CV_32F).ravel()
+        places = np.arange(size)[:, None] - np.arange(size) + kernel.size // 2
+        inside = (places >= 0) & (places < kernel.size)
+        _BLURS[size, sigma] = np.where(inside, kernel[np.clip(places, 0, kernel.size - 1)], 0).astype(np.float32)
+    return _BLURS[size, sigma]
+
+
+_BLURS: dict[tuple[int, float], np.ndarray] = {}
 
 
 def _block_sum(values: np.ndarray, cell: int) -> np.ndarray:

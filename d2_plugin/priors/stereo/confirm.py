@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
-from d2_plugin.priors.geometry import Projection, interpolated_surface, pixel_grid, triangulation_angle, view_pair
+from d2_plugin.priors.geometry import Projection, angle_of_rays, interpolated_surface, view_pair, viewing_rays
 from d2_plugin.priors.stereo.settings import StereoSettings
 
 NUDGE = 1e-3
@@ -36,32 +36,59 @@ def confirm(
     rays meet at an angle between `min_angle` and `max_angle`.
     """
     reference, depth = cameras[index], depths[index]
-    u, v = pixel_grid(reference)
+    rows, columns = np.nonzero(depth > 0)
+    points = viewing_rays(reference)[rows, columns] * depth[rows, columns][:, None]
+    asked = _Asked(columns.astype(np.float32), rows.astype(np.float32), points)
     count = np.zeros(depth.shape, np.uint8)
     information, difference = np.zeros(depth.shape), np.zeros(depth.shape)
     for other, source in enumerate(cameras):
         if other == index:
             continue
-        pair = view_pair(reference, source)
-        forth = pair.project(u, v, depth)
-        seen = (sample_surface if settings.between_pixels else sample_nearest)(depths[other], forth)
-        back = view_pair(source, reference).project(forth.x, forth.y, seen)
-        with np.errstate(invalid="ignore", over="ignore"):
-            near_pixel = np.hypot(back.x - u, back.y - v) < settings.reprojection_max
-            near_depth = np.abs(back.z - depth) < settings.relative_depth_max * depth
-        angle = np.rad2deg(triangulation_angle(reference, pair, depth))
-        trusted = (angle > settings.min_angle) & (angle < settings.max_angle)
-        confirmed = (depth > 0) & (seen > 0) & near_pixel & near_depth & trusted
-        nudged = pair.project(u, v, depth * np.exp(NUDGE))
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            parallax = np.hypot(nudged.x - forth.x, nudged.y - forth.y) / NUDGE
-            precision = np.where(confirmed & np.isfinite(parallax), parallax**2, 0)
-            apart = np.where(confirmed, back.z / depth - 1, 0)
-        count += confirmed
-        information += precision
-        difference += precision * apart**2
+        place, precision, apart = _confirmed_by(asked, reference, source, depths[other], settings)
+        at = rows[place], columns[place]
+        count[at] += 1
+        information[at] += precision
+        difference[at] += precision * apart**2
     spread = np.sqrt(difference / np.where(information > 0, information, 1))
     return Confirmation(count, np.sqrt(information), spread)
+
+
+class _Asked(NamedTuple):
+    """K pixels that have a depth."""
+
+    u: np.ndarray
+    """Columns [K], float32."""
+    v: np.ndarray
+    """Rows [K], float32."""
+    points: np.ndarray
+    """[K, 3] in camera coordinates; the last is planar depth."""
+
+    def only(self, chosen: np.ndarray) -> _Asked:
+        return _Asked(*(values[chosen] for values in self))
+
+
+def _confirmed_by(
+    asked: _Asked, reference: Camera, source: Camera, theirs: np.ndarray, settings: StereoSettings
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(indices [C] of the pixels that a source confirms, P^2 [C], relative difference to its own depth [C]).
+
+    Each test is made of those alone that passed the one before.
+    """
+    pair, way_back = view_pair(reference, source), view_pair(source, reference)
+    forth = pair.project(asked.u, asked.v, asked.points[:, 2])
+    seen = (sample_surface if settings.between_pixels else sample_nearest)(theirs, forth)
+    place = np.flatnonzero(seen > 0)
+    asked, forth = asked.only(place), Projection(*(values[place] for values in forth))
+    depth = asked.points[:, 2]
+    back = way_back.project(forth.x, forth.y, seen[place])
+    near = np.hypot(back.x - asked.u, back.y - asked.v) < settings.reprojection_max
+    near &= np.abs(back.z - depth) < settings.relative_depth_max * depth
+    angle = np.rad2deg(angle_of_rays(asked.points, pair))
+    confirmed = np.flatnonzero(near & (angle > settings.min_angle) & (angle < settings.max_angle))
+    asked, depth = asked.only(confirmed), depth[confirmed]
+    nudged = pair.project(asked.u, asked.v, depth * np.exp(NUDGE))
+    parallax = np.hypot(nudged.x - forth.x[confirmed], nudged.y - forth.y[confirmed]) / NUDGE
+    return place[confirmed], np.where(np.isfinite(parallax), parallax**2, 0), back.z[confirmed] / depth - 1
 
 
 def sample_nearest(depth: np.ndarray, at: Projection) -> np.ndarray:
