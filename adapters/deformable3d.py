@@ -53,6 +53,11 @@ class Deformable3DAdapter(InriaAdapter):
         self.is_6dof = bool(getattr(deform.deform, "is_6dof", False)) if is_6dof is None else is_6dof
         self.inversion: Inversion | None = None
 
+    def trained(self) -> dict[str, Tensor]:
+        """See `InriaAdapter.trained`; the network has an optimizer of its own."""
+        network = {f"deform.{name}": value for name, value in self.deform.deform.named_parameters()}
+        return super().trained() | network
+
     @property
     def deforms(self) -> bool:
         """Whether the field is used in the present step, the one given to `begin_step`."""

@@ -106,6 +106,10 @@ class GsplatAdapter:
         centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
         return harmonic_colors(coefficients[splats.rows], splats.means - centre, None, degree, 0)
 
+    def trained(self) -> dict[str, Tensor]:
+        """The tensors that are trained, by name."""
+        return dict(self.parameters)
+
     @torch.no_grad()
     def insert(self, points: Points) -> int:
         """Isotropic Gaussians at the finite ones of the points, at the end; returns their number.

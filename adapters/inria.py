@@ -124,6 +124,16 @@ class InriaAdapter(ABC):
         centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
         return harmonic_colors(coefficients, splats.means - centre, phase, degree, time_degree)
 
+    def trained(self) -> dict[str, Tensor]:
+        """The tensors that the trainer's optimizer changes, by the names of its groups."""
+        groups = getattr(getattr(self.gaussians, "optimizer", None), "param_groups", [])
+        named = [(group.get("name", "parameter"), group["params"]) for group in groups]
+        return {
+            name if len(values) == 1 else f"{name}.{i}": value
+            for name, values in named
+            for i, value in enumerate(values)
+        }
+
     @torch.no_grad()
     def insert(self, points: Points) -> int:
         """Isotropic Gaussians at the points, by the repository's own function; returns how many were added.

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.backbones.model import Observer, SplatModel
+from d2_plugin.gaussians.trained import trained_tensors
 from d2_plugin.protocol import RasterSettings, Render, ResizeListener, Splats, View
 
 from .renders import Renders
@@ -46,6 +47,10 @@ class WatchedModel(Observer, Generic[Model]):
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] of the sliced Gaussians as seen in `view`."""
         return self.model.colors(view, splats)
+
+    def trained(self) -> dict[str, Tensor]:
+        """The tensors that are trained, by name."""
+        return dict(trained_tensors(self.model))
 
     def behind(self, render: Render, view: View) -> Render:
         """The render with the model's background, if it has one."""

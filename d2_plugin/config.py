@@ -51,6 +51,9 @@ class D2Config(_HookTables):
     remove_at_most: Annotated[float, Range(0, 1, open_low=True)] = 0.9
     """Largest share of the Gaussians that all hooks together remove in one step; what is more waits for the next
     evaluation, where it must be asked for again. 1 sets no limit, as the paper."""
+    finite_every: Count = 100
+    """Steps from one look to the next at whether all parameters are finite numbers; before hooks edit Gaussians and
+    before their state is saved it is looked as well. Training stops where one is not; 0 never looks."""
     seed: Seed = 0
     """Seed of D2's own random generator."""
 

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from d2_plugin.errors import D2Error
+from d2_plugin.reading import json_text
 
 LEFTOVER = ".part"
 """How the temporary names end; what a killed process left behind is found by it."""
@@ -154,11 +155,11 @@ def is_leftover(path: Path) -> bool:
 def write_table(path: Path, values: Mapping[str, Any], kind: Kind) -> None:
     """Write a JSON object with the version of its format and its checksum.
 
-    NaN and infinity are refused (`ValueError`), since JSON has neither.
+    NaN and infinity are refused by the name that leads to them, since JSON has neither.
     """
     sealed = {**values, "format": kind.format}
     sealed["seal"] = _seal(sealed)
-    write_text(path, SEALED + json.dumps(sealed, indent=1, allow_nan=False, sort_keys=True))
+    write_text(path, SEALED + json_text(sealed, str(path), indent=1, sort_keys=True))
 
 
 def read_table(path: Path, kind: Kind) -> dict[str, Any]:

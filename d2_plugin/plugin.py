@@ -22,6 +22,7 @@ from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, PriorLoader
 from d2_plugin.hooks.expected import check_backbone, check_state, converted
+from d2_plugin.hooks.finite import FiniteCheck
 from d2_plugin.hooks.prior import Store
 from d2_plugin.hooks.table import HOOKS
 from d2_plugin.hooks.views import ViewSampler
@@ -75,6 +76,7 @@ class D2Hooks:
         self.trace: deque[Trace] = deque(maxlen=1000)
         self.generator = torch.Generator().manual_seed(config.seed)
         self._sampler = ViewSampler()
+        self._finite = FiniteCheck(backbone, config.finite_every)
         self._evaluated = False
         self._count = len(backbone)
         self._warned = False
@@ -142,6 +144,7 @@ class D2Hooks:
             if term is not None:
                 self.trace.append(Trace(step, name, "loss", 0))
                 total = total + term
+        self._finite.heard(total, shown)
         return total
 
     @torch.no_grad()
@@ -150,18 +153,21 @@ class D2Hooks:
         if not self.hooks:
             return Report(gaussians=len(self.backbone))
         self._begin(step)
+        due = self._due(step)
+        self._finite.look(step, any(name in HOOKS and HOOKS[name].edits_structure for name, _ in due))
         context = self._context(step, ())
-        proposals = [(name, hook.edit(context)) for name, hook in self._due(step)]
+        proposals = [(name, hook.edit(context)) for name, hook in due]
         edits = [(name, edit) for name, edit in proposals if edit is not None]
         for name, edit in proposals:
             self._retire_if_idle(step, name, edit, context)
-        removed = self._remove(step, edits)
-        inserted = self._insert(step, edits)
+        removed, inserted = self._remove(step, edits), self._insert(step, edits)
         return Report(inserted, removed, len(self.backbone))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything an exact continuation needs; save it beside the trainer's checkpoint."""
+        self._finite.before_saving()
         return {
+            "step": self._finite.step,
             "hooks": {name: hook.state_dict() for name, hook in self.hooks.items()},
             "views": self._sampler.state_dict(),
             "evaluated": self._evaluated,
@@ -181,6 +187,7 @@ class D2Hooks:
         self._evaluated = bool(state.get("evaluated", True))
         self._idle, self.retired = dict(state["idle"]), dict(state["retired"])
         self._count = len(self.backbone)
+        self._finite.step = self._finite.saved = state.get("step", 0)
         # A checkpoint from before 2026-11 does not say; nothing that trains depends on it.
         self.inserted_at = state.get("inserted_at", torch.zeros(self._count, dtype=torch.int32)).cpu()
 

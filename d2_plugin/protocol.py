@@ -223,6 +223,8 @@ class Backbone(Protocol):
         False while the hooks must wait (stages, warm-up); a question, which changes nothing.
     ``colors(view, splats) -> Tensor``
         RGB [M, 3], 0 or more, of what `slice_at(view)` returned: the live viewer shows them, and grey without.
+    ``trained() -> Mapping[str, Tensor]``
+        the tensors that are trained, by name: training stops where one is not finite, and names it.
     ``behind(render, view) -> Render``
         the render with the backbone's own background where the Gaussians leave some of a ray.
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import re
 from pathlib import Path
 from typing import ClassVar
 
@@ -107,6 +108,18 @@ def test_every_document_that_is_named_is_there() -> None:
     places = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "setup.cfg", "docs", *PACKAGES.values(), "tests", ".ci"]
     patterns = ["*.md", "*.py", "*.h", "*.cpp", "*.cu", "setup.cfg", "run"]
     nothing_in(missing_documents(ROOT, text_files(ROOT, places, patterns)))
+
+
+def test_all_json_is_written_by_one_function() -> None:
+    """`json_text` refuses NaN and Infinity by name, which `json.dumps` writes into files that nothing else reads."""
+    plain = {"reading.py", "durable.py", "config.py", "settings.py", "frame.py"}  # hashes, copies and TOML: no files
+    writers = [
+        path.relative_to(ROOT)
+        for folder in PACKAGES.values()
+        for path in (ROOT / folder).rglob("*.py")
+        if path.name not in plain and re.search(r"\bjson\.dumps?\(", path.read_text(encoding="utf-8"))
+    ]
+    nothing_in([f"{path} writes JSON by itself: use d2_plugin.reading.json_text" for path in writers])
 
 
 class TestTheReaderFinds:

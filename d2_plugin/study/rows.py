@@ -7,7 +7,6 @@ stands beside these under names of its own; `d2 report` makes tables and plots o
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ import torch
 
 from d2_plugin.durable import append
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.reading import field, parse_json, read_text
+from d2_plugin.reading import field, json_text, parse_json, read_text
 from d2_plugin.runs.provenance import circumstances
 
 Row = dict[str, Any]
@@ -89,7 +88,7 @@ def append_rows(path: Path, rows: Iterable[Row]) -> None:
 
 def as_line(row: Row) -> str:
     """A row as one line of JSON."""
-    return json.dumps(_plain(row), allow_nan=False) + "\n"
+    return json_text(_plain(row), "the row") + "\n"
 
 
 def read_rows(paths: Sequence[Path]) -> list[Row]:

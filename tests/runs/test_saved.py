@@ -20,11 +20,12 @@ from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.durable import write_table
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.trained import trained_tensors
 from d2_plugin.locks import only_writer
 from d2_plugin.runs import run as run_module
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved.checkpoint import load_checkpoint, save_checkpoint
-from d2_plugin.runs.saved.finite import Diverged, all_finite, parameters_of, watched, what_diverged
+from d2_plugin.runs.saved.finite import Diverged, all_finite, watched, what_diverged
 from d2_plugin.runs.saved.kinds import METRICS, read_metrics
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TimedPoints
@@ -168,12 +169,12 @@ class TestARunThatDiverges:
     def test_every_parameter_is_watched(self) -> None:
         for backbone in ("yang4d", "mlp", "hexplane"):
             model = make_model(backbone=backbone, background=True)
-            names = [name for name, _ in parameters_of(model)]
+            names = [name for name, _ in trained_tensors(model)]
             expected = sum(p.numel() for group in model.gaussians.optimizer.param_groups for p in group["params"])
             assert {"positions", "background.constant", "background.harmonics"} <= set(names)
-            assert sum(value.numel() for _, value in parameters_of(model)) > expected
+            assert sum(value.numel() for _, value in trained_tensors(model)) > expected
             assert any(name.startswith("field") for name in names) is (backbone != "yang4d")
-            for name, value in parameters_of(model):
+            for name, value in trained_tensors(model):
                 kept = value.detach().flatten()[0].clone()
                 value.data.view(-1)[0] = math.nan
                 assert not all_finite(model)
@@ -197,6 +198,7 @@ class TestARunThatDiverges:
 
         trainer.run(2)
         kept = r"checkpoint.pt, step 2; lower"
+
         def trained() -> None:
             with watched(trainer, tmp_path / "checkpoint.pt") as watch:
                 inner = watch(lambda step, loss: None)

@@ -21,6 +21,7 @@ from d2_plugin.viewing.live.cloud import cloud_of
 from d2_plugin.viewing.live.pace import Resolution, Share
 from d2_plugin.viewing.live.page import Page, Wanted
 from d2_plugin.viewing.live.show import ViewSettings, said_of, subject_at
+from d2_plugin.viewing.live.viewer import MOVED, WATCHED
 from d2_plugin.viewing.paths import pose_of
 from d2_plugin.viewing.stand_in import subject_of_store
 from d2_plugin.viewing.subject import Subject
@@ -93,26 +94,74 @@ def test_one_line_shows_any_trainer_and_training_stays_bitwise_the_same(config: 
     assert step.__func__ is type(watched.d2).step, "closed, it lets go of the trainer"
 
 
-def test_who_only_looks_takes_no_more_than_the_share_of_the_time(port: int) -> None:
-    trainer = make_trainer(ALL_HOOKS, iterations=60)
-    viewer, client, spent = Viewer(trainer.d2, port=port, height=48), looker(), []
-    after_step = viewer.after_step
+class Clock:
+    """Seconds that pass only where a test says so."""
 
-    def timed(step: int, loss: float | None = None) -> None:
-        begun = time.perf_counter()
-        after_step(step, loss)
-        spent.append(time.perf_counter() - begun)
+    def __init__(self) -> None:
+        self.now = 0.0
 
-    viewer.after_step = timed
-    try:
-        viewer._connected(client)
-        begun = time.perf_counter()
-        trainer.run()
-        total = time.perf_counter() - begun
-        # The first pictures are drawn at once and then paid off; most steps cost no more than a look at the clock.
-        assert np.median(spent) < 0.05 * total / len(spent)
-    finally:
-        viewer.close()
+    def monotonic(self) -> float:
+        return self.now
+
+
+class TestWhoOnlyLooks:
+    """Pictures take a twentieth of the time of a training that somebody only looks at."""
+
+    STEPS, SECONDS_OF_A_STEP = 4000, 0.01
+
+    def spent_on_pictures(self, subject: Subject, patch: pytest.MonkeyPatch, seconds: float, moves: bool) -> float:
+        """Share of the whole time that pictures of `seconds` each take."""
+        clock, drawn = Clock(), []
+        patch.setattr("d2_plugin.viewing.live.viewer.time", clock)
+        viewer, client = Viewer(subject=subject, port=18190, height=48, iterations=self.STEPS), looker()
+
+        def draw(*_: object) -> None:
+            clock.now += seconds
+            drawn.append(seconds)
+
+        patch.setattr(viewer._drawer, "draw", draw)
+        try:
+            viewer._connected(client)
+            for step in range(self.STEPS):
+                clock.now += self.SECONDS_OF_A_STEP
+                client.camera.position = np.full(3, step * moves)
+                viewer.after_step(step)
+        finally:
+            viewer.close()
+        assert len(drawn) > 1
+        return sum(drawn) / clock.now
+
+    @pytest.mark.parametrize("seconds", [0.001, 0.02, 0.2])
+    def test_pictures_keep_to_their_share(
+        self, subject: Subject, monkeypatch: pytest.MonkeyPatch, seconds: float
+    ) -> None:
+        share = self.spent_on_pictures(subject, monkeypatch, seconds, moves=False)
+        assert 0.5 * WATCHED < share < 1.1 * WATCHED + seconds / (self.STEPS * self.SECONDS_OF_A_STEP)
+
+    def test_who_moves_gets_more(self, subject: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
+        share = self.spent_on_pictures(subject, monkeypatch, 0.02, moves=True)
+        assert 2 * WATCHED < share < 1.1 * MOVED
+
+    @pytest.mark.slow
+    def test_training_keeps_85_percent_of_its_speed_on_the_clock(self, port: int) -> None:
+        trainer, spent = make_trainer(ALL_HOOKS, iterations=400), []
+        viewer = Viewer(trainer.d2, port=port, height=360)
+        after_step = viewer.after_step
+
+        def timed(step: int, loss: float | None = None) -> None:
+            begun = time.perf_counter()
+            after_step(step, loss)
+            spent.append(time.perf_counter() - begun)
+
+        viewer.after_step = timed
+        try:
+            viewer._connected(looker())
+            begun = time.perf_counter()
+            trainer.run()
+            total = time.perf_counter() - begun
+        finally:
+            viewer.close()
+        assert sum(spent) < 0.15 * total, f"a client that looks took {sum(spent) / total:.1%} of {total:.1f} s"
 
 
 def test_d2_knows_which_gaussians_it_inserted_across_all_edits_and_a_resume() -> None:

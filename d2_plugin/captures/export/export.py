@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from d2_plugin.captures.export.n3dv import write_n3dv
 from d2_plugin.captures.export.ply import PointCloud
 from d2_plugin.captures.export.transforms_json import write_transforms
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import json_text
 
 EXPORT_FILE = "export.json"
 """Written last: a folder without it is half an export."""
@@ -64,7 +64,7 @@ def export_capture(
         refuse_skew(camera)
     with whole_folder(path) as folder:
         written = WRITERS[layout](Export(capture, held_out, cloud, folder))
-        described = json.dumps(_description(capture, layout, written, held_out), indent=1)
+        described = json_text(_description(capture, layout, written, held_out), EXPORT_FILE, indent=1)
         (folder / EXPORT_FILE).write_text(described + "\n")
     return Path(path)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.export.base import refuse_skew, whole_folder
 from d2_plugin.captures.pictures import write_png
+from d2_plugin.reading import json_text
 
 
 def save_capture(capture: Capture, path: Path | str) -> Path:
@@ -18,14 +18,14 @@ def save_capture(capture: Capture, path: Path | str) -> Path:
 
     Pictures are lossless PNG; maps are float32. Raises `D2Error` where `path` already holds something.
     """
-    description = json.dumps(_description(capture), indent=1)
+    description = json_text(_description(capture), "cameras.json", indent=1)
     with whole_folder(path) as folder:
         for camera in capture.cameras:
             for frame in capture.frames:
                 _save_frame(capture, folder, camera, frame)
         if capture.mono_kind is not None:
             declared = {"kind": capture.mono_kind, "emulated": capture.mono_emulated}
-            (folder / "mono" / "mono.json").write_text(json.dumps(declared) + "\n")
+            (folder / "mono" / "mono.json").write_text(json_text(declared, "mono.json") + "\n")
         (folder / "cameras.json").write_text(description + "\n")  # last: a folder without it is no capture
     return Path(path)
 

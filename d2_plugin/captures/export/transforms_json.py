@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Any
 
@@ -12,6 +11,7 @@ from d2_plugin.captures.calibration import OPENGL_TO_OPENCV
 from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.export.base import Export, Written
 from d2_plugin.captures.export.ply import write_point_cloud
+from d2_plugin.reading import json_text
 
 
 def write_transforms(export: Export) -> Written:
@@ -23,7 +23,8 @@ def write_transforms(export: Export) -> Written:
     for split, cameras in (("train", export.train_cameras), ("test", export.test_cameras)):
         content = _transforms(export, cameras or export.train_cameras[:1])
         content["frames"] = content["frames"] if cameras else []
-        (export.folder / f"transforms_{split}.json").write_text(json.dumps(content, indent=1) + "\n")
+        path = export.folder / f"transforms_{split}.json"
+        path.write_text(json_text(content, path.name, indent=1) + "\n")
     if export.cloud is not None:
         write_point_cloud(export.folder / "points3d.ply", export.cloud)
     return export.written()

@@ -10,7 +10,6 @@ all matchers share does the rest.
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 import signal
@@ -33,6 +32,7 @@ from d2_plugin.priors.geometry import check_depth_range, check_views, index_intr
 from d2_plugin.priors.stereo.pyramid import NO_MATCH
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.priors.stereo.source_views import choose_sources
+from d2_plugin.reading import json_text
 
 CHILD = Path(__file__).with_name("mvs_process.py")
 CACHE_GIGABYTES = 8.0
@@ -175,7 +175,7 @@ def write_workspace(
     listed = {_picture(index): ", ".join(map(_picture, others)) for index, others in enumerate(sources) if others}
     problems = "".join(f"{reference}\n{names}\n" for reference, names in listed.items())
     (folder / "stereo" / "patch-match.cfg").write_text(problems)
-    (folder / OPTIONS).write_text(json.dumps(options, indent=1))
+    (folder / OPTIONS).write_text(json_text(options, OPTIONS, indent=1))
 
 
 def write_model(folder: Path, cameras: Sequence[Camera]) -> None:

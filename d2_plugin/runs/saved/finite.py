@@ -10,7 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.trained import trained_tensors
+from d2_plugin.hooks import finite
+from d2_plugin.hooks.finite import Diverged
+
+__all__ = ["Diverged", "OnStep", "Watch", "all_finite", "watched", "what_diverged"]
 
 OnStep = Callable[[int, float], None]
 """Called with the number of a training step and its loss."""
@@ -18,43 +22,14 @@ Watch = Callable[[Any], OnStep]
 """From a trainer to what is called after each of its steps."""
 
 
-class Diverged(D2Error):
-    """The loss or a parameter is no finite number."""
-
-
-def parameters_of(model: Any) -> Iterator[tuple[str, Tensor]]:
-    """The named tensors that a model trains: of its Gaussians and of each network or background that it holds."""
-    for owner, part in vars(model).items():
-        found = getattr(part, "parameters", None)
-        if isinstance(found, dict):
-            yield from found.items()
-        elif isinstance(part, torch.nn.Module):
-            yield from ((f"{owner}.{name}", value) for name, value in part.named_parameters())
-        elif hasattr(part, "__dict__"):
-            own = vars(part).items()
-            yield from ((f"{owner}.{name}", value) for name, value in own if isinstance(value, torch.nn.Parameter))
-
-
-@torch.no_grad()
 def all_finite(model: Any, loss: Tensor | None = None) -> bool:
-    """Whether no parameter is NaN or infinite, nor the loss; asks the device once.
-
-    A sum is finite only where all its terms are, and reads the tensor once.
-    """
-    values = [value.sum() for _, value in parameters_of(model)] + ([] if loss is None else [loss])
-    if not values or bool(torch.stack([value.double().reshape(()) for value in values]).isfinite().all()):
-        return True
-    return not what_diverged(model, loss)  # the sum of finite numbers may overflow
+    """Whether no parameter of the model is NaN or infinite, nor the loss."""
+    return finite.all_finite(dict(trained_tensors(model)), loss)
 
 
-@torch.no_grad()
 def what_diverged(model: Any, loss: Tensor | None = None) -> str:
-    """Which parameter is not finite, and how much of it; else that the loss is not; nothing where all are."""
-    for name, value in parameters_of(model):
-        bad = 1 - value.isfinite().double().mean().item() if value.numel() else 0.0
-        if bad > 0:
-            return f"{bad:.2%} of {name} is NaN or infinite"
-    return "" if loss is None or bool(loss.isfinite()) else f"the loss is {float(loss):g}"
+    """Which parameter of the model is not finite, else that the loss is not; nothing where all are."""
+    return finite.what_diverged(dict(trained_tensors(model)), loss)
 
 
 @contextmanager
@@ -89,8 +64,6 @@ def watched(trainer: Any, checkpoint: Path) -> Iterator[Callable[[OnStep], OnSte
 
     try:
         yield watch
-    except Diverged:
-        raise
     except (RuntimeError, ValueError, ArithmeticError, IndexError):
         error = diverged(trainer.step)
         if error is not None:

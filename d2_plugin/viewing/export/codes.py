@@ -10,12 +10,13 @@ bytes: bytes of one kind beside each other are what a general compressor makes s
 from __future__ import annotations
 
 import gzip
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from d2_plugin.reading import json_text
 
 BLOCK = 256
 COMPRESSION = 6
@@ -101,5 +102,5 @@ def morton_order(positions: np.ndarray) -> np.ndarray:
 
 def to_json(table: Any) -> str:
     """JSON that may stand inside an HTML <script>: no '<', so no name in it can close the element or open one."""
-    text = json.dumps(table, separators=(",", ":"), allow_nan=False)
+    text = json_text(table, "the page", separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

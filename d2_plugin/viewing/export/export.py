@@ -74,7 +74,7 @@ def export_scene(scene: ExportScene, settings: Export, folder: Path) -> Made:
     if scene.background is None or settings.format == "html":
         return made
     return made._replace(
-        notes=(*made.notes, "the sky behind the Gaussians is not in it: the format has no place for it")
+        notes=(*made.notes, "the background behind the Gaussians is left out: the format has no place for it, html has")
     )
 
 

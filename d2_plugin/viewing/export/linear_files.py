@@ -8,7 +8,6 @@ all else in 16-bit floats, one colour for every direction. `.ftgs.ply`: 3DGS col
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +20,7 @@ from d2_plugin.captures import Camera
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, LinearMotion, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
+from d2_plugin.reading import json_text
 from d2_plugin.runs.gaussian_ply import scales_and_rotations, write_ply
 
 from .ply_files import covariances_from, read_columns, still_gaussians
@@ -68,7 +68,8 @@ def write_splatv(
     height = max(-(-texels // SPLATV_WIDTH), 1)
     data = _words(rows).tobytes().ljust(16 * SPLATV_WIDTH * height, b"\0")
     chunk = {"type": "splat", "size": len(data), "texwidth": SPLATV_WIDTH, "texheight": height}
-    text = json.dumps([chunk | {"cameras": [_splatv_camera(i, camera) for i, camera in enumerate(cameras)]}]).encode()
+    described = [chunk | {"cameras": [_splatv_camera(i, camera) for i, camera in enumerate(cameras)]}]
+    text = json_text(described, path.name).encode()
     path.write_bytes(np.array([SPLATV_MAGIC, len(text)], "<u4").tobytes() + text + data)
 
 

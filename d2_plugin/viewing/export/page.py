@@ -127,6 +127,8 @@ def _about(scene: ExportScene, coded: CodedScene, keys: Keys | None, rounding: O
         )
     elif coded.facts["motion"] == "lines":
         lines.append("every Gaussian moves on a straight line and fades in time, exactly as it was trained")
+    if scene.background is not None:
+        lines.append("behind the Gaussians the learnt background, in every direction; its colours are not rounded")
     return [*lines, f"made by d2-4dgs {d2_plugin.__version__}; no network is used"]
 
 

@@ -119,7 +119,7 @@ def scene_of_model(model: Any, run: Run) -> ExportScene:
     slice_at = slicer(model, view)
     harmonics = _harmonics(model, view, slice_at)
     return ExportScene(
-        capture.name, clip, tuple(train), tuple(test), raster, harmonics, slice_at, moving, _background(model)
+        capture.name, clip, tuple(train), tuple(test), raster, harmonics, slice_at, moving, background_of(model)
     )
 
 
@@ -147,7 +147,8 @@ def _harmonics(model: Any, view: View, splats_at: Callable[[float], Splats]) -> 
     return Harmonics(coefficients_from_rgb(colors, 0, 0).double(), 0)
 
 
-def _background(model: Any) -> Tensor | None:
+def background_of(model: Any) -> Tensor | None:
+    """Spherical harmonics [16, 3] of what lies behind all Gaussians of the model; None where it has none."""
     background = getattr(model, "background", None)
     if background is None:
         return None

@@ -9,7 +9,7 @@ from tiny import make_model, make_views
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.captures import Camera
 from d2_plugin.protocol import View
-from d2_plugin.viewing.export.scene import Clip, ExportScene, slicer
+from d2_plugin.viewing.export.scene import Clip, ExportScene, background_of, slicer
 
 NASTY = '</script><script>alert(1)</script> & "tiny"'
 WIDTH, HEIGHT = 160, 120
@@ -18,7 +18,8 @@ DURATION = 0.5
 
 
 def sharp_model(backbone: str, count: int = 400, **options: object) -> SplatModel:
-    """Gaussians of a few pixels, of all shapes and colours, that move; `backbone` is one of `tiny.BACKBONES`."""
+    """Gaussians of a few pixels, of all shapes and colours, that move, before a background that differs by direction;
+    `backbone` is one of `tiny.BACKBONES`."""
     generator = torch.Generator().manual_seed(1)
     model = make_model(count, backbone=backbone, **options)
     with torch.no_grad():
@@ -32,6 +33,9 @@ def sharp_model(backbone: str, count: int = 400, **options: object) -> SplatMode
         if "right" in rows:
             rows["right"].copy_(rows["left"] + 0.05 * torch.randn(count, 4, generator=generator))
             rows["log_time_scales"] += 0.5 * torch.randn(count, generator=generator)
+        if model.background is not None:
+            model.background.constant.normal_(0, 0.2, generator=generator)
+            model.background.harmonics.normal_(0, 0.2, generator=generator)
         if backbone == "hexplane":
             model.deforms = True
             for plane in model.field.time:
@@ -69,14 +73,20 @@ def make_scene(
         harmonics._replace(coefficients=harmonics.coefficients.detach().double()),
         slicer(model, views[0]),
         model.moving(),
+        background_of(model),
     )
 
 
-def rasterized(model: SplatModel, camera: int, time: float) -> dict[str, np.ndarray]:
-    """What our rasterizer draws: color [H, W, 3] in 0..1, expected depth and alpha [H, W]."""
+def rasterized(
+    model: SplatModel, camera: int, time: float, turned: torch.Tensor | None = None
+) -> dict[str, np.ndarray]:
+    """What our rasterizer draws: color [H, W, 3] in 0..1, expected depth and alpha [H, W].
+
+    `turned` [4, 4] takes the camera's axes to those of another camera at its place."""
     view = larger(make_views()[camera])
+    T_camera_world = view.T_camera_world if turned is None else turned @ view.T_camera_world
     with torch.no_grad():
-        render = model.render(View(view.camera, 0, time, view.T_camera_world, view.K, WIDTH, HEIGHT))
+        render = model.render(View(view.camera, 0, time, T_camera_world, view.K, WIDTH, HEIGHT))
     depth = render.depth_sum / render.alpha.clamp(min=1e-4)
     return {
         "color": render.color.clamp(0, 1).numpy(),

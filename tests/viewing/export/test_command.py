@@ -52,13 +52,18 @@ def test_a_run_becomes_a_page_of_a_stated_size(
     header = read_page(path).header
     assert header["frames"] == [0, 1, 2]
     assert [camera["held_out"] for camera in header["cameras"]] == [False, False, False, True]
+    assert "the learnt background, in every direction" in said
+    background = Run.load(trained / backbone).trained().model.background
+    assert header["background"] == torch.cat([background.constant, background.harmonics]).tolist()
 
 
 def test_frames_are_chosen_by_number(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(trained / "yang4d"), "--format", "spz", "--frames", "0:2:2"]) == 0
     folder = trained / "yang4d" / "export" / "spz"
     assert sorted(path.name for path in folder.iterdir()) == ["frame_00000.spz", "frame_00002.spz"]
-    assert f"2 files in {folder}" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"2 files in {folder}" in said
+    assert "the background behind the Gaussians is left out" in said
 
 
 class TestOneSentence:

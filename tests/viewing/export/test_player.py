@@ -74,6 +74,26 @@ def test_the_page_shows_what_the_rasterizer_draws(new_page: Any, tmp_path: Path,
     assert page.requests == []
 
 
+def test_without_its_background_the_page_would_not_pass(new_page: Any, tmp_path: Path) -> None:
+    model = sharp_model("yang4d")
+    page = opened(new_page, model, tmp_path / "scene.html")
+    model.background = None
+    assert psnr(shown(page, 2, TIMES[1]), rasterized(model, 2, TIMES[1])["color"]) < 28
+
+
+def test_a_camera_that_looks_away_from_all_gaussians_shows_the_background(new_page: Any, tmp_path: Path) -> None:
+    model = sharp_model("yang4d")
+    scene = make_scene(model, "tiny", CAMERAS)
+    around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))  # half a turn about the vertical
+    cameras = [replace(camera, T_camera_world=around.numpy() @ camera.T_camera_world) for camera in scene.test_cameras]
+    write_page(replace(scene, test_cameras=tuple(cameras)), tmp_path / "scene.html")
+    page = new_page().open(tmp_path / "scene.html")
+    true = rasterized(model, 2, TIMES[1], around)
+    assert true["opacity"].max() == 0
+    assert true["color"].std() > 0.02
+    assert psnr(shown(page, 2, TIMES[1]), true["color"]) > 45
+
+
 def test_pictures_of_other_times_and_cameras_would_not_pass(new_page: Any, tmp_path: Path) -> None:
     model = sharp_model("yang4d")
     page = opened(new_page, model, tmp_path / "scene.html")
@@ -91,10 +111,7 @@ def test_harmonics_and_cosines_in_time_and_a_sky_are_drawn(new_page: Any, tmp_pa
     assert model.background is not None
     with torch.no_grad():
         model.background.harmonics.normal_(0, 0.2, generator=generator)
-    scene_background = torch.cat([model.background.constant, model.background.harmonics]).detach().double()
-    path = tmp_path / "scene.html"
-    write_page(replace(make_scene(model, "sky", CAMERAS), background=scene_background), path)
-    page = new_page().open(path)
+    page = opened(new_page, model, tmp_path / "scene.html")
     for time in TIMES:
         assert psnr(shown(page, 2, time), rasterized(model, 2, time)["color"]) > 30
 

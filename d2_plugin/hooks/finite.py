@@ -1,0 +1,99 @@
+"""Training stops where a model or a loss is no number any more, in any trainer, at the cost of a look now and then."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from d2_plugin.errors import D2Error
+from d2_plugin.protocol import Backbone, View
+
+
+class Diverged(D2Error):
+    """The loss or a parameter is no finite number."""
+
+
+@torch.no_grad()
+def all_finite(parameters: Mapping[str, Tensor], loss: Tensor | None = None) -> bool:
+    """Whether no parameter is NaN or infinite, nor the loss; asks the device once.
+
+    A sum is finite only where all its terms are, and reads the tensor once.
+    """
+    values = [value.sum() for value in parameters.values()] + ([] if loss is None else [loss])
+    sums = [value.double().reshape(()).to(values[0].device) for value in values]
+    if not sums or bool(torch.stack(sums).isfinite().all()):
+        return True
+    return not what_diverged(parameters, loss)  # the sum of finite numbers may overflow
+
+
+@torch.no_grad()
+def what_diverged(parameters: Mapping[str, Tensor], loss: Tensor | None = None) -> str:
+    """Which parameter is not finite, and how much of it; else that the loss is not; nothing where all are."""
+    for name, value in parameters.items():
+        bad = 1 - value.isfinite().double().mean().item() if value.numel() else 0.0
+        if bad > 0:
+            return f"{bad:.2%} of {name} is NaN or infinite"
+    return "" if loss is None or bool(loss.isfinite()) else f"the loss is {float(loss):g}"
+
+
+class FiniteCheck:
+    """Looks at a backbone every so many steps, before hooks edit it, and before its state is saved.
+
+    A trainer's loss that is NaN makes parameters NaN in the same step, so these tell of it as well.
+    """
+
+    def __init__(self, backbone: Backbone, every: int) -> None:
+        """`every`: steps from look to look; 0 never looks."""
+        self.backbone, self.every = backbone, every
+        self.step, self.saved = 0, 0
+        """The last step, and the one at which the state was saved last; 0 for none."""
+        self._loss: Tensor | None = None
+        self._view: View | None = None
+
+    def heard(self, loss: Tensor | float, views: Sequence[View]) -> None:
+        """D2's share of the loss in this step, and what was trained on."""
+        self._loss = loss.detach() if isinstance(loss, Tensor) else None
+        self._view = views[-1] if views else self._view
+
+    def look(self, step: int, now: bool) -> None:
+        """Look where it is time to, or `now`.
+
+        Raises:
+            Diverged: with the step, the parameter, and the last step whose state was saved.
+        """
+        self.step = step
+        if not self.every or not (now or step % self.every == 0):
+            return
+        parameters = self._parameters()
+        if all_finite(parameters, self._loss):
+            return
+        wrong = what_diverged(parameters, self._loss)
+        if wrong.startswith("the loss"):
+            wrong = wrong.replace("the loss", "D2's loss")
+        elif self._loss is not None and not bool(self._loss.isfinite()):
+            wrong += ", and so is D2's loss"
+        kept = f"the last state that was saved is of step {self.saved}" if self.saved else "no state was saved yet"
+        raise Diverged(
+            f"training diverged at step {step} or less than {self.every} steps before it ({wrong}): {kept}; lower the "
+            "weight or the learning rate that was raised last"
+        )
+
+    def before_saving(self) -> None:
+        """A state that cannot be gone on from is not saved; one that can is the last good one."""
+        if self.step:
+            self.look(self.step, now=True)
+        self.saved = self.step
+
+    def _parameters(self) -> Mapping[str, Tensor]:
+        """The backbone's own, by its names; of one that does not tell them, what it shows in the last view."""
+        tell = getattr(self.backbone, "trained", None)
+        if tell is not None:
+            named: Mapping[str, Tensor] = tell()
+            return named
+        if self._view is None:
+            return {}
+        with torch.no_grad():
+            splats = self.backbone.slice_at(self._view)
+        return {"means": splats.means, "covariances": splats.covariances, "opacities": splats.opacities}
