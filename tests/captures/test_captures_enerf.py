@@ -157,11 +157,11 @@ def test_declared_depth_bounds_are_read(tmp_path: Path) -> None:
     assert cameras["00"].near_far is None
 
 
-def test_masks_and_backgrounds_are_named_and_not_used(tmp_path: Path) -> None:
+def test_hulls_and_backgrounds_are_named_and_not_used(tmp_path: Path) -> None:
     path = scene(tmp_path)
-    (path / "bgmtv2").mkdir()
+    (path / "vhull").mkdir()
     (path / "background.ply").touch()
-    assert "not used: bgmtv2, background.ply" in open_capture(path).notes
+    assert "not used: vhull, background.ply" in open_capture(path).notes
 
 
 def test_a_camera_asked_for_must_have_everything(tmp_path: Path) -> None:
