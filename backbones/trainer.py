@@ -54,6 +54,7 @@ class Frames(Protocol):
     """The training pictures: views, and the picture [H, W, 3] in 0..1 of each.
 
     Where there is also `picture(index)`, the same as it is kept (uint8, 0..255), the loss is computed from that.
+    It may have `weights(index) -> [H, W] | None` as well: how much each pixel counts, 0..1.
     """
 
     views: Sequence[View]
@@ -108,7 +109,7 @@ class Trainer:
             view = self.frames.views[index]
             render = model.render(view)
             target = self.early_stop.target(index, self._picture(index), render.color)
-            loss = photometric_loss(render.color, target, self.settings.ssim_weight)
+            loss = photometric_loss(render.color, target, self.settings.ssim_weight, self._weights(index))
             logged = loss.item()
             regularization = model.regularization()
             if not isinstance(regularization, float):
@@ -145,6 +146,10 @@ class Trainer:
         self.early_stop.load_state_dict(state.get("early_stop", {"rounds": [], "errors": []}))  # absent until 0.1.0
         if self.d2 is not None:
             self.d2.load_state_dict(state["d2"])
+
+    def _weights(self, index: int) -> Tensor | None:
+        weights: Callable[[int], Tensor | None] | None = getattr(self.frames, "weights", None)
+        return None if weights is None else weights(index)
 
     def _next_view(self) -> int:
         """Every view once, in a new random order each time round."""
