@@ -19,7 +19,7 @@ import numpy as np
 from d2_plugin.arrays import read_array
 from d2_plugin.captures.capture import Camera, Capture, MonoKind, Source
 from d2_plugin.captures.files import FrameFiles, numbered_files
-from d2_plugin.captures.lens import Lens, UndistortedSource, black_share
+from d2_plugin.captures.lens import LARGEST_COEFFICIENT, Lens, UndistortedSource, black_share
 from d2_plugin.captures.pictures import read_picture
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import read_bytes, read_json
@@ -29,9 +29,6 @@ log = logging.getLogger(__name__)
 
 BLACK_NOTED = 1e-3
 """Black share of an undistorted picture above which a note reports it."""
-
-LARGEST_COEFFICIENT = 1e4
-"""Distortion coefficients beyond this are a damaged file: those of real lenses are below 100."""
 
 CORRECT = "correct the file, see docs/captures.md"
 REPLACE = "replace the file or remove it"
@@ -115,7 +112,7 @@ def _lens_notes(bent: Mapping[str, Lens], cameras: Mapping[str, Camera]) -> tupl
 
 
 def _check_lens(lens: Lens, name: str, path: Path) -> None:
-    numbers = np.array([*lens.K.ravel(), *lens.radial, *lens.tangential])
+    numbers = np.array([*lens.K.ravel(), *lens.radial, *lens.tangential, *lens.denominator])
     coefficients = numbers[lens.K.size :]
     if not np.isfinite(numbers).all() or np.abs(coefficients).max(initial=0) > LARGEST_COEFFICIENT:
         raise D2Error(

@@ -2,7 +2,8 @@
 
 Both models are OpenCV's and map an undistorted ray (x, y) at z = 1 to a distorted one, r^2 = x^2 + y^2:
 
-    radial-tangential   x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), y' alike
+    radial-tangential   x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)
+                             + 2 p1 x y + p2 (r^2 + 2 x^2), y' alike
     fisheye             theta' = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8), theta = atan r
 
 The polynomials fold back at a large radius. Rays beyond the fold have no picture and are black, as are pixels outside
@@ -27,6 +28,9 @@ KEPT_MAPS = 8
 COVERAGE_STEP = 8
 """Grid step in pixels, across and down, for measuring how much of a picture is black."""
 
+LARGEST_COEFFICIENT = 1e4
+"""Distortion coefficients beyond this are a damaged file: those of real lenses are below 100."""
+
 NEVER = 1e-12
 """A fold is ignored where 1 / a^2 is below this: it lies a million focal lengths away from the centre."""
 
@@ -39,11 +43,13 @@ class Lens:
     radial: tuple[float, ...] = ()  # k1, k2, ... in the order of powers
     tangential: tuple[float, float] = (0.0, 0.0)  # p1, p2
     fisheye: bool = False
+    denominator: tuple[float, ...] = ()  # k4, k5, k6 of the rational model
 
     @property
     def bends(self) -> bool:
         """Whether anything has to be undone: a distortion or skew."""
-        return self.fisheye or any(self.radial) or any(self.tangential) or bool(self.K[0, 1] != 0)
+        coefficients = (*self.radial, *self.tangential, *self.denominator)
+        return self.fisheye or any(coefficients) or bool(self.K[0, 1] != 0)
 
     @property
     def pinhole(self) -> np.ndarray:
@@ -58,9 +64,12 @@ class Lens:
         argument = np.arctan(radius) if self.fisheye else radius
         square = argument**2
         factor = 1 + sum(k * square**power for power, k in enumerate(self.radial, start=1))
+        if self.denominator:
+            with np.errstate(divide="ignore", invalid="ignore"):  # a pole lies beyond the fold
+                factor = factor / (1 + sum(k * square**power for power, k in enumerate(self.denominator, start=1)))
         if self.fisheye:
             factor = factor * np.where(radius > 0, argument / np.maximum(radius, 1e-300), 1)
-        folded = argument >= _fold(self.radial)
+        folded = argument >= _fold(self.radial, self.denominator)
         return np.where(folded, np.nan, rays * factor + self._decentring(rays))
 
     def recorded_pixels(self, pixels: np.ndarray) -> np.ndarray:
@@ -122,22 +131,22 @@ class UndistortedSource:
 
 
 def opencv_lens(K: np.ndarray, coefficients: np.ndarray, where: str) -> Lens:
-    """The lens of OpenCV's coefficient vector k1 k2 p1 p2 [k3], where zeros mean none.
+    """The lens of OpenCV's coefficient vector k1 k2 p1 p2 [k3 [k4 k5 k6]], where zeros mean none.
 
     Raises:
-        D2Error: more coefficients than five that are not zero (rational, thin prism and tilted models).
+        D2Error: more coefficients than eight that are not zero (thin prism and tilted models).
     """
-    values = np.zeros(max(5, np.size(coefficients)))
+    values = np.zeros(max(8, np.size(coefficients)))
     values[: np.size(coefficients)] = np.ravel(coefficients)
     if not np.isfinite(values).all():
         raise D2Error(f"{where} has a distortion coefficient that is not finite: correct the calibration")
-    if values[5:].any():
+    if values[8:].any():
         raise D2Error(
-            f"{where} has {np.size(coefficients)} distortion coefficients, expected k1 k2 p1 p2 and k3 only: "
+            f"{where} has {np.size(coefficients)} distortion coefficients, expected k1 k2 p1 p2 and k3 to k6 only: "
             "undistort the pictures first"
         )
-    k1, k2, p1, p2, k3 = (float(value) for value in values[:5])
-    return Lens(K, (k1, k2, k3), (p1, p2))
+    k1, k2, p1, p2, *more = (float(value) for value in values[:8])
+    return Lens(K, (k1, k2, more[0]), (p1, p2), denominator=tuple(more[1:]) if any(more[1:]) else ())
 
 
 def black_share(lens: Lens, camera: Camera) -> float:
@@ -153,9 +162,19 @@ def _recorded_grid(lens: Lens, size: tuple[int, int], step: int) -> np.ndarray:
     return lens.recorded_pixels(np.stack(np.meshgrid(columns, rows), axis=-1))
 
 
-def _fold(radial: tuple[float, ...]) -> float:
-    """Smallest argument a > 0 where a (1 + k1 a^2 + k2 a^4 + ...) stops growing; infinite where it never does."""
-    slope = [1.0, *((2 * power + 1) * k for power, k in enumerate(radial, start=1))]
-    inverse = np.roots(slope)  # of 1 / a^2: the leading coefficient is 1, so tiny k cannot overflow
+def _fold(radial: tuple[float, ...], denominator: tuple[float, ...] = ()) -> float:
+    """Smallest argument a > 0 where a N(a^2) / D(a^2) stops growing, or has a pole; infinite where it never does.
+
+    N and D are 1 + k a^2 + ... of the coefficients. The slope is zero where (N + 2 s N') D - 2 s N D' is, s = a^2.
+    """
+    upper, lower = (np.polynomial.Polynomial([1.0, *values]) for values in (radial, denominator))
+    s = np.polynomial.Polynomial([0.0, 1.0])
+    slope = (upper + 2 * s * upper.deriv()) * lower - 2 * s * upper * lower.deriv()
+    return min(_first_root(slope.coef), _first_root(lower.coef))
+
+
+def _first_root(coefficients: np.ndarray) -> float:
+    """The smallest a > 0 at whose square a polynomial, which is 1 at 0, is zero; infinite where there is none."""
+    inverse = np.roots(coefficients)  # of 1 / a^2: the leading coefficient is 1, so tiny k cannot overflow
     positive = (inverse.real > NEVER) & (np.abs(inverse.imag) < 1e-9 * np.abs(inverse))
     return float(1 / np.sqrt(inverse.real[positive].max())) if positive.any() else np.inf

@@ -18,7 +18,7 @@ from d2_plugin.captures.calibration import checked_camera, resized
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import FrameFiles, cameras_with_pictures, common_frames
 from d2_plugin.captures.lens import Lens
-from d2_plugin.captures.naming import Shot, arrange, by_camera, pictures_below
+from d2_plugin.captures.naming import Reading, Shot, arrange, by_camera, pictures_below
 from d2_plugin.captures.pictures import picture_size
 from d2_plugin.captures.readers.colmap_model import ColmapImage, ColmapModel, find_model, read_model
 from d2_plugin.errors import D2Error
@@ -71,14 +71,20 @@ def _model(path: Path) -> ColmapModel:
     return read_model(folder)
 
 
-def _shots(model: ColmapModel, files: Iterable[str]) -> tuple[dict[str, ColmapImage], dict[str, Shot], tuple[str, ...]]:
-    """One registered picture per camera, camera and frame of every picture that has a pose, and notes."""
+def standing_cameras(model: ColmapModel) -> tuple[dict[str, ColmapImage], dict[str, Shot], Reading | None]:
+    """One registered picture per camera, camera and frame of all of them, and how their names were read."""
     registered = {image.name: image for image in model.images.values()}
     spread = _spread(model.images.values())
     shots, reading = arrange(registered, lambda group: _still([registered[name] for name in group], spread))
     poses: dict[str, ColmapImage] = {}
     for name in sorted(shots, key=lambda name: shots[name].frame):
         poses.setdefault(shots[name].camera, registered[name])
+    return dict(sorted(poses.items())), shots, reading
+
+
+def _shots(model: ColmapModel, files: Iterable[str]) -> tuple[dict[str, ColmapImage], dict[str, Shot], tuple[str, ...]]:
+    """One registered picture per camera, camera and frame of every picture that has a pose, and notes."""
+    poses, shots, reading = standing_cameras(model)
     left_out = 0
     for name in files:
         if name not in shots:
@@ -90,7 +96,7 @@ def _shots(model: ColmapModel, files: Iterable[str]) -> tuple[dict[str, ColmapIm
     notes = (f"{left_out} pictures left out because the COLMAP model has no pose for them",) if left_out else ()
     if reading is None and len(poses) > 1:
         notes = (*notes, "every picture is a camera of its own at one instant: neither names nor poses show frames")
-    return dict(sorted(poses.items())), shots, notes
+    return poses, shots, notes
 
 
 def _spread(images: Iterable[ColmapImage]) -> float:

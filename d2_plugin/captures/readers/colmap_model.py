@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from d2_plugin.captures.calibration import LARGEST_NUMBER, pinhole, rigid
-from d2_plugin.captures.lens import Lens
+from d2_plugin.captures.lens import Lens, opencv_lens
 from d2_plugin.captures.rotations import rotation_of_quaternion
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import read_bytes, read_text, said
@@ -48,6 +48,8 @@ class ColmapCamera(NamedTuple):
                 return Lens(pinhole(p[0], p[0], p[1], p[2]), p[3:])
             case "OPENCV", 8:
                 return Lens(pinhole(*p[:4]), p[4:6], (p[6], p[7]))
+            case "FULL_OPENCV", 12:
+                return opencv_lens(pinhole(*p[:4]), np.array(p[4:]), where)
             case "OPENCV_FISHEYE", 8:
                 return Lens(pinhole(*p[:4]), p[4:], fisheye=True)
             case ("SIMPLE_RADIAL_FISHEYE", 4) | ("RADIAL_FISHEYE", 5):

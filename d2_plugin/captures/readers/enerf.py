@@ -1,96 +1,27 @@
 """ENeRF-Outdoor and other captures of EasyMocap and EasyVolcap: intri.yml and extri.yml beside images/<camera>/.
 
 Both are OpenCV's YAML. intri.yml: K_<camera> and D_<camera> or dist_<camera>; extri.yml: R_<camera> (rotation vector)
-or Rot_<camera> (matrix) and T_<camera>, mapping world to camera. Principal points are taken as they are written.
-Pictures are undistorted on load with K kept.
+or Rot_<camera> (matrix) and T_<camera>, mapping world to camera. OpenCV's pixels have their centres at whole numbers,
+so half a pixel is added to principal points. Pictures are undistorted on load with K kept.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from d2_plugin.captures.assembly import assembled
-from d2_plugin.captures.calibration import LARGEST_NUMBER, checked_camera, resized, rigid
+from d2_plugin.captures.calibrations.easymocap import EXTRINSICS, INTRINSICS, OpencvYaml, entry_of
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import FrameFiles, common_frames, numbered_files
-from d2_plugin.captures.lens import Lens, opencv_lens
-from d2_plugin.captures.pictures import opencv, picture_size
-from d2_plugin.captures.rotations import rotation_of_vector
+from d2_plugin.captures.lens import Lens
+from d2_plugin.captures.pictures import picture_size
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.reading import parsing, read_text
-
-LARGEST_MATRIX = 64
-"""Rows and columns of a calibration's matrices, at most."""
-
-INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 
 ENERF_FPS = 60.0
 """Frame rate at which EasyVolcap plays the data set; the files name none."""
 
 NOT_USED = ("masks", "mask", "bgmtv2", "bkgd", "vhull", "background.ply")
 """What recordings of this layout may also hold. It is not used, because the whole picture is the truth."""
-
-
-class OpencvYaml:
-    """The entries of one file of OpenCV's FileStorage."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        cv2 = opencv("reading OpenCV's YAML files")
-        flags = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
-        text = read_text(path)
-        if "\0" in text or not text.startswith("%YAML"):
-            raise D2Error(f"{path} is not a YAML file of OpenCV's, which begins with %YAML: restore the file")
-        with parsing(f"{path}, which is not a YAML file of OpenCV's"):
-            self._storage = cv2.FileStorage(text, flags)  # the nodes live as long as their storage
-        if not self._storage.isOpened():
-            raise D2Error(f"{path} is not a YAML file of OpenCV's: restore the file")
-
-    def names(self) -> list[str]:
-        """The list `names`, empty where there is none."""
-        with parsing(f"names in {self.path}"):
-            node = self._storage.getNode("names")
-            return [_text(node.at(i)) for i in range(node.size())] if node.isSeq() else []
-
-    def matrix(self, *keys: str) -> np.ndarray | None:
-        """The matrix under the first of `keys` that is there, float64, or None."""
-        for key in keys:
-            with parsing(f"{key} in {self.path}"):
-                node = self._storage.getNode(key)
-                if node.empty():
-                    continue
-                matrix = self._small_matrix(node)
-            if matrix is None:
-                raise D2Error(f"{key} in {self.path} is no matrix of numbers: write it as !!opencv-matrix")
-            if not np.isfinite(matrix).all() or np.abs(matrix).max(initial=0) > LARGEST_NUMBER:
-                raise D2Error(f"{key} in {self.path} has a number that is not finite or too large: correct it")
-            return matrix
-        return None
-
-    @staticmethod
-    def _small_matrix(node: Any) -> np.ndarray | None:
-        """The numbers of a matrix node, or None: a size is looked at before OpenCV takes memory for it."""
-        if not node.isMap():
-            return None
-        sizes = node.getNode("sizes")  # of matrices with one axis, or more than two
-        many = [sizes.at(i) for i in range(min(sizes.size(), 3))] if sizes.isSeq() else []
-        sides = many or [node.getNode(name) for name in ("rows", "cols")]
-        if len(sides) > 2 or not all(side.isInt() and 0 < side.real() <= LARGEST_MATRIX for side in sides):
-            return None
-        matrix = node.mat()
-        return None if matrix is None else np.asarray(matrix, np.float64)
-
-    def number(self, key: str) -> float | None:
-        """The number under `key`, or None."""
-        with parsing(f"{key} in {self.path}"):
-            node = self._storage.getNode(key)
-            number = float(node.real()) if node.isReal() or node.isInt() else None
-        if number is not None and not abs(number) <= LARGEST_NUMBER:
-            raise D2Error(f"{key} in {self.path} is {number:g}: correct the calibration")
-        return number
 
 
 def is_enerf(path: Path) -> bool:
@@ -157,39 +88,8 @@ def _camera(
     name: str, intrinsics: OpencvYaml, extrinsics: OpencvYaml, files: FrameFiles, frame: int
 ) -> tuple[Camera, Lens]:
     """The pinhole camera of the undistorted pictures, and the lens of the recorded ones."""
-    size, where = picture_size(files[frame]), str(intrinsics.path)
-    K = _shaped(intrinsics.matrix(f"K_{name}"), (3, 3), f"K_{name}", where)
-    width, height = intrinsics.number(f"W_{name}"), intrinsics.number(f"H_{name}")
-    if width and height:
-        K = resized(K, (round(width), round(height)), size, name, where)
-    distortion = intrinsics.matrix(f"D_{name}", f"dist_{name}")
-    lens = opencv_lens(K, np.zeros(5) if distortion is None else distortion, f"camera {name} in {where}")
+    size, where = picture_size(files[frame]), f"{intrinsics.path} and {EXTRINSICS}"
     near, far = extrinsics.number(f"n_{name}"), extrinsics.number(f"f_{name}")
     near_far = (near, far) if near is not None and far is not None else None
-    pose = _pose(name, extrinsics)
-    return checked_camera(name, size, lens.pinhole, pose, near_far, f"{where} and {EXTRINSICS}"), lens
-
-
-def _pose(name: str, extrinsics: OpencvYaml) -> np.ndarray:
-    """T_camera_world [4, 4]; the rotation vector is preferred, as the layout's own readers do."""
-    where = str(extrinsics.path)
-    translation = _shaped(extrinsics.matrix(f"T_{name}"), (3,), f"T_{name}", where)
-    vector = extrinsics.matrix(f"R_{name}")
-    if vector is not None:
-        return rigid(rotation_of_vector(_shaped(vector, (3,), f"R_{name}", where)), translation)
-    rotation = extrinsics.matrix(f"Rot_{name}")
-    if rotation is None:
-        raise D2Error(f"{where} has neither R_{name} nor Rot_{name}: add the rotation of camera {name}")
-    return rigid(_shaped(rotation, (3, 3), f"Rot_{name}", where), translation)
-
-
-def _shaped(matrix: np.ndarray | None, shape: tuple[int, ...], key: str, where: str) -> np.ndarray:
-    if matrix is None or matrix.size != np.prod(shape):
-        found = "nothing" if matrix is None else f"shape {matrix.shape}"
-        raise D2Error(f"{key} in {where} has {found}, expected {shape}: correct the calibration")
-    return matrix.reshape(shape)
-
-
-def _text(node: Any) -> str:
-    """A name as text: YAML reads a name without quotes as a number."""
-    return node.string() if node.isString() else str(int(node.real()))
+    camera = entry_of(name, intrinsics, extrinsics).recorded(size, where)
+    return camera.pinhole(where, near_far), camera.lens

@@ -1,7 +1,8 @@
 """The folder layout: images/<camera>/<frame>.(png|jpg), cameras.json and, optionally, depth/ and mono/ maps.
 
 `cameras.json` holds {"fps", "cameras": [{"name", "width", "height", "fx", "fy", "cx", "cy", "R", "t"}], "bounds":
-{camera: [near, far]}} with OpenCV axes, x_cam = R X + t and the centre of pixel i at i + 0.5.
+{camera: [near, far]}} with OpenCV axes, x_cam = R X + t and the centre of pixel i at i + 0.5. Where a camera has a
+`model` and its `distortion` as well (see d2_plugin.captures.calibrations), its pictures are undistorted when read.
 depth/<camera>/<frame>.npz holds true planar z under the key "depth" (0 = unknown). mono/<camera>/<frame>.npy holds a
 monocular prediction: affine-invariant inverse depth, unless mono/mono.json says otherwise with
 {"kind": "metric" | "relative", "emulated": bool}.
@@ -10,18 +11,18 @@ monocular prediction: affine-invariant inverse depth, unless mono/mono.json says
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
-
-import numpy as np
+from typing import Any
 
 from d2_plugin.captures.assembly import CORRECT, assembled
-from d2_plugin.captures.calibration import LARGEST_NUMBER, checked_camera, checked_rate, pinhole, rigid
+from d2_plugin.captures.calibration import checked_rate
+from d2_plugin.captures.calibrations.cameras_json import read_entry
+from d2_plugin.captures.calibrations.document import NUMBER
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import common_frames, numbered_files
+from d2_plugin.captures.lens import Lens
 from d2_plugin.captures.pictures import picture_size
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.reading import field, read_json, said
-from d2_plugin.values import Range, shown
+from d2_plugin.reading import field, read_json
 
 CALIBRATION = "cameras.json"
 
@@ -47,52 +48,32 @@ def open_folder(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
     images = {name: numbered_files(pictured[name]) for name in names}
     frames, frame_notes = common_frames(images, path / "images")
     for name in names:
-        _check_size(calibrated[name], images[name][frames[0]])
+        _check_size(calibrated[name][0], images[name][frames[0]])
     fps, fps_notes = _frame_rate(description, path, len(frames))
-    return assembled(
-        path, {name: calibrated[name] for name in names}, images, frames, fps, (*notes, *frame_notes, *fps_notes)
-    )
+    pinholes = {name: calibrated[name][0] for name in names}
+    lenses = {name: calibrated[name][1] for name in names}
+    return assembled(path, pinholes, images, frames, fps, (*notes, *frame_notes, *fps_notes), lenses)
 
 
-def _calibrations(description: dict[str, Any], path: Path) -> dict[str, Camera]:
+def _calibrations(description: dict[str, Any], path: Path) -> dict[str, tuple[Camera, Lens]]:
     entries = description.get("cameras")
     if not isinstance(entries, list) or not entries:
         raise D2Error(f"{path} has no list 'cameras': write one entry per camera")
     bounds = field(description, "bounds", dict, str(path), CORRECT, default={})
-    found: dict[str, Camera] = {}
+    found: dict[str, tuple[Camera, Lens]] = {}
     for entry in entries:
-        camera = _calibration(entry, bounds, path)
+        camera, lens = _calibration(entry, bounds, path)
         if camera.name in found:
             raise D2Error(f"{path} describes camera {camera.name} twice: remove one entry")
-        found[camera.name] = camera
+        found[camera.name] = (camera, lens)
     return found
 
 
-def _calibration(entry: Any, bounds: dict[str, Any], path: Path) -> Camera:
-    if not isinstance(entry, dict):
-        raise D2Error(f"a camera in {path} cannot be understood ({shown(entry)} is no object): {CORRECT}")
-    name = str(field(entry, "name", str | int, f"a camera in {path}", CORRECT))
-    where = f"camera {name} in {path}"
-    K = pinhole(*(field(entry, key, _NUMBER, where, CORRECT) for key in ("fx", "fy", "cx", "cy")))
-    T = rigid(_numbers(entry, "R", (3, 3), where), _numbers(entry, "t", (3,), where))
-    size = (field(entry, "width", int, where, CORRECT), field(entry, "height", int, where, CORRECT))
-    near_far = field(bounds, name, tuple[_NUMBER, _NUMBER] | None, f"bounds in {path}", CORRECT, default=None)
-    return checked_camera(name, size, K, T, near_far, str(path))
-
-
-_NUMBER = Annotated[float, Range(-LARGEST_NUMBER, LARGEST_NUMBER)]
-
-
-def _numbers(entry: dict[str, Any], key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """An array of a given shape, nested in lists or not."""
-    value = field(entry, key, list, where, CORRECT)
-    try:
-        array = np.array(value, np.float64).reshape(shape)
-    except (TypeError, ValueError, OverflowError) as failure:
-        raise D2Error(f"{where} cannot be understood ({key}: {said(failure)}): {CORRECT}") from None
-    if not np.abs(array).max() <= LARGEST_NUMBER:
-        raise D2Error(f"{key} of {where} has a number that is not finite or too large: {CORRECT}")
-    return array
+def _calibration(entry: Any, bounds: dict[str, Any], path: Path) -> tuple[Camera, Lens]:
+    """The pinhole camera of the undistorted pictures, and the lens of the recorded ones."""
+    camera = read_entry(entry, str(path)).recorded(None, str(path))
+    near_far = field(bounds, camera.name, tuple[NUMBER, NUMBER] | None, f"bounds in {path}", CORRECT, default=None)
+    return camera.pinhole(str(path), near_far), camera.lens
 
 
 def _agreed(

@@ -11,28 +11,20 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
 from d2_plugin.captures.assembly import CORRECT, assembled
-from d2_plugin.captures.calibration import (
-    LARGEST_NUMBER,
-    OPENGL_TO_OPENCV,
-    check_name,
-    checked_camera,
-    checked_rate,
-    pinhole,
-    resized,
-)
+from d2_plugin.captures.calibration import LARGEST_NUMBER, check_name, checked_rate
+from d2_plugin.captures.calibrations.transforms import read_entry
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import common_frames
-from d2_plugin.captures.lens import Lens, opencv_lens
+from d2_plugin.captures.lens import Lens
 from d2_plugin.captures.naming import Shot, arrange, by_camera
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES, picture_size
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import field, read_json, said
-from d2_plugin.values import Range
 
 FILES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
 """All that are there are read; their pictures are joined."""
@@ -192,51 +184,8 @@ def _camera(name: str, entry: _Entry) -> tuple[Camera, Lens]:
     """The pinhole camera of the undistorted pictures, and the lens of the recorded ones."""
     size, where = picture_size(entry.file), str(entry.listed_in)
     check_name(name, where)
-    said_by = f"camera {name} in {where}"
-    given = {key: field(entry.intrinsics, key, _SIZED, said_by, CORRECT) for key in _NUMBERS if key in entry.intrinsics}
-    calibrated = (round(given.get("w", size[0])), round(given.get("h", size[1])))
-    focal = _focal_lengths(given, calibrated, name, where)
-    centre = given.get("cx", calibrated[0] / 2), given.get("cy", calibrated[1] / 2)
-    K = resized(pinhole(*focal, *centre), calibrated, size, name, where)
-    lens = _lens(K, given, str(entry.intrinsics.get("camera_model", "")), f"camera {name} in {where}")
-    T_world_camera = entry.matrix @ OPENGL_TO_OPENCV
-    rotation = T_world_camera[:3, :3].T  # checked to be orthonormal next
-    T_camera_world = np.eye(4)
-    T_camera_world[:3, :3], T_camera_world[:3, 3] = rotation, -rotation @ T_world_camera[:3, 3]
-    return checked_camera(name, size, lens.pinhole, T_camera_world, None, where), lens
-
-
-_SIZED = Annotated[float, Range(-LARGEST_NUMBER, LARGEST_NUMBER)]
-_NUMBERS = (
-    *("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"),
-    *("k1", "k2", "k3", "k4", "p1", "p2"),
-)
-
-
-def _focal_lengths(given: dict[str, float], size: tuple[int, int], name: str, where: str) -> tuple[float, float]:
-    """Focal lengths in pixels: given as such, or by the angle of view in radians; one of the two serves for both."""
-    focal: dict[str, float] = {}
-    for axis, length in zip("xy", size):
-        if f"fl_{axis}" in given:
-            focal[axis] = given[f"fl_{axis}"]
-        elif f"camera_angle_{axis}" in given:
-            angle = given[f"camera_angle_{axis}"]
-            if not 0 < angle < math.pi:
-                raise D2Error(
-                    f"camera {name} in {where} has camera_angle_{axis} {angle:g}, expected radians: {CORRECT}"
-                )
-            focal[axis] = length / (2 * math.tan(angle / 2))
-    if not focal:
-        raise D2Error(f"camera {name} in {where} has neither fl_x nor camera_angle_x: add its focal length in pixels")
-    return focal.get("x", focal.get("y", 0.0)), focal.get("y", focal.get("x", 0.0))
-
-
-def _lens(K: np.ndarray, given: dict[str, float], model: str, where: str) -> Lens:
-    k1, k2, k3, k4, p1, p2 = (given.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    if "FISHEYE" in model.upper():
-        return Lens(K, (k1, k2, k3, k4), fisheye=True)
-    coefficients = [k1, k2, p1, p2, k3] + ([k4] if k4 else [])
-    return opencv_lens(K, np.array(coefficients), where)
+    camera = read_entry(name, entry.intrinsics, entry.matrix, size, where).recorded(size, where)
+    return camera.pinhole(where), camera.lens
 
 
 def _split_notes(entries: dict[str, _Entry], shots: dict[str, Shot]) -> tuple[str, ...]:

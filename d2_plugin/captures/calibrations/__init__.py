@@ -1,0 +1,15 @@
+"""Calibration files of other tools, read into cameras with their lenses."""
+
+from d2_plugin.captures.calibrations.camera import MODELS, CalibratedCamera, scaled
+from d2_plugin.captures.calibrations.table import FORMATS, Calibration, Format, open_calibration, read_calibration
+
+__all__ = [
+    "FORMATS",
+    "MODELS",
+    "CalibratedCamera",
+    "Calibration",
+    "Format",
+    "open_calibration",
+    "read_calibration",
+    "scaled",
+]
