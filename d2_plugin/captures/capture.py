@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -30,6 +31,14 @@ class Camera:
         return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
 
 
+class Exposure(NamedTuple):
+    """How bright a camera sees what others see, per channel: its gain over their geometric mean."""
+
+    gain: tuple[float, float, float]
+    error: tuple[float, float, float]
+    """Standard error."""
+
+
 class Source(Protocol):
     """Where pictures come from; each read opens one file (or decodes one video frame) and keeps nothing."""
 
@@ -51,7 +60,9 @@ class Capture:
     `mono_kind` says what `source.mono` returns: "relative" is affine-invariant inverse depth (larger is nearer),
     "metric" is depth; None when there are no maps. `mono_emulated` is True when those maps were made from true
     depth rather than predicted by a network: whoever shows a figure that rests on them must say so. `layout` names the
-    reader in `d2_plugin.captures.LAYOUTS` that opened it, which camera presets go by.
+    reader in `d2_plugin.captures.LAYOUTS` that opened it, which camera presets go by. `exposures` are what the import
+    of videos measured, by camera; none elsewhere. `late` says by how many seconds a camera's frame was taken after the
+    instant that its number stands for, where cameras did not expose together.
     """
 
     name: str
@@ -64,6 +75,8 @@ class Capture:
     mono_emulated: bool = False
     notes: tuple[str, ...] = field(default=())
     layout: str = "folder"
+    exposures: Mapping[str, Exposure] = field(default_factory=dict)
+    late: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3]; refuses a picture whose size is not the camera's."""
@@ -78,9 +91,10 @@ class Capture:
         """Monocular map of `mono_kind` from disk, float32 at the size it is stored in, or None."""
         return self.source.mono(self._known(camera), frame)
 
-    def seconds(self, frame: int) -> float:
-        """Time of a frame since the first one, in seconds."""
-        return (frame - self.frames[0]) / self.fps
+    def seconds(self, frame: int, camera: str | None = None) -> float:
+        """Time of a frame since the first one, in seconds; with `camera`, the instant at which that one took it."""
+        late = 0.0 if camera is None else self.late.get(camera, {}).get(frame, 0.0)
+        return (frame - self.frames[0]) / self.fps + late
 
     def _sized(self, array: np.ndarray, camera: str, frame: int, what: str) -> np.ndarray:
         expected = (self.cameras[camera].height, self.cameras[camera].width)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import keyword
 import os
 import sys
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from d2_plugin.errors import D2Error, unknown_name
 
 COMMANDS = (
     "demo",
+    "import",
     "plan",
     "priors",
     "train",
@@ -72,7 +74,8 @@ def _overview() -> str:
 
 def _module(command: str) -> ModuleType:
     room = "study." if command in STUDY else ""
-    return importlib.import_module(f"d2_plugin.commands.{room}{command.replace('-', '_')}")
+    name = f"{command.replace('-', '_')}{'_' if keyword.iskeyword(command) else ''}"
+    return importlib.import_module(f"d2_plugin.commands.{room}{name}")
 
 
 if __name__ == "__main__":

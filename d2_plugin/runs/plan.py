@@ -186,9 +186,7 @@ def _stereo(capture: Capture, cameras: Sequence[str], settings: PriorSettings, p
     return Decision("stereo", overlap and textured, lacking + figures)
 
 
-def appearance_decision(
-    capture: Capture, cameras: Sequence[str], positions: np.ndarray, times: np.ndarray
-) -> Decision:
+def appearance_decision(capture: Capture, cameras: Sequence[str], positions: np.ndarray, times: np.ndarray) -> Decision:
     """Whether each training camera learns a change of colour: only where their exposures differ.
 
     Args:

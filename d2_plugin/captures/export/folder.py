@@ -18,7 +18,7 @@ def save_capture(capture: Capture, path: Path | str) -> Path:
 
     Pictures are lossless PNG; maps are float32. Raises `D2Error` where `path` already holds something.
     """
-    description = json.dumps(_description(capture), indent=1)
+    description = json.dumps(described(capture), indent=1)
     with whole_folder(path) as folder:
         for camera in capture.cameras:
             for frame in capture.frames:
@@ -44,9 +44,14 @@ def _save_frame(capture: Capture, folder: Path, camera: str, frame: int) -> None
         np.save(place("mono", ".npy"), mono.astype(np.float32))
 
 
-def _description(capture: Capture) -> dict[str, Any]:
+def described(capture: Capture) -> dict[str, Any]:
+    """What cameras.json says of a capture."""
     bounds = {name: list(camera.near_far) for name, camera in capture.cameras.items() if camera.near_far is not None}
+    exposures = {name: one._asdict() for name, one in capture.exposures.items() if name in capture.cameras}
+    late = {name: {str(k): v for k, v in one.items()} for name, one in capture.late.items() if name in capture.cameras}
     return {
+        **({"exposures": exposures} if exposures else {}),
+        **({"late": late} if late else {}),
         "convention": "OpenCV axes, x_cam = R X + t, pixel centres at +0.5",
         "source": capture.name,
         "notes": list(capture.notes),

@@ -23,7 +23,7 @@ BAND = (100.0, 4000.0)
 MOST_SECONDS = 900.0
 """Of the sound that is read."""
 
-CLEAR = 9.0
+CLEAR = 12.0
 """A peak this many standard deviations of the correlation high is an event that both heard. The largest of a million
 samples of noise reaches 5."""
 
