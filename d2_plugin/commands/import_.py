@@ -17,7 +17,7 @@ def form(words: list[str]) -> Form:
         say_notes(capture.notes)
         sizes = sorted({(camera.width, camera.height) for camera in capture.cameras.values()})
         shown = ", ".join(f"{width}x{height}" for width, height in sizes)
-        about = f"{len(capture.cameras)} cameras, {len(capture.frames)} frames at {capture.fps:g} per second, {shown} pixels"
-        return f"{about} in {found.folder}\n`d2 doctor {found.folder}` says what it lacks"
+        about = f"{len(capture.cameras)} cameras, {len(capture.frames)} frames at {capture.fps:g} per second"
+        return f"{about}, {shown} pixels in {found.folder}\n`d2 doctor {found.folder}` says what it lacks"
 
     return Form.of("d2 import", __doc__, ImportSettings, run)

@@ -1,4 +1,4 @@
-"""From videos and a calibration to a recording: each step is kept in the recording's folder, so a stopped import goes on.
+"""From videos and a calibration to a recording: each step is kept in its folder, so a stopped import goes on.
 
 import/import.json    what is imported, with checksums: another import into the same folder is refused
 import/videos.json    sizes, turns and time stamps

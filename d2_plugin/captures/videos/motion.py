@@ -140,7 +140,8 @@ def _curve(
         _resampled(_profile(change, angle, low, high), times, step)
         for (change, times), angle in zip((changes, other_changes), angles)
     ]
-    return _correlated(*profiles, starts=(changes[1][0], other_changes[1][0]), step=step, search=search)
+    starts = (float(changes[1][0]), float(other_changes[1][0]))
+    return _correlated(profiles[0], profiles[1], starts, step, search)
 
 
 def _at(angles: np.ndarray, share: float) -> float:
@@ -197,14 +198,14 @@ def _correlated(one: np.ndarray, other: np.ndarray, starts: tuple[float, float],
     product = np.fft.irfft(spectra, size, axis=0)[shifts % size]
     sums, squares = zip(*(_running(one, begin, end), _running(other, begin - shifts, end - shifts)))
     product = product - sums[0] * sums[1] / count[:, None]
-    squares = [square - total**2 / count[:, None] for square, total in zip(squares, sums)]
+    spreads = [square - total**2 / count[:, None] for square, total in zip(squares, sums)]
     lags = shifts + (starts[0] - starts[1]) / step
     kept = np.abs(lags) <= search / step + 1
 
     def grouped(values: np.ndarray) -> np.ndarray:
         return np.stack([part.sum(1) for part in np.array_split(values[kept], GROUPS, axis=1)])
 
-    return _Curve(lags[kept], grouped(product), np.stack([grouped(s) for s in squares]), count[kept] / FINE)
+    return _Curve(lags[kept], grouped(product), np.stack([grouped(s) for s in spreads]), count[kept] / FINE)
 
 
 def _running(values: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,7 @@ class ImportChoices(Settings):
 
     offsets: tuple[str, ...] = ("auto",)
     """How the cameras' start is found: auto (timecode, then sound, then motion), timecode, sound, motion, none (they
-    start together), or given as NAME=FRAMES,...: how many of its frames later than at the first camera its clock began."""
+    start together), or given as NAME=FRAMES,...: how many of its frames after the first camera each one started."""
     times: tuple[Annotated[float, Range(0, unit="seconds")], ...] | None = None
     """First and last second to take, joined by a comma, of the time that all cameras recorded."""
     frames: tuple[Count, ...] | None = None
@@ -33,7 +33,7 @@ class ImportChoices(Settings):
     crop: tuple[str, ...] = ()
     """Part to keep, WIDTHxHEIGHT+LEFT+TOP in pixels of the upright video; NAME=... for one camera, joined by commas."""
     pictures: Literal["png", "jpg", "videos"] = "png"
-    """Write pictures as png (lossless) or jpg, or decode them from the videos, which must stay, when they are needed."""
+    """Write pictures as png (lossless) or jpg, or leave them in the videos, which are decoded when they are needed."""
     unit: Literal["m", "cm", "mm"] | None = None
     """Unit of the calibration's positions; the recording is in metres then."""
     exposure: bool = True

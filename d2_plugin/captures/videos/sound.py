@@ -7,6 +7,7 @@ one behind the other: every frequency counts alike, so loudness, distance and th
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -137,7 +138,7 @@ def _lags_of_parts(one: np.ndarray, other: np.ndarray, lag: float) -> np.ndarray
     count = int(min(max((end - begin) / (PART * RATE), 1), PARTS))
     reach, found = int(AROUND * RATE), []
     edges = np.linspace(begin, end, count + 1).astype(int)
-    for first, last in zip(edges[:-1], edges[1:]):
+    for first, last in pairwise(edges):
         correlation = phase_transform(one[first:last], other[first - shift : last - shift])
         near = np.concatenate([correlation[-reach:], correlation[:reach]])
         noise = 1.4826 * float(np.median(np.abs(correlation))) + 1e-20

@@ -1,4 +1,4 @@
-"""Frames of several videos as one recording: decoded by time stamp, undistorted, cut and made smaller when asked for."""
+"""Frames of several videos as one recording: decoded, undistorted, cut and made smaller when asked for."""
 
 from __future__ import annotations
 
