@@ -1,7 +1,6 @@
 """From videos and a calibration to a recording: each step is kept in its folder, so a stopped import goes on.
 
 import/import.json    what is imported, with checksums: another import into the same folder is refused
-import/videos.json    sizes, turns and time stamps
 import/clocks.json    when each camera began
 images/CAMERA/*.png   the pictures, each written whole or not at all
 import/exposures.json
