@@ -51,7 +51,10 @@ class Hooks(Protocol):
 
 
 class Frames(Protocol):
-    """The training pictures: views, and the picture [H, W, 3] in 0..1 of each."""
+    """The training pictures: views, and the picture [H, W, 3] in 0..1 of each.
+
+    It may have `weights(index) -> [H, W] | None` as well: how much each pixel counts, 0..1.
+    """
 
     views: Sequence[View]
 
@@ -104,7 +107,7 @@ class Trainer:
             view = self.frames.views[index]
             render = model.render(view)
             target = self.early_stop.target(index, self.frames.image(index), render.color)
-            loss = photometric_loss(render.color, target, self.settings.ssim_weight)
+            loss = photometric_loss(render.color, target, self.settings.ssim_weight, self._weights(index))
             logged = loss.item()
             loss = loss + model.regularization()
             if d2 is not None:
@@ -139,6 +142,10 @@ class Trainer:
         self.early_stop.load_state_dict(state.get("early_stop", {"rounds": [], "errors": []}))  # absent until 0.1.0
         if self.d2 is not None:
             self.d2.load_state_dict(state["d2"])
+
+    def _weights(self, index: int) -> Tensor | None:
+        weights: Callable[[int], Tensor | None] | None = getattr(self.frames, "weights", None)
+        return None if weights is None else weights(index)
 
     def _next_view(self) -> int:
         """Every view once, in a new random order each time round."""

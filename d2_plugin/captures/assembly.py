@@ -2,7 +2,7 @@
 
 Beside the pictures, whatever the layout, there may be depth/<camera>/<frame>.npz with true planar z under the key
 "depth" (0 = unknown) and mono/<camera>/<frame>.npy with a monocular prediction: affine-invariant inverse depth, unless
-mono/mono.json says otherwise with {"kind": "metric" | "relative", "emulated": bool}.
+mono/mono.json says otherwise with {"kind": "metric" | "relative", "emulated": bool}. Masks: see `masks`.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from d2_plugin.arrays import read_array
 from d2_plugin.captures.capture import Camera, Capture, MonoKind, Source
 from d2_plugin.captures.files import FrameFiles, numbered_files
 from d2_plugin.captures.lens import LARGEST_COEFFICIENT, Lens, UndistortedSource, black_share
+from d2_plugin.captures.masks import NO_MASKS, MaskFiles, find_masks
 from d2_plugin.captures.pictures import read_picture
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import read_bytes, read_json
@@ -41,6 +42,7 @@ class FolderSource:
     images: dict[str, FrameFiles]
     depths: dict[str, FrameFiles]
     monos: dict[str, FrameFiles]
+    masks: MaskFiles = NO_MASKS
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3]."""
@@ -62,6 +64,14 @@ class FolderSource:
         path = self.monos.get(camera, {}).get(frame)
         return None if path is None else _map(path, None)
 
+    def mask(self, camera: str, frame: int) -> np.ndarray | None:
+        """How much each pixel is foreground, float32 [H, W] in 0..1, or None."""
+        return self.masks.mask(camera, frame)
+
+    def recorded(self, camera: str) -> np.ndarray | None:
+        """Which pixels were recorded, bool [H, W], or None where all were."""
+        return self.masks.recorded(camera)
+
 
 def assembled(
     path: Path,
@@ -78,13 +88,14 @@ def assembled(
     """
     kind, emulated, mono_notes = _mono_description(path)
     monos = _maps(path / "mono", list(cameras), ".npy")
-    source: Source = FolderSource(dict(images), _maps(path / "depth", list(cameras), ".npz"), monos)
+    masks, mask_notes = find_masks(path, cameras)
+    source: Source = FolderSource(dict(images), _maps(path / "depth", list(cameras), ".npz"), monos, masks)
     for name, lens in (lenses or {}).items():
         _check_lens(lens, name, path)
     bent = {name: lens for name, lens in (lenses or {}).items() if name in cameras and lens.bends}
     if bent:
         source = UndistortedSource(source, bent, {name: (cameras[name].width, cameras[name].height) for name in bent})
-    all_notes = (*notes, *mono_notes, *_lens_notes(bent, cameras))
+    all_notes = (*notes, *mono_notes, *mask_notes, *_lens_notes(bent, cameras))
     for note in all_notes:
         log.info("%s: %s", path.name, note)
     return Capture(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -40,7 +40,10 @@ class Exposure(NamedTuple):
 
 
 class Source(Protocol):
-    """Where pictures come from; each read opens one file (or decodes one video frame) and keeps nothing."""
+    """Where pictures come from; each read opens one file (or decodes one video frame) and keeps nothing.
+
+    A source may also have `mask(camera, frame)` and `recorded(camera)`, see `MaskedSource`.
+    """
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3]."""
@@ -50,6 +53,17 @@ class Source(Protocol):
 
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
         """A monocular prediction float32 [h, w] lying on disk, or None."""
+
+
+@runtime_checkable
+class MaskedSource(Protocol):
+    """What a source has that knows of masks."""
+
+    def mask(self, camera: str, frame: int) -> np.ndarray | None:
+        """How much each pixel is foreground, float32 [H, W] in 0..1, or None where nobody says."""
+
+    def recorded(self, camera: str) -> np.ndarray | None:
+        """Which pixels were recorded, bool [H, W], or None where all were."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +104,18 @@ class Capture:
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
         """Monocular map of `mono_kind` from disk, float32 at the size it is stored in, or None."""
         return self.source.mono(self._known(camera), frame)
+
+    def mask(self, camera: str, frame: int) -> np.ndarray | None:
+        """How much each pixel is foreground, float32 [H, W] in 0..1, or None where nobody says."""
+        self._known(camera)
+        mask = self.source.mask(camera, frame) if isinstance(self.source, MaskedSource) else None
+        return None if mask is None else self._sized(mask, camera, frame, "mask of frame")
+
+    def recorded(self, camera: str) -> np.ndarray | None:
+        """Which pixels were recorded, bool [H, W], or None where all were: undistorting leaves some without."""
+        self._known(camera)
+        valid = self.source.recorded(camera) if isinstance(self.source, MaskedSource) else None
+        return None if valid is None else self._sized(valid, camera, self.frames[0], "valid region at frame")
 
     def seconds(self, frame: int, camera: str | None = None) -> float:
         """Time of a frame since the first one, in seconds; with `camera`, the instant at which that one took it."""

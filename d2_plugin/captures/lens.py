@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera, Source
+from d2_plugin.captures.capture import Camera, MaskedSource, Source
 from d2_plugin.captures.pictures import opencv
 from d2_plugin.errors import D2Error
 
@@ -95,18 +95,11 @@ class UndistortedSource:
     source: Source
     lenses: Mapping[str, Lens]
     sizes: Mapping[str, tuple[int, int]]
-    _maps: dict[str, tuple[Any, Any]] = field(default_factory=dict, repr=False)
+    _maps: dict[str, Resampling] = field(default_factory=dict, repr=False)
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3], bilinear, black where nothing was recorded."""
-        picture = self.source.image(camera, frame)
-        if camera not in self.lenses:
-            return picture
-        width, height = self.sizes[camera]
-        if picture.shape[:2] != (height, width):
-            return picture  # `Capture.image` refuses it in its own words
-        cv2 = opencv("undoing lens distortion")
-        return cv2.remap(picture, *self._map(camera), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return self._undone(camera, self.source.image(camera, frame))
 
     def depth(self, camera: str, frame: int) -> np.ndarray | None:
         """True planar z of the undistorted picture as it lies on disk, or None."""
@@ -116,18 +109,64 @@ class UndistortedSource:
         """A monocular map of the undistorted picture as it lies on disk, or None."""
         return self.source.mono(camera, frame)
 
+    def mask(self, camera: str, frame: int) -> np.ndarray | None:
+        """The mask of the recorded picture, undistorted with it, or None."""
+        mask = self.source.mask(camera, frame) if isinstance(self.source, MaskedSource) else None
+        return None if mask is None else self._undone(camera, mask)
+
+    def recorded(self, camera: str) -> np.ndarray | None:
+        """Which pixels [H, W] of the undistorted picture were recorded, or None where all were."""
+        valid = self.source.recorded(camera) if isinstance(self.source, MaskedSource) else None
+        if camera not in self.lenses:
+            return valid
+        here = recorded_pixels(self.lenses[camera], self.sizes[camera])
+        if valid is not None:
+            here &= self._undone(camera, valid.astype(np.float32)) > 0.99
+        return None if here.all() else here
+
+    def _undone(self, camera: str, picture: np.ndarray) -> np.ndarray:
+        if camera not in self.lenses:
+            return picture
+        width, height = self.sizes[camera]
+        if picture.shape[:2] != (height, width):
+            return picture  # `Capture.image` refuses it in its own words
+        return resampled(picture, self._map(camera))
+
     def __reduce__(self) -> tuple[Any, ...]:  # maps are made anew in another process
         return UndistortedSource, (self.source, self.lenses, self.sizes)
 
-    def _map(self, camera: str) -> tuple[Any, Any]:
+    def _map(self, camera: str) -> Resampling:
         if camera not in self._maps:
-            cv2 = opencv("undoing lens distortion")
-            recorded = _recorded_grid(self.lenses[camera], self.sizes[camera], step=1)
-            positions = np.nan_to_num(recorded - 0.5, nan=-10.0).astype(np.float32)  # cv2 puts centres on integers
-            self._maps[camera] = cv2.convertMaps(positions, None, cv2.CV_16SC2)
+            self._maps[camera] = resampling(self.lenses[camera], self.sizes[camera])
             while len(self._maps) > KEPT_MAPS:
                 del self._maps[next(iter(self._maps))]
         return self._maps[camera]
+
+
+Resampling = tuple[Any, Any]
+"""Where each pixel of an undistorted picture comes from, as `cv2.remap` wants it."""
+
+
+def resampling(lens: Lens, size: tuple[int, int]) -> Resampling:
+    """How recorded pictures of `size` (width, height) become undistorted ones."""
+    cv2 = opencv("undoing lens distortion")
+    positions = np.nan_to_num(_recorded_grid(lens, size, step=1) - 0.5, nan=-10.0)  # cv2 puts centres on integers
+    maps: Resampling = cv2.convertMaps(positions.astype(np.float32), None, cv2.CV_16SC2)
+    return maps
+
+
+def resampled(picture: np.ndarray, maps: Resampling) -> np.ndarray:
+    """The undistorted picture [H, W] or [H, W, C], bilinear, 0 where nothing was recorded."""
+    cv2 = opencv("undoing lens distortion")
+    undone: np.ndarray = cv2.remap(picture, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return undone
+
+
+def recorded_pixels(lens: Lens, size: tuple[int, int]) -> np.ndarray:
+    """Which pixels of the undistorted picture were recorded, bool [H, W]; those half beyond the edge were not."""
+    x, y = np.moveaxis(_recorded_grid(lens, size, step=1), -1, 0)
+    inside: np.ndarray = (x >= 0.5) & (x <= size[0] - 0.5) & (y >= 0.5) & (y <= size[1] - 0.5)  # NaN is outside
+    return inside
 
 
 def opencv_lens(K: np.ndarray, coefficients: np.ndarray, where: str) -> Lens:

@@ -87,6 +87,11 @@ def shrink_picture(picture: np.ndarray, factor: int) -> np.ndarray:
     return ((total + area // 2) // area).astype(np.uint8)
 
 
+def shrink_mask(mask: np.ndarray, factor: int) -> np.ndarray:
+    """Mean over blocks of factor x factor pixels, float32 [H // factor, W // factor]; see `shrink_picture`."""
+    return _blocks(mask, factor).mean(axis=(1, 3), dtype=np.float32)
+
+
 def shrink_depth(depth: np.ndarray, factor: int, tolerance: float = 0.05) -> np.ndarray:
     """Depth float32 [H // factor, W // factor] of blocks of pixels; 0 (unknown) where no depth in a block is known.
 

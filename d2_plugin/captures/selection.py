@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from d2_plugin.captures.capture import Camera, Capture
-from d2_plugin.captures.pictures import shrink_depth, shrink_picture
+from d2_plugin.captures.pictures import shrink_depth, shrink_mask, shrink_picture
 from d2_plugin.errors import D2Error, unknown_name
 
 
@@ -68,6 +68,16 @@ class DownscaledSource:
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
         """The monocular map at the size it is stored in, or None."""
         return self.capture.mono(camera, frame)
+
+    def mask(self, camera: str, frame: int) -> np.ndarray | None:
+        """The mean of each block of the mask, float32 [H // factor, W // factor], or None."""
+        mask = self.capture.mask(camera, frame)
+        return None if mask is None else shrink_mask(mask, self.factor)
+
+    def recorded(self, camera: str) -> np.ndarray | None:
+        """Which blocks were recorded whole, bool [H // factor, W // factor], or None where all were."""
+        valid = self.capture.recorded(camera)
+        return None if valid is None else shrink_mask(valid.astype(np.float32), self.factor) > 1 - 1e-6
 
 
 def _smaller_camera(camera: Camera, factor: int) -> Camera:

@@ -15,7 +15,7 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.construct import CONSTRUCTION_VERSION, Construction
 from d2_plugin.priors.depth_on_disk import FilteredDepthOnDisk, find_depth_on_disk
 from d2_plugin.priors.disk.confidence import OF_DEPTH, OF_MONO, ConfidenceMaps
-from d2_plugin.priors.frame import Frame, describe_camera, describe_capture, digest, hash_of, not_of
+from d2_plugin.priors.frame import Frame, describe_camera, describe_capture, digest, hash_of, not_of, view_digest
 from d2_plugin.priors.monocular.maps import mono_source
 from d2_plugin.priors.settings import PriorSettings, Variant
 from d2_plugin.priors.stereo.cache import DepthCache, GeometricSource
@@ -206,7 +206,7 @@ def _refuse_other_pictures(capture: Capture, names: list[str], output: Path) -> 
     views = [(name, number) for number in shared for name in names if name in store.cameras]
     recorded = [(view, record) for view in views if (record := _recorded(store, *view)) is not None]
     compared = recorded[:: max(len(recorded) // COMPARED, 1)]
-    if compared and not any(digest(capture.image(*view)) == record.get("image") for view, record in compared):
+    if compared and not any(view_digest(capture, *view) == record.get("image") for view, record in compared):
         raise not_of(output, store.about, describe_capture(capture), "their pictures differ")
 
 

@@ -114,13 +114,19 @@ class Construction:
         nothing = np.zeros(image.shape[:2], np.float32)
         if stereo is None:
             stereo = StoredDepth(nothing, np.full_like(nothing, np.inf), {})
+        recorded = frame.recorded.get(name)
+        if recorded is not None:
+            sigma = np.where(recorded, stereo.sigma, np.float32(np.inf))
+            stereo = replace(stereo, depth=stereo.depth * recorded, sigma=sigma)
         mono = self._aligned(name, frame, stereo.depth)
         maps = self._fused(mono, stereo)
         if self.settings.far and self.settings.variant == "dual" and mono.inverse is not None:
             maps = _with_far(maps, far_pixels(mono.inverse, stereo.depth, image), stereo.depth)
-        recorded = {key: value for key, value in stereo.record.items() if key != "checksum"} or None
+        if recorded is not None:
+            maps = _within(maps, recorded)
+        about_stereo = {key: value for key, value in stereo.record.items() if key != "checksum"} or None
         skill = None if mono.uncertainty is None else mono.uncertainty.skill
-        return ViewPrior(replace(maps, colors=image), mono.refused, mono.alignment, skill, recorded)
+        return ViewPrior(replace(maps, colors=image), mono.refused, mono.alignment, skill, about_stereo)
 
     def _fused(self, mono: AlignedMap, stereo: StoredDepth) -> FusedPrior:
         """Verification and fusion. A map that was refused leaves the stereo depth alone, or nothing in the paper."""
@@ -179,6 +185,16 @@ class Construction:
         if self.geometric is None or self.settings.variant == "dual_unaligned":
             return not_aligned(kind)
         return align(prediction, geometric, kind=kind, settings=self.settings.align)
+
+
+def _within(maps: FusedPrior, recorded: np.ndarray) -> FusedPrior:
+    """Nothing is known of pixels that were not recorded."""
+    return replace(
+        maps,
+        depth=np.where(recorded, maps.depth, np.float32(0)),
+        labels=np.where(recorded, maps.labels, np.uint8(Label.EMPTY)),
+        sigma=np.where(recorded, maps.sigma, np.float32(np.inf)),
+    )
 
 
 def _with_far(maps: FusedPrior, far: np.ndarray, geometric: np.ndarray) -> FusedPrior:

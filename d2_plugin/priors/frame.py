@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,16 @@ class Frame:
     number: int
     images: dict[str, np.ndarray]
     hashes: dict[str, str]
+    recorded: dict[str, np.ndarray | None] = field(default_factory=dict)
+    """Which pixels of each picture were recorded; all where there is nothing."""
 
     @classmethod
     def read(cls, capture: Capture, cameras: Sequence[str], number: int) -> Frame:
         """Read the pictures of `cameras` at one frame."""
         images = {camera: capture.image(camera, number) for camera in cameras}
-        return cls(number, images, {camera: digest(image) for camera, image in images.items()})
+        recorded = {camera: capture.recorded(camera) for camera in cameras}
+        hashes = {camera: _digest(image, recorded[camera]) for camera, image in images.items()}
+        return cls(number, images, hashes, recorded)
 
 
 def describe_camera(camera: Camera) -> dict[str, Any]:
@@ -81,6 +85,15 @@ def digest(array: np.ndarray) -> str:
     """Hash of an array's type, shape and bytes."""
     head = f"{array.dtype.str}{array.shape}".encode()
     return hashlib.blake2b(head + np.ascontiguousarray(array).tobytes(), digest_size=16).hexdigest()
+
+
+def view_digest(capture: Capture, camera: str, number: int) -> str:
+    """Hash of the picture of one camera at one frame, as `Frame.hashes` has it."""
+    return _digest(capture.image(camera, number), capture.recorded(camera))
+
+
+def _digest(image: np.ndarray, recorded: np.ndarray | None) -> str:
+    return digest(image) if recorded is None else hash_of(digest(image), digest(recorded))
 
 
 def hash_of(*parts: Any) -> str:

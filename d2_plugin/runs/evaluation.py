@@ -81,7 +81,7 @@ def evaluate(
         true_depth = capture.depth(camera, frame)
         compared = metrics.Compared(
             *(color, truth, depth, None if true_depth is None else torch.from_numpy(true_depth)),
-            *(_moving(truth, still), None if before is None else before[1:], networks),
+            *(_moving(truth, still), None if before is None else before[1:], networks, _inside(capture, camera, frame)),
         )
         scores = {name: metric.score(compared) for name, metric in metrics.METRICS.items()}
         rows.append({"camera": camera, "frame": frame, **scores})
@@ -117,6 +117,15 @@ def _moving(truth: Tensor, still: np.ndarray | None) -> np.ndarray | None:
         return None
     moving = np.abs(truth.numpy() - still).max(-1) > CHANGED
     return moving if moving.mean() > MOVING_SHARE else None
+
+
+def _inside(capture: Capture, camera: str, frame: int) -> np.ndarray | None:
+    """The pixels [H, W] of the foreground mask that were recorded; None where neither is known."""
+    mask, recorded = capture.mask(camera, frame), capture.recorded(camera)
+    if mask is None:
+        return recorded
+    inside = mask > 0.5 if recorded is None else (mask > 0.5) & recorded
+    return inside if inside.any() else None
 
 
 def _checked(

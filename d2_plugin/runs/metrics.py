@@ -204,6 +204,8 @@ class Compared:
     before: tuple[Tensor, Tensor] | None = None
     """Render and truth of the frame before, of the same camera."""
     networks: Mapping[str, Callable[[Tensor, Tensor], float] | None] = field(default_factory=dict)
+    inside: np.ndarray | None = None
+    """[H, W] bool, recorded pixels inside the capture's foreground mask; None where it has neither."""
 
     @property
     def depths(self) -> tuple[Tensor, Tensor] | None:
@@ -235,6 +237,10 @@ METRICS = {
     "psnr_moving": Metric(
         "PSNR of the pixels that differ by more than 12/255 from the median of their camera's frames (this project)",
         lambda c: None if c.moving is None else psnr(c.image, c.truth, c.moving),
+    ),
+    "psnr_mask": Metric(
+        "PSNR of the recorded pixels inside the capture's foreground mask, where it has one (this project)",
+        lambda c: None if c.inside is None else psnr(c.image, c.truth, c.inside),
     ),
     "ssim1": Metric(
         "uniform 7x7 window, sample covariance, 3 px border dropped, data range 1 (scikit-image)",

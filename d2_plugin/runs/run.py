@@ -222,7 +222,8 @@ class Run:
             settings=(self._needed() if attach else {}) | dict(self.settings.overrides.get("backbone", {})),
         )
         training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
-        pictures = TrainingFrames(capture, cameras, self.settings.device)
+        weight = self.settings.background_weight
+        pictures = TrainingFrames(capture, cameras, self.settings.device, background_weight=weight)
         return backbone.Trainer(model, pictures, training, self._attach if attach and self.uses_prior else None)
 
     def _needed(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks.table import HOOKS
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.reading import said, shown_path
-from d2_plugin.settings import FORMAT, Count, Positional, Range, Seed, Settings, declared, of_this_format
+from d2_plugin.settings import FORMAT, Count, Positional, Range, Seed, Settings, Share, declared, of_this_format
 from d2_plugin.values import shown
 
 HOOK_NAMES = ("prior", *HOOKS)
@@ -68,6 +68,9 @@ class RunSettings(Settings):
     """Folder of a finished depth prior; without it the run builds its own."""
     accept_empty_prior: bool = False
     """Train with hooks even where no view has a usable prior, as the backbone alone would."""
+    background_weight: Share = 1.0
+    """Weight in the photometric loss of pixels outside the capture's foreground masks; 1 looks at no mask, 0 learns the
+    foreground alone."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the trainer runs."""
     protocol: str | None = None

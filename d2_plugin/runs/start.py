@@ -122,9 +122,16 @@ class TrainingFrames:
     """Views and pictures of the training cameras; decoded pictures are kept up to `keep_bytes`, the rest re-read."""
 
     def __init__(
-        self, capture: Capture, cameras: Sequence[str], device: torch.device | str = "cpu", keep_bytes: int = 1 << 30
+        self,
+        capture: Capture,
+        cameras: Sequence[str],
+        device: torch.device | str = "cpu",
+        keep_bytes: int = 1 << 30,
+        background_weight: float = 1.0,
     ) -> None:
         self.capture, self.device, self.keep_bytes = capture, device, keep_bytes
+        self.background_weight = background_weight
+        self._recorded = {camera: capture.recorded(camera) for camera in cameras}
         self.views = [make_view(capture, camera, frame, device) for frame in capture.frames for camera in cameras]
         self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
 
@@ -136,6 +143,21 @@ class TrainingFrames:
             while len(self._kept) > 1 and sum(image.nbytes for image in self._kept.values()) > self.keep_bytes:
                 self._kept.popitem(last=False)
         return torch.from_numpy(self._kept[index]).to(self.device).float() / 255
+
+    def weights(self, index: int) -> Tensor | None:
+        """How much each pixel [H, W] of `views[index]` counts: `background_weight` outside the foreground mask, 0 where
+        nothing was recorded; None where all pixels count alike."""
+        view = self.views[index]
+        mask = self.capture.mask(view.camera, view.frame) if self.background_weight < 1 else None
+        recorded = self._recorded[view.camera]
+        if mask is None and recorded is None:
+            return None
+        weights: np.ndarray = np.ones((view.height, view.width))
+        if mask is not None:
+            weights = self.background_weight + (1 - self.background_weight) * mask
+        if recorded is not None:
+            weights = weights * recorded
+        return torch.from_numpy(weights.astype(np.float32)).to(self.device)
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ COLUMNS = (
     Column("PSNR", r"PSNR$\uparrow$", "psnr", ".2f", True, unit="dB"),
     Column("PSNR cc", r"PSNR$_\mathrm{cc}\uparrow$", "psnr_cc", ".2f", True, always=False, unit="dB"),
     Column("PSNR moving", r"PSNR$_\mathrm{moving}\uparrow$", "psnr_moving", ".2f", True, always=False, unit="dB"),
+    Column("PSNR mask", r"PSNR$_\mathrm{mask}\uparrow$", "psnr_mask", ".2f", True, always=False, unit="dB"),
     Column("SSIM1", r"SSIM$_1\uparrow$", "ssim1", ".4f", True),
     Column("SSIM2", r"SSIM$_2\uparrow$", "ssim2", ".4f", True),
     Column("LPIPS", r"LPIPS$\downarrow$", "lpips", ".4f", False),

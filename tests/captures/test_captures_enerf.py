@@ -16,6 +16,8 @@ from d2_plugin.errors import D2Error
 cv2 = pytest.importorskip("cv2")
 
 W, H = 48, 32
+HALF_A_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+"""From OpenCV's pixels, whose centres lie at whole numbers, to this project's."""
 R_11 = (1.631797, -1.236095, 0.801056)
 T_11 = (0.327633, 1.096058, 3.260243)
 
@@ -89,7 +91,8 @@ def test_poses_map_world_to_camera(tmp_path: Path) -> None:
     rotation = cv2.Rodrigues(np.array(R_11))[0]
     np.testing.assert_allclose(camera.T_camera_world[:3, :3], rotation, atol=2e-6)
     np.testing.assert_allclose(camera.centre, -rotation.T @ np.array(T_11), atol=1e-5)
-    np.testing.assert_allclose(camera.K, [[40.1, 0, 25.06], [0, 40.3, 13.3], [0, 0, 1]])
+    # OpenCV, with which EasyMocap calibrates, has the centre of the first pixel at 0: here it is at 0.5.
+    np.testing.assert_allclose(camera.K, [[40.1, 0, 25.56], [0, 40.3, 13.8], [0, 0, 1]])
 
 
 def test_a_capture_written_by_opencv_reads_back(tmp_path: Path) -> None:
@@ -110,7 +113,7 @@ def test_a_capture_written_by_opencv_reads_back(tmp_path: Path) -> None:
     found = open_capture(tmp_path)  # without a list of names, the folders say which cameras there are
     assert sorted(found.cameras) == sorted(original.cameras)
     for name, camera in original.cameras.items():
-        np.testing.assert_allclose(found.cameras[name].K, camera.K, atol=1e-12)
+        np.testing.assert_allclose(found.cameras[name].K - HALF_A_PIXEL, camera.K, atol=1e-12)
         np.testing.assert_allclose(found.cameras[name].T_camera_world, camera.T_camera_world, atol=1e-9)
         np.testing.assert_array_equal(found.image(name, 1), original.image(name, 1))
 
@@ -141,7 +144,7 @@ def test_a_picture_that_is_smaller_than_its_calibration_scales_it(tmp_path: Path
     with (path / "intri.yml").open("a") as file:
         file.write(f"W_11: {2 * W}\nH_11: {2 * H}\n")
     cameras = open_capture(path).cameras
-    np.testing.assert_allclose(cameras["11"].K, [[20.05, 0, 12.53], [0, 20.15, 6.65], [0, 0, 1]])
+    np.testing.assert_allclose(cameras["11"].K, [[20.05, 0, 12.78], [0, 20.15, 6.9], [0, 0, 1]])
     assert cameras["00"].K[0, 0] == 40.1
 
 
@@ -154,11 +157,11 @@ def test_declared_depth_bounds_are_read(tmp_path: Path) -> None:
     assert cameras["00"].near_far is None
 
 
-def test_masks_and_backgrounds_are_named_and_not_used(tmp_path: Path) -> None:
+def test_hulls_and_backgrounds_are_named_and_not_used(tmp_path: Path) -> None:
     path = scene(tmp_path)
-    (path / "bgmtv2").mkdir()
+    (path / "vhull").mkdir()
     (path / "background.ply").touch()
-    assert "not used: bgmtv2, background.ply" in open_capture(path).notes
+    assert "not used: vhull, background.ply" in open_capture(path).notes
 
 
 def test_a_camera_asked_for_must_have_everything(tmp_path: Path) -> None:

@@ -137,9 +137,27 @@ def test_a_source_travels_to_another_process() -> None:
     np.testing.assert_array_equal(again.image("a", 0), before)
 
 
-def test_models_beyond_five_coefficients_are_refused() -> None:
-    assert opencv_lens(K, np.zeros((1, 8)), "here").bends is False
-    with pytest.raises(D2Error, match="camera 3 in intri.yml has 8 distortion coefficients.*undistort the pictures"):
-        opencv_lens(K, np.array([0.1, 0, 0, 0, 0, 0, 0, 0.2]), "camera 3 in intri.yml")
+def test_a_rational_lens_is_opencvs() -> None:
+    rational = (0.4, -0.1, 1e-3, 2e-3, 0.02, 0.5, 0.03, 0.01)
+    cv2 = pytest.importorskip("cv2")
+    lens = opencv_lens(K, np.array(rational), "here")
+    rays = np.stack(np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.4, 0.4, 7)), axis=-1).reshape(-1, 2)
+    points = np.column_stack([rays, np.ones(len(rays))])
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), np.array(rational))[0][:, 0]
+    np.testing.assert_allclose(lens.distort(rays), expected, atol=1e-12)
+
+
+def test_a_rational_lens_ends_before_it_folds_or_has_a_pole() -> None:
+    rays = np.array([[0.9, 0.0], [1.1, 0.0], [3.0, 0.0]])
+    pole = opencv_lens(K, np.array([0, 0, 0, 0, 0, -1.0, 0, 0]), "here")  # r / (1 - r^2)
+    np.testing.assert_allclose(pole.distort(rays)[:, 0], [0.9 / 0.19, np.nan, np.nan])
+    fold = opencv_lens(K, np.array([0, 0, 0, 0, 0, 1.0, 0, 0]), "here")  # r / (1 + r^2) is largest at 1
+    np.testing.assert_allclose(fold.distort(rays)[:, 0], [0.9 / 1.81, np.nan, np.nan])
+
+
+def test_models_beyond_eight_coefficients_are_refused() -> None:
+    assert opencv_lens(K, np.zeros((1, 14)), "here").bends is False
+    with pytest.raises(D2Error, match="camera 3 in intri.yml has 12 distortion coefficients.*undistort the pictures"):
+        opencv_lens(K, np.array([0.1, 0, 0, 0, 0, 0, 0, 0.2, 0, 0, 0.1, 0]), "camera 3 in intri.yml")
     with pytest.raises(D2Error, match="not finite"):
         opencv_lens(K, np.array([math.nan, 0, 0, 0]), "here")

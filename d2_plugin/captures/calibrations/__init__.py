@@ -2,6 +2,7 @@
 
 from d2_plugin.captures.calibrations.camera import MODELS, CalibratedCamera, scaled
 from d2_plugin.captures.calibrations.table import FORMATS, Calibration, Format, open_calibration, read_calibration
+from d2_plugin.captures.calibrations.undistort import Undistortion
 
 __all__ = [
     "FORMATS",
@@ -9,6 +10,7 @@ __all__ = [
     "CalibratedCamera",
     "Calibration",
     "Format",
+    "Undistortion",
     "open_calibration",
     "read_calibration",
     "scaled",

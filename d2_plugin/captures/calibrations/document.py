@@ -87,7 +87,10 @@ def numbers(table: Mapping[str, Any], key: str, shape: tuple[int, ...], place: s
     except (TypeError, ValueError, OverflowError) as failure:
         raise D2Error(f"{key} of {place} is {shown(value)}, which cannot be understood ({said(failure)})") from None
     if -1 not in shape and array.size != np.prod(shape):
-        raise D2Error(f"{key} of {place} is {shown(value)}, expected {' x '.join(map(str, shape))} numbers: {CORRECT}")
+        raise D2Error(
+            f"{key} of {place} cannot be understood: it is {shown(value)}, expected "
+            f"{' x '.join(map(str, shape))} numbers: {CORRECT}"
+        )
     if not (np.abs(array) <= LARGEST_NUMBER).all():
         raise D2Error(f"{key} of {place} has a number that is not finite or too large: {CORRECT}")
     return array.reshape(shape)

@@ -128,5 +128,8 @@ def _lens(K: np.ndarray, given: dict[str, float], model: str, where: str) -> tup
     if "FISHEYE" in model.upper():
         return "fisheye", (k1, k2, k3, k4)
     if k4:
-        raise D2Error(f"{where} has a k4 of r^8, which OpenCV's lens has not: undistort the pictures first")
+        raise D2Error(
+            f"{where} has 6 distortion coefficients, of which OpenCV's lens has not the last, k4 of r^8: undistort the "
+            "pictures first"
+        )
     return ("opencv", (k1, k2, p1, p2, k3)) if any((k1, k2, p1, p2, k3)) else ("pinhole", ())

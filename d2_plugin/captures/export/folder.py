@@ -10,6 +10,7 @@ import numpy as np
 
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.export.base import refuse_skew, whole_folder
+from d2_plugin.captures.masks import MASK_FOLDERS, VALID_FOLDER, as_picture
 from d2_plugin.captures.pictures import write_png
 
 
@@ -23,6 +24,10 @@ def save_capture(capture: Capture, path: Path | str) -> Path:
         for camera in capture.cameras:
             for frame in capture.frames:
                 _save_frame(capture, folder, camera, frame)
+            recorded = capture.recorded(camera)
+            if recorded is not None:
+                (folder / VALID_FOLDER).mkdir(exist_ok=True)
+                write_png(folder / VALID_FOLDER / f"{camera}.png", as_picture(recorded))
         if capture.mono_kind is not None:
             declared = {"kind": capture.mono_kind, "emulated": capture.mono_emulated}
             (folder / "mono" / "mono.json").write_text(json.dumps(declared) + "\n")
@@ -42,6 +47,9 @@ def _save_frame(capture: Capture, folder: Path, camera: str, frame: int) -> None
         np.savez_compressed(place("depth", ".npz"), depth=depth.astype(np.float32))
     if mono is not None:
         np.save(place("mono", ".npy"), mono.astype(np.float32))
+    mask = capture.mask(camera, frame)
+    if mask is not None:
+        write_png(place(MASK_FOLDERS[0], ".png"), as_picture(mask))
 
 
 def described(capture: Capture) -> dict[str, Any]:

@@ -20,8 +20,8 @@ from d2_plugin.errors import D2Error, unknown_name
 ENERF_FPS = 60.0
 """Frame rate at which EasyVolcap plays the data set; the files name none."""
 
-NOT_USED = ("masks", "mask", "bgmtv2", "bkgd", "vhull", "background.ply")
-"""What recordings of this layout may also hold. It is not used, because the whole picture is the truth."""
+NOT_USED = ("bkgd", "vhull", "background.ply")
+"""What recordings of this layout may also hold."""
 
 
 def is_enerf(path: Path) -> bool:

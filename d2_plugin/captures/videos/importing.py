@@ -20,6 +20,7 @@ from d2_plugin.captures.calibrations import CalibratedCamera, open_calibration, 
 from d2_plugin.captures.capture import Capture, Exposure
 from d2_plugin.captures.checks.calibrated import calibration_contradicted
 from d2_plugin.captures.export.folder import described
+from d2_plugin.captures.masks import VALID_FOLDER, as_picture
 from d2_plugin.captures.pictures import opencv, write_png
 from d2_plugin.captures.readers.videos import KIND as VIDEOS
 from d2_plugin.captures.readers.videos import TABLE
@@ -31,7 +32,7 @@ from d2_plugin.captures.videos.files import VideoFile, read_video
 from d2_plugin.captures.videos.grid import Grid, grid_of
 from d2_plugin.captures.videos.motion import LONG_SIDE, MOST_FRAMES, Watched
 from d2_plugin.captures.videos.settings import UNITS, ImportSettings, check_names, cut_of
-from d2_plugin.captures.videos.source import Cut, Upright, VideosSource, unturned, valid_pixels
+from d2_plugin.captures.videos.source import Cut, Upright, VideosSource, unturned
 from d2_plugin.durable import make_folder, remove_leftovers, write, write_table, write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
@@ -231,12 +232,10 @@ def _write_picture(path: Path, picture: np.ndarray) -> None:
 
 def _write_masks(folder: Path, capture: Capture) -> None:
     """valid/CAMERA.png, white where the camera recorded something, of those whose pictures have black margins."""
-    source = capture.source
-    assert isinstance(source, VideosSource)
-    for name, camera in source.cameras.items():
-        valid = valid_pixels(camera, source.cuts[name])
-        if not valid.all():
-            write_png(folder / "valid" / f"{name}.png", np.repeat(valid[..., None] * np.uint8(255), 3, axis=-1))
+    for name in capture.cameras:
+        recorded = capture.recorded(name)
+        if recorded is not None:
+            write_png(folder / VALID_FOLDER / f"{name}.png", as_picture(recorded))
 
 
 def _exposures(settings: ImportSettings, folder: Path, capture: Capture, told: Told) -> Capture:

@@ -120,6 +120,14 @@ class VideosSource:
     def mono(self, camera: str, frame: int) -> None:
         """None: a video carries no monocular maps."""
 
+    def mask(self, camera: str, frame: int) -> None:
+        """None: a video carries no masks."""
+
+    def recorded(self, camera: str) -> np.ndarray | None:
+        """Which pixels [h, w] were recorded, or None where all were."""
+        valid = valid_pixels(self.cameras[camera], self.cuts[camera])
+        return None if valid.all() else valid
+
     def as_dict(self) -> dict[str, Any]:
         """Plain values, from which `from_dict` makes the same."""
         return {name: self._camera(name) for name in self.cameras}

@@ -1,0 +1,39 @@
+"""Lens distortion undone once, when a recording is imported, instead of at every read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from d2_plugin.captures.calibrations.camera import CalibratedCamera
+from d2_plugin.captures.capture import Camera
+from d2_plugin.captures.lens import Lens, Resampling, recorded_pixels, resampled, resampling
+
+
+@dataclass(frozen=True, eq=False)
+class Undistortion:
+    """What turns the pictures of one camera into a pinhole's: `picture` for each, `valid` once, `camera` for the rest.
+
+    Size, focal lengths and principal point stay, so nothing is stretched; what was not recorded is black and not valid.
+    """
+
+    camera: Camera
+    """The pinhole camera of the undistorted pictures."""
+    valid: np.ndarray | None
+    """Which of their pixels were recorded, bool [H, W]; None where all were."""
+    _maps: Resampling | None
+
+    @classmethod
+    def of(cls, camera: CalibratedCamera) -> Undistortion:
+        """That of a calibrated camera; one without distortion and skew leaves its pictures as they are."""
+        lens: Lens = camera.lens
+        if not lens.bends:
+            return cls(camera.pinhole(), None, None)
+        size = (camera.width, camera.height)
+        valid = recorded_pixels(lens, size)
+        return cls(camera.pinhole(), None if valid.all() else valid, resampling(lens, size))
+
+    def picture(self, recorded: np.ndarray) -> np.ndarray:
+        """The undistorted picture or mask [H, W] or [H, W, C], of the same type."""
+        return recorded if self._maps is None else resampled(recorded, self._maps)
