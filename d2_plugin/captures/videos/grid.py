@@ -99,8 +99,8 @@ def _asked(numbers: np.ndarray, fps: float, times: Sequence[float] | None, frame
         numbers = numbers[(numbers / fps >= times[0] - 1e-9) & (numbers / fps <= times[1] + 1e-9)]
         if not len(numbers):
             raise D2Error(
-                f"--times asks for {times[0]:g} to {times[1]:g} seconds and all cameras recorded 0 to {last / fps:.2f}, "
-                "so choose within that"
+                f"--times asks for {times[0]:g} to {times[1]:g} seconds and the videos share 0 to {last / fps:.2f}: "
+                "choose within that"
             )
     if frames is not None:
         missing = sorted(set(frames) - set(numbers.tolist()))
