@@ -1,12 +1,13 @@
 """Cameras of different exposure: an affine change of colour for each training camera, learnt with the Gaussians.
 
 The Gaussians keep the colours of the mean camera, which is what a camera that did not train is shown in: the changes
-of all cameras have the mean zero, so that no common change can hide in them.
+of all cameras have the mean zero, so that no common change can hide in them. Where gains were measured beforehand the
+changes begin there, and a camera that does not train is shown with its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -25,17 +26,33 @@ class Appearance:
         self.device = device
         self.changes: dict[str, nn.Parameter] = {}
         self._optimizers: dict[str, torch.optim.Adam] = {}
+        self.measured: dict[str, Tensor] = {}
+        """Changes [3, 4] of cameras that do not train, relative to the mean of those that do."""
+
+    def start_from(self, gains: Mapping[str, Sequence[float]], training: Sequence[str]) -> None:
+        """Begin with measured gains, by camera and channel, before the first step; only their ratios count."""
+        logs = {name: torch.tensor(gain, dtype=torch.float64, device=self.device).log() for name, gain in gains.items()}
+        if not set(training) <= logs.keys():
+            return
+        ratios = {name: log.exp() for name, log in logs.items()}
+        mean = torch.stack([ratios[name] for name in training]).mean(0)
+        for name, ratio in ratios.items():
+            change = torch.cat([torch.diag(ratio / mean - 1), ratio.new_zeros(3, 1)], 1).float()
+            if name not in training:
+                self.measured[name] = change
+            elif name not in self.changes:
+                self._add(name, change)
 
     def seen_by(self, camera: str, render: Render) -> Render:
         """The render in the colours of `camera`; unchanged where that camera never trained.
 
         A camera that renders with gradients trains from then on.
         """
-        if torch.is_grad_enabled() and camera not in self.changes:
+        if torch.is_grad_enabled() and camera not in self.changes and camera not in self.measured:
             self._add(camera, torch.zeros(3, 4, device=self.device))
-        if camera not in self.changes:
+        if camera not in self.changes and camera not in self.measured:
             return render
-        change = self.change(camera)
+        change = self.change(camera) if camera in self.changes else self.measured[camera]
         return render._replace(color=render.color + render.color @ change[:, :3].T + change[:, 3])
 
     def change(self, camera: str) -> Tensor:
@@ -51,16 +68,20 @@ class Appearance:
                 self._optimizers[camera].zero_grad(set_to_none=True)
 
     def state_dict(self) -> dict[str, Any]:
-        """Changes and optimizers, by camera."""
-        return {
+        """Changes and optimizers, by camera; those of cameras that do not train are measured and have none."""
+        fixed = {camera: {"measured": value.clone()} for camera, value in self.measured.items()}
+        return fixed | {
             camera: {"change": value.detach().clone(), "optimizer": self._optimizers[camera].state_dict()}
             for camera, value in self.changes.items()
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`: with its cameras, and no others."""
-        self.changes, self._optimizers = {}, {}
+        self.changes, self._optimizers, self.measured = {}, {}, {}
         for camera, part in state.items():
+            if "measured" in part:
+                self.measured[camera] = part["measured"].to(self.device).clone()
+                continue
             self._add(camera, part["change"].to(self.device).clone())
             self._optimizers[camera].load_state_dict(part["optimizer"])
 

@@ -19,7 +19,7 @@ from d2_plugin.attach.names import RenamedStore
 from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.export.export import EXPORT_FILE, export_capture
 from d2_plugin.captures.pictures import picture_size, read_picture, write_png
-from d2_plugin.captures.video import VideoSource, video_header
+from d2_plugin.captures.videos.plain import VideoSource, video_header
 from d2_plugin.config import D2Config, for_iterations
 from d2_plugin.priors.colmap.dense_arrays import read_dense_array, write_dense_array
 from d2_plugin.priors.depth_on_disk import SensorDepth

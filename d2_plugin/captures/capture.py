@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -28,6 +29,14 @@ class Camera:
     def centre(self) -> np.ndarray:
         """Camera centre in the world, [3]."""
         return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
+
+
+class Exposure(NamedTuple):
+    """How bright a camera sees what others see, per channel: its gain over their geometric mean."""
+
+    gain: tuple[float, float, float]
+    error: tuple[float, float, float]
+    """Standard error."""
 
 
 class Source(Protocol):
@@ -65,7 +74,9 @@ class Capture:
     `mono_kind` says what `source.mono` returns: "relative" is affine-invariant inverse depth (larger is nearer),
     "metric" is depth; None when there are no maps. `mono_emulated` is True when those maps were made from true
     depth rather than predicted by a network: whoever shows a figure that rests on them must say so. `layout` names the
-    reader in `d2_plugin.captures.LAYOUTS` that opened it, which camera presets go by.
+    reader in `d2_plugin.captures.LAYOUTS` that opened it, which camera presets go by. `exposures` are what the import
+    of videos measured, by camera; none elsewhere. `late` says by how many seconds a camera's frame was taken after the
+    instant that its number stands for, where cameras did not expose together.
     """
 
     name: str
@@ -78,6 +89,8 @@ class Capture:
     mono_emulated: bool = False
     notes: tuple[str, ...] = field(default=())
     layout: str = "folder"
+    exposures: Mapping[str, Exposure] = field(default_factory=dict)
+    late: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3]; refuses a picture whose size is not the camera's."""
@@ -104,9 +117,10 @@ class Capture:
         valid = self.source.recorded(camera) if isinstance(self.source, MaskedSource) else None
         return None if valid is None else self._sized(valid, camera, self.frames[0], "valid region at frame")
 
-    def seconds(self, frame: int) -> float:
-        """Time of a frame since the first one, in seconds."""
-        return (frame - self.frames[0]) / self.fps
+    def seconds(self, frame: int, camera: str | None = None) -> float:
+        """Time of a frame since the first one, in seconds; with `camera`, the instant at which that one took it."""
+        late = 0.0 if camera is None else self.late.get(camera, {}).get(frame, 0.0)
+        return (frame - self.frames[0]) / self.fps + late
 
     def _sized(self, array: np.ndarray, camera: str, frame: int, what: str) -> np.ndarray:
         expected = (self.cameras[camera].height, self.cameras[camera].width)

@@ -14,6 +14,7 @@ from d2_plugin.captures.readers.folder import CALIBRATION, is_folder, open_folde
 from d2_plugin.captures.readers.n3dv import is_n3dv, open_n3dv
 from d2_plugin.captures.readers.technicolor import is_technicolor, open_technicolor
 from d2_plugin.captures.readers.transforms_json import is_transforms, open_transforms
+from d2_plugin.captures.readers.videos import is_videos, open_videos
 from d2_plugin.captures.selection import downscale as downscaled
 from d2_plugin.captures.selection import select_frames
 from d2_plugin.errors import D2Error, unknown_name
@@ -33,6 +34,7 @@ class Layout(NamedTuple):
 
 LAYOUTS: dict[str, Layout] = {
     "folder": Layout(is_folder, open_folder),
+    "videos": Layout(is_videos, open_videos),
     "n3dv": Layout(is_n3dv, open_n3dv),
     "technicolor": Layout(is_technicolor, open_technicolor),
     "enerf": Layout(is_enerf, open_enerf),

@@ -20,6 +20,9 @@ from d2_plugin.captures.protocols import PREFIX as PROTOCOL
 from d2_plugin.captures.readers.n3dv import UNSYNCHRONISED
 from d2_plugin.errors import D2Error, unknown_name
 
+ALL = ("all",)
+"""In place of camera names: every camera that is not held out trains."""
+
 PREFIX = "preset:"
 """How a preset begins where camera names are expected."""
 
@@ -114,6 +117,9 @@ def resolve_cameras(
     Where `train` is one preset or protocol, the capture is opened (headers only) and the names are filled in, those of
     `test` only where it is None. Names pass through unchanged.
     """
+    if train == ALL:
+        names = tuple(name for name in open_capture(path).cameras if name not in (test or ()))
+        return names, test, ()
     if split_name(train) is None:
         return train, test, ()
     if len(train) > 1:

@@ -16,6 +16,7 @@ from d2_plugin.errors import D2Error, unknown_name
 
 COMMANDS = {
     "demo": "demo",
+    "import": "import_",
     "plan": "plan",
     "priors": "priors",
     "train": "train",

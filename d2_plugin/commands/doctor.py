@@ -1,4 +1,4 @@
-"""What is installed, what is missing for which feature, and which compiler and caches are used."""
+"""What is installed and what is missing for which feature; of a recording, what it lacks."""
 
 from __future__ import annotations
 
@@ -6,25 +6,46 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
 from d2_plugin import __version__, compiler, registry
 from d2_plugin.commands.arguments.form import Form
+from d2_plugin.settings import Positional, Settings
 
 OPTIONAL = {
     "onnxruntime": ("mono", "monocular depth from an ONNX network"),
     "pycolmap": ("stereo", "sparse points from known cameras"),
     "cv2": ("image", "pictures, videos, the OpenCV stereo sweep"),
     "kornia": ("test", "image operations that tests compare with"),
-    "av": ("video", "videos of a run"),
+    "av": ("video", "the import of videos, and videos of a run"),
     "viser": ("view", "the page that shows a run, and one that trains"),
     "rich": ("cli", "progress bars"),
     "distributed": ("cluster", "priors built by several processes or machines"),
 }
 
 
+@dataclass(frozen=True)
+class DoctorSettings(Settings):
+    """What is examined."""
+
+    capture: Annotated[Path | None, Positional()] = None
+    """A recording: what it has and what it lacks. Without one, what is installed."""
+
+
 def form(words: list[str]) -> Form:
-    """What `d2 doctor` takes: nothing."""
-    return Form("d2 doctor", __doc__ or "", (), lambda given: report())
+    """What `d2 doctor` takes."""
+
+    def run(settings: DoctorSettings) -> str:
+        if settings.capture is None:
+            return report()
+        from d2_plugin.captures import open_capture
+        from d2_plugin.captures.checks.lacking import lacking_text
+
+        return lacking_text(open_capture(settings.capture))
+
+    return Form.of("d2 doctor", __doc__, DoctorSettings, run)
 
 
 def report() -> str:

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from d2_plugin.commands.arguments.form import Form, Given
-from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
+from d2_plugin.commands.arguments.recording import (
+    ConfigFile,
+    recording_form,
+    run_settings,
+    say,
+    say_notes,
+    say_plan,
+    table_of_config,
+)
+from d2_plugin.errors import D2Error
 
 if TYPE_CHECKING:
     from d2_plugin.runs.run import Run
     from d2_plugin.viewing.live.run import LiveRun
 
 OF_THE_RUN = ("test_cameras", "backbone", "iterations", "hooks", "priors", "accept_empty_prior", "seed", "device")
-TABLES = ("densify", "prune", "depth_loss", "d2", "priors", "backbone", "plan")
+TABLES = ("densify", "prune", "depth_loss", "d2", "priors", "backbone", "plan", "import")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +32,8 @@ class TrainOptions(ConfigFile):
 
     output: Path
     """Folder of the run; an unfinished run in it is continued."""
+    calibration: Path | None = None
+    """Calibration of the cameras where CAPTURE is a folder of videos: they are imported first, into OUTPUT-capture."""
     view: bool = False
     """Watch it train on a page in the browser."""
     export_ply: bool = False
@@ -40,6 +51,7 @@ def run(given: Given) -> str:
     from d2_plugin.runs.tables import metrics_table
 
     options = given.make(TrainOptions)
+    given = _imported(given, options)
     run = Run(run_settings(given), options.output)
     say_notes(run.scene.capture.notes)
     say_plan(run.scene.plan)
@@ -56,6 +68,31 @@ def run(given: Given) -> str:
     table = metrics_table({options.output.name: metrics})
     where = f"metrics in {options.output / 'metrics.json'}, pictures in {options.output / 'pictures'}"
     return "\n".join([table, where, *([] if run.prior is None else [run.prior["headline"]])])
+
+
+def _imported(given: Given, options: TrainOptions) -> Given:
+    """What was given, with videos replaced by the recording that they become; an unfinished import goes on."""
+    from d2_plugin.captures.videos.importing import import_videos
+    from d2_plugin.captures.videos.settings import ImportChoices, ImportSettings
+
+    videos = Path(given.values["capture"])
+    if options.calibration is None:
+        _refuse_videos(videos)
+        return given
+    chosen = ImportChoices.from_dict(table_of_config(given, "import"), "import")
+    folder = options.output.with_name(f"{options.output.name}-capture")
+    settings = ImportSettings(videos=(videos,), calibration=options.calibration, output=folder, **vars(chosen))
+    import_videos(settings, told=say)
+    return replace(given, values={**given.values, "capture": str(folder)})
+
+
+def _refuse_videos(path: Path) -> None:
+    """Say what a folder of nothing but videos needs."""
+    from d2_plugin.captures.layouts import LAYOUTS
+    from d2_plugin.captures.videos.files import videos_below
+
+    if path.is_dir() and not any(layout.recognised(path) for layout in LAYOUTS.values()) and videos_below(path):
+        raise D2Error(f"{path} holds videos and no calibration that goes with them: give it with --calibration FILE")
 
 
 def _live(run: Run) -> LiveRun:

@@ -109,9 +109,7 @@ def _joined(parts: list[Any], total: int, progress: Progress | None) -> PriorSum
 
 
 @contextmanager
-def cluster_client(
-    scheduler: str | None, workers: int, purpose: str = "building priors on a cluster"
-) -> Iterator[Any]:
+def cluster_client(scheduler: str | None, workers: int, purpose: str = "building priors on a cluster") -> Iterator[Any]:
     """A client of the scheduler at that address, or of processes that are started here and ended afterwards.
 
     `purpose` completes the sentence "<purpose> needs dask.distributed".

@@ -97,9 +97,7 @@ def encode_sigma(sigma: np.ndarray) -> np.ndarray:
 class PriorStore:
     """Priors of one capture, by camera and frame; safe for many readers, and for writers of different frames."""
 
-    def __init__(
-        self, path: Path | str, cameras: Sequence[str], frames: Sequence[int], about: dict[str, Any]
-    ) -> None:
+    def __init__(self, path: Path | str, cameras: Sequence[str], frames: Sequence[int], about: dict[str, Any]) -> None:
         """Use `open` or `create`."""
         self.path, self.about = Path(path), about
         self.cameras, self.frames = tuple(cameras), tuple(frames)

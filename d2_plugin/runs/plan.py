@@ -186,9 +186,7 @@ def _stereo(capture: Capture, cameras: Sequence[str], settings: PriorSettings, p
     return Decision("stereo", overlap and textured, lacking + figures)
 
 
-def appearance_decision(
-    capture: Capture, cameras: Sequence[str], positions: np.ndarray, times: np.ndarray
-) -> Decision:
+def appearance_decision(capture: Capture, cameras: Sequence[str], positions: np.ndarray, times: np.ndarray) -> Decision:
     """Whether each training camera learns a change of colour: only where their exposures differ.
 
     Args:
@@ -198,6 +196,8 @@ def appearance_decision(
     """
     if len(cameras) < 2:
         return Decision("appearance", False, "one training camera", "it takes a second training camera")
+    if set(cameras) <= capture.exposures.keys():
+        return _measured_at_import(capture, cameras)
     found = relative_exposures(capture, cameras, positions, times)
     if found is None:
         return Decision("appearance", False, f"exposures not known: a camera shares fewer than {FEWEST} points")
@@ -206,6 +206,18 @@ def appearance_decision(
     agree = "differ" if differ else "agree"
     figures = f"gains off the mean by {gain:.1%} at most (standard error {error:.1%}, {found.points} points or more)"
     return Decision("appearance", differ, f"the cameras' exposures {agree}: {figures}")
+
+
+def _measured_at_import(capture: Capture, cameras: Sequence[str]) -> Decision:
+    """The decision by the gains that the import of the videos found."""
+    gains = np.log([capture.exposures[name].gain for name in cameras])
+    errors = np.array([capture.exposures[name].error for name in cameras])
+    off = np.abs(gains - gains.mean(0))
+    worst = np.unravel_index(off.argmax(), off.shape)
+    gain, error = float(off[worst]), float(errors[worst])
+    differ = gain > DIFFERENT_GAIN and gain > 3 * error
+    figures = f"gains off the mean by {gain:.1%} at most (standard error {error:.1%}, measured at import)"
+    return Decision("appearance", differ, f"the cameras' exposures {'differ' if differ else 'agree'}: {figures}")
 
 
 def _in_words(seen: Overlap) -> str:

@@ -91,11 +91,11 @@ class TimedPoints:
 
 
 def make_view(capture: Capture, camera: str, frame: int, device: torch.device | str = "cpu") -> View:
-    """The view of one camera at one frame; time is in seconds since the first frame."""
+    """The view of one camera at one frame; time is in seconds since the first frame, as this camera took it."""
     calibration = capture.cameras[camera]
     pose = torch.tensor(calibration.T_camera_world, dtype=torch.float32, device=device)
     intrinsics = torch.tensor(calibration.K, dtype=torch.float32, device=device)
-    time = capture.seconds(frame)
+    time = capture.seconds(frame, camera)
     return View(camera, frame, time, pose, intrinsics, calibration.width, calibration.height)
 
 

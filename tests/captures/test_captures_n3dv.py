@@ -14,7 +14,7 @@ from d2_plugin.captures import open_capture
 from d2_plugin.captures.export.folder import save_capture
 from d2_plugin.captures.pictures import write_png
 from d2_plugin.captures.readers.n3dv import camera_from_row
-from d2_plugin.captures.video import SKIP_LIMIT, VideoSource
+from d2_plugin.captures.videos.plain import SKIP_LIMIT, VideoSource
 from d2_plugin.errors import D2Error
 
 ROW = np.array(

@@ -9,6 +9,8 @@ are refused here already, not after the training that they are to judge.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +48,9 @@ ENOUGH = 12
 
 ENOUGH_SHARE = 0.5
 """Share of the matched features that must lie on one geometry: false matches do not."""
+
+MOST_SWAPPED = 6
+"""Cameras of a recording in which two that were swapped are looked for."""
 
 MISSED = 0.01
 """Median distance from the epipolar lines, in diagonals of the picture, beyond which a calibration is named."""
@@ -143,6 +148,30 @@ def _plain(capture: Capture, cameras: Sequence[str]) -> Iterator[str]:
         for what, frames in found.items():
             listed = ", ".join(map(str, frames[:5])) + (", ..." if len(frames) > 5 else "")
             yield f"camera {name} is {what} at frame {listed}: nothing can be learned from that"
+
+
+def calibration_contradicted(capture: Capture) -> str:
+    """What `check_capture` says of a calibration that contradicts the pictures, and whose swap would mend it; or ""."""
+    said = next(iter(_contradicted(capture, list(capture.cameras))), "")
+    swap = _swapped(capture) if said else None
+    return f"cameras {swap[0]} and {swap[1]} are swapped: exchange their videos or their entries" if swap else said
+
+
+def _swapped(capture: Capture) -> tuple[str, str] | None:
+    """Two cameras of few whose calibrations, exchanged, miss nothing."""
+    names = list(capture.cameras)
+    if not 2 < len(names) <= MOST_SWAPPED:
+        return None
+    features = {name: _features(capture, name) for name in names}
+    for one, other in combinations(names, 2):
+        a, b = capture.cameras[one], capture.cameras[other]
+        exchanged = {one: replace(b, name=one), other: replace(a, name=other)}
+        trial = replace(capture, cameras={**capture.cameras, **exchanged})
+        pairs = [_pair(trial, *pair, features) for pair in _neighbours(trial, names)]
+        checked = [pair for pair in pairs if pair is not None]
+        if checked and not any(pair.missed for pair in checked):
+            return one, other
+    return None
 
 
 def _contradicted(capture: Capture, cameras: Sequence[str]) -> Iterator[str]:

@@ -19,7 +19,7 @@ def save_capture(capture: Capture, path: Path | str) -> Path:
 
     Pictures are lossless PNG; maps are float32. Raises `D2Error` where `path` already holds something.
     """
-    description = json_text(_description(capture), "cameras.json", indent=1)
+    description = json_text(described(capture), "cameras.json", indent=1)
     with whole_folder(path) as folder:
         for camera in capture.cameras:
             for frame in capture.frames:
@@ -52,9 +52,14 @@ def _save_frame(capture: Capture, folder: Path, camera: str, frame: int) -> None
         write_png(place(MASK_FOLDERS[0], ".png"), as_picture(mask))
 
 
-def _description(capture: Capture) -> dict[str, Any]:
+def described(capture: Capture) -> dict[str, Any]:
+    """What cameras.json says of a capture."""
     bounds = {name: list(camera.near_far) for name, camera in capture.cameras.items() if camera.near_far is not None}
+    exposures = {name: one._asdict() for name, one in capture.exposures.items() if name in capture.cameras}
+    late = {name: {str(k): v for k, v in one.items()} for name, one in capture.late.items() if name in capture.cameras}
     return {
+        **({"exposures": exposures} if exposures else {}),
+        **({"late": late} if late else {}),
         "convention": "OpenCV axes, x_cam = R X + t, pixel centres at +0.5",
         "source": capture.name,
         "notes": list(capture.notes),

@@ -21,6 +21,7 @@ from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import common_frames, numbered_files
 from d2_plugin.captures.lens import Lens
 from d2_plugin.captures.pictures import picture_size
+from d2_plugin.captures.readers.measured import with_measured
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import field, read_json
 
@@ -52,7 +53,8 @@ def open_folder(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
     fps, fps_notes = _frame_rate(description, path, len(frames))
     pinholes = {name: calibrated[name][0] for name in names}
     lenses = {name: calibrated[name][1] for name in names}
-    return assembled(path, pinholes, images, frames, fps, (*notes, *frame_notes, *fps_notes), lenses)
+    capture = assembled(path, pinholes, images, frames, fps, (*notes, *frame_notes, *fps_notes), lenses)
+    return with_measured(capture, description, str(path / CALIBRATION))
 
 
 def _calibrations(description: dict[str, Any], path: Path) -> dict[str, tuple[Camera, Lens]]:

@@ -20,7 +20,7 @@ from d2_plugin.captures.calibration import LARGEST_NUMBER, checked_camera, check
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.files import FrameFiles, cameras_with_pictures, collect, common_frames, numbered_files
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES, picture_size
-from d2_plugin.captures.video import VideoSource, video_header
+from d2_plugin.captures.videos.plain import VideoSource, video_header
 from d2_plugin.errors import D2Error
 
 log = logging.getLogger(__name__)

@@ -27,7 +27,7 @@ CAPTURE = ("capture", "train_cameras", "frames", "downscale", "mono_onnx", "mono
 WRITTEN = {
     "capture": "images/CAMERA/FRAME.png with cameras.json, or as N3DV, Technicolor, ENeRF-Outdoor, COLMAP or "
     "transforms.json lay it out.",
-    "train_cameras": "Names joined by commas, as in 00,02,05,07; or preset:2, preset:3, preset:4 for a known data set; "
+    "train_cameras": "Names joined by commas, as in 00,02,05,07; all; or preset:2, preset:3, preset:4 for a known data set; "
     "or protocol:gc-4dgs-4, protocol:4c4d and others for a published split.",
     "test_cameras": "Names joined by commas.",
     "frames": "Written first:last or first:last:step, the last one included.",
@@ -77,6 +77,7 @@ def recording_form(
 def all_tables(backbone: str) -> dict[str, Group]:
     """Every table of settings of a run, with the class that declares it."""
     from d2_plugin import registry
+    from d2_plugin.captures.videos.settings import ImportChoices
     from d2_plugin.config import D2Config
     from d2_plugin.priors.settings import PriorSettings
     from d2_plugin.runs.settings import PlanChoices
@@ -89,6 +90,7 @@ def all_tables(backbone: str) -> dict[str, Group]:
         "priors": Group(PriorSettings),
         "backbone": Group(type(module.settings_from({}))),
         "plan": Group(PlanChoices),
+        "import": Group(ImportChoices),
     }
 
 
@@ -102,8 +104,16 @@ def run_settings(given: Given, **more: Any) -> RunSettings:
     )
     say_notes(notes)
     overrides = _over(read_toml(given.values["config"]), given.tables)
+    overrides.pop("import", None)  # of the recording, not of the run
     more["protocol"] = split_name(given.values["train_cameras"])
     return given.make(RunSettings, train_cameras=train, test_cameras=test, overrides=overrides, **more)
+
+
+def table_of_config(given: Given, name: str) -> dict[str, Any]:
+    """One table of settings: that of the --config file with the flags over it."""
+    both = _over(read_toml(given.values["config"]), given.tables)
+    found = both.get(name, {})
+    return found if isinstance(found, dict) else {name: found}
 
 
 def hook_names(text: str) -> tuple[str, ...]:

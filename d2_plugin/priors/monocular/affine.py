@@ -111,9 +111,7 @@ def charbonnier(residual: np.ndarray, epsilon: float) -> np.ndarray:
     return residual * (residual / (np.hypot(residual, epsilon) + epsilon))
 
 
-def _usable(
-    x: np.ndarray, y: np.ndarray, weights: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _usable(x: np.ndarray, y: np.ndarray, weights: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     x, y = np.asarray(x, np.float64).ravel(), np.asarray(y, np.float64).ravel()
     weights = np.ones_like(x) if weights is None else np.asarray(weights, np.float64).ravel()
     keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(weights) & (weights > 0)

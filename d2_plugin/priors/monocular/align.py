@@ -189,9 +189,7 @@ def _fit(x: np.ndarray, target: np.ndarray, settings: AlignSettings) -> tuple[Af
     return fit, epsilon, t
 
 
-def _judge(
-    fit: AffineFit, correlation: float, t: float, inliers: float, settings: AlignSettings
-) -> AlignStatus:
+def _judge(fit: AffineFit, correlation: float, t: float, inliers: float, settings: AlignSettings) -> AlignStatus:
     if correlation < settings.wrong_kind_correlation:
         return AlignStatus.WRONG_KIND
     if fit.flat or fit.boundary:

@@ -121,4 +121,3 @@ def remove_speckles(depth: np.ndarray, size: int, relative_step: float) -> np.nd
     steps = np.where(valid, np.clip(scaled, 0, 32000) + 1, 0).astype(np.int16)
     cv2.filterSpeckles(steps, 0, size, 8)
     return np.where(steps > 0, depth, 0).astype(np.float32)
-

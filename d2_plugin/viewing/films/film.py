@@ -194,5 +194,3 @@ def _depths(subjects: Sequence[Subject], plan: Plan, size: tuple[int, int], show
         views = [subject.view(plan.stops[i].pose, plan.stops[i].time, small) for i in chosen]
         found += [look(subject.backbone, view).depth.numpy() for view in views]
     return depth_scale(found)
-
-

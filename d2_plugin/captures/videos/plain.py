@@ -1,4 +1,4 @@
-"""Frames out of videos, decoded when asked for."""
+"""Frames out of videos of a constant rate by their number, decoded by OpenCV when asked for: what N3DV needs."""
 
 from __future__ import annotations
 
