@@ -19,7 +19,9 @@ from d2_plugin.errors import D2Error
 from .cpu import run_on_cpu
 from .names import RenamedStore
 from .originals import provide
+from .packages import stand_in_for
 from .recipes import RECIPES, recipe
+from .repairs import repair
 from .session import Session
 
 log = logging.getLogger(__name__)
@@ -47,6 +49,8 @@ def launch(options: argparse.Namespace, command: Sequence[str]) -> Session | Non
     sys.argv = list(command)
     sys.path.insert(0, str(script.resolve().parent))
     found = recipe(options.repository)
+    repair()
+    stand_in_for(script.resolve(), {original.name for original in found.originals})
     provide(found.originals, script.parent, options.cpu)
     if options.cpu:
         run_on_cpu()
