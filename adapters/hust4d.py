@@ -10,6 +10,7 @@ adapter of the fine stage takes the place of the coarse one's. Iterations count 
 
 from __future__ import annotations
 
+from pathlib import PurePosixPath
 from typing import Any
 
 import torch
@@ -20,7 +21,7 @@ from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_ma
 from d2_plugin.gaussians.slicing import unit_quaternions
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
-from .inria import InriaAdapter
+from .inria import InriaAdapter, RenderedCamera
 from .inverse_deformation import Inversion, invert_at_times
 from .keys import KeyOf, PriorKey, key_from_picture
 
@@ -102,9 +103,21 @@ class Hust4DAdapter(InriaAdapter):
     def _default_key(self, camera: Any) -> PriorKey:
         if self._dataset is None:
             return key_from_picture(str(camera.image_name))
-        paths = getattr(self._dataset, "image_paths", None)
-        index = int(camera.uid)  # data sets of Blender and COLMAP are lists of CameraInfo instead
-        return key_from_picture(str(paths[index] if paths is not None else self._dataset[index].image_path))
+        return key_from_picture(str(self.picture(camera)))
+
+    def picture(self, camera: Any) -> str | None:
+        """Path of the picture, from the data set: the camera's object has its place there and nothing more."""
+        if isinstance(camera, RenderedCamera):
+            camera = camera.camera
+        if self._dataset is None or not hasattr(camera, "uid"):
+            return None
+        paths, index = getattr(self._dataset, "image_paths", None), int(camera.uid)
+        if paths is not None:
+            return str(paths[index])
+        # Data sets of Blender, COLMAP and HyperNeRF give CameraInfo instead; the last one's path is the folder alone.
+        info = self._dataset[index]
+        path = PurePosixPath(str(info.image_path))
+        return str(path if path.suffix else path / str(info.image_name))
 
     def _append(self, points: Points) -> None:
         """Canonical Gaussians that the field moves onto the points; those outside its grid are left out.

@@ -98,6 +98,13 @@ class InriaAdapter(ABC):
             self._renders.put(view, package)
         return view
 
+    def picture(self, camera: Any) -> str | None:
+        """Path of the picture that a camera shows, where its object says it: an export's names are found by it."""
+        if isinstance(camera, RenderedCamera):
+            camera = camera.camera
+        path = getattr(camera, "image_path", None)
+        return None if path is None else str(path)
+
     def begin_step(self, step: int) -> None:
         """Note the training step; renders of earlier steps are out of date and forgotten."""
         if step != self._step:

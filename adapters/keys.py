@@ -29,6 +29,7 @@ KeyOf = Callable[[Any], PriorKey]
 """From a trainer's camera object to the key of its prior; every adapter takes one as `key`."""
 
 _PREFIXED = re.compile(r"(?P<camera>.+)_(?P<frame>\d+)$")
+_TECHNICOLOR = re.compile(r"(?P<frame>\d+)_(?P<camera>\d+)$")
 _NUMBER = re.compile(r"(\d+)\D*$")
 _NO_CAMERA = {"frame", "image", "img"}
 _NO_FOLDER = {"", ".", "..", "/", "images"}
@@ -40,8 +41,7 @@ def key_from_picture(name: str) -> PriorKey:
     Raises:
         D2Error: the name has no camera or no frame in it.
     """
-    path = PurePosixPath(name.replace("\\", "/"))
-    stem = path.stem if path.suffix and not path.suffix[1:].isdigit() else path.name
+    path, stem = PurePosixPath(name.replace("\\", "/")), _stem(name)
     match = _PREFIXED.match(stem)
     if match and match["camera"].lower() not in _NO_CAMERA:
         return PriorKey(match["camera"], int(match["frame"]))
@@ -55,9 +55,29 @@ def key_from_picture(name: str) -> PriorKey:
     )
 
 
+def key_of_technicolor(name: str) -> PriorKey:
+    """The key in a name of the Technicolor recordings, SCENE_undist_FRAME_CAMERA.png, where the camera comes last.
+
+    Cameras are called 00 to 15, as in the prior of such a folder.
+
+    Raises:
+        D2Error: the name does not end in two numbers.
+    """
+    match = _TECHNICOLOR.search(_stem(name))
+    if match is None:
+        raise D2Error(f"picture '{name}' does not end in FRAME_CAMERA as those of Technicolor do: give another `key`")
+    return PriorKey(f"{int(match['camera']):02d}", int(match["frame"]))
+
+
 def one_picture_each(camera: Any) -> PriorKey:
     """The key of a recording by one moving camera, where every picture is a camera of its own at frame 0."""
     return PriorKey(PurePosixPath(str(camera.image_name)).stem, 0)
+
+
+def _stem(name: str) -> str:
+    """The file's name without folders and without the suffix of a picture."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    return path.stem if path.suffix and not path.suffix[1:].isdigit() else path.name
 
 
 def frame_of_time(time: float, frames: float, first: int = 0) -> int:

@@ -41,6 +41,13 @@ class D2Config(_HookTables):
 
     prior: str | None = None
     """Folder of the depth prior, as `d2 priors` writes it."""
+    exported: str | None = None
+    """Folder that `d2 export-capture` wrote and the trainer reads, where the prior is that of the source: its cameras
+    and frames have other names there. Found without this where the trainer's cameras know the paths of their pictures.
+    """
+    iterations: AtLeastOne | None = None
+    """Length of the trainer's run: what the hooks' tables leave out of start, stop, every and budget follows from it.
+    """
     views_per_evaluation: AtLeastOne = 8
     """Training views surveyed at each structure update, taken in turn over all cameras and frames; at the first one at
     least one of each camera seen so far."""
@@ -64,20 +71,26 @@ class D2Config(_HookTables):
         for name, value in plain.items():
             if isinstance(value, Mapping) and name not in HOOKS:
                 raise unknown_name("hook", name, HOOKS)
+        length = plain.get("iterations")
+        if isinstance(length, int) and not isinstance(length, bool) and length > 0:
+            plain |= {name: _scheduled(name, plain[name], length) for name in HOOKS if name in plain}
         return super().from_dict(plain, where)
 
     @classmethod
-    def from_toml(cls, path: str | Path) -> D2Config:
-        """From a TOML file: `prior = "..."` and one table per hook, empty for its defaults."""
+    def from_toml(cls, path: str | Path, iterations: int | None = None) -> D2Config:
+        """From a TOML file: `prior = "..."` and one table per hook, empty for its defaults.
+
+        `iterations` is the length of the run where the file does not say one.
+        """
         path = Path(path)
         try:
             table = read_toml(path, "correct the configuration")
         except NoSuchFile:
             raise D2Error(f"no configuration at {path}: write one, or pass the settings as a dict") from None
-        config = cls.from_dict(of_this_format(table, str(path)))
-        if config.prior is not None and not Path(config.prior).is_absolute():
-            config = replace(config, prior=str(path.parent / config.prior))
-        return config
+        told = {} if iterations is None else {"iterations": iterations}
+        config = cls.from_dict(told | of_this_format(table, str(path)))
+        folders = {name: getattr(config, name) for name in ("prior", "exported")}
+        return replace(config, **{name: str(path.parent / value) for name, value in folders.items() if value})
 
     def to_toml(self) -> str:
         """The same configuration as text, complete with defaults and the version of the format."""
@@ -107,6 +120,14 @@ def for_iterations(hooks: Iterable[str], iterations: int, **settings: Any) -> D2
             raise unknown_name("hook", name, ["prior", *HOOKS])
         chosen[name] = HOOKS[name].config.for_iterations(iterations)
     return D2Config(**chosen, **settings)
+
+
+def _scheduled(name: str, table: Any, iterations: int) -> Any:
+    """A hook's table with what it leaves out of its schedule, for a run of so many steps."""
+    if not isinstance(table, Mapping):
+        return table
+    fitting, usual = (asdict(made) for made in (HOOKS[name].config.for_iterations(iterations), HOOKS[name].config()))
+    return {key: value for key, value in fitting.items() if value != usual[key]} | dict(table)
 
 
 def _literal(value: Any) -> str:

@@ -11,9 +11,8 @@ import logging
 import warnings
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,9 +20,11 @@ from torch import Tensor
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, PriorLoader
+from d2_plugin.hooks.edits import spread_over
 from d2_plugin.hooks.expected import check_backbone, check_state, converted
 from d2_plugin.hooks.finite import FiniteCheck
 from d2_plugin.hooks.prior import Store
+from d2_plugin.hooks.reports import Listener, Report, Telling, Trace
 from d2_plugin.hooks.table import HOOKS
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Backbone, Edit, Points
@@ -31,24 +32,6 @@ from d2_plugin.reading import said
 from d2_plugin.registry import ADAPTERS, load
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Trace:
-    """One thing a hook did: `action` is "loss", "insert", "remove" or "retire"; `count` is the number of Gaussians."""
-
-    step: int
-    hook: str
-    action: str
-    count: int
-
-
-class Report(NamedTuple):
-    """What one call of `D2Hooks.step` changed."""
-
-    inserted: int = 0
-    removed: int = 0
-    gaussians: int = 0
 
 
 class D2Hooks:
@@ -79,15 +62,16 @@ class D2Hooks:
         self._finite = FiniteCheck(backbone, config.finite_every)
         self._evaluated = False
         self._count = len(backbone)
-        self._warned = False
+        self._warned = self._named = False
         self._inserting = 0  # the step while the backbone inserts for us, else 0
         self.inserted_at = torch.zeros(self._count, dtype=torch.int32)
         """Per Gaussian [N], the step at which D2 inserted it; 0 for the backbone's own."""
         self._idle = dict.fromkeys(self.hooks, 0)  # evaluations in a row that changed next to nothing
         self.retired: dict[str, int] = {}
         """Hooks that stopped because their last evaluations changed next to nothing, and the step of the last one."""
+        self.telling = Telling(self.hooks)
         if self.hooks:
-            self._prior = PriorLoader(store if store is not None else _open_store(config.prior))
+            self._prior = PriorLoader(store if store is not None else _open_store(config))
             backbone.on_resize(self._follow)
 
     @classmethod
@@ -107,11 +91,19 @@ class D2Hooks:
 
     @classmethod
     def attach(
-        cls, config: str | Path | Mapping[str, Any] | D2Config, adapter: str, *model: Any, **options: Any
+        cls,
+        config: str | Path | Mapping[str, Any] | D2Config,
+        adapter: str,
+        *model: Any,
+        iterations: int | None = None,
+        on_report: Listener | None = None,
+        writer: Any = None,
+        **options: Any,
     ) -> D2Hooks:
         """From a configuration and the name of a registered adapter, which gets the trainer's own objects.
 
         The first of the three lines where there is an adapter: `d2 = D2Hooks.attach("d2.toml", "fudan", gaussians)`.
+        Schedules that the configuration leaves out follow from `iterations`, the length of the trainer's run; see `tell`.
         """
         build = load(ADAPTERS, adapter)
         try:
@@ -124,7 +116,17 @@ class D2Hooks:
                 f"the adapter '{adapter}' cannot take {given} ({said(failure)}): give the trainer's own objects, as "
                 f"the docstring of {getattr(build, '__name__', adapter)} says"
             ) from failure
-        return cls.from_config(config, backbone)
+        if isinstance(config, (str, Path)):
+            config = D2Config.from_toml(config, iterations)
+        elif iterations is not None and not isinstance(config, D2Config):
+            config = D2Config.from_dict({"iterations": iterations, **config})
+        attached = cls.from_config(config, backbone)
+        attached.tell(iterations, on_report, writer)
+        return attached
+
+    def tell(self, iterations: int | None = None, on_report: Listener | None = None, writer: Any = None) -> None:
+        """From now on say what happens, see `d2_plugin.hooks.reports.Telling.start`."""
+        self.telling.start(self.backbone, self._prior.store if self.hooks else None, iterations, on_report, writer)
 
     def loss(self, step: int, views: object) -> Tensor | float:
         """The hooks' share of this step's loss: a scalar on the backbone's device, or 0.0 when there is none.
@@ -135,6 +137,8 @@ class D2Hooks:
             return 0.0
         self._begin(step)
         batch = views if isinstance(views, (list, tuple)) else [views]
+        if not self._named and batch and hasattr(self.backbone, "picture"):
+            self._prior.store, self._named = _renamed(self._prior.store, self.backbone.picture(batch[0])), True
         shown = [converted(self.backbone, camera) for camera in batch]
         self._sampler.add(shown)
         context = self._context(step, shown)
@@ -143,6 +147,7 @@ class D2Hooks:
             term = hook.loss(context)
             if term is not None:
                 self.trace.append(Trace(step, name, "loss", 0))
+                self.telling.lost(name, term)
                 total = total + term
         self._finite.heard(total, shown)
         return total
@@ -151,7 +156,7 @@ class D2Hooks:
     def step(self, step: int) -> Report:
         """Insert and remove what the hooks ask for, in one edit; call after the optimizer's step and zero_grad."""
         if not self.hooks:
-            return Report(gaussians=len(self.backbone))
+            return Report(gaussians=len(self.backbone), step=step)
         self._begin(step)
         due = self._due(step)
         self._finite.look(step, any(name in HOOKS and HOOKS[name].edits_structure for name, _ in due))
@@ -161,7 +166,9 @@ class D2Hooks:
         for name, edit in proposals:
             self._retire_if_idle(step, name, edit, context)
         removed, inserted = self._remove(step, edits), self._insert(step, edits)
-        return Report(inserted, removed, len(self.backbone))
+        report = Report(inserted, removed, len(self.backbone), step)
+        self.telling.stepped(report)
+        return report
 
     def state_dict(self) -> dict[str, Any]:
         """Everything an exact continuation needs; save it beside the trainer's checkpoint."""
@@ -240,9 +247,7 @@ class D2Hooks:
             return mask
         message = "step %d: the hooks would remove %d of %d Gaussians, and at most %d go in one step (remove_at_most)"
         _log.warning(message, step, asked, len(self.backbone), most)
-        rows = torch.nonzero(mask).squeeze(1)
-        chosen = torch.arange(most, device=mask.device) * asked // max(most, 1)
-        return torch.zeros_like(mask).index_fill(0, rows[chosen], True)
+        return spread_over(mask, most)
 
     def _insert(self, step: int, edits: Sequence[tuple[str, Edit]]) -> int:
         proposals = [(name, edit.insert) for name, edit in edits if edit.insert is not None]
@@ -292,9 +297,15 @@ def _of_other_names(hooks: Mapping[str, Hook]) -> dict[str, Hook]:
     return dict(hooks)
 
 
-def _open_store(path: str | None) -> Store:
-    if path is None:
+def _open_store(config: D2Config) -> Store:
+    if config.prior is None:
         raise D2Error(f"{', '.join(HOOKS)} need a depth prior: set `prior` to the folder that `d2 priors` wrote")
-    from d2_plugin.priors.store import PriorStore
+    from d2_plugin.priors.disk.exported import opened
 
-    return PriorStore.open(Path(path))
+    return opened(config.prior, config.exported)
+
+
+def _renamed(store: Store, picture: str | None) -> Store:
+    from d2_plugin.priors.disk.exported import renamed_by
+
+    return renamed_by(store, picture)

@@ -219,6 +219,8 @@ class Backbone(Protocol):
         second render. The views of a batch are told apart by camera and frame.
     ``begin_step(step) -> None``
         called with the number of the training step before anything else is asked in it.
+    ``picture(camera) -> str | None``
+        path of the picture that a camera of the trainer shows; priors of an exported capture are found by it.
     ``active(step) -> bool``
         False while the hooks must wait (stages, warm-up); a question, which changes nothing.
     ``colors(view, splats) -> Tensor``

@@ -15,7 +15,6 @@ from small_layouts import small_capture
 from tiny_onnx import mean_network
 
 from d2_plugin.arrays import map_array, read_array
-from d2_plugin.attach.names import RenamedStore
 from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.export.export import EXPORT_FILE, export_capture
 from d2_plugin.captures.pictures import picture_size, read_picture, write_png
@@ -23,6 +22,7 @@ from d2_plugin.captures.videos.plain import VideoSource, video_header
 from d2_plugin.config import D2Config, for_iterations
 from d2_plugin.priors.colmap.dense_arrays import read_dense_array, write_dense_array
 from d2_plugin.priors.depth_on_disk import SensorDepth
+from d2_plugin.priors.disk.exported import RenamedStore
 from d2_plugin.priors.monocular.network import MonocularModel
 from d2_plugin.reading import read_json
 from d2_plugin.study.report.report import collect, make_report

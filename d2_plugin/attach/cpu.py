@@ -11,6 +11,7 @@ from torch.overrides import TorchFunctionMode
 log = logging.getLogger(__name__)
 
 _NOTHING = ("empty_cache", "synchronize", "set_device", "reset_peak_memory_stats")
+_TYPES = ("FloatTensor", "DoubleTensor", "HalfTensor", "IntTensor", "LongTensor", "ByteTensor", "BoolTensor")
 _ZERO = ("memory_allocated", "max_memory_allocated", "memory_reserved", "max_memory_reserved")
 
 
@@ -19,7 +20,9 @@ class CudaMeansCpu(TorchFunctionMode):
 
     def __torch_function__(self, function: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         """Call `function` with devices replaced."""
-        named = {name: _cpu(value) for name, value in (kwargs or {}).items()}
+        if function is torch.device and args and isinstance(args[0], int):
+            return torch.device("cpu")  # the number of a GPU, as in Ex4DGS's safe_state
+        named = {name: _cpu(value, name == "device") for name, value in (kwargs or {}).items()}
         return function(*[_cpu(value) for value in args], **named)
 
 
@@ -44,10 +47,15 @@ def run_on_cpu() -> None:
         setattr(torch.cuda, name, lambda *_, **__: None)
     for name in _ZERO:
         setattr(torch.cuda, name, lambda *_, **__: 0)
+    for name in _TYPES:
+        setattr(torch.cuda, name, getattr(torch, name))
+    torch.cuda.current_device = lambda: 0
     CudaMeansCpu().__enter__()
 
 
-def _cpu(value: Any) -> Any:
+def _cpu(value: Any, is_device: bool = False) -> Any:
+    if is_device and type(value) is int:
+        return "cpu"
     if isinstance(value, torch.device):
         return torch.device("cpu") if value.type == "cuda" else value
     # Only whole device strings: "cuda" in another argument is not a torch function's.

@@ -9,7 +9,7 @@ import runpy
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import torch
 
@@ -17,9 +17,10 @@ from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 
 from .cpu import run_on_cpu
-from .names import RenamedStore
 from .originals import provide
+from .packages import stand_in_for
 from .recipes import RECIPES, recipe
+from .repairs import repair
 from .session import Session
 
 log = logging.getLogger(__name__)
@@ -34,7 +35,7 @@ def main(arguments: Sequence[str]) -> int:
         sys.stderr.write(f"d2: {error}\n")
         return 2
     if session is not None:
-        log.info("%s", session.summary())
+        session.end()
     return 0
 
 
@@ -47,13 +48,15 @@ def launch(options: argparse.Namespace, command: Sequence[str]) -> Session | Non
     sys.argv = list(command)
     sys.path.insert(0, str(script.resolve().parent))
     found = recipe(options.repository)
+    repair()
+    stand_in_for(script.resolve(), {original.name for original in found.originals})
     provide(found.originals, script.parent, options.cpu)
     if options.cpu:
         run_on_cpu()
     session = None
     if options.d2 is not None:
-        config = D2Config.from_toml(options.d2)
-        session = Session(found, config, _store(config, options.exported))
+        D2Config.from_toml(options.d2)  # a mistake is told now, not when the trainer has read its pictures
+        session = Session(found, options.d2, exported=options.exported)
         session.wrap()
     os.execv = _refuse_restart  # type: ignore[assignment]
     runpy.run_path(str(script), run_name="__main__")
@@ -66,15 +69,6 @@ def _check_device(cpu: bool) -> None:
     if cpu:
         raise D2Error("--cpu is for machines without a GPU, and this one has one: leave it out")
     raise D2Error("this trainer needs a GPU and torch finds none: add --cpu to try it on the CPU, which is slow")
-
-
-def _store(config: D2Config, exported: Path | None) -> Any:
-    """None lets D2Hooks open the store of the configuration."""
-    if exported is None or config.prior is None or not config.hooks:
-        return None
-    from d2_plugin.priors.store import PriorStore
-
-    return RenamedStore.of_export(PriorStore.open(config.prior), exported)
 
 
 def _refuse_restart(path: str, arguments: Sequence[str]) -> NoReturn:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import logging
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import wraps
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -48,11 +50,14 @@ class Session:
     That size is the number of pictures in the step before, so the first step has no term.
     """
 
-    def __init__(self, recipe: Recipe, config: D2Config, store: Store | None = None) -> None:
-        self.recipe, self.config, self.store = recipe, config, store
+    def __init__(
+        self, recipe: Recipe, config: D2Config | Path, store: Store | None = None, exported: Path | None = None
+    ) -> None:
+        """A configuration in a file gets its schedules once the trainer says how long it runs."""
+        self.recipe, self.config, self.store, self.exported = recipe, config, store, exported
         self.objects = Objects()
         self.hooks: D2Hooks | None = None
-        self.inserted = self.removed = 0
+        self.writer: Any = None
         self._iteration, self._told = 0, False
         self._drawn, self._batch = 0, 0
 
@@ -71,8 +76,14 @@ class Session:
         """What D2 did, in one line."""
         if self.hooks is None:
             return "the trainer never called training_setup: D2 was not attached"
-        hooks = ", ".join(self.hooks.hooks) or "no hook"
-        return f"{hooks}: {self.inserted} inserted, {self.removed} removed, {len(self.hooks.backbone)} Gaussians"
+        return self.hooks.telling.summary()
+
+    def end(self) -> None:
+        """Say what D2 did, at the end of the script."""
+        if self.hooks is None:
+            log.warning("%s", self.summary())
+        else:
+            self.hooks.telling.end()
 
     def _remember(self, kind: type, name: str) -> None:
         original = kind.__init__  # type: ignore[misc]
@@ -91,13 +102,18 @@ class Session:
             result = training_setup(model, options, *arguments, **named)
             self.objects.model, self.objects.options = model, options
             backbone = self.recipe.build(adapter_of(self.recipe), self.objects)
-            self.hooks = D2Hooks(self.config, backbone, self.store)
+            iterations = getattr(options, "iterations", None)
+            self.hooks = D2Hooks(self._configured(iterations), backbone, self.store)
             self._watch(model.optimizer)
             self._iteration, self._told, self._drawn, self._batch = 0, False, 0, 0
-            log.info("attached to %s with %d Gaussians", type(model).__name__, len(backbone))
+            self.hooks.tell(iterations, writer=self.writer)
             return result
 
         return attaching
+
+    def _configured(self, iterations: int | None) -> D2Config:
+        config = self.config if isinstance(self.config, D2Config) else D2Config.from_toml(self.config, iterations)
+        return config if self.exported is None else replace(config, exported=str(self.exported))
 
     def _listening(self, update_learning_rate: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(update_learning_rate)
@@ -152,14 +168,8 @@ class Session:
     def _after_step(self) -> None:
         if self.hooks is None:
             return
-        report = self.hooks.step(self._iteration)
+        self.hooks.step(self._iteration)
         self._told, self._drawn, self._batch = False, 0, self._drawn
-        self.inserted, self.removed = self.inserted + report.inserted, self.removed + report.removed
-        if report.inserted or report.removed:
-            log.info(
-                "step %d: %d inserted, %d removed, %d Gaussians",
-                self._iteration, report.inserted, report.removed, report.gaussians,
-            )  # fmt: skip
 
 
 def _found(module: str, attribute: str) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Protocol
@@ -14,6 +15,8 @@ from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, Label, View
 
 from .camera_check import CameraCheck
+
+log = logging.getLogger(__name__)
 
 
 class Store(Protocol):
@@ -55,6 +58,7 @@ class PriorLoader:
         self.store, self.keep_bytes = store, keep_bytes
         self._kept: OrderedDict[tuple[str, int], DepthPrior | None] = OrderedDict()
         self._cameras = CameraCheck()
+        self._without: set[str] = set()
         self._pixels: dict[tuple[str, int], KnownPixels] = {}
 
     def __call__(self, view: View) -> DepthPrior | None:
@@ -64,6 +68,9 @@ class PriorLoader:
             self._kept.move_to_end(key)
             return self._kept[key]
         prior = self.store.prior(*key)
+        if prior is None and view.camera not in self._without:
+            self._without.add(view.camera)
+            log.info("camera %s has no prior at frame %d: it is trained without D2 there", view.camera, view.frame)
         if prior is not None:
             self._check(view, prior)
             prior = _usable(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior))

@@ -249,8 +249,14 @@ class PriorStore:
 
     def _entry(self, camera: str, frame: int) -> Entry | None:
         if camera not in self.cameras:
-            raise unknown_name("camera of the prior store", camera, self.cameras)
+            raise D2Error(f"{unknown_name('camera of the prior store', camera, self.cameras)}; {_OTHER_NAMES}")
         return self.entries.find(camera, frame)
+
+
+_OTHER_NAMES = (
+    "if the pictures were written by `d2 export-capture`, set `exported` in the configuration to the folder of its "
+    "export.json; else give the adapter a function `key` from a camera object to PriorKey(camera, frame)"
+)
 
 
 def _joined(cameras: Sequence[str]) -> str:

@@ -5,16 +5,44 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import pytest
-from mimics import ex4dgs, fudan, hust4d, spacetime
+from mimics import deformable3d, ex4dgs, fudan, hust4d, spacetime
 from mimics.inria import cameras_of
 from tiny import make_views
 
 from d2_plugin import D2Error
+from d2_plugin.adapters.deformable3d import Deformable3DAdapter
 from d2_plugin.adapters.ex4dgs import Ex4DGSAdapter
 from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
 from d2_plugin.adapters.keys import KeysByPose, PriorKey, frame_of_time, key_from_picture, one_picture_each
 from d2_plugin.adapters.spacetime import SpacetimeAdapter
+
+READERS = [
+    # adapter, what the reader leaves on a camera object, key; from the files of each repository at the pages' commits
+    ("fudan", {"image_path": "/d/images/cam01_0003.png", "image_name": "cam01_0003", "uid": 9}, ("cam01", 3)),
+    ("fudan", {"image_path": None, "image_name": "cam01_0003", "uid": 9}, ("cam01", 3)),
+    ("deformable3d", {"image_name": "cam01_0003.png", "fid": 0.1}, ("cam01", 3)),
+    ("deformable3d", {"image_name": "left1_000012", "fid": 0.1}, ("left1", 12)),
+    ("spacetime", {"image_name": "cam04", "timestamp": 0.5}, ("cam04", 1)),
+    ("spacetime", {"image_name": "camera_0001", "timestamp": 0.0}, ("camera_0001", 0)),
+    ("ex4dgs", {"image_path": "/d/sear_steak/cam12/47.png", "image_name": "47.png", "timestamp": 40}, ("cam12", 47)),
+    (
+        "ex4dgs",
+        {"image_path": "/d/Birthday/Birthday_undist_00151_10.png", "image_name": "Birthday_undist_00151_10.png"},
+        ("10", 151),
+    ),
+    ("ex4dgs", {"image_path": "/d/Painter/Painter_undist_00000_00.png", "image_name": "-"}, ("00", 0)),
+]
+
+
+def default_key(name: str, camera: SimpleNamespace) -> PriorKey:
+    makers = {
+        "fudan": lambda: FudanAdapter(fudan.make()[0]),
+        "deformable3d": lambda: Deformable3DAdapter(*deformable3d.make()[:2]),
+        "spacetime": lambda: SpacetimeAdapter(spacetime.make()[0], 2),
+        "ex4dgs": lambda: Ex4DGSAdapter(ex4dgs.make()[0]),
+    }
+    return makers[name]()._default_key(camera)
 
 
 class TestNames:
@@ -64,12 +92,30 @@ class TestNames:
         listed = SimpleNamespace(train_camera=SimpleNamespace(dataset=infos))
         assert Hust4DAdapter(model, listed, "fine").view(scene.cameras[4]).camera == "cam1"
 
-    def test_spacetime_and_ex4dgs_count_frames_by_time(self) -> None:
+    def test_spacetime_counts_frames_by_time(self) -> None:
         model, scene = spacetime.make()
         assert SpacetimeAdapter(model, 2).view(scene.cameras[4]).frame == 1
+
+    def test_ex4dgs_reads_the_path_of_the_picture(self) -> None:
+        """Its `timestamp` is no frame number: it starts at 0 wherever the clip starts, and padding mirrors it."""
         model, scene = ex4dgs.make()
-        view = Ex4DGSAdapter(model, first_frame=100).view(scene.cameras[4])
-        assert (view.camera, view.frame) == ("cam1", 101)
+        camera = scene.cameras[4]
+        camera.timestamp = -1
+        view = Ex4DGSAdapter(model).view(camera)
+        assert (view.camera, view.frame, view.time) == ("cam1", 1, -1.0)
+        assert Ex4DGSAdapter(model, first_frame=100).view(camera).frame == 101
+
+    @pytest.mark.parametrize(("adapter", "fields", "key"), READERS)
+    def test_what_every_reader_hands_out(self, adapter: str, fields: dict, key: tuple[str, int]) -> None:
+        assert default_key(adapter, SimpleNamespace(**fields)) == key
+
+    def test_hypernerf_of_hust_says_the_folder_and_the_file_apart(self) -> None:
+        """scene/hyper_loader.py:165; its order of training pictures is another than that of all pictures."""
+        files = [SimpleNamespace(image_path="/data/vrig/rgb/2x", image_name=f"left1_00000{i}.png") for i in (7, 9)]
+        scene = SimpleNamespace(train_camera=SimpleNamespace(dataset=files))
+        model, _ = hust4d.make()
+        adapter = Hust4DAdapter(model, scene, "fine")
+        assert adapter._default_key(SimpleNamespace(uid=1, image_name="1")) == ("left1", 9)
 
     def test_a_key_of_ones_own_goes_before_everything(self) -> None:
         model, scene = fudan.make()

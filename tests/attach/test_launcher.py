@@ -20,10 +20,10 @@ from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
 from d2_plugin.attach import originals
 from d2_plugin.attach.launch import main
-from d2_plugin.attach.names import RenamedStore
 from d2_plugin.attach.recipes import Original, recipe
 from d2_plugin.attach.session import AddGradient, Session
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
+from d2_plugin.priors.disk.exported import RenamedStore
 
 DEPTH_LOSS = D2Config(depth_loss=DepthLossConfig(start=2))
 EDITS = D2Config(
@@ -100,9 +100,9 @@ class TestSession:
 
     def test_edits_happen_after_zero_grad_and_are_counted(self, monkeypatch: pytest.MonkeyPatch) -> None:
         positions, session = run_wrapped(EDITS, monkeypatch)
-        assert session.inserted > 0
+        assert session.hooks.telling.inserted > 0
         assert len(positions) == len(session.hooks.backbone)
-        assert session.summary().startswith(f"densify, prune, depth_loss: {session.inserted} inserted")
+        assert session.summary().startswith(f"densify, prune, depth_loss: {session.hooks.telling.inserted} inserted")
 
     def test_renders_without_gradients_are_not_part_of_the_training(self, monkeypatch: pytest.MonkeyPatch) -> None:
         session = Session(recipe("fudan"), DEPTH_LOSS, TinyStore())

@@ -166,11 +166,15 @@ _FEATURES = ("_features_dc", "_features_rest")
 
 
 class Scene:
+    """Cameras of its N3V reader (dataset_readers.py:291): `image_name` is the FRAME's file, the camera is a folder."""
+
     cameras_extent = 2.0
 
     def __init__(self, cameras: list[Camera]) -> None:
         for camera in cameras:
-            camera.image_name = f"{camera.image_name[:4]}.png"
+            name, frame = camera.image_name.split("_")
+            camera.image_name = f"{int(frame)}.png"
+            camera.image_path = f"/data/scene/{name}/{camera.image_name}"
         self.cameras = cameras
 
 

@@ -14,7 +14,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from d2_plugin.captures.capture import Capture
+import numpy as np
+
+from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.export.base import Export, Written, refuse_skew, whole_folder
 from d2_plugin.captures.export.colmap import write_colmap, write_multipleview
 from d2_plugin.captures.export.n3dv import write_n3dv
@@ -75,9 +77,16 @@ def _description(capture: Capture, layout: str, written: Written, held_out: tupl
         "layout": layout,
         "cameras": written.cameras,
         "frames": written.frames,
+        "calibrations": {name: _calibration(camera) for name, camera in capture.cameras.items()},
         "fps": capture.fps,
         "test_cameras": [written.cameras[name] for name in held_out if name in written.cameras],
     }
+
+
+def _calibration(camera: Camera) -> dict[str, Any]:
+    """By which a prior store knows its capture again (d2_plugin.priors.frame.describe_camera)."""
+    K, pose = (np.asarray(matrix, float).tolist() for matrix in (camera.K, camera.T_camera_world))
+    return {"size": [camera.width, camera.height], "K": K, "T_camera_world": pose}
 
 
 def _known(capture: Capture, test_cameras: Sequence[str]) -> tuple[str, ...]:

@@ -86,7 +86,7 @@ def all_tables(backbone: str) -> dict[str, Group]:
     module: Any = registry.load(registry.BACKBONES, backbone)
     return {
         **{name: Group(kind) for name, kind in hooks.items() if isinstance(kind, type)},
-        "d2": Group(D2Config, tuple(hooks)),
+        "d2": Group(D2Config, (*hooks, "exported", "iterations")),  # for other trainers
         "priors": Group(PriorSettings),
         "backbone": Group(type(module.settings_from({}))),
         "plan": Group(PlanChoices),

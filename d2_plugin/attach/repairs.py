@@ -1,0 +1,47 @@
+"""What newer libraries took away and the repositories still use, given back in the memory of this process."""
+
+from __future__ import annotations
+
+import logging
+from functools import wraps
+from typing import Any
+
+import numpy as np
+
+log = logging.getLogger(__name__)
+
+NUMPY_NAMES = {"NaN": np.nan, "Inf": np.inf, "float": float, "int": int, "object": object, "product": np.prod}
+"""Names that numpy dropped in 1.24 and 2.0, and what they were."""
+
+
+def repair() -> None:
+    """Apply every repair that this environment needs; each is said."""
+    for sentence in (_numpy(), _pillow()):
+        if sentence:
+            log.info("%s", sentence)
+
+
+def _numpy() -> str | None:
+    gone = [name for name in NUMPY_NAMES if name not in vars(np)]
+    for name in gone:
+        setattr(np, name, NUMPY_NAMES[name])
+    return f"numpy {np.__version__} has no np.{', np.'.join(gone)}: given back for this process" if gone else None
+
+
+def _pillow() -> str | None:
+    """fudan and 4C4D hand signed bytes to PIL (utils/data_utils.py:22), which Pillow 11 and later refuse."""
+    try:
+        from PIL import Image, __version__
+    except ImportError:
+        return None
+    if int(__version__.split(".")[0]) < 11:
+        return None
+    original = Image.fromarray
+
+    @wraps(original)
+    def fromarray(obj: Any, *arguments: Any, **named: Any) -> Any:
+        values = obj.view(np.uint8) if getattr(obj, "dtype", None) == np.int8 else obj
+        return original(values, *arguments, **named)
+
+    Image.fromarray = fromarray
+    return f"Pillow {__version__} takes no signed bytes: Image.fromarray reads them as unsigned in this process"

@@ -1,0 +1,69 @@
+"""What trainers call of torchvision on their way through a training: grids, saving pictures, PIL pictures to tensors.
+
+torchvision has to match torch to the last digit of its build, which is why it is so often missing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+
+def make_grid(tensor: Tensor | Sequence[Tensor], nrow: int = 8, padding: int = 2, **_: Any) -> Tensor:
+    """Pictures [B, C, H, W], or a list of [C, H, W], side by side on black, `nrow` to a row; [C, H', W']."""
+    pictures = tensor if isinstance(tensor, Tensor) else torch.stack(list(tensor))
+    if pictures.ndim < 4:
+        pictures = pictures.reshape(1, -1, *pictures.shape[-2:])
+    count, channels, height, width = pictures.shape
+    columns = min(nrow, count)
+    rows = math.ceil(count / columns)
+    grid = pictures.new_zeros(channels, rows * (height + padding) + padding, columns * (width + padding) + padding)
+    for index, picture in enumerate(pictures):
+        top, left = (padding + place * (size + padding) for place, size in zip(divmod(index, columns), (height, width)))
+        grid[:, top : top + height, left : left + width] = picture
+    return grid
+
+
+def save_image(tensor: Tensor, fp: str | Path, **options: Any) -> None:
+    """One picture in 0..1, or a grid of several, as a file."""
+    from PIL import Image
+
+    picture = make_grid(tensor, **options) if tensor.ndim == 4 and len(tensor) > 1 else tensor.reshape(
+        -1, *tensor.shape[-2:]
+    )  # fmt: skip
+    values = (picture.detach().cpu().clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
+    Image.fromarray(values[..., 0] if values.shape[-1] == 1 else np.ascontiguousarray(values)).save(fp)
+
+
+def resize(img: Tensor, size: Sequence[int], interpolation: Any = None, antialias: bool = True, **_: Any) -> Tensor:
+    """Pictures [..., C, H, W] at `size` (height, width), bilinear."""
+    batch = img.reshape(-1, *img.shape[-3:])
+    return interpolate(batch, tuple(size), mode="bilinear", antialias=antialias).reshape(*img.shape[:-2], *size)
+
+
+class ToTensor:
+    """A PIL picture or an array [H, W, C] uint8 as float [C, H, W] in 0..1."""
+
+    def __call__(self, pic: Any) -> Tensor:
+        """The tensor."""
+        values = np.array(pic)
+        values = values[..., None] if values.ndim == 2 else values
+        tensor = torch.from_numpy(np.ascontiguousarray(values)).permute(2, 0, 1).contiguous()
+        return tensor.float() / 255 if tensor.dtype == torch.uint8 else tensor
+
+
+class ToPILImage:
+    """A tensor [C, H, W] in 0..1 as a PIL picture."""
+
+    def __call__(self, pic: Tensor) -> Any:
+        """The picture."""
+        from PIL import Image
+
+        return Image.fromarray((pic.detach().cpu() * 255).byte().permute(1, 2, 0).contiguous().numpy())

@@ -1,0 +1,100 @@
+"""A prior store under the names that an export gave to cameras and frames (see d2_plugin.captures.export.export).
+
+The export says so in `export.json` beside the pictures. Who trains from an export says where it lies (`exported` in the
+configuration), or it is found above the picture's own path.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from d2_plugin.captures.export.export import EXPORT_FILE
+from d2_plugin.errors import unknown_name
+from d2_plugin.priors.frame import other_capture
+from d2_plugin.priors.store import PriorStore
+from d2_plugin.protocol import DepthPrior
+from d2_plugin.reading import field, parsing, read_json
+from d2_plugin.values import fitting
+
+log = logging.getLogger(__name__)
+
+GIVE = "give the folder that `d2 export-capture` wrote"
+
+
+class RenamedStore:
+    """The priors of the source capture, asked for by the names of its export."""
+
+    def __init__(self, store: Any, cameras: dict[str, str], frames: dict[int, int]) -> None:
+        """`cameras` and `frames` map those of the export to those of the source."""
+        self.store, self.sources, self.frames = store, cameras, frames
+
+    @classmethod
+    def of_export(cls, store: Any, folder: Path) -> RenamedStore:
+        """The priors under the names of an exported folder; names that the source uses itself are kept."""
+        path = folder / EXPORT_FILE
+        described = read_json(path, GIVE)
+        names = field(described, "cameras", dict, str(path), GIVE)
+        numbers = field(described, "frames", dict, str(path), GIVE)
+        cameras = {fitting(str, exported, f"a camera in {path}"): source for source, exported in names.items()}
+        with parsing(f"the frames in {path}", GIVE):
+            frames = {int(exported): int(source) for source, exported in numbers.items()}
+        return cls(store, cameras, frames)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names, in the export, of the cameras that have priors."""
+        known = getattr(self.store, "cameras", None)
+        return tuple(name for name, source in self.sources.items() if known is None or source in known)
+
+    def prior(self, camera: str, frame: int) -> DepthPrior | None:
+        """D* of one view, or None where there is none; a camera that the export does not have is refused."""
+        return self._asked("prior", camera, frame)
+
+    def camera(self, camera: str, frame: int) -> Any:
+        """The camera that one prior was built for, or None where the store does not say."""
+        return self._asked("camera", camera, frame)
+
+    def _asked(self, what: str, camera: str, frame: int) -> Any:
+        if camera not in self.sources:
+            raise unknown_name("camera of the export", camera, self.sources)
+        if frame not in self.frames or camera not in self.cameras:
+            return None  # a camera of the capture that the prior was not built for is trained without one
+        ask = getattr(self.store, what, None)
+        return None if ask is None else ask(self.sources[camera], self.frames[frame])
+
+
+def opened(prior: str, exported: str | None) -> Any:
+    """The store in the folder `prior`, under the names of an export of its capture where one is given."""
+    store = PriorStore.open(Path(prior))
+    return store if exported is None else RenamedStore.of_export(store, Path(exported))
+
+
+def renamed_by(store: Any, picture: str | None) -> Any:
+    """`store`, or the same one under other names, where the trainer's picture lies in an export of its capture."""
+    folder = export_above(picture) if picture else None
+    if folder is None or isinstance(store, RenamedStore) or not is_source_of(store, folder):
+        return store
+    log.info("the pictures are an export of the prior's capture: names are translated by %s", folder / EXPORT_FILE)
+    return RenamedStore.of_export(store, folder)
+
+
+def export_above(picture: str) -> Path | None:
+    """The folder with an `export.json` that a picture lies in, at most three folders below it."""
+    parents = list(Path(picture).parents)[:3]
+    return next((folder for folder in parents if (folder / EXPORT_FILE).is_file()), None)
+
+
+def is_source_of(store: Any, folder: Path) -> bool:
+    """Whether the priors of `store` are those of the capture that an export was written from, not of the export.
+
+    Both say the calibrations of their cameras under their own names; where the export kept all names, the name of the
+    capture decides.
+    """
+    about, described = getattr(store, "about", None) or {}, read_json(folder / EXPORT_FILE, GIVE)
+    source = {"calibrations": described.get("calibrations"), "capture": described.get("source")}
+    if not source["calibrations"] or not about.get("calibrations") or other_capture(about, source) is not None:
+        return False
+    kept = all(name == exported for name, exported in described.get("cameras", {}).items())
+    return not kept or about.get("capture") == source["capture"]
