@@ -241,7 +241,7 @@ class D2Hooks:
         proposals = [(name, edit.insert) for name, edit in edits if edit.insert is not None]
         if not proposals:
             return 0
-        points = Points(*(torch.cat(values) for values in zip(*(p for _, p in proposals), strict=True)))
+        points = Points(*(torch.cat(values) for values in zip(*(p for _, p in proposals))))
         self._inserting = step
         try:
             inserted = self.backbone.insert(points)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Self
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -52,7 +52,7 @@ class DensifyConfig(HookConfig):
     """An existing Gaussian that is more opaque than this occupies its cell."""
 
     @classmethod
-    def for_iterations(cls, iterations: int) -> Self:
+    def for_iterations(cls, iterations: int) -> DensifyConfig:
         """Insertion from the first fortieth to half of the run, in numbers that the run has time to train."""
         every = steps_between_evaluations(iterations)
         start = max(1, min(every, iterations // 40))

@@ -17,6 +17,7 @@ from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Surve
 from . import cuda, native
 from .evidence import reliability
 from .frame import RECORD
+from .operator import custom_op
 
 INPUTS = 9
 """Tensors that `rasterize` takes: 6 of the Gaussians and what they are drawn on, 2 of the camera, the near edge."""
@@ -79,7 +80,7 @@ def _constants(settings: RasterSettings) -> list[float]:
     return [float(value) for value in dataclasses.astuple(settings)]
 
 
-_rasterize = torch.library.custom_op(
+_rasterize = custom_op(
     "d2::rasterize",
     native.rasterize,
     mutates_args=(),
@@ -87,7 +88,7 @@ _rasterize = torch.library.custom_op(
     schema=f"({_INPUTS}, int width, int height, float[] constants) -> ({_IMAGES}, {_STATE})",
 )
 
-_rasterize_backward = torch.library.custom_op(
+_rasterize_backward = custom_op(
     "d2::rasterize_backward",
     native.backward,
     mutates_args=(),
@@ -96,7 +97,7 @@ _rasterize_backward = torch.library.custom_op(
     "(Tensor means, Tensor covariances, Tensor opacities, Tensor colors, Tensor background, Tensor screen_offsets)",
 )
 
-_survey = torch.library.custom_op(
+_survey = custom_op(
     "d2::survey",
     native.survey,
     mutates_args=(),
