@@ -143,7 +143,7 @@ def train_step(item, params, optimizers, hexplane, deform_net, hex_optimizer, st
 
 
 def training(params, optimizers, hexplane, deform_net, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
-    dataset, first = items(), 0
+    dataset, first, parser = items(), 0, SimpleNamespace(times=[0.0, 0.5])
     hex_optimizer = torch.optim.Adam([*hexplane.parameters(), *deform_net.parameters()], lr=1e-3)
     strategy = DynamicStrategy()
     state = strategy.initialize_state(scene_scale=1.0, num_gaussians=len(params["means"]))
