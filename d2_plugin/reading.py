@@ -11,13 +11,13 @@ import json
 import math
 import os
 import stat
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
 from d2_plugin.errors import D2Error
+from d2_plugin.older import tomllib
 from d2_plugin.values import fitting
 
 MOST_BYTES = 1 << 31

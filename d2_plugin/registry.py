@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -37,4 +38,6 @@ def load(group: str, name: str) -> Any:
 
 
 def _points(group: str) -> dict[str, EntryPoint]:
-    return {point.name: point for point in entry_points(group=group)}
+    if sys.version_info >= (3, 10):
+        return {point.name: point for point in entry_points(group=group)}
+    return {point.name: point for point in entry_points().get(group, ())}

@@ -16,13 +16,13 @@ from __future__ import annotations
 import ast
 import functools
 import inspect
-import itertools
 import textwrap
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
-from typing import Any, NamedTuple, TypeVar, cast, get_args, get_type_hints
+from typing import Any, NamedTuple, TypeVar, cast, get_args
 
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.older import hints_of
 from d2_plugin.values import (
     Angle,
     AtLeastOne,
@@ -134,7 +134,7 @@ def declared(kind: Any) -> tuple[Declared, ...]:
 
 @functools.cache
 def _declared(kind: Any) -> tuple[Declared, ...]:
-    hints, helps = get_type_hints(kind, include_extras=True), _docstrings(kind)
+    hints, helps = hints_of(kind), _docstrings(kind)
     found = []
     for entry in fields(kind):
         default = entry.default if entry.default_factory is MISSING else entry.default_factory()
@@ -190,8 +190,10 @@ def _docstrings(kind: type) -> dict[str, str]:
             module = ast.parse(textwrap.dedent(inspect.getsource(base)))
         except (OSError, TypeError):
             continue
-        for field, below in itertools.pairwise(cast(ast.ClassDef, module.body[0]).body):
-            match field, below:
-                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
-                    found[name] = " ".join(text.split())
+        body = cast(ast.ClassDef, module.body[0]).body
+        for field, below in zip(body, body[1:]):
+            if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(below, ast.Expr):
+                text = below.value.value if isinstance(below.value, ast.Constant) else None
+                if isinstance(text, str):
+                    found[field.target.id] = " ".join(text.split())
     return found

@@ -14,6 +14,9 @@ from d2_plugin.errors import D2Error, unknown_name
 FAR = (1e4, 1e15)
 """An upper bound within these is named only where it was crossed."""
 
+UNIONS = (Union, getattr(types, "UnionType", Union))
+"""What `get_origin` says of `Union[A, B]` and of `A | B`, which Python 3.9 does not evaluate yet."""
+
 
 @dataclass(frozen=True)
 class Range:
@@ -73,7 +76,7 @@ class OutOfRange(D2Error):
 
 def options_of(kind: Any) -> tuple[Any, ...]:
     """The kinds of which a value may be: the members of a union, else the kind itself."""
-    return get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+    return get_args(kind) if get_origin(kind) in UNIONS else (kind,)
 
 
 def checked(kind: Any, limits: Range, value: Any, name: str) -> Any:
@@ -160,7 +163,7 @@ def _as_tuple(kinds: Sequence[Any], limits: Range, value: Any, name: str) -> tup
     if not endless and len(value) != len(kinds):
         raise _wrong(name, f"must be a list of {len(kinds)} values", value)
     each = [kinds[0]] * len(value) if endless else kinds
-    pairs = zip(each, value, strict=True)
+    pairs = zip(each, value)
     return tuple(_checked(*_inner(kind, limits), item, f"{name}[{i}]") for i, (kind, item) in enumerate(pairs))
 
 

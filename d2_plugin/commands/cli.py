@@ -34,6 +34,9 @@ COMMANDS = {
 }
 """Name -> module beside this file: its docstring is the help, its `form(words)` what it takes."""
 
+NEEDED = (3, 11)
+"""The Python of the commands; a trainer's process, which imports none of them, may be older."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; an error is one sentence on stderr and exit code 2, Ctrl-C exit code 130."""
@@ -49,6 +52,9 @@ def _answer(words: list[str]) -> str | None:
     """Run what the words say; returns what is left to print."""
     if words[:1] == ["--version"]:
         return f"d2-4dgs {__version__}"
+    if sys.version_info[:2] < NEEDED:
+        needed, found = (".".join(map(str, version)) for version in (NEEDED, sys.version_info[:2]))
+        raise D2Error(f"d2 needs Python {needed} or later, this is {found}: use another environment for its commands")
     if not words:
         raise D2Error(f"no command is given: have {', '.join(COMMANDS)}; `d2 --help` says what each does")
     if words[0] in HELP:

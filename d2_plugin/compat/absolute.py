@@ -101,7 +101,7 @@ def absolute_gradient(drawing: Drawing, picture: Tensor, gradient: Tensor) -> Te
         *reach.unbind(-1),
         values[kept],
     )
-    arrays = {name: _plain(column[order]) for name, column in zip(_GAUSSIANS, columns, strict=True)}
+    arrays = {name: _plain(column[order]) for name, column in zip(_GAUSSIANS, columns)}
     arrays |= {"picture": _plain(picture), "gradient": _plain(gradient), "sums": torch.zeros(len(order), 2)}
     walk = _Walk(view.width, view.height, picture.shape[-1], len(order))
     walk.alpha_min, walk.alpha_max = settings.alpha_min, settings.alpha_max

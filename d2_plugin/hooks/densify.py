@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Self
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -61,7 +61,7 @@ class DensifyConfig(HookConfig):
     From .05 to .15 scores stay within .2 dB (studio, plaza, 500 steps, three seeds); more means more Gaussians."""
 
     @classmethod
-    def for_iterations(cls, iterations: int) -> Self:
+    def for_iterations(cls, iterations: int) -> DensifyConfig:
         """Insertion from the first fortieth to half of the run, in numbers that the run has time to train."""
         every = steps_between_evaluations(iterations)
         start = max(1, min(every, iterations // 40))

@@ -71,7 +71,7 @@ def check_splats(splats: Splats, count: int, inserting: bool) -> None:
     """Refuse Gaussians that do not fit each other; those that hooks add to are float32, as the prior is."""
     means, rows = splats.means, splats.rows
     if means.ndim != 2 or means.shape[1] != 3 or len(rows) != len(means) or len(splats.opacities) != len(means):
-        shapes = ", ".join(f"{name} {tuple(part.shape)}" for name, part in zip(splats._fields, splats, strict=True))
+        shapes = ", ".join(f"{name} {tuple(part.shape)}" for name, part in zip(splats._fields, splats))
         raise D2Error(f"slice_at() returned {shapes}, expected M rows each and means [M, 3]: mend the adapter")
     if len(means) > count:
         raise D2Error(f"slice_at() returned {len(means)} Gaussians of {count}: mend the adapter")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -34,6 +34,9 @@ class Window:
         return self.start <= step and (self.stop is None or step < self.stop) and (step - self.start) % self.every == 0
 
 
+Chosen = TypeVar("Chosen", bound="HookConfig")
+
+
 @dataclass(frozen=True)
 class HookConfig(Settings):
     """When a hook runs. A hook's own settings are a subclass of this, in the file of the hook."""
@@ -46,7 +49,7 @@ class HookConfig(Settings):
     """Steps from one time to the next."""
 
     @classmethod
-    def for_iterations(cls, iterations: int) -> Self:
+    def for_iterations(cls: type[Chosen], iterations: int) -> Chosen:
         """The defaults with a schedule that fits a run of so many steps."""
         return cls()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import torch
 from torch import Tensor
@@ -49,7 +48,7 @@ class PruneConfig(HookConfig):
             raise D2Error(f"lambda_e = {self.lambda_e} and lambda_o = {self.lambda_o} must sum to 1: set both")
 
     @classmethod
-    def for_iterations(cls, iterations: int) -> Self:
+    def for_iterations(cls, iterations: int) -> PruneConfig:
         """Pruning from a fifth to two thirds of the run: the last third only refines."""
         return cls(start=iterations // 5, stop=2 * iterations // 3, every=steps_between_evaluations(iterations))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from pathlib import Path
-from typing import Self
+from typing import TypeVar
 
 from torch import Tensor
 
@@ -15,10 +15,13 @@ RECORD = 16
 """Floats of a projected Gaussian, one cache line; the same everywhere, so that the operators have one shape."""
 
 
+Frame = TypeVar("Frame", bound="PointingFrame")
+
+
 class PointingFrame(ctypes.Structure):
     """A C structure with pointers into tensors, which live as long as it does; absent pointers stay null."""
 
-    def point(self, **tensors: Tensor | None) -> Self:
+    def point(self: Frame, **tensors: Tensor | None) -> Frame:
         """Set pointers by name and keep their tensors alive as long as the frame."""
         for name, tensor in tensors.items():
             if tensor is not None:

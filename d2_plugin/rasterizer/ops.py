@@ -19,6 +19,7 @@ from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Surve
 from . import cuda, native
 from .evidence import reliability
 from .frame import RECORD
+from .operator import custom_op
 
 INPUTS = 9
 """Tensors that `rasterize` takes: 6 of the Gaussians and what they are drawn on, 2 of the camera, the near edge."""
@@ -85,7 +86,7 @@ def _constants(settings: RasterSettings) -> list[float]:
 _known_constants = functools.lru_cache(maxsize=64)(_constants)
 
 
-_rasterize = torch.library.custom_op(
+_rasterize = custom_op(
     "d2::rasterize",
     native.rasterize,
     mutates_args=(),
@@ -93,7 +94,7 @@ _rasterize = torch.library.custom_op(
     schema=f"({_INPUTS}, int width, int height, float[] constants) -> ({_IMAGES}, {_STATE})",
 )
 
-_rasterize_backward = torch.library.custom_op(
+_rasterize_backward = custom_op(
     "d2::rasterize_backward",
     native.backward,
     mutates_args=(),
@@ -102,7 +103,7 @@ _rasterize_backward = torch.library.custom_op(
     "(Tensor means, Tensor covariances, Tensor opacities, Tensor colors, Tensor background, Tensor screen_offsets)",
 )
 
-_survey = torch.library.custom_op(
+_survey = custom_op(
     "d2::survey",
     native.survey,
     mutates_args=(),

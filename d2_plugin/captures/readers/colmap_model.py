@@ -39,21 +39,21 @@ class ColmapCamera(NamedTuple):
     def lens(self, where: str) -> Lens:
         """Focal lengths, principal point and distortion; `D2Error` for a model without undistortion here."""
         p = self.parameters
-        match self.model, len(p):
-            case "SIMPLE_PINHOLE", 3:
-                return Lens(pinhole(p[0], p[0], p[1], p[2]))
-            case "PINHOLE", 4:
-                return Lens(pinhole(*p))
-            case ("SIMPLE_RADIAL", 4) | ("RADIAL", 5):
-                return Lens(pinhole(p[0], p[0], p[1], p[2]), p[3:])
-            case "OPENCV", 8:
-                return Lens(pinhole(*p[:4]), p[4:6], (p[6], p[7]))
-            case "FULL_OPENCV", 12:
-                return opencv_lens(pinhole(*p[:4]), np.array(p[4:]), where)
-            case "OPENCV_FISHEYE", 8:
-                return Lens(pinhole(*p[:4]), p[4:], fisheye=True)
-            case ("SIMPLE_RADIAL_FISHEYE", 4) | ("RADIAL_FISHEYE", 5):
-                return Lens(pinhole(p[0], p[0], p[1], p[2]), p[3:], fisheye=True)
+        kind = (self.model, len(p))
+        if kind == ("SIMPLE_PINHOLE", 3):
+            return Lens(pinhole(p[0], p[0], p[1], p[2]))
+        if kind == ("PINHOLE", 4):
+            return Lens(pinhole(*p))
+        if kind in (("SIMPLE_RADIAL", 4), ("RADIAL", 5)):
+            return Lens(pinhole(p[0], p[0], p[1], p[2]), p[3:])
+        if kind == ("OPENCV", 8):
+            return Lens(pinhole(*p[:4]), p[4:6], (p[6], p[7]))
+        if kind == ("FULL_OPENCV", 12):
+            return opencv_lens(pinhole(*p[:4]), np.array(p[4:]), where)
+        if kind == ("OPENCV_FISHEYE", 8):
+            return Lens(pinhole(*p[:4]), p[4:], fisheye=True)
+        if kind in (("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5)):
+            return Lens(pinhole(p[0], p[0], p[1], p[2]), p[3:], fisheye=True)
         raise D2Error(
             f"{where} has a camera of model {self.model} with {len(p)} parameters, which cannot be undistorted here: "
             "run `colmap image_undistorter` and give its output folder"

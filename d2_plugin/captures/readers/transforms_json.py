@@ -166,7 +166,7 @@ def _rate(entry: _Entry, path: Path) -> float | None:
 
 def _timed(shots: dict[str, Shot], times: dict[str, float]) -> tuple[dict[str, Shot], float]:
     """Frames and their rate; frames are counted by time where the numbers in names do not grow with it."""
-    numbers, instants = zip(*sorted({(shots[name].frame, time) for name, time in times.items()}), strict=True)
+    numbers, instants = zip(*sorted({(shots[name].frame, time) for name, time in times.items()}))
     distinct = sorted(set(instants))
     if list(instants) == distinct and len(set(numbers)) == len(numbers):
         return shots, (numbers[-1] - numbers[0]) / (distinct[-1] - distinct[0])

@@ -1,0 +1,199 @@
+"""nerficg-project/faster-gaussian-splatting, branch FasterGS4D (CVPR 2026): Yang's 4D Gaussians, trained the fastest.
+
+    self.d2 = D2Hooks.attach("d2.toml", "fastergs4d", self.model.gaussians)     # Trainer.py:96, end of setup_gaussians
+    loss = loss + self.d2.loss(iteration + 1, view) / self.BATCH_SIZE           # before loss.backward() (:168)
+    self.d2.step(iteration + 1)                                                 # after optimizer.zero_grad() (:180)
+
+Its rasterizer returns a picture and nothing else, so depth comes from ours. It counts iterations from 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.slicing import slice_gaussians
+from d2_plugin.gaussians.spherical_harmonics import SH_C0
+from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
+from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
+
+from ..keys import KeyOf, PriorKey, key_from_picture
+
+CONSTANTS = RasterSettings(alpha_max=1 - 1e-6)
+"""Of its rasterizer (rasterization_config.h): alpha is not clamped; near comes from the camera."""
+
+COLUMNS = (
+    "spatial_means",
+    "temporal_means",
+    "sh_coefficients_0",
+    "sh_coefficients_rest",
+    "opacities",
+    "spatial_scales",
+    "temporal_scales",
+    "left_isoclinic_rotations",
+    "right_isoclinic_rotations",
+)
+"""Names of the optimizer's groups; the model keeps each under the same name with an underscore in front."""
+
+LEFT_SIGNS, RIGHT_SIGNS = (1.0, -1.0, 1.0, -1.0), (1.0, -1.0, 1.0, 1.0)
+"""From its quaternions to Yang's. It rotates v = x + yi + zj + tk as l v r, Yang w = t + zi + yj + xk as l w conj(r).
+Reversing the order of the axes is w = j v (-i), hence l' = j l j and r' = conj(i r i) up to a common sign."""
+
+
+class FasterGS4DAdapter:
+    """A `Gaussians` of FasterGS4D as a `d2_plugin.protocol.Backbone`.
+
+    Rows change in two methods only: `prune`, after `adaptive_density_control` has appended, and `sort`, which orders
+    all rows by place and time every 5,000 iterations. Both are overridden on the instance.
+
+    Args:
+        gaussians: `model.gaussians`, after `training_setup`.
+        duration: of the clip in the unit of `view.timestamp`, which its data sets bring to 0..1.
+        settings: constants of its rasterizer, where they were changed.
+        key: finds the prior of a view; needed where the picture's path does not say camera and frame.
+    """
+
+    def __init__(
+        self, gaussians: Any, duration: float = 1.0, *, settings: RasterSettings | None = None, key: KeyOf | None = None
+    ) -> None:
+        missing = [name for name in ("prune", "sort", "_temporal_means") if not hasattr(gaussians, name)]
+        if missing:
+            raise D2Error(
+                f"{type(gaussians).__name__} has no {missing[0]}, which FasterGS4DAdapter needs: "
+                "give it model.gaussians of the branch FasterGS4D"
+            )
+        self.gaussians, self.duration = gaussians, duration
+        self.settings = settings or CONSTANTS
+        self._key = key
+        self._listeners: list[ResizeListener] = []
+        self._told = len(self)
+        self._watch("prune", lambda mask: torch.nonzero(~mask).squeeze(-1))
+        self._watch("sort", lambda ordering: ordering)
+
+    def __len__(self) -> int:
+        return len(self.gaussians._spatial_means)
+
+    def view(self, camera: Any) -> View:
+        """The view of NeRFICG's `View` (Datasets/utils.py), which holds camera, pose and time, or a `View` as it is."""
+        if isinstance(camera, View):
+            return camera
+        lens = getattr(camera, "camera", None)
+        if lens is None or not hasattr(lens, "focal_x"):
+            raise D2Error(f"a camera of type {type(camera).__name__} has no perspective `camera`: pass the trainer's view")
+        key = self._key(camera) if self._key is not None else _key_of_picture(camera)
+        like = self.gaussians._spatial_means
+        K = torch.tensor([[lens.focal_x, 0, lens.center_x], [0, lens.focal_y, lens.center_y], [0, 0, 1]])
+        pose = camera.w2c.detach().to(like).contiguous()
+        return View(key.camera, key.frame, float(camera.timestamp), pose, K.to(like), int(lens.width), int(lens.height))
+
+    def slice_at(self, view: View) -> Splats:
+        """The 3D Gaussians at `view.time`; those with F(t) below 0.05 are left out, as in its rasterizer."""
+        model = self.gaussians
+        like = model._left_isoclinic_rotations
+        return slice_gaussians(
+            {
+                "positions": model._spatial_means,
+                "log_scales": model._spatial_scales,
+                "left": like * like.new_tensor(LEFT_SIGNS),
+                "opacity_logits": model._opacities.squeeze(-1),
+                "times": model._temporal_means.squeeze(-1),
+                "log_time_scales": model._temporal_scales.squeeze(-1),
+                "right": model._right_isoclinic_rotations * like.new_tensor(RIGHT_SIGNS),
+            },
+            view.time,
+        )
+
+    def colors(self, view: View, splats: Splats) -> Tensor:
+        """RGB [M, 3] from the spherical harmonics in use."""
+        model = self.gaussians
+        coefficients = torch.cat([model._sh_coefficients_0, model._sh_coefficients_rest], 1)[splats.rows]
+        centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
+        degree = int(model.active_sh_degree)
+        return harmonic_colors(coefficients[:, : (degree + 1) ** 2], splats.means - centre, None, degree, 0)
+
+    @torch.no_grad()
+    def insert(self, points: Points) -> int:
+        """Isotropic Gaussians at the finite ones of the points, at the end; returns their number.
+
+        They live around the time of their frame with the width that the repository starts with: a variance of a fifth
+        of the duration. `_densification_info` is kept, with zeros for the new rows.
+        """
+        finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
+        rows, before = self._rows(Points(*(value[finite] for value in points))), len(self)
+        for group in self.gaussians.optimizer.param_groups:
+            self._extend(group, rows[group["name"]])
+        evidence, added = self.gaussians._densification_info, int(finite.sum())
+        if evidence is not None:
+            self.gaussians._densification_info = torch.cat([evidence, evidence.new_zeros(len(evidence), added)], 1)
+        index = torch.arange(len(self), device=points.positions.device)
+        index[before:] = -1
+        self._tell(index)
+        return added
+
+    @torch.no_grad()
+    def remove(self, mask: Tensor) -> None:
+        """Delete the rows where `mask` [N] is True, by the repository's own function."""
+        self.gaussians.prune(mask)
+
+    def on_resize(self, listener: ResizeListener) -> None:
+        """Register a listener for every structural change, the backbone's own densification included."""
+        self._listeners.append(listener)
+
+    def _rows(self, points: Points) -> dict[str, Tensor]:
+        model, count = self.gaussians, len(points.positions)
+        identity = points.positions.new_zeros(count, 4)
+        identity[:, 0] = 1
+        return {
+            "spatial_means": points.positions,
+            "temporal_means": points.times[:, None],
+            "sh_coefficients_0": ((points.colors - 0.5) / SH_C0)[:, None, :],
+            "sh_coefficients_rest": points.positions.new_zeros(count, *model._sh_coefficients_rest.shape[1:]),
+            "opacities": torch.logit(points.opacities, eps=1e-6)[:, None],
+            "spatial_scales": points.scales.log()[:, None].repeat(1, 3),
+            "temporal_scales": points.times.new_full((count, 1), 0.5 * math.log(self.duration / 5)),
+            "left_isoclinic_rotations": identity,
+            "right_isoclinic_rotations": identity.clone(),
+        }
+
+    def _extend(self, group: dict[str, Any], rows: Tensor) -> None:
+        """New rows at the end of one column, with moments of zero."""
+        optimizer, old = self.gaussians.optimizer, group["params"][0]
+        new = torch.nn.Parameter(torch.cat([old.detach(), rows.to(old)]))
+        moments = optimizer.state.pop(old, {})
+        for name in ("exp_avg", "exp_avg_sq"):
+            if name in moments:
+                moments[name] = torch.cat([moments[name], torch.zeros_like(rows)])
+        if moments:
+            optimizer.state[new] = moments
+        group["params"][0] = new
+        setattr(self.gaussians, f"_{group['name']}", new)
+
+    def _watch(self, name: str, kept: Callable[[Tensor], Tensor]) -> None:
+        """Override a method on the instance: `kept` gives the rows that its argument keeps, in their new order."""
+        original = getattr(type(self.gaussians), name).__get__(self.gaussians)
+
+        def reporting(argument: Tensor) -> None:
+            rows = kept(argument)
+            index = torch.where(rows < self._told, rows, -1)  # beyond: appended just now, and not yet reported
+            original(argument)
+            self._tell(index)
+
+        object.__setattr__(self.gaussians, name, reporting)
+
+    def _tell(self, index: Tensor) -> None:
+        self._told = len(self)
+        for listener in self._listeners:
+            listener(index)
+
+
+def _key_of_picture(view: Any) -> PriorKey:
+    """Its data sets number frames through all cameras; only the path of the picture says which is which."""
+    picture = getattr(view, "_rgb", None)
+    if picture is None:
+        raise D2Error("a view without a picture does not say its camera: give the adapter a function `key`")
+    return key_from_picture(str(picture.path))

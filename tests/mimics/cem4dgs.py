@@ -1,0 +1,222 @@
+"""After tho-kn/cem-4dgs: one table of splats that are drawn, and one of motions that carry some of them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import torch
+from torch import Tensor, nn
+
+from d2_plugin.rasterizer import RasterSettings, Splats
+
+from .ex4dgs import Scene, opacity_compensation
+from .fastergs4d import product
+from .inria import InriaModel, cameras_of, covariances, default_options, draw, initial_points, l1_loss, shuffled
+
+STATIC = (
+    *InriaModel.columns,
+    ("xyz_disp", "_xyz_disp"),
+    ("opacity_center", "_opacity_duration_center"),
+    ("opacity_var", "_opacity_duration_var"),
+)
+MOTION = (("motion_xyz", "_xyz_motion"), ("motion_rotation", "_rotation_motion"))
+
+
+class GaussianModel(InriaModel):
+    """Splats of level 0 drift; those of level 1 hang on a motion, whose number in the joint table is their parent."""
+
+    columns = (*STATIC, *MOTION)
+    accumulated = ("xyz_gradient_accum", "denom", "xyz_error_accum", "xyz_ssim_error_accum", "error_denom")
+    kept = ("xyz_error_min", "xyz_error_min_timestamp", "min_radii2D")
+    kernel_size, duration, time_shift, interval = 0.1, 1, 1, 1
+
+    def create_from_pcd(self, points, colors, scale: float = 0.15) -> None:
+        super().create_from_pcd(points, colors, scale)
+        count = len(points)
+        span = torch.zeros(count, 2, 1)
+        span[:, 1] = 1
+        self._set("_xyz_disp", torch.zeros(count, 3))
+        self._set("_opacity_duration_center", span)
+        self._set("_opacity_duration_var", torch.ones(count, 2, 1))
+        self._set("_xyz_motion", torch.empty(0, 2, 3))
+        self._set("_rotation_motion", torch.empty(0, 2, 4))
+        self._parent, self._level = torch.full((count, 1), -1), torch.zeros(count, 1, dtype=torch.long)
+
+    def rates(self, opt: SimpleNamespace) -> dict[str, float]:
+        return super().rates(opt) | dict.fromkeys([name for name, _ in (*STATIC[6:], *MOTION)], 1e-3)
+
+    def training_setup(self, training_args: SimpleNamespace) -> None:
+        super().training_setup(training_args)
+        count = len(self._xyz)
+        self.xyz_error_min, self.xyz_error_min_timestamp = torch.full((count, 1), 1000.0), torch.full((count, 1), -1.0)
+        self.min_radii2D = torch.full((count,), 1000.0)
+
+    def _joint(self, t: float) -> tuple[Tensor, Tensor]:
+        """Positions and rotations of splats and motions together, children carried by their parents."""
+        moved = self._xyz_motion[:, 0] * (1 - t) + self._xyz_motion[:, 1] * t
+        turned = self._rotation_motion[:, 0] * (1 - t) + self._rotation_motion[:, 1] * t
+        xyz = torch.cat([self._xyz, moved])
+        rotation = nn.functional.normalize(torch.cat([self._rotation, turned]))
+        child = torch.nonzero(self._level[:, 0] != 0).squeeze(1)
+        parent = self._parent[child, 0]
+        q, v = rotation[parent], torch.cat([torch.zeros(len(child), 1), xyz[child]], 1)
+        carried = product(product(q, v), q * q.new_tensor([1.0, -1, -1, -1]))[:, 1:]
+        xyz = xyz.index_copy(0, child, xyz[parent] + carried)
+        return xyz, rotation.index_copy(0, child, product(q, rotation[child]))
+
+    def get_xyz_at_t(self, t: float) -> Tensor:
+        return self._joint(t)[0][: len(self._xyz)] + self._xyz_disp * t / self.duration
+
+    def get_rotation_at_t(self, t: float) -> Tensor:
+        return self._joint(t)[1][: len(self._xyz)]
+
+    def get_scaling(self) -> Tensor:
+        return self._scaling.exp()
+
+    def get_opacity_at_t(self, t: float) -> Tensor:
+        span = (t - self._opacity_duration_center).amin(1) / self._opacity_duration_var.exp().amax(1)
+        child = self._level[: len(self._xyz)] > 0
+        return torch.sigmoid(self._opacity) * torch.where(child, torch.exp(-span * span), torch.ones_like(span))
+
+    def prune_points(self, static_mask: Tensor, dynamic_mask: Tensor | None = None) -> None:
+        count = len(self._xyz)
+        if dynamic_mask is None:
+            dynamic_mask = torch.zeros(len(self._xyz_motion), dtype=torch.bool)
+        living = self._parent[:count][(self._level[:count] > 0) & ~static_mask[:, None]]
+        assert (living >= count).all(), "only motions are parents"
+        dynamic_mask[living.unique() - count] = False
+        keep = torch.cat([~static_mask, ~dynamic_mask])
+        renumbered = torch.cat([torch.cumsum(keep, 0) - 1, torch.tensor([-1])])  # the last for parents of -1
+        self._parent, self._level = renumbered[self._parent[keep]], self._level[keep]
+        for group, moments in self._each_column():
+            rows = ~(dynamic_mask if group["name"].startswith("motion_") else static_mask)
+            self._swap(group, group["params"][0][rows], {key: value[rows] for key, value in moments.items()})
+        for name in (*self.accumulated, *self.kept, "max_radii2D"):
+            setattr(self, name, getattr(self, name)[~static_mask])
+
+    def cat_tensors_to_optimizer(self, new: dict[str, Tensor]) -> None:
+        for group, moments in self._each_column():
+            if group["name"] in new:
+                rows = new[group["name"]]
+                padded = {key: torch.cat([value, torch.zeros_like(rows)]) for key, value in moments.items()}
+                self._swap(group, torch.cat([group["params"][0], rows]), padded)
+
+    def densification_postfix(self, *values: Tensor) -> None:
+        self._added(self.columns, values)
+
+    def densification_postfix_onlystatic(
+        self, new_xyz, new_features_dc, new_features_rest, new_opacity, new_scaling, new_rotation, new_xyz_disp,
+        new_opacity_duration_center, new_opacity_duration_var,
+    ) -> None:  # fmt: skip
+        self._added(STATIC, (
+            new_xyz, new_features_dc, new_features_rest, new_opacity, new_scaling, new_rotation, new_xyz_disp,
+            new_opacity_duration_center, new_opacity_duration_var,
+        ))  # fmt: skip
+
+    def _added(self, columns, values: tuple[Tensor, ...]) -> None:
+        self.cat_tensors_to_optimizer({name: value for (name, _), value in zip(columns, values, strict=True)})
+        self._zero_accumulators()
+        self.max_radii2D, self.min_radii2D = torch.zeros(len(self._xyz)), torch.full((len(self._xyz),), 1000.0)
+
+    def densify_and_clone(self, grads: Tensor, threshold: float, extent: float) -> None:
+        """The errors, parents and levels are lengthened by the caller, splats before motions."""
+        chosen, count = grads.norm(dim=-1) >= threshold, len(self._xyz)
+        self.xyz_error_min = torch.cat([self.xyz_error_min, self.xyz_error_min[chosen]])
+        self.xyz_error_min_timestamp = torch.cat([self.xyz_error_min_timestamp, self.xyz_error_min_timestamp[chosen]])
+        for name in ("_parent", "_level"):
+            joint = getattr(self, name)
+            setattr(self, name, torch.cat([joint[:count], joint[:count][chosen], joint[count:]]))
+        self._parent[self._parent >= count] += int(chosen.sum())
+        self.densification_postfix_onlystatic(*(getattr(self, attribute)[chosen] for _, attribute in STATIC))
+
+    def densify_and_prune(self, max_grad: float, min_opacity: float, extent: float, max_screen_size: object) -> None:
+        self.densify_and_clone((self.xyz_gradient_accum / self.denom).nan_to_num(), max_grad, extent)
+        self.prune_points(torch.sigmoid(self._opacity).squeeze(-1) < min_opacity)
+
+    def extract_dynamic_points_from_static(self, share: float = 0.1) -> None:
+        """The fastest still splats become children of a motion each, at its origin."""
+        count = len(self._xyz)
+        drift = self._xyz_disp.norm(dim=-1)
+        still = self._level[:count, 0] == 0
+        moving = torch.nonzero((drift > torch.quantile(drift, 1 - share)) & still).squeeze(1)
+        rows = torch.stack([self._xyz, self._xyz + self._xyz_disp], 1)[moving].detach()
+        identity = torch.zeros(len(moving), 2, 4)
+        identity[..., 0] = 1
+        first = len(self._parent)
+        self.cat_tensors_to_optimizer({"motion_xyz": rows, "motion_rotation": identity})
+        self._parent[moving, 0] = torch.arange(len(moving)) + first
+        self._level[moving] = 1
+        blank = len(moving)
+        self._parent = torch.cat([self._parent, torch.full((blank, 1), -1)])
+        self._level = torch.cat([self._level, torch.zeros(blank, 1, dtype=torch.long)])
+        self._xyz.data[moving] = 0.0
+        self._xyz_disp.data[moving] = 0.0
+
+    def prune_nan_points(self) -> None:
+        if self._xyz.isnan().any():
+            self.prune_points(self._xyz.isnan().any(1))
+
+    def capture(self) -> tuple[object, ...]:
+        return super().capture(), tuple(getattr(self, name) for name in (*self.kept, "_parent", "_level"))
+
+    def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
+        super().restore(model_args[0], training_args)
+        for name, value in zip((*self.kept, "_parent", "_level"), model_args[1], strict=True):
+            setattr(self, name, value.clone())
+
+
+def render(viewpoint_camera, pc, bg_color, near=0.2) -> dict[str, Tensor]:
+    """As Ex4DGS draws, of the splats alone; depth is divided by `acc`."""
+    t = viewpoint_camera.timestamp
+    means = pc.get_xyz_at_t(t)
+    cov = covariances(pc.get_scaling(), pc.get_rotation_at_t(t))
+    opacities = pc.get_opacity_at_t(t).squeeze(-1)
+    opacities = opacities * opacity_compensation(means, cov, viewpoint_camera, pc.kernel_size)
+    projected = torch.cat([means, torch.ones(len(means), 1)], 1) @ viewpoint_camera.full_proj_transform
+    inside = (projected[:, :2] / projected[:, 3:]).abs().amax(1) <= 1.3
+    rows = torch.nonzero(inside & (projected[:, 3] > near)).squeeze(1)
+    splats = Splats(means[rows], cov[rows], opacities[rows], rows)
+    settings = RasterSettings(near=near, blur=pc.kernel_size)
+    package = draw(splats, pc.rgb[rows], viewpoint_camera, len(means), bg_color, settings)
+    acc = package.pop("alpha")
+    return package | {"acc": acc, "depth_sum": package["depth"], "depth": package["depth"] / acc.clamp_min(1e-9)}
+
+
+def make() -> tuple[GaussianModel, Scene]:
+    gaussians = GaussianModel()
+    gaussians.create_from_pcd(*initial_points())
+    return gaussians, Scene(cameras_of(timestamp=lambda view: view.frame))
+
+
+def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
+    opt = opt or default_options()
+    dataset, first_iter = SimpleNamespace(white_background=False, near=0.2, far=100.0), 0
+    gaussians.training_setup(opt)
+    if checkpoint:
+        (model_params, first_iter) = checkpoint
+        gaussians.restore(model_params, opt)
+
+    bg_color = [1, 1, 1] if dataset.white_background else [0, 0, 0]
+    for iteration in range(first_iter + 1, min(opt.iterations, stop) + 1):
+        torch.manual_seed(iteration)
+        viewpoint_cam = scene.cameras[shuffled(len(scene.cameras), iteration)[0]]
+        render_pkg = render(viewpoint_cam, gaussians, bg_color, near=dataset.near)
+        loss = l1_loss(render_pkg["render"], viewpoint_cam.original_image)
+        loss.backward()
+
+        with torch.no_grad():
+            if iteration < opt.densify_until_iter:
+                seen, radii = render_pkg["visibility_filter"], render_pkg["radii"]
+                gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
+                gaussians.add_densification_stats(render_pkg["viewspace_points"].grad, seen)
+                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+                    gaussians.densify_and_prune(opt.densify_grad_threshold, 0.01, scene.cameras_extent, None)
+                elif iteration % 17 == 0:
+                    gaussians.extract_dynamic_points_from_static()
+            if iteration < opt.iterations:
+                gaussians.optimizer.step()
+                gaussians.optimizer.zero_grad(set_to_none=True)
+
+                gaussians.prune_nan_points()
+
+    return SimpleNamespace(**locals())

@@ -1,0 +1,151 @@
+"""What a trainer's process imports runs where official environments stand: Python 3.9 and torch 2.0.
+
+The list of modules is what importing them brings in, never one that is kept by hand.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Optional
+
+import pytest
+import torch
+from splat_scenes import random_scene
+
+from d2_plugin import older, registry
+from d2_plugin.config import D2Config
+from d2_plugin.errors import D2Error
+from d2_plugin.hooks.table import HOOKS
+from d2_plugin.rasterizer import RasterSettings, ops
+from d2_plugin.settings import Range, Settings, declared
+
+OLDEST = "3.9"
+
+LOADED = """
+import importlib, pkgutil, sys
+import d2_plugin
+from d2_plugin import D2Config, D2Hooks, registry
+import d2_plugin.attach.launch, d2_plugin.priors.store
+for room in ("hooks", "gaussians", "rasterizer", "adapters", "compat", "attach"):
+    package = importlib.import_module("d2_plugin." + room)
+    for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if not found.name.endswith("__main__"):
+            importlib.import_module(found.name)
+for name in registry.names(registry.ADAPTERS):
+    registry.load(registry.ADAPTERS, name)
+for name, module in sorted(sys.modules.items()):
+    if name.split(".")[0] == "d2_plugin" and getattr(module, "__file__", None):
+        print(module.__file__)
+"""
+"""Imports what a trainer may, and prints the files that this loads."""
+
+
+def trainer_files() -> list[str]:
+    done = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
+def vermin(*files: str) -> subprocess.CompletedProcess:
+    """Exit code 1 where a file needs a newer Python than OLDEST, in syntax or library."""
+    command = [sys.executable, "-c", "from vermin import main; main()", "--no-tips", "--violations", f"-t={OLDEST}-", *files]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def test_what_a_trainer_imports_keeps_to_python_3_9() -> None:
+    pytest.importorskip("vermin", reason="needs vermin")
+    files = trainer_files()
+    names = {Path(file).relative_to(Path(files[0]).parent).as_posix() for file in files if "d2_plugin" in file}
+    assert {"plugin.py", "protocol.py", "settings.py", "priors/store.py", "attach/launch.py"} <= names
+    judged = vermin(*files)
+    assert judged.returncode == 0, judged.stdout + judged.stderr
+
+
+def test_the_judge_sees_a_newer_word(tmp_path: Path) -> None:
+    """A green test above says something."""
+    pytest.importorskip("vermin", reason="needs vermin")
+    for number, text in enumerate(("zip([1], [2], strict=True)", "match 1:\n    case 1: pass", "import tomllib")):
+        file = tmp_path / f"newer{number}.py"
+        file.write_text(f"{text}\n")
+        assert vermin(str(file)).returncode == 1
+
+
+class TestAnnotations:
+    """Settings are declared as `int | None`, which Python 3.9 evaluates with a stand-in."""
+
+    @pytest.mark.parametrize("kind", [D2Config, *(hook.config for hook in HOOKS.values())])
+    def test_the_stand_in_reads_what_newer_pythons_read(self, kind: type) -> None:
+        pytest.importorskip("eval_type_backport", reason="needs eval-type-backport")
+        assert older.backported_hints(kind) == older.hints_of(kind)
+
+    def test_unions_are_known_in_both_spellings(self) -> None:
+        @dataclass(frozen=True)
+        class Old(Settings):
+            share: Optional[Annotated[float, Range(0, 1)]] = None  # noqa: UP045  as the stand-in evaluates it
+
+        assert Old(share=0.5).share == 0.5
+        with pytest.raises(D2Error, match=r"Old.share"):
+            Old(share=2.0)
+        assert declared(Old)[0].default is None
+
+    def test_a_missing_stand_in_is_named_with_its_command(self) -> None:
+        with pytest.raises(D2Error, match=r"cannot read TOML by itself: run `pip install tomli`"):
+            older.stand_in("no_such_module", "tomli", "read TOML")
+
+
+def test_entry_points_are_found_in_the_shape_of_python_3_9(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = {point.name: point for point in registry.entry_points(group=registry.ADAPTERS)}
+    monkeypatch.setattr(registry.sys, "version_info", (3, 9, 2))
+    monkeypatch.setattr(registry, "entry_points", lambda: {registry.ADAPTERS: tuple(found.values())})
+    assert registry.names(registry.ADAPTERS) == sorted(found)
+    assert registry.names("d2_plugin.no_such_group") == []
+
+
+class TestTorchWithoutOperators:
+    """Before 2.4 torch cannot define operators: then kernels run in plain autograd functions, the same bits."""
+
+    @pytest.fixture
+    def plain(self, monkeypatch: pytest.MonkeyPatch):
+        """The module `ops`, loaded anew by a torch in which the feature is hidden."""
+        monkeypatch.delattr(torch.library, "custom_op")
+        spec = importlib.util.spec_from_file_location("d2_plugin.rasterizer.plain_ops", ops.__file__)
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, spec.name, module)
+        spec.loader.exec_module(module)
+        return module
+
+    def test_images_and_gradients_are_the_same_bits(self, plain) -> None:
+        outcomes = []
+        for module in (ops, plain):
+            scene = random_scene(1, 40, 32, 24).to(torch.float32).requires_grad()
+            offsets, edge = torch.zeros(40, 2, requires_grad=True), torch.full((24, 32), 3.0)
+            drawn = scene.splats, scene.colors, scene.view, RasterSettings()
+            render = module.rasterize(*drawn, torch.ones(3), offsets, edge)
+            (render.color.square().sum() + render.depth_sum.sum() + render.front.sum()).backward()
+            outcomes.append([*render, *(part.grad for part in (*scene[:4], offsets))])
+        for ours, theirs in zip(*outcomes):
+            assert torch.equal(ours, theirs)
+        assert all(bool(value.any()) for value in outcomes[0])
+
+    def test_there_is_no_second_derivative_and_it_says_so(self, plain) -> None:
+        scene = random_scene(1, 40, 32, 24).to(torch.float32).requires_grad()
+        render = plain.rasterize(scene.splats, scene.colors, scene.view, RasterSettings(), None, None)
+        (gradient,) = torch.autograd.grad(render.color.square().sum(), scene.colors, create_graph=True)
+        with pytest.raises(RuntimeError, match="once_differentiable"):
+            gradient.sum().backward()
+
+    def test_a_device_without_kernels_is_named(self, plain) -> None:
+        with pytest.raises(NotImplementedError, match="d2::survey has no kernel for meta: have cpu, cuda"):
+            plain._survey(torch.empty(1, 3, device="meta"))
+
+
+def test_the_command_line_says_which_python_it_needs() -> None:
+    """`d2` is for the environment where priors are built; a trainer's may be older and needs the three lines alone."""
+    ask = "import sys\nsys.version_info = (3, 9, 2, 'final', 0)\nfrom d2_plugin.commands.cli import main\nsys.exit(main())"
+    done = subprocess.run([sys.executable, "-c", ask, "plan"], capture_output=True, text=True, env=os.environ)
+    assert done.returncode == 2
+    assert "needs Python 3.11 or later, this is 3.9: use another environment for its commands" in done.stderr
