@@ -92,7 +92,6 @@ class Trainer:
         """The last step's loss with all its terms, for whoever watches that it stays finite."""
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
-        self._picture = getattr(frames, "picture", frames.image)
         self.d2 = attach(model) if attach else None  # D2, line 1: after the optimizer exists
 
     @property
@@ -146,6 +145,10 @@ class Trainer:
         self.early_stop.load_state_dict(state.get("early_stop", {"rounds": [], "errors": []}))  # absent until 0.1.0
         if self.d2 is not None:
             self.d2.load_state_dict(state["d2"])
+
+    def _picture(self, index: int) -> Tensor:
+        picture: Callable[[int], Tensor] = getattr(self.frames, "picture", self.frames.image)
+        return picture(index)
 
     def _weights(self, index: int) -> Tensor | None:
         weights: Callable[[int], Tensor | None] | None = getattr(self.frames, "weights", None)

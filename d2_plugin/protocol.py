@@ -76,7 +76,7 @@ class Points(NamedTuple):
     @classmethod
     def joined(cls, parts: Sequence[Points]) -> Points:
         """All points of at least one part, in their order."""
-        known = [torch.cat(values) for values in zip(*(part[:5] for part in parts), strict=True)]
+        known = [torch.cat(values) for values in zip(*(part[:5] for part in parts))]
         if all(part.lifetimes is None for part in parts):
             return cls._make([*known, None])
         given = [torch.full_like(p.times, torch.inf) if p.lifetimes is None else p.lifetimes for p in parts]

@@ -124,7 +124,7 @@ class FasterGS4DAdapter:
         of the duration. `_densification_info` is kept, with zeros for the new rows.
         """
         finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
-        rows, before = self._rows(Points(*(value[finite] for value in points))), len(self)
+        rows, before = self._rows(points.select(finite)), len(self)
         for group in self.gaussians.optimizer.param_groups:
             self._extend(group, rows[group["name"]])
         evidence, added = self.gaussians._densification_info, int(finite.sum())

@@ -83,10 +83,10 @@ class GsplatDynamicAdapter(GsplatAdapter):
     def insert(self, points: Points) -> int:
         """See `GsplatAdapter.insert`; the new rows are marked as their neighbours are."""
         finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
-        points = Points(*(value[finite] for value in points))
+        points = points.select(finite)
         moving = self._neighbours_move(points)
         if bool(moving.any()):
-            chosen = Points(*(value[moving] for value in points))
+            chosen = points.select(moving)
             self.inversion = invert_at_times(chosen, self._as_new, self.parameters["means"].detach())
             positions = points.positions.clone()
             positions[moving] = self.inversion.positions

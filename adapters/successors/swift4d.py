@@ -76,7 +76,7 @@ class Swift4DAdapter(Hust4DAdapter):
 
     def _canonical(self, points: Points, moving: Tensor) -> Points:
         """Points on what moves at the places that the field carries onto them; a place outside of its box stays."""
-        chosen = Points(*(value[moving] for value in points))
+        chosen = points.select(moving)
         self.inversion = invert_at_times(chosen, self._as_new, self.gaussians._xyz.detach())
         positions = points.positions.clone()
         positions[moving] = self.inversion.positions

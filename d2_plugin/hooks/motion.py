@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -61,5 +60,5 @@ def _same_place(view: View, other: View) -> bool:
 
 def _interval(views: Sequence[View]) -> float:
     """The shortest time between two instants; infinite if there is but one."""
-    times = sorted({view.time for view in views})
-    return min((later - earlier for earlier, later in pairwise(times)), default=torch.inf)
+    times = torch.tensor(sorted({view.time for view in views}), dtype=torch.float64)
+    return float(times.diff().min()) if len(times) > 1 else torch.inf
