@@ -20,9 +20,10 @@ from torch import Tensor
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, PriorLoader
-from d2_plugin.hooks.edits import spread_over
+from d2_plugin.hooks.edits import followed, limited
 from d2_plugin.hooks.expected import check_backbone, check_state, converted
 from d2_plugin.hooks.finite import FiniteCheck
+from d2_plugin.hooks.idle import Idle
 from d2_plugin.hooks.prior import Store
 from d2_plugin.hooks.reports import Listener, Report, Telling, Trace
 from d2_plugin.hooks.table import HOOKS
@@ -66,9 +67,7 @@ class D2Hooks:
         self._inserting = 0  # the step while the backbone inserts for us, else 0
         self.inserted_at = torch.zeros(self._count, dtype=torch.int32)
         """Per Gaussian [N], the step at which D2 inserted it; 0 for the backbone's own."""
-        self._idle = dict.fromkeys(self.hooks, 0)  # evaluations in a row that changed next to nothing
-        self.retired: dict[str, int] = {}
-        """Hooks that stopped because their last evaluations changed next to nothing, and the step of the last one."""
+        self._idle = Idle(self.hooks, config.retire_after, config.retire_below)
         self.telling = Telling(self.hooks)
         if self.hooks:
             self._prior = PriorLoader(store if store is not None else _open_store(config))
@@ -128,6 +127,11 @@ class D2Hooks:
         """From now on say what happens, see `d2_plugin.hooks.reports.Telling.start`."""
         self.telling.start(self.backbone, self._prior.store if self.hooks else None, iterations, on_report, writer)
 
+    @property
+    def retired(self) -> dict[str, int]:
+        """Hooks that stopped because their last evaluations changed next to nothing, and the step of the last one."""
+        return self._idle.retired
+
     def loss(self, step: int, views: object) -> Tensor | float:
         """The hooks' share of this step's loss: a scalar on the backbone's device, or 0.0 when there is none.
 
@@ -180,7 +184,7 @@ class D2Hooks:
             "evaluated": self._evaluated,
             "generator": self.generator.get_state(),
             "inserted_at": self.inserted_at.clone(),
-            "idle": dict(self._idle),
+            "idle": dict(self._idle.evaluations),
             "retired": dict(self.retired),
         }
 
@@ -192,7 +196,7 @@ class D2Hooks:
         self._sampler.load_state_dict(state["views"])
         self.generator.set_state(state["generator"].cpu())
         self._evaluated = bool(state.get("evaluated", True))
-        self._idle, self.retired = dict(state["idle"]), dict(state["retired"])
+        self._idle.load(state)
         self._count = len(self.backbone)
         self._finite.step = self._finite.saved = state.get("step", 0)
         # A checkpoint from before 2026-11 does not say; nothing that trains depends on it.
@@ -220,34 +224,21 @@ class D2Hooks:
         return Context(step, self.backbone, views, self._prior, self.generator, sample, self._sampler.instants)
 
     def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
-        """Retire a structure hook whose last evaluations changed next to nothing, because its surveys cost time."""
-        config, hook = self.config, self.hooks[name]
-        if not config.retire_after or name not in HOOKS or not HOOKS[name].edits_structure or not context.evaluation:
+        if name not in HOOKS or not HOOKS[name].edits_structure or not context.evaluation:
             return
-        changed = edit is not None and edit.changes >= max(config.retire_below * len(self.backbone), 1)
-        self._idle[name] = 0 if changed else self._idle[name] + 1
-        if self._idle[name] >= config.retire_after + hook.settling:
-            self.retired[name] = step
+        changes, settling = 0 if edit is None else edit.changes, self.hooks[name].settling
+        if self._idle.retires(name, step, changes, len(self.backbone), settling):
             self.trace.append(Trace(step, name, "retire", 0))
-            _log.info("%s retires at step %d: %d evaluations changed next to nothing", name, step, self._idle[name])
+            _log.info("%s retires at step %d: its last evaluations changed next to nothing", name, step)
 
     def _remove(self, step: int, edits: Sequence[tuple[str, Edit]]) -> int:
         masks = [(name, edit.remove) for name, edit in edits if edit.remove is not None]
         if not masks:
             return 0
-        union = self._limited(step, torch.stack([mask for _, mask in masks]).any(0))
+        union = limited(torch.stack([mask for _, mask in masks]).any(0), self.config.remove_at_most, step)
         self.trace.extend(Trace(step, name, "remove", int((mask & union).sum())) for name, mask in masks)
         self.backbone.remove(union)
         return int(union.sum())
-
-    def _limited(self, step: int, mask: Tensor) -> Tensor:
-        """At most the share of rows that may go in one step, spread evenly over those that were asked for."""
-        asked, most = int(mask.sum()), int(self.config.remove_at_most * len(self.backbone))
-        if asked <= most:
-            return mask
-        message = "step %d: the hooks would remove %d of %d Gaussians, and at most %d go in one step (remove_at_most)"
-        _log.warning(message, step, asked, len(self.backbone), most)
-        return spread_over(mask, most)
 
     def _insert(self, step: int, edits: Sequence[tuple[str, Edit]]) -> int:
         proposals = [(name, edit.insert) for name, edit in edits if edit.insert is not None]
@@ -266,11 +257,7 @@ class D2Hooks:
         for hook in self.hooks.values():
             hook.follow(index)
         self._count = len(index)
-        old = index.cpu()
-        # Rows that nobody reported (a model resumed without our state) count as the backbone's own.
-        count = max(len(self.inserted_at), int(old.max()) + 1 if len(old) else 0)
-        before = torch.nn.functional.pad(self.inserted_at, (0, count - len(self.inserted_at)))
-        self.inserted_at = torch.where(old < 0, self._inserting, before[old.clamp(min=0)] if count else 0).int()
+        self.inserted_at = followed(self.inserted_at, index.cpu(), self._inserting)
 
     def _check_count(self) -> None:
         """The safety net of the contract: a change of N that nobody reported resets per-Gaussian state."""

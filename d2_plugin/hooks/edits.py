@@ -1,9 +1,23 @@
-"""What becomes of the hooks' edits before the backbone makes them."""
+"""What becomes of the hooks' edits before the backbone makes them, and of what is known of its rows after."""
 
 from __future__ import annotations
 
+import logging
+
 import torch
 from torch import Tensor
+
+_log = logging.getLogger(__name__)
+
+
+def limited(mask: Tensor, share: float, step: int) -> Tensor:
+    """The rows to remove, bool [N], or a share of all N spread evenly over them where more were asked for."""
+    asked, most = int(mask.sum()), int(share * len(mask))
+    if asked <= most:
+        return mask
+    message = "step %d: the hooks would remove %d of %d Gaussians, and at most %d go in one step (remove_at_most)"
+    _log.warning(message, step, asked, len(mask), most)
+    return spread_over(mask, most)
 
 
 def spread_over(mask: Tensor, most: int) -> Tensor:
@@ -11,3 +25,13 @@ def spread_over(mask: Tensor, most: int) -> Tensor:
     rows = torch.nonzero(mask).squeeze(1)
     chosen = torch.arange(most, device=mask.device) * len(rows) // max(most, 1)
     return torch.zeros_like(mask).index_fill(0, rows[chosen], True)
+
+
+def followed(values: Tensor, index: Tensor, new: int) -> Tensor:
+    """Per-row integers after a change: row r was row index[r] before, -1 for a new one, which gets `new`.
+
+    Rows that nobody reported (a model resumed without our state) have 0.
+    """
+    count = max(len(values), int(index.max()) + 1 if len(index) else 0)
+    before = torch.nn.functional.pad(values, (0, count - len(values)))
+    return torch.where(index < 0, new, before[index.clamp(min=0)] if count else 0).int()
