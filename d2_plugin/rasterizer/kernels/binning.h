@@ -117,6 +117,7 @@ D2_INLINE void project_group(const Frame& f, int64_t i, int rows, Box* boxes, in
 // Fills records, boxes and counts; returns the number of pairs.
 inline int64_t project_all(const Frame& f) {
   const int tiles = f.tile_count();
+  ask_for_large_pages(f.records, sizeof(Record) * f.count);
   Box* boxes = scratch().boxes.reserve(f.count);
   int32_t* all_counts = scratch().counts.reserve(size_t(f.chunks) * (tiles + 1));
   parallel_for(f.threads, f.chunks, [&](int64_t chunk) {

@@ -172,14 +172,16 @@ D2_INLINE void for_each_reaching(const Frame& f, const uint64_t* keys, int pairs
   const Lattice lattice;
   const float log2_alpha_min = f.log2_alpha_min();
   uint64_t blocks[BATCH];
+  for (int i = 0; i < std::min(BATCH, pairs); i++) __builtin_prefetch(f.records + uint32_t(keys[i]));
   for (int first = 0; first < pairs && alive; first += BATCH) {
-    const int count = std::min(BATCH, pairs - first);
+    const int count = std::min(BATCH, pairs - first), ahead = std::min(2 * BATCH, pairs - first) - BATCH;
     for (int i = 0; i < count; i++) {
-      if (first + i + 8 < pairs) __builtin_prefetch(f.records + uint32_t(keys[first + i + 8]));
       const Record& r = f.records[uint32_t(keys[first + i])];
       blocks[i] = lattice.spread(r, corner).blocks(r, corner, log2_alpha_min);
     }
     for (int i = 0; i < count; i++) {
+      // The records of a batch arrive, one by one, while the batch before it is drawn.
+      if (i < ahead) __builtin_prefetch(f.records + uint32_t(keys[first + BATCH + i]));
       const uint32_t id = uint32_t(keys[first + i]);
       if (const uint64_t reached = blocks[i] & alive) visit(id, f.records[id], reached);
     }

@@ -84,6 +84,15 @@ struct Frame {
   float log2_alpha_max() const { return d2::log2(constants.alpha_max); }
 };
 
+// Asks for pages of 2 MB where memory is read at random: with small ones most of the time goes into finding them.
+inline void ask_for_large_pages(void* memory, size_t bytes) {
+#if defined(MADV_HUGEPAGE)
+  const uintptr_t page = uintptr_t(2) << 20, begin = uintptr_t(memory), end = begin + bytes;
+  const uintptr_t first = (begin + page - 1) / page * page, last = end / page * page;
+  if (last > first) madvise(reinterpret_cast<void*>(first), last - first, MADV_HUGEPAGE);
+#endif
+}
+
 // Memory that only grows, so that a training loop does not pay for fresh pages in every step.
 template <class T>
 class Buffer {
@@ -97,9 +106,7 @@ class Buffer {
       const size_t alignment = bytes < page ? 64 : page;
       data_ = static_cast<T*>(std::aligned_alloc(alignment, (bytes + alignment - 1) / alignment * alignment));
       if (!data_) throw std::bad_alloc();
-#if defined(MADV_HUGEPAGE)
-      if (bytes >= page) madvise(data_, bytes, MADV_HUGEPAGE);
-#endif
+      ask_for_large_pages(data_, (bytes + alignment - 1) / alignment * alignment);
     }
     return data_;
   }

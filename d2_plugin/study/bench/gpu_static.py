@@ -1,0 +1,99 @@
+"""What the GPU kernels take, told by the compiler: no device is needed, and nothing here is a time on one.
+
+nvcc compiles `gpu.cu` for an architecture; ptxas says registers, spills and shared memory of each kernel, and the
+binary says how many instructions it has. Rows of this are called "static analysis" and never more.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import struct
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from d2_plugin.errors import D2Error
+from d2_plugin.rasterizer.cuda_frame import SOURCE, Frame
+from d2_plugin.rasterizer.nvrtc import FLAGS
+from d2_plugin.study.rows import Row, make_row
+
+ARCHITECTURES = ("sm_90", "sm_120")
+"""H100, and the consumer GPUs of its successor."""
+
+INSTRUCTION_BYTES = 16
+"""Of one machine instruction, since sm_70."""
+
+ENTRY = re.compile(
+    r"Compiling entry function '(?P<kernel>\w+)' for '\w+'.*?"
+    r"(?P<stack>\d+) bytes stack frame, (?P<stores>\d+) bytes spill stores, (?P<loads>\d+) bytes spill loads.*?"
+    r"Used (?P<registers>\d+) registers(?P<rest>[^\n]*)",
+    re.DOTALL,
+)
+
+
+def static_analysis(nvcc: str, architecture: str, command: str = "") -> list[Row]:
+    """One row per kernel: registers, bytes spilled, bytes of shared memory, instructions.
+
+    Args:
+        nvcc: the compiler's path.
+        architecture: e.g. ``sm_90``.
+        command: how this was started.
+
+    Raises:
+        D2Error: nvcc refuses the source.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        cubin = Path(folder) / "gpu.cubin"
+        defines = ("-DD2_CHANNELS=3", f"-DD2_FRAME_SIZE={ctypes.sizeof(Frame)}")
+        words = [nvcc, "-cubin", f"-arch={architecture}", *FLAGS, *defines, "-Xptxas", "-v", "-o", str(cubin), str(SOURCE)]
+        result = subprocess.run(words, capture_output=True, text=True, check=False)
+        if result.returncode:
+            raise D2Error(f"nvcc refused gpu.cu for {architecture}; please report what it said:\n{result.stderr[:4000]}")
+        counts = instructions(cubin.read_bytes())
+    return [
+        make_row(
+            *("gpu", f"static analysis of {kernel}", "d2", architecture),
+            error=None,
+            seconds=None,
+            command=command,
+            instructions=counts[kernel],
+            **found,
+        )
+        for kernel, found in resources(result.stderr).items()
+    ]
+
+
+def resources(told: str) -> dict[str, dict[str, Any]]:
+    """What `ptxas -v` says of each kernel: registers per thread, bytes spilled and stacked, bytes of shared memory."""
+    found = {}
+    for match in ENTRY.finditer(told):
+        shared = re.search(r"(\d+) bytes smem", match["rest"])
+        found[match["kernel"]] = {
+            "registers": int(match["registers"]),
+            "spill_bytes": int(match["stores"]) + int(match["loads"]),
+            "stack_bytes": int(match["stack"]),
+            "shared_bytes": int(shared[1]) if shared else 0,
+        }
+    return dict(sorted(found.items()))
+
+
+def instructions(cubin: bytes) -> dict[str, int]:
+    """Machine instructions of each kernel, padding included: the sizes of the sections ``.text.KERNEL`` of an ELF file.
+
+    Raises:
+        D2Error: it is no 64-bit ELF file.
+    """
+    if cubin[:5] != b"\x7fELF\x02":
+        raise D2Error("the compiler wrote no 64-bit ELF file: give a cubin")
+    (table,) = struct.unpack_from("<Q", cubin, 40)
+    size, count, names = struct.unpack_from("<3H", cubin, 58)
+    sections = [struct.unpack_from("<IIQQQQ", cubin, table + i * size) for i in range(count)]
+    start = sections[names][4]
+    found = {}
+    for name, _, _, _, _, length in sections:
+        label = cubin[start + name : cubin.index(b"\0", start + name)].decode()
+        if label.startswith(".text."):
+            found[label.removeprefix(".text.")] = length // INSTRUCTION_BYTES
+    return found
