@@ -118,11 +118,20 @@ def renderer(model: Any, capture: Capture, device: torch.device | str) -> Callab
     return render
 
 
+KEPT_PICTURES = 320 << 20
+"""Bytes of decoded pictures that training keeps: four cameras of 20 frames at 1352x1014. A longer recording takes no
+more memory than that; what it re-reads is a small part of a step at its size."""
+
+
 class TrainingFrames:
     """Views and pictures of the training cameras; decoded pictures are kept up to `keep_bytes`, the rest re-read."""
 
     def __init__(
-        self, capture: Capture, cameras: Sequence[str], device: torch.device | str = "cpu", keep_bytes: int = 1 << 30
+        self,
+        capture: Capture,
+        cameras: Sequence[str],
+        device: torch.device | str = "cpu",
+        keep_bytes: int = KEPT_PICTURES,
     ) -> None:
         self.capture, self.device, self.keep_bytes = capture, device, keep_bytes
         self.views = [make_view(capture, camera, frame, device) for frame in capture.frames for camera in cameras]

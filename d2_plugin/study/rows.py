@@ -33,6 +33,7 @@ KINDS = {
     "stability": "as each case defines it",
     "plan": "loss of what is left out, as each decision defines it",
     "scaling": "none",
+    "step": "none",
 }
 """What `error` is for each kind of row."""
 
