@@ -7,7 +7,7 @@ import importlib.util
 import os
 import platform
 
-from d2_plugin import __version__, compiler, registry
+from d2_plugin import __version__, compiler, prebuilt, registry
 from d2_plugin.commands.arguments.form import Form
 
 OPTIONAL = {
@@ -63,6 +63,8 @@ def _cuda_kernels() -> str:
 
 
 def _compiler() -> str:
+    if (prebuilt.FOLDER / prebuilt.CHECKSUMS).is_file():
+        return f"not needed: the CPU kernels came compiled, for {', '.join(prebuilt.usable()) or 'other CPUs'}"
     try:
         return " ".join(compiler.find_compiler())
     except compiler.NoCompiler as error:
