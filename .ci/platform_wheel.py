@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -110,7 +111,9 @@ def main(wheel: Path, folder: Path) -> str:
     """What was written."""
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as work:
-        kernels = [compiled(library, level, Path(work)) for library in libraries() for level in prebuilt.LEVELS]
+        wanted = [(library, level) for library in libraries() for level in prebuilt.LEVELS]
+        with ThreadPoolExecutor(8) as pool:
+            kernels = list(pool.map(lambda pair: compiled(*pair, Path(work)), wanted))
         out = with_kernels(wheel, folder, kernels)
     return f"{out}: {len(kernels)} libraries, {out.stat().st_size / 1e6:.1f} MB"
 
