@@ -1,6 +1,7 @@
 """C++ sources of this package, compiled at first use and kept in a cache.
 
-Nothing is compiled at import or at installation, and no torch header is involved: a source is a plain C ABI reached
+Where a platform wheel brought them compiled (`d2_plugin.prebuilt`), those are used and no compiler is needed. Else
+nothing is compiled at import or at installation, and no torch header is involved: a source is a plain C ABI reached
 through ctypes, so a torch upgrade never invalidates a build. An entry of the cache is named by a hash of everything
 that shapes the machine code: sources, headers, flags, and all that the compiler predefines for this CPU (its version
 and the instruction sets among it), so that a home folder shared by different machines stays safe.
@@ -30,6 +31,7 @@ from pathlib import Path
 from .cache import cache_folder, cache_lock, check_private, is_trusted, private_cache
 from .durable import write_text
 from .errors import D2Error
+from .prebuilt import find as find_prebuilt
 
 __all__ = ["CompileError", "NoCompiler", "cache_folder", "find_compiler", "load_library"]
 
@@ -87,7 +89,7 @@ def _words(variable: str, text: str) -> list[str]:
 def load_library(
     name: str, sources: Sequence[Path], headers: Sequence[Path] = (), flags: Sequence[str] = ()
 ) -> ctypes.CDLL:
-    """The shared library compiled from `sources`, from the cache where it is there already.
+    """The shared library compiled from `sources`: as a platform wheel brought it, else from the cache if it is there.
 
     Args:
         name: what the library is called in the cache and in messages, e.g. ``"rasterizer"``.
@@ -100,6 +102,9 @@ def load_library(
         CompileError: the compiler refused the sources.
         D2Error: the cache folder cannot be written, or others may write it.
     """
+    prebuilt = find_prebuilt(name, sources, headers, flags)
+    if prebuilt is not None:
+        return _opened(prebuilt)
     compiler = find_compiler()
     command = [*compiler, *_flags(compiler, (*sources, *headers), flags)]
     key = _key(_predefined(tuple(command)), sources, headers, flags)
@@ -108,6 +113,13 @@ def load_library(
         if library not in _loaded:
             check_private(library.parent)
             _loaded[library] = _open(library) or _build(library, command, sources)
+        return _loaded[library]
+
+
+def _opened(library: Path) -> ctypes.CDLL:
+    with _guard:
+        if library not in _loaded:
+            _loaded[library] = ctypes.CDLL(str(library))
         return _loaded[library]
 
 

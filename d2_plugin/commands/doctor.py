@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from d2_plugin import __version__, compiler, registry
+from d2_plugin import __version__, compiler, prebuilt, registry
 from d2_plugin.commands.arguments.form import Form
 from d2_plugin.settings import Positional, Settings
 
@@ -84,6 +84,8 @@ def _cuda_kernels() -> str:
 
 
 def _compiler() -> str:
+    if (prebuilt.FOLDER / prebuilt.CHECKSUMS).is_file():
+        return f"not needed: the CPU kernels came compiled, for {', '.join(prebuilt.usable()) or 'other CPUs'}"
     try:
         return " ".join(compiler.find_compiler())
     except compiler.NoCompiler as error:

@@ -1,15 +1,15 @@
 """Adam over all tensors of a model in one call, in `kernels/adam.cpp`.
 
 The same numbers as `torch.optim.Adam` within rounding and the same state (`step`, `exp_avg`, `exp_avg_sq`), so that
-checkpoints, and whoever carries its moments along, see nothing new. Compiled at first use; results are the same bits for
-any number of threads.
+checkpoints, and whoever carries its moments along, see nothing new. Compiled at first use; results are the same bits
+for any number of threads.
 """
 
 from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -49,59 +49,70 @@ def library() -> ctypes.CDLL | None:
 
 
 class Adam(torch.optim.Adam):
-    """`torch.optim.Adam` whose step is one kernel where all tensors are dense float32 on the CPU; else it is torch's."""
+    """`torch.optim.Adam` with its step in one kernel where all tensors are dense float32 on the CPU, else as it is."""
+
+    _checked: tuple[tuple[Tensor, ...], ...] = ()
+    """Parameters, moments and counters that were found plain before, in the order of the groups."""
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """One step of all parameters that have a gradient."""
-        updates = self._updates() if closure is None else None
-        if updates is None:
+        pairs = [(value, group) for group in self.param_groups for value in group["params"] if value.grad is not None]
+        kernel = library() if closure is None else None
+        if kernel is None or not all(_is_standard(group) for group in self.param_groups) or not self._are_plain(pairs):
             return super().step(closure)
-        kernel = library()
-        assert kernel is not None
-        kernel.d2_adam((_Tensor * len(updates))(*updates), len(updates), torch.get_num_threads())
-        for group in self.param_groups:
-            for value in group["params"]:
-                if value.grad is not None:
-                    increment_version(value)  # a graph that still needs the old values is refused, as after torch's step
+        threads = torch.get_num_threads()
+        updates = [_update(*kept, group) for kept, (_, group) in zip(self._checked, pairs, strict=True)]
+        kernel.d2_adam((_Tensor * len(updates))(*updates), len(updates), threads)
+        for value, _ in pairs:
+            increment_version(value)  # a graph that still needs the old values is refused, as after torch's step
         return None
 
-    def _updates(self) -> list[_Tensor] | None:
-        """What the kernel has to do, or None where it cannot."""
-        if library() is None:
-            return None
-        found = []
-        for group in self.param_groups:
-            plain = not (group["weight_decay"] or group["amsgrad"] or group["maximize"] or group["differentiable"])
-            for value in group["params"]:
-                if value.grad is None:
-                    continue
-                update = self._update(value, group) if plain else None
-                if update is None:
-                    return None
-                found.append(update)
-        return found
+    def _are_plain(self, pairs: Sequence[tuple[Tensor, dict[str, Any]]]) -> bool:
+        """Whether the kernel takes all parameters, gradients and states, which are made where they are missing."""
+        if not all(_is_plain(value.grad) for value, _ in pairs):
+            return False
+        if len(self._checked) == len(pairs) and all(map(self._is_known, self._checked, pairs)):
+            return True
+        if not all(_is_plain(value) for value, _ in pairs):
+            return False
+        found = tuple(self._with_state(value) for value, _ in pairs)
+        fit = all(_is_plain(part) for kept in found for part in kept)
+        self._checked = found if fit else ()
+        return fit
 
-    def _update(self, value: Tensor, group: dict[str, Any]) -> _Tensor | None:
-        gradient, state = value.grad, self.state[value]
-        assert gradient is not None
-        if not (_is_plain(value) and _is_plain(gradient)):
-            return None
+    def _is_known(self, kept: tuple[Tensor, ...], pair: tuple[Tensor, dict[str, Any]]) -> bool:
+        value, first, second, steps = kept
+        if value is not pair[0]:
+            return False
+        state = self.state.get(value, {})
+        same = state.get("exp_avg") is first and state.get("exp_avg_sq") is second and state.get("step") is steps
+        return same and value.shape == first.shape == second.shape
+
+    def _with_state(self, value: Tensor) -> tuple[Tensor, ...]:
+        state = self.state[value]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32)
             state["exp_avg"] = torch.zeros_like(value, memory_format=torch.preserve_format)
             state["exp_avg_sq"] = torch.zeros_like(value, memory_format=torch.preserve_format)
-        kept = state["exp_avg"], state["exp_avg_sq"], state["step"]
-        if not all(_is_plain(part) for part in kept):
-            return None
-        first, second = group["betas"]
-        pointers = (part.data_ptr() for part in (value, *kept[:2], gradient, kept[2]))
-        return _Tensor(*pointers, value.numel(), float(group["lr"]), first, second, group["eps"])
+        return value, state["exp_avg"], state["exp_avg_sq"], state["step"]
 
 
-def _is_plain(part: Tensor) -> bool:
+def _update(value: Tensor, first: Tensor, second: Tensor, steps: Tensor, group: dict[str, Any]) -> _Tensor:
+    gradient = value.grad
+    assert gradient is not None
+    places = value.data_ptr(), first.data_ptr(), second.data_ptr(), gradient.data_ptr(), steps.data_ptr()
+    return _Tensor(*places, value.numel(), float(group["lr"]), *group["betas"], group["eps"])
+
+
+def _is_standard(group: dict[str, Any]) -> bool:
+    return not (group["weight_decay"] or group["amsgrad"] or group["maximize"] or group["differentiable"])
+
+
+def _is_plain(part: Tensor | None) -> bool:
     return (
-        part.dtype == torch.float32
+        part is not None
+        and part.dtype == torch.float32
         and part.device.type == "cpu"
         and part.layout is torch.strided
         and part.is_contiguous()

@@ -149,7 +149,8 @@ class _Background(torch.autograd.Function):
 
 def _call(parts: tuple[Tensor | None, ...], nodes: tuple[int, int, int]) -> _Behind:
     color, alpha, basis, constant, harmonics = parts
-    assert alpha is not None and basis is not None
+    assert alpha is not None
+    assert basis is not None
     call = _Behind(*alpha.shape, *nodes, basis.shape[1], torch.get_num_threads())
     pointers = (None if part is None else part.data_ptr() for part in (basis, constant, harmonics, color, alpha))
     call.basis, call.constant, call.harmonics, call.color, call.alpha = pointers

@@ -20,6 +20,7 @@ from d2_plugin.rasterizer import rasterize
 from d2_plugin.settings import Every, Positive, Range, Share, Steps
 
 from .hook import Context, Hook, HookConfig
+from .native_depth_loss import Constants, can_compare, native_depth_loss
 from .prior import KnownPixels
 from .rendered_depth import EPSILON
 
@@ -98,7 +99,7 @@ class _PixelDepthLoss(torch.autograd.Function):
         root = torch.hypot(residual, epsilon)
         total = weight.sum() + EPSILON
         slope = weight * (residual / root) / (target * opaque * total)  # d loss / d depth_sum
-        near = (~pixels.far).to(a) * (config.opaque / max(int((~pixels.far).sum()), 1))
+        near = (~pixels.far).to(a) * (config.opaque / max(pixels.near, 1))
         context.save_for_backward(pixels.index, slope, -slope * depth - near)
         context.shape = depth_sum.shape
         return (weight * residual * (residual / (root + epsilon))).sum() / total + (near * (1 - a)).sum()
@@ -117,13 +118,16 @@ class _PixelDepthLoss(torch.autograd.Function):
 
 def pixel_depth_loss(depth_sum: Tensor, alpha: Tensor, pixels: KnownPixels, config: DepthLossConfig) -> Tensor:
     """L_depth of a render: `depth_loss` of `rendered_depth` plus `opaque` times the mean of 1 - alpha at near pixels,
-    computed at the known pixels alone.
+    computed at the known pixels alone; by a kernel where there is one.
 
     Args:
         depth_sum, alpha: sum of w z and of w, [H, W], differentiable once.
         pixels: where something is known of D*, and how much.
         config: tau_v, epsilon, sigma_full and opaque.
     """
+    if can_compare(depth_sum, alpha, pixels):
+        constants = Constants(config.tau_v, config.sigma_full, config.epsilon, config.opaque)
+        return native_depth_loss(depth_sum, alpha, pixels, constants)
     return _PixelDepthLoss.apply(depth_sum, alpha, pixels, config)
 
 
@@ -136,6 +140,8 @@ class DepthLoss(Hook):
         """lambda_d times the mean of L_depth over the step's views that have known pixels."""
         pairs = [(view, context.prior.known(view)) for view in context.views]
         terms = [self._term(context, view, pixels) for view, pixels in pairs if pixels is not None]
+        if len(terms) == 1:
+            return self.config.weight * terms[0]
         return self.config.weight * torch.stack(terms).mean() if terms else None
 
     def _term(self, context: Context, view: View, pixels: KnownPixels) -> Tensor:

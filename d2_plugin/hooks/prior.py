@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import torch
@@ -49,6 +50,11 @@ class KnownPixels:
     """float32, relative standard deviation of the depth; 0 at far pixels and, in the paper, at verified ones."""
     far: Tensor
     """bool: only a depth in front of `depth` is wrong."""
+
+    @cached_property
+    def near(self) -> int:
+        """How many are not far."""
+        return int((~self.far).sum())
 
 
 class PriorLoader:

@@ -99,6 +99,11 @@ def make_view(capture: Capture, camera: str, frame: int, device: torch.device | 
     return View(camera, frame, time, pose, intrinsics, calibration.width, calibration.height)
 
 
+KEPT_PICTURES = 320 << 20
+"""Bytes of decoded pictures that training keeps: four cameras of 20 frames at 1352x1014. A longer recording takes no
+more memory than that; what it re-reads is a small part of a step at its size."""
+
+
 class TrainingFrames:
     """Views and pictures of the training cameras; decoded pictures are kept up to `keep_bytes`, the rest re-read."""
 
@@ -107,7 +112,7 @@ class TrainingFrames:
         capture: Capture,
         cameras: Sequence[str],
         device: torch.device | str = "cpu",
-        keep_bytes: int = 1 << 30,
+        keep_bytes: int = KEPT_PICTURES,
         background_weight: float = 1.0,
     ) -> None:
         self.capture, self.device, self.keep_bytes = capture, device, keep_bytes

@@ -33,6 +33,7 @@ KINDS = {
     "plan": "loss of what is left out, as each decision defines it",
     "scaling": "none",
     "gpu": "none",
+    "step": "none",
 }
 """What `error` is for each kind of row."""
 

@@ -156,3 +156,16 @@ def test_torch_takes_over_where_the_kernel_does_not_apply(monkeypatch: pytest.Mo
     torch.testing.assert_close(photometric_loss(image, target, 0.0), (image - target).abs().mean())
     monkeypatch.setattr(kernel, "library", lambda: None)
     torch.testing.assert_close(photometric_loss(image, target), native)
+
+
+@pytest.mark.parametrize("height", [20, 70])
+def test_a_target_of_bytes_is_the_same_as_its_numbers_to_the_bit(height: int) -> None:
+    image, target = pictures(height, 45)
+    kept = (255 * target).round().to(torch.uint8)
+    exact = loss_with_gradient(photometric_loss, image, kept.float() / 255, torch.float32)
+    image.requires_grad_()
+    loss = photometric_loss(image, kept)
+    loss.backward()
+    assert torch.equal(loss.detach(), exact[0])
+    assert torch.equal(image.grad, exact[1])
+    torch.testing.assert_close(photometric_loss(image.double(), kept).float(), loss)  # in torch

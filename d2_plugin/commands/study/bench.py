@@ -34,4 +34,4 @@ def form(words: list[str]) -> Form:
 
 def _parts() -> str:
     """A line per benchmark, for the help."""
-    return "\n".join(f"  {name:9} {benchmark.help}" for name, benchmark in BENCHMARKS.items())
+    return "\n".join(f"  {name:13} {benchmark.help}" for name, benchmark in BENCHMARKS.items())

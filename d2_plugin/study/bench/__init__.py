@@ -22,5 +22,8 @@ BENCHMARKS = {
     "scaling": Benchmark("d2_plugin.study.bench.scaling", "ScalingBench", "priors and training over more frames"),
     "stereo": Benchmark("d2_plugin.study.bench.stereo", "StereoBench", "geometric depth: matchers and settings"),
     "training": Benchmark("d2_plugin.study.training.bench", "TrainingBench", "D², backbone and rivals at equal time"),
+    "training-step": Benchmark(
+        "d2_plugin.study.bench.training_step", "TrainingStepBench", "one optimizer step beside the rasterizer's part"
+    ),
 }
 """Every benchmark by name; none is imported before it is asked for."""

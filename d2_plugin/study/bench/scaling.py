@@ -1,7 +1,7 @@
 """`d2 bench scaling`: how the time of priors and the memory of training grow with the number of frames.
 
 The capture is synthetic, written to disk and read back frame by frame as a recording would be. Priors and training run
-in processes of their own. Training keeps decoded pictures up to a bound (1 GiB) and re-reads the others.
+in processes of their own. Training keeps decoded pictures up to a bound (320 MiB) and re-reads the others.
 """
 
 from __future__ import annotations
