@@ -105,7 +105,7 @@ class Construction:
         if not self.agrees:
             return views
         maps = {name: view.maps for name, view in views.items()}
-        tails = {name: 1.0 if view.skill is None else view.skill.tail for name, view in views.items()}
+        tails = {name: view.skill.tail for name, view in views.items() if view.skill is not None}
         informed = with_evidence(maps, self.cameras, self.settings.agreement, tails)
         return {name: replace(view, maps=informed[name]) for name, view in views.items()}
 

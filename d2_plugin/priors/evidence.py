@@ -25,13 +25,13 @@ from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.geometry import ViewPair, interpolated_surface, view_pair
 from d2_plugin.protocol import Label
 
-AGREED = 0.6
+AGREED = 0.55
 """Factor of sigma where another camera's monocular depth agrees and the colours are alike. What a heavy tail added to
 sigma falls away there: agreement is evidence that this is not one of the things that the map misses. Measured without
 the tail, maps of PyDNet err there as those that belong to the pictures do (1.2 sigma of these; elsewhere 2.5 to 6)."""
 AT_BEST = 0.01
 """What agreement cannot go below, in quadrature: errors that the maps share do not show in their difference."""
-ALONE = 1.1
+ALONE = 1.05
 """Factor of sigma where others see the place and none agrees."""
 WITHIN = 1.2
 """A surface confirms a monocular depth within this many of its standard deviations. Farther ones are often another
@@ -114,11 +114,11 @@ def with_evidence(
         priors: D* of synchronized views, by camera.
         cameras: their calibrations.
         tolerance: largest relative difference at which two monocular depths agree.
-        tails: by camera, how many times sigma is enlarged for a heavy tail (`Skill.tail`); 1 where None.
+        tails: by camera, how many times sigma is enlarged for a heavy tail (`Skill.tail`); 1 where that is unknown.
     """
-    tails = dict.fromkeys(priors, 1.0) if tails is None else tails
+    known = {} if tails is None else {name: tail for name, tail in tails.items() if tail >= 1}
     views = {name: _View.of(prior) for name, prior in priors.items()}
-    return {name: _informed(name, prior, views, cameras, tolerance, tails[name]) for name, prior in priors.items()}
+    return {name: _informed(name, prior, views, cameras, tolerance, known.get(name, 1.0)) for name, prior in priors.items()}
 
 
 def _informed(

@@ -55,9 +55,9 @@ LEAST = 200
 USUAL, EVIDENCE = 0.12, 1000
 """The scale of most maps, and how many anchors (at `WIDTH`) weigh as much: a few that lie together are held from near
 by, and do not make a map surer than usual. Measured on plaza, two views, 400 anchors: scale .03 where .1 is true."""
-IN_TAIL, USUAL_TAIL = 0.98, 2.6
+IN_TAIL, USUAL_TAIL = 0.98, 3.0
 """A quantile far out, and where it lies in maps that belong to their pictures, in units of the scale (2.33 if errors
-were normal). Measured in these units: 2.3 to 2.6; PyDNet, or the maps of another camera, 5 to 6, where errors away
+were normal). Measured in these units: 2.3 to 2.9, once 3.4; PyDNet, or the maps of another camera, 5 to 6, where errors away
 from anchors are 2.5 to 6 times what the scale alone declares, and 3 to 6 % of right stereo would be vetoed."""
 HOPELESS = 0.5
 """A larger sigma says nothing about depth: it becomes infinite."""
@@ -75,7 +75,7 @@ class Skill(NamedTuple):
     gain: float
     """Median error of a constant map corrected by the same anchors over that of the map, at the same left-out anchors;
     the map says nothing where it is not above `NIL`."""
-    tail: float = 1.0
+    tail: float
     """How much farther than usual the tail of its errors goes, 1 at least."""
 
     @property
@@ -145,7 +145,7 @@ def measured_skill(
             flat = corrected_depth(np.full_like(rest, np.median(anchors[anchors > 0])), rest, settings)
             without.append(np.abs(np.log(flat[held] / anchors[held])))
     if sum(map(len, errors)) < LEAST:
-        return Skill(np.nan, np.nan, np.nan)
+        return Skill(np.nan, np.nan, np.nan, np.nan)
     compared, alone = (float(np.median(np.concatenate(found))) for found in (errors[:COMPARED], without))
     all_ratios, error = np.concatenate(ratios), float(np.median(np.concatenate(errors)))
     scale = _scale(all_ratios, int(np.count_nonzero(anchors)))
