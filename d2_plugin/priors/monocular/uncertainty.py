@@ -57,8 +57,8 @@ USUAL, EVIDENCE = 0.12, 1000
 by, and do not make a map surer than usual. Measured on plaza, two views, 400 anchors: scale .03 where .1 is true."""
 IN_TAIL, USUAL_TAIL = 0.98, 3.0
 """A quantile far out, and where it lies in maps that belong to their pictures, in units of the scale (2.33 if errors
-were normal). Measured in these units: 2.3 to 2.9, once 3.4; PyDNet, or the maps of another camera, 5 to 6, where errors away
-from anchors are 2.5 to 6 times what the scale alone declares, and 3 to 6 % of right stereo would be vetoed."""
+were normal). Measured in these units: 2.3 to 2.9, once 3.4; PyDNet, or the maps of another camera, 5 to 6. There errors
+away from anchors are 2.5 to 6 times what the scale alone declares, and 3 to 6 % of right stereo would be vetoed."""
 HOPELESS = 0.5
 """A larger sigma says nothing about depth: it becomes infinite."""
 EVER = 1e3
