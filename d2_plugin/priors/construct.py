@@ -28,7 +28,7 @@ from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.cache import DepthCache, StoredDepth
 from d2_plugin.protocol import Label
 
-CONSTRUCTION_VERSION = 7  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 8  # raise it when alignment or fusion change what they return
 
 NO_GEOMETRY = "no geometric depth survived the filter"
 NO_MAP = "there is no monocular map of this frame"
@@ -105,7 +105,8 @@ class Construction:
         if not self.agrees:
             return views
         maps = {name: view.maps for name, view in views.items()}
-        informed = with_evidence(maps, self.cameras, self.settings.agreement)
+        tails = {name: view.skill.tail for name, view in views.items() if view.skill is not None}
+        informed = with_evidence(maps, self.cameras, self.settings.agreement, tails)
         return {name: replace(view, maps=informed[name]) for name, view in views.items()}
 
     def _view(self, name: str, frame: Frame, stereo: StoredDepth | None) -> ViewPrior:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, BESIDE, NEAR, WITHIN, with_evidence
+from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, BESIDE, LIKE, NEAR, WITHIN, with_evidence
 from d2_plugin.priors.fuse import FusedPrior, empty_prior
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.store import PriorStore
@@ -48,6 +49,11 @@ def prior_of(depth: np.ndarray | float, label: Label = Label.MONO, sigma: float 
 def left_of(left: FusedPrior, right: FusedPrior) -> FusedPrior:
     """The left view after the right one was asked."""
     return with_evidence({"left": left, "right": right}, CAMERAS, TOLERANCE)["left"]
+
+
+def painted(prior: FusedPrior, color: int) -> FusedPrior:
+    """With a picture of one grey value."""
+    return replace(prior, colors=np.full((HEIGHT, WIDTH, 3), color, np.uint8))
 
 
 def share(prior: FusedPrior, label: Label) -> float:
@@ -215,3 +221,30 @@ def test_the_builder_asks_other_cameras_for_the_dual_prior_alone(tmp_path: Path)
     for variant in ("dual_unverified", "mono"):
         assert not (labels(variant, PriorSettings(variant=variant)) == Label.AGREED).any()
     assert PriorSettings.paper().agreement == 0
+
+
+def test_a_surface_of_another_colour_is_not_the_thing_that_the_ray_sees() -> None:
+    """A near thing that the map does not know hides what lies behind it from this camera and not from the other."""
+    pytest.importorskip("cv2")
+    ours, theirs = prior_of(WALL * 1.01), prior_of(WALL, Label.VERIFIED, 0.001)
+    for apart, taken in ((0, True), (0.9, True), (1.1, False)):
+        asked = left_of(painted(ours, 100), painted(theirs, 100 + int(apart * LIKE * 255)))
+        assert (share(asked, Label.VERIFIED) > 0.5) is taken
+        assert taken or (asked.depth == ours.depth).all()
+    assert share(left_of(ours, theirs), Label.VERIFIED) > 0.5, "without pictures nothing speaks against it"
+
+
+def test_maps_agree_only_about_places_of_one_colour() -> None:
+    pytest.importorskip("cv2")
+    maps = {name: painted(prior_of(WALL), grey) for name, grey in (("left", 100), ("right", 130))}
+    for prior in with_evidence(maps, CAMERAS, TOLERANCE).values():
+        assert share(prior, Label.AGREED) == 0
+        np.testing.assert_allclose(np.unique(prior.sigma), [SIGMA, ALONE * SIGMA], rtol=1e-6)
+
+
+def test_agreement_takes_back_what_a_heavy_tail_added() -> None:
+    maps = {name: prior_of(WALL) for name in ("left", "right")}
+    asked = with_evidence(maps, CAMERAS, TOLERANCE, {"left": 2.0, "right": float("nan")})
+    for name, tail in (("left", 2.0), ("right", 1.0)):
+        sigma = asked[name].sigma[asked[name].labels == Label.AGREED]
+        np.testing.assert_allclose(sigma, np.hypot(AGREED * SIGMA / tail, AT_BEST), rtol=1e-6)

@@ -191,7 +191,7 @@ def test_small_pictures_and_few_anchors_declare_nothing(shape: tuple[int, int], 
     assert np.isinf(found.sigma).all()
     assert np.isinf(found.at_anchors).all()
     assert np.isnan(found.skill.scale)
-    assert found.skill.as_json() == {"scale": None, "error": None, "gain": None}
+    assert found.skill.as_json() == {"scale": None, "error": None, "gain": None, "tail": None}
 
 
 def test_too_few_anchors_declare_nothing_however_large_the_picture(scenes: list[Scene]) -> None:
@@ -307,3 +307,18 @@ def test_more_allowed_sigmas_are_fewer_conflicts_and_never_another_depth(scenes:
     assert shares[0] > shares[-1]
     for prior in found:
         np.testing.assert_array_equal(prior.depth[prior.labels == Label.VERIFIED], wrong[prior.labels == 2])
+
+
+def test_a_map_that_misses_some_things_is_less_sure_everywhere_and_vetoes_less(scenes: list[Scene]) -> None:
+    """A tenth of the picture, in blocks of a tenth of its width, is off by a factor of two."""
+    for scene in scenes[:3]:
+        random = np.random.default_rng(5)
+        height, width = scene.truth.shape
+        missed = np.kron(random.random((9, 15)) < 0.1, np.ones((15, 16))).astype(bool)[:height, :width]
+        map_ = np.where(missed, 2 * scene.aligned, scene.aligned)
+        good, weak = (monocular_uncertainty(m, scene.anchors, SETTINGS) for m in (scene.aligned, map_))
+        assert good.skill.tail < 1.4
+        assert weak.skill.tail > 1.5 * good.skill.tail
+        # Beyond what the scale, the 68 % quantile, says by itself.
+        enlarged = np.median(weak.at_anchors[~missed] / good.at_anchors[~missed])
+        assert enlarged > 1.3 * weak.skill.scale / good.skill.scale

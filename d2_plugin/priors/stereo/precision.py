@@ -9,8 +9,8 @@ confirming source lies from ours.
     sigma^2 = ((m + n / g + k (1 - coherence)) / P)^2 + (r scatter)^2 + (s spread)^2 + floor^2
 
 What the match cost says is in the other terms already: a fit gives it no weight. The numbers are the same for every
-capture. They are a fit to studio and plaza (4 and 2 views), rendered rooms and Middlebury pairs (art, motorcycle,
-teddy): the table of docs/priors.md says what share of the errors they hold.
+capture. They are a fit to studio and plaza (4 and 2 views), rendered rooms and Middlebury pairs (art, laundry,
+motorcycle, teddy): the table of docs/priors.md says what share of the errors they hold.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ import numpy as np
 
 from d2_plugin.priors.extras import opencv
 
-MATCHING = 0.038
-"""Error of the best match, pixels."""
-GRAY_NOISE = 1.25e-3
+MATCHING = 0.003
+"""Error of the best match, pixels: next to nothing, what it is worth is told by the gradient."""
+GRAY_NOISE = 1.33e-3
 """Error of the grey values (0..1) that a match compares: noise, exposure, resampling."""
-PER_INCOHERENCE = 1.5
+PER_INCOHERENCE = 2.9
 """Further error where none of the neighbours lies on the same surface, pixels."""
-OF_SCATTER = 2.0
-"""Times the scatter about the local plane: planes are averaged over neighbours, which hides most of their scatter."""
-OF_SPREAD = 0.42
+OF_SCATTER = 0.85
+"""Times the scatter about the local plane."""
+OF_SPREAD = 0.41
 """Share of the difference to the sources' own depths."""
-FLOOR = 6e-4
+FLOOR = 8.3e-4
 """What no map is better than: calibration, resampling, the nearest pixel of a source."""
 FLATTEST = 3e-3
 """Gradients of the grey value are not told from noise below this, per pixel."""
