@@ -197,8 +197,8 @@ def _parsed(path: Path, kind: Kind) -> tuple[dict[str, Any], bool]:
         refuse_no_file(path)
         content = path.read_bytes()
         table = json.loads(content)
-    except FileNotFoundError:
-        raise
+    except (FileNotFoundError, NotADirectoryError):
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from None
     except (OSError, ValueError, RecursionError) as error:
         raise _damaged(path, kind, str(error)) from None
     if not isinstance(table, dict):

@@ -32,7 +32,7 @@ PRELOADED = [
     *("torch", "torch._dynamo", "torch.onnx", "sympy", "cv2", "pycolmap"),
     *("d2_plugin.commands.cli", "d2_plugin.runs.run", "d2_plugin.runs.evaluation", "d2_plugin.priors.build"),
     *("d2_plugin.backbones.yang4d", "d2_plugin.adapters.yang4d", "d2_plugin.study.capture_export"),
-    *("d2_plugin.study.report.report", "trust_commands"),
+    *("d2_plugin.study.report.report", "d2_plugin.viewing.export.export", "trust_commands"),
 ]
 """What the commands import, some of it late."""
 

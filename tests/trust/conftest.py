@@ -92,6 +92,7 @@ def workplace(commands: Commands, recording: Path) -> Workplace:
         "train": Work([*train, "--output", str(out)], out, lambda: None),
         "eval": Work(["eval", str(out)], out, trained),
         "export": Work([*export, str(out)], out, lambda: None),
+        "page": Work(["export", str(run), "--output", str(out)], out, lambda: None),
         "report": Work(["report", str(ROWS), "--output", str(out)], out, lambda: None),
     }
     whole, operations, renames, seconds = {}, {}, {}, {}

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from trust_commands import contents, killed
 
-WORK = ("priors", "train", "eval", "export", "report")
+WORK = ("priors", "train", "eval", "export", "page", "report")
 
 
 def killed_at_random(place: Any, name: str, draw: random.Random, times: int) -> int:

@@ -28,7 +28,7 @@ def trained(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished run with all hooks."""
     pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
     folder = tmp_path_factory.mktemp("runs") / "full"
-    Run(RunSettings(str(room), CAMERAS, iterations=80), folder).train()
+    Run(RunSettings(str(room), CAMERAS, iterations=40), folder).train()
     return folder
 
 

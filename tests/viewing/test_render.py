@@ -178,7 +178,7 @@ class TestSentences:
         state = torch.load(copy / "checkpoint.pt", weights_only=True)
         torch.save(state | {"step": 33}, copy / "checkpoint.pt")
         assert main(["render", str(copy), "--output", str(tmp_path / "a.mp4")]) == 0
-        assert f"{copy.name} still trains: this is step 33 of 80" in capsys.readouterr().out
+        assert f"{copy.name} still trains: this is step 33 of 40" in capsys.readouterr().out
         (copy / "checkpoint.pt").unlink()
         assert "holds no checkpoint yet" in refused(capsys, copy)
 
@@ -200,7 +200,7 @@ class TestSentences:
             "optimizer": state["model"]["optimizer"] | {"state": {}},
         }
         torch.save(state, copy / "checkpoint.pt")
-        assert "has no Gaussian left at step 80" in refused(capsys, copy)
+        assert "has no Gaussian left at step 40" in refused(capsys, copy)
         table = json.loads((copy / "run.json").read_text())
         plain = {name: value for name, value in table.items() if name not in ("format", "seal")}
         (copy / "run.json").write_text(json.dumps(plain | {"version": 99}))

@@ -288,6 +288,11 @@ class TestSentences:
         assert np.array_equal(alone.capture.image("train0", 0), found.capture.image("train0", 0))
         assert np.allclose(alone.capture.cameras["train0"].K, found.capture.cameras["train0"].K)
 
+    @pytest.mark.parametrize("host", ["192.0.2.1", "no such host", "a" * 300, "\u200b.."])
+    def test_an_address_that_is_not_ours(self, subject: Subject, host: str) -> None:
+        with pytest.raises(D2Error, match=r"nothing can listen at .*: give an address of this machine"):
+            Viewer(subject=subject, host=host)
+
     def test_who_may_look_is_said(self, subject: Subject, port: int) -> None:
         viewer = Viewer(subject=subject, port=port)
         try:

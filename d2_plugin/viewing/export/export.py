@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
+from d2_plugin.durable import make_folder, remove_leftovers
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
+from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.gaussian_ply import write_ply
 from d2_plugin.runs.run import Run
@@ -69,8 +71,9 @@ def run(settings: Export) -> str:
 
 def export_scene(scene: ExportScene, settings: Export, folder: Path) -> Made:
     """Write the scene under `folder` in the format that the settings name."""
-    folder.mkdir(parents=True, exist_ok=True)
-    made = FORMATS[settings.format](scene, settings, folder)
+    with only_writer(make_folder(folder)):
+        remove_leftovers(folder)
+        made = FORMATS[settings.format](scene, settings, folder)
     if scene.background is None or settings.format == "html":
         return made
     return made._replace(
@@ -126,7 +129,7 @@ def _each_frame(
     scene: ExportScene, settings: Export, folder: Path, write: Callable[[Path, MovingGaussians], object]
 ) -> Made:
     clip = scene.clip if settings.frames is None else scene.restricted(settings.frames)
-    (folder / settings.format).mkdir(exist_ok=True)
+    make_folder(folder / settings.format)
     paths = []
     with progress_bar(settings.format, len(clip.frames)) as bar:
         for frame, time in zip(clip.frames, clip.seconds):

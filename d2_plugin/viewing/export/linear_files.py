@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from d2_plugin.captures import Camera
+from d2_plugin.durable import write
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, LinearMotion, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
@@ -70,7 +71,7 @@ def write_splatv(
     chunk = {"type": "splat", "size": len(data), "texwidth": SPLATV_WIDTH, "texheight": height}
     described = [chunk | {"cameras": [_splatv_camera(i, camera) for i, camera in enumerate(cameras)]}]
     text = json_text(described, path.name).encode()
-    path.write_bytes(np.array([SPLATV_MAGIC, len(text)], "<u4").tobytes() + text + data)
+    write(path, np.array([SPLATV_MAGIC, len(text)], "<u4").tobytes(), text, data)
 
 
 def read_splatv(path: Path, duration: float) -> MovingGaussians:

@@ -17,6 +17,7 @@ import torch
 
 import d2_plugin
 from d2_plugin.captures import Camera
+from d2_plugin.durable import write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
 from d2_plugin.runs.drawing import color_scale
@@ -50,7 +51,7 @@ def write_page(scene: ExportScene, path: Path, megabytes: float = 40.0) -> Page:
     contents, data = packed(coded.arrays)
     about = _about(scene, coded, keys, _rounding(scene, coded, keys))
     header = _header(scene, coded) | {"arrays": contents, "about": about}
-    path.write_text(_assembled(scene.name, header, data), encoding="utf-8")
+    write_text(path, _assembled(scene.name, header, data))
     return Page(path.stat().st_size, tuple(about))
 
 

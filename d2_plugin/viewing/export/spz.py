@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from d2_plugin.durable import write
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.runs.gaussian_ply import scales_and_rotations
@@ -47,7 +48,7 @@ def write_spz(path: Path, gaussians: MovingGaussians) -> int:
     body = [np.clip(np.rint(plane), 0, 255).astype(np.uint8).tobytes() for plane in planes]
     body += [_rotation_words(quaternions.numpy()).tobytes(), _harmonic_bytes(coefficients[:, 1:]).tobytes()]
     header = np.array([(MAGIC, VERSION, len(shown), (degree, bits, 0, 0))], HEADER)
-    path.write_bytes(gzip.compress(header.tobytes() + b"".join(body), mtime=0))
+    write(path, gzip.compress(header.tobytes() + b"".join(body), mtime=0), synced=False)
     return len(shown)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import math
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -230,7 +231,21 @@ def viser() -> ModuleType:
     return viser
 
 
+def _refuse_foreign(host: str) -> None:
+    """Raise where nothing can listen at an address: viser would try one port after the other, for ever."""
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind(address)
+    except (OSError, UnicodeError) as failure:
+        reason = getattr(failure, "strerror", None) or failure
+        raise D2Error(
+            f"nothing can listen at {host!r} ({reason}): give an address of this machine, or leave --host out"
+        ) from None
+
+
 def _serve(host: str, port: int) -> Any:
+    _refuse_foreign(host)
     with redirect_stdout(io.StringIO()):  # it prints a table with addresses; we say ours in one line
         server = viser().ViserServer(host=host, port=port, label="D2-4DGS", verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="medium")
