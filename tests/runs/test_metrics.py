@@ -185,7 +185,7 @@ def test_leaving_depth_out_never_flatters(missing: float) -> None:
 
 def test_every_metric_has_its_definition_in_words() -> None:
     named = {"psnr", "ssim1", "ssim2", "ssim_3dgs", "lpips", "lpips_vgg", "flicker", "depth_absrel", "depth_delta1"}
-    assert named | {"psnr_cc", "psnr_moving"} == set(metrics.VARIANTS)
+    assert named | {"psnr_cc", "psnr_moving", "psnr_mask"} == set(metrics.VARIANTS)
     assert "range 1" in metrics.VARIANTS["ssim1"]
     assert "range 2" in metrics.VARIANTS["ssim2"]
     assert len(set(metrics.VARIANTS.values())) == len(metrics.VARIANTS)

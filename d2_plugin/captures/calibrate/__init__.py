@@ -3,6 +3,8 @@
 Everything runs on the CPU, with pycolmap and OpenCV (`calibration` extra), and gives the same result each time.
 """
 
+from d2_plugin.captures.calibrate.boards import Board, scaled_by_board
 from d2_plugin.captures.calibrate.refine import RefinedPoses, refine
+from d2_plugin.captures.calibrate.solve import SolvedRig, solve_rig
 
-__all__ = ["RefinedPoses", "refine"]
+__all__ = ["Board", "RefinedPoses", "SolvedRig", "refine", "scaled_by_board", "solve_rig"]

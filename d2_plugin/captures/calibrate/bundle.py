@@ -16,8 +16,29 @@ from d2_plugin.captures.capture import Camera
 SMALLEST_ANGLE = 1.0
 """Degrees between the rays of a point below which its depth is a guess."""
 
-Track = dict[str, int]
-"""Camera -> index of the feature in its list: one thing at one moment."""
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """What cameras saw of the same things: one row per thing at one moment."""
+
+    names: tuple[str, ...]
+    """All cameras, in the order of the columns."""
+    seen: np.ndarray  # [n, cameras] int, index into the camera's list of features, -1 where it did not see it
+
+    def column(self, name: str) -> np.ndarray:
+        """What one camera saw, [n]."""
+        column: np.ndarray = self.seen[:, self.names.index(name)]
+        return column
+
+    def within(self, cameras: Mapping[str, Camera]) -> Tracks:
+        """The rows that at least two of `cameras` saw, and only what these saw."""
+        inside = np.array([name in cameras for name in self.names])
+        seen = np.where(inside, self.seen, -1)
+        return Tracks(self.names, seen[(seen >= 0).sum(axis=1) >= 2])
+
+    def counts(self, cameras: Mapping[str, Camera]) -> list[int]:
+        """How many rows each of `cameras` saw."""
+        return [int((self.column(name) >= 0).sum()) for name in cameras]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,15 +47,16 @@ class Bundle:
 
     cameras: dict[str, Camera]
     points: np.ndarray  # [n, 3]
-    tracks: list[Track]
+    tracks: Tracks
 
-    def errors(self, features: Mapping[str, Features]) -> dict[str, np.ndarray]:
-        """Reprojection errors in pixels, by camera."""
-        found: dict[str, np.ndarray] = {}
+    def errors(self, features: Mapping[str, Features]) -> np.ndarray:
+        """Reprojection errors [n, cameras] in pixels, in the columns of the tracks; NaN where a camera saw nothing."""
+        found = np.full(self.tracks.seen.shape, np.nan)
         for name, camera in self.cameras.items():
-            rows = [i for i, track in enumerate(self.tracks) if name in track]
-            seen = features[name].pixels[[self.tracks[i][name] for i in rows]]
-            found[name] = np.linalg.norm(project(camera, self.points[rows]) - seen, axis=1)
+            seen = self.tracks.column(name)
+            rows = seen >= 0
+            missed = project(camera, self.points[rows]) - features[name].pixels[seen[rows]]
+            found[rows, self.tracks.names.index(name)] = np.linalg.norm(missed, axis=1)
         return found
 
 
@@ -45,8 +67,8 @@ def project(camera: Camera, points: np.ndarray) -> np.ndarray:
     return np.where(inside[:, 2:] > 0, pixels[:, :2] / np.maximum(pixels[:, 2:], 1e-12), 1e9)
 
 
-def join_matches(matches: Matches) -> list[Track]:
-    """Matches joined to tracks; those that would see one thing twice in a camera are dropped."""
+def join_matches(matches: Matches, names: Sequence[str]) -> Tracks:
+    """Matches joined to tracks; those that would see two things in one camera are dropped."""
     parent: dict[tuple[str, int], tuple[str, int]] = {}
 
     def root(node: tuple[str, int]) -> tuple[str, int]:
@@ -61,89 +83,84 @@ def join_matches(matches: Matches) -> list[Track]:
     groups: dict[tuple[str, int], list[tuple[str, int]]] = {}
     for node in list(parent):
         groups.setdefault(root(node), []).append(node)
-    return [dict(group) for group in groups.values() if len(dict(group)) == len(group)]
+    whole = [dict(group) for group in groups.values() if len(dict(group)) == len(group)]
+    seen = np.array([[track.get(name, -1) for name in names] for track in whole], int).reshape(-1, len(names))
+    return Tracks(tuple(names), seen)
 
 
-def triangulate(
-    cameras: Mapping[str, Camera], features: Mapping[str, Features], tracks: Sequence[Track]
-) -> tuple[np.ndarray, list[Track]]:
-    """(points [n, 3], their tracks within `cameras`) of all tracks with two rays that meet at an angle.
+def triangulate(cameras: Mapping[str, Camera], features: Mapping[str, Features], tracks: Tracks) -> Bundle:
+    """The points of all tracks with two rays from `cameras` that meet at an angle.
 
     Linear, from all rays of a track at once; whether it fits is for `fitting` to say.
     """
-    projections = {name: camera.K @ camera.T_camera_world[:3] for name, camera in cameras.items()}
-    points, kept = [np.zeros((0, 3))], []
-    for track in tracks:
-        inside = {name: index for name, index in track.items() if name in cameras}
-        if len(inside) < 2:
-            continue
-        rows = []
-        for name, index in inside.items():
-            P, (x, y) = projections[name], features[name].pixels[index]
-            rows += [(x * P[2] - P[0]) / cameras[name].K[0, 0], (y * P[2] - P[1]) / cameras[name].K[1, 1]]
-        homogeneous = np.linalg.svd(np.stack(rows))[2][-1]
-        if abs(homogeneous[3]) < 1e-12:
-            continue
-        point = homogeneous[:3] / homogeneous[3]
-        if _angle([cameras[name].centre for name in inside], point) >= SMALLEST_ANGLE:
-            points.append(point[None])
-            kept.append(inside)
-    return np.concatenate(points), kept
+    inside = tracks.within(cameras)
+    rows = np.zeros((len(inside.seen), 2 * len(cameras), 4))
+    for place, (name, camera) in enumerate(cameras.items()):
+        seen = inside.column(name)
+        there = np.flatnonzero(seen >= 0)
+        P, pixels = camera.K @ camera.T_camera_world[:3], features[name].pixels[seen[there]]
+        for axis in (0, 1):
+            rows[there, 2 * place + axis] = (pixels[:, axis : axis + 1] * P[2] - P[axis]) / camera.K[0, 0]
+    vectors = np.linalg.eigh(rows.transpose(0, 2, 1) @ rows)[1][:, :, 0]
+    finite = np.abs(vectors[:, 3]) > 1e-12
+    points = vectors[:, :3] / np.where(finite, vectors[:, 3], 1)[:, None]
+    good = finite & (_widest_angle(cameras, inside, points) >= SMALLEST_ANGLE)
+    return Bundle(dict(cameras), points[good], Tracks(inside.names, inside.seen[good]))
 
 
-def _angle(centres: Sequence[np.ndarray], point: np.ndarray) -> float:
-    """Largest angle in degrees between the rays of a point."""
-    rays = np.stack([point - centre for centre in centres])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True).clip(1e-300)
-    return float(np.rad2deg(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
+def _widest_angle(cameras: Mapping[str, Camera], tracks: Tracks, points: np.ndarray) -> np.ndarray:
+    """Largest angle [n] in degrees between the rays of each point."""
+    rays = []
+    for name, camera in cameras.items():
+        ray = points - camera.centre
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True).clip(1e-300)
+        rays.append(np.where((tracks.column(name) >= 0)[:, None], ray, np.nan))
+    stacked = np.stack(rays, axis=1)
+    cosines = np.einsum("nik,njk->nij", stacked, stacked)
+    return np.rad2deg(np.arccos(np.clip(np.nanmin(cosines, axis=(1, 2), initial=1.0), -1, 1)))
 
 
 def fitting(bundle: Bundle, features: Mapping[str, Features], pixels: float) -> Bundle:
     """The bundle without the observations that miss by more than `pixels` (of `pixel_error`)."""
-    kept_points, kept = [], []
-    limits = {name: pixels * pixel_error(camera) for name, camera in bundle.cameras.items()}
-    missed = [dict.fromkeys(track, 0.0) for track in bundle.tracks]
-    for name, errors in bundle.errors(features).items():
-        rows = [i for i, track in enumerate(bundle.tracks) if name in track]
-        for i, error in zip(rows, errors.tolist(), strict=True):
-            missed[i][name] = error
-    for point, track, errors_of in zip(bundle.points, bundle.tracks, missed, strict=True):
-        good = {name: index for name, index in track.items() if errors_of[name] <= limits[name]}
-        if len(good) >= 2:
-            kept_points.append(point)
-            kept.append(good)
-    return replace(bundle, points=np.array(kept_points).reshape(-1, 3), tracks=kept)
+    limits = [pixels * pixel_error(bundle.cameras[n]) if n in bundle.cameras else 0.0 for n in bundle.tracks.names]
+    errors = bundle.errors(features)
+    seen = np.where(np.nan_to_num(errors, nan=np.inf) <= np.array(limits), bundle.tracks.seen, -1)
+    kept = (seen >= 0).sum(axis=1) >= 2
+    return Bundle(bundle.cameras, bundle.points[kept], Tracks(bundle.tracks.names, seen[kept]))
 
 
 def adjust(bundle: Bundle, features: Mapping[str, Features], scale: float, focal: bool = False) -> Bundle:
     """Poses and points that make the reprojection errors least, with the gauge held by two cameras.
 
-    The loss is Cauchy's with `scale` pixels: what misses by much more hardly counts.
-
-    `focal` frees the focal length of each camera as well, one for both axes.
+    The loss is Cauchy's with `scale` pixels: what misses by much more hardly counts. `focal` frees the focal length of
+    each camera as well, one for both axes.
     """
     pycolmap = pycolmap_module("adjusting poses")
-    names = {name: number for number, name in enumerate(bundle.cameras, start=1)}
+    numbers = {name: number for number, name in enumerate(bundle.cameras, start=1)}
     rec = pycolmap.Reconstruction()
-    for name, number in names.items():
-        camera = bundle.cameras[name]
-        K = camera.K
-        values = [K[0, 0], K[0, 2], K[1, 2]] if focal else [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-        model = "SIMPLE_PINHOLE" if focal else "PINHOLE"
-        rec.add_camera_with_trivial_rig(
-            pycolmap.Camera(camera_id=number, model=model, width=camera.width, height=camera.height, params=values)
-        )
-        image = pycolmap.Image(
-            name=name, keypoints=features[name].pixels.reshape(-1, 2), camera_id=number, image_id=number
-        )
-        rec.add_image_with_trivial_frame(image, as_rigid(pycolmap, camera))
-    for point, track in zip(bundle.points, bundle.tracks, strict=True):
-        elements = [pycolmap.TrackElement(names[name], index) for name, index in track.items()]
+    for name, number in numbers.items():
+        _add_camera(pycolmap, rec, bundle.cameras[name], number, features[name].pixels, focal)
+    columns = [(numbers[name], place) for place, name in enumerate(bundle.tracks.names) if name in numbers]
+    for point, seen in zip(bundle.points, bundle.tracks.seen.tolist(), strict=True):
+        elements = [pycolmap.TrackElement(number, seen[place]) for number, place in columns if seen[place] >= 0]
         rec.add_point3D(point, pycolmap.Track(elements))
     identities = sorted(rec.points3D)
     _solve(pycolmap, rec, scale, focal)
-    cameras = {name: _moved(bundle.cameras[name], rec, number, focal) for name, number in names.items()}
-    return Bundle(cameras, np.stack([rec.points3D[i].xyz for i in identities]), bundle.tracks)
+    cameras = {name: _moved(bundle.cameras[name], rec, number, focal) for name, number in numbers.items()}
+    points = np.array([rec.points3D[i].xyz for i in identities]).reshape(-1, 3)
+    return Bundle(cameras, points, bundle.tracks)
+
+
+def _add_camera(pycolmap: ModuleType, rec: Any, camera: Camera, number: int, pixels: np.ndarray, focal: bool) -> None:
+    K = camera.K
+    values = [K[0, 0], K[0, 2], K[1, 2]] if focal else [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    model = "SIMPLE_PINHOLE" if focal else "PINHOLE"
+    rec.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=number, model=model, width=camera.width, height=camera.height, params=values)
+    )
+    image = pycolmap.Image(name=camera.name, keypoints=pixels.reshape(-1, 2), camera_id=number, image_id=number)
+    T = camera.T_camera_world
+    rec.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(T[:3, :3]), T[:3, 3]))
 
 
 def _solve(pycolmap: ModuleType, rec: Any, scale: float, focal: bool) -> None:
@@ -156,12 +173,6 @@ def _solve(pycolmap: ModuleType, rec: Any, scale: float, focal: bool) -> None:
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_bundle_adjuster(options, config, rec).solve()
-
-
-def as_rigid(pycolmap: ModuleType, camera: Camera) -> Any:
-    """The pose of a camera as pycolmap has it."""
-    T = camera.T_camera_world
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(T[:3, :3]), T[:3, 3])
 
 
 def _moved(camera: Camera, rec: Any, number: int, focal: bool) -> Camera:

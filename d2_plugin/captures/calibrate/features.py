@@ -19,7 +19,7 @@ from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.pictures import opencv
 from d2_plugin.errors import missing_extra
 
-MOST_FEATURES = 2500
+MOST_FEATURES = 1500
 """Per picture."""
 
 RATIO = 0.85

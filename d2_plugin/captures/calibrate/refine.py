@@ -1,7 +1,7 @@
 """Known poses that are slightly wrong, mended by what the pictures share; kept as they are unless that is proven.
 
 The proof is twofold. Poses from one half of the picture must explain the matches of the other half better than the
-given poses do. And they must differ from the given ones by clearly more than the two halves' poses differ from each
+given poses do. And they must differ from the given ones by more than the two halves' poses differ from each
 other. False matches agree within a half, but not across, so they pass neither.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from d2_plugin.captures.calibrate.align import aligned, differences
-from d2_plugin.captures.calibrate.bundle import Bundle, Track, adjust, fitting, join_matches, triangulate
+from d2_plugin.captures.calibrate.bundle import Bundle, Tracks, adjust, fitting, join_matches, triangulate
 from d2_plugin.captures.calibrate.features import Features, Matches, find_features, match_all, pixel_error, sampson
 from d2_plugin.captures.calibrate.verify import verified
 from d2_plugin.captures.capture import Camera, Capture
@@ -32,12 +32,12 @@ FEWEST_POINTS = 20
 """Points per half, and `FEWEST_SEEN` of them per camera, below which nothing is concluded."""
 FEWEST_SEEN = 8
 
-FALLS_TO = 0.95
+FALLS_TO = 0.9
 """The error of the other half falls at least to this part of what it was."""
 
-BEYOND_DOUBT = 1.5
-"""The poses change by at least this many times what the two halves' poses differ by, which is about two standard
-deviations of the result."""
+BEYOND_DOUBT = 1.0
+"""The poses turn or move by more than this many times what the two halves' poses differ by, which is about two
+standard deviations of the result."""
 
 CELLS = 8
 """Across and down a picture; alternating ones are the two halves, as on a board for chess."""
@@ -98,12 +98,13 @@ def refine_poses(given: Mapping[str, Camera], features: Mapping[str, Features]) 
     """`refine` for features that were found already."""
     diagonal = max(float(np.hypot(camera.width, camera.height)) for camera in given.values())
     matches = verified(match_all(features), features, given, REACH * diagonal)
-    halves = [_half(matches, features, given, which) for which in (0, 1)]
-    tracks = [join_matches(half) for half in halves]
+    names = tuple(given)
+    halves = [halved(matches, features, given, which) for which in (0, 1)]
+    tracks = [join_matches(half, names) for half in halves]
     lost = _undetermined(given, tracks)
     if lost:
         return _kept(given, lost)
-    whole = bundled(given, features, join_matches(matches))
+    whole = bundled(given, features, join_matches(matches, names))
     parts = [bundled(given, features, half) for half in tracks]
     if whole is None or parts[0] is None or parts[1] is None:
         return _kept(given, "the poses stay: the points that the cameras share do not hold them")
@@ -113,20 +114,25 @@ def refine_poses(given: Mapping[str, Camera], features: Mapping[str, Features]) 
     return _judged(given, whole, differences(parts[0].cameras, parts[1].cameras), before, after)
 
 
-def bundled(given: Mapping[str, Camera], features: Mapping[str, Features], tracks: Sequence[Track]) -> Bundle | None:
+def bundled(
+    given: Mapping[str, Camera],
+    features: Mapping[str, Features],
+    tracks: Tracks,
+    schedule: Sequence[tuple[float, float]] = SCHEDULE,
+) -> Bundle | None:
     """The bundle that starts at `given`; None where a camera is left without points."""
-    bundle = Bundle(dict(given), np.zeros((0, 3)), [])
-    for limit, scale in SCHEDULE:
-        points, kept = triangulate(bundle.cameras, features, tracks)
-        bundle = fitting(Bundle(bundle.cameras, points, kept), features, limit)
-        seen = [sum(name in track for track in bundle.tracks) for name in given]
-        if min(seen, default=0) < FEWEST_SEEN:
+    cameras = dict(given)
+    bundle = None
+    for limit, scale in schedule:
+        bundle = fitting(triangulate(cameras, features, tracks), features, limit)
+        if min(bundle.tracks.counts(given), default=0) < FEWEST_SEEN:
             return None
         bundle = adjust(bundle, features, scale * min(pixel_error(camera) for camera in given.values()))
+        cameras = bundle.cameras
     return bundle
 
 
-def _half(matches: Matches, features: Mapping[str, Features], given: Mapping[str, Camera], which: int) -> Matches:
+def halved(matches: Matches, features: Mapping[str, Features], given: Mapping[str, Camera], which: int) -> Matches:
     """The matches whose place in the first of all cameras that sees them lies in one half of the cells."""
     found = {}
     for (a, b), pairs in matches.items():
@@ -136,10 +142,11 @@ def _half(matches: Matches, features: Mapping[str, Features], given: Mapping[str
     return found
 
 
-def _undetermined(given: Mapping[str, Camera], tracks: Sequence[list[Track]]) -> str:
+def _undetermined(given: Mapping[str, Camera], tracks: Sequence[Tracks]) -> str:
     """Why the matches cannot settle the poses, or nothing."""
-    fewest = min(len(half) for half in tracks)
-    lonely = [name for name in given if min(sum(name in track for track in half) for half in tracks) < FEWEST_SEEN]
+    fewest = min(len(half.seen) for half in tracks)
+    counts = np.min([half.counts(given) for half in tracks], axis=0)
+    lonely = [name for name, count in zip(given, counts, strict=True) if count < FEWEST_SEEN]
     if fewest >= FEWEST_POINTS and not lonely:
         return ""
     whose = f"camera {', '.join(lonely)} shares" if lonely else "the cameras share"
@@ -169,15 +176,13 @@ def _judged(
     pixels = float(np.sqrt(np.mean(np.square(before)))), float(np.sqrt(np.mean(np.square(after))))
     told = f"from {pixels[0]:.2f} to {pixels[1]:.2f} pixels"
     degrees, share = (max(change[i] for change in changes.values()) for i in (0, 1))
-    if falls and bool(larger.all()):
+    if falls and bool(larger.any()):
         reason = f"poses refined: the error fell {told}, by up to {degrees:.2g} degrees and {share:.2%} of the rig"
     elif not falls:
         reason = f"the poses stay: others would change the error {told}, which is no clear fall"
     else:
-        reason = (
-            f"the poses stay: two halves of the pictures differ about them by as much as they would change, {told}"
-        )
-    accepted = falls and bool(larger.all())
+        reason = f"the poses stay: two halves of the pictures differ about them by as much as they would change, {told}"
+    accepted = falls and bool(larger.any())
     cameras = laid if accepted else dict(given)
     return RefinedPoses(cameras, accepted, reason, *pixels, changes, doubt, len(whole.points))
 

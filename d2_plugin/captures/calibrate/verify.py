@@ -16,7 +16,9 @@ from d2_plugin.captures.calibrate.features import (
     pycolmap_module,
     sampson,
 )
+from d2_plugin.captures.calibration import rigid
 from d2_plugin.captures.capture import Camera
+from d2_plugin.captures.pictures import opencv
 
 LEAST_INLIERS = 0.05
 """Share of inliers that RANSAC looks for, at least."""
@@ -42,6 +44,29 @@ def essential(
     pair: Pair, pairs: np.ndarray, features: Mapping[str, Features], cameras: Mapping[str, Camera]
 ) -> np.ndarray | None:
     """Which [m] of the pairs one essential matrix explains, None where there is none; the same each time."""
+    result = _ransac(pair, pairs, features, cameras)
+    return None if result is None else np.asarray(result["inlier_mask"], bool)
+
+
+def essential_pose(
+    pair: Pair, pairs: np.ndarray, features: Mapping[str, Features], cameras: Mapping[str, Camera]
+) -> np.ndarray | None:
+    """T [4, 4] from the first camera to the second, which stands a unit away; None where the pairs say nothing."""
+    result = _ransac(pair, pairs, features, cameras)
+    if result is None:
+        return None
+    cv2 = opencv("finding cameras", "calibration")
+    rays = []
+    for name, column in zip(pair, (0, 1), strict=True):
+        K, pixels = cameras[name].K, features[name].pixels[pairs[:, column]]
+        rays.append((pixels - K[:2, 2]) / K[[0, 1], [0, 1]])
+    _, rotation, translation, _ = cv2.recoverPose(np.asarray(result["E"]), rays[0], rays[1], np.eye(3))
+    return rigid(rotation, translation[:, 0])
+
+
+def _ransac(
+    pair: Pair, pairs: np.ndarray, features: Mapping[str, Features], cameras: Mapping[str, Camera]
+) -> dict[str, Any] | None:
     if len(pairs) < ENOUGH_MATCHES:
         return None
     pycolmap = pycolmap_module("verifying matches")
@@ -49,8 +74,8 @@ def essential(
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed, options.min_inlier_ratio = pixel_error(one), 0, LEAST_INLIERS
     p, q = features[pair[0]].pixels[pairs[:, 0]], features[pair[1]].pixels[pairs[:, 1]]
-    result = pycolmap.estimate_essential_matrix(p, q, as_colmap(one), as_colmap(other), options)
-    return None if result is None else np.asarray(result["inlier_mask"], bool)
+    found: dict[str, Any] | None = pycolmap.estimate_essential_matrix(p, q, as_colmap(one), as_colmap(other), options)
+    return found
 
 
 def as_colmap(camera: Camera) -> Any:

@@ -1,0 +1,113 @@
+"""A board that several cameras saw at the same moment says how large the world is.
+
+Boards are ChArUco or plain checkerboards, found by OpenCV. Pictures are undistorted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.captures.calibrate.bundle import Tracks, fitting, triangulate
+from d2_plugin.captures.calibrate.features import Features
+from d2_plugin.captures.calibrate.solve import SolvedRig
+from d2_plugin.captures.pictures import opencv
+from d2_plugin.errors import D2Error
+
+FEWEST_SIDES = 4
+"""Sides of squares that must be measured."""
+
+LARGEST_SPREAD = 0.05
+"""Interquartile range of the measured sides, as a share of their median, beyond which they say no scale."""
+
+CORNER_ERROR = 4.0
+"""Reprojection error beyond which a corner is left out, in `pixel_error`."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A board of `columns` x `rows` squares with sides of `square`, in the unit that the world gets.
+
+    With `marker`, the side of its ArUco markers, it is a ChArUco board with markers of `dictionary`; without, a plain
+    checkerboard, which all of its cameras must see the same way up.
+    """
+
+    columns: int
+    rows: int
+    square: float
+    marker: float | None = None
+    dictionary: str = "DICT_4X4_50"
+
+    def corners(self, picture: np.ndarray) -> dict[int, np.ndarray]:
+        """Number of an inner corner, row by row -> its pixel [2], centres at i + 0.5."""
+        cv2 = opencv("finding boards", "calibration")
+        grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+        if self.marker is not None:
+            return self._charuco(cv2, grey)
+        found, corners = cv2.findChessboardCornersSB(grey, (self.columns - 1, self.rows - 1))
+        return {i: corner + 0.5 for i, corner in enumerate(corners.reshape(-1, 2))} if found else {}
+
+    def _charuco(self, cv2: Any, grey: np.ndarray) -> dict[int, np.ndarray]:
+        number = getattr(cv2.aruco, self.dictionary, None)
+        if number is None or not self.dictionary.startswith("DICT_"):
+            raise D2Error(f"unknown marker dictionary '{self.dictionary}': name one of OpenCV's, such as DICT_4X4_50")
+        dictionary = cv2.aruco.getPredefinedDictionary(number)
+        board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, dictionary)
+        corners, identities, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+        if identities is None:
+            return {}
+        pairs = zip(identities.ravel().tolist(), corners.reshape(-1, 2), strict=True)
+        return {number: corner + 0.5 for number, corner in pairs}
+
+
+def scaled_by_board(rig: SolvedRig, pictures: Mapping[str, Sequence[np.ndarray]], board: Board) -> SolvedRig:
+    """The rig in the unit of the board, from the sides of squares between corners that two cameras saw.
+
+    Raises:
+        D2Error: no moment at which two cameras saw enough of the board, or sides that contradict each other.
+    """
+    seen = {
+        (name, moment): board.corners(picture) for name in rig.cameras for moment, picture in enumerate(pictures[name])
+    }
+    moments = max(len(pictures[name]) for name in rig.cameras)
+    sides = [side for moment in range(moments) for side in _sides(rig, board, moment, seen)]
+    if len(sides) < FEWEST_SIDES:
+        raise D2Error(
+            f"two cameras saw {len(sides)} sides of the board's squares at the same moment, expected {FEWEST_SIDES} at "
+            f"least: show the whole board ({board.columns} x {board.rows} squares) to two cameras, larger and in focus"
+        )
+    low, middle, high = np.percentile(sides, [25, 50, 75])
+    spread = float((high - low) / middle)
+    if spread > LARGEST_SPREAD:
+        raise D2Error(
+            f"the sides of the board's squares differ by {spread:.0%}, expected {LARGEST_SPREAD:.0%} at most: hold it "
+            "still and flat, and check that the cameras are synchronised"
+        )
+    return rig.times(board.square / float(middle), f"from {len(sides)} sides of a board's squares, within {spread:.1%}")
+
+
+def _sides(
+    rig: SolvedRig, board: Board, moment: int, seen: Mapping[tuple[str, int], Mapping[int, np.ndarray]]
+) -> list[float]:
+    """Lengths between neighbouring corners of the board at one moment, in the unit of the rig."""
+    names, across = tuple(rig.cameras), board.columns - 1
+    corners = {name: seen.get((name, moment), {}) for name in names}
+    numbers = sorted({number for found in corners.values() for number in found})
+    features, rows = {}, np.full((len(numbers), len(names)), -1)
+    for column, name in enumerate(names):
+        found = corners[name]
+        places = [i for i, number in enumerate(numbers) if number in found]
+        rows[places, column] = np.arange(len(places))
+        pixels = np.array([found[numbers[i]] for i in places]).reshape(-1, 2)
+        features[name] = Features(pixels, np.zeros((len(places), 128), np.float32), np.full(len(places), moment))
+    bundle = fitting(triangulate(rig.cameras, features, Tracks(names, rows)), features, CORNER_ERROR)
+    where = {tuple(row): number for row, number in zip(rows.tolist(), numbers, strict=True)}
+    points = {}
+    for point, row in zip(bundle.points, bundle.tracks.seen.tolist(), strict=True):
+        if tuple(row) in where:
+            points[where[tuple(row)]] = point
+    neighbours = [(n, n + 1) for n in points if (n + 1) % across] + [(n, n + across) for n in points]
+    return [float(np.linalg.norm(points[a] - points[b])) for a, b in neighbours if a in points and b in points]
