@@ -197,6 +197,7 @@ class TestARunThatDiverges:
 
         trainer.run(2)
         kept = r"checkpoint.pt, step 2; lower"
+
         def trained() -> None:
             with watched(trainer, tmp_path / "checkpoint.pt") as watch:
                 inner = watch(lambda step, loss: None)

@@ -10,13 +10,14 @@ cameras.json          last: a folder without it is no recording yet (videos.json
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from d2_plugin.captures.calibrations import CalibratedCamera, open_calibration, scaled
+from d2_plugin.captures.calibrations import CalibratedCamera, Calibration, open_calibration, scaled
 from d2_plugin.captures.capture import Capture, Exposure
 from d2_plugin.captures.checks.calibrated import calibration_contradicted
 from d2_plugin.captures.export.folder import described
@@ -89,25 +90,26 @@ def _calibrated(
     settings: ImportSettings, videos: Mapping[str, VideoFile]
 ) -> tuple[dict[str, VideoFile], dict[str, CalibratedCamera], tuple[str, ...]]:
     """(videos turned as the calibration has them, their cameras, notes)."""
-    turned, notes = dict(videos), ()
-    try:
-        read = open_calibration(settings.calibration, {n: v.turn.size(*v.size) for n, v in turned.items()})
-    except D2Error:
-        stored = {name: unturned(video) for name, video in videos.items()}
-        if all(video.turn == stored[name].turn for name, video in videos.items()):
-            raise
-        try:
-            read = open_calibration(settings.calibration, {name: video.size for name, video in stored.items()})
-        except D2Error:
-            read = None
-        if read is None:
-            raise
-        turned, notes = stored, ("the calibration is of the pictures as stored: rotation flags are not followed",)
+    turned, read, notes = _oriented(settings.calibration, videos)
     said = tuple(note for note in read.notes if "scale" not in note) if settings.unit else read.notes
     cameras = scaled(read.cameras, UNITS[settings.unit]) if settings.unit else read.cameras
     _refuse_wide(cameras, settings)
     _refuse_contradiction(turned, cameras, settings)
     return turned, {camera.name: camera for camera in cameras}, (*notes, *said)
+
+
+def _oriented(path: Path, videos: Mapping[str, VideoFile]) -> tuple[dict[str, VideoFile], Calibration, tuple[str, ...]]:
+    """The calibration of the upright videos; of the stored ones where only those have its aspect."""
+    try:
+        return dict(videos), open_calibration(path, {n: v.turn.size(*v.size) for n, v in videos.items()}), ()
+    except D2Error:
+        if not any(video.turn.degrees % 180 for video in videos.values()):
+            raise
+        stored = {name: unturned(video) for name, video in videos.items()}
+        with suppress(D2Error):
+            read = open_calibration(path, {name: video.size for name, video in videos.items()})
+            return stored, read, ("the calibration is of the pictures as stored: rotation flags are not followed",)
+        raise
 
 
 def _refuse_wide(cameras: tuple[CalibratedCamera, ...], settings: ImportSettings) -> None:
