@@ -117,7 +117,7 @@ def _refuse_wide(cameras: tuple[CalibratedCamera, ...], settings: ImportSettings
     width = float(np.linalg.norm(centres[:, None] - centres, axis=-1).max())
     if settings.unit is None and width > WIDE:
         raise D2Error(
-            f"{settings.calibration} puts the cameras up to {width:.3g} apart, which is no metres: say what it is with "
+            f"{settings.calibration} puts the cameras up to {width:.0f} apart, which is no metres: say what it is with "
             "--unit mm, --unit cm or --unit m"
         )
     if len(cameras) > 1 and width == 0:

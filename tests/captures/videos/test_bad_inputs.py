@@ -156,7 +156,7 @@ def no_calibration(given: Filmed) -> None:
 
 CASES: list[tuple[Callable[[Filmed], None], list[str], str]] = [
     (no_frames, [], r"has no frame|no frame of video"),
-    (damaged, [], r"cannot be decoded.*(repair|replace) the"),
+    (damaged, [], r"can(not)? be decoded.*(repair|replace) the"),
     (cut_off, [], r"cannot read video .*03\.mp4.*replace the file or leave its camera out"),
     (text, [], r"03\.mp4.*replace the file or leave its camera out"),
     (empty, [], r"03\.mp4.*replace the file or leave its camera out"),
