@@ -174,9 +174,7 @@ def _judged(
     elif not falls:
         reason = f"the poses stay: others would change the error {told}, which is no clear fall"
     else:
-        reason = (
-            f"the poses stay: two halves of the pictures differ about them by as much as they would change, {told}"
-        )
+        reason = f"the poses stay: two halves of the pictures differ about them by as much as they would change, {told}"
     accepted = falls and bool(larger.all())
     cameras = laid if accepted else dict(given)
     return RefinedPoses(cameras, accepted, reason, *pixels, changes, doubt, len(whole.points))

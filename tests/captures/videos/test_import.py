@@ -158,7 +158,7 @@ def test_the_commands(filmed: Filmed, tmp_path: Path, capsys: pytest.CaptureFixt
     assert main(["doctor", str(tmp_path / "c")]) == 0
     said = capsys.readouterr().out
     assert "lacks  mono" in said
-    assert "has  cameras     4, 2" in said
+    assert "has  cameras     4, 19 to 20 degrees" in said
 
 
 def test_doctor_says_what_is_there_and_what_is_not(imported: Path, plaza: Capture) -> None:
