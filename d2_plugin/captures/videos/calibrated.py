@@ -14,7 +14,8 @@ from d2_plugin.captures.checks.calibrated import calibration_contradicted
 from d2_plugin.captures.pictures import opencv
 from d2_plugin.captures.videos.decoding import Decoder
 from d2_plugin.captures.videos.files import VideoFile
-from d2_plugin.captures.videos.motion import LONG_SIDE, MOST_FRAMES, Watched
+from d2_plugin.captures.videos.motion import LONG_SIDE, MOST_FRAMES
+from d2_plugin.captures.videos.profiles import Watched
 from d2_plugin.captures.videos.settings import UNITS, ImportSettings
 from d2_plugin.captures.videos.source import Cut, Upright, VideosSource, unturned
 from d2_plugin.errors import D2Error

@@ -14,7 +14,8 @@ from recorded import SOUND_RATE, graded, room_sound
 from d2_plugin.captures import Capture, open_capture
 from d2_plugin.captures.videos.clocks import Evidence, _solved, common_clock, given_clock
 from d2_plugin.captures.videos.files import Turn, VideoFile
-from d2_plugin.captures.videos.motion import Watched, offsets_from_motion
+from d2_plugin.captures.videos.motion import offsets_from_motion
+from d2_plugin.captures.videos.profiles import Watched
 from d2_plugin.captures.videos.sound import RATE, Sound, lag_between
 from d2_plugin.captures.videos.timecode import shortest, timecode_seconds
 from d2_plugin.errors import D2Error
