@@ -57,7 +57,8 @@ class Spoiled:
 def main(output: str, *folders: str) -> None:
     """Measure and write one table a question."""
     captures = {Path(folder).name: open_capture(folder, downscale=DOWNSCALE) for folder in folders}
-    lines = [f"`python docs/your-recording.py OUTPUT {' '.join(captures)}`, frame {FRAME}, two cameras, pictures made {DOWNSCALE} times smaller, seed 0.", ""]
+    about = f"frame {FRAME}, two cameras, pictures made {DOWNSCALE} times smaller, seed 0"
+    lines = [f"`python docs/your-recording.py OUTPUT {' '.join(captures)}`: {about}.", ""]
     for title, rows in (("degrees apart", angles(captures)), ("of one camera", spoiled(captures))):
         lines += [f"| {title} | recording | verified | median error | verified where something moves |"]
         lines += ["|---|---|---|---|---|"]
