@@ -183,10 +183,7 @@ class Run:
         }
 
     def export_ply(self) -> list[Path]:
-        """One 3DGS PLY per frame under ply/: the Gaussians of that instant, temporal opacity folded in.
-
-        A background is not among them, since the format has no place for it: what it showed is black in a viewer.
-        """
+        """One 3DGS PLY per frame under ply/; what a background showed is black there: the format has no place for it."""
         from d2_plugin.runs.gaussian_ply import write_frames
 
         capture, camera = self.scene.capture, self.scene.train_cameras[0]
