@@ -119,9 +119,7 @@ def render_kernels(scene: Scene, device: torch.device) -> tuple[Scene, tuple[Ten
     return scene, cuda.rasterize(*inputs_of(scene), *camera_of(scene), *size, ops._constants(scene.settings))
 
 
-def gradients_of_kernels(
-    scene: Scene, device: torch.device, upstream: tuple[Tensor | None, ...]
-) -> tuple[Tensor, ...]:
+def gradients_of_kernels(scene: Scene, device: torch.device, upstream: tuple[Tensor | None, ...]) -> tuple[Tensor, ...]:
     """Those of `cuda.backward`; upstream gradients that are not given, at the end, are absent."""
     scene, outputs = render_kernels(scene, device)
     given = [None if part is None else part.to(device, torch.float32) for part in upstream]
@@ -143,8 +141,10 @@ def random_upstream(scene: Scene, seed: int = 5) -> tuple[Tensor, ...]:
     """Gradients of color, depth_sum, alpha and, with a near edge, front; 0 where float32 may decide otherwise."""
     generator = torch.Generator().manual_seed(seed)
     calm = ~near_a_cut_off(scene)
-    color, depth_sum, alpha = torch.randn(scene.colors.shape[1] + 2, *calm.shape, generator=generator).double().split(
-        (scene.colors.shape[1], 1, 1)
+    color, depth_sum, alpha = (
+        torch.randn(scene.colors.shape[1] + 2, *calm.shape, generator=generator)
+        .double()
+        .split((scene.colors.shape[1], 1, 1))
     )
     upstream = ((color * calm).permute(1, 2, 0).contiguous(), depth_sum[0] * calm, alpha[0] * calm)
     if scene.near_edge is None:

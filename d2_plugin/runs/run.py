@@ -27,6 +27,7 @@ from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config
 from d2_plugin.runs.start import (
     TimedPoints,
     TrainingFrames,
+    begin_with_exposures,
     initial_points,
     make_view,
     scene_extent,
@@ -179,10 +180,7 @@ class Run:
         }
 
     def export_ply(self) -> list[Path]:
-        """One 3DGS PLY per frame under ply/: the Gaussians of that instant, temporal opacity folded in.
-
-        A background is not among them, since the format has no place for it: what it showed is black in a viewer.
-        """
+        """One 3DGS PLY per frame under ply/; what a background showed is black there: the format has no place for it."""
         from d2_plugin.runs.gaussian_ply import write_frames
 
         capture, camera = self.scene.capture, self.scene.train_cameras[0]
@@ -218,19 +216,11 @@ class Run:
             temporal=self.scene.plan.uses("temporal"),
             settings=(self._needed() if attach else {}) | dict(self.settings.overrides.get("backbone", {})),
         )
-        self._start_appearance(model)
+        begin_with_exposures(model, capture, cameras, self.scene.test_cameras)
         training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
         weight = self.settings.background_weight
         pictures = TrainingFrames(capture, cameras, self.settings.device, background_weight=weight)
         return backbone.Trainer(model, pictures, training, self._attach if attach and self.uses_prior else None)
-
-    def _start_appearance(self, model: Any) -> None:
-        """Let the model begin with the gains that the import measured, where it learns exposures."""
-        begin = getattr(getattr(model, "appearance", None), "start_from", None)
-        exposures, training = self.scene.capture.exposures, self.scene.train_cameras
-        known = {name: one.gain for name, one in exposures.items() if name in (*training, *self.scene.test_cameras)}
-        if begin is not None and known:
-            begin(known, training)
 
     def _needed(self) -> dict[str, Any]:
         """The backbone's settings that the scene needs, those alone: one of somebody else's may not know the names."""

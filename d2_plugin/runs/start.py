@@ -104,6 +104,14 @@ KEPT_PICTURES = 320 << 20
 more memory than that; what it re-reads is a small part of a step at its size."""
 
 
+def begin_with_exposures(model: Any, capture: Capture, training: Sequence[str], held_out: Sequence[str]) -> None:
+    """Let a model that learns exposures begin with the gains that the import of the videos measured."""
+    begin = getattr(getattr(model, "appearance", None), "start_from", None)
+    known = {name: one.gain for name, one in capture.exposures.items() if name in (*training, *held_out)}
+    if begin is not None and known:
+        begin(known, training)
+
+
 class TrainingFrames:
     """Views and pictures of the training cameras; decoded pictures are kept up to `keep_bytes`, the rest re-read."""
 

@@ -34,7 +34,9 @@ def exposed(capture: Capture, gains: dict[str, tuple[float, float, float]]) -> S
         bright = capture.image(camera, frame) * np.array(gains.get(camera, (1, 1, 1)))
         return np.clip(np.rint(bright), 0, 255).astype(np.uint8)
 
-    return SimpleNamespace(**{name: getattr(capture, name) for name in ("cameras", "frames", "seconds", "exposures")}, image=image)
+    return SimpleNamespace(
+        **{name: getattr(capture, name) for name in ("cameras", "frames", "seconds", "exposures")}, image=image
+    )
 
 
 def test_cameras_of_equal_exposure_agree(room: tuple) -> None:

@@ -122,9 +122,7 @@ def training(
         else:
             time_input = fid.unsqueeze(0).expand(len(gaussians.get_xyz), -1)
             d_xyz, d_rotation, d_scaling = deform.step(gaussians.get_xyz.detach(), time_input)
-        render_pkg_re = render(
-            viewpoint_cam, gaussians, bg_color, d_xyz, d_rotation, d_scaling, deform.deform.is_6dof
-        )
+        render_pkg_re = render(viewpoint_cam, gaussians, bg_color, d_xyz, d_rotation, d_scaling, deform.deform.is_6dof)
         image, visibility_filter, radii = (render_pkg_re[k] for k in ("render", "visibility_filter", "radii"))
         loss = l1_loss(image, viewpoint_cam.original_image)
         loss.backward()

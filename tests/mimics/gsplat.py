@@ -76,9 +76,7 @@ def split(splats, optimizers, state, mask: Tensor) -> None:
             children = (spread / 1.6).log().repeat(2, 1)
         return torch.cat([p[rest], children])
 
-    change(
-        splats, optimizers, state, halves, lambda v: torch.cat([v[rest], torch.zeros((2 * len(sel), *v.shape[1:]))])
-    )
+    change(splats, optimizers, state, halves, lambda v: torch.cat([v[rest], torch.zeros((2 * len(sel), *v.shape[1:]))]))
     for key, value in state.items():
         if isinstance(value, Tensor):
             state[key] = torch.cat([value[rest], value[sel].repeat([2] + [1] * (value.dim() - 1))])

@@ -89,7 +89,7 @@ def test_the_gap_bounds_the_distance_to_every_other_line(
     candidates = [(best.scale, best.shift), *zip(rng.uniform(0, 4, 30), rng.uniform(-2, 5, 30))]
     for scale, shift in candidates:
         # sums of weighted residuals round at about 1e-12 of their value
-            assert objective(scale, shift, x, y, w, epsilon) >= bound - 1e-11 * (1 + abs(bound)) * n
+        assert objective(scale, shift, x, y, w, epsilon) >= bound - 1e-11 * (1 + abs(bound)) * n
 
 
 @settings(max_examples=40, deadline=None)

@@ -141,9 +141,7 @@ def test_the_leverage_guard_saves_a_fit_that_every_convex_one_loses() -> None:
 @pytest.mark.parametrize("kind", ["relative", "metric"])
 def test_with_the_leverage_guard_most_anchors_may_be_wrong(kind: str, wrong: float) -> None:
     problem = align_problem(kind, 20_000, wrong)
-    found = align(
-        problem.mono[None], problem.geometric[None], kind=kind, settings=AlignSettings(leverage_guard=True)
-    )
+    found = align(problem.mono[None], problem.geometric[None], kind=kind, settings=AlignSettings(leverage_guard=True))
     assert found.accepted
     assert found.gap <= 1e-9
     assert np.median(problem.depth_error((found.scale, found.shift))) < 0.004

@@ -163,9 +163,7 @@ def test_cameras_on_one_spot_need_no_colmap_to_have_no_depth(rig: Rig, grays: li
 )
 def test_what_colmap_leaves_is_checked(rig: Rig, grays: list[np.ndarray], left: np.ndarray, message: str) -> None:
     with pytest.raises(D2Error, match=message):
-        colmap_patch_match(
-            grays, rig.cameras, rig.depth_range, SETTINGS, run=oracle(rig, **{"0001.png": left})
-        )
+        colmap_patch_match(grays, rig.cameras, rig.depth_range, SETTINGS, run=oracle(rig, **{"0001.png": left}))
 
 
 def test_no_depth_at_all_is_told(rig: Rig, grays: list[np.ndarray], caplog: pytest.LogCaptureFixture) -> None:

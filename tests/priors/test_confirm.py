@@ -75,5 +75,3 @@ def test_the_paper_reads_depth_at_pixels() -> None:
     kept = PriorSettings.paper(stereo=StereoSettings(cost_max=0.3)).stereo
     assert kept == StereoSettings(cost_max=0.3, between_pixels=False)
     assert StereoSettings().between_pixels
-
-

@@ -90,9 +90,7 @@ def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(
 
 
 @needs_dask
-def test_a_second_build_on_the_cluster_computes_nothing(
-    capture: Capture, two_workers: object, tmp_path: Path
-) -> None:
+def test_a_second_build_on_the_cluster_computes_nothing(capture: Capture, two_workers: object, tmp_path: Path) -> None:
     store = tmp_path / "priors"
     build_priors(capture, NAMES, store, SETTINGS)
     before = contents(store)
@@ -106,18 +104,14 @@ def test_what_a_single_build_refuses_the_cluster_refuses_in_the_same_words(
     capture: Capture, two_workers: object, tmp_path: Path
 ) -> None:
     with pytest.raises(D2Error, match="unknown camera 'train7'.*did you mean"):
-        build_priors_on_cluster(
-            capture, ["train7"], tmp_path / "p", SETTINGS, scheduler=two_workers.scheduler_address
-        )
+        build_priors_on_cluster(capture, ["train7"], tmp_path / "p", SETTINGS, scheduler=two_workers.scheduler_address)
     with pytest.raises(D2Error, match="no dask scheduler answers at tcp://127.0.0.1:1 "):
         build_priors_on_cluster(capture, NAMES, tmp_path / "p", SETTINGS, scheduler="tcp://127.0.0.1:1")
     with pytest.raises(D2Error, match="give at least 1"):
         build_priors_on_cluster(capture, NAMES, tmp_path / "p", SETTINGS, workers=0)
 
 
-def test_without_dask_its_extra_is_named(
-    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_dask_its_extra_is_named(capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingExtra, match=r"dask.distributed, which is not installed: .*d2-4dgs\[cluster\]"):
         build_priors_on_cluster(capture, NAMES, tmp_path / "p", SETTINGS)

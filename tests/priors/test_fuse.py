@@ -54,9 +54,7 @@ def test_each_depth_has_the_sigma_of_its_source_and_what_has_none_is_unknown() -
 def test_verification_by_a_map_judges_each_pixel_by_its_own_tolerance() -> None:
     tolerance = np.array([[0.01, 0.6, 0.6, 0.6, 0.6]], np.float32)
     labels = fuse(MONO, GEOMETRIC, tau_c=tolerance).labels
-    np.testing.assert_array_equal(
-        labels, [[Label.CONFLICT, Label.VERIFIED, Label.CONFLICT, Label.MONO, Label.EMPTY]]
-    )
+    np.testing.assert_array_equal(labels, [[Label.CONFLICT, Label.VERIFIED, Label.CONFLICT, Label.MONO, Label.EMPTY]])
 
 
 @pytest.mark.parametrize(

@@ -263,9 +263,7 @@ def verified(scene: Scene, map_: np.ndarray, geometric: np.ndarray, sigmas: floa
     stereo = np.where(geometric > 0, sigma, np.inf)
     depth = corrected_depth(map_, scene.anchors, SETTINGS)
     tolerance = sigmas * np.hypot(found.at_anchors, stereo)
-    return fuse(
-        depth, geometric, tau_c=tolerance, sigma_mono=found.sigma, sigma_geometric=stereo.astype(np.float32)
-    )
+    return fuse(depth, geometric, tau_c=tolerance, sigma_mono=found.sigma, sigma_geometric=stereo.astype(np.float32))
 
 
 def conflicts(scene: Scene, prior: FusedPrior) -> float:

@@ -107,5 +107,3 @@ def workplace(commands: Commands, recording: Path) -> Workplace:
         counts = (name, ended.operations, ended.renames, took[0])
         logging.getLogger(__name__).info("%s: %d operations, %d renames, %.1f s", *counts)
     return Workplace(folder, recording, commands, work, whole, operations, renames, seconds)
-
-

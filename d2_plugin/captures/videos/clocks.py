@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from d2_plugin.captures.videos.files import VideoFile
-from d2_plugin.captures.videos.motion import Watched, offsets_from_motion
+from d2_plugin.captures.videos.motion import offsets_from_motion
+from d2_plugin.captures.videos.profiles import Watched
 from d2_plugin.captures.videos.sound import Sound, lag_between, read_sound
 from d2_plugin.captures.videos.timecode import shortest, timecode_seconds
 from d2_plugin.errors import D2Error

@@ -69,8 +69,12 @@ class VideoFile:
 
     @property
     def rate(self) -> float:
-        """Frames per second, from the median distance between frames; 0 for a single frame."""
-        return 0.0 if len(self.stamps) < 2 else 1.0 / float(np.median(np.diff(self.times)))
+        """Frames per second, those that were dropped counted as well; 0 for a single frame."""
+        if len(self.stamps) < 2:
+            return 0.0
+        steps = np.diff(self.stamps)
+        # The whole length, since the median of stamps that are rounded to whole units is rounded itself.
+        return float(np.maximum(np.rint(steps / np.median(steps)), 1).sum() / (steps.sum() * float(self.unit)))
 
     @property
     def unsteady(self) -> bool:

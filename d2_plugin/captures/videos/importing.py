@@ -2,6 +2,7 @@
 
 import/import.json    what is imported, with checksums: another import into the same folder is refused
 import/clocks.json    when each camera began
+import/poses.json     what --refine-poses found
 images/CAMERA/*.png   the pictures, each written whole or not at all
 import/exposures.json
 cameras.json          last: a folder without it is no recording yet (videos.json with --pictures videos)
@@ -16,33 +17,28 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.captures.calibrations import CalibratedCamera, open_calibration, scaled
+from d2_plugin.captures.calibrate import refine
+from d2_plugin.captures.calibrations import CalibratedCamera
 from d2_plugin.captures.capture import Capture, Exposure
-from d2_plugin.captures.checks.calibrated import calibration_contradicted
 from d2_plugin.captures.export.folder import described
 from d2_plugin.captures.masks import VALID_FOLDER, as_picture
 from d2_plugin.captures.pictures import opencv, write_png
 from d2_plugin.captures.readers.videos import KIND as VIDEOS
 from d2_plugin.captures.readers.videos import TABLE
 from d2_plugin.captures.videos import claimed
+from d2_plugin.captures.videos.calibrated import calibrated, watched
 from d2_plugin.captures.videos.clocks import METHODS, Clock, common_clock, given_clock
-from d2_plugin.captures.videos.decoding import Decoder
 from d2_plugin.captures.videos.exposure import measured_exposures
 from d2_plugin.captures.videos.files import VideoFile, read_video
 from d2_plugin.captures.videos.grid import Grid, grid_of
-from d2_plugin.captures.videos.motion import LONG_SIDE, MOST_FRAMES, Watched
-from d2_plugin.captures.videos.settings import UNITS, ImportSettings, check_names, cut_of
-from d2_plugin.captures.videos.source import Cut, Upright, VideosSource, unturned
+from d2_plugin.captures.videos.settings import ImportSettings, check_names, cut_of
+from d2_plugin.captures.videos.source import Cut, Upright, VideosSource
 from d2_plugin.durable import make_folder, remove_leftovers, write, write_table, write_text
-from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
 from d2_plugin.reading import json_text
 
 Told = Callable[[str], None]
-
-WIDE = 100.0
-"""A rig wider than this is in millimetres or centimetres, unless --unit says otherwise."""
 
 JPEG_QUALITY = 95
 
@@ -70,7 +66,7 @@ def import_videos(settings: ImportSettings, told: Told = lambda line: None) -> I
     identity = claimed.identity(settings, paths)
     claimed.refuse_another(folder, identity)
     found = {name: read_video(path) for name, path in paths.items()}
-    videos, cameras, notes = _calibrated(settings, found)
+    videos, cameras, notes = calibrated(settings, found)
     cuts = {name: cut_of(settings, name, (camera.width, camera.height)) for name, camera in cameras.items()}
     with only_writer(make_folder(folder)):
         claimed.claim(folder, identity)
@@ -79,63 +75,12 @@ def import_videos(settings: ImportSettings, told: Told = lambda line: None) -> I
         told(_said_of_clocks(clocks, videos))
         grid = grid_of(videos, clocks, settings.rate, settings.times, settings.frames)
         capture = _capture(folder, videos, cameras, cuts, grid, notes)
+        if settings.refine_poses:
+            capture = _with_refined_poses(folder, capture, told)
         capture = _pictures(settings, folder, capture, told)
         capture = _exposures(settings, folder, capture, told)
         _finish(settings, folder, capture)
     return Imported(capture, clocks, folder)
-
-
-def _calibrated(
-    settings: ImportSettings, videos: Mapping[str, VideoFile]
-) -> tuple[dict[str, VideoFile], dict[str, CalibratedCamera], tuple[str, ...]]:
-    """(videos turned as the calibration has them, their cameras, notes)."""
-    turned, notes = dict(videos), ()
-    try:
-        read = open_calibration(settings.calibration, {n: v.turn.size(*v.size) for n, v in turned.items()})
-    except D2Error:
-        stored = {name: unturned(video) for name, video in videos.items()}
-        if all(video.turn == stored[name].turn for name, video in videos.items()):
-            raise
-        try:
-            read = open_calibration(settings.calibration, {name: video.size for name, video in stored.items()})
-        except D2Error:
-            read = None
-        if read is None:
-            raise
-        turned, notes = stored, ("the calibration is of the pictures as stored: rotation flags are not followed",)
-    said = tuple(note for note in read.notes if "scale" not in note) if settings.unit else read.notes
-    cameras = scaled(read.cameras, UNITS[settings.unit]) if settings.unit else read.cameras
-    _refuse_wide(cameras, settings)
-    _refuse_contradiction(turned, cameras, settings)
-    return turned, {camera.name: camera for camera in cameras}, (*notes, *said)
-
-
-def _refuse_wide(cameras: tuple[CalibratedCamera, ...], settings: ImportSettings) -> None:
-    centres = np.stack([camera.centre for camera in cameras])
-    width = float(np.linalg.norm(centres[:, None] - centres, axis=-1).max())
-    if settings.unit is None and width > WIDE:
-        raise D2Error(
-            f"{settings.calibration} puts the cameras up to {width:.3g} apart, which is no metres: say what it is with "
-            "--unit mm, --unit cm or --unit m"
-        )
-    if len(cameras) > 1 and width == 0:
-        raise D2Error(f"{settings.calibration} puts all cameras at one place: give a calibration with their poses")
-
-
-def _refuse_contradiction(
-    videos: Mapping[str, VideoFile], cameras: tuple[CalibratedCamera, ...], settings: ImportSettings
-) -> None:
-    """Hold the calibration against the first pictures, before anything long begins."""
-    if len(videos) < 2:
-        return
-    indices = {name: {0: len(video.stamps) // 2} for name, video in videos.items()}
-    by_name = {camera.name: camera for camera in cameras}
-    cuts = {name: Cut(0, 0, camera.width, camera.height) for name, camera in by_name.items()}
-    source = VideosSource(Upright(videos, indices), by_name, cuts)
-    capture = Capture("videos", {name: cuts[name].camera(by_name[name]) for name in videos}, (0,), 1.0, source)
-    wrong = calibration_contradicted(capture)
-    if wrong:
-        raise D2Error(f"{settings.calibration} does not fit the videos: {wrong}")
 
 
 def _clocks(
@@ -144,35 +89,12 @@ def _clocks(
     def find() -> dict[str, Any]:
         chosen = settings.offsets
         if len(chosen) == 1 and chosen[0] in METHODS:
-            clocks = common_clock(videos, chosen[0], lambda: _watched(videos, cameras))
+            clocks = common_clock(videos, chosen[0], lambda: watched(videos, cameras))
         else:
             clocks = given_clock(videos, chosen)
         return {name: clock.as_dict() for name, clock in clocks.items()}
 
     return {name: Clock(**table) for name, table in claimed.kept(folder, "clocks", find).items()}
-
-
-def _watched(videos: Mapping[str, VideoFile], cameras: Mapping[str, CalibratedCamera]) -> dict[str, Watched]:
-    """Small undistorted pictures of all cameras, from the beginning."""
-    cv2 = opencv("finding motion")
-    found = {}
-    with progress_bar("look for motion", sum(min(len(v.stamps), MOST_FRAMES) for v in videos.values())) as bar:
-        done = 0
-        for name, video in videos.items():
-            decoder, count = Decoder(video), min(len(video.stamps), MOST_FRAMES)
-            pictures = []
-            for index in range(count):
-                pictures.append(decoder.grey(index, LONG_SIDE))
-                bar.update(done := done + 1, name)
-            decoder.close()
-            height, width = pictures[0].shape
-            small = cameras[name].of_size((width, height)) if cameras[name].width != width else cameras[name]
-            if small.lens.bends:
-                x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-                places = np.nan_to_num(small.lens.recorded_pixels(np.stack([x, y], -1)) - 0.5, nan=-9.0)
-                pictures = [cv2.remap(p, places.astype(np.float32), None, cv2.INTER_LINEAR) for p in pictures]
-            found[name] = Watched(small.pinhole(), np.stack(pictures), video.times[:count])
-    return found
 
 
 def _said_of_clocks(clocks: Mapping[str, Clock], videos: Mapping[str, VideoFile]) -> str:
@@ -200,6 +122,32 @@ def _capture(
     frames = tuple(grid.indices[next(iter(videos))])
     return Capture(
         folder.resolve().name, pinholes, frames, grid.rate, source, folder, notes=(*notes, *grid.notes), late=grid.late
+    )
+
+
+def _with_refined_poses(folder: Path, capture: Capture, told: Told) -> Capture:
+    """The recording with the poses that its pictures prove to be better, or with those that were given."""
+
+    def find() -> dict[str, Any]:
+        found = refine(capture)
+        poses = {name: camera.T_camera_world.tolist() for name, camera in found.cameras.items()}
+        return {"accepted": found.accepted, "reason": found.reason, "poses": poses if found.accepted else {}}
+
+    found = claimed.kept(folder, "poses", find)
+    told(f"poses: {found['reason']}")
+    poses = {name: np.array(pose) for name, pose in found["poses"].items()}
+    source = capture.source
+    if not isinstance(source, VideosSource) or not poses:
+        return capture
+    moved = {
+        name: replace(camera, rotation=poses[name][:3, :3], translation=poses[name][:3, 3])
+        for name, camera in source.cameras.items()
+    }
+    return replace(
+        capture,
+        cameras={name: replace(camera, T_camera_world=poses[name]) for name, camera in capture.cameras.items()},
+        source=replace(source, cameras=moved),
+        notes=(*capture.notes, found["reason"]),
     )
 
 

@@ -28,14 +28,19 @@ CLEAR = 12.0
 """A peak this many standard deviations of the correlation high is an event that both heard. The largest of a million
 samples of noise reaches 5."""
 
-DOUBTFUL = 0.85
-"""Another peak of this share of the highest makes it doubtful: a sound that repeats itself."""
+DOUBTFUL = 0.6
+"""Another peak of this share of the highest makes it doubtful: a sound that repeats itself, or two events. In rooms of
+claps and noise the second highest reached 0.05 of the highest, 0.4 where next to nothing was heard; between recordings
+of different events 0.8 to 1."""
 
-BLUNT = 0.6
+BLUNT = 0.45
 """As much within `ECHO` is no single peak: two claps of different events, laid over each other, look like that."""
 
 ECHO, SHARP = 0.1, 0.001
 """Seconds around a peak in which others are its echoes, and in which they are the peak itself."""
+
+LEAST_SECONDS = 0.3
+"""Of a sound that says anything."""
 
 PART, PARTS = 1.0, 6
 """Seconds of the shortest part, and how many, in which the lag is looked for again: they say how sure it is."""
@@ -79,7 +84,7 @@ def read_sound(path: Path) -> Sound | None:
             if length > MOST_SECONDS * RATE:
                 break
         samples = np.concatenate(parts) if parts else np.zeros(0, np.float32)
-    silent = len(samples) < PART * RATE or float(np.abs(samples).max(initial=0)) < 1e-4
+    silent = len(samples) < LEAST_SECONDS * RATE or float(np.abs(samples).max(initial=0)) < 1e-4
     return None if silent else Sound(samples, start or 0.0)
 
 

@@ -169,7 +169,8 @@ def valid_pixels(camera: CalibratedCamera, cut: Cut) -> np.ndarray:
     x, y = np.meshgrid(columns / small.width * cut.width + cut.left, rows / small.height * cut.height + cut.top)
     recorded = camera.lens.recorded_pixels(np.stack([x, y], axis=-1))
     with np.errstate(invalid="ignore"):
-        return ((recorded >= 0.5) & (recorded <= np.array([camera.width, camera.height]) - 0.5)).all(axis=-1)
+        inside = ((recorded >= 0.5) & (recorded <= np.array([camera.width, camera.height]) - 0.5)).all(axis=-1)
+    return np.asarray(inside)
 
 
 def unturned(video: VideoFile) -> VideoFile:

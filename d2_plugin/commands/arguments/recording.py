@@ -27,7 +27,7 @@ CAPTURE = ("capture", "train_cameras", "frames", "downscale", "mono_onnx", "mono
 WRITTEN = {
     "capture": "images/CAMERA/FRAME.png with cameras.json, or as N3DV, Technicolor, ENeRF-Outdoor, COLMAP or "
     "transforms.json lay it out.",
-    "train_cameras": "Names joined by commas, as in 00,02,05,07; all; or preset:2, preset:3, preset:4 for a known data set; "
+    "train_cameras": "Names joined by commas, as in 00,02,05,07; all; preset:2, preset:3, preset:4 for a data set; "
     "or protocol:gc-4dgs-4, protocol:4c4d and others for a published split.",
     "test_cameras": "Names joined by commas.",
     "frames": "Written first:last or first:last:step, the last one included.",

@@ -1,0 +1,84 @@
+"""A video as its container describes it: time stamps, turn, timecode, and its frames in any order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from films import write_film
+
+from d2_plugin.captures.videos.decoding import Decoder
+from d2_plugin.captures.videos.files import VideoFile, read_video, videos_below
+
+pytest.importorskip("av")
+
+SIZE = (48, 64)
+
+
+def pictures(count: int) -> list[np.ndarray]:
+    """Soft stripes that move by two pixels a frame."""
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    return [
+        np.stack([120 + 80 * np.sin((x + 2 * i) / 9), 100 + y, np.full(SIZE, 4.0 * i)], -1).round().astype(np.uint8)
+        for i in range(count)
+    ]
+
+
+@pytest.fixture(scope="module")
+def unsteady(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
+    """A video whose camera left out frames at times, and when each was shown."""
+    rng = np.random.default_rng(3)
+    times = np.cumsum(np.r_[0.0, rng.choice([1, 1, 1, 2], 39) / 30])
+    path = tmp_path_factory.mktemp("video") / "a.mp4"
+    return write_film(path, pictures(40), list(times), turn=90, timecode="01:00:00:05"), times
+
+
+def test_time_stamps_are_those_of_the_container(unsteady: tuple[Path, np.ndarray]) -> None:
+    path, times = unsteady
+    video = read_video(path)
+    assert np.abs(video.times - times).max() < 1e-4
+    assert video.unsteady
+    assert video.rate == pytest.approx(30, rel=1e-3)
+    assert video.timecode == "01:00:00:05"
+    assert not video.sound
+
+
+def test_a_table_keeps_everything(unsteady: tuple[Path, np.ndarray]) -> None:
+    video = read_video(unsteady[0])
+    again = VideoFile.from_dict(video.as_dict())
+    assert again.as_dict() == video.as_dict()
+    assert (again.times == video.times).all()
+
+
+def test_frames_in_any_order_are_the_same(unsteady: tuple[Path, np.ndarray]) -> None:
+    decoder, truth = Decoder(read_video(unsteady[0])), pictures(40)
+    for index in (0, 1, 39, 5, 6, 38, 0):
+        assert np.abs(decoder.picture(index).astype(int) - truth[index]).mean() < 3
+    in_order = Decoder(read_video(unsteady[0]))
+    kept = [in_order.picture(index) for index in range(40)]
+    assert all((decoder.picture(index) == kept[index]).all() for index in (17, 3, 29))
+
+
+@pytest.mark.parametrize("turn", [0, 90, 180, 270])
+def test_pictures_stand_as_players_show_them(tmp_path: Path, turn: int) -> None:
+    path = write_film(tmp_path / "a.mp4", pictures(3), [0, 0.04, 0.08], turn=turn)
+    video = read_video(path)
+    assert video.turn.degrees == turn
+    assert video.turn.size(*video.size) == SIZE[::-1]
+    assert np.abs(Decoder(video).picture(0).astype(int) - pictures(1)[0]).mean() < 3
+    cv2 = pytest.importorskip("cv2")
+    _, shown = cv2.VideoCapture(str(path)).read()
+    assert np.abs(shown[..., ::-1].astype(int) - pictures(1)[0]).mean() < 3  # OpenCV turns as players do
+
+
+def test_small_brightness_has_the_shape_of_the_upright_picture(unsteady: tuple[Path, np.ndarray]) -> None:
+    grey = Decoder(read_video(unsteady[0])).grey(2, 32)
+    assert grey.shape == (24, 32)
+
+
+def test_a_folder_names_its_videos(unsteady: tuple[Path, np.ndarray]) -> None:
+    folder = unsteady[0].parent
+    (folder / "notes.txt").write_text("no video")
+    (folder / ".hidden.mp4").write_text("no video")
+    assert videos_below(folder) == (unsteady[0],)

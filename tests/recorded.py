@@ -1,0 +1,98 @@
+"""Recordings filmed again by cameras that start when they like: videos of a capture with known offsets and gains."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from films import write_film
+
+from d2_plugin.captures import Capture
+from d2_plugin.captures.export.folder import described
+
+SOUND_RATE = 48_000
+
+
+@dataclass(frozen=True)
+class Shooting:
+    """How one camera filmed."""
+
+    offset: float = 0.0
+    """Seconds after the first instant of the capture at which its clock began."""
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    turn: int = 0
+    dropped: tuple[int, ...] = ()
+    """Places of frames, counted from its first, that it never wrote."""
+    timecode: str | None = None
+
+
+def room_sound(seconds: float, seed: int = 0) -> np.ndarray:
+    """Claps and quiet noise, float [N]."""
+    rng = np.random.default_rng(seed)
+    sound = rng.normal(0, 0.003, int(seconds * SOUND_RATE))
+    for start in rng.uniform(0, max(seconds - 0.1, 0.01), max(int(8 * seconds), 3)):
+        first = int(start * SOUND_RATE)
+        length = min(2400, len(sound) - first)
+        sound[first : first + length] += rng.normal(0, 0.4, length) * np.exp(-np.arange(length) / 400)
+    return sound.clip(-1, 1)
+
+
+@dataclass
+class Filmed:
+    """A folder of videos and the calibration of their cameras."""
+
+    folder: Path
+    calibration: Path
+    shootings: dict[str, Shooting] = field(default_factory=dict)
+
+    @property
+    def videos(self) -> Path:
+        """Where they lie."""
+        return self.folder / "videos"
+
+
+def film(
+    capture: Capture,
+    folder: Path,
+    shootings: Mapping[str, Shooting],
+    sound: bool = False,
+    sounds: Mapping[str, int] | None = None,
+) -> Filmed:
+    """Write one video per shooting, with what the room sounds like; `sounds` are seeds of other rooms by camera.
+
+    A camera that begins after the first instant lacks the first frames; one that begins earlier waits for them, and
+    its first video frame is the first of the capture at a later time of its own.
+    """
+    (folder / "videos").mkdir(parents=True)
+    length = (len(capture.frames) + 1) / capture.fps
+    early = -min(min(one.offset for one in shootings.values()), 0.0)
+    for name, shot in shootings.items():
+        instants = np.array([capture.seconds(frame) for frame in capture.frames]) - shot.offset
+        begun = np.flatnonzero(instants >= -1e-9)
+        kept = [i for place, i in enumerate(begun) if place not in shot.dropped]
+        pictures = [graded(capture.image(name, capture.frames[i]), shot.gain) for i in kept]
+        heard = None
+        if sound:
+            rng = np.random.default_rng(sum(name.encode()))
+            room = room_sound(length + early, (sounds or {}).get(name, 7))
+            own = room[round((early + shot.offset) * SOUND_RATE) :]
+            heard = (own * rng.uniform(0.3, 1.0) + rng.normal(0, 0.002, len(own))).clip(-1, 1)
+        write_film(
+            folder / "videos" / f"{name}.mp4",
+            pictures,
+            [max(float(instants[i]), 0.0) for i in kept],
+            turn=shot.turn,
+            sound=heard,
+            timecode=shot.timecode,
+        )
+    calibration = folder / "cameras.json"
+    calibration.write_text(json.dumps(described(capture)))
+    return Filmed(folder, calibration, dict(shootings))
+
+
+def graded(picture: np.ndarray, gain: tuple[float, float, float]) -> np.ndarray:
+    """The picture as a camera of another exposure has it."""
+    return np.rint(picture.astype(float) * gain).clip(0, 255).astype(np.uint8)
