@@ -1,4 +1,7 @@
-"""What is installed, what is missing for which feature, and which compiler and caches are used."""
+"""What is installed, what is missing for which feature, and which compiler and caches are used.
+
+With --attach REPOSITORY PATH: what that trainer imports and this environment lacks, and how to get it.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,14 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
 from d2_plugin import __version__, compiler, registry
 from d2_plugin.commands.arguments.form import Form
+from d2_plugin.errors import D2Error
+from d2_plugin.settings import Positional, Settings
 
 OPTIONAL = {
     "onnxruntime": ("mono", "monocular depth from an ONNX network"),
@@ -22,9 +30,30 @@ OPTIONAL = {
 }
 
 
+@dataclass(frozen=True)
+class Doctor(Settings):
+    """What to look at: this installation, or what a trainer needs beside it."""
+
+    path: Annotated[Path | None, Positional()] = None
+    """Folder of the trainer's repository, or its script."""
+    attach: str | None = None
+    """Name of the repository, as the launcher knows it."""
+
+
 def form(words: list[str]) -> Form:
-    """What `d2 doctor` takes: nothing."""
-    return Form("d2 doctor", __doc__ or "", (), lambda given: report())
+    """What `d2 doctor` takes."""
+    return Form.of("d2 doctor", __doc__, Doctor, run)
+
+
+def run(settings: Doctor) -> str:
+    """The report on this installation, or on what a trainer needs."""
+    if settings.attach is None and settings.path is None:
+        return report()
+    if settings.attach is None or settings.path is None:
+        raise D2Error("a trainer is examined by both its name and its folder: d2 doctor --attach fudan FOLDER")
+    from d2_plugin.attach.needs import needs
+
+    return needs(settings.attach, settings.path)
 
 
 def report() -> str:
