@@ -1,0 +1,26 @@
+"""One evaluation takes at most a share of the light away: holes that nothing stands behind are slow to close."""
+
+from __future__ import annotations
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from d2_plugin.hooks.prune import within_light
+
+
+def test_the_faintest_go_first_and_the_rest_waits() -> None:
+    weight = torch.tensor([5.0, 1.0, 3.0, 0.5, 90.5])
+    asked = torch.tensor([True, True, True, True, False])
+    assert within_light(asked, weight, 0.05).tolist() == [False, True, True, True, False]
+    assert within_light(asked, weight, 0.02).tolist() == [False, True, False, True, False]
+    assert within_light(asked, weight, 1.0) is asked
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.booleans(), st.floats(0, 1e3)), min_size=1, max_size=30), st.floats(0, 0.99))
+def test_never_more_than_was_asked_for_and_never_more_light(rows: list[tuple[bool, float]], share: float) -> None:
+    asked, weight = torch.tensor([row[0] for row in rows]), torch.tensor([row[1] for row in rows])
+    chosen = within_light(asked, weight, share)
+    assert not (chosen & ~asked).any()
+    assert weight[chosen].double().sum() <= share * weight.double().sum() + 1e-6
