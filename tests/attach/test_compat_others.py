@@ -10,7 +10,7 @@ import pytest
 import torch
 from mimics.ex4dgs import opacity_compensation
 from mimics.inria import Camera
-from rasterizer_arguments import inria_camera, view_24x16
+from rasterizer_arguments import inria_camera
 from splat_scenes import random_scene
 
 from d2_plugin.compat import depth, ex4dgs, spacetime, vision

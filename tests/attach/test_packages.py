@@ -41,7 +41,8 @@ def test_what_a_script_needs_is_read_from_the_files_it_reaches(script: Path) -> 
 
 
 def test_what_nothing_stands_in_for_is_one_sentence_with_the_command(script: Path) -> None:
-    with pytest.raises(D2Error, match=r"absent_one \(thirdparty.*:2\), absent_two .*run `pip install absent_one absent"):
+    sentence = r"absent_one \(thirdparty.*:2\), absent_two .*run `pip install absent_one absent_two`"
+    with pytest.raises(D2Error, match=sentence):
         stand_in_for(script, set())
 
 

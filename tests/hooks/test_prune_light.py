@@ -5,7 +5,9 @@ from __future__ import annotations
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tiny import make_trainer
 
+from d2_plugin.config import D2Config, PruneConfig
 from d2_plugin.hooks.prune import within_light
 
 
@@ -24,3 +26,15 @@ def test_never_more_than_was_asked_for_and_never_more_light(rows: list[tuple[boo
     chosen = within_light(asked, weight, share)
     assert not (chosen & ~asked).any()
     assert weight[chosen].double().sum() <= share * weight.double().sum() + 1e-6
+
+
+def test_the_hook_removes_little_by_little() -> None:
+    """With a threshold that condemns everything that is seen."""
+
+    def after_three(light: float) -> int:
+        prune = PruneConfig(start=1, every=1, patience=1, tau_p=0.0, light=light)
+        trainer = make_trainer(D2Config(prune=prune, views_per_evaluation=3))
+        trainer.run(until=3)
+        return trainer.d2.telling.removed
+
+    assert 0 < after_three(0.05) < after_three(1.0) / 2
