@@ -103,12 +103,14 @@ def gather(evaluation: Sequence[Surveyed], count: int, free_space: bool) -> tupl
 
 
 def within_light(remove: Tensor, weight: Tensor, share: float) -> Tensor:
-    """Of the rows of `remove` [N], the faintest that together carry at most `share` of all `weight` [N]."""
+    """Of the rows of `remove` [N], the faintest that together carry at most `share` of all `weight` [N]; at least one,
+    so that a bright floater that is alone goes, too."""
     if share >= 1 or not remove.any():
         return remove
     rows = torch.nonzero(remove).squeeze(1)
     rows = rows[torch.argsort(weight[rows], stable=True)]
     taken = torch.cumsum(weight[rows].double(), 0) <= share * weight.sum(dtype=torch.float64)
+    taken[0] = True
     return torch.zeros_like(remove).index_fill(0, rows[taken], True)
 
 
