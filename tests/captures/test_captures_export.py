@@ -201,8 +201,9 @@ class TestColmapFrames:
         assert np.load(folder / "poses_bounds.npy").shape == (3, 17)
         for index in range(3):
             model = folder / f"colmap_{index}" / "sparse" / "0"
-            assert sorted(image.name for image in read_model(model).images.values()) == ["cam00.png", "cam01.png", "cam02.png"]
-            assert len(read_points(model)[0]) == len(CLOUD.positions)
+            registered = sorted(image.name for image in read_model(model).images.values())
+            assert registered == ["cam00.png", "cam01.png", "cam02.png"]
+            assert len(read_points(model).positions) == len(CLOUD.positions)
             linked = folder / f"colmap_{index}" / "images" / "cam01.png"
             assert linked.read_bytes() == (folder / "cam01" / f"{index}.png").read_bytes()
 
