@@ -102,7 +102,7 @@ class D2Hooks:
         """From a configuration and the name of a registered adapter, which gets the trainer's own objects.
 
         The first of the three lines where there is an adapter: `d2 = D2Hooks.attach("d2.toml", "fudan", gaussians)`.
-        Schedules that the configuration leaves out follow from `iterations`, the length of the trainer's run; see `tell`.
+        What the configuration leaves out of schedules follows from `iterations`, the length of the run; see `tell`.
         """
         build = load(ADAPTERS, adapter)
         try:
@@ -124,7 +124,7 @@ class D2Hooks:
         return attached
 
     def tell(self, iterations: int | None = None, on_report: Listener | None = None, writer: Any = None) -> None:
-        """From now on say what happens, see `d2_plugin.hooks.reports.Telling.start`."""
+        """From now on say what happens, see `Telling.start`."""
         self.telling.start(self.backbone, self._prior.store if self.hooks else None, iterations, on_report, writer)
 
     @property
@@ -199,19 +199,15 @@ class D2Hooks:
         self._idle.load(state)
         self._count = len(self.backbone)
         self._finite.step = self._finite.saved = state.get("step", 0)
-        # A checkpoint from before 2026-11 does not say; nothing that trains depends on it.
         self.inserted_at = state.get("inserted_at", torch.zeros(self._count, dtype=torch.int32)).cpu()
 
     def _begin(self, step: int) -> None:
         """Tell the backbone the step, if it has `begin_step`, and notice changes that nobody reported."""
-        begin = getattr(self.backbone, "begin_step", None)
-        if begin is not None:
-            begin(step)
+        getattr(self.backbone, "begin_step", int)(step)
         self._check_count()
 
     def _due(self, step: int) -> list[tuple[str, Hook]]:
-        active = getattr(self.backbone, "active", None)
-        if active is not None and not active(step):
+        if not getattr(self.backbone, "active", lambda step: True)(step):
             return []
         return [(name, hook) for name, hook in self.hooks.items() if name not in self.retired and hook.window.due(step)]
 

@@ -46,7 +46,7 @@ ROOMS = {
     "runs": "ground config plugin hooks priors captures gaussians rasterizer",
     "viewing": "ground config plugin hooks priors captures gaussians rasterizer runs",
     "study": "ground config plugin hooks priors captures gaussians rasterizer runs viewing testing",
-    "commands": "ground config plugin hooks priors captures gaussians rasterizer runs viewing study testing compat",
+    "commands": "ground config plugin hooks priors captures gaussians rasterizer runs viewing study testing (attach)",
     "testing": "ground config plugin hooks rasterizer gaussians",
     "compat": "ground gaussians rasterizer",
     "attach": "ground config plugin hooks (priors) captures gaussians rasterizer compat",

@@ -46,8 +46,9 @@ def launch(options: argparse.Namespace, command: Sequence[str]) -> Session | Non
         raise D2Error(f"no script at {script}: give the repository's train.py and its arguments after --")
     _check_device(options.cpu)
     sys.argv = list(command)
-    sys.path.insert(0, str(script.resolve().parent))
     found = recipe(options.repository)
+    folder = script.resolve().parent
+    sys.path[:0] = [str(folder), *(str(folder / name) for name in found.folders)]
     repair()
     stand_in_for(script.resolve(), {original.name for original in found.originals})
     provide(found.originals, script.parent, options.cpu)

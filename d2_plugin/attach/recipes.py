@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from d2_plugin import registry
@@ -22,6 +23,8 @@ class Objects:
     """What `training_setup` was given: the optimization parameters."""
     scene: Any = None
     deform: Any = None
+    given: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = field(default_factory=dict)
+    """By the name of the field, what its instance was made from: arguments, and named ones."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,16 @@ class Recipe:
     """Name among the entry points `d2_plugin.adapters`."""
     build: Callable[[Adapter, Objects], Backbone]
     originals: tuple[Original, ...]
-    model: tuple[str, str] = ("scene.gaussian_model", "GaussianModel")
-    renderer: tuple[str, str] = ("gaussian_renderer", "render")
+    models: tuple[tuple[str, str], ...] = (("scene.gaussian_model", "GaussianModel"),)
+    """Classes that the repository may train, where they are imported from."""
+    renderers: tuple[tuple[str, str], ...] = (("gaussian_renderer", "render"),)
+    """Functions that draw a training view."""
+    script: str = "train.py"
+    """What trains, relative to the repository."""
+    folders: tuple[str, ...] = ()
+    """Folders below the script's that it puts on the path itself."""
+    averages_gradients: bool = False
+    """Whether the trainer divides the gradients of a batch afterwards, instead of each loss before."""
     heard: Callable[[Any, Mapping[str, Any]], None] | None = None
     """Hands the adapter what it needs from the named arguments of each render."""
     seen: dict[str, tuple[str, str]] = field(default_factory=lambda: {"scene": ("scene", "Scene")})
@@ -71,6 +82,24 @@ def _hear_stage(adapter: Any, named: Mapping[str, Any]) -> None:
     if "stage" in named:
         adapter.enter_stage(named["stage"])
 
+
+def _spacetime(adapter: Adapter, objects: Objects) -> Backbone:
+    """Its Scene is told the number of frames, and the folder colmap_N says the first of them."""
+    (dataset, *_), named = objects.given["scene"]
+    first = Path(dataset.source_path).name.split("_")[1:2]
+    number = int(first[0]) if first and first[0].isdigit() else 0
+    return adapter(objects.model, int(named["duration"]), first_frame=number)
+
+
+def _ex4dgs(adapter: Adapter, objects: Objects) -> Backbone:
+    dataset = objects.given["scene"][0][0]
+    return adapter(objects.model, near=dataset.near, far=dataset.far)
+
+
+_SPLATTING = "thirdparty.gaussian_splatting"
+_STG_RASTERIZERS = tuple(
+    Original(f"diff_gaussian_rasterization_{kind}", "d2_plugin.compat.spacetime") for kind in ("ch3", "ch9")
+)
 
 RECIPES = {
     "fudan": Recipe(
@@ -105,6 +134,22 @@ RECIPES = {
         _hust4d,
         (Original("diff_gaussian_rasterization", "d2_plugin.compat.depth"), _KNN),
         heard=_hear_stage,
+    ),
+    "spacetime": Recipe(
+        "spacetime",
+        _spacetime,
+        (*_STG_RASTERIZERS, _KNN),
+        models=tuple((f"{_SPLATTING}.scene.{kind}", "GaussianModel") for kind in ("oursfull", "ourslite")),
+        renderers=tuple((f"{_SPLATTING}.renderer", f"train_{kind}") for kind in ("ours_full", "ours_lite")),
+        seen={"scene": (f"{_SPLATTING}.scene", "Scene")},
+        folders=("thirdparty/gaussian_splatting",),
+        averages_gradients=True,
+    ),
+    "ex4dgs": Recipe(
+        "ex4dgs",
+        _ex4dgs,
+        (Original("diff_gaussian_rasterization_df", "d2_plugin.compat.ex4dgs"), _KNN),
+        models=(("scene.c_gaussian_model", "CGaussianModel"),),
     ),
 }
 

@@ -65,12 +65,13 @@ class Session:
         """Override the choke points of the repository's modules; call before its script runs."""
         for name, place in self.recipe.seen.items():
             self._remember(_found(*place), name)
-        model = _found(*self.recipe.model)
-        model.training_setup = self._attaching(model.training_setup)
-        if hasattr(model, "update_learning_rate"):
-            model.update_learning_rate = self._listening(model.update_learning_rate)
-        module, attribute = self.recipe.renderer
-        setattr(importlib.import_module(module), attribute, self._rendering(_found(module, attribute)))
+        for place in self.recipe.models:
+            model = _found(*place)
+            model.training_setup = self._attaching(model.training_setup)
+            if hasattr(model, "update_learning_rate"):
+                model.update_learning_rate = self._listening(model.update_learning_rate)
+        for module, attribute in self.recipe.renderers:
+            setattr(importlib.import_module(module), attribute, self._rendering(_found(module, attribute)))
 
     def summary(self) -> str:
         """What D2 did, in one line."""
@@ -92,6 +93,7 @@ class Session:
         def remembering(instance: Any, *arguments: Any, **named: Any) -> None:
             # Before the call: a scene builds its model inside, and may be asked for before it returns.
             setattr(self.objects, name, instance)
+            self.objects.given[name] = arguments, named
             original(instance, *arguments, **named)
 
         kind.__init__ = remembering  # type: ignore[misc]  # a foreign class, overridden for all its instances
@@ -113,7 +115,18 @@ class Session:
 
     def _configured(self, iterations: int | None) -> D2Config:
         config = self.config if isinstance(self.config, D2Config) else D2Config.from_toml(self.config, iterations)
-        return config if self.exported is None else replace(config, exported=str(self.exported))
+        exported = self.exported or self._export_read(config)
+        return config if exported is None else replace(config, exported=str(exported))
+
+    def _export_read(self, config: D2Config) -> Path | None:
+        """The export of the prior's capture that the trainer reads, by the folder that its Scene was given."""
+        arguments, _ = self.objects.given.get("scene", ((), {}))
+        source = getattr(arguments[0], "source_path", None) if arguments else None
+        if source is None or config.prior is None or config.exported is not None or self.store is not None:
+            return None
+        from d2_plugin.priors.disk.exported import export_read
+
+        return export_read(Path(config.prior), Path(source))
 
     def _listening(self, update_learning_rate: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(update_learning_rate)
@@ -144,7 +157,8 @@ class Session:
         view = rendered(camera, package) if rendered is not None else camera
         term = hooks.loss(self._iteration, [view])
         if self._batch and isinstance(term, Tensor) and term.requires_grad:
-            return {**package, "render": AddGradient.apply(package["render"], term, 1 / self._batch)}
+            weight = 1.0 if self.recipe.averages_gradients else 1 / self._batch
+            return {**package, "render": AddGradient.apply(package["render"], term, weight)}
         return package
 
     def _watch(self, optimizer: torch.optim.Optimizer) -> None:

@@ -1,4 +1,7 @@
-"""What is installed and what is missing for which feature; of a recording, what it lacks."""
+"""What is installed and what is missing for which feature; of a recording, what it lacks.
+
+With --attach REPOSITORY PATH: what that trainer imports and this environment lacks, and how to get it.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from typing import Annotated
 
 from d2_plugin import __version__, compiler, prebuilt, registry
 from d2_plugin.commands.arguments.form import Form
+from d2_plugin.errors import D2Error
 from d2_plugin.settings import Positional, Settings
 
 OPTIONAL = {
@@ -27,25 +31,34 @@ OPTIONAL = {
 
 
 @dataclass(frozen=True)
-class DoctorSettings(Settings):
-    """What is examined."""
+class Doctor(Settings):
+    """What to look at: this installation, a recording, or what a trainer needs beside it."""
 
-    capture: Annotated[Path | None, Positional()] = None
-    """A recording: what it has and what it lacks. Without one, what is installed."""
+    path: Annotated[Path | None, Positional()] = None
+    """A recording; with --attach the folder of a trainer's repository, or its script. Without one: what is installed."""
+    attach: str | None = None
+    """Name of the repository, as the launcher knows it."""
 
 
 def form(words: list[str]) -> Form:
     """What `d2 doctor` takes."""
+    return Form.of("d2 doctor", __doc__, Doctor, run)
 
-    def run(settings: DoctorSettings) -> str:
-        if settings.capture is None:
-            return report()
-        from d2_plugin.captures import open_capture
-        from d2_plugin.captures.checks.lacking import lacking_text
 
-        return lacking_text(open_capture(settings.capture))
+def run(settings: Doctor) -> str:
+    """The report on this installation, on a recording, or on what a trainer needs."""
+    if settings.attach is not None:
+        if settings.path is None:
+            raise D2Error("a trainer is examined by both its name and its folder: d2 doctor --attach fudan FOLDER")
+        from d2_plugin.attach.needs import needs
 
-    return Form.of("d2 doctor", __doc__, DoctorSettings, run)
+        return needs(settings.attach, settings.path)
+    if settings.path is None:
+        return report()
+    from d2_plugin.captures import open_capture
+    from d2_plugin.captures.checks.lacking import lacking_text
+
+    return lacking_text(open_capture(settings.path))
 
 
 def report() -> str:

@@ -43,6 +43,7 @@ def draw(
     means2D: Tensor | None,
     count: int,
     absolute: Tensor | None = None,
+    constants: RasterSettings = SETTINGS,
 ) -> Drawn:
     """Composite `splats`, which are rows `splats.rows` of `count` Gaussians.
 
@@ -55,20 +56,23 @@ def draw(
             times half the image's size: the unit that `densify_grad_threshold` is in. Its values are not used.
         count: N.
         absolute: [N, 3]; receives the sum over pixels of absolute gradients in the same unit (`absolute.py`).
+        constants: those of the variant's rasterizer, where they are not Inria's.
     """
     view = view_of(settings)
     offsets = None
     if means2D is not None and means2D.requires_grad:
         chosen = means2D[splats.rows, :2]
         offsets = (chosen - chosen.detach()) * chosen.new_tensor([0.5 * view.width, 0.5 * view.height])
-    image = rasterize(splats, colors, view, SETTINGS, background=background.to(colors), screen_offsets=offsets)
+    background = background.to(colors)[: colors.shape[1]]  # SpacetimeGaussians gives nine values for three channels
+    image = rasterize(splats, colors, view, constants, background=background, screen_offsets=offsets)
     color = image.color
     if absolute is not None and absolute.requires_grad:
-        drawing = Drawing(Splats(*(field.detach() for field in splats)), colors.detach(), view, SETTINGS)
+        drawing = Drawing(Splats(*(field.detach() for field in splats)), colors.detach(), view, constants)
         color = WithAbsoluteGradient.apply(color, absolute, drawing)
     radii = torch.zeros(count, dtype=torch.int32, device=splats.means.device)
-    radii[splats.rows] = screen_radii(splats, view)
-    return Drawn(color.permute(2, 0, 1), image.depth_sum[None], image.alpha[None], radii)
+    radii[splats.rows] = screen_radii(splats, view, constants)
+    # Contiguous, as the originals': trainers call .view on the picture.
+    return Drawn(color.permute(2, 0, 1).contiguous(), image.depth_sum[None], image.alpha[None], radii)
 
 
 def view_of(settings: Any) -> View:
@@ -124,13 +128,13 @@ def harmonics(means: Tensor, camera_centre: Tensor, degree: int) -> Tensor:
 
 
 @torch.no_grad()
-def screen_radii(splats: Splats, view: View) -> Tensor:
+def screen_radii(splats: Splats, view: View, constants: RasterSettings = SETTINGS) -> Tensor:
     """Inria's radii [M] int32: three standard deviations along the longer axis, 0 where no tile is touched."""
     forward = view.T_camera_world[2].to(splats.means)
     depths = splats.means @ forward[:3] + forward[3]
-    front = (depths > SETTINGS.near).nonzero()[:, 0]
+    front = (depths > constants.near).nonzero()[:, 0]
     part = Splats(*(field[front] for field in splats))
-    screen = project(part, view, SETTINGS)
+    screen = project(part, view, constants)
     middle = 0.5 * (screen.variance_x + screen.variance_y)
     determinant = screen.variance_x_given_y * screen.variance_y
     radii = torch.ceil(3 * (middle + (middle.square() - determinant).clamp(min=0.1).sqrt()).sqrt())

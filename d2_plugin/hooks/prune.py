@@ -42,6 +42,12 @@ class PruneConfig(HookConfig):
     One seed, 2000 steps, 500 samples in a view: plaza 22.24 dB without, 22.49 with and 11 % fewer Gaussians; studio
     31.74 dB without, 31.65 with."""
 
+    light: Share = 0.05
+    """Largest share of the light in the surveyed views that one evaluation takes away: the faintest go first, the rest
+    waits with its evidence for the next. 1 sets no limit, as the paper. What a random start has in front of every
+    surface, removed at once, leaves holes. Studio at 80x45 with the rates of Deformable-3D-Gaussians, 300 steps, one
+    seed: 26.5 dB before the first removal, 13.8 after and 25.9 at the end without a limit; 26.3 and 28.3 at .05."""
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if abs(self.lambda_e + self.lambda_o - 1) > 1e-9:
@@ -96,6 +102,18 @@ def gather(evaluation: Sequence[Surveyed], count: int, free_space: bool) -> tupl
     return error, weight, maxima, observations
 
 
+def within_light(remove: Tensor, weight: Tensor, share: float) -> Tensor:
+    """Of the rows of `remove` [N], the faintest that together carry at most `share` of all `weight` [N]; at least one,
+    so that a bright floater that is alone goes, too."""
+    if share >= 1 or not remove.any():
+        return remove
+    rows = torch.nonzero(remove).squeeze(1)
+    rows = rows[torch.argsort(weight[rows], stable=True)]
+    taken = torch.cumsum(weight[rows].double(), 0) <= share * weight.sum(dtype=torch.float64)
+    taken[0] = True
+    return torch.zeros_like(remove).index_fill(0, rows[taken], True)
+
+
 class Prune(Hook):
     """Removes Gaussians whose score stays above tau_p in consecutive evaluations with evidence."""
 
@@ -119,7 +137,7 @@ class Prune(Hook):
             self.streak = torch.zeros(count, dtype=torch.int64, device=weight.device)
         updated = torch.where(high, self.streak + 1, torch.zeros_like(self.streak))
         self.streak = torch.where(weight > 0, updated, self.streak)
-        remove = self.streak >= config.patience
+        remove = within_light(self.streak >= config.patience, weight, config.light)
         return Edit(remove=remove) if remove.any() else None
 
     def follow(self, index: Tensor) -> None:

@@ -167,7 +167,7 @@ def test_what_a_layout_cannot_hold_is_refused_by_camera(uneven: Capture, layout:
 
 
 def test_mistakes_are_one_sentence(original: Capture, tmp_path: Path) -> None:
-    with pytest.raises(D2Error, match="unknown layout 'blender': have colmap, multipleview, n3dv, transforms"):
+    with pytest.raises(D2Error, match="unknown layout 'blender': have colmap, colmap_frames, multipleview, n3dv"):
         export_capture(original, "blender", tmp_path / "a")
     with pytest.raises(D2Error, match="all cameras of .* are held out"):
         export_capture(original, "colmap", tmp_path / "a", test_cameras=list(original.cameras))
@@ -189,3 +189,32 @@ def test_the_command_writes_points_and_says_where(tmp_path: Path, capsys) -> Non
     assert (list(content["cameras"]), content["test_cameras"]) == (["00", "02", "01"], ["01"])
     header = (tmp_path / "scene" / "points3d.ply").read_bytes().split(b"end_header")[0].decode()
     assert int(header.split("element vertex ")[1].split()[0]) >= 50
+
+
+class TestColmapFrames:
+    """What the readers of SpacetimeGaussians and Ex4DGS open, file by file (their dataset_readers.py)."""
+
+    def test_every_instant_is_a_model_and_the_held_out_camera_is_cam00(self, tmp_path: Path) -> None:
+        capture = smooth_capture(("05", "07", "11"), frames=3, width=32, height=24)
+        folder = export_capture(capture, "colmap_frames", tmp_path / "data", test_cameras=["07"], cloud=CLOUD)
+        assert names_of(folder) == {"07": "cam00", "05": "cam01", "11": "cam02"}
+        assert np.load(folder / "poses_bounds.npy").shape == (3, 17)
+        for index in range(3):
+            model = folder / f"colmap_{index}" / "sparse" / "0"
+            registered = sorted(image.name for image in read_model(model).images.values())
+            assert registered == ["cam00.png", "cam01.png", "cam02.png"]
+            assert len(read_points(model).positions) == len(CLOUD.positions)
+            linked = folder / f"colmap_{index}" / "images" / "cam01.png"
+            assert linked.read_bytes() == (folder / "cam01" / f"{index}.png").read_bytes()
+
+    def test_without_a_held_out_camera_nothing_is_called_cam00(self, tmp_path: Path) -> None:
+        capture = smooth_capture(("05", "07"), frames=1, width=32, height=24)
+        assert set(names_of(export_capture(capture, "colmap_frames", tmp_path / "d", cloud=CLOUD)).values()) == {
+            "cam01",
+            "cam02",
+        }
+
+    def test_two_held_out_cameras_are_refused_since_one_would_be_trained_on(self, tmp_path: Path) -> None:
+        capture = smooth_capture(("05", "07", "11"), frames=1, width=32, height=24)
+        with pytest.raises(D2Error, match="hold out one camera, got 05, 07"):
+            export_capture(capture, "colmap_frames", tmp_path / "d", test_cameras=["05", "07"], cloud=CLOUD)

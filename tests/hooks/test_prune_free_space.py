@@ -28,7 +28,7 @@ from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Label, RasterSettings, Splats, View
 from d2_plugin.rasterizer import rasterize
 
-EVERY_ONE = PruneConfig(patience=1)
+EVERY_ONE = PruneConfig(patience=1, light=1)
 
 
 class Fixed:
@@ -173,14 +173,14 @@ def removed(hook: Prune, prior: DepthPrior) -> set[str]:
 
 
 def test_what_floats_in_free_space_goes_after_patience_and_a_surface_never() -> None:
-    hook = Prune(PruneConfig(patience=3))
+    hook = Prune(PruneConfig(patience=3, light=1))
     assert [removed(hook, bands()) for _ in range(5)] == [set(), set(), FLOATING, FLOATING, FLOATING]
 
 
 def test_without_the_term_only_the_papers_evidence_counts() -> None:
-    hook = Prune(PruneConfig(patience=3, free_space=False))
+    hook = Prune(PruneConfig(patience=3, free_space=False, light=1))
     assert [removed(hook, bands()) for _ in range(4)] == [set(), set(), {"before the surface"}, {"before the surface"}]
-    with_term = Prune(PruneConfig(patience=1))
+    with_term = Prune(PruneConfig(patience=1, light=1))
     assert removed(with_term, bands()._replace(sigma=None)) == {"before the surface"}
 
 
@@ -201,7 +201,7 @@ def test_the_sums_are_those_of_the_two_kinds_of_evidence() -> None:
 
 
 def test_streaks_of_free_space_follow_their_gaussians_and_are_saved() -> None:
-    hook, resumed = Prune(PruneConfig(patience=3)), Prune(PruneConfig(patience=3))
+    hook, resumed = Prune(PruneConfig(patience=3, light=1)), Prune(PruneConfig(patience=3, light=1))
     for _ in range(2):
         removed(hook, bands())
     streaks = [2 * (name in FLOATING) for name in CAST]
@@ -216,7 +216,7 @@ def test_far_pixels_alone_reach_the_hook_through_the_plugin() -> None:
     """A prior of sky alone removes translucent Gaussians before it, through D2Hooks and a real backbone."""
     everywhere = torch.full((HEIGHT, WIDTH), int(Label.FAR), dtype=torch.uint8)
     sky = DepthPrior(torch.full((HEIGHT, WIDTH), 50.0), everywhere, sigma=torch.full((HEIGHT, WIDTH), torch.inf))
-    config = replace(ALL_HOOKS, densify=None, depth_loss=None, prune=PruneConfig(start=1, every=1, patience=1))
+    config = replace(ALL_HOOKS, densify=None, depth_loss=None, prune=PruneConfig(start=1, every=1, patience=1, light=1))
     left = {}
     for free_space in (True, False):
         model = make_model()

@@ -134,11 +134,11 @@ def make() -> tuple[GaussianModel, Scene]:
 def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
     opt = opt or default_options()
     if checkpoint is None:
-        scene_reconstruction(gaussians, scene, "coarse", opt, None, min(20, stop))
-    return scene_reconstruction(gaussians, scene, "fine", opt, checkpoint, stop)
+        scene_reconstruction(gaussians, scene, "coarse", opt, None, min(20, stop), 20)
+    return scene_reconstruction(gaussians, scene, "fine", opt, checkpoint, stop, opt.iterations)
 
 
-def scene_reconstruction(gaussians, scene, stage, opt, checkpoint, stop) -> SimpleNamespace:
+def scene_reconstruction(gaussians, scene, stage, opt, checkpoint, stop, train_iter) -> SimpleNamespace:
     dataset, first_iter = SimpleNamespace(white_background=False), 0
     gaussians.training_setup(opt)
     if checkpoint:
@@ -146,7 +146,7 @@ def scene_reconstruction(gaussians, scene, stage, opt, checkpoint, stop) -> Simp
         gaussians.restore(model_params, opt)
 
     bg_color = [1, 1, 1] if dataset.white_background else [0, 0, 0]
-    for iteration in range(first_iter + 1, min(opt.iterations, stop) + 1):
+    for iteration in range(first_iter + 1, min(train_iter, stop) + 1):
         torch.manual_seed(iteration)
         stack = scene.getTrainCameras()
         viewpoint_cams = [stack[i] for i in shuffled(len(stack), iteration)[: opt.batch_size]]

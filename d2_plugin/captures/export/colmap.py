@@ -23,7 +23,7 @@ JPEG_QUALITY = 98
 """Of the pictures that 4DGaussians insists to be JPEG."""
 
 
-class _Picture(NamedTuple):
+class Picture(NamedTuple):
     """A registered picture: its file name and the number and calibration of its camera."""
 
     name: str
@@ -41,10 +41,10 @@ def write_colmap(export: Export) -> Written:
     export.write_pictures(lambda camera, frame: export.folder / "images" / f"{camera}_{frame:04d}.png")
     first = capture.frames[0]
     pictures = [
-        _Picture(f"{name}_{first:04d}.png", index + 1, camera)
+        Picture(f"{name}_{first:04d}.png", index + 1, camera)
         for index, (name, camera) in enumerate(capture.cameras.items())
     ]
-    _write_model(export.folder / "sparse" / "0", pictures, export.cloud)
+    write_model(export.folder / "sparse" / "0", pictures, export.cloud)
     if export.cloud is not None:
         write_point_cloud(export.folder / "sparse" / "0" / "points3D.ply", export.cloud)
     return export.written()
@@ -67,15 +67,15 @@ def write_multipleview(export: Export) -> Written:
         for index, frame in enumerate(export.capture.frames):
             _write_jpeg(export.folder / names[name] / f"frame_{index + 1:05d}.jpg", export.capture.image(name, frame))
     # Its reader takes the digits behind the fifth letter of a picture's name for the number of the camera.
-    pictures = [_Picture(f"image{index + 1}.jpg", index + 1, camera) for index, camera in enumerate(kept.values())]
-    _write_model(export.folder / "sparse_", pictures, export.cloud)
+    pictures = [Picture(f"image{index + 1}.jpg", index + 1, camera) for index, camera in enumerate(kept.values())]
+    write_model(export.folder / "sparse_", pictures, export.cloud)
     rows = [llff_row(camera, depth_bounds(camera, export.cloud)) for camera in kept.values()]
     np.save(export.folder / "poses_bounds_multipleview.npy", np.stack(rows))
     write_point_cloud(export.folder / "points3D_multipleview.ply", export.cloud)
     return export.written(names, {frame: index + 1 for index, frame in enumerate(export.capture.frames)})
 
 
-def _write_model(folder: Path, pictures: list[_Picture], cloud: PointCloud | None) -> None:
+def write_model(folder: Path, pictures: list[Picture], cloud: PointCloud | None) -> None:
     """cameras.bin, images.bin and points3D.bin; pictures have no observations and points no tracks."""
     folder.mkdir(parents=True)
     cameras = {picture.number: picture.camera for picture in pictures}
@@ -92,7 +92,7 @@ def _camera_record(number: int, camera: Camera) -> bytes:
     return struct.pack("<iiQQ4d", number, PINHOLE, camera.width, camera.height, *intrinsics)
 
 
-def _image_record(identity: int, picture: _Picture) -> bytes:
+def _image_record(identity: int, picture: Picture) -> bytes:
     pose = picture.camera.T_camera_world
     head = struct.pack("<I7dI", identity, *quaternion_of_rotation(pose[:3, :3]), *pose[:3, 3], picture.number)
     return head + picture.name.encode() + b"\0" + struct.pack("<Q", 0)

@@ -4,6 +4,7 @@
     n3dv         ingra14m/Deformable-3D-Gaussians: poses_bounds.npy, frames/, points3D.ply
     multipleview hustvl/4DGaussians, its layout for own recordings: sparse_/, camNN/frame_NNNNN.jpg
     colmap       everything that reads a COLMAP model: sparse/0, images/
+    colmap_frames oppo-us-research/SpacetimeGaussians, juno181/Ex4DGS: colmap_N/ folders, camNN/N.png
 
 `export.json` beside the pictures says which camera and which frame of the source became which of the export.
 """
@@ -19,6 +20,7 @@ import numpy as np
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.export.base import Export, Written, refuse_skew, whole_folder
 from d2_plugin.captures.export.colmap import write_colmap, write_multipleview
+from d2_plugin.captures.export.colmap_frames import write_colmap_frames
 from d2_plugin.captures.export.n3dv import write_n3dv
 from d2_plugin.captures.export.ply import PointCloud
 from d2_plugin.captures.export.transforms_json import write_transforms
@@ -35,6 +37,7 @@ WRITERS: dict[str, Writer] = {
     "n3dv": write_n3dv,
     "multipleview": write_multipleview,
     "colmap": write_colmap,
+    "colmap_frames": write_colmap_frames,
 }
 """By the name of the layout. A new layout is one module beside this one and one row here."""
 

@@ -80,6 +80,14 @@ def renamed_by(store: Any, picture: str | None) -> Any:
     return RenamedStore.of_export(store, folder)
 
 
+def export_read(prior: Path, source: Path) -> Path | None:
+    """The export in which a trainer's `source` lies, if the priors are those of its capture."""
+    folder = export_above(str(source / "picture"))
+    if folder is None or not (prior / "store.json").is_file():
+        return None
+    return folder if is_source_of(PriorStore.described(prior), folder) else None
+
+
 def export_above(picture: str) -> Path | None:
     """The folder with an `export.json` that a picture lies in, at most three folders below it."""
     parents = list(Path(picture).parents)[:3]

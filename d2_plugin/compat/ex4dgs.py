@@ -1,0 +1,115 @@
+"""`diff_gaussian_rasterization_df` of juno181/Ex4DGS: another blur, depth over alpha, and a flow that carries errors.
+
+Footprints are blurred by `kernel_size`, and opacities are lowered by what the blur spreads (Mip-Splatting); Gaussians
+are drawn between `min_depth` and `max_depth` and within 1.3 half pictures of the centre. The trainer registers a hook
+on the flow that replaces its gradient by pictures of errors, whose sums per Gaussian then arrive at `dir3D`: no
+gradient of the flow may therefore reach anything else, as in the original.
+
+What differs: the gradients of depth and acc are the true ones (backward.cu:596 has a sign reversed, and the trainer
+uses neither), and the index of the strongest Gaussian of each pixel, which the trainer never reads, is -1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from d2_plugin.protocol import Splats
+from d2_plugin.rasterizer import rasterize
+
+from .inria import SETTINGS, colors_of, covariances_of, draw, exactly_one, given, in_front, shape_given, view_of
+
+FRUSTUM = 1.3
+"""Gaussians whose centre projects beyond this multiple of the half picture are not drawn (auxiliary.h, in_frustum)."""
+
+
+class GaussianRasterizationSettings(NamedTuple):
+    """The camera and constants of one image, as in the original; matrices act on row vectors."""
+
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    kernel_size: float
+    subpixel_offset: Tensor
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool = False
+    min_depth: float = 0.2
+    max_depth: float = 100.0
+    debug: bool = False
+
+
+class GaussianRasterizer(nn.Module):
+    """The original's module: construct it with settings for every image, call it with the Gaussians."""
+
+    def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
+        super().__init__()
+        self.raster_settings = raster_settings
+
+    def markVisible(self, positions: Tensor) -> Tensor:
+        """bool [N]: which positions [N, 3] lie before the near plane."""
+        return in_front(positions, self.raster_settings.viewmatrix)
+
+    def forward(
+        self,
+        means3D: Tensor,
+        means2D: Tensor,
+        dir3D: Tensor | None,
+        opacities: Tensor,
+        shs: Tensor | None = None,
+        colors_precomp: Tensor | None = None,
+        scales: Tensor | None = None,
+        rotations: Tensor | None = None,
+        cov3D_precomp: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:
+        """Color [3, H, W], radii [N] int32, depth [1, H, W], flow [3, H, W], acc [1, H, W] and indices [1, H, W]."""
+        settings = self.raster_settings
+        exactly_one("shs or colors_precomp", shs, colors_precomp)
+        shape_given(scales, rotations, cov3D_precomp)
+        rows = torch.nonzero(self._in_frustum(means3D.detach())).squeeze(-1)
+        if cov3D_precomp is None:
+            shape = given(scales, "scales")[rows], given(rotations, "rotations")[rows]
+            covariances = covariances_of(*shape, settings.scale_modifier)
+        else:
+            covariances = cov3D_precomp[rows]
+        if colors_precomp is None:
+            colors = colors_of(given(shs, "shs")[rows], settings.sh_degree, means3D[rows], settings.campos)
+        else:
+            colors = colors_precomp[rows]
+        splats = Splats(means3D[rows], covariances, opacities.squeeze(-1)[rows], rows)
+        return self._outputs(splats, colors, means2D, dir3D, len(means3D))
+
+    def _outputs(
+        self, splats: Splats, colors: Tensor, means2D: Tensor, dir3D: Tensor | None, count: int
+    ) -> tuple[Tensor, ...]:
+        settings = self.raster_settings
+        constants = replace(
+            SETTINGS, near=float(settings.min_depth), blur=float(settings.kernel_size), antialiased=True
+        )
+        drawn = draw(settings, splats, colors, settings.bg, means2D, count, constants=constants)
+        weighed, acc = drawn.alpha > 0, drawn.alpha.clamp_min(torch.finfo(drawn.alpha.dtype).tiny)
+        depth = torch.where(weighed, drawn.depth / acc, settings.max_depth)
+        flow = drawn.color.new_zeros(3, settings.image_height, settings.image_width)
+        if dir3D is not None:
+            still = Splats(*(field.detach() for field in splats))
+            sums = rasterize(still, dir3D[splats.rows], view_of(settings), constants).color.permute(2, 0, 1)
+            flow = torch.where(weighed, sums / acc.detach(), 0.0).contiguous()
+        nobody = torch.full_like(drawn.alpha, -1, dtype=torch.int32)
+        return drawn.color, drawn.radii, depth, flow, drawn.alpha, nobody
+
+    def _in_frustum(self, means: Tensor) -> Tensor:
+        settings = self.raster_settings
+        points = torch.cat([means, torch.ones_like(means[:, :1])], 1)
+        depths = (points @ settings.viewmatrix.to(means))[:, 2]
+        projected = points @ settings.projmatrix.to(means)
+        screen = projected[:, :2] / (projected[:, 3:] + 1e-7)
+        inside = (screen.abs() <= FRUSTUM).all(-1)
+        return inside & (depths > settings.min_depth) & (depths <= settings.max_depth)

@@ -1,0 +1,139 @@
+"""The rasterizers of SpacetimeGaussians and Ex4DGS, and torchvision, mmcv: what stands in for them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from mimics.ex4dgs import opacity_compensation
+from mimics.inria import Camera
+from rasterizer_arguments import inria_camera
+from splat_scenes import random_scene
+
+from d2_plugin.compat import depth, ex4dgs, spacetime, vision
+from d2_plugin.compat.knn import knn
+from d2_plugin.compat.python_config import Config
+from d2_plugin.protocol import RasterSettings, Splats
+from d2_plugin.rasterizer import reference
+
+
+@pytest.fixture
+def scene():
+    return random_scene(3, 40, 24, 16)
+
+
+@pytest.fixture
+def camera(scene) -> dict:
+    return inria_camera(scene.view)
+
+
+def test_pictures_are_contiguous(camera: dict, scene) -> None:
+    """A permuted one breaks `.view(-1)`, which trainers call."""
+    raster = depth.GaussianRasterizer(depth.GaussianRasterizationSettings(**camera))
+    given = {"means3D": scene.means, "opacities": scene.opacities[:, None], "means2D": torch.zeros(40, 3)}
+    color = raster(**given, colors_precomp=scene.colors, cov3D_precomp=scene.covariances)[0]
+    assert color.is_contiguous()
+    assert color.view(-1).shape == (3 * 24 * 16,)
+
+
+class TestSpacetime:
+    @pytest.mark.parametrize("channels", [3, 9])
+    def test_draws_as_many_channels_as_there_are_on_the_reference(self, camera: dict, scene, channels: int) -> None:
+        """The lite trainer gives nine background values for three channels (train.py:90)."""
+        colors = torch.rand(40, channels, generator=torch.Generator().manual_seed(1)).to(scene.means)
+        raster = spacetime.GaussianRasterizer(
+            spacetime.GaussianRasterizationSettings(**{**camera, "bg": torch.zeros(9)}),
+        )
+        color, radii, depths = raster(
+            means3D=scene.means, means2D=torch.zeros(40, 3), opacities=scene.opacities[:, None],
+            colors_precomp=colors, cov3D_precomp=scene.covariances,
+        )  # fmt: skip
+        splats = Splats(*(value.double() for value in scene.splats[:3]), scene.splats.rows)
+        expected = reference.rasterize(splats, colors.double(), scene.view, RasterSettings())
+        torch.testing.assert_close(color.double(), expected.color.permute(2, 0, 1), atol=1e-5, rtol=1e-5)
+        seen = expected.alpha > 0.5
+        assert seen.any()
+        assert not seen.all()
+        assert (depths[0][~seen] == 15.0).all()
+        mean = (expected.depth_sum / expected.alpha)[seen]
+        torch.testing.assert_close(depths[0][seen].double(), mean, atol=1e-4, rtol=1e-4)
+        assert not depths.requires_grad
+        assert radii.shape == (40,)
+
+
+class TestEx4DGS:
+    KERNEL = 0.1
+
+    def drawn(self, camera: dict, scene, dir3D=None, **changed):
+        known = {key: value for key, value in camera.items() if key not in ("antialiasing", "debug")}
+        settings = ex4dgs.GaussianRasterizationSettings(
+            **known, kernel_size=self.KERNEL, subpixel_offset=torch.zeros(16, 24, 2), max_depth=100.0, **changed
+        )
+        return ex4dgs.GaussianRasterizer(settings)(
+            means3D=scene.means, means2D=torch.zeros(40, 3), dir3D=dir3D, opacities=scene.opacities[:, None],
+            colors_precomp=scene.colors, cov3D_precomp=scene.covariances,
+        )  # fmt: skip
+
+    def test_is_the_reference_with_compensated_opacities(self, camera: dict, scene) -> None:
+        color, _, depths, flow, acc, _ = self.drawn({**camera, "bg": torch.zeros(3)}, scene)
+        view = scene.view
+        stand = Camera(view, torch.zeros(16, 24, 3))
+        means, covariances = scene.means.float(), scene.covariances.float()
+        projected = torch.cat([means, torch.ones(40, 1)], 1) @ stand.full_proj_transform
+        inside = (projected[:, :2] / projected[:, 3:]).abs().amax(1) <= 1.3
+        factor = opacity_compensation(means, covariances, stand, self.KERNEL).double() * inside
+        splats = Splats(
+            scene.means.double(), scene.covariances.double(), scene.opacities.double() * factor, scene.splats.rows
+        )
+        settings = replace(RasterSettings(), blur=self.KERNEL)
+        expected = reference.rasterize(splats, scene.colors.double(), view, settings)
+        torch.testing.assert_close(color.double(), expected.color.permute(2, 0, 1), atol=2e-3, rtol=1e-3)
+        covered = expected.alpha > 0.1
+        mean = (expected.depth_sum / expected.alpha)[covered]
+        torch.testing.assert_close(depths[0][covered].double(), mean, atol=1e-2, rtol=1e-2)
+        assert (depths[0][acc[0] == 0] == 100.0).all()
+        assert not flow.any()
+
+    def test_the_gradient_of_the_flow_reaches_the_directions_alone(self, camera: dict, scene) -> None:
+        """train.py:148 replaces it by errors, whose weighted sums it reads from `viewspace_l1points.grad`."""
+        scene.means.requires_grad_(True)
+        directions = torch.zeros(40, 3, dtype=scene.means.dtype, requires_grad=True)
+        _, _, _, flow, acc, _ = self.drawn(camera, scene, directions)
+        flow.register_hook(lambda gradient: acc.detach().expand(3, -1, -1).contiguous())
+        (flow.mean() * 0).backward()
+        assert scene.means.grad is None or not scene.means.grad.any()
+        total = directions.grad[:, 0].sum()  # sum over Gaussians of w acc / acc
+        torch.testing.assert_close(total, acc.sum().to(total), atol=1e-3, rtol=1e-3)
+
+
+class TestPackages:
+    def test_pictures_go_there_and_back(self, tmp_path: Path) -> None:
+        from PIL import Image
+
+        picture = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(0))
+        vision.save_image(picture, tmp_path / "a.png")
+        again = vision.ToTensor()(Image.open(tmp_path / "a.png"))
+        torch.testing.assert_close(again, picture, atol=0.5 / 255 + 1e-6, rtol=0)
+        grid = vision.make_grid([picture, picture], nrow=2)
+        assert grid.shape == (3, 5 + 4, 2 * (7 + 2) + 2)
+        assert torch.equal(grid[:, 2:7, 2:9], picture)
+        assert vision.resize(picture, (10, 14)).shape == (3, 10, 14)
+
+    def test_a_python_configuration_lies_over_its_base(self, tmp_path: Path) -> None:
+        (tmp_path / "base.py").write_text("A = dict(x=1, y=dict(z=2))\nB = 3\n")
+        (tmp_path / "own.py").write_text("import math\n_base_ = './base.py'\nA = dict(y=dict(w=math.pi))\n")
+        config = Config.fromfile(tmp_path / "own.py")
+        assert config["A"] == {"x": 1, "y": {"z": 2, "w": np.pi}}
+        assert config.A.y.z == 2
+        assert config.B == 3
+
+    def test_nearest_points_are_those_of_all_distances(self) -> None:
+        points = torch.rand(1, 50, 3, generator=torch.Generator().manual_seed(0))
+        found = knn(2, points, points, False)
+        distances = torch.cdist(points[0], points[0])
+        assert found.shape == (1, 2, 50)
+        assert torch.equal(found[0, 0].long(), torch.arange(50))
+        assert torch.equal(found[0, 1].long(), distances.fill_diagonal_(9).argmin(1))

@@ -1,0 +1,111 @@
+"""What a trainer imports and this environment lacks: found in its files, stood in for in memory, or asked for."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from d2_plugin.attach import cpu, packages, repairs
+from d2_plugin.attach.needs import needs
+from d2_plugin.attach.packages import STAND_INS, StandIn, missing, needed, stand_in_for
+from d2_plugin.errors import D2Error
+
+
+@pytest.fixture
+def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A repository in small, as SpacetimeGaussians lays it out: a folder that its script puts on the path."""
+    inner = tmp_path / "thirdparty" / "splatting"
+    (inner / "scene").mkdir(parents=True)
+    (inner / "scene" / "__init__.py").write_text("from utils.tools import thing\nimport absent_one.part as p\n")
+    (inner / "utils").mkdir()
+    (inner / "utils" / "tools.py").write_text("import numpy, os.path\nfrom absent_two import *\n")
+    waiting = "def later():\n    import absent_inside\ntry:\n    import absent_tried\nexcept ImportError:\n    pass\n"
+    (tmp_path / "train.py").write_text(f"import torch\nfrom thirdparty.splatting.scene import Scene\n{waiting}")
+    before = list(sys.meta_path)
+    yield tmp_path / "train.py"
+    sys.meta_path[:] = before
+    for name in [name for name in sys.modules if name.startswith("absent_")]:
+        del sys.modules[name]
+
+
+def test_what_a_script_needs_is_read_from_the_files_it_reaches(script: Path) -> None:
+    found = needed(script)
+    assert set(found) == {"torch", "numpy", "absent_one", "absent_two"}
+    assert found["absent_two"] == "thirdparty/splatting/utils/tools.py:2"
+    assert set(missing(script, {"absent_one.part"})) == {"absent_two"}
+
+
+def test_what_nothing_stands_in_for_is_one_sentence_with_the_command(script: Path) -> None:
+    sentence = r"absent_one \(thirdparty.*:2\), absent_two .*run `pip install absent_one absent_two`"
+    with pytest.raises(D2Error, match=sentence):
+        stand_in_for(script, set())
+
+
+def test_ours_takes_the_place_and_the_rest_says_so_when_it_is_called(script: Path, monkeypatch, caplog) -> None:
+    ours = StandIn({"absent_one.part.clamp": "torch:clamp"}, "it is made up")
+    monkeypatch.setitem(STAND_INS, "absent_one", ours)
+    monkeypatch.setitem(STAND_INS, "absent_two", StandIn({}, "it is made up"))
+    stand_in_for(script, set())
+    assert "absent_one is missing: D2 stands in for what training calls of it (it is made up)" in caplog.text
+    import absent_one
+    from absent_one.part import clamp
+    from absent_two.deeper import Anything
+
+    assert clamp is torch.clamp
+    assert absent_one.part.clamp is torch.clamp
+    with pytest.raises(D2Error, match="the trainer calls absent_two.deeper.Anything, and absent_two is missing"):
+        Anything(1)
+
+
+@pytest.mark.parametrize("name", sorted({target for row in STAND_INS.values() for target in row.provided.values()}))
+def test_every_row_of_the_table_leads_somewhere(name: str) -> None:
+    module, attribute = name.split(":")
+    __import__(module)
+    assert callable(getattr(sys.modules[module], attribute))
+
+
+def test_names_that_numpy_dropped_are_given_back(monkeypatch) -> None:
+    for name in repairs.NUMPY_NAMES.keys() & vars(np).keys():
+        monkeypatch.delattr(np, name)
+    said = repairs._numpy()
+    assert np.NaN is np.nan
+    assert "has no np.NaN" in said
+    assert repairs._numpy() is None
+
+
+def test_signed_bytes_become_a_picture(monkeypatch) -> None:
+    """As fudan hands them over (utils/data_utils.py:22)."""
+    image = pytest.importorskip("PIL.Image")
+    monkeypatch.setattr(image, "fromarray", image.fromarray)
+    repairs._pillow()
+    values = np.array([[[0, 127, 255]]], np.uint8)
+    assert np.array_equal(np.array(image.fromarray(values.view(np.int8), "RGB")), values)
+
+
+def test_the_number_of_a_gpu_is_the_cpu_too() -> None:
+    """Ex4DGS says torch.device(0) in safe_state; torch refuses that where there is no GPU."""
+    with cpu.CudaMeansCpu():
+        assert torch.device(0).type == "cpu"
+        assert torch.zeros(2, device=0).device.type == "cpu"
+        assert torch.zeros(2, device="cuda").device.type == "cpu"
+
+
+def test_the_doctor_lists_what_a_trainer_lacks(script: Path, monkeypatch) -> None:
+    monkeypatch.setitem(packages.STAND_INS, "absent_two", StandIn({}, "it is made up"))
+    report = needs("fudan", script.parent)
+    assert "absent_one" in report
+    assert "run `pip install absent_one`" in report
+    assert "the launcher stands in for it; it is made up" in report
+    assert "d2_plugin.compat.nearest" in report
+    assert report.splitlines()[-1] == "install what is missing: `pip install absent_one`"
+    with pytest.raises(D2Error, match="no train.py in .* give the folder of fudan's repository"):
+        needs("fudan", script.parent / "thirdparty")
+
+
+def test_logging_is_not_touched_by_importing(caplog) -> None:
+    assert logging.getLogger("d2_plugin.attach").handlers == []
