@@ -1,7 +1,7 @@
 """The diffs that pages in docs/attach print, and the lines of the files that they are for.
 
-Of those files only a checksum of each line is kept (tests/data/commits.json): enough to hold every line of context to its
-place in the named commit, and none of their text.
+Of those files only a checksum of each line is kept (tests/data/commits.json): enough to hold every line of context to
+its place in the named commit, and none of their text.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""FasterGS4D, gsplat's contrib.dynamic, Swift4D and CEM-4DGS, as mimics: attached by the printed lines, nothing lost."""
+"""FasterGS4D, gsplat's contrib.dynamic, Swift4D and CEM-4DGS, as mimics, attached by the printed lines."""
 
 from __future__ import annotations
 
@@ -247,7 +247,7 @@ class TestFasterGS4D:
 
 class TestSwift4D:
     def test_points_move_where_their_surroundings_move(self) -> None:
-        """The logit of the nearest Gaussian decides, and what moves is put where the field carries it onto the point."""
+        """The nearest logit decides, and what moves is put where the field carries it onto the point."""
         standing = swift()
         model, view = standing.model, standing.adapter.view(standing.cameras[0])
         placed = standing.adapter.slice_at(view).means.detach()

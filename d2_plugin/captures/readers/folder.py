@@ -10,7 +10,7 @@ monocular prediction: affine-invariant inverse depth, unless mono/mono.json says
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Optional, Union
 
 import numpy as np
 
@@ -71,12 +71,13 @@ def _calibrations(description: dict[str, Any], path: Path) -> dict[str, Camera]:
 def _calibration(entry: Any, bounds: dict[str, Any], path: Path) -> Camera:
     if not isinstance(entry, dict):
         raise D2Error(f"a camera in {path} cannot be understood ({shown(entry)} is no object): {CORRECT}")
-    name = str(field(entry, "name", str | int, f"a camera in {path}", CORRECT))
+    name = str(field(entry, "name", Union[str, int], f"a camera in {path}", CORRECT))  # noqa: UP007
     where = f"camera {name} in {path}"
     K = pinhole(*(field(entry, key, _NUMBER, where, CORRECT) for key in ("fx", "fy", "cx", "cy")))
     T = rigid(_numbers(entry, "R", (3, 3), where), _numbers(entry, "t", (3,), where))
     size = (field(entry, "width", int, where, CORRECT), field(entry, "height", int, where, CORRECT))
-    near_far = field(bounds, name, tuple[_NUMBER, _NUMBER] | None, f"bounds in {path}", CORRECT, default=None)
+    pair = Optional[tuple[_NUMBER, _NUMBER]]  # noqa: UP045  at run time, on Python 3.9 too
+    near_far = field(bounds, name, pair, f"bounds in {path}", CORRECT, default=None)
     return checked_camera(name, size, K, T, near_far, str(path))
 
 
