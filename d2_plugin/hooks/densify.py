@@ -127,7 +127,7 @@ class Densify(Hook):
                 inserted += [points] if len(points.positions) else []
         if not inserted:
             return None
-        return Edit(insert=Points(*(torch.cat(values) for values in zip(*inserted, strict=True))))
+        return Edit(insert=Points(*(torch.cat(values) for values in zip(*inserted))))
 
     def _propose(self, surveyed: Surveyed, earlier: list[Points], budget: int, generator: torch.Generator) -> Points:
         """New points of one view that no existing Gaussian and no point of an earlier view already stands for."""
