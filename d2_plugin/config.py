@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, make_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks.densify import DensifyConfig
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 else:  # one field per row of the table of hooks
     _HookTables = make_dataclass(
         "_HookTables",
-        [(name, row.config | None, None) for name, row in HOOKS.items()],
+        [(name, Optional[row.config], None) for name, row in HOOKS.items()],  # noqa: UP045  at run time, on Python 3.9 too
         bases=(Settings,),
         frozen=True,
         namespace={"__module__": __name__},

@@ -37,8 +37,11 @@ def backported_hints(kind: type) -> dict[str, Any]:
     for base in reversed(kind.__mro__):
         names = vars(sys.modules[base.__module__])
         for name, text in vars(base).get("__annotations__", {}).items():
-            reference = ForwardRef(text, is_argument=False) if isinstance(text, str) else text
-            found[name] = evaluated.eval_type_backport(reference, names, dict(vars(base)), try_default=False)
+            if isinstance(text, str):
+                reference = ForwardRef(text, is_argument=False)
+                found[name] = evaluated.eval_type_backport(reference, names, dict(vars(base)), try_default=False)
+            else:
+                found[name] = text  # made by make_dataclass
     return found
 
 

@@ -240,7 +240,7 @@ def _not_finite(values: Any, place: str = "") -> str | None:
     """Where in nested values the first number stands that is not finite."""
     if isinstance(values, float):
         return None if math.isfinite(values) else place or "its top"
-    if not isinstance(values, Mapping | list | tuple):
+    if not isinstance(values, (Mapping, list, tuple)):
         return None
     pairs = values.items() if isinstance(values, Mapping) else enumerate(values)
     found = (_not_finite(value, f"{place}.{name}".lstrip(".")) for name, value in pairs)

@@ -38,6 +38,6 @@ def load(group: str, name: str) -> Any:
 
 
 def _points(group: str) -> dict[str, EntryPoint]:
-    if sys.version_info >= (3, 10):
+    if sys.version_info >= (3, 10):  # noqa: UP036
         return {point.name: point for point in entry_points(group=group)}
     return {point.name: point for point in entry_points().get(group, ())}

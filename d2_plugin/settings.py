@@ -191,7 +191,7 @@ def _docstrings(kind: type) -> dict[str, str]:
         except (OSError, TypeError):
             continue
         body = cast(ast.ClassDef, module.body[0]).body
-        for field, below in zip(body, body[1:]):
+        for field, below in zip(body, body[1:]):  # noqa: RUF007  newer than Python 3.9
             if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(below, ast.Expr):
                 text = below.value.value if isinstance(below.value, ast.Constant) else None
                 if isinstance(text, str):

@@ -66,5 +66,7 @@ class CEM4DGSAdapter(Ex4DGSAdapter):
     def _before_append(self, *_: Any, **__: Any) -> Report:
         return InriaAdapter._before_append(self)
 
-    def _before_prune(self, static_mask: Tensor, *_: Any, **__: Any) -> Report:
+    def _before_prune(  # type: ignore[override]
+        self, static_mask: Tensor, *_: Any, **__: Any
+    ) -> Report:
         return InriaAdapter._before_prune(self, static_mask)

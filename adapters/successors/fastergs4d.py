@@ -84,7 +84,8 @@ class FasterGS4DAdapter:
             return camera
         lens = getattr(camera, "camera", None)
         if lens is None or not hasattr(lens, "focal_x"):
-            raise D2Error(f"a camera of type {type(camera).__name__} has no perspective `camera`: pass the trainer's view")
+            kind = type(camera).__name__
+            raise D2Error(f"a camera of type {kind} has no perspective `camera`: pass the trainer's view")
         key = self._key(camera) if self._key is not None else _key_of_picture(camera)
         like = self.gaussians._spatial_means
         K = torch.tensor([[lens.focal_x, 0, lens.center_x], [0, lens.focal_y, lens.center_y], [0, 0, 1]])

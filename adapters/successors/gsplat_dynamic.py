@@ -110,11 +110,11 @@ class GsplatDynamicAdapter(GsplatAdapter):
 
     def _deformed(self, time: float) -> tuple[Tensor, Tensor, Tensor]:
         """Positions, quaternions and logits of all rows at an instant; rows without a mark pass as they are."""
-        raw = tuple(self.parameters[name] for name in ("means", "quats", "opacities"))
+        raw = self.parameters["means"], self.parameters["quats"], self.parameters["opacities"]
         moving = torch.nonzero(self._state[MASK]).squeeze(-1)
         if not len(moving):
-            return raw[0], raw[1], raw[2]
-        moved = self._moved(*(part[moving] for part in raw), time=time)
+            return raw
+        moved = self._moved(raw[0][moving], raw[1][moving], raw[2][moving], time)
         means, quats, logits = (part.index_copy(0, moving, now) for part, now in zip(raw, moved))
         return means, quats, logits
 
@@ -127,7 +127,7 @@ class GsplatDynamicAdapter(GsplatAdapter):
         if not len(positions):
             return positions
         count, zeros = len(positions), positions.new_zeros
-        return self._moved(positions, zeros(count, 4), zeros(count, 1), time=time)[0]
+        return self._moved(positions, zeros(count, 4), zeros(count, 1), time)[0]
 
     def _neighbours_move(self, points: Points) -> Tensor:
         """Whether the present Gaussian nearest to each point, at the point's own time, is deformed; bool [K]."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Optional
 
 from d2_plugin.captures.capture import Capture
 from d2_plugin.captures.readers.colmap import is_colmap, open_colmap
@@ -20,7 +20,7 @@ from d2_plugin.captures.selection import select_frames
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import reaching
 
-Reader = Callable[[Path, tuple[str, ...] | None, bool], Capture]
+Reader = Callable[[Path, Optional[tuple[str, ...]], bool], Capture]  # noqa: UP045  at run time, on Python 3.9 too
 """(folder, cameras to read or None, whether to leave out cameras without counterpart) -> capture."""
 
 

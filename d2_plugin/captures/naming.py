@@ -10,7 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path, PurePosixPath
-from typing import NamedTuple
+from typing import NamedTuple, Optional
 
 from d2_plugin.captures.files import FrameFiles, frame_number
 from d2_plugin.captures.pictures import PICTURE_SUFFIXES
@@ -28,7 +28,7 @@ _FRAME = re.compile(r"(\d+)\D*$")
 _PREFIXED = re.compile(r"(?P<camera>.+)_(?P<frame>\d+)$")
 
 
-Reading = Callable[[str], Shot | None]
+Reading = Callable[[str], Optional[Shot]]  # noqa: UP045  at run time, on Python 3.9 too
 """One way to read a name; None for a name that does not say both camera and frame."""
 
 

@@ -41,7 +41,7 @@ def downscale(capture: Capture, factor: int) -> Capture:
     Rows and columns that fill no block are cut off at the bottom and on the right, so K / factor is exact with pixel
     centres at i + 0.5. Monocular maps keep the size they are stored in.
     """
-    if isinstance(factor, bool) or not isinstance(factor, int | np.integer) or factor < 1:
+    if isinstance(factor, bool) or not isinstance(factor, (int, np.integer)) or factor < 1:
         raise D2Error(f"downscale {factor!r} is no whole number of at least 1: give 1, 2, 4 or the like")
     if factor == 1:
         return capture

@@ -54,7 +54,7 @@ def _answer(words: list[str]) -> str | None:
         return f"d2-4dgs {__version__}"
     if sys.version_info[:2] < NEEDED:
         needed, found = (".".join(map(str, version)) for version in (NEEDED, sys.version_info[:2]))
-        raise D2Error(f"d2 needs Python {needed} or later, this is {found}: use another environment for its commands")
+        raise D2Error(f"the commands need Python {needed} or later, this is {found}: run them in another environment")
     if not words:
         raise D2Error(f"no command is given: have {', '.join(COMMANDS)}; `d2 --help` says what each does")
     if words[0] in HELP:

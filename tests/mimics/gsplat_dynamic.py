@@ -1,4 +1,4 @@
-"""After gsplat's dynamic_surgical_trainer.py: a dict of parameters, planes and a network that deform the marked ones."""
+"""After gsplat's dynamic_surgical_trainer.py: planes and a network deform the marked rows of a dict."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ monocular prediction: affine-invariant inverse depth, unless mono/mono.json says
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Optional
 
 from d2_plugin.captures.assembly import CORRECT, assembled
 from d2_plugin.captures.calibration import checked_rate
@@ -74,7 +74,8 @@ def _calibrations(description: dict[str, Any], path: Path) -> dict[str, tuple[Ca
 def _calibration(entry: Any, bounds: dict[str, Any], path: Path) -> tuple[Camera, Lens]:
     """The pinhole camera of the undistorted pictures, and the lens of the recorded ones."""
     camera = read_entry(entry, str(path)).recorded(None, str(path))
-    near_far = field(bounds, camera.name, tuple[NUMBER, NUMBER] | None, f"bounds in {path}", CORRECT, default=None)
+    pair = Optional[tuple[NUMBER, NUMBER]]  # noqa: UP045  at run time, on Python 3.9 too
+    near_far = field(bounds, camera.name, pair, f"bounds in {path}", CORRECT, default=None)
     return camera.pinhole(str(path), near_far), camera.lens
 
 

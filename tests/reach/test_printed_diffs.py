@@ -1,0 +1,76 @@
+"""What a page prints goes into the file of the commit that it names: three lines and an import, each at its place."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from printed import COMMITS, PAGES, checksum, checksums, file_of, hunks, pages, printed
+
+IMPORT = "from d2_plugin import D2Hooks"
+
+
+def test_every_page_with_a_diff_names_a_commit_that_is_known() -> None:
+    assert set(pages()) <= set(COMMITS), "add the file's checksums to tests/data/commits.json"
+    assert len(pages()) >= 9
+
+
+@pytest.mark.parametrize("page", pages())
+class TestEveryPage:
+    def test_it_names_the_commit_that_its_lines_are_from(self, page: str) -> None:
+        assert COMMITS[page]["commit"] in (PAGES / f"{page}.md").read_text()
+
+    def test_its_context_stands_in_that_file_at_the_printed_lines(self, page: str) -> None:
+        patch = printed(page)
+        lines = checksums(page, file_of(patch))
+        for hunk in hunks(patch):
+            for number, line in hunk.context.items():
+                assert lines[number - 1] == checksum(line), f"line {number} of {file_of(patch)} is not '{line.strip()}'"
+
+    def test_its_hunks_count_what_they_hold(self, page: str) -> None:
+        """What `git apply` refuses as a corrupt patch."""
+        shift = 0
+        for hunk in hunks(printed(page)):
+            assert (hunk.olds, hunk.news) == (len(hunk.context), len(hunk.context) + len(hunk.added))
+            assert hunk.new == hunk.old + shift
+            shift += len(hunk.added)
+
+    def test_it_adds_an_import_and_three_lines(self, page: str) -> None:
+        added = [line.strip() for hunk in hunks(printed(page)) for line in hunk.added]
+        assert added.count(IMPORT) == 1
+        lines = [line for line in added if line != IMPORT]
+        assert len(lines) == 3
+        for word in (r"D2Hooks\.attach\(", r"loss = loss \+ \S*d2\.loss\(", r"d2\.step\("):
+            assert sum(bool(re.search(word, line)) for line in lines) == 1
+
+    def test_git_applies_it(self, page: str, tmp_path: Path) -> None:
+        """To a file as long as the real one, with its context at its place; afterwards each line is there once."""
+        if shutil.which("git") is None:
+            pytest.skip("needs git")
+        patch = printed(page)
+        file, places = tmp_path / file_of(patch), {}
+        for hunk in hunks(patch):
+            places |= hunk.context
+        length = len(checksums(page, file_of(patch)))
+        text = [places.get(number, f"line {number}") for number in range(1, length + 1)]
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("\n".join(text))
+        (tmp_path / "d2.patch").write_text(patch)
+        command = ["git", "apply", "--ignore-whitespace", "d2.patch"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        after = file.read_text().split("\n")
+        assert len(after) == length + 4
+        for hunk in hunks(patch):
+            assert after[hunk.new - 1 : hunk.new - 1 + hunk.news] == [line[1:] for line in hunk.lines]
+
+
+def test_a_line_that_moved_is_found_out() -> None:
+    """Checksums tell lines apart, and spaces do not matter."""
+    lines = checksums("fudan", "train.py")
+    assert checksum("  import   torch ") == checksum("import torch")
+    assert checksum("import torch") in lines
+    assert checksum("import torch_of_another_commit") not in lines
