@@ -89,8 +89,8 @@ class D2Config(_HookTables):
             raise D2Error(f"no configuration at {path}: write one, or pass the settings as a dict") from None
         told = {} if iterations is None else {"iterations": iterations}
         config = cls.from_dict(told | of_this_format(table, str(path)))
-        folders = {name: getattr(config, name) for name in ("prior", "exported")}
-        return replace(config, **{name: str(path.parent / value) for name, value in folders.items() if value})
+        below = {name: str(path.parent / value) for name in ("prior", "exported") if (value := getattr(config, name))}
+        return replace(config, **cast("dict[str, Any]", below))
 
     def to_toml(self) -> str:
         """The same configuration as text, complete with defaults and the version of the format."""

@@ -64,7 +64,8 @@ def needed(script: Path) -> dict[str, str]:
 
     Imports inside functions and inside `try` wait or may fail, so they are left out, and so is the standard library.
     """
-    root, found, seen, waiting = script.parent, {}, set(), [script]
+    found: dict[str, str] = {}
+    root, seen, waiting = script.parent, set[Path](), [script]
     while waiting:
         file = waiting.pop()
         if file in seen:

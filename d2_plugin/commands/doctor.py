@@ -35,7 +35,7 @@ class Doctor(Settings):
     """What to look at: this installation, a recording, or what a trainer needs beside it."""
 
     path: Annotated[Path | None, Positional()] = None
-    """A recording; with --attach the folder of a trainer's repository, or its script. Without one: what is installed."""
+    """A recording; with --attach the folder of a trainer's repository, or its script. Else what is installed."""
     attach: str | None = None
     """Name of the repository, as the launcher knows it."""
 

@@ -66,7 +66,7 @@ class _Points(NamedTuple):
     """Mean of 3x3 pixels, uint8 [K, 3]; None where there is no picture."""
 
     def only(self, chosen: np.ndarray) -> _Points:
-        return _Points(*(None if values is None else values[chosen] for values in self))
+        return _Points._make(None if values is None else values[chosen] for values in self)
 
 
 class _Answer(NamedTuple):
@@ -97,9 +97,9 @@ class _View(NamedTuple):
     def of(cls, prior: FusedPrior) -> _View:
         mono = (prior.labels == Label.MONO) | (prior.labels == Label.AGREED)
         verified = prior.labels == Label.VERIFIED
-        depths = (np.where(labelled, prior.depth, 0) for labelled in (mono, verified))
+        monocular, surface = (np.where(labelled, prior.depth, 0) for labelled in (mono, verified))
         colors = None if prior.colors is None else opencv("the evidence of other cameras").blur(prior.colors, (3, 3))
-        return cls(*depths, prior.sigma, colors)
+        return cls(monocular, surface, prior.sigma, colors)
 
 
 def with_evidence(
