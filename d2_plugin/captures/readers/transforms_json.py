@@ -160,7 +160,7 @@ def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], flo
 
 def _rate(entry: _Entry, path: Path) -> float | None:
     """The frame rate that a file declares, or None."""
-    rate = field(entry.intrinsics, "fps", Optional[float], str(entry.listed_in), CORRECT, default=None)
+    rate = field(entry.intrinsics, "fps", Optional[float], str(entry.listed_in), CORRECT, None)  # noqa: UP045
     return checked_rate(rate, str(path)) if rate else None  # 0 is how some programs say that there is none
 
 

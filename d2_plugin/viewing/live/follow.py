@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, Protocol
 
-from d2_plugin.plugin import D2Hooks, Report
+from d2_plugin.hooks.reports import Report
+from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import View
 from d2_plugin.viewing.stand_in import subject_of_views
 from d2_plugin.viewing.subject import Subject
