@@ -62,7 +62,7 @@ class Adam(torch.optim.Adam):
         if kernel is None or not all(_is_standard(group) for group in self.param_groups) or not self._are_plain(pairs):
             return super().step(closure)
         threads = torch.get_num_threads()
-        updates = [_update(*kept, group) for kept, (_, group) in zip(self._checked, pairs, strict=True)]
+        updates = [_update(kept, group) for kept, (_, group) in zip(self._checked, pairs, strict=True)]
         kernel.d2_adam((_Tensor * len(updates))(*updates), len(updates), threads)
         for value, _ in pairs:
             increment_version(value)  # a graph that still needs the old values is refused, as after torch's step
@@ -98,7 +98,8 @@ class Adam(torch.optim.Adam):
         return value, state["exp_avg"], state["exp_avg_sq"], state["step"]
 
 
-def _update(value: Tensor, first: Tensor, second: Tensor, steps: Tensor, group: dict[str, Any]) -> _Tensor:
+def _update(kept: tuple[Tensor, ...], group: dict[str, Any]) -> _Tensor:
+    value, first, second, steps = kept
     gradient = value.grad
     assert gradient is not None
     places = value.data_ptr(), first.data_ptr(), second.data_ptr(), gradient.data_ptr(), steps.data_ptr()
