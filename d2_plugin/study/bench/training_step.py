@@ -66,9 +66,9 @@ def run(settings: TrainingStepBench) -> str:
     """Measure and add the rows; the table, and where the rows lie."""
     torch.set_num_threads(settings.threads)
     cases = [
-        StepCase(count, *parse_size(size), frames)
+        StepCase(count, width, height, frames)
         for count in settings.gaussians
-        for size in settings.sizes
+        for width, height in map(parse_size, settings.sizes)
         for frames in settings.frames
     ]
     command = command_line("bench training-step", settings)
