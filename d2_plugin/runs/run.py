@@ -183,7 +183,7 @@ class Run:
         }
 
     def export_ply(self) -> list[Path]:
-        """One 3DGS PLY per frame under ply/; what a background showed is black there: the format has no place for it."""
+        """One 3DGS PLY per frame under ply/; a background is black there: the format has no place for it."""
         from d2_plugin.runs.gaussian_ply import write_frames
 
         capture, camera = self.scene.capture, self.scene.train_cameras[0]
