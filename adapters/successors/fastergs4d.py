@@ -121,8 +121,8 @@ class FasterGS4DAdapter:
     def insert(self, points: Points) -> int:
         """Isotropic Gaussians at the finite ones of the points, at the end; returns their number.
 
-        They live around the time of their frame with the width that the repository starts with: a variance of a fifth
-        of the duration. `_densification_info` is kept, with zeros for the new rows.
+        They live around the time of their frame with the width that the repository starts with, a variance of a fifth
+        of the duration, or with their lifetime where that is shorter. `_densification_info` is kept, with zeros for the new rows.
         """
         finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
         rows, before = self._rows(points.select(finite)), len(self)
@@ -149,6 +149,9 @@ class FasterGS4DAdapter:
         model, count = self.gaussians, len(points.positions)
         identity = points.positions.new_zeros(count, 4)
         identity[:, 0] = 1
+        extents = points.times.new_full((count, 1), 0.5 * math.log(self.duration / 5))
+        if points.lifetimes is not None:
+            extents = torch.minimum(extents, points.lifetimes.log()[:, None])
         return {
             "spatial_means": points.positions,
             "temporal_means": points.times[:, None],
@@ -156,7 +159,7 @@ class FasterGS4DAdapter:
             "sh_coefficients_rest": points.positions.new_zeros(count, *model._sh_coefficients_rest.shape[1:]),
             "opacities": torch.logit(points.opacities, eps=1e-6)[:, None],
             "spatial_scales": points.scales.log()[:, None].repeat(1, 3),
-            "temporal_scales": points.times.new_full((count, 1), 0.5 * math.log(self.duration / 5)),
+            "temporal_scales": extents,
             "left_isoclinic_rotations": identity,
             "right_isoclinic_rotations": identity.clone(),
         }
