@@ -234,6 +234,21 @@ def test_a_surface_of_another_colour_is_not_the_thing_that_the_ray_sees() -> Non
     assert share(left_of(ours, theirs), Label.VERIFIED) > 0.5, "without pictures nothing speaks against it"
 
 
+@pytest.mark.parametrize(("mine", "seen", "taken"), [(100, 120, True), (100, 100, False), (120, 100, False)])
+def test_a_colour_is_compared_in_the_exposure_of_the_other_camera(mine: int, seen: int, taken: bool) -> None:
+    """The left camera verified half of the wall, where the other one shows grey 100 as 120."""
+    pytest.importorskip("cv2")
+    mono, verified = prior_of(WALL * 1.01), prior_of(WALL, Label.VERIFIED, 0.001)
+    half = np.arange(WIDTH) < WIDTH // 2
+    maps = {name: np.where(half, vars(verified)[name], vars(mono)[name]) for name in ("depth", "labels", "sigma")}
+    ours = replace(mono, **maps)
+    colors = [np.where(half[:, None], grey, other)[None].repeat(HEIGHT, 0) for grey, other in ((100, mine), (120, seen))]
+    ours, theirs = (replace(p, colors=c.astype(np.uint8)) for p, c in zip((ours, verified), colors, strict=True))
+    asked = left_of(ours, theirs)
+    right = asked.labels[:, 3 * WIDTH // 4 :]
+    assert bool(np.mean(right == Label.VERIFIED) > 0.3) is taken
+
+
 def test_maps_agree_only_about_places_of_one_colour() -> None:
     pytest.importorskip("cv2")
     maps = {name: painted(prior_of(WALL), grey) for name, grey in (("left", 100), ("right", 130))}
