@@ -242,7 +242,8 @@ def test_a_colour_is_compared_in_the_exposure_of_the_other_camera(mine: int, see
     half = np.arange(WIDTH) < WIDTH // 2
     maps = {name: np.where(half, vars(verified)[name], vars(mono)[name]) for name in ("depth", "labels", "sigma")}
     ours = replace(mono, **maps)
-    colors = [np.where(half[:, None], grey, other)[None].repeat(HEIGHT, 0) for grey, other in ((100, mine), (120, seen))]
+    greys = (100, mine), (120, seen)
+    colors = [np.tile(np.where(half[:, None], left, right), (HEIGHT, 1, 3)) for left, right in greys]
     ours, theirs = (replace(p, colors=c.astype(np.uint8)) for p, c in zip((ours, verified), colors, strict=True))
     asked = left_of(ours, theirs)
     right = asked.labels[:, 3 * WIDTH // 4 :]
