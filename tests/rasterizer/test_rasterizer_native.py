@@ -299,3 +299,13 @@ def test_an_image_as_wide_as_a_panorama_has_its_gaussians_in_place():
     alpha = scene.to(torch.float32).render().alpha
     assert alpha.argmax().item() == 5000 + 4900
     np.testing.assert_allclose(alpha.double().numpy(), scene.render().alpha.numpy(), atol=1e-4)
+
+
+def test_nothing_is_weighed_beside_the_image() -> None:
+    """A block that sticks out of the image has pixels that are none; the survey's largest weight is not theirs."""
+    scene = random_scene(5, 50, 7, 5)
+    prior = prior_of(scene)
+    splats = Splats(scene.means, scene.covariances, scene.opacities, torch.arange(len(scene.means)))
+    found = survey(splats, scene.view, prior)
+    exact = survey(Splats(*(part.double() for part in splats[:3]), splats.rows), scene.view, prior)
+    assert torch.allclose(found.max_weight, exact.max_weight.float(), atol=1e-5)

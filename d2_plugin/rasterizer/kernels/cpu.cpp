@@ -73,6 +73,15 @@ D2_INLINE void store_plane(Floats values, float* plane, const Patch& p) {
   WHOLE ? store_block(values, plane + p.pixel, p.stride) : store_part(values, plane, 1, 0, p);
 }
 
+// The transmittance that a block begins with: nothing reaches the lanes outside of the image.
+template <bool WHOLE>
+D2_INLINE Floats untouched(const Patch& p) {
+  if (WHOLE) return Floats(1.f);
+  alignas(64) float lane[LANES];
+  for (int i = 0; i < LANES; i++) lane[i] = p.lanes() >> i & 1;
+  return Floats::load(lane);
+}
+
 // Calls visit(channel, values) for the numbers of a pixel; three of them are unwoven together.
 template <int FIXED, bool WHOLE, class Visit>
 D2_INLINE void load_channels(const float* image, int channels, const Patch& p, Visit visit) {
@@ -229,7 +238,7 @@ static void render_tile(const Frame& f, int tile) {
   Unfinished unfinished;
   for_each_block(f, tile, [&](int block, const Patch& patch, auto whole) {
     float* field = state + block * fields * LANES;
-    Floats(1.f).store(field);
+    untouched<whole>(patch).store(field);
     for (int k = 1; k < fields; k++) Floats(0.f).store(field + k * LANES);
     if (FRONT) free_space(load_plane<whole>(f.near_edge, patch)).near.store(field + edge * LANES);
     unfinished.add(block, patch);
@@ -325,7 +334,7 @@ static void load_gradients(const Frame& f, int tile, float* state, float* backgr
         total = fma(Floats::load(field + (4 + c) * LANES), color - Floats(f.background[c]), total);
       });
     }
-    Floats(1.f).store(field);
+    untouched<whole>(patch).store(field);
     total.store(field + LANES);
     on_alpha.store(field + 2 * LANES);
     on_depth.store(field + 3 * LANES);
@@ -477,7 +486,7 @@ static void survey_tile(const Frame& f, int tile, uint8_t* touched, Statistics* 
     const Floats depth = load_plane<whole>(f.prior_depth, patch), reliability = load_plane<whole>(f.reliability, patch);
     const Mask usable = (reliability > Floats(0.f)) & (reliability < infinity) & (depth > Floats(0.f)) & (depth < infinity);
     const Floats scale = where(usable, Floats(1.f) / (depth + Floats(f.eps)) * reliability);
-    Floats(1.f).store(field);
+    untouched<whole>(patch).store(field);
     for (int k = 1; k < 3; k++) Floats(0.f).store(field + k * LANES);
     scale.store(field + 3 * LANES);
     (where(usable, depth) * scale).store(field + 4 * LANES);
