@@ -1,6 +1,6 @@
 """`platform_wheel.py WHEEL FOLDER`: the same wheel with the CPU kernels compiled, for who has no compiler.
 
-Every library of the package is compiled for each level of `d2_plugin.prebuilt.LEVELS` with the compiler of this machine
+Every library of the package is compiled for each level of `d2_plugin.compiler.prebuilt.LEVELS` with the compiler of this machine
 and without a dependency on libstdc++; the wheel's tag names the oldest glibc that they need. Nothing else changes.
 """
 
@@ -19,9 +19,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
-from d2_plugin import compiler, prebuilt
+from d2_plugin import compiler
+from d2_plugin.compiler import prebuilt
 
-PACKAGE = Path(prebuilt.__file__).parent
+PACKAGE = Path(prebuilt.__file__).parents[1]
 STATIC = ("-static-libstdc++", "-static-libgcc")
 OLDEST_GLIBC = 17  # of manylinux_2_17, the oldest that there is a name for
 

@@ -16,7 +16,8 @@ from pathlib import Path
 import torch
 
 import d2_plugin
-from d2_plugin import prebuilt, registry
+from d2_plugin import registry
+from d2_plugin.compiler import prebuilt
 from d2_plugin.protocol import View
 from d2_plugin.rasterizer import Splats, rasterize
 from d2_plugin.testing import check_backbone

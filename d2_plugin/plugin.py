@@ -20,10 +20,9 @@ from torch import Tensor
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, PriorLoader
-from d2_plugin.hooks.edits import followed, limited
+from d2_plugin.hooks.edits import Idle, followed, limited
 from d2_plugin.hooks.expected import check_backbone, check_state, converted
 from d2_plugin.hooks.finite import FiniteCheck
-from d2_plugin.hooks.idle import Idle
 from d2_plugin.hooks.prior import Store
 from d2_plugin.hooks.reports import Listener, Report, Telling, Trace
 from d2_plugin.hooks.table import HOOKS

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from d2_plugin import compiler, prebuilt
-from d2_plugin.compiler import NoCompiler, find_compiler, load_library
+from d2_plugin import compiler
+from d2_plugin.compiler import NoCompiler, find_compiler, load_library, prebuilt
 from d2_plugin.errors import D2Error
 
 try:

@@ -59,6 +59,11 @@ INSTALL = {"cv2": "opencv-python-headless", "sklearn": "scikit-learn", "PIL": "p
 """What pip calls a package whose import has another name."""
 
 
+def _standard_library() -> frozenset[str]:
+    """Names of its modules; Python 3.9 does not list them, so there everything is looked for."""
+    return getattr(sys, "stdlib_module_names", frozenset())
+
+
 def needed(script: Path) -> dict[str, str]:
     """Packages that `script` and the files of its repository import at once, and where first; from the files alone.
 
@@ -77,7 +82,7 @@ def needed(script: Path) -> dict[str, str]:
             top = name.split(".")[0]
             if inside is not None:
                 waiting.append(inside)
-            elif top not in sys.stdlib_module_names and not any((base / top).is_dir() for base in roots):
+            elif top not in _standard_library() and not any((base / top).is_dir() for base in roots):
                 found.setdefault(top, f"{file.relative_to(root)}:{line}")
     return found
 

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from d2_plugin import __version__, compiler, prebuilt, registry
+from d2_plugin import __version__, compiler, registry
 from d2_plugin.commands.arguments.form import Form
+from d2_plugin.compiler import prebuilt
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Positional, Settings
 

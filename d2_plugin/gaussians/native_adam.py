@@ -62,7 +62,7 @@ class Adam(torch.optim.Adam):
         if kernel is None or not all(_is_standard(group) for group in self.param_groups) or not self._are_plain(pairs):
             return super().step(closure)
         threads = torch.get_num_threads()
-        updates = [_update(kept, group) for kept, (_, group) in zip(self._checked, pairs, strict=True)]
+        updates = [_update(kept, group) for kept, (_, group) in zip(self._checked, pairs)]
         kernel.d2_adam((_Tensor * len(updates))(*updates), len(updates), threads)
         for value, _ in pairs:
             increment_version(value)  # a graph that still needs the old values is refused, as after torch's step

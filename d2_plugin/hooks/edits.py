@@ -1,8 +1,10 @@
-"""What becomes of the hooks' edits before the backbone makes them, and of what is known of its rows after."""
+"""What becomes of the hooks' edits: limits before the backbone makes them, its rows followed after, idle hooks."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,3 +37,28 @@ def followed(values: Tensor, index: Tensor, new: int) -> Tensor:
     count = max(len(values), int(index.max()) + 1 if len(index) else 0)
     before = torch.nn.functional.pad(values, (0, count - len(values)))
     return torch.where(index < 0, new, before[index.clamp(min=0)] if count else 0).int()
+
+
+class Idle:
+    """Counts each hook's evaluations in a row that changed next to nothing, which cost surveys of several views."""
+
+    def __init__(self, names: Iterable[str], after: int, below: float) -> None:
+        """A hook retires after so many of them (0: never); the share `below` of all Gaussians is next to nothing."""
+        self.after, self.below = after, below
+        self.evaluations = dict.fromkeys(names, 0)
+        self.retired: dict[str, int] = {}
+
+    def retires(self, name: str, step: int, changes: int, gaussians: int, settling: int) -> bool:
+        """Whether the hook retires with this evaluation; `settling` is how many at its start cannot change anything."""
+        if not self.after:
+            return False
+        changed = changes >= max(self.below * gaussians, 1)
+        self.evaluations[name] = 0 if changed else self.evaluations[name] + 1
+        if self.evaluations[name] < self.after + settling:
+            return False
+        self.retired[name] = step
+        return True
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state with `idle` and `retired`."""
+        self.evaluations, self.retired = dict(state["idle"]), dict(state["retired"])

@@ -8,7 +8,7 @@ nothing is said; with another one the pictures are undistorted when they are rea
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Union
 
 import numpy as np
 
@@ -36,7 +36,7 @@ def read_entry(entry: Any, path: str) -> Entry:
     """One camera of the list in the file `path`."""
     if not isinstance(entry, dict):
         raise D2Error(f"a camera in {path} cannot be understood ({shown(entry)} is no object): {CORRECT}")
-    name = str(field(entry, "name", str | int, f"a camera in {path}", CORRECT))
+    name = str(field(entry, "name", Union[str, int], f"a camera in {path}", CORRECT))  # noqa: UP007
     where = f"camera {name} in {path}"
     K = pinhole(*(field(entry, key, NUMBER, where, CORRECT) for key in ("fx", "fy", "cx", "cy")))
     size = (field(entry, "width", int, where, CORRECT), field(entry, "height", int, where, CORRECT))

@@ -39,7 +39,7 @@ def read(document: Document) -> list[Entry]:
     listed = [_picture(frame, document.place) for frame in content["frames"]]
     labels = {str(frame.get("camera_label", "")) for frame in content["frames"]}
     if len(labels) == len(listed):  # one picture per camera, which says whose it is
-        named = {str(frame["camera_label"]): pair for frame, pair in zip(content["frames"], listed, strict=True)}
+        named = {str(frame["camera_label"]): pair for frame, pair in zip(content["frames"], listed)}
     else:
         named = _cameras(listed)
     return [

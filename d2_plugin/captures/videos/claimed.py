@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -48,10 +47,19 @@ def paths_of(settings: ImportSettings) -> dict[str, Path]:
 
 def identity(settings: ImportSettings, paths: Mapping[str, Path]) -> dict[str, Any]:
     """What makes two imports the same one."""
-    table = json.loads(json.dumps(asdict(settings), default=str))
+    table = {name: _plain(value) for name, value in asdict(settings).items()}
     del table["output"], table["videos"]
     table["calibration"] = _fingerprint(settings.calibration)
     return {**table, "videos": {name: _fingerprint(path) for name, path in paths.items()}}
+
+
+def _plain(value: Any) -> Any:
+    """As JSON has it: lists for tuples, text for what it does not know."""
+    if isinstance(value, dict):
+        return {str(name): _plain(part) for name, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
 
 
 def refuse_another(folder: Path, wanted: Mapping[str, Any]) -> None:

@@ -139,7 +139,7 @@ class VideosSource:
         for name, entry in table.items():
             video = VideoFile.from_dict(entry["video"])
             videos[name] = replace(video, path=folder / video.path)
-            indices[name] = dict(zip(entry["frames"], entry["places"], strict=True))
+            indices[name] = dict(zip(entry["frames"], entry["places"]))
             lens = {key: np.array(entry[key], np.float64) for key in ("matrix", "rotation", "translation")}
             width, height = videos[name].turn.size(*video.size)
             cameras[name] = CalibratedCamera(

@@ -16,17 +16,17 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.markup import Table, markdown
-from d2_plugin.settings import Settings
+from d2_plugin.settings import Range, Settings
 from d2_plugin.study.command_line import command_line
 from d2_plugin.study.rows import Row, append_rows, make_row
 
-from .gpu_static import ARCHITECTURES, static_analysis
+from .static import ARCHITECTURES, static_analysis
 
 logger = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ class GpuBench(Settings):
     """Recording that is trained on the GPU and on the CPU."""
     train_cameras: str = "preset:4"
     """Cameras to train with, as `d2 train` takes them."""
-    iterations: int = 600
+    iterations: Annotated[int, Range(1, unit="steps")] = 600
     """Steps of each of the two trainings."""
     output: Path = Path("bench-gpu")
     """Folder of rows, outputs and profiles."""
@@ -88,7 +88,7 @@ def _pytest(*words: str) -> Callable[[GpuBench], list[str]]:
 
 
 def _d2(*words: str) -> list[str]:
-    return [sys.executable, "-m", "d2_plugin.commands.cli", *words]
+    return [str(Path(sys.executable).with_name("d2")), *words]
 
 
 def _sanitizer(tool: str) -> Step:

@@ -20,11 +20,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from .errors import unknown_name
+from ..errors import unknown_name
 
 logger = logging.getLogger(__name__)
 
-FOLDER = Path(__file__).parent / "compiled"
+FOLDER = Path(__file__).parents[1] / "compiled"
 """Where a platform wheel has them."""
 
 CHECKSUMS = "compiled.json"
