@@ -122,7 +122,8 @@ class FasterGS4DAdapter:
         """Isotropic Gaussians at the finite ones of the points, at the end; returns their number.
 
         They live around the time of their frame with the width that the repository starts with, a variance of a fifth
-        of the duration, or with their lifetime where that is shorter. `_densification_info` is kept, with zeros for the new rows.
+        of the duration, or with their lifetime where that is shorter. `_densification_info` is kept, with zeros for the
+        new rows.
         """
         finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
         rows, before = self._rows(points.select(finite)), len(self)

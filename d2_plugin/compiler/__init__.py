@@ -1,6 +1,6 @@
 """C++ sources of this package, compiled at first use and kept in a cache.
 
-Where a platform wheel brought them compiled (`d2_plugin.compiler.prebuilt`), those are used and no compiler is needed. Else
+Where a platform wheel brought them compiled (`.prebuilt`), those are used and no compiler is needed. Else
 nothing is compiled at import or at installation, and no torch header is involved: a source is a plain C ABI reached
 through ctypes, so a torch upgrade never invalidates a build. An entry of the cache is named by a hash of everything
 that shapes the machine code: sources, headers, flags, and all that the compiler predefines for this CPU (its version
