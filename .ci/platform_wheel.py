@@ -1,7 +1,8 @@
 """`platform_wheel.py WHEEL FOLDER`: the same wheel with the CPU kernels compiled, for who has no compiler.
 
 Every library of the package is compiled for each level of `d2_plugin.compiler.prebuilt.LEVELS` with the compiler of
-this machine and without a dependency on libstdc++; the wheel's tag names the oldest glibc that they need. Nothing else changes.
+this machine and without a dependency on libstdc++; the wheel's tag names the oldest glibc that they need. Nothing
+else changes.
 """
 
 from __future__ import annotations

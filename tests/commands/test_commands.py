@@ -88,16 +88,16 @@ class TestHelp:
     def test_bench_names_its_parts(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["bench", "--help"]) == 0
         told = capsys.readouterr().out
-        assert all(f"{name:9} {benchmark.help}" in told for name, benchmark in BENCHMARKS.items())
+        assert all(f"{name:13} {benchmark.help}" in told for name, benchmark in BENCHMARKS.items())
         assert main(["bench"]) == 2
-        assert "have align, priors, raster, scaling, stereo" in capsys.readouterr().err
+        assert "have align, gpu, priors, raster, scaling, stereo" in capsys.readouterr().err
         assert main(["bench", "sterio"]) == 2
         assert "did you mean 'stereo'?" in capsys.readouterr().err
 
 
 class TestTables:
     def test_every_table_of_a_configuration_file_can_be_given_by_flags(self) -> None:
-        assert set(all_tables("yang4d")) == set(TABLES)
+        assert set(all_tables("yang4d")) == set(TABLES) | {"import"}
         assert {setting.name for setting in declared(all_tables("yang4d")["plan"].kind)} == set(OVERRIDABLE)
 
     def test_every_setting_of_the_prior_has_a_flag(self) -> None:

@@ -156,3 +156,46 @@ def scaling(rows: Sequence[Row]) -> Section:
         sources=sources_of(rows),
         headlines=("; ".join(f"{cell[0]}, {cell[1]}: as {cell[-1]}" for cell in cells if cell[-1] != "-"),),
     )
+
+
+def step(rows: Sequence[Row]) -> Section:
+    """One training step beside the rasterizer's own forward and backward, in CPU time."""
+    header = ("scene", "work", "threads", "CPU ms", "in rasterizer passes", "peak MB")
+    cells = tuple(
+        (
+            *(row["case"], row["method"], str(row["threads"]), number(row["passes"]["step"]["cpu_ms"])),
+            *(f"{row['ratio']:.2f}", shown(row["peak_mb"])),
+        )
+        for row in rows
+    )
+    return Section(
+        "step",
+        "A training step",
+        "The rasterizer alone, a bare step and a step with the depth loss run in turn in one process on a synthetic "
+        "scene. What counts is the ratio: the machine is shared. The views were all seen before, so the search for the "
+        "known pixels of a view, once for each, is not in it.",
+        tables=(("Steps", Table(header, cells)),),
+        sources=sources_of(rows),
+    )
+
+
+def gpu(rows: Sequence[Row]) -> Section:
+    """What is known of the CUDA kernels: steps that ran on a device, and what nvcc says of them without one."""
+    compiled = [row for row in rows if "registers" in row]
+    kernels = tuple(
+        (
+            *(row["case"].rpartition(" ")[2], row["setting"], str(row["registers"]), str(row["spill_bytes"])),
+            *(str(row["shared_bytes"]), str(row["instructions"])),
+        )
+        for row in compiled
+    )
+    steps = tuple((row["case"], row["device"] or "-", row["failed"] or "done") for row in rows if row not in compiled)
+    header = ("kernel", "target", "registers", "spilled bytes", "shared bytes", "instructions")
+    return Section(
+        "gpu",
+        "The GPU kernels",
+        "Static analysis is what the compiler says of a kernel, and no measurement: nothing here has run on a GPU "
+        "unless a step below says so.",
+        tables=(("Static analysis", Table(header, kernels)), ("Steps", Table(("step", "device", "result"), steps))),
+        sources=sources_of(rows),
+    )

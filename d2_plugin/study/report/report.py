@@ -17,7 +17,7 @@ from d2_plugin.study.rows import Row, read_rows
 from d2_plugin.study.training_rows import method_of, picture_of, training_rows
 
 from .ablation import ablation
-from .limits import plan, scaling, stability
+from .limits import gpu, plan, scaling, stability, step
 from .page import Picture, html, markdown
 from .precision import alignment, raster, stereo
 from .priors import priors
@@ -28,7 +28,7 @@ from .versions import versions
 
 BUILDERS: dict[str, Callable[[Sequence[Row]], Section]] = {
     build.__name__: build
-    for build in (training, quality, ablation, alignment, stereo, priors, raster, stability, plan, scaling)
+    for build in (training, quality, ablation, alignment, stereo, priors, raster, step, gpu, stability, plan, scaling)
 }
 """The function that makes a section from the rows of a kind, in the order of the page."""
 
