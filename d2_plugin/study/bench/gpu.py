@@ -1,7 +1,7 @@
 """`d2 bench gpu`: everything that a GPU has to show, one step after another, in less than 25 minutes.
 
-Each step has a time limit of its own and leaves its output and a row as soon as it ends, so that a machine lent for half
-an hour loses nothing. A step that cannot run here says why in one sentence; what needs no device runs without one.
+Each step has a time limit of its own and leaves its output and a row as soon as it ends, so that a machine lent for
+half an hour loses nothing. A step that cannot run here says why in one sentence; what needs no device runs without one.
 """
 
 from __future__ import annotations
@@ -88,13 +88,14 @@ def _pytest(*words: str) -> Callable[[GpuBench], list[str]]:
 
 
 def _d2(*words: str) -> list[str]:
-    return [sys.executable, "-m", "d2_plugin.commands.cli", *words]
+    # The command of this environment: a study knows no command by import.
+    return [str(Path(sys.executable).with_name("d2")), *words]
 
 
 def _sanitizer(tool: str) -> Step:
     # Small scenes: a sanitizer slows a kernel down a hundred times.
     chosen = ["-m", "cuda", "tests/rasterizer/test_rasterizer_cuda.py", "-k", "1x1 or 15x33 or empty or survey"]
-    words = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", sys.executable, "-m", "pytest", "-q", *chosen]
+    words = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", *_pytest(*chosen)(GpuBench())]
     return Step(120, (_device, _tests, _program("compute-sanitizer")), lambda settings: words)
 
 
@@ -106,7 +107,8 @@ def _raster(settings: GpuBench) -> list[str]:
 
 def _train(device: str) -> Callable[[GpuBench], list[str]]:
     def words(settings: GpuBench) -> list[str]:
-        given = ("--device", device, "--iterations", str(settings.iterations), "--train-cameras", settings.train_cameras)
+        given = ("--device", device, "--iterations", str(settings.iterations))
+        given += ("--train-cameras", settings.train_cameras)
         return _d2("train", str(settings.capture), *given, "--output", str(settings.output / f"train-{device}"))
 
     return words
@@ -218,5 +220,6 @@ def table(rows: list[Row]) -> str:
     cells = tuple((row["case"], row["setting"], *(str(row[fact]) for fact in facts)) for row in kernels)
     if cells:
         head = ("static analysis", "for", "registers", "bytes spilled", "bytes shared", "instructions")
-        parts.append(markdown(Table(head, tuple((cell[0].removeprefix("static analysis of "), *cell[1:]) for cell in cells))))
+        short = tuple((cell[0].removeprefix("static analysis of "), *cell[1:]) for cell in cells)
+        parts.append(markdown(Table(head, short)))
     return "\n\n".join(parts)

@@ -47,10 +47,12 @@ def static_analysis(nvcc: str, architecture: str, command: str = "") -> list[Row
     with tempfile.TemporaryDirectory() as folder:
         cubin = Path(folder) / "gpu.cubin"
         defines = ("-DD2_CHANNELS=3", f"-DD2_FRAME_SIZE={ctypes.sizeof(Frame)}")
-        words = [nvcc, "-cubin", f"-arch={architecture}", *FLAGS, *defines, "-Xptxas", "-v", "-o", str(cubin), str(SOURCE)]
+        words = [nvcc, "-cubin", f"-arch={architecture}", *FLAGS, *defines, "-Xptxas", "-v"]
+        words += ["-o", str(cubin), str(SOURCE)]
         result = subprocess.run(words, capture_output=True, text=True, check=False)
         if result.returncode:
-            raise D2Error(f"nvcc refused gpu.cu for {architecture}; please report what it said:\n{result.stderr[:4000]}")
+            said = result.stderr[:4000]
+            raise D2Error(f"nvcc refused gpu.cu for {architecture}; please report what it said:\n{said}")
         counts = instructions(cubin.read_bytes())
     return [
         make_row(
