@@ -90,7 +90,7 @@ class TestHelp:
         told = capsys.readouterr().out
         assert all(f"{name:9} {benchmark.help}" in told for name, benchmark in BENCHMARKS.items())
         assert main(["bench"]) == 2
-        assert "have align, priors, raster, scaling, stereo" in capsys.readouterr().err
+        assert "have align, gpu, priors, raster, scaling, stereo" in capsys.readouterr().err
         assert main(["bench", "sterio"]) == 2
         assert "did you mean 'stereo'?" in capsys.readouterr().err
 
@@ -166,6 +166,7 @@ OLD = {
     "export-capture": "room --format colmap --output o --train-cameras a --test-cameras b --frames 0:1 --downscale 2 "
     "--points 0 --seed 1",
     "bench align": "--output o --anchors 10 20 --outliers 0 .2 --methods a b --seeds 1 --seconds .1 --threads 1",
+    "bench gpu": "--output o --steps static shim --repository r --capture c --train-cameras a --iterations 5",
     "bench raster": "--output o --scenes synth:30 garden --sizes 64x36 --garden g.npz --device cuda --seconds 1 "
     "--threads 1 --error-limit 5 --no-memory",
     "bench scaling": "--output o --frames 5 20 --width 64 --iterations 5",

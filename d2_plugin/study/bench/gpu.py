@@ -107,8 +107,8 @@ def _raster(settings: GpuBench) -> list[str]:
 
 def _train(device: str) -> Callable[[GpuBench], list[str]]:
     def words(settings: GpuBench) -> list[str]:
-        given = ("--device", device, "--iterations", str(settings.iterations))
-        given += ("--train-cameras", settings.train_cameras)
+        given = ["--device", device, "--iterations", str(settings.iterations)]
+        given += ["--train-cameras", settings.train_cameras]
         return _d2("train", str(settings.capture), *given, "--output", str(settings.output / f"train-{device}"))
 
     return words
