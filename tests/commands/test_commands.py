@@ -166,6 +166,7 @@ OLD = {
     "export-capture": "room --format colmap --output o --train-cameras a --test-cameras b --frames 0:1 --downscale 2 "
     "--points 0 --seed 1",
     "bench align": "--output o --anchors 10 20 --outliers 0 .2 --methods a b --seeds 1 --seconds .1 --threads 1",
+    "bench gpu": "--output o --steps static shim --repository r --capture c --train-cameras a --iterations 5",
     "bench raster": "--output o --scenes synth:30 garden --sizes 64x36 --garden g.npz --device cuda --seconds 1 "
     "--threads 1 --error-limit 5 --no-memory",
     "bench scaling": "--output o --frames 5 20 --width 64 --iterations 5",
