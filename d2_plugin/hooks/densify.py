@@ -53,7 +53,9 @@ class DensifyConfig(HookConfig):
     above: .05 gives 30.7 and 21.9 dB with a third more Gaussians, .1 30.7 and 21.8, .3 30.1 and 21.6."""
     lifetime: Positive | None = 1.0
     """Standard deviation in time of a new Gaussian where the picture moves, in intervals from instant to instant, in a
-    backbone that has one; none: as it begins there."""
+    backbone that has one; none: as it begins there. 1000 steps, seed 0, PSNR of what moves: studio 26.0 dB (none 20.4),
+    plaza 20.9 (19.6); a rendered room at 10 and 60 frames a second 21.2 and 20.6, at 6 intervals 20.2 and 20.6, none
+    20.2 and 20.1."""
     cell: Positive = 1.0
     """Side of the frustum cells that keep duplicates out, in units of the distance between samples."""
     occupied_opacity: Share = 0.08
