@@ -9,7 +9,6 @@ finish, and the same command continues where it was stopped. `d2 report` draws t
 
 from __future__ import annotations
 
-import itertools
 import os
 import tomllib
 from collections.abc import Iterator, Sequence
@@ -78,11 +77,12 @@ def run(settings: TrainingBench) -> str:
     known = read_rows([path]) if path.is_file() else []
     lines = [line for text in settings.captures for line in _lines(settings, text, known)]
     with progress_bar("bench training", len(lines) * len(settings.seeds) * len(_targets(settings))) as bar:
-        done = itertools.count(1)
+        done: list[Row] = []
 
         def write(row: Row) -> None:
             append_rows(path, [row])
-            bar.update(next(done), f"{row['case']}: {row['method']}, {row['setting']}")
+            done.extend([row] if row["target"] != TRY else [])  # a run that finds a length is beside the count
+            bar.update(len(done), f"{row['case']}: {row['method']}, {row['setting']}")
 
         with workers(settings.jobs, settings.scheduler) as submit:
             follow(lines, submit, write)
