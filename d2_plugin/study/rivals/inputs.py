@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,10 @@ class Inputs:
             self._maps[key] = self._read(view)
         return self._maps[key]
 
+    @cached_property
+    def _store(self) -> PriorStore:
+        return PriorStore.open(self.priors)
+
     def _read(self, view: View) -> Tensor | None:
         entry = EntryFolder(self.priors / "cache" / "mono").find(view.camera, view.frame)
         found = self.scene.capture.mono(view.camera, view.frame) if entry is None else entry.array()
@@ -57,7 +62,7 @@ class Inputs:
 
     def _kind(self, view: View) -> str:
         """What the maps are: a network's declared kind stands in the record of the prior."""
-        record = PriorStore.open(self.priors).record(view.camera, view.frame) or {}
+        record = self._store.record(view.camera, view.frame) or {}
         return record.get("settings", {}).get("mono_kind") or self.scene.capture.mono_kind or "relative"
 
     def stereo_depth(self, camera: str, frame: int) -> np.ndarray | None:
