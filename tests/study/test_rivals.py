@@ -21,11 +21,13 @@ from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
+from d2_plugin.priors.store import PriorStore
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved.kinds import read_run
 from d2_plugin.runs.settings import RunSettings
+from d2_plugin.runs.start import make_view
 from d2_plugin.study.rivals.dense_start import back_projected
-from d2_plugin.study.rivals.inputs import expected_depth
+from d2_plugin.study.rivals.inputs import Inputs, expected_depth
 from d2_plugin.study.rivals.patch_norm import patch_norm_loss
 from d2_plugin.study.rivals.pearson import PearsonConfig, pearson_correlation, pearson_depth_loss
 from d2_plugin.study.rivals.scale_shift import fitted_scale_and_shift, scale_shift_loss
@@ -293,6 +295,15 @@ class TestOnARecording:
         assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of six pictures rounds
         np.testing.assert_array_equal(started.positions[: len(points)], points.positions)
         assert set(started.times) == {0.0, run.scene.capture.seconds(1)}
+
+    def test_the_store_is_opened_once_for_all_maps(self, ablation: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A rival is charged for its own work: opening the store costs more than a step."""
+        run, opened = Run.load(ablation / "yang4d" / "pearson" / "seed0"), []
+        inputs = Inputs(run.scene, run.prepare(priors=False), ablation / "priors" / "dual")
+        open_store = PriorStore.open
+        monkeypatch.setattr(PriorStore, "open", lambda path: opened.append(path) or open_store(path))
+        views = [make_view(run.scene.capture, c, f) for c in run.scene.train_cameras for f in run.scene.capture.frames]
+        assert len([m for view in views if (m := inputs.inverse_depth(view)) is not None]) > 1 and len(opened) == 1
 
     def test_a_resumed_rival_is_bitwise_the_uninterrupted_one(self, ablation: Path, tmp_path: Path) -> None:
         """patch_norm draws at random: its draws come from the run's own generator, which is saved."""
