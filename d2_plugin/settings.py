@@ -25,6 +25,7 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.older import hints_of
 from d2_plugin.values import (
     Angle,
+    AtATime,
     AtLeastOne,
     Count,
     Every,
@@ -46,6 +47,7 @@ __all__ = [
     "FORMAT",
     "NONE",
     "Angle",
+    "AtATime",
     "AtLeastOne",
     "Count",
     "Declared",

@@ -226,21 +226,25 @@ class Metric:
     score: Callable[[Compared], float | None]
 
 
+NO_DIFFERENCE = 100.0
+"""What counts as the PSNR of equal pictures, dB: their own is infinite, which has no mean and no place in JSON."""
+
 METRICS = {
     "psnr": Metric(
-        "20 log10(1 / sqrt(MSE)) per image in dB, then the mean over images", lambda c: psnr(c.image, c.truth)
+        f"20 log10(1 / sqrt(MSE)) per image in dB, at most {NO_DIFFERENCE:g}, then the mean over images",
+        lambda c: min(psnr(c.image, c.truth), NO_DIFFERENCE),
     ),
     "psnr_cc": Metric(
         "PSNR after the best affine change of each channel, a truth + b = image undone (gsplat color_correct_affine)",
-        lambda c: psnr_color_corrected(c.image, c.truth),
+        lambda c: min(psnr_color_corrected(c.image, c.truth), NO_DIFFERENCE),
     ),
     "psnr_moving": Metric(
         "PSNR of the pixels that differ by more than 12/255 from the median of their camera's frames (this project)",
-        lambda c: None if c.moving is None else psnr(c.image, c.truth, c.moving),
+        lambda c: None if c.moving is None else min(psnr(c.image, c.truth, c.moving), NO_DIFFERENCE),
     ),
     "psnr_mask": Metric(
         "PSNR of the recorded pixels inside the capture's foreground mask, where it has one (this project)",
-        lambda c: None if c.inside is None else psnr(c.image, c.truth, c.inside),
+        lambda c: None if c.inside is None else min(psnr(c.image, c.truth, c.inside), NO_DIFFERENCE),
     ),
     "ssim1": Metric(
         "uniform 7x7 window, sample covariance, 3 px border dropped, data range 1 (scikit-image)",

@@ -21,6 +21,7 @@ from d2_plugin.durable import write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
 from d2_plugin.runs.drawing import color_scale
+from d2_plugin.values import checked_arguments
 
 from .coded_scene import MARGINAL_REACH, CodedScene, code_keys, code_lines, read_harmonics, read_state
 from .codes import BLOCK, packed, to_json, unpacked
@@ -71,6 +72,7 @@ class ReadPage(NamedTuple):
         return read_harmonics(self.arrays, self.header).coefficients
 
 
+@checked_arguments
 def read_page(path: Path) -> ReadPage:
     """Read what `write_page` wrote.
 
