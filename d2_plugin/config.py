@@ -111,6 +111,7 @@ class D2Config(_HookTables):
         return tuple(name for name in HOOKS if getattr(self, name) is not None)
 
 
+@checked_arguments
 def for_iterations(hooks: Iterable[str], iterations: int, **settings: Any) -> D2Config:
     """The named hooks with schedules that fit a run of `iterations` steps; `settings` are further fields of D2Config.
 

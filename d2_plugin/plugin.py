@@ -30,6 +30,7 @@ from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Backbone, Edit, Points
 from d2_plugin.reading import said
 from d2_plugin.registry import ADAPTERS, load
+from d2_plugin.values import checked_arguments
 
 _log = logging.getLogger(__name__)
 
@@ -88,6 +89,7 @@ class D2Hooks:
         return cls(config, backbone, store, hooks)
 
     @classmethod
+    @checked_arguments
     def attach(
         cls,
         config: str | Path | Mapping[str, Any] | D2Config,

@@ -128,11 +128,18 @@ def _as_kind(kind: Any, limits: Range, value: Any, name: str) -> Any:
         return _as_tuple(get_args(kind), limits, value, name)
     if kind in (int, float):
         return _as_number(kind, limits, value, name)
-    if kind is Path and isinstance(value, str) and value:  # no text at all would be the current folder
+    if kind is Path and isinstance(value, (str, Path)) and _names_a_file(value):
         return Path(value)
+    if kind is Path:
+        raise _wrong(name, "must be a path", value)
     if isinstance(value, get_origin(kind) or kind):
         return value
     raise _wrong(name, f"must be {_noun(kind)}", value)
+
+
+def _names_a_file(path: str | Path) -> bool:
+    """Whether it may be a path; no text at all would be the current folder, and a zero byte ends a name."""
+    return str(path) != "" and "\0" not in str(path)
 
 
 def _is_choice(kind: Any) -> bool:
@@ -185,12 +192,13 @@ def checked_arguments(function: Called) -> Called:
     told apart (protocols, arrays of a shape, type variables) passes.
     """
     signature = inspect.signature(function)
+    many = {name for name, one in signature.parameters.items() if one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD)}
 
     @functools.wraps(function)
     def guarded(*given: Any, **named: Any) -> Any:
         bound = signature.bind(*given, **named)
         kinds = _kinds_of(function)
-        for name in kinds.keys() & bound.arguments.keys():
+        for name in (kinds.keys() & bound.arguments.keys()) - many:
             where = f"{name} of {getattr(function, '__qualname__', function)}"
             bound.arguments[name] = _as_argument(kinds[name], bound.arguments[name], where)
         return function(*bound.args, **bound.kwargs)
@@ -219,13 +227,13 @@ def _as_argument(kind: Any, value: Any, name: str) -> Any:
             items = get_args(bare)[:1] or (Any,)
             if isinstance(value, Iterable) and not isinstance(value, (str, bytes)):
                 return tuple(_as_argument(items[0], item, f"an item of {name}") for item in value)
-        elif not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
+        elif origin is Any or not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
             if not _is_choice(bare) or any(value == choice for choice in get_args(bare)):
                 return value
         elif origin in (int, float, str, bool, Path):
             if len(options) == 1:
                 return _as_kind(bare, limits, value, name)
-            if isinstance(value, origin):
+            if isinstance(value, origin) and (Path not in options or _names_a_file(value)):
                 return value
         elif origin is tuple:
             return _as_kind(bare, limits, value, name)

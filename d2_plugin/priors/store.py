@@ -190,6 +190,7 @@ class PriorStore:
         table = read_table(path / "store.json", STORE)
         return cls(path, table["cameras"], table["frames"], table["about"])
 
+    @checked_arguments
     def prior(self, camera: str, frame: int) -> DepthPrior | None:
         """D* of one view as tensors on the CPU, or None where the store has none.
 
@@ -205,6 +206,7 @@ class PriorStore:
         sigma = SIGMA[codes["sigma"]]
         return DepthPrior(*(torch.from_numpy(map_) for map_ in (depth, labels, colors, sigma)))
 
+    @checked_arguments
     def record(self, camera: str, frame: int) -> dict[str, Any] | None:
         """What is known about one prior: alignment, shares, settings, hashes; None where the store has none."""
         entry = self._entry(camera, frame)

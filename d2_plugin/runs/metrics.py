@@ -178,6 +178,9 @@ def _filtered(values: np.ndarray, taps: Sequence[float], axis: int) -> np.ndarra
 
 def _pair(image: Tensor, truth: Tensor, window: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Both pictures as [3, H, W] float64 (in float32 the variances of flat regions would be rounding noise)."""
+    if not isinstance(image, Tensor) or not isinstance(truth, Tensor):
+        kinds = f"{type(image).__name__} and {type(truth).__name__}"
+        raise D2Error(f"pictures are compared as tensors [H, W, 3], got {kinds}: give two tensors")
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
         raise D2Error(
             f"pictures of shape {tuple(image.shape)} and {tuple(truth.shape)} cannot be compared: give two [H, W, 3]"

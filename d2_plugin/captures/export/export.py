@@ -67,6 +67,8 @@ def export_capture(
     if layout not in WRITERS:
         raise unknown_name("layout", layout, WRITERS)
     held_out = _known(capture, test_cameras)
+    if cloud is not None:
+        cloud.check()
     for camera in capture.cameras.values():
         refuse_skew(camera)
     with whole_folder(path) as folder:

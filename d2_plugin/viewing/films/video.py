@@ -13,15 +13,16 @@ from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar, Literal, Protocol, get_args
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
 from d2_plugin.captures.pictures import checked_picture, write_png
 from d2_plugin.durable import LEFTOVER, make_folder, remove_leftovers, writing
-from d2_plugin.errors import D2Error, missing_extra, unknown_name
+from d2_plugin.errors import D2Error, missing_extra
 from d2_plugin.locks import one_of_many
 from d2_plugin.reading import said
+from d2_plugin.values import checked_arguments
 
 Format = Literal["mp4", "webp", "gif", "png"]
 RATES = (0.001, 1000.0)
@@ -47,6 +48,7 @@ def pyav() -> ModuleType:
     return av
 
 
+@checked_arguments
 @contextmanager
 def write_film(path: Path, form: Format, fps: float, quality: int = 18) -> Iterator[Film]:
     """A film at `path`, complete when the block ends; what stood there is replaced then and not before.
@@ -58,10 +60,8 @@ def write_film(path: Path, form: Format, fps: float, quality: int = 18) -> Itera
         quality: x264's constant rate factor for mp4, 0 is lossless and 51 the worst; webp's quality is 100 less twice
             this number.
     """
-    if form not in get_args(Format):
-        raise unknown_name("format of films", form, get_args(Format))
-    if not (isinstance(fps, (int, float)) and RATES[0] <= fps <= RATES[1]):
-        raise D2Error(f"a film has {fps!r} pictures per second, expected {RATES[0]:g} to {RATES[1]:g}: correct them")
+    if not RATES[0] <= fps <= RATES[1]:
+        raise D2Error(f"a film has {fps:g} pictures per second, expected {RATES[0]:g} to {RATES[1]:g}: correct them")
     if form == "png":
         yield _Pngs(make_folder(path))
         return
