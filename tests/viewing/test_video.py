@@ -130,10 +130,18 @@ def test_what_the_encoder_refuses_is_one_sentence_and_leaves_nothing(tmp_path: P
 
 def test_a_film_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    for path in (tmp_path / "file" / "a.mp4", tmp_path / f"{'y' * 300}.mp4", tmp_path):
+    (tmp_path / "folder.mp4").mkdir()
+    for path in (tmp_path / "file" / "a.mp4", tmp_path / f"{'y' * 300}.mp4", tmp_path / "folder.mp4"):
         with pytest.raises(D2Error, match="cannot write"):
             write(path, soft(1, 32, 32))
-    assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "folder.mp4"]
+
+
+def test_a_film_replaces_no_other_kind_of_file(tmp_path: Path) -> None:
+    (tmp_path / "cameras.json").write_text("{}")
+    with pytest.raises(D2Error, match=r"a film of format mp4 needs a name that ends so, got cameras\.json"):
+        write(tmp_path / "cameras.json", soft(1, 32, 32))
+    assert (tmp_path / "cameras.json").read_text() == "{}"
 
 
 def test_a_film_without_a_picture_is_refused(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from d2_plugin.priors.store import PriorStore
 from d2_plugin.runs.start import triangulated_points
 from d2_plugin.settings import AtATime, Count, Positional, Range, Settings
 from d2_plugin.study.command_line import command_line
-from d2_plugin.study.rows import Row, append_rows, make_row
+from d2_plugin.study.rows import Row, append_rows, begin_rows, make_row
 
 from .stereo_rigs import ARCS
 
@@ -69,6 +69,7 @@ class Case(NamedTuple):
 
 def run(settings: PriorsBench) -> str:
     """Measure and add the rows; a table per capture, and where the rows lie."""
+    begin_rows(settings.output)
     torch.set_num_threads(settings.threads)
     command, told = _command(settings), []
     for case in cases(settings):

@@ -19,7 +19,7 @@ import torch
 from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.settings import AtATime, Range, Settings
 from d2_plugin.study.command_line import command_line
-from d2_plugin.study.rows import Row, append_rows, make_row
+from d2_plugin.study.rows import Row, append_rows, begin_rows, make_row
 
 from .memory import in_fresh_process
 from .raster import parse_size
@@ -65,6 +65,7 @@ class StepCase(NamedTuple):
 def run(settings: TrainingStepBench) -> str:
     """Measure and add the rows; the table, and where the rows lie."""
     torch.set_num_threads(settings.threads)
+    begin_rows(settings.output)
     cases = [
         StepCase(count, width, height, frames)
         for count in settings.gaussians

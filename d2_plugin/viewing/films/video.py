@@ -65,6 +65,8 @@ def write_film(path: Path, form: Format, fps: float, quality: int = 18) -> Itera
     if form == "png":
         yield _Pngs(make_folder(path))
         return
+    if path.suffix.lower() != f".{form}":  # a slip of the hand must not replace another kind of file
+        raise D2Error(f"a film of format {form} needs a name that ends so, got {path.name}: mend the name or --format")
     folder = make_folder(path.parent)
     with one_of_many(folder, lambda: remove_leftovers(folder, below=False)):
         unfinished = path.with_name(f".{secrets.token_hex(8)}{LEFTOVER}")
