@@ -32,6 +32,7 @@ SEALED = "\n"
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
+NO_PLACE = (errno.ENOENT, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP)
 
 
 class CannotWrite(D2Error):
@@ -64,6 +65,8 @@ def cannot_write(path: Path, error: OSError) -> CannotWrite:
     elif error.errno in FORBIDDEN:
         advice = "choose a folder that you may write"
     reason = error.strerror or str(error)
+    if error.errno in NO_PLACE:
+        return CannotWrite(f"cannot write {path} ({reason}): choose another place")
     return CannotWrite(f"cannot write {path} ({reason}): {advice} and give the same command again, which goes on")
 
 

@@ -189,7 +189,7 @@ def reaching(place: Path | str, remedy: str) -> Iterator[None]:
 
 def said(failure: BaseException) -> str:
     """What an exception says, on one short line."""
-    reason = failure.strerror if isinstance(failure, OSError) and failure.strerror else str(failure)
+    reason = getattr(failure, "strerror", None) or str(failure)  # OSError has it, and so have FFmpeg's errors
     text = " ".join(reason.encode("utf-8", "backslashreplace").decode().split()) or type(failure).__name__
     return text if len(text) <= 160 else f"{text[:156]} ..."
 

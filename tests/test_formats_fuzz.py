@@ -64,6 +64,14 @@ def report(path: Path) -> object:
     return make_report(rows, path.parent / "report", pictures)
 
 
+def some_rows() -> list[str]:
+    """Two rows of each kind: a report of all of them takes a while."""
+    found: dict[str, list[str]] = {}
+    for line in (Path(__file__).parent / "data" / "runs.jsonl").read_text().splitlines(keepends=True):
+        found.setdefault(json.loads(line)["kind"], []).append(line)
+    return [line for lines in found.values() for line in lines[:2]]
+
+
 def network(path: Path) -> np.ndarray:
     return MonocularModel(path, "relative")(PICTURE)
 
@@ -113,7 +121,7 @@ CASES = {
     "sensor png": Case("depth/cam00/0.png", write_sensor, sensor),
     "rows": Case(
         "runs.jsonl",
-        lambda p: p.write_text((Path(__file__).parent / "data" / "runs.jsonl").read_text()),
+        lambda p: p.write_text("".join(some_rows())),
         report,
     ),
     "export": Case(
