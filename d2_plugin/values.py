@@ -233,12 +233,13 @@ def _as_argument(kind: Any, value: Any, name: str) -> Any:
         elif origin in (int, float, str, bool, Path):
             if len(options) == 1:
                 return _as_kind(bare, limits, value, name)
-            if isinstance(value, origin) and (Path not in options or _names_a_file(value)):
+            if isinstance(value, origin) and (Path not in options or _names_a_file(str(value))):
                 return value
         elif origin is tuple:
             return _as_kind(bare, limits, value, name)
         elif isinstance(value, origin):
-            for key, item in value.items() if origin is Mapping and get_args(bare) else ():
+            entries = value.items() if isinstance(value, Mapping) and len(get_args(bare)) == 2 else ()
+            for key, item in entries:
                 _as_argument(get_args(bare)[1], item, f"{shown(key)} in {name}")
             return value
     raise _wrong(name, "must be " + " or ".join(_noun(bare_and_range(option)[0]) for option in options), value)

@@ -113,7 +113,8 @@ def noise(path: Path) -> None:
 
 
 def cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:600])
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
 
 
 def piped(path: Path) -> None:
