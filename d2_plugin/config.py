@@ -20,6 +20,7 @@ from d2_plugin.hooks.prune import PruneConfig
 from d2_plugin.hooks.table import HOOKS
 from d2_plugin.reading import NoSuchFile, read_toml
 from d2_plugin.settings import FORMAT, NONE, AtLeastOne, Count, Range, Seed, Settings, Share, of_this_format
+from d2_plugin.values import checked_arguments
 
 __all__ = ["D2Config", "DensifyConfig", "DepthLossConfig", "PruneConfig", "for_iterations"]
 
@@ -77,6 +78,7 @@ class D2Config(_HookTables):
         return super().from_dict(plain, where)
 
     @classmethod
+    @checked_arguments
     def from_toml(cls, path: str | Path, iterations: int | None = None) -> D2Config:
         """From a TOML file: `prior = "..."` and one table per hook, empty for its defaults.
 
@@ -109,6 +111,7 @@ class D2Config(_HookTables):
         return tuple(name for name in HOOKS if getattr(self, name) is not None)
 
 
+@checked_arguments
 def for_iterations(hooks: Iterable[str], iterations: int, **settings: Any) -> D2Config:
     """The named hooks with schedules that fit a run of `iterations` steps; `settings` are further fields of D2Config.
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import json_text
+from d2_plugin.reading import MOST_TEXT, json_text
 
 LEFTOVER = ".part"
 """How the temporary names end; what a killed process left behind is found by it."""
@@ -32,6 +32,7 @@ SEALED = "\n"
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
+NO_PLACE = (errno.ENOENT, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP)
 
 
 class CannotWrite(D2Error):
@@ -64,6 +65,8 @@ def cannot_write(path: Path, error: OSError) -> CannotWrite:
     elif error.errno in FORBIDDEN:
         advice = "choose a folder that you may write"
     reason = error.strerror or str(error)
+    if error.errno in NO_PLACE:
+        return CannotWrite(f"cannot write {path} ({reason}): choose another place")
     return CannotWrite(f"cannot write {path} ({reason}): {advice} and give the same command again, which goes on")
 
 
@@ -195,6 +198,8 @@ def _parsed(path: Path, kind: Kind) -> tuple[dict[str, Any], bool]:
     """The table, and whether its file begins as sealed ones do."""
     try:
         refuse_no_file(path)
+        if path.stat().st_size > MOST_TEXT:
+            raise ValueError(f"it has more than {MOST_TEXT} bytes")
         content = path.read_bytes()
         table = json.loads(content)
     except (FileNotFoundError, NotADirectoryError):
@@ -219,11 +224,14 @@ def _seal(table: Mapping[str, Any]) -> str:
 def archive_problem(path: Path) -> str:
     """What is wrong with a zip archive (.npz, or what `torch.save` writes), or nothing: its checksums are compared.
 
-    The readers of numpy and torch compare them in part or not at all.
+    The readers of numpy and torch compare them in part or not at all. What we write is not compressed, so a part that
+    says it is larger than its file is none of ours, and is not unpacked.
     """
     try:
         refuse_no_file(path)
         with zipfile.ZipFile(path) as archive:
+            if sum(part.file_size for part in archive.infolist()) > path.stat().st_size:
+                return "its parts say that they are larger than the file"
             bad = archive.testzip()
     except (OSError, ValueError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile) as error:
         return str(error) or type(error).__name__

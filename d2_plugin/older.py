@@ -23,18 +23,19 @@ def stand_in(module: str, package: str, use: str) -> Any:
         raise D2Error(f"Python {version} cannot {use} by itself: run `pip install {package}`") from None
 
 
-def hints_of(kind: type) -> dict[str, Any]:
-    """The annotations of a class and its bases, evaluated: `A | B` and `Annotated` included, also on Python 3.9."""
+def hints_of(kind: Any) -> dict[str, Any]:
+    """The annotations of a class and its bases, or of a function, evaluated: `A | B` and `Annotated` included, also on
+    Python 3.9."""
     if sys.version_info >= (3, 10):
         return get_type_hints(kind, include_extras=True)
     return backported_hints(kind)
 
 
-def backported_hints(kind: type) -> dict[str, Any]:
+def backported_hints(kind: Any) -> dict[str, Any]:
     """`hints_of` where Python cannot evaluate `A | B`: pydantic's stand-in reads it as `Union[A, B]`."""
     evaluated = stand_in("eval_type_backport", "eval-type-backport", "read annotations like `int | None`")
     found: dict[str, Any] = {}
-    for base in reversed(kind.__mro__):
+    for base in reversed(getattr(kind, "__mro__", (kind,))):
         names = vars(sys.modules[base.__module__])
         for name, text in vars(base).get("__annotations__", {}).items():
             if isinstance(text, str):

@@ -21,7 +21,7 @@ from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, PriorLoader
 from d2_plugin.hooks.edits import Idle, followed, limited
-from d2_plugin.hooks.expected import check_backbone, check_state, converted
+from d2_plugin.hooks.expected import check_backbone, check_state, check_step, converted, fitting_state
 from d2_plugin.hooks.finite import FiniteCheck
 from d2_plugin.hooks.prior import Store
 from d2_plugin.hooks.reports import Listener, Report, Telling, Trace
@@ -30,6 +30,7 @@ from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Backbone, Edit, Points
 from d2_plugin.reading import said
 from d2_plugin.registry import ADAPTERS, load
+from d2_plugin.values import checked_arguments
 
 _log = logging.getLogger(__name__)
 
@@ -88,6 +89,7 @@ class D2Hooks:
         return cls(config, backbone, store, hooks)
 
     @classmethod
+    @checked_arguments
     def attach(
         cls,
         config: str | Path | Mapping[str, Any] | D2Config,
@@ -190,18 +192,20 @@ class D2Hooks:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`, once the backbone is restored; refuses the state of other hooks than these."""
         check_state(state, self.hooks, len(self.backbone))
-        for name, hook in self.hooks.items():
-            hook.load_state_dict(state["hooks"][name])
-        self._sampler.load_state_dict(state["views"])
-        self.generator.set_state(state["generator"].cpu())
+        with fitting_state():
+            for name, hook in self.hooks.items():
+                hook.load_state_dict(state["hooks"][name])
+            self._sampler.load_state_dict(state["views"])
+            self.generator.set_state(state["generator"].cpu())
+            self._idle.load(state)
         self._evaluated = bool(state.get("evaluated", True))
-        self._idle.load(state)
         self._count = len(self.backbone)
         self._finite.step = self._finite.saved = state.get("step", 0)
         self.inserted_at = state.get("inserted_at", torch.zeros(self._count, dtype=torch.int32)).cpu()
 
     def _begin(self, step: int) -> None:
         """Tell the backbone the step, if it has `begin_step`, and notice changes that nobody reported."""
+        check_step(step)
         getattr(self.backbone, "begin_step", int)(step)
         self._check_count()
 

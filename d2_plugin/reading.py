@@ -51,6 +51,8 @@ def opened(path: Path | str, remedy: str = RESTORE) -> Iterator[BinaryIO]:
         NoSuchFile: there is none.
         Unreadable: it is a folder, a pipe, a socket or a device, may not be read, or its name is impossible.
     """
+    if not isinstance(path, (str, os.PathLike)):
+        raise Unreadable(f"{said(ValueError(repr(path)))} is no path: {remedy}")
     try:
         _check_regular(os.stat(path).st_mode, path, remedy)  # to open a device or a pipe may already change it
         handle = os.open(path, os.O_RDONLY | _NO_WAITING)
@@ -187,7 +189,7 @@ def reaching(place: Path | str, remedy: str) -> Iterator[None]:
 
 def said(failure: BaseException) -> str:
     """What an exception says, on one short line."""
-    reason = failure.strerror if isinstance(failure, OSError) and failure.strerror else str(failure)
+    reason = getattr(failure, "strerror", None) or str(failure)  # OSError has it, and so have FFmpeg's errors
     text = " ".join(reason.encode("utf-8", "backslashreplace").decode().split()) or type(failure).__name__
     return text if len(text) <= 160 else f"{text[:156]} ..."
 

@@ -25,6 +25,7 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.older import hints_of
 from d2_plugin.values import (
     Angle,
+    AtATime,
     AtLeastOne,
     Count,
     Every,
@@ -46,6 +47,7 @@ __all__ = [
     "FORMAT",
     "NONE",
     "Angle",
+    "AtATime",
     "AtLeastOne",
     "Count",
     "Declared",
@@ -147,6 +149,8 @@ def _declared(kind: Any) -> tuple[Declared, ...]:
 
 def of_this_format(table: Mapping[str, Any], place: str) -> dict[str, Any]:
     """The settings of a file without its `version`, which must be `FORMAT`; a file that has none is of version 1."""
+    if not isinstance(table, Mapping):
+        raise D2Error(f"{place} must be a table of settings, got {shown(table)}: give a file, a mapping or a D2Config")
     version = table.get("version", 1)
     if version != FORMAT or isinstance(version, bool):
         raise D2Error(

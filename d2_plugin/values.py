@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import math
 import types
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.older import hints_of
 
 FAR = (1e4, 1e15)
 """An upper bound within these is named only where it was crossed."""
+
+LISTS = (Iterable, Sequence, Collection)
+"""Annotations of arguments that any iterable fits."""
 
 UNIONS = (Union, getattr(types, "UnionType", Union))
 """What `get_origin` says of `Union[A, B]` and of `A | B`, which Python 3.9 does not evaluate yet."""
@@ -58,6 +64,8 @@ Every = Annotated[int, Range(1, unit="steps")]
 """Optimizer steps from one time to the next, 1 or more."""
 AtLeastOne = Annotated[int, Range(1)]
 """A whole number, 1 or more."""
+AtATime = Annotated[int, Range(1, 1024)]
+"""How many threads or processes work at a time, 1 or more."""
 Seed = Annotated[int, Range(0, 2**63 - 1)]
 """Seed of a random generator."""
 Positive = Annotated[float, Range(0, open_low=True)]
@@ -120,11 +128,18 @@ def _as_kind(kind: Any, limits: Range, value: Any, name: str) -> Any:
         return _as_tuple(get_args(kind), limits, value, name)
     if kind in (int, float):
         return _as_number(kind, limits, value, name)
-    if kind is Path and isinstance(value, str):
+    if kind is Path and isinstance(value, (str, Path)) and _names_a_file(value):
         return Path(value)
+    if kind is Path:
+        raise _wrong(name, "must be a path", value)
     if isinstance(value, get_origin(kind) or kind):
         return value
     raise _wrong(name, f"must be {_noun(kind)}", value)
+
+
+def _names_a_file(path: str | Path) -> bool:
+    """Whether it may be a path; no text at all would be the current folder, and a zero byte ends a name."""
+    return str(path) != "" and "\0" not in str(path)
 
 
 def _is_choice(kind: Any) -> bool:
@@ -167,6 +182,69 @@ def _as_tuple(kinds: Sequence[Any], limits: Range, value: Any, name: str) -> tup
     return tuple(_checked(*_inner(kind, limits), item, f"{name}[{i}]") for i, (kind, item) in enumerate(pairs))
 
 
+Called = TypeVar("Called", bound=Callable[..., Any])
+
+
+def checked_arguments(function: Called) -> Called:
+    """Hold what a public function is given against its annotations: a D2Error says what was expected and got.
+
+    Where a list of something is declared, any iterable but a text is taken, and handed on as a tuple. What cannot be
+    told apart (protocols, arrays of a shape, type variables) passes.
+    """
+    signature = inspect.signature(function)
+    many = {name for name, one in signature.parameters.items() if one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD)}
+
+    @functools.wraps(function)
+    def guarded(*given: Any, **named: Any) -> Any:
+        bound = signature.bind(*given, **named)
+        kinds = _kinds_of(function)
+        for name in (kinds.keys() & bound.arguments.keys()) - many:
+            where = f"{name} of {getattr(function, '__qualname__', function)}"
+            bound.arguments[name] = _as_argument(kinds[name], bound.arguments[name], where)
+        return function(*bound.args, **bound.kwargs)
+
+    return cast(Called, guarded)
+
+
+@functools.cache
+def _kinds_of(function: Any) -> dict[str, Any]:
+    """The declared kinds of arguments; none where an annotation names what this process never imported."""
+    try:
+        return {name: kind for name, kind in hints_of(function).items() if name != "return"}
+    except NameError:
+        return {}
+
+
+def _as_argument(kind: Any, value: Any, name: str) -> Any:
+    options = options_of(kind)
+    if value is None and type(None) in options:
+        return None
+    options = tuple(option for option in options if option is not type(None))
+    for option in options:
+        bare, limits = bare_and_range(option)
+        origin = get_origin(bare) or bare
+        if origin in LISTS:
+            items = get_args(bare)[:1] or (Any,)
+            if isinstance(value, Iterable) and not isinstance(value, (str, bytes)):
+                return tuple(_as_argument(items[0], item, f"an item of {name}") for item in value)
+        elif origin is Any or not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
+            if not _is_choice(bare) or any(value == choice for choice in get_args(bare)):
+                return value
+        elif origin in (int, float, str, bool, Path):
+            if len(options) == 1:
+                return _as_kind(bare, limits, value, name)
+            if isinstance(value, origin) and (Path not in options or _names_a_file(str(value))):
+                return value
+        elif origin is tuple:
+            return _as_kind(bare, limits, value, name)
+        elif isinstance(value, origin):
+            entries = value.items() if isinstance(value, Mapping) and len(get_args(bare)) == 2 else ()
+            for key, item in entries:
+                _as_argument(get_args(bare)[1], item, f"{shown(key)} in {name}")
+            return value
+    raise _wrong(name, "must be " + " or ".join(_noun(bare_and_range(option)[0]) for option in options), value)
+
+
 def _inner(kind: Any, limits: Range) -> tuple[Any, Range]:
     """A kind inside a union or tuple, and its range: its own, else that of the whole."""
     bare, own = bare_and_range(kind)
@@ -185,8 +263,10 @@ def _noun(kind: Any) -> str:
     """What a value of this kind is called in a sentence."""
     if _is_choice(kind):
         return f"one of {', '.join(map(str, get_args(kind)))}"
-    if get_origin(kind) is tuple:
+    if get_origin(kind) is tuple or get_origin(kind) in LISTS:
         return "a list"
+    if get_origin(kind) is Mapping or kind is Mapping:
+        return "a table"
     if get_origin(kind) is not None or is_dataclass(kind):
         return "a table of settings"
     words = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}

@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import random
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -132,6 +133,20 @@ def test_a_link_in_the_place_of_a_file_is_replaced_and_not_followed(tmp_path: Pa
     write(tmp_path / "file", b"new")
     assert (tmp_path / "precious").read_text() == "mine"
     assert not (tmp_path / "file").is_symlink()
+
+
+def test_an_archive_that_unfolds_is_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("positions.npy", bytes(1 << 24))
+    assert archive_problem(path) == "its parts say that they are larger than the file"
+
+
+def test_a_table_of_gigabytes_is_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "table.json").open("wb") as file:
+        file.truncate(1 << 40)  # takes no room on the disk
+    with pytest.raises(Damaged, match="it has more than 268435456 bytes"):
+        read_table(tmp_path / "table.json", KIND)
 
 
 def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) -> None:

@@ -26,6 +26,8 @@ from d2_plugin.priors.disk.exported import RenamedStore
 from d2_plugin.priors.monocular.network import MonocularModel
 from d2_plugin.reading import read_json
 from d2_plugin.study.report.report import collect, make_report
+from d2_plugin.viewing.checkpoints import read_ply
+from d2_plugin.viewing.films.path_file import read_camera_path
 
 cv2 = pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
@@ -62,6 +64,14 @@ def report(path: Path) -> object:
     return make_report(rows, path.parent / "report", pictures)
 
 
+def some_rows() -> list[str]:
+    """Two rows of each kind: a report of all of them takes a while."""
+    found: dict[str, list[str]] = {}
+    for line in (Path(__file__).parent / "data" / "runs.jsonl").read_text().splitlines(keepends=True):
+        found.setdefault(json.loads(line)["kind"], []).append(line)
+    return [line for lines in found.values() for line in lines[:2]]
+
+
 def network(path: Path) -> np.ndarray:
     return MonocularModel(path, "relative")(PICTURE)
 
@@ -78,7 +88,21 @@ def write_video(path: Path) -> None:
     writer.release()
 
 
+def write_camera_path(path: Path) -> None:
+    pose = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50.0, "aspect": 1.5, "render_time": 0.5}
+    table = {"camera_type": "perspective", "render_height": 54, "render_width": 96, "camera_path": [pose, pose]}
+    path.write_text(json.dumps({**table, "fps": 24, "seconds": 2}))
+
+
+def write_cloud(path: Path) -> None:
+    names = ["x", "y", "z", "opacity", "scale_0", "rot_0", "f_dc_0"]
+    head = ["ply", "format binary_little_endian 1.0", "element vertex 5", *(f"property float {n}" for n in names)]
+    path.write_bytes("\n".join([*head, "end_header\n"]).encode() + np.zeros((5, 7), np.float32).tobytes())
+
+
 CASES = {
+    "camera path": Case("camera_path.json", write_camera_path, read_camera_path),
+    "point cloud": Case("cloud.ply", write_cloud, read_ply),
     "json": Case("a.json", lambda p: p.write_text(json.dumps({"a": [1, {"b": 2.5}], "c": "d"})), read_json),
     "toml": Case(
         "d2.toml",
@@ -97,7 +121,7 @@ CASES = {
     "sensor png": Case("depth/cam00/0.png", write_sensor, sensor),
     "rows": Case(
         "runs.jsonl",
-        lambda p: p.write_text((Path(__file__).parent / "data" / "runs.jsonl").read_text()),
+        lambda p: p.write_text("".join(some_rows())),
         report,
     ),
     "export": Case(

@@ -76,6 +76,32 @@ def test_a_state_of_other_things() -> None:
     d2.load_state_dict(state)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("views", 5),
+        ("generator", None),
+        ("generator", torch.zeros(3)),
+        ("idle", [1]),
+        ("retired", "x"),
+        ("inserted_at", torch.zeros(2, dtype=torch.int32)),
+        ("hooks", {"densify": {}, "prune": None, "depth_loss": {}}),
+    ],
+)
+def test_a_state_with_something_else_in_it(name: str, value: Any) -> None:
+    d2 = attached()
+    with pytest.raises(D2Error, match=r"the state of D2 (does not fit|has)|inserted_at of d2 in the checkpoint"):
+        d2.load_state_dict(d2.state_dict() | {name: value})
+
+
+@pytest.mark.parametrize("step", [None, "x", -1, 1.5, True])
+def test_what_is_no_step(step: Any) -> None:
+    d2 = attached()
+    for call in (lambda: d2.step(step), lambda: d2.loss(step, make_views()[:1])):
+        with pytest.raises(D2Error, match="as the step: give the number of the optimizer's step"):
+            call()
+
+
 class InFloat64:
     """A backbone whose Gaussians are float64."""
 

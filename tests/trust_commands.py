@@ -17,8 +17,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -32,7 +30,8 @@ PRELOADED = [
     *("torch", "torch._dynamo", "torch.onnx", "sympy", "cv2", "pycolmap"),
     *("d2_plugin.commands.cli", "d2_plugin.runs.run", "d2_plugin.runs.evaluation", "d2_plugin.priors.build"),
     *("d2_plugin.backbones.yang4d", "d2_plugin.adapters.yang4d", "d2_plugin.study.capture_export"),
-    *("d2_plugin.study.report.report", "d2_plugin.viewing.export.export", "trust_commands"),
+    *("d2_plugin.study.report.report", "d2_plugin.viewing.export.export", "d2_plugin.captures.videos.importing"),
+    *("av", "trust_commands"),
 ]
 """What the commands import, some of it late."""
 
@@ -55,6 +54,8 @@ class Ended:
     said: str
     operations: int = 0
     renames: int = 0
+    cpu: float = 0.0
+    """Seconds of CPU time, where a fault was given."""
 
     @property
     def refusal(self) -> str:
@@ -72,7 +73,7 @@ def compiled_faults(folder: Path) -> Path | None:
     if compiler is None or not sys.platform.startswith("linux"):
         return None
     library = folder / "faults.so"
-    subprocess.run([compiler, "-shared", "-fPIC", "-O1", str(SOURCE), "-o", str(library), "-ldl"], check=True)
+    subprocess.run([compiler, "-shared", "-fPIC", "-O1", str(SOURCE), "-o", str(library), "-ldl", "-lrt"], check=True)
     return library
 
 
@@ -94,12 +95,12 @@ class Commands:
             for name, value in before.items():
                 os.environ.pop(name) if value is None else os.environ.update({name: value})
 
-    def start(self, words: list[str], fault: Fault | None = None) -> Started:
-        """A command that runs while this one goes on."""
+    def start(self, words: list[str], fault: Fault | None = None, kill_after: float | None = None) -> Started:
+        """A command that runs while this one goes on; it is killed (SIGKILL) after so many CPU seconds."""
         self._count += 1
         log = self.logs / f"{os.getpid()}-{self._count}.log"
         armed = None if fault is None else (str(fault.folder), fault.how, fault.at, fault.error)
-        process = self._context.Process(target=_command, args=(words, str(log), armed))
+        process = self._context.Process(target=_command, args=(words, str(log), armed, kill_after))
         process.start()
         return Started(process, log)
 
@@ -108,11 +109,8 @@ class Commands:
         return self.start(words, fault).end(limit)
 
     def kill_after(self, words: list[str], seconds: float) -> Ended:
-        """A command that is killed (SIGKILL) after so many seconds, unless it ended before."""
-        started = self.start(words)
-        started.process.join(seconds)
-        started.process.kill()
-        return started.end()
+        """A command that is killed (SIGKILL) after so many CPU seconds, unless it ended before."""
+        return self.start(words, kill_after=seconds).end()
 
 
 @dataclass(frozen=True)
@@ -129,9 +127,9 @@ class Started:
             self.process.kill()
             raise AssertionError(f"did not end within {limit} s: {self.log.read_text()[-2000:]}")
         said = self.log.read_text(errors="replace") if self.log.exists() else ""
-        counted = re.search(r"^counted (\d+) (\d+)$", said, re.MULTILINE)
-        operations, renames = (int(n) for n in counted.groups()) if counted else (0, 0)
-        return Ended(self.process.exitcode, said, operations, renames)
+        counted = re.search(r"^counted (\d+) (\d+) (\S+)$", said, re.MULTILINE)
+        operations, renames, cpu = counted.groups() if counted else (0, 0, 0)
+        return Ended(self.process.exitcode, said, int(operations), int(renames), float(cpu))
 
 
 def killed(ended: Ended) -> bool:
@@ -143,7 +141,7 @@ def _nothing() -> None:
     return
 
 
-def _command(words: list[str], log: str, fault: tuple[str, int, int, int] | None) -> None:
+def _command(words: list[str], log: str, fault: tuple[str, int, int, int] | None, kill_after: float | None) -> None:
     """What the new process does."""
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(descriptor, 1)
@@ -158,9 +156,12 @@ def _command(words: list[str], log: str, fault: tuple[str, int, int, int] | None
     if fault is not None:
         folder, how, at, error = fault
         shim.d2_fault_arm(folder.encode(), ctypes.c_int(how), ctypes.c_long(at), ctypes.c_int(error))
+    if kill_after is not None:
+        assert shim.d2_fault_kill_after(ctypes.c_double(kill_after)) == 0
     code = main(words)
     if fault is not None:
-        sys.stderr.write(f"counted {shim.d2_fault_operations()} {shim.d2_fault_renames()}\n")
+        counted = f"{shim.d2_fault_operations()} {shim.d2_fault_renames()} {time.process_time():.3f}"
+        sys.stderr.write(f"counted {counted}\n")
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)
@@ -196,14 +197,3 @@ def _digest(state: Any) -> Any:
     if isinstance(state, dict):
         return {str(name): _digest(value) for name, value in state.items()}
     return [_digest(value) for value in state] if isinstance(state, list | tuple) else state
-
-
-@contextmanager
-def measured() -> Iterator[list[float]]:
-    """The seconds that something took, in a list of one."""
-    seconds = [0.0]
-    start = time.monotonic()
-    try:
-        yield seconds
-    finally:
-        seconds[0] = time.monotonic() - start

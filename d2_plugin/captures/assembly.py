@@ -19,7 +19,7 @@ import numpy as np
 from d2_plugin.arrays import read_array
 from d2_plugin.captures.capture import Camera, Capture, MonoKind, Source
 from d2_plugin.captures.files import FrameFiles, numbered_files
-from d2_plugin.captures.lens import LARGEST_COEFFICIENT, Lens, UndistortedSource, black_share
+from d2_plugin.captures.lens import LARGEST_COEFFICIENT, Lens, UndistortedSource, black_share, refuse_black
 from d2_plugin.captures.masks import NO_MASKS, MaskFiles, find_masks
 from d2_plugin.captures.pictures import read_picture
 from d2_plugin.errors import D2Error
@@ -116,6 +116,7 @@ def _lens_notes(bent: Mapping[str, Lens], cameras: Mapping[str, Camera]) -> tupl
         return ()
     shares = {name: black_share(lens, cameras[name]) for name, lens in bent.items()}
     worst = max(shares, key=lambda name: shares[name])
+    refuse_black(shares[worst], worst)
     note = f"lens distortion of {', '.join(bent)} is undone when a picture is read"
     if shares[worst] > BLACK_NOTED:
         note += f"; pixels that were not recorded are black: up to {shares[worst]:.1%} ({worst})"

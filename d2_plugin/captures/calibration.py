@@ -26,6 +26,9 @@ LARGEST_SIDE = 65_535
 FIELD_OF_VIEW = (0.5, 178.0)
 """A camera that sees less or more than this, in degrees, is refused. What is unusual is noted, see `check`."""
 
+MOST_OBLIQUE = 80.0
+"""Degrees between a camera's axis and the middle of its picture, at most: what is farther out is no principal point."""
+
 FOCAL_RATIO = 4.0
 """fx and fy differ by less than this factor: anamorphic lenses reach 2."""
 
@@ -103,6 +106,12 @@ def checked_camera(
             f"sees {across:.3g} x {down:.3g} degrees, expected {FIELD_OF_VIEW[0]:g} to {FIELD_OF_VIEW[1]:g} "
             "(are the focal lengths in pixels of these pictures?)"
         )
+    oblique = off_axis(K, size)
+    if oblique > MOST_OBLIQUE:
+        raise refuse(
+            f"has its principal point at ({K[0, 2]:g}, {K[1, 2]:g}), {oblique:.1f} degrees from the middle of the "
+            f"picture, expected at most {MOST_OBLIQUE:g}"
+        )
     rotation = T_camera_world[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         raise refuse("has an R that is no rotation (orthonormal rows, determinant +1)")
@@ -117,6 +126,12 @@ def field_of_view(K: np.ndarray, size: tuple[int, int]) -> tuple[float, float]:
     angles = np.arctan2(edges - K[:2, 2], K[[0, 1], [0, 1]])
     across, down = np.rad2deg(angles[1] - angles[0])
     return float(across), float(down)
+
+
+def off_axis(K: np.ndarray, size: tuple[int, int]) -> float:
+    """Angle between a camera's axis and the ray through the middle of its picture, degrees."""
+    middle = (np.array(size) / 2 - K[:2, 2]) / K[[0, 1], [0, 1]]
+    return float(np.rad2deg(np.arctan(np.hypot(*middle))))
 
 
 def check_name(name: str, where: str) -> None:

@@ -94,20 +94,20 @@ class Capture:
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3]; refuses a picture whose size is not the camera's."""
-        return self._sized(self.source.image(self._known(camera), frame), camera, frame, "frame")
+        return self._sized(self.source.image(self._known(camera, frame), frame), camera, frame, "frame")
 
     def depth(self, camera: str, frame: int) -> np.ndarray | None:
         """True planar z float32 [H, W] (0 = unknown), or None; refuses a map whose size is not the camera's."""
-        depth = self.source.depth(self._known(camera), frame)
+        depth = self.source.depth(self._known(camera, frame), frame)
         return None if depth is None else self._sized(depth, camera, frame, "true depth of frame")
 
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
         """Monocular map of `mono_kind` from disk, float32 at the size it is stored in, or None."""
-        return self.source.mono(self._known(camera), frame)
+        return self.source.mono(self._known(camera, frame), frame)
 
     def mask(self, camera: str, frame: int) -> np.ndarray | None:
         """How much each pixel is foreground, float32 [H, W] in 0..1, or None where nobody says."""
-        self._known(camera)
+        self._known(camera, frame)
         mask = self.source.mask(camera, frame) if isinstance(self.source, MaskedSource) else None
         return None if mask is None else self._sized(mask, camera, frame, "mask of frame")
 
@@ -131,7 +131,9 @@ class Capture:
             )
         return array
 
-    def _known(self, camera: str) -> str:
-        if camera not in self.cameras:
+    def _known(self, camera: str, frame: int = 0) -> str:
+        if not isinstance(camera, str) or camera not in self.cameras:
             raise unknown_name("camera", camera, self.cameras)
+        if isinstance(frame, bool) or not isinstance(frame, (int, np.integer)):
+            raise D2Error(f"frame {frame!r} is no number: choose among frames {self.frames[0]} to {self.frames[-1]}")
         return camera

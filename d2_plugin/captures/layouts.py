@@ -19,6 +19,7 @@ from d2_plugin.captures.selection import downscale as downscaled
 from d2_plugin.captures.selection import select_frames
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import reaching
+from d2_plugin.values import checked_arguments
 
 Reader = Callable[[Path, Optional[tuple[str, ...]], bool], Capture]  # noqa: UP045  at run time, on Python 3.9 too
 """(folder, cameras to read or None, whether to leave out cameras without counterpart) -> capture."""
@@ -44,6 +45,7 @@ LAYOUTS: dict[str, Layout] = {
 """By name, in the order in which a folder is tried. A new layout is one module in readers/ and one row here."""
 
 
+@checked_arguments
 def open_capture(
     path: Path | str,
     *,

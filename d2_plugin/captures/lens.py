@@ -31,6 +31,9 @@ COVERAGE_STEP = 8
 LARGEST_COEFFICIENT = 1e4
 """Distortion coefficients beyond this are a damaged file: those of real lenses are below 100."""
 
+MOST_BLACK = 0.5
+"""Share of an undistorted picture that may be without a recorded pixel: more is a wrong coefficient."""
+
 NEVER = 1e-12
 """A fold is ignored where 1 / a^2 is below this: it lies a million focal lengths away from the centre."""
 
@@ -193,6 +196,15 @@ def black_share(lens: Lens, camera: Camera) -> float:
     x, y = np.moveaxis(_recorded_grid(lens, (camera.width, camera.height), COVERAGE_STEP), -1, 0)
     inside = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
     return 1 - float(inside.mean())
+
+
+def refuse_black(share: float, name: str) -> None:
+    """Raise for a lens that leaves hardly anything of the pictures of camera `name`."""
+    if share > MOST_BLACK:
+        raise D2Error(
+            f"undoing the lens distortion of camera {name} leaves {1 - share:.0%} of its pictures, expected at least "
+            f"{1 - MOST_BLACK:.0%}: correct its distortion coefficients and their model"
+        )
 
 
 def _recorded_grid(lens: Lens, size: tuple[int, int], step: int) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from d2_plugin.durable import write
 from d2_plugin.errors import D2Error, missing_extra
 from d2_plugin.reading import opened, parsing, read_bytes, shown_path
+from d2_plugin.values import shown
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -50,6 +51,14 @@ def read_picture(path: Path) -> np.ndarray:
     flags = cv2.IMREAD_UNCHANGED if transparent else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     picture = _decoded(path, encoded, flags)
     return _over_black(picture) if transparent else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def checked_picture(picture: object, what: str) -> np.ndarray:
+    """What somebody handed over as a picture; a D2Error where it is no RGB uint8 [H, W, 3]."""
+    if isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.shape[2:] == (3,) and picture.size:
+        return picture
+    found = f"{picture.dtype} {picture.shape}" if isinstance(picture, np.ndarray) else shown(picture)
+    raise D2Error(f"{what} is {found}, expected RGB uint8 [H, W, 3]: give a picture as `read_picture` returns it")
 
 
 def read_numbers(path: Path) -> np.ndarray:

@@ -10,8 +10,10 @@ import numpy as np
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.pictures import shrink_depth, shrink_mask, shrink_picture
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.values import checked_arguments
 
 
+@checked_arguments
 def select_cameras(capture: Capture, cameras: Iterable[str]) -> Capture:
     """The capture with the named cameras only, in the order given."""
     names = list(cameras)
@@ -25,10 +27,11 @@ def select_cameras(capture: Capture, cameras: Iterable[str]) -> Capture:
     return replace(capture, cameras={name: capture.cameras[name] for name in names})
 
 
+@checked_arguments
 def select_frames(capture: Capture, frames: Iterable[int]) -> Capture:
     """The capture with the given frame numbers only, ascending."""
-    chosen = tuple(sorted(set(frames)))
-    missing = [frame for frame in chosen if frame not in set(capture.frames)]
+    chosen, there = tuple(sorted(set(frames))), set(capture.frames)
+    missing = [frame for frame in chosen if frame not in there]
     if missing or not chosen:
         what = f"frame {missing[0]} is not in {capture.name}" if missing else f"no frame chosen from {capture.name}"
         raise D2Error(f"{what}: choose among frames {capture.frames[0]} to {capture.frames[-1]}")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from d2_plugin.commands.arguments.form import Form, Given
 from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
 from d2_plugin.errors import D2Error
-from d2_plugin.settings import Range
+from d2_plugin.settings import AtATime
 
 HELD_FRAMES = 8
 """At most this many frames are held against the true depth: the errors of all their pixels are in memory at once."""
@@ -23,7 +23,7 @@ class PriorOptions(ConfigFile):
     """Folder of the prior store."""
     shard: str | None = None
     """Build part I of N only, as I/N with I from 1 to N."""
-    workers: Annotated[int, Range(1, unit="processes")] | None = None
+    workers: AtATime | None = None
     """Build with this many processes on this machine."""
     scheduler: str | None = None
     """Address of a dask cluster to build on, as tcp://host:8786."""

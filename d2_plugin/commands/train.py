@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from d2_plugin.runs.run import Run
     from d2_plugin.viewing.live.run import LiveRun
 
-OF_THE_RUN = ("test_cameras", "backbone", "iterations", "hooks", "priors", "accept_empty_prior", "seed", "device")
+OF_THE_RUN = (
+    *("test_cameras", "backbone", "iterations", "hooks", "priors", "accept_empty_prior", "background_weight"),
+    *("seed", "device"),
+)
 TABLES = ("densify", "prune", "depth_loss", "d2", "priors", "backbone", "plan", "import")
 
 

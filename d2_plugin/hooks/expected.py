@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import operator
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -10,6 +12,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Backbone, Splats, View
+from d2_plugin.reading import said
 from d2_plugin.values import shown
 
 MEMBERS = ("settings", "__len__", "view", "slice_at", "insert", "remove", "on_resize")
@@ -82,6 +85,29 @@ def check_splats(splats: Splats, count: int, inserting: bool) -> None:
         )
 
 
+def check_step(step: object) -> None:
+    """Refuse what is no number of an optimizer step."""
+    try:
+        fits = not isinstance(step, bool) and operator.index(step) >= 0  # type: ignore[arg-type]
+    except TypeError:
+        fits = False
+    if not fits:
+        raise D2Error(f"d2 got {shown(step)} as the step: give the number of the optimizer's step, 0 or more")
+
+
+@contextmanager
+def fitting_state() -> Iterator[None]:
+    """Within it, a state that does not fit is one sentence."""
+    try:
+        yield
+    except D2Error:
+        raise
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as failure:
+        raise D2Error(
+            f"the state of D2 does not fit ({said(failure)}): give what d2.state_dict() returned, of this version"
+        ) from failure
+
+
 def check_state(state: object, hooks: Mapping[str, Any], count: int) -> None:
     """Refuse a state that `state_dict` did not give, one of other hooks, or one of another number of Gaussians."""
     lacks = [name for name in STATE if not isinstance(state, Mapping) or name not in state]
@@ -94,10 +120,16 @@ def check_state(state: object, hooks: Mapping[str, Any], count: int) -> None:
             f"the checkpoint was made with hooks {names or 'none'} but this run has {sorted(hooks) or 'none'}: "
             "resume with the same hooks"
         )
-    for name, tensors in saved.items():
-        for what, tensor in tensors.items():
-            if isinstance(tensor, Tensor) and tensor.ndim > 0 and len(tensor) != count:
-                raise D2Error(
-                    f"{what} of {name} in the checkpoint is of {len(tensor)} Gaussians but the backbone has {count}: "
-                    "restore the backbone from the same checkpoint before d2"
-                )
+    of_hooks = [(name, *entry) for name, tensors in saved.items() for entry in _entries(name, tensors)]
+    for name, what, tensor in [*of_hooks, ("d2", "inserted_at", state.get("inserted_at"))]:
+        if isinstance(tensor, Tensor) and tensor.ndim > 0 and len(tensor) != count:
+            raise D2Error(
+                f"{what} of {name} in the checkpoint is of {len(tensor)} Gaussians but the backbone has {count}: "
+                "restore the backbone from the same checkpoint before d2"
+            )
+
+
+def _entries(name: str, tensors: object) -> list[tuple[str, Any]]:
+    if not isinstance(tensors, Mapping):
+        raise D2Error(f"the state of D2 has {shown(tensors)} for {name}: give what d2.state_dict() returned")
+    return list(tensors.items())

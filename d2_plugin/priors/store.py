@@ -37,6 +37,7 @@ from d2_plugin.priors.files import Entry, EntryFolder
 from d2_plugin.priors.frame import hash_of, not_of, other_capture
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import CameraRecord, DepthPrior, Label
+from d2_plugin.values import checked_arguments
 
 FORMAT = 4
 """Of store.json and of the arrays; raise it when either changes."""
@@ -104,6 +105,7 @@ class PriorStore:
         self.entries = EntryFolder(self.path / "priors")
 
     @classmethod
+    @checked_arguments
     def open(cls, path: Path | str) -> PriorStore:
         """Open a store for reading; every record is checked against the header and size of its array.
 
@@ -122,6 +124,7 @@ class PriorStore:
         return store
 
     @classmethod
+    @checked_arguments
     def create(
         cls, path: Path | str, cameras: Sequence[str], frames: Sequence[int], about: dict[str, Any]
     ) -> PriorStore:
@@ -187,6 +190,7 @@ class PriorStore:
         table = read_table(path / "store.json", STORE)
         return cls(path, table["cameras"], table["frames"], table["about"])
 
+    @checked_arguments
     def prior(self, camera: str, frame: int) -> DepthPrior | None:
         """D* of one view as tensors on the CPU, or None where the store has none.
 
@@ -202,6 +206,7 @@ class PriorStore:
         sigma = SIGMA[codes["sigma"]]
         return DepthPrior(*(torch.from_numpy(map_) for map_ in (depth, labels, colors, sigma)))
 
+    @checked_arguments
     def record(self, camera: str, frame: int) -> dict[str, Any] | None:
         """What is known about one prior: alignment, shares, settings, hashes; None where the store has none."""
         entry = self._entry(camera, frame)

@@ -178,6 +178,9 @@ def _filtered(values: np.ndarray, taps: Sequence[float], axis: int) -> np.ndarra
 
 def _pair(image: Tensor, truth: Tensor, window: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Both pictures as [3, H, W] float64 (in float32 the variances of flat regions would be rounding noise)."""
+    if not isinstance(image, Tensor) or not isinstance(truth, Tensor):
+        kinds = f"{type(image).__name__} and {type(truth).__name__}"
+        raise D2Error(f"pictures are compared as tensors [H, W, 3], got {kinds}: give two tensors")
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
         raise D2Error(
             f"pictures of shape {tuple(image.shape)} and {tuple(truth.shape)} cannot be compared: give two [H, W, 3]"
@@ -226,21 +229,25 @@ class Metric:
     score: Callable[[Compared], float | None]
 
 
+NO_DIFFERENCE = 100.0
+"""What counts as the PSNR of equal pictures, dB: their own is infinite, which has no mean and no place in JSON."""
+
 METRICS = {
     "psnr": Metric(
-        "20 log10(1 / sqrt(MSE)) per image in dB, then the mean over images", lambda c: psnr(c.image, c.truth)
+        f"20 log10(1 / sqrt(MSE)) per image in dB, at most {NO_DIFFERENCE:g}, then the mean over images",
+        lambda c: min(psnr(c.image, c.truth), NO_DIFFERENCE),
     ),
     "psnr_cc": Metric(
         "PSNR after the best affine change of each channel, a truth + b = image undone (gsplat color_correct_affine)",
-        lambda c: psnr_color_corrected(c.image, c.truth),
+        lambda c: min(psnr_color_corrected(c.image, c.truth), NO_DIFFERENCE),
     ),
     "psnr_moving": Metric(
         "PSNR of the pixels that differ by more than 12/255 from the median of their camera's frames (this project)",
-        lambda c: None if c.moving is None else psnr(c.image, c.truth, c.moving),
+        lambda c: None if c.moving is None else min(psnr(c.image, c.truth, c.moving), NO_DIFFERENCE),
     ),
     "psnr_mask": Metric(
         "PSNR of the recorded pixels inside the capture's foreground mask, where it has one (this project)",
-        lambda c: None if c.inside is None else psnr(c.image, c.truth, c.inside),
+        lambda c: None if c.inside is None else min(psnr(c.image, c.truth, c.inside), NO_DIFFERENCE),
     ),
     "ssim1": Metric(
         "uniform 7x7 window, sample covariance, 3 px border dropped, data range 1 (scikit-image)",

@@ -33,6 +33,7 @@ from d2_plugin.runs.start import (
     scene_extent,
     triangulated_points,
 )
+from d2_plugin.values import checked_arguments
 
 CHECKPOINTS = 10
 """How often a run is saved. One that was cut off continues from its last checkpoint, bitwise."""
@@ -41,6 +42,7 @@ CHECKPOINTS = 10
 class Run:
     """A run folder: run.json (settings), points.npz, priors/, checkpoint.pt, metrics.json, pictures/."""
 
+    @checked_arguments
     def __init__(self, settings: RunSettings, folder: Path, guidance: Guidance | None = None) -> None:
         self.settings, self.folder, self.guidance = check(settings), folder, guidance
         self._checkpoint = folder / "checkpoint.pt"
@@ -56,6 +58,7 @@ class Run:
         self._writes = False
 
     @classmethod
+    @checked_arguments
     def load(cls, folder: Path) -> Run:
         """The run that lies in `folder`."""
         table = read_run(folder)

@@ -9,12 +9,15 @@ from typing import Any, Protocol
 
 from d2_plugin.captures import Capture, open_capture
 from d2_plugin.captures.checks.calibrated import check_capture
+from d2_plugin.captures.checks.masked import check_background_weight
 from d2_plugin.captures.checks.memory import check_memory
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks import Hook
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
+from d2_plugin.runs.saved.kinds import RUN
 from d2_plugin.runs.settings import RunSettings, prior_settings
 from d2_plugin.runs.start import TimedPoints
+from d2_plugin.values import shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +41,7 @@ class Scene:
         capture = open_capture(settings.capture, cameras=named, frames=settings.frames, downscale=settings.downscale)
         train, test = _split(capture, settings)
         check_memory(capture, train)
+        check_background_weight(capture, train, settings.background_weight)
         capture = replace(capture, notes=(*capture.notes, *check_capture(capture, (*train, *test), scored=test)))
         plan = plan_scene(capture, train, _mono_source(capture, settings), prior_settings(settings))
         return cls(capture, train, test, plan.override(**settings.overrides.get("plan", {})))
@@ -67,6 +71,10 @@ class Remembered:
     """The guidance of a run that lies in a folder: it can be scored and looked at, and only its maker trains it on."""
 
     found: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.found, Mapping) or not isinstance(self.found.get("name"), str):
+            raise D2Error(f"the run is guided by {shown(self.found)}, which has no name: {RUN.remedy}")
 
     def identity(self) -> Mapping[str, Any]:
         """As run.json has it."""

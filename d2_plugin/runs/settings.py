@@ -105,6 +105,8 @@ def check(settings: RunSettings) -> RunSettings:
 
 
 def _absolute(path: str, name: str) -> str:
+    if not path:
+        raise D2Error(f"{name} is no text at all, expected a path: name it, or a dot for the current folder")
     try:
         return str(Path(path).resolve())
     except (OSError, ValueError, RuntimeError) as failure:  # a zero byte, a name too long, links in a circle

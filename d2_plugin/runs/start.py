@@ -65,7 +65,7 @@ class TimedPoints:
         problem = archive_problem(path)
         if not problem:
             try:
-                with np.load(path) as stored:
+                with np.load(path, allow_pickle=False) as stored:
                     found = stored["format"].tolist() if "format" in stored else None
                     points = cls(stored["positions"], stored["colors"], stored["times"])
                 problem = points.problem() if found == POINTS_FORMAT else f"format {found}, expected {POINTS_FORMAT}"

@@ -28,7 +28,7 @@ from d2_plugin.study.command_line import command_line
 from d2_plugin.study.report.limits import plan as plan_section
 from d2_plugin.study.verdict import LEAST_SEEDS
 
-from .rows import Row, append_rows, make_row
+from .rows import Row, append_rows, begin_rows, make_row
 
 USED, LEFT_OUT = "used", "left out"
 
@@ -61,6 +61,7 @@ class PlanVerification(Settings):
 
 def run(settings: PlanVerification) -> str:
     """Take each decision both ways and add the rows; the table, and where the rows lie."""
+    begin_rows(settings.output)
     train, test, notes = resolve_cameras(settings.capture, settings.train_cameras, None)
     base = RunSettings(
         settings.capture,

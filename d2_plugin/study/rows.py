@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import torch
 
 from d2_plugin.durable import append
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.reading import field, json_text, parse_json, read_text
+from d2_plugin.reading import field, json_text, opened, parse_json, read_text
 from d2_plugin.runs.provenance import circumstances
 
 Row = dict[str, Any]
@@ -84,8 +85,37 @@ def make_row(
 
 
 def append_rows(path: Path, rows: Iterable[Row]) -> None:
-    """Add rows to the end of a file, which is created where absent."""
+    """Add rows to the end of a file, which is created where absent.
+
+    Raises:
+        D2Error: the file holds something else; nothing is written.
+    """
+    check_rows_file(path)
     append(path, "".join(as_line(row) for row in rows))
+
+
+def begin_rows(path: Path) -> None:
+    """Make sure, before anything is measured, that rows can be added to a file.
+
+    Raises:
+        D2Error: it cannot be written, or holds something else.
+    """
+    absent = not path.exists()
+    append_rows(path, [])
+    if absent:
+        with suppress(OSError):
+            path.unlink()
+
+
+def check_rows_file(path: Path) -> None:
+    """Refuse a file that holds something else than rows: they are added to its end."""
+    if not path.exists():
+        return
+    remedy = "give another --output"
+    with opened(path, remedy) as file:
+        begin = file.read(1).strip()
+    if begin not in (b"", b"{"):
+        raise D2Error(f"{path} is no file of rows, one JSON object a line, to which more could be added: {remedy}")
 
 
 def as_line(row: Row) -> str:

@@ -28,6 +28,10 @@ from d2_plugin import registry
 from d2_plugin.captures import Capture, open_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import RasterSettings
+from d2_plugin.reading import parsing, read_bytes, shown_path
+from d2_plugin.values import checked_arguments
+from d2_plugin.viewing.look import look
+from d2_plugin.viewing.paths import pose_of
 from d2_plugin.viewing.subject import Subject, subject_of_run
 
 FUDAN = (
@@ -39,6 +43,9 @@ FUDAN = (
 STATIC = FUDAN[:9] + FUDAN[10:13]
 """What that of 3D Gaussian Splatting returns."""
 
+MOST_PLY = 1 << 33
+"""Bytes of a point cloud, at most."""
+
 ELSEWHERE = {
     "deform": "Deformable-3D-Gaussians",
     "deformation.pth": "4DGaussians",
@@ -47,6 +54,7 @@ ELSEWHERE = {
 """Files that say that the motion of a point cloud lies in a network."""
 
 
+@checked_arguments
 def open_subject(
     path: Path, capture: Path | None = None, train_cameras: Sequence[str] | None = None, downscale: int = 1
 ) -> Subject:
@@ -63,7 +71,8 @@ def open_subject(
     if capture is None:
         raise D2Error(f"{path.name} does not say where its cameras stood: name its recording with --capture")
     opened = open_capture(capture, downscale=downscale)
-    backbone, time_scale, note = _loaded(path, opened)
+    with parsing(f"checkpoint {shown_path(path)}", "give one of the trainers that docs/see.md names"):
+        backbone, time_scale, note = _loaded(path, opened)
     names = tuple(opened.cameras)
     for name in train_cameras or ():
         opened.image(name, opened.frames[0])  # an unknown name is refused there
@@ -72,7 +81,18 @@ def open_subject(
     found = Subject(path.stem, opened, trained, held_out, backbone, note=note)
     if not len(backbone):
         raise D2Error(f"{path} has no Gaussian: nothing can be shown")
-    return replace(found, time_scale=time_scale)
+    found = replace(found, time_scale=time_scale)
+    _try(found, path)
+    return found
+
+
+def _try(subject: Subject, path: Path) -> None:
+    """Look once at what a file of somebody else's holds, so that what does not fit together is said now."""
+    view = subject.view(pose_of(next(iter(subject.capture.cameras.values()))), 0.0, (16, 16))
+    with parsing(f"checkpoint {shown_path(path)}", "give one whose tensors fit together"):
+        shown = look(subject.backbone, view).splats
+    if not all(bool(torch.isfinite(part).all()) for part in (shown.means, shown.covariances, shown.opacities)):
+        raise D2Error(f"{path} has numbers that are not finite: its training diverged, give an earlier checkpoint")
 
 
 def _loaded(path: Path, capture: Capture) -> tuple[Any, float, str]:
@@ -164,6 +184,7 @@ def _of_spacetime(rows: dict[str, Tensor], capture: Capture) -> tuple[Any, float
     return adapter(_frozen(values), count), capture.fps / count, note
 
 
+@checked_arguments
 def read_ply(path: Path) -> dict[str, Tensor]:
     """The float properties of the vertices of a binary PLY, [N] each.
 
@@ -171,12 +192,14 @@ def read_ply(path: Path) -> dict[str, Tensor]:
         D2Error: no such file, or one cut short.
     """
     kinds = {"float": "<f4", "float32": "<f4", "double": "<f8", "uchar": "u1", "int": "<i4", "uint": "<u4"}
+    data = read_bytes(path, "export it again", MOST_PLY)
     try:
-        data = path.read_bytes()
         head, end = data.split(b"end_header\n", 1)[0].decode("ascii").splitlines(), data.index(b"end_header\n") + 11
         if head[0] != "ply" or "format binary_little_endian 1.0" not in head:
             raise ValueError("expected a binary little-endian PLY")
         count = next(int(line.split()[2]) for line in head if line.startswith("element vertex"))
+        if count < 0:
+            raise ValueError(f"it says {count} vertices")
         fields = [line.split()[1:] for line in head if line.startswith("property") and " list " not in line]
         table = np.frombuffer(data, np.dtype([(name, kinds[kind]) for kind, name in fields]), count, end)
     except (ValueError, KeyError, IndexError, StopIteration, UnicodeDecodeError) as error:

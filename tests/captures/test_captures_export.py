@@ -179,6 +179,15 @@ def test_mistakes_are_one_sentence(original: Capture, tmp_path: Path) -> None:
         export_capture(original, "colmap", tmp_path / "full")
 
 
+def test_a_link_in_the_place_of_an_unfinished_export_is_not_followed(original: Capture, tmp_path: Path) -> None:
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "thesis.tex").write_text("mine")
+    (tmp_path / ".out.part").symlink_to(tmp_path / "precious")
+    with pytest.raises(D2Error, match=r"\.out\.part is a link, and an unfinished export is none: remove it"):
+        export_capture(original, "transforms", tmp_path / "out")
+    assert (tmp_path / "precious" / "thesis.tex").read_text() == "mine"
+
+
 def test_the_command_writes_points_and_says_where(tmp_path: Path, capsys) -> None:
     source = save_capture(smooth_capture(("00", "01", "02", "03"), frames=3), tmp_path / "source")
     command = f"{source} --format transforms --output {tmp_path / 'scene'} --train-cameras 00,02"

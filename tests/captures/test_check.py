@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from d2_plugin.captures import Capture, open_capture, select_cameras
+from d2_plugin.captures.calibration import checked_camera
 from d2_plugin.captures.checks import memory as memory_module
 from d2_plugin.captures.checks.calibrated import check_capture
 from d2_plugin.captures.checks.memory import available_bytes, check_memory, needed_bytes
@@ -118,3 +119,17 @@ def test_too_little_memory_is_said_before_work_begins(room: Capture, monkeypatch
 def test_what_is_available_is_no_more_than_the_machine_has() -> None:
     available = available_bytes()
     assert available is None or 0 < available < 1 << 50
+
+
+@pytest.mark.parametrize("place", [(1e9, H / 2), (W / 2, -1e6)])
+def test_a_principal_point_far_from_the_picture_is_refused(room: Capture, place: tuple[float, float]) -> None:
+    camera = next(iter(room.cameras.values()))
+    K = camera.K.copy()
+    K[:2, 2] = place
+    with pytest.raises(
+        D2Error, match=r"principal point .* degrees from the middle of the picture, expected at most 80"
+    ):
+        checked_camera("a", (W, H), K, camera.T_camera_world, None, "cameras.json")
+    part = camera.K.copy()  # of a picture of 40 times the width, as a crop of a large one is
+    part[:2] *= 40
+    checked_camera("a", (W, H), part, camera.T_camera_world, None, "cameras.json")

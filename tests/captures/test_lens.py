@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import math
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from d2_plugin.captures import open_capture
 from d2_plugin.captures.calibration import pinhole
 from d2_plugin.captures.capture import Camera
+from d2_plugin.captures.export.folder import save_capture
 from d2_plugin.captures.lens import Lens, UndistortedSource, black_share, opencv_lens
+from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 
 SIZE = (96, 64)
@@ -114,6 +119,15 @@ def test_the_share_of_black_pixels_is_measured() -> None:
     exact = 1 - ((x >= 0) & (x <= SIZE[0]) & (y >= 0) & (y <= SIZE[1])).mean()
     assert wide == pytest.approx(exact, abs=0.05)
     assert wide > 0.1
+
+
+def test_a_lens_that_leaves_hardly_anything_of_a_picture_is_refused(tmp_path: Path) -> None:
+    path = save_capture(synthetic_capture(cameras=2, held_out=0, frames=1, width=64, height=48), tmp_path / "room")
+    table = json.loads((path / "cameras.json").read_text())
+    table["cameras"][0] |= {"model": "fisheye", "distortion": [-50.0, 0, 0, 0]}
+    (path / "cameras.json").write_text(json.dumps(table))
+    with pytest.raises(D2Error, match=r"camera train0 leaves \d% of its pictures, expected at least 50%"):
+        open_capture(path)
 
 
 def test_pixels_outside_the_recorded_picture_are_black() -> None:

@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from d2_plugin.commands.cli import main
 from d2_plugin.settings import Settings, declared
 from d2_plugin.study.bench import BENCHMARKS
+from d2_plugin.study.rows import begin_rows
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
@@ -21,6 +23,26 @@ def test_each_benchmark_has_settings_with_help_and_something_that_runs_them(name
     assert all(setting.help for setting in declared(settings))
     assert settings().output != Path()
     assert callable(module.run)
+
+
+@pytest.mark.parametrize("words", [["stability"], ["bench", "training-step"], ["bench", "scaling"]])
+def test_a_place_for_rows_that_cannot_be_is_said_before_anything_is_measured(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.set_num_threads", lambda count: None)
+    (tmp_path / "thesis.tex").write_text("mine")
+    for name, says in (("thesis.tex", "is no file of rows"), ("thesis.tex/x.jsonl", "cannot"), (".", "is a folder")):
+        assert main([*words, "--output", str(tmp_path / name)]) == 2
+        assert says in capsys.readouterr().err
+    assert (tmp_path / "thesis.tex").read_text() == "mine"
+
+
+def test_rows_can_begin_where_nothing_is(tmp_path: Path) -> None:
+    begin_rows(tmp_path / "new" / "runs.jsonl")
+    assert not list((tmp_path / "new").iterdir())
+    (tmp_path / "runs.jsonl").write_text('{"kind": "step"}\n')
+    begin_rows(tmp_path / "runs.jsonl")
+    assert (tmp_path / "runs.jsonl").read_text() == '{"kind": "step"}\n'
 
 
 def test_the_table_is_read_without_importing_torch() -> None:

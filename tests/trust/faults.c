@@ -1,5 +1,5 @@
 // Preloaded into a process, makes the operating system fail: the n-th operation that changes something below a folder
-// fails once with an error number, or the process is killed at the n-th rename there.
+// fails once with an error number, or the process is killed at the n-th rename there, or after some CPU time.
 //
 // Counted are creating a file, making a folder, write, fsync, ftruncate and rename.
 
@@ -14,6 +14,7 @@
 #include <string.h>
 #include <sys/stat.h>
 #include <sys/types.h>
+#include <time.h>
 #include <unistd.h>
 
 enum { COUNT = 0, FAIL_ONCE = 1, FAIL_FROM = 2, KILL_BEFORE_RENAME = 3, KILL_AFTER_RENAME = 4 };
@@ -25,6 +26,21 @@ static long at, operations, renames;
 void d2_fault_arm(const char *folder, int mode, long place, int error) {
   strncpy(below, folder, sizeof below - 1);
   how = mode, at = place, number = error, operations = 0, renames = 0;
+}
+
+// SIGKILL when the process has used so many more CPU seconds: the same moment of its work however busy the machine is.
+int d2_fault_kill_after(double seconds) {
+  struct sigevent event;
+  memset(&event, 0, sizeof event);
+  event.sigev_notify = SIGEV_SIGNAL;
+  event.sigev_signo = SIGKILL;
+  timer_t timer;
+  if (timer_create(CLOCK_PROCESS_CPUTIME_ID, &event, &timer) != 0) return -1;
+  struct itimerspec limit;
+  memset(&limit, 0, sizeof limit);
+  limit.it_value.tv_sec = (time_t)seconds;
+  limit.it_value.tv_nsec = (long)((seconds - (double)limit.it_value.tv_sec) * 1e9) + 1;
+  return timer_settime(timer, 0, &limit, NULL);
 }
 
 long d2_fault_operations(void) { return operations; }

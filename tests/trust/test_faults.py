@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from trust_commands import FAIL_FROM, FAIL_ONCE, KILL_AFTER_RENAME, KILL_BEFORE_RENAME, Fault, contents, killed
 
-WORK = ("priors", "train", "eval", "export", "page", "report")
+WORK = ("import", "priors", "train", "eval", "export", "page", "report")
 ERRORS = {errno.ENOSPC: "No space left on device", errno.EIO: "Input/output error"}
 
 

@@ -37,17 +37,14 @@ class Day:
 
     def live(self) -> None:
         """Until every run is finished."""
-        running: dict[Started, tuple[int, float | None]] = {}
+        running: dict[Started, int] = {}
         while self.open or running:
             while len(running) < AT_ONCE and (self.open or not running):
                 seed = self.draw.choice(sorted(self.open))
-                limit = None if self.draw.random() < 0.6 else self.draw.uniform(0, self.place.seconds["train"])
-                started = self.place.commands.start(self._next(seed))
-                running[started] = (seed, None if limit is None else time.monotonic() + limit)
+                limit = None if self.draw.random() < 0.6 else self.draw.uniform(0, self.place.cpu["train"])
+                running[self.place.commands.start(self._next(seed), kill_after=limit)] = seed
             time.sleep(0.02)
-            for started, (seed, until) in list(running.items()):
-                if until is not None and time.monotonic() > until:
-                    started.process.kill()
+            for started, seed in list(running.items()):
                 if not started.process.is_alive():
                     del running[started]
                     self._ended(seed, started.end())

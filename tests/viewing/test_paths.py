@@ -111,6 +111,9 @@ def test_a_lens_of_another_size_keeps_its_shape_and_its_middle(size: tuple[int, 
     assert np.allclose(other.K[:2, 2] - np.array(size) / 2, (np.array([50, 25]) - np.array([48, 27])) * scale)
 
 
+SOMEWHERE = np.eye(4).flatten().tolist()
+
+
 class TestCameraPathFiles:
     def write(self, folder: Path, camera: Camera, **more: object) -> Path:
         opengl = np.linalg.inv(camera.T_camera_world) @ OPENGL
@@ -155,8 +158,15 @@ class TestCameraPathFiles:
         [
             ({"camera_type": "fisheye"}, "of type 'fisheye', expected perspective"),
             ({"camera_path": []}, "has no camera"),
-            ({"camera_path": [{"fov": 50}]}, "is no camera_path.json of nerfstudio"),
-            ({"camera_path": [{"fov": 0, "camera_to_world": list(np.eye(4).flatten())}]}, "is no camera_path.json"),
+            ({"camera_path": [{"fov": 50}]}, "camera 0 of .* has no camera_to_world"),
+            ({"camera_path": [{"fov": 0, "camera_to_world": SOMEWHERE}]}, "fov of camera 0 of .* must be above 0"),
+            ({"camera_path": [{"fov": 50, "camera_to_world": SOMEWHERE[:3]}]}, "no matrix of 4 x 4 numbers"),
+            ({"camera_path": [{"fov": 50, "camera_to_world": [0.0] * 16}]}, "turns by no rotation"),
+            ({"camera_path": [{"fov": 50, "camera_to_world": [1e300] * 16}]}, "not finite or too large"),
+            ({"camera_path": [None]}, "camera 0 of .* is no object"),
+            ({"render_width": 10**9}, "render_width of .* must be at least 1 and at most 65535"),
+            ({"fps": -1}, "fps of .* must be above 0"),
+            ({"fps": 0, "seconds": "long"}, "seconds of .* must be a number"),
         ],
     )
     def test_another_file_is_refused_in_a_sentence(self, tmp_path: Path, change: dict, said: str) -> None:
@@ -167,5 +177,5 @@ class TestCameraPathFiles:
         with pytest.raises(D2Error, match="no camera path at"):
             read_camera_path(tmp_path / "none.json")
         (tmp_path / "text.json").write_text("{")
-        with pytest.raises(D2Error, match="is no JSON"):
+        with pytest.raises(D2Error, match="is not JSON"):
             read_camera_path(tmp_path / "text.json")

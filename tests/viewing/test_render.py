@@ -131,6 +131,30 @@ def test_time_plays_bounces_slows_and_freezes(subject: Subject) -> None:
         plan_film(subject, Wishes(at=3.0))
 
 
+@pytest.mark.parametrize(
+    ("wishes", "said"),
+    [
+        ({"seconds": 1e300}, "would have 1.2e.301 pictures, at most 1000000"),
+        ({"speed": 1e-6}, "pictures, at most 1000000: choose fewer --seconds"),
+        ({"path": "orbit", "seconds": 1e300}, "pictures, at most 1000000"),
+        ({"fps": 1e300}, "a film of 1e.300 pictures per second cannot be written"),
+        ({"fps": 1e-5}, "give --fps from 0.001 to 1000"),
+    ],
+)
+def test_a_film_without_end_is_refused_before_it_is_laid_out(subject: Subject, wishes: dict, said: str) -> None:
+    with pytest.raises(D2Error, match=said):
+        plan_film(subject, Wishes(**wishes))
+
+
+def test_pictures_that_memory_does_not_hold_are_refused(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("d2_plugin.captures.checks.memory.available_bytes", lambda: 2**30)
+    with pytest.raises(D2Error, match=r"pictures of 16384x9216 pixels need about 14.1 GiB .* smaller --width"):
+        run(RenderSettings(runs=(trained,), output=tmp_path / "a.mp4", width=16384))
+    assert not list(tmp_path.iterdir())
+
+
 def test_every_kind_of_picture_stands_beside_the_others_and_runs_below(trained: Path, tmp_path: Path) -> None:
     again = tmp_path / "again"
     shutil.copytree(trained, again)
@@ -245,6 +269,33 @@ class TestOfficialTrainers:
         assert torch.equal(drawn.means, splats["means"])
         assert torch.allclose(found.backbone.colors(view, drawn), 0.5 + 0.2820948 * splats["sh0"][:, 0], atol=1e-5)
 
+    @pytest.mark.parametrize(
+        ("name", "value", "said"),
+        [
+            ("quats", torch.zeros(20, 3), "cannot read checkpoint"),
+            ("scales", torch.zeros(7, 3), "cannot read checkpoint"),
+            ("means", "text", "cannot read checkpoint"),
+            ("sh0", torch.zeros(20, 3), "cannot read checkpoint"),
+            ("opacities", None, "cannot read checkpoint"),
+            ("means", torch.full((20, 3), torch.nan), "numbers that are not finite"),
+        ],
+    )
+    def test_a_checkpoint_whose_tensors_do_not_fit_is_one_sentence(
+        self, room: Path, tmp_path: Path, name: str, value: object, said: str
+    ) -> None:
+        splats = {
+            "means": torch.randn(20, 3),
+            "scales": torch.full((20, 3), -1.0),
+            "quats": torch.randn(20, 4),
+            "opacities": torch.zeros(20),
+            "sh0": torch.rand(20, 1, 3),
+            "shN": torch.zeros(20, 15, 3),
+        }
+        torch.save({"step": 1, "splats": splats | {name: value}}, tmp_path / "a.pt")
+        with pytest.raises(D2Error, match=said) as caught:
+            open_subject(tmp_path / "a.pt", room)
+        assert "\n" not in str(caught.value)
+
     def test_a_point_cloud_of_spacetime_gaussians_moves_with_the_recording(self, room: Path, tmp_path: Path) -> None:
         from d2_plugin.adapters.spacetime import SpacetimeAdapter
 
@@ -302,6 +353,9 @@ class TestOfficialTrainers:
         torch.save({"weights": torch.zeros(3)}, path)
         with pytest.raises(D2Error, match="is no checkpoint that can be shown"):
             open_subject(path, room)
+        (tmp_path / "a.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex -1\nend_header\n")
+        with pytest.raises(D2Error, match="it says -1 vertices"):
+            open_subject(tmp_path / "a.ply", room)
         (tmp_path / "a.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
         with pytest.raises(D2Error, match="no readable point cloud"):
             open_subject(tmp_path / "a.ply", room)

@@ -121,6 +121,29 @@ def test_a_film_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == ["film.mp4"]
 
 
+def test_what_the_encoder_refuses_is_one_sentence_and_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / ".0123.part").write_bytes(b"of a film that was killed")
+    with pytest.raises(D2Error, match=r"cannot write the film .*a\.mp4 \(.*\): choose other --width"):
+        write(tmp_path / "a.mp4", [np.zeros((2, 20_000, 3), np.uint8)])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_film_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "folder.mp4").mkdir()
+    for path in (tmp_path / "file" / "a.mp4", tmp_path / f"{'y' * 300}.mp4", tmp_path / "folder.mp4"):
+        with pytest.raises(D2Error, match="cannot write"):
+            write(path, soft(1, 32, 32))
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "folder.mp4"]
+
+
+def test_a_film_replaces_no_other_kind_of_file(tmp_path: Path) -> None:
+    (tmp_path / "cameras.json").write_text("{}")
+    with pytest.raises(D2Error, match=r"a film of format mp4 needs a name that ends so, got cameras\.json"):
+        write(tmp_path / "cameras.json", soft(1, 32, 32))
+    assert (tmp_path / "cameras.json").read_text() == "{}"
+
+
 def test_a_film_without_a_picture_is_refused(tmp_path: Path) -> None:
     with pytest.raises(D2Error, match="without a picture"):
         write(tmp_path / "film.mp4", [])

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from d2_plugin.captures.calibrate.bundle import Tracks, fitting, triangulate
 from d2_plugin.captures.calibrate.features import Features
 from d2_plugin.captures.calibrate.solve import SolvedRig
-from d2_plugin.captures.pictures import opencv
+from d2_plugin.captures.pictures import checked_picture, opencv
 from d2_plugin.errors import D2Error
+from d2_plugin.settings import Positive, Range, Settings
+from d2_plugin.values import checked_arguments
 
 FEWEST_SIDES = 4
 """Sides of squares that must be measured."""
@@ -27,24 +29,36 @@ CORNER_ERROR = 4.0
 """Reprojection error beyond which a corner is left out, in `pixel_error`."""
 
 
+Squares = Annotated[int, Range(3, 1000)]
+"""How many squares a board has along a side."""
+
+
 @dataclass(frozen=True)
-class Board:
+class Board(Settings):
     """A board of `columns` x `rows` squares with sides of `square`, in the unit that the world gets.
 
     With `marker`, the side of its ArUco markers, it is a ChArUco board with markers of `dictionary`; without, a plain
     checkerboard, which all of its cameras must see the same way up.
     """
 
-    columns: int
-    rows: int
-    square: float
-    marker: float | None = None
+    columns: Squares
+    rows: Squares
+    square: Positive
+    marker: Positive | None = None
     dictionary: str = "DICT_4X4_50"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.marker is not None and self.marker >= self.square:
+            raise D2Error(
+                f"the board's markers have sides of {self.marker:g} and its squares of {self.square:g}, expected "
+                "smaller markers: give both in the same unit"
+            )
 
     def corners(self, picture: np.ndarray) -> dict[int, np.ndarray]:
         """Number of an inner corner, row by row -> its pixel [2], centres at i + 0.5."""
         cv2 = opencv("finding boards", "calibration")
-        grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+        grey = cv2.cvtColor(checked_picture(picture, "the picture of a board"), cv2.COLOR_RGB2GRAY)
         if self.marker is not None:
             return self._charuco(cv2, grey)
         found, corners = cv2.findChessboardCornersSB(grey, (self.columns - 1, self.rows - 1))
@@ -52,9 +66,15 @@ class Board:
 
     def _charuco(self, cv2: Any, grey: np.ndarray) -> dict[int, np.ndarray]:
         number = getattr(cv2.aruco, self.dictionary, None)
-        if number is None or not self.dictionary.startswith("DICT_"):
+        if not isinstance(number, int) or not self.dictionary.startswith("DICT_"):
             raise D2Error(f"unknown marker dictionary '{self.dictionary}': name one of OpenCV's, such as DICT_4X4_50")
         dictionary = cv2.aruco.getPredefinedDictionary(number)
+        needed, there = self.columns * self.rows // 2, len(dictionary.bytesList)
+        if needed > there:
+            raise D2Error(
+                f"a board of {self.columns} x {self.rows} squares has {needed} markers and {self.dictionary} has "
+                f"{there}: name the board's own dictionary"
+            )
         board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, dictionary)
         corners, identities, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
         if identities is None:
@@ -63,6 +83,7 @@ class Board:
         return {number: corner + 0.5 for number, corner in pairs}
 
 
+@checked_arguments
 def scaled_by_board(rig: SolvedRig, pictures: Mapping[str, Sequence[np.ndarray]], board: Board) -> SolvedRig:
     """The rig in the unit of the board, from the sides of squares between corners that two cameras saw.
 

@@ -16,7 +16,7 @@ from types import ModuleType
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.pictures import opencv
+from d2_plugin.captures.pictures import checked_picture, opencv
 from d2_plugin.errors import missing_extra
 
 MOST_FEATURES = 1500
@@ -65,7 +65,8 @@ def find_features(pictures: Sequence[np.ndarray], recorded: np.ndarray | None = 
     mask = None if recorded is None else recorded.astype(np.uint8)
     pixels, descriptors, moments = [np.zeros((0, 2))], [np.zeros((0, 128), np.float32)], [np.zeros(0, int)]
     for moment, picture in enumerate(pictures):
-        points, found = sift.detectAndCompute(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), mask)
+        whole = checked_picture(picture, f"picture {moment} of a camera")
+        points, found = sift.detectAndCompute(cv2.cvtColor(whole, cv2.COLOR_RGB2GRAY), mask)
         if found is None:
             continue
         pixels.append(np.array([point.pt for point in points]) + 0.5)

@@ -18,6 +18,7 @@ from d2_plugin.captures.calibrate.features import Features, Matches, find_featur
 from d2_plugin.captures.calibrate.verify import verified
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.errors import D2Error
+from d2_plugin.values import checked_arguments
 
 MOMENTS = 6
 """Frames that are looked at, spread over the recording."""
@@ -67,6 +68,7 @@ class RefinedPoses:
         return replace(capture, cameras={**capture.cameras, **self.cameras}, notes=(*capture.notes, self.reason))
 
 
+@checked_arguments
 def refine(capture: Capture, cameras: Sequence[str] | None = None, moments: int = MOMENTS) -> RefinedPoses:
     """Bundle the poses of the named cameras (the training ones) over several frames; intrinsics stay.
 

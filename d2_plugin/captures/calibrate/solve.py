@@ -27,7 +27,9 @@ from d2_plugin.captures.calibrate.refine import bundled, halved
 from d2_plugin.captures.calibrate.verify import as_colmap, essential_pose, verified
 from d2_plugin.captures.calibration import rigid
 from d2_plugin.captures.capture import Camera
+from d2_plugin.captures.pictures import checked_picture
 from d2_plugin.errors import D2Error
+from d2_plugin.values import checked_arguments
 
 STARTS = 2
 """Pairs of cameras that are tried as a start, the most promising first."""
@@ -70,6 +72,7 @@ class SolvedRig:
             for name in self.cameras
         }
 
+    @checked_arguments
     def scaled(self, one: str, other: str, distance: float) -> SolvedRig:
         """The same rig with `distance` between two of its cameras."""
         if not distance > 0 or one == other or one not in self.cameras or other not in self.cameras:
@@ -90,6 +93,7 @@ class SolvedRig:
         return replace(self, cameras=cameras, scale=why)
 
 
+@checked_arguments
 def solve_rig(
     pictures: Mapping[str, Sequence[np.ndarray]],
     intrinsics: Mapping[str, Camera],
@@ -105,7 +109,10 @@ def solve_rig(
     Raises:
         D2Error: the pictures do not settle the pose of every camera; the sentence names those, and what to add.
     """
-    features = {name: find_features(_moments(taken)) for name, taken in pictures.items()}
+    unknown = [name for name in (*pictures, *(stills or {})) if name not in intrinsics]
+    if unknown or not pictures:
+        raise D2Error(f"no intrinsics for camera {unknown[0] if unknown else 'any'}: give size and K of every camera")
+    features = {name: find_features(_moments(name, taken)) for name, taken in pictures.items()}
     features |= {name: find_features([picture]) for name, picture in (stills or {}).items()}
     return solve_features(features, intrinsics, tuple(pictures))
 
@@ -133,8 +140,11 @@ def solve_features(
     return _result(found, features, doubt, wanted)
 
 
-def _moments(taken: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _moments(name: str, taken: Sequence[np.ndarray]) -> list[np.ndarray]:
     """What a camera sees where nothing moves, which stills see as well, then every picture."""
+    shapes = {checked_picture(picture, f"a picture of camera {name}").shape for picture in taken}
+    if len(shapes) != 1:
+        raise D2Error(f"camera {name} has pictures of {len(shapes)} sizes, expected one: give pictures of one size")
     still = np.median(np.stack(taken), axis=0).astype(np.uint8) if len(taken) > 2 else taken[0]
     return [still, *taken]
 

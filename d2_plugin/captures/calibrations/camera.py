@@ -12,7 +12,7 @@ from d2_plugin.captures.calibration import LARGEST_NUMBER, checked_camera, resiz
 from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.lens import LARGEST_COEFFICIENT, Lens, opencv_lens
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.values import shown
+from d2_plugin.values import checked_arguments, shown
 
 Model = Literal["pinhole", "opencv", "fisheye"]
 
@@ -108,6 +108,7 @@ class Entry(NamedTuple):
         return camera if size is None else camera.of_size(size, where)
 
 
+@checked_arguments
 def scaled(cameras: Sequence[CalibratedCamera], scale: float) -> tuple[CalibratedCamera, ...]:
     """The cameras in a world whose unit is 1 / `scale` of the old one: .001 makes metres of millimetres."""
     if not 0 < scale < LARGEST_NUMBER:

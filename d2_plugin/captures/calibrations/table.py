@@ -25,6 +25,7 @@ from d2_plugin.captures.calibrations.document import CORRECT, Document
 from d2_plugin.captures.calibrations.names import matched
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import reaching
+from d2_plugin.values import checked_arguments
 
 log = logging.getLogger(__name__)
 
@@ -66,6 +67,7 @@ class Calibration:
     notes: tuple[str, ...]
 
 
+@checked_arguments
 def read_calibration(
     path: Path | str, sizes: Mapping[str, tuple[int, int]] | None = None
 ) -> tuple[CalibratedCamera, ...]:
@@ -87,8 +89,11 @@ def read_calibration(
     return calibration.cameras
 
 
+@checked_arguments
 def open_calibration(path: Path | str, sizes: Mapping[str, tuple[int, int]] | None = None) -> Calibration:
     """`read_calibration` with the name of the format and the notes, which it does not log."""
+    if sizes is not None and not sizes:
+        raise D2Error(f"{path} is read for no recording: name at least one with its size, or leave the sizes out")
     with reaching(path, CORRECT):
         document = _document(Path(path))
         name = _recognised(document)

@@ -8,7 +8,9 @@ import numpy as np
 
 from d2_plugin.captures.calibrations.camera import CalibratedCamera
 from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.lens import Lens, Resampling, recorded_pixels, resampled, resampling
+from d2_plugin.captures.lens import Lens, Resampling, recorded_pixels, refuse_black, resampled, resampling
+from d2_plugin.errors import D2Error
+from d2_plugin.values import checked_arguments
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +27,7 @@ class Undistortion:
     _maps: Resampling | None
 
     @classmethod
+    @checked_arguments
     def of(cls, camera: CalibratedCamera) -> Undistortion:
         """That of a calibrated camera; one without distortion and skew leaves its pictures as they are."""
         lens: Lens = camera.lens
@@ -32,8 +35,17 @@ class Undistortion:
             return cls(camera.pinhole(), None, None)
         size = (camera.width, camera.height)
         valid = recorded_pixels(lens, size)
+        refuse_black(1 - float(valid.mean()), camera.name)
         return cls(camera.pinhole(), None if valid.all() else valid, resampling(lens, size))
 
     def picture(self, recorded: np.ndarray) -> np.ndarray:
-        """The undistorted picture or mask [H, W] or [H, W, C], of the same type."""
+        """The undistorted picture or mask [H, W] or [H, W, C], of the same type.
+
+        Raises:
+            D2Error: what has not the size of the camera's pictures.
+        """
+        expected = (self.camera.height, self.camera.width)
+        if not isinstance(recorded, np.ndarray) or recorded.shape[:2] != expected:
+            found = recorded.shape if isinstance(recorded, np.ndarray) else type(recorded).__name__
+            raise D2Error(f"a picture of camera {self.camera.name} is {found}, expected {expected}: give its pictures")
         return recorded if self._maps is None else resampled(recorded, self._maps)

@@ -17,6 +17,7 @@ import numpy as np
 
 from d2_plugin.captures.calibration import field_of_view
 from d2_plugin.captures.capture import Camera, Capture
+from d2_plugin.captures.checks.masked import empty_masks
 from d2_plugin.captures.pictures import opencv
 
 USUAL_VIEW = (5.0, 170.0)
@@ -78,7 +79,9 @@ def check_capture(capture: Capture, cameras: Sequence[str], scored: Sequence[str
     for name in scored:
         for frame in _frames(capture, len(scored)):
             capture.depth(name, frame)
-    return (*_views(rig), *_origin(rig), *_alone(rig), *_plain(capture, cameras), *_contradicted(capture, cameras))
+    masks = empty_masks(capture, cameras, _frames(capture, len(cameras)))
+    seen = (*_views(rig), *_origin(rig), *_alone(rig), *_plain(capture, cameras))
+    return (*seen, *masks, *_contradicted(capture, cameras))
 
 
 def _views(rig: Sequence[Camera]) -> Iterator[str]:

@@ -54,6 +54,20 @@ def check_memory(capture: Capture, cameras: Sequence[str]) -> None:
     )
 
 
+def check_bytes(needed: float, what: str, remedy: str) -> None:
+    """Refuse `what`, a plural, where this machine has too little memory for it.
+
+    Raises:
+        D2Error: more than is available is needed.
+    """
+    available = available_bytes()
+    if available is not None and needed > available:
+        raise D2Error(
+            f"{what} need about {needed / 2**30:.1f} GiB of memory and {available / 2**30:.1f} GiB are available: "
+            f"{remedy}"
+        )
+
+
 def _free_on_linux() -> list[int]:
     with suppress(OSError, ValueError):
         found = re.search(r"MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text())

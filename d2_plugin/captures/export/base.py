@@ -93,7 +93,10 @@ def whole_folder(path: Path | str) -> Iterator[Path]:
         with only_writer(folder), writing(folder):
             yield folder
         return
-    unfinished = make_folder(folder.with_name(f".{folder.name}{LEFTOVER}"))
+    unfinished = folder.with_name(f".{folder.name}{LEFTOVER}")
+    if unfinished.is_symlink():  # what is left there is removed, and nobody's link may say what that is
+        raise D2Error(f"{unfinished} is a link, and an unfinished export is none: remove it")
+    make_folder(unfinished)
     with only_writer(unfinished), writing(folder):
         for left in unfinished.iterdir():
             shutil.rmtree(left) if left.is_dir() and not left.is_symlink() else left.unlink()

@@ -26,6 +26,7 @@ from d2_plugin.captures.export.ply import PointCloud
 from d2_plugin.captures.export.transforms_json import write_transforms
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import json_text
+from d2_plugin.values import checked_arguments
 
 EXPORT_FILE = "export.json"
 """Written last: a folder without it is half an export."""
@@ -42,6 +43,7 @@ WRITERS: dict[str, Writer] = {
 """By the name of the layout. A new layout is one module beside this one and one row here."""
 
 
+@checked_arguments
 def export_capture(
     capture: Capture,
     layout: str,
@@ -65,6 +67,8 @@ def export_capture(
     if layout not in WRITERS:
         raise unknown_name("layout", layout, WRITERS)
     held_out = _known(capture, test_cameras)
+    if cloud is not None:
+        cloud.check()
     for camera in capture.cameras.values():
         refuse_skew(camera)
     with whole_folder(path) as folder:

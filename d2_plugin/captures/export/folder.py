@@ -12,8 +12,10 @@ from d2_plugin.captures.export.base import refuse_skew, whole_folder
 from d2_plugin.captures.masks import MASK_FOLDERS, VALID_FOLDER, as_picture
 from d2_plugin.captures.pictures import write_png
 from d2_plugin.reading import json_text
+from d2_plugin.values import checked_arguments
 
 
+@checked_arguments
 def save_capture(capture: Capture, path: Path | str) -> Path:
     """Write pictures, cameras, true depth and monocular maps of `capture` under `path`; returns it.
 

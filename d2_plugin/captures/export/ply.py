@@ -17,6 +17,17 @@ class PointCloud(NamedTuple):
     colors: np.ndarray  # [P, 3] in 0..1
     times: np.ndarray | None = None  # [P] in the unit of the trainer's cameras
 
+    def check(self) -> None:
+        """Raise `D2Error` for arrays that do not fit together or numbers that are not finite."""
+        count = len(self.positions)
+        expected = [(count, 3), (count, 3)] + ([] if self.times is None else [(count,)])
+        parts = [self.positions, self.colors] + ([] if self.times is None else [self.times])
+        shapes = [np.shape(part) for part in parts]
+        if shapes != expected:
+            raise D2Error(f"the initial points have shapes {shapes}, expected {expected}: give a row for each point")
+        if not all(np.isfinite(part).all() for part in parts):
+            raise D2Error("the initial points have numbers that are not finite: leave those points out")
+
 
 _NORMALS = ("nx", "ny", "nz")
 _CHANNELS = ("red", "green", "blue", "alpha")

@@ -23,6 +23,7 @@ from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.synthetic import materials
 from d2_plugin.captures.synthetic.raycast import Motion, Room, Scene, Solid, render_color, render_depth
 from d2_plugin.errors import D2Error
+from d2_plugin.values import checked_arguments
 
 CACHE_BYTES = 64 * 2**20
 """Pictures kept after rendering them, oldest forgotten first."""
@@ -50,6 +51,7 @@ class MonocularEmulation:
     """Range of the random shift of a frame, added after scaling."""
 
 
+@checked_arguments
 def synthetic_capture(
     cameras: int = 4,
     held_out: int | None = None,

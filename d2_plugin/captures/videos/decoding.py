@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.captures.videos.files import REMEDY, VideoFile, pyav
+from d2_plugin.captures.videos.files import VideoFile, pyav
+from d2_plugin.captures.videos.plain import check_container
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import opened, said, shown_path
+from d2_plugin.reading import said, shown_path
 
 SKIP_LIMIT = 48
 """A frame at most this far ahead is reached by decoding on; any other by a seek, which starts at a key frame."""
@@ -68,8 +69,7 @@ class Decoder:
     def _approach(self, index: int) -> None:
         """Open the file where it is not, and stand at most `SKIP_LIMIT` frames before `index` if one can."""
         if self._container is None:
-            with opened(self.video.path, REMEDY):
-                pass
+            check_container(self.video.path)
             self._container = pyav().open(str(self.video.path))
             self._container.streams.video[0].thread_type = "AUTO"
             self._frames = self._container.decode(video=0)

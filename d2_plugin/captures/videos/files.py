@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from d2_plugin.captures.pictures import MOST_PIXELS
+from d2_plugin.captures.videos.plain import check_container
 from d2_plugin.errors import D2Error, missing_extra
-from d2_plugin.reading import opened, parsing, said, shown_path
+from d2_plugin.reading import parsing, said, shown_path
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".360", ".lrv")
 """Endings by which a folder's videos are found."""
@@ -114,8 +115,7 @@ def pyav() -> ModuleType:
 def container_of(path: Path) -> Iterator[Any]:
     """The opened file; whatever FFmpeg says against it becomes one sentence."""
     av = pyav()
-    with opened(path, REMEDY):
-        pass  # a pipe or a device would block
+    check_container(path)
     with parsing(f"video {shown_path(path)}", REMEDY), av.open(str(path)) as container:
         yield container
 

@@ -37,6 +37,7 @@ from d2_plugin.durable import make_folder, remove_leftovers, write, write_table,
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
 from d2_plugin.reading import json_text
+from d2_plugin.values import checked_arguments
 
 Told = Callable[[str], None]
 
@@ -52,6 +53,7 @@ class Imported:
     folder: Path
 
 
+@checked_arguments
 def import_videos(settings: ImportSettings, told: Told = lambda line: None) -> Imported:
     """Import the videos, or continue an import that was stopped; a finished one is only read.
 

@@ -20,6 +20,17 @@ MOST_FRAMES = 10_000_000
 """A video that says more is damaged: this many are four days at 30 per second."""
 
 
+ATOMS = (b"ftyp", b"styp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
+"""What an MP4 or MOV may begin with, behind its length."""
+
+BEGINNINGS = (b"\x1aE\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3")
+"""Of Matroska and WebM, of an MPEG program stream and of MPEG video."""
+
+
+PACKETS = ((0, 188), (4, 196))
+"""Where the first two packets of an MPEG transport stream begin, without and with time codes."""
+
+
 class VideoHeader(NamedTuple):
     """What a video says about itself."""
 
@@ -95,9 +106,25 @@ def video_header(path: Path) -> VideoHeader:
         video.release()
 
 
+def check_container(path: Path) -> None:
+    """Refuse what holds no video itself: FFmpeg also follows playlists and scripts to other files and addresses.
+
+    Raises:
+        D2Error: a file that cannot be read, or that begins like none of the containers that cameras write.
+    """
+    with opened(path, "replace the file or leave its camera out") as file:  # a pipe or a device would block
+        head = file.read(256)
+    riff = head[:4] == b"RIFF" and head[8:11] == b"AVI"
+    transport = any(head[first : first + 1] == b"G" == head[second : second + 1] for first, second in PACKETS)
+    if not (riff or transport or head[4:8] in ATOMS or head[:4] in BEGINNINGS):
+        raise D2Error(
+            f"{shown_path(path)} is no video in an MP4, MOV, Matroska, WebM, AVI or MPEG container: replace the file "
+            "or leave its camera out"
+        )
+
+
 def _open_video(path: Path) -> Any:
-    with opened(path, "replace the file or leave its camera out"):
-        pass  # a pipe or a device would block
+    check_container(path)
     with parsing(f"video {shown_path(path)}", "replace the file or leave its camera out"):
         video = opencv("reading videos").VideoCapture(str(path))
     if not video.isOpened():

@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Declared, Range, checked
 
-MOST_NUMBERS = 10_000_000
-"""The largest number in a list: a range of more would fill the memory."""
+MOST_NUMBERS = 1_000_000
+"""How many numbers a list may hold: a range of more would fill the memory."""
 
 
 def flag_of(name: str) -> str:
@@ -108,12 +108,12 @@ def _numbers(pieces: Sequence[str], said: str) -> tuple[int, ...]:
         try:
             first, *last = (int(part) for part in piece.split(":"))
             numbers = range(first, last[0] + 1, *last[1:]) if last else [first]
-            if max(abs(number) for number in (first, *last)) > MOST_NUMBERS or not len(numbers):
+            if not 0 < len(numbers) <= MOST_NUMBERS - len(found):
                 raise ValueError(piece)
             found += numbers
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             raise D2Error(
-                f"{said} is '{piece[:80]}': give whole numbers joined by commas, or first:last or first:last:step, of "
-                f"at most {MOST_NUMBERS}"
+                f"{said} is '{piece[:80]}': give whole numbers joined by commas, or first:last or first:last:step, "
+                f"{MOST_NUMBERS} numbers at most"
             ) from None
     return tuple(found)

@@ -11,7 +11,7 @@ from typing import Annotated
 from d2_plugin.commands.arguments.form import Form, Given
 from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings
 from d2_plugin.commands.train import TABLES
-from d2_plugin.settings import Range, Seed
+from d2_plugin.settings import AtATime, Range, Seed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,7 @@ class AblationOptions(ConfigFile):
     """Numbers joined by commas."""
     iterations: Annotated[int, Range(1, unit="steps")] = 2000
     """Optimizer steps of each run, one view each."""
-    jobs: Annotated[int, Range(1)] = os.cpu_count() or 1
+    jobs: AtATime = os.cpu_count() or 1
     """Runs at a time, one thread each."""
 
 

@@ -11,8 +11,7 @@ import itertools
 import math
 import os
 import tempfile
-import zipfile
-import zlib  # before pycolmap, whose own copy of zlib would otherwise be bound and crash later calls
+import zlib  # noqa: F401  before pycolmap, whose own copy of zlib would otherwise be bound and crash later calls
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -22,6 +21,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from d2_plugin.arrays import read_array
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.errors import D2Error, missing_extra
 from d2_plugin.priors.colmap.matching import Features, epipolar_matches, fundamental_matrix, same_spot
@@ -94,13 +94,13 @@ class SparsePoints:
     @classmethod
     def load(cls, path: Path) -> SparsePoints:
         """Read what `save` wrote."""
-        try:
-            with open(path, "rb") as file, np.load(file) as arrays:  # np.load leaves a damaged file open
-                return cls(*(arrays[field.name] for field in fields(cls)))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as failure:
-            raise D2Error(
-                f"cannot read sparse points from {path} ({failure}): delete the file and build again"
-            ) from None
+        remedy = "delete the file and build again"
+        found = cls(*(read_array(path, remedy, key=field.name) for field in fields(cls)))
+        count = len(found.positions) if found.positions.ndim == 2 else -1
+        shapes = [getattr(found, field.name).shape for field in fields(cls)]
+        if shapes != [(count, 3), (count, 3), (count,), (count,), (count,)]:
+            raise D2Error(f"{path} has points of shapes {shapes}, expected (N, 3) twice and (N,) else: {remedy}")
+        return found
 
 
 def triangulate(

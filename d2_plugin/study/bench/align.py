@@ -16,7 +16,7 @@ from d2_plugin.captures.capture import MonoKind
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.provenance import provenance
-from d2_plugin.settings import NotNegative, Range, Settings, Share
+from d2_plugin.settings import AtATime, NotNegative, Range, Settings, Share
 from d2_plugin.study.command_line import command_line
 from d2_plugin.study.report.svg import figure
 from d2_plugin.study.report.work_precision import colors_of, growth, work_precision
@@ -44,7 +44,7 @@ class AlignBench(Settings):
     """Problems per case; figures are medians over them."""
     seconds: NotNegative = 0.03
     """Time for which each fit is repeated, seconds."""
-    threads: Annotated[int, Range(1)] | None = None
+    threads: AtATime | None = None
     """CPU threads of torch; if not given, torch chooses. The fits themselves use one."""
     output: Path = Path("bench-align")
     """Folder of the results."""

@@ -25,9 +25,9 @@ from d2_plugin.priors.calibration import NORMAL_SHARE, Calibration, frames_with_
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.runs.start import triangulated_points
-from d2_plugin.settings import Count, Positional, Range, Settings
+from d2_plugin.settings import AtATime, Count, Positional, Range, Settings
 from d2_plugin.study.command_line import command_line
-from d2_plugin.study.rows import Row, append_rows, make_row
+from d2_plugin.study.rows import Row, append_rows, begin_rows, make_row
 
 from .stereo_rigs import ARCS
 
@@ -53,7 +53,7 @@ class PriorsBench(Settings):
     """Numbers of the frames, in every capture; the first and the last with a true depth if none is named."""
     width: Annotated[int, Range(32, unit="pixels")] = 320
     """Width of rendered pictures, which are 16:9, pixels."""
-    threads: Annotated[int, Range(1)] = 1
+    threads: AtATime = 1
     """CPU threads."""
     output: Path = Path("runs.jsonl")
     """File that the rows are added to."""
@@ -69,6 +69,7 @@ class Case(NamedTuple):
 
 def run(settings: PriorsBench) -> str:
     """Measure and add the rows; a table per capture, and where the rows lie."""
+    begin_rows(settings.output)
     torch.set_num_threads(settings.threads)
     command, told = _command(settings), []
     for case in cases(settings):

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import TypeVar
 
 import torch
 
+from d2_plugin.captures.checks.memory import BYTES_PER_PIXEL, check_bytes
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.provenance import provenance
-from d2_plugin.settings import Count, NotNegative, Range, Settings
+from d2_plugin.settings import AtATime, Count, NotNegative, Settings
 from d2_plugin.study.command_line import command_line
 from d2_plugin.study.growth import power
 from d2_plugin.study.report.precision import raster_plot
@@ -55,7 +57,7 @@ class RasterBench(Settings):
     """Where it is drawn: cpu or cuda."""
     seconds: NotNegative = 3.0
     """About how long each pass is repeated, seconds."""
-    threads: Annotated[int, Range(1)] | None = None
+    threads: AtATime | None = None
     """CPU threads; if not given, torch chooses."""
     error_limit: Count = 60_000
     """Most Gaussians for which the error is measured; with more of them the truth in float64 takes minutes."""
@@ -131,10 +133,12 @@ def bench_raster(
 
 def parse_size(text: str) -> tuple[int, int]:
     """(width, height) from `WIDTHxHEIGHT`."""
-    width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
-        raise D2Error(f"size '{text}' is not WIDTHxHEIGHT in pixels, e.g. 640x360")
-    return int(width), int(height)
+    found = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", text)
+    if found is None:
+        raise D2Error(f"size '{text[:40]}' is not WIDTHxHEIGHT in pixels of at most five digits, e.g. 640x360")
+    width, height = int(found[1]), int(found[2])
+    check_bytes(width * height * BYTES_PER_PIXEL, f"pictures of {width}x{height} pixels", "measure smaller ones")
+    return width, height
 
 
 def _measure(

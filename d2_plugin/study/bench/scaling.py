@@ -20,7 +20,7 @@ from d2_plugin.runs.settings import RunSettings
 from d2_plugin.settings import Range, Settings
 from d2_plugin.study.command_line import command_line
 from d2_plugin.study.growth import exponent, power
-from d2_plugin.study.rows import Row, append_rows, make_row
+from d2_plugin.study.rows import Row, append_rows, begin_rows, make_row
 
 from .memory import in_fresh_process
 
@@ -43,6 +43,7 @@ class ScalingBench(Settings):
 
 def run(settings: ScalingBench) -> str:
     """Measure and add the rows; how each cost grows, and where the rows lie."""
+    begin_rows(settings.output)
     command = command_line("bench scaling", settings)
     rows = bench_scaling(settings.frames, settings.width, settings.iterations, command)
     append_rows(settings.output, rows)

@@ -13,7 +13,7 @@ import torch
 from d2_plugin.errors import unknown_name
 from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.provenance import provenance
-from d2_plugin.settings import Range, Settings
+from d2_plugin.settings import AtATime, Range, Settings
 from d2_plugin.study.command_line import command_line
 from d2_plugin.study.report.svg import figure
 from d2_plugin.study.report.work_precision import work_precision
@@ -49,7 +49,7 @@ class StereoBench(Settings):
     """Make the depth range too wide by this factor at both ends."""
     repeats: Annotated[int, Range(1)] = 1
     """Matchings per row; times are medians, CPU seconds."""
-    threads: Annotated[int, Range(1)] = 1
+    threads: AtATime = 1
     """CPU threads."""
     output: Path = Path("bench-stereo")
     """Folder of the results."""

@@ -17,9 +17,9 @@ from typing import Annotated, Any, NamedTuple
 import torch
 
 from d2_plugin.runs.markup import Table, markdown
-from d2_plugin.settings import Range, Settings
+from d2_plugin.settings import AtATime, Range, Settings
 from d2_plugin.study.command_line import command_line
-from d2_plugin.study.rows import Row, append_rows, make_row
+from d2_plugin.study.rows import Row, append_rows, begin_rows, make_row
 
 from .memory import in_fresh_process
 from .raster import parse_size
@@ -33,15 +33,15 @@ BARE, GUIDED = "step", "step with D2"
 class TrainingStepBench(Settings):
     """Settings of `d2 bench training-step`."""
 
-    gaussians: tuple[Annotated[int, Range(1)], ...] = (4000,)
+    gaussians: tuple[Annotated[int, Range(1, 10_000_000)], ...] = (4000,)
     """How many Gaussians the model has."""
     sizes: tuple[str, ...] = ("320x180",)
     """Picture sizes as WIDTHxHEIGHT in pixels."""
-    frames: tuple[Annotated[int, Range(1)], ...] = (20,)
+    frames: tuple[Annotated[int, Range(1, 10_000)], ...] = (20,)
     """Lengths of the recording of four cameras; all pictures are looked at once before memory is measured."""
     seconds: Annotated[float, Range(0)] = 6.0
     """About how long each of the three works is repeated, seconds."""
-    threads: Annotated[int, Range(1)] = 2
+    threads: AtATime = 2
     """CPU threads."""
     no_memory: bool = False
     """Leave out peak memory, which takes a new process for every row."""
@@ -65,6 +65,7 @@ class StepCase(NamedTuple):
 def run(settings: TrainingStepBench) -> str:
     """Measure and add the rows; the table, and where the rows lie."""
     torch.set_num_threads(settings.threads)
+    begin_rows(settings.output)
     cases = [
         StepCase(count, width, height, frames)
         for count in settings.gaussians

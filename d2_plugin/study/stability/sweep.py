@@ -17,7 +17,7 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.progress import progress_bar
 from d2_plugin.settings import Settings
 from d2_plugin.study.command_line import command_line
-from d2_plugin.study.rows import Row, append_rows, make_row
+from d2_plugin.study.rows import Row, append_rows, begin_rows, make_row
 
 from .definition import Sweep
 from .gaussians import gaussian_sweeps
@@ -41,6 +41,7 @@ class StabilitySettings(Settings):
 
 def run(settings: StabilitySettings) -> str:
     """Sweep and add the rows; a line per sweep, and where the rows lie."""
+    begin_rows(settings.output)
     rows = run_sweeps(settings.sweeps, command_line("stability", settings))
     append_rows(settings.output, rows)
     return f"{summary(rows)}\nrows are in {settings.output}; `d2 report {settings.output}` shows them"

@@ -10,7 +10,6 @@ finish, and the same command continues where it was stopped. `d2 report` draws t
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,8 +17,9 @@ from typing import Annotated, Any, Literal
 
 from d2_plugin.errors import D2Error
 from d2_plugin.progress import progress_bar
+from d2_plugin.reading import read_toml
 from d2_plugin.runs.settings import RunSettings
-from d2_plugin.settings import AtLeastOne, Count, Positional, Positive, Range, Seed, Settings
+from d2_plugin.settings import AtATime, AtLeastOne, Count, Positional, Positive, Range, Seed, Settings
 from d2_plugin.study.ablation.job import Job
 from d2_plugin.study.ablation.presets import Preset, rows_named
 from d2_plugin.study.command_line import command_line
@@ -61,7 +61,7 @@ class TrainingBench(Settings):
     """TOML file with tables of settings over the defaults, for every method."""
     label: str = ""
     """Stands behind the names of the methods, to tell settings of your own from the defaults."""
-    jobs: Annotated[int, Range(1)] = os.cpu_count() or 1
+    jobs: AtATime = os.cpu_count() or 1
     """Runs at a time on this machine, one thread each."""
     scheduler: str | None = None
     """Address of a dask cluster to run on, as tcp://host:8786; its workers see the same files."""
@@ -178,10 +178,7 @@ def _tables(path: Path | None) -> dict[str, Any]:
     """The tables of a --config file; none where there is no file."""
     if path is None:
         return {}
-    try:
-        return tomllib.loads(path.read_text())
-    except (OSError, tomllib.TOMLDecodeError) as error:
-        raise D2Error(f"{path} is no file of settings ({error}): write TOML tables, or leave out --config") from None
+    return read_toml(path, "write TOML tables, or leave out --config")
 
 
 def _prior_seconds(preset: Preset, case: Case, shared: Shared) -> float | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.frame import hash_of
+from d2_plugin.runs.saved.kinds import read_metrics
 from d2_plugin.study.ablation.job import Job
 from d2_plugin.study.rivals.table import rival
 from d2_plugin.study.rows import Row, make_row
@@ -66,7 +66,7 @@ def _metrics(work: Work) -> dict[str, Any]:
     job, done = work.job, work.job.folder / "metrics.json"
     run = job.run()
     if done.is_file() and not (job.folder / "checkpoint.pt").is_file():
-        return json.loads(done.read_text())
+        return read_metrics(job.folder)
     work.shared.give_points(job.folder)
     run.train()
     metrics = run.evaluate(pictures=False)

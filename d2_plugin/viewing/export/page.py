@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import json
 import re
 from collections.abc import Sequence
 from importlib.resources import files
@@ -20,7 +19,9 @@ from d2_plugin.captures import Camera
 from d2_plugin.durable import write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
+from d2_plugin.reading import parse_json, parsing, read_text
 from d2_plugin.runs.drawing import color_scale
+from d2_plugin.values import checked_arguments, shown
 
 from .coded_scene import MARGINAL_REACH, CodedScene, code_keys, code_lines, read_harmonics, read_state
 from .codes import BLOCK, packed, to_json, unpacked
@@ -30,6 +31,9 @@ from .rounding import rounding, states_of
 from .scene import ExportScene
 
 VERSION = 1
+EXPORT = "export it anew"
+MOST_PAGE = 1 << 31
+"""Bytes of a page, at most."""
 TEXT_PER_BYTE = 4 / 3
 """Base64."""
 BYTES_AT_REST, BYTES_OF_POSITION, BYTES_OF_SHAPE = 28, 6, 16
@@ -71,22 +75,23 @@ class ReadPage(NamedTuple):
         return read_harmonics(self.arrays, self.header).coefficients
 
 
+@checked_arguments
 def read_page(path: Path) -> ReadPage:
     """Read what `write_page` wrote.
 
     Raises:
         D2Error: the file is no such page, or one of another version.
     """
-    text = path.read_text(encoding="utf-8")
+    text = read_text(path, EXPORT, MOST_PAGE)
     found = [re.search(rf'<script id="{name}" type="[^"]*">(.*?)</script>', text, re.S) for name in ("header", "data")]
     if found[0] is None or found[1] is None:
         raise D2Error(f"{path} is no page of `d2 export --format html`: it holds no scene")
-    header = json.loads(found[0].group(1))
-    if header.get("version") != VERSION:
-        raise D2Error(
-            f"{path} is a page of version {header.get('version')}, and this d2-4dgs reads {VERSION}: export it anew"
-        )
-    return ReadPage(header, unpacked(header["arrays"], base64.b64decode(found[1].group(1))))
+    header = parse_json(found[0].group(1), f"the header of {path}", EXPORT)
+    version = header.get("version") if isinstance(header, dict) else None
+    if version != VERSION:
+        raise D2Error(f"{path} is a page of version {shown(version)}, and this d2-4dgs reads {VERSION}: {EXPORT}")
+    with parsing(f"the data of {path}", EXPORT):
+        return ReadPage(header, unpacked(header["arrays"], base64.b64decode(found[1].group(1))))
 
 
 def _coded(scene: ExportScene, megabytes: float) -> tuple[CodedScene, Keys | None]:

@@ -9,16 +9,20 @@ from typing import Annotated
 
 import numpy as np
 
+from d2_plugin.captures.checks.memory import check_bytes
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.drawing import GAP, Panel, side_by_side
-from d2_plugin.settings import AtLeastOne, Positional, Positive, Range, Settings
+from d2_plugin.settings import AtLeastOne, Positional, Range, Settings
 from d2_plugin.viewing.checkpoints import open_subject
 from d2_plugin.viewing.films.plan import Plan, Stop, Wishes, plan_film
-from d2_plugin.viewing.films.video import Format, pyav, write_film
+from d2_plugin.viewing.films.video import RATES, Format, pyav, write_film
 from d2_plugin.viewing.look import look
 from d2_plugin.viewing.panels import KINDS, Scale, Shot, depth_scale
 from d2_plugin.viewing.subject import Subject, size_of
+
+BYTES_PER_PIXEL, BYTES_PER_PANEL = 60, 40
+"""Of a film at its peak: of drawing one panel, and of each panel that is kept until the picture is whole."""
 
 SAMPLED = 5
 """Pictures of a film from which the range of depths is taken."""
@@ -42,12 +46,12 @@ class RenderSettings(Settings):
     """Cameras of the path; by default all held-out or all training cameras."""
     at: Annotated[float, Range(0, unit="seconds")] | None = None
     """Freeze time at this instant while the camera moves."""
-    speed: Positive = 1.0
+    speed: Annotated[float, Range(1e-6, 1e6)] = 1.0
     """Of time in the recording: 0.25 is slow motion, with pictures between the recorded frames."""
     seconds: Annotated[float, Range(0, unit="seconds", open_low=True)] | None = None
     """Length of the film, for each camera where it stands; by default that of the recording, and at least 6 where the
     camera moves. Time runs back and forth in a film that is longer than the recording."""
-    fps: Annotated[float, Range(0, unit="pictures per second", open_low=True)] | None = None
+    fps: Annotated[float, Range(*RATES, unit="pictures per second")] | None = None
     """Of the film; by default those of the recording."""
     degrees: Annotated[float, Range(0, 360, unit="degrees", open_low=True)] | None = None
     """Angle that an orbit swings; by default what the training cameras span, since nobody saw the rest."""
@@ -77,6 +81,7 @@ def run(settings: RenderSettings) -> str:
     ]
     plan = plan_film(subjects[0], _wishes(settings))
     size = size_of(plan.stops[0].pose.lens, settings.width, settings.height)
+    _check_memory(size, len(settings.show) * len(subjects))
     path = settings.output or _default_output(settings)
     depths = _depths(subjects, plan, size, settings.show)
     captions = not settings.no_captions
@@ -111,6 +116,12 @@ def _check(settings: RenderSettings) -> None:
         )
     if settings.format != "png":
         pyav()
+
+
+def _check_memory(size: tuple[int, int], panels: int) -> None:
+    """Refuse pictures that this machine has too little memory for."""
+    needed = size[0] * size[1] * (BYTES_PER_PIXEL + BYTES_PER_PANEL * panels)
+    check_bytes(needed, f"pictures of {size[0]}x{size[1]} pixels", "choose a smaller --width and --height")
 
 
 def _wishes(settings: RenderSettings) -> Wishes:

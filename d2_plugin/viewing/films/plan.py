@@ -12,6 +12,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.viewing.films.path_file import read_camera_path
+from d2_plugin.viewing.films.video import RATES
 from d2_plugin.viewing.paths import Pose, orbit, pose_of, spiral, through
 from d2_plugin.viewing.subject import Subject
 
@@ -20,6 +21,8 @@ MOVING = ("orbit", "spiral", "through")
 """Paths by name; anything else is the path of a file."""
 MOVING_SECONDS = 6.0
 """Length of a film whose camera moves, where the recording is shorter."""
+MOST_PICTURES = 1_000_000
+"""Of a film: nine hours at 30 per second."""
 
 
 class Stop(NamedTuple):
@@ -64,7 +67,7 @@ def plan_film(subject: Subject, wishes: Wishes) -> Plan:
     """
     if wishes.at is not None and not 0 <= wishes.at <= subject.duration + 1e-9:
         raise D2Error(f"--at {wishes.at:g} s lies outside the recording, which lasts {subject.duration:g} s")
-    fps = wishes.fps or subject.capture.fps
+    fps = _checked_rate(wishes.fps or subject.capture.fps)
     if wishes.path in STANDING:
         stops = _standing(subject, wishes, fps)
     elif wishes.path in MOVING:
@@ -100,9 +103,9 @@ def _standing(subject: Subject, wishes: Wishes, fps: float) -> list[Stop]:
     seconds = wishes.seconds
     if seconds is None:
         moves = wishes.at is None and subject.duration > 0
-        count = math.floor(subject.duration / wishes.speed * fps + 1e-6) + 1 if moves else max(round(fps), 1)
+        count = math.floor(_bounded(subject.duration / wishes.speed * fps) + 1e-6) + 1 if moves else max(round(fps), 1)
     else:
-        count = max(round(seconds * fps), 1)
+        count = max(round(_bounded(seconds * fps)), 1)
     times = instants(subject, wishes, count, fps)
     return [Stop(pose_of(subject.capture.cameras[name]), time, name) for name in known for time in times]
 
@@ -111,7 +114,7 @@ def _moving(subject: Subject, wishes: Wishes, fps: float) -> list[Stop]:
     names = _known(subject, wishes.cameras or subject.train_cameras)
     cameras = [subject.capture.cameras[name] for name in names]
     seconds = wishes.seconds or max(MOVING_SECONDS, 0 if wishes.at is not None else subject.duration / wishes.speed)
-    count = max(round(seconds * fps), 2)
+    count = max(round(_bounded(seconds * fps)), 2)
     if wishes.path == "orbit":
         poses = orbit(cameras, count, wishes.degrees, subject.depth)
     elif wishes.path == "spiral":
@@ -125,12 +128,30 @@ def _from_file(subject: Subject, wishes: Wishes) -> tuple[list[Stop], float]:
     if not wishes.path.endswith(".json"):
         raise unknown_name("camera path", wishes.path, [*STANDING, *MOVING, "FILE.json"])
     found = read_camera_path(Path(wishes.path))
-    fps = wishes.fps or found.fps
+    fps = _checked_rate(wishes.fps or found.fps)
     if found.shares is not None and wishes.at is None:
         times = [share * subject.duration for share in found.shares]
     else:
         times = instants(subject, wishes, len(found.poses), fps)
     return [Stop(pose, time) for pose, time in zip(found.poses, times, strict=True)], fps
+
+
+def _checked_rate(fps: float) -> float:
+    if not RATES[0] <= fps <= RATES[1]:
+        raise D2Error(
+            f"a film of {fps:g} pictures per second cannot be written: give --fps from {RATES[0]:g} to {RATES[1]:g}"
+        )
+    return fps
+
+
+def _bounded(pictures: float) -> float:
+    """How many pictures a film would have, where that is no more than one may have."""
+    if not pictures <= MOST_PICTURES:
+        raise D2Error(
+            f"the film would have {pictures:.3g} pictures, at most {MOST_PICTURES}: choose fewer --seconds, a lower "
+            "--fps or a higher --speed"
+        )
+    return pictures
 
 
 def _known(subject: Subject, names: Sequence[str]) -> Sequence[str]:

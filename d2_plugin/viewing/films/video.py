@@ -7,8 +7,9 @@ copy of its last. Nothing is scaled. Scores are never computed from a video.
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
@@ -16,10 +17,16 @@ from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
-from d2_plugin.captures.pictures import write_png
+from d2_plugin.captures.pictures import checked_picture, write_png
+from d2_plugin.durable import LEFTOVER, make_folder, remove_leftovers, writing
 from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.locks import one_of_many
+from d2_plugin.reading import said
+from d2_plugin.values import checked_arguments
 
 Format = Literal["mp4", "webp", "gif", "png"]
+RATES = (0.001, 1000.0)
+"""Pictures per second that files of films can say."""
 
 
 class Film(Protocol):
@@ -41,6 +48,7 @@ def pyav() -> ModuleType:
     return av
 
 
+@checked_arguments
 @contextmanager
 def write_film(path: Path, form: Format, fps: float, quality: int = 18) -> Iterator[Film]:
     """A film at `path`, complete when the block ends; what stood there is replaced then and not before.
@@ -52,20 +60,43 @@ def write_film(path: Path, form: Format, fps: float, quality: int = 18) -> Itera
         quality: x264's constant rate factor for mp4, 0 is lossless and 51 the worst; webp's quality is 100 less twice
             this number.
     """
+    if not RATES[0] <= fps <= RATES[1]:
+        raise D2Error(f"a film has {fps:g} pictures per second, expected {RATES[0]:g} to {RATES[1]:g}: correct them")
     if form == "png":
-        path.mkdir(parents=True, exist_ok=True)
-        yield _Pngs(path)
+        yield _Pngs(make_folder(path))
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.stem}.unfinished.{form}")
-    film = {"mp4": _Mp4, "webp": _WebP, "gif": _Gif}[form](unfinished, _rate(fps), quality)
-    try:
-        yield film
-        film.close()
-        os.replace(unfinished, path)
-    finally:
-        film.abandon()
-        unfinished.unlink(missing_ok=True)
+    if path.suffix.lower() != f".{form}":  # a slip of the hand must not replace another kind of file
+        raise D2Error(f"a film of format {form} needs a name that ends so, got {path.name}: mend the name or --format")
+    folder = make_folder(path.parent)
+    with one_of_many(folder, lambda: remove_leftovers(folder, below=False)):
+        unfinished = path.with_name(f".{secrets.token_hex(8)}{LEFTOVER}")
+        try:
+            with _encoding(path):
+                film = {"mp4": _Mp4, "webp": _WebP, "gif": _Gif}[form](unfinished, _rate(fps), quality)
+                try:
+                    yield film
+                    film.close()
+                finally:
+                    film.abandon()
+                os.replace(unfinished, path)
+        finally:
+            with suppress(OSError):
+                unfinished.unlink(missing_ok=True)
+
+
+@contextmanager
+def _encoding(path: Path) -> Iterator[None]:
+    """Within it, whatever FFmpeg or the system says against a film is one sentence."""
+    with writing(path):
+        try:
+            yield
+        except (D2Error, OSError):
+            raise
+        except (pyav().error.FFmpegError, OverflowError) as error:
+            raise D2Error(
+                f"cannot write the film {path} ({said(error)}): choose other --width, --height or --fps, or another "
+                "--format"
+            ) from None
 
 
 class _Pngs:
@@ -74,24 +105,24 @@ class _Pngs:
 
     def add(self, picture: np.ndarray) -> None:
         """Write one picture."""
-        write_png(self.folder / f"{self.count:05d}.png", picture)
+        write_png(self.folder / f"{self.count:05d}.png", checked_picture(picture, "a picture of a film"))
         self.count += 1
 
 
 class _Encoded:
     """One stream in one container."""
 
-    codec, pixels = "", "yuv420p"
+    muxer, codec, pixels = "", "", "yuv420p"
     container_options: ClassVar[dict[str, str]] = {}
 
     def __init__(self, path: Path, rate: Fraction, quality: int) -> None:
         self.av, self.rate, self.quality, self.count = pyav(), rate, quality, 0
-        self.container: Any = self.av.open(str(path), "w", options=self.container_options)
+        self.container: Any = self.av.open(str(path), "w", format=self.muxer, options=self.container_options)
         self.stream: Any = None
 
     def add(self, picture: np.ndarray) -> None:
         """Encode one picture, RGB uint8 [H, W, 3]; all have the size of the first."""
-        picture = self._shaped(picture)
+        picture = self._shaped(checked_picture(picture, "a picture of a film"))
         if self.stream is None:
             self._begin(picture.shape[1], picture.shape[0])
         if (self.stream.width, self.stream.height) != (picture.shape[1], picture.shape[0]):
@@ -112,7 +143,8 @@ class _Encoded:
     def abandon(self) -> None:
         """Let go of the file where `close` was not reached."""
         if self.container is not None:
-            self.container.close()
+            with suppress(self.av.error.FFmpegError, OSError):  # what went wrong before is what is said
+                self.container.close()
             self.container = None
 
     def _shaped(self, picture: np.ndarray) -> np.ndarray:
@@ -135,7 +167,7 @@ class _Encoded:
 
 
 class _Mp4(_Encoded):
-    codec = "libx264"
+    muxer, codec = "mp4", "libx264"
     container_options: ClassVar = {"movflags": "+faststart"}
 
     def _shaped(self, picture: np.ndarray) -> np.ndarray:
@@ -162,7 +194,7 @@ class _Mp4(_Encoded):
 
 
 class _WebP(_Encoded):
-    codec = "libwebp_anim"
+    muxer, codec = "webp", "libwebp_anim"
     container_options: ClassVar = {"loop": "0"}
 
     def _tune(self) -> None:
@@ -170,7 +202,7 @@ class _WebP(_Encoded):
 
 
 class _Gif(_Encoded):
-    codec, pixels = "gif", "pal8"
+    muxer, codec, pixels = "gif", "gif", "pal8"
     container_options: ClassVar = {"loop": "0"}
     graph: Any = None
 

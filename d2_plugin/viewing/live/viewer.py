@@ -22,6 +22,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error, missing_extra
 from d2_plugin.plugin import D2Hooks
+from d2_plugin.values import checked_arguments
 from d2_plugin.viewing.live.draw import Drawer
 from d2_plugin.viewing.live.follow import Follower
 from d2_plugin.viewing.live.overlay import Overlay, frustum_size, rig_of
@@ -38,6 +39,7 @@ MOVING_SECONDS = 0.06
 class Viewer:
     """The page, its clients, and what they look at."""
 
+    @checked_arguments
     def __init__(
         self,
         d2: D2Hooks | None = None,

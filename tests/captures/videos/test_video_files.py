@@ -10,6 +10,8 @@ from films import write_film
 
 from d2_plugin.captures.videos.decoding import Decoder
 from d2_plugin.captures.videos.files import VideoFile, read_video, videos_below
+from d2_plugin.captures.videos.plain import video_header
+from d2_plugin.errors import D2Error
 
 pytest.importorskip("av")
 
@@ -82,3 +84,27 @@ def test_a_folder_names_its_videos(unsteady: tuple[Path, np.ndarray]) -> None:
     (folder / "notes.txt").write_text("no video")
     (folder / ".hidden.mp4").write_text("no video")
     assert videos_below(folder) == (unsteady[0],)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv", ".mts", ".m2ts", ".avi"])
+def test_the_containers_of_cameras_are_read(suffix: str, tmp_path: Path) -> None:
+    path = write_film(tmp_path / f"a{suffix}", pictures(5), [i / 25 for i in range(5)])
+    assert len(read_video(path).stamps) == 5
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:9/a.ts\n#EXT-X-ENDLIST\n",
+        "ffconcat version 1.0\nfile 'a.mp4'\n",
+        "<MPD><Period><BaseURL>http://127.0.0.1:9/</BaseURL></Period></MPD>",
+        "1\n00:00:01,000 --> 00:00:02,000\nhello\n",
+        "v=0\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\n",
+    ],
+)
+def test_playlists_and_scripts_are_no_videos_and_lead_nowhere(text: str, tmp_path: Path) -> None:
+    write_film(tmp_path / "a.mp4", pictures(5), [i / 25 for i in range(5)])
+    (tmp_path / "b.mp4").write_text(text)
+    for read in (read_video, video_header):
+        with pytest.raises(D2Error, match=r"b\.mp4 is no video in an MP4, MOV, .* container"):
+            read(tmp_path / "b.mp4")
