@@ -34,7 +34,9 @@ def _layers(names: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, ...]]:
     """Weight and bias of linear layers (out, in)."""
     parts = [(name, size) for name, size in names.items()]
     return {
-        f"{name}.{part}": (size if part == "weight" else size[:1]) for name, size in parts for part in ("weight", "bias")
+        f"{name}.{part}": (size if part == "weight" else size[:1])
+        for name, size in parts
+        for part in ("weight", "bias")
     }
 
 

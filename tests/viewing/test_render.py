@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from d2_plugin.captures import open_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.run import Run
@@ -19,7 +18,6 @@ from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import make_view
 from d2_plugin.viewing.films.film import RenderSettings, run
 from d2_plugin.viewing.films.plan import Wishes, plan_film
-from d2_plugin.viewing.look import look
 from d2_plugin.viewing.panels import KINDS, Shot
 from d2_plugin.viewing.paths import pose_of
 from d2_plugin.viewing.subject import Subject

@@ -2,7 +2,7 @@
 
 | file | from | shown as |
 |---|---|---|
-| chkpnt*.pth with 19 or 21 entries | fudan-zvg/4d-gaussian-splatting, 4C4D | 4D Gaussians, through the adapter `fudan` |
+| chkpnt*.pth with 19 or 21 entries | fudan-zvg/4d-gaussian-splatting, 4C4D | 4D Gaussians, by the adapter `fudan` |
 | chkpnt*.pth with 12 or 14 entries | 3D Gaussian Splatting, and theirs without time | one instant |
 | chkpnt_fine_*.pth; a point cloud with deformation.pth beside it | 4DGaussians | planes and decoder, see `hexplanes` |
 | a point cloud with deform/iteration_N/deform.pth | Deformable-3D-Gaussians | its network, see `networks` |

@@ -1,9 +1,9 @@
 """The network of Deformable-3D-Gaussians, rebuilt from its weights: where a Gaussian is at a time.
 
-With e(x) = (x, sin 2^k x, cos 2^k x) for k = 0, 1, ..., position and time go encoded through layers with ReLU; the layer
-after the middle one sees them a second time. Three linear heads then tell the offset of the centre, of the quaternion
-and of the scales. In a variant for synthetic scenes two layers encode time first; in another the head of the centre is
-a screw motion. Widths, depth and variant follow from the names and shapes of the weights.
+With e(x) = (x, sin 2^k x, cos 2^k x) for k = 0, 1, ..., position and time go encoded through layers with ReLU; the
+layer after the middle one sees them a second time. Three linear heads then tell the offset of the centre, of the
+quaternion and of the scales. In a variant for synthetic scenes two layers encode time first; in another the head of the
+centre is a screw motion. Widths, depth and variant follow from the names and shapes of the weights.
 """
 
 from __future__ import annotations
