@@ -21,6 +21,7 @@ from d2_plugin.viewing.checkpoints.files import read_options, read_ply
 from d2_plugin.viewing.checkpoints.hexplanes import PlaneField
 from d2_plugin.viewing.checkpoints.networks import MotionNetwork
 from d2_plugin.viewing.checkpoints.tuples import FOUR_C, FOUR_C_STATIC, FUDAN, PLANES, STATIC
+from d2_plugin.viewing.export.page import read_page
 from d2_plugin.viewing.live.show import ViewSettings, subject_at
 from d2_plugin.viewing.look import look
 from d2_plugin.viewing.paths import pose_of
@@ -346,3 +347,43 @@ class TestRefused:
             open_subject(tmp_path / "a.ply", room)
         assert main(["render", str(path), "--capture", str(room)]) == 2
         assert capsys.readouterr().err.count("\n") == 1
+
+
+class TestExport:
+    """`d2 export` of a checkpoint: straight lines exactly where it has them, baked key times where not."""
+
+    def test_4d_gaussians_become_the_same_straight_lines(
+        self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        from d2_plugin.adapters.fudan import FudanAdapter
+
+        path = tmp_path / "chkpnt30000.pth"
+        model = TestTuples.checkpoint(path)
+        assert main(["export", str(path), "--capture", str(room), "--train-cameras", "train0,train1"]) == 0
+        said = capsys.readouterr().out
+        assert "times are taken to be seconds since the first frame" in said
+        assert "moves on a straight line and fades in time, exactly as it was trained" in said
+        page = read_page(tmp_path / "export" / "scene.html")
+        assert [camera["held_out"] for camera in page.header["cameras"]] == [False, False, True, True]
+        for time in (0.0, 0.1, 0.25):
+            true = FudanAdapter(model).slice_at(seen(open_subject(path, room), time))
+            told = page.at(time)
+            drawn = told.positions[told.opacities >= 1 / 255]
+            assert torch.cdist(true.means[true.opacities >= 1 / 255].double(), drawn).amin(1).max() < 1e-3
+
+    def test_a_network_is_baked(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        Test4DGaussians.output(tmp_path)
+        assert main(["export", str(tmp_path), "--capture", str(room)]) == 0
+        assert "a deformation field at" in capsys.readouterr().out
+        found = open_subject(tmp_path, room)
+        page = read_page(tmp_path / "export" / "scene.html")
+        assert page.coefficients.shape[1:] == (16, 3)
+        at = found.capture.seconds(found.capture.frames[-1])
+        true, told = found.backbone.slice_at(seen(found, at)), page.at(at)
+        drawn = told.positions[told.opacities >= 1 / 255]
+        assert torch.cdist(true.means[true.opacities >= 1 / 255].double(), drawn).amin(1).max() < 1e-3
+
+    def test_without_its_recording_it_is_refused(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        TestTuples.checkpoint(tmp_path / "chkpnt1.pth")
+        assert main(["export", str(tmp_path / "chkpnt1.pth")]) == 2
+        assert "name its recording with --capture" in capsys.readouterr().err

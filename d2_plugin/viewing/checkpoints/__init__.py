@@ -13,6 +13,6 @@
 Nothing of their code is run or imported, and files are read as tensors and plain values only.
 """
 
-from d2_plugin.viewing.checkpoints.opening import is_output_folder, open_subject
+from d2_plugin.viewing.checkpoints.opening import is_output_folder, open_checkpoint, open_subject
 
-__all__ = ["is_output_folder", "open_subject"]
+__all__ = ["is_output_folder", "open_checkpoint", "open_subject"]

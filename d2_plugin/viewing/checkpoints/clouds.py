@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 from torch import Tensor
@@ -14,7 +13,7 @@ from d2_plugin.protocol import RasterSettings
 
 from .files import columns, read_options, read_ply, read_state
 from .hexplanes import PlaneField
-from .loaded import Loaded, frozen, gsplat_model, planes_model, with_adapter
+from .loaded import Loaded, frozen, gsplat_model, harmonics_of, planes_model, with_adapter
 from .networks import MotionNetwork
 
 CLOUD = "point_cloud.ply"
@@ -72,7 +71,7 @@ def _of_one_instant(rows: dict[str, Tensor]) -> Loaded:
         "sh0": constant,
         "shN": rest,
     }
-    return Loaded(gsplat_model(parameters, RasterSettings()), 1.0, "a point cloud shows one instant")
+    return gsplat_model(parameters, RasterSettings(), "a point cloud shows one instant")
 
 
 def _inria_values(rows: dict[str, Tensor]) -> dict[str, Any]:
@@ -100,10 +99,10 @@ def _of_planes(rows: dict[str, Tensor], path: Path, capture: Capture) -> Loaded:
 def _of_network(rows: dict[str, Tensor], weights: Path, capture: Capture) -> Loaded:
     if not weights.is_file():
         raise D2Error(f"{weights} is not there: a point cloud of Deformable-3D-Gaussians moves by it, copy both")
-    model: SimpleNamespace = frozen(_inria_values(rows))
-    adapter = with_adapter("deformable3d", model, MotionNetwork(read_state(weights), weights), warm_up=0)
-    last = capture.seconds(capture.frames[-1])
-    return Loaded(adapter, 1 / max(last, 1e-9), "the first frame is taken to be at time 0 and the last one at 1")
+    values = _inria_values(rows)
+    adapter = with_adapter("deformable3d", frozen(values), MotionNetwork(read_state(weights), weights), warm_up=0)
+    note = "the first frame is taken to be at time 0 and the last one at 1"
+    return Loaded(adapter, 1 / max(capture.seconds(capture.frames[-1]), 1e-9), note, harmonics_of(values))
 
 
 def _of_spacetime(rows: dict[str, Tensor], capture: Capture) -> Loaded:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from d2_plugin import registry
 from d2_plugin.captures import Capture
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.moving import Harmonics, MovingGaussians, moving_gaussians
+from d2_plugin.gaussians.spherical_harmonics import channel_count
 from d2_plugin.protocol import RasterSettings
 
 
@@ -22,6 +26,10 @@ class Loaded(NamedTuple):
     """The trainer's unit of time, per second."""
     note: str = ""
     """What a person should know, in one sentence."""
+    harmonics: Harmonics | None = None
+    """Colours; None where only the adapter can tell them, for one direction after the other."""
+    moving: MovingGaussians | None = None
+    """The same Gaussians as straight lines that fade, in seconds since the first frame, where they are of that form."""
 
 
 def frozen(values: dict[str, Any]) -> SimpleNamespace:
@@ -40,9 +48,17 @@ def with_adapter(name: str, *arguments: Any, **options: Any) -> Any:
     return adapter(*arguments, **options)
 
 
-def gsplat_model(parameters: dict[str, Tensor], settings: RasterSettings) -> Any:
+def gsplat_model(parameters: Mapping[str, Tensor], settings: RasterSettings, note: str) -> Loaded:
     """Gaussians that stand still, by gsplat's names."""
-    return with_adapter("gsplat", {name: value.detach() for name, value in parameters.items()}, {}, settings=settings)
+    found = {name: value.detach() for name, value in parameters.items()}
+    backbone = with_adapter("gsplat", dict(found), {}, settings=settings)
+    if "sh0" not in found:
+        return Loaded(backbone, 1.0, note)
+    coefficients = torch.cat([found["sh0"], found["shN"]], 1) if "shN" in found else found["sh0"]
+    harmonics = Harmonics(coefficients, round(coefficients.shape[1] ** 0.5) - 1)
+    raw = {"positions": found["means"], "log_scales": found["scales"], "left": found["quats"]}
+    moving = moving_gaussians(raw | {"opacity_logits": found["opacities"]}, harmonics)
+    return Loaded(backbone, 1.0, note, moving.harmonics, moving)
 
 
 def planes_model(values: dict[str, Any], field: Any, stage: str, capture: Capture) -> Loaded:
@@ -50,9 +66,14 @@ def planes_model(values: dict[str, Any], field: Any, stage: str, capture: Captur
     count = max(len(capture.frames), 1)
     backbone = with_adapter("hust4d", frozen(values | {"_deformation": field}), None, stage)
     if stage == "coarse":
-        return Loaded(backbone, 1.0, "the coarse stage of 4DGaussians stands still")
-    return Loaded(
-        backbone,
-        capture.fps / count,
-        "a frame's time is taken to be its number / the number of frames, as the trainer reads several cameras",
-    )
+        return Loaded(backbone, 1.0, "the coarse stage of 4DGaussians stands still", harmonics_of(values))
+    note = "a frame's time is taken to be its number / the number of frames, as the trainer reads several cameras"
+    return Loaded(backbone, capture.fps / count, note, harmonics_of(values))
+
+
+def harmonics_of(values: Mapping[str, Any], time_degree: int = 0) -> Harmonics:
+    """The colours of a model of Inria's heirs, up to the degree that it uses so far."""
+    degree = int(values["active_sh_degree"])
+    coefficients = torch.cat([values["_features_dc"], values["_features_rest"]], 1).detach()
+    used = coefficients[:, : channel_count(degree, time_degree)]
+    return Harmonics(used.double().cpu(), degree, time_degree)

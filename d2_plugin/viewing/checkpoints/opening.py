@@ -33,25 +33,36 @@ def open_subject(
     Raises:
         D2Error: one sentence for what cannot be opened, and why.
     """
+    if path.is_dir() and not is_output_folder(path):
+        return subject_of_run(path)
+    return open_checkpoint(path, capture, train_cameras, downscale)[0]
+
+
+def open_checkpoint(
+    path: Path, capture: Path | None = None, train_cameras: Sequence[str] | None = None, downscale: int = 1
+) -> tuple[Subject, Loaded]:
+    """What another trainer wrote, with its recording, and what its file says beside.
+
+    Raises:
+        D2Error: one sentence for what cannot be opened, and why.
+    """
     if is_output_folder(path):
         path = newest_cloud(path)
-    if path.is_dir():
-        return subject_of_run(path)
     if not path.is_file():
         raise D2Error(f"no run at {path}: give the --output folder of `d2 train`, or a trainer's checkpoint")
     if capture is None:
         raise D2Error(f"{path.name} does not say where its cameras stood: name its recording with --capture")
     opened = open_capture(capture, downscale=downscale)
-    backbone, time_scale, note = _loaded(path, opened)
+    loaded = _loaded(path, opened)
     names = tuple(opened.cameras)
     for name in train_cameras or ():
         opened.image(name, opened.frames[0])  # an unknown name is refused there
     trained = tuple(train_cameras) if train_cameras else names
     held_out = tuple(name for name in names if name not in trained)
-    found = Subject(path.stem, opened, trained, held_out, backbone, note=note)
-    if not len(backbone):
+    if not len(loaded.backbone):
         raise D2Error(f"{path} has no Gaussian: nothing can be shown")
-    return replace(found, time_scale=time_scale)
+    found = Subject(path.stem, opened, trained, held_out, loaded.backbone, note=loaded.note)
+    return replace(found, time_scale=loaded.time_scale), loaded
 
 
 def _loaded(path: Path, capture: Capture) -> Loaded:
@@ -59,8 +70,7 @@ def _loaded(path: Path, capture: Capture) -> Loaded:
         return of_cloud(path, capture)
     stored = read_tensors(path)
     if isinstance(stored, dict) and "splats" in stored:
-        still = gsplat_model(stored["splats"], RasterSettings(near=0.01))
-        return Loaded(still, 1.0, "gsplat's Gaussians stand still")
+        return gsplat_model(stored["splats"], RasterSettings(near=0.01), "gsplat's Gaussians stand still")
     if isinstance(stored, (tuple, list)) and len(stored) == 2 and isinstance(stored[0], (tuple, list)):
         return of_tuple(stored[0], path, capture)
     raise D2Error(

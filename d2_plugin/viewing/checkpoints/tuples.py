@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from d2_plugin.captures import Capture
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.moving import moving_gaussians
 
 from .files import read_options
 from .hexplanes import PlaneField
-from .loaded import Loaded, frozen, planes_model, with_adapter
+from .loaded import Loaded, frozen, harmonics_of, planes_model, with_adapter
 
 FUDAN = (
     *("active_sh_degree", "_xyz", "_features_dc", "_features_rest", "_scaling", "_rotation", "_opacity"),
@@ -47,12 +48,28 @@ def of_tuple(stored: Sequence[Any], path: Path, capture: Capture) -> Loaded:
             f"{path} has {len(stored)} entries, expected {len(FUDAN)} (fudan), {len(FOUR_C)} (4C4D), {len(PLANES)} "
             f"(4DGaussians) or {len(STATIC)} (3DGS): show another trainer's model from inside it, with Viewer(d2)"
         )
-    model = frozen(dict(zip(names, stored, strict=True)))
+    values = dict(zip(names, stored, strict=True))
+    model = frozen(values)
     timed = names in WITH_TIME
     model.gaussian_dim = 4 if timed else 3
     model.time_duration = [0.0, max(capture.seconds(capture.frames[-1]), 1e-9)]
     note = "times are taken to be seconds since the first frame" if timed else "3D Gaussians stand still"
-    return Loaded(with_adapter("fudan", model), 1.0, note)
+    loaded = Loaded(with_adapter("fudan", model), 1.0, note)
+    return _with_lines(loaded, values, timed)
+
+
+def _with_lines(loaded: Loaded, values: Mapping[str, Any], timed: bool) -> Loaded:
+    """The same as straight lines: what a 4D Gaussian is exactly, if its rotation is one of 4D."""
+    harmonics = harmonics_of(values, int(values["active_sh_degree_t"]) if timed else 0)
+    raw = {"positions": values["_xyz"], "log_scales": values["_scaling"], "left": values["_rotation"]}
+    raw |= {"opacity_logits": values["_opacity"].squeeze(-1)}
+    if timed:
+        if not values["rot_4d"]:  # another reading of `_scaling_t`: sampled through the adapter
+            return loaded if harmonics.time_degree else loaded._replace(harmonics=harmonics)
+        raw |= {"times": values["_t"].squeeze(-1), "log_time_scales": values["_scaling_t"].squeeze(-1)}
+        raw |= {"right": values["_rotation_r"]}
+    moving = moving_gaussians(raw, harmonics)
+    return loaded._replace(harmonics=moving.harmonics, moving=moving)
 
 
 def _of_planes(values: dict[str, Any], path: Path, capture: Capture) -> Loaded:
