@@ -203,6 +203,24 @@ def test_a_moving_picture_is_as_large_as_fits_its_time() -> None:
     assert resolution.size(1.0, 360, 0.06) == (72, 72)
 
 
+def test_pictures_of_many_gaussians_are_not_made_small_for_nothing() -> None:
+    """What Gaussians cost before the first pixel does not get less with fewer pixels."""
+
+    def seconds(size: tuple[int, int]) -> float:
+        return 0.15 + 1e-7 * size[0] * size[1]
+
+    resolution = Resolution()
+    moving = (0, 0)
+    for _ in range(5):
+        for _ in range(3):
+            moving = resolution.size(16 / 9, 360, 0.06)
+            resolution.drew(moving[0] * moving[1], seconds(moving))
+        still = resolution.size(16 / 9, 360)
+        resolution.drew(still[0] * still[1], seconds(still))
+    assert moving[1] > 300
+    assert seconds(moving) < 1.2 * seconds((128, 72))
+
+
 def test_a_share_pays_off_what_was_spent_and_saves_little() -> None:
     share = Share(0.1)
     assert share.due
