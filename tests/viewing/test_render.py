@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from viewing.hostile import emptied, of_another_version, still_training
 
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
@@ -169,10 +170,7 @@ class TestSentences:
         assert "there is no depth prior of camera test0" in refused(capsys, trained, "--show", "sigma")
 
     def test_a_run_that_still_trains(self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        copy = tmp_path / "<script>alert(1)</script>".replace("/", "_")
-        shutil.copytree(trained, copy)
-        state = torch.load(copy / "checkpoint.pt", weights_only=True)
-        torch.save(state | {"step": 33}, copy / "checkpoint.pt")
+        copy = still_training(trained, tmp_path / "<script>alert(1)</script>".replace("/", "_"), 33)
         assert main(["render", str(copy), "--output", str(tmp_path / "a.mp4")]) == 0
         assert f"{copy.name} still trains: this is step 33 of 40" in capsys.readouterr().out
         (copy / "checkpoint.pt").unlink()
@@ -187,17 +185,5 @@ class TestSentences:
     def test_an_empty_run_and_one_of_another_version(
         self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        copy = tmp_path / "copy"
-        shutil.copytree(trained, copy)
-        state = torch.load(copy / "checkpoint.pt", weights_only=True)
-        state["model"] = {
-            "parameters": {name: value[:0] for name, value in state["model"]["parameters"].items()},
-            "statistics": {name: value[:0] for name, value in state["model"]["statistics"].items()},
-            "optimizer": state["model"]["optimizer"] | {"state": {}},
-        }
-        torch.save(state, copy / "checkpoint.pt")
-        assert "has no Gaussian left at step 40" in refused(capsys, copy)
-        table = json.loads((copy / "run.json").read_text())
-        plain = {name: value for name, value in table.items() if name not in ("format", "seal")}
-        (copy / "run.json").write_text(json.dumps(plain | {"version": 99}))
-        assert "version 99" in refused(capsys, copy)
+        assert "has no Gaussian left at step 40" in refused(capsys, emptied(trained, tmp_path / "empty"))
+        assert "version 99" in refused(capsys, of_another_version(trained, tmp_path / "later"))
