@@ -35,7 +35,7 @@ TEXT_PER_BYTE = 4 / 3
 """Base64."""
 BYTES_AT_REST, BYTES_OF_POSITION, BYTES_OF_SHAPE = 28, 6, 16
 """Per Gaussian, with 16-bit codes and before compression, without harmonics."""
-PAGE_SCRIPTS = ("scene.js", "shaders.js", "renderer.js", "controls.js", "player.js")
+PAGE_SCRIPTS = ("scene.js", "shaders.js", "renderer.js", "controls.js", "pace.js", "player.js")
 WORKER_SCRIPTS = ("scene.js", "sorter.js")
 
 

@@ -155,6 +155,24 @@ def test_the_slider_and_the_play_button_move_time(new_page: Any, tmp_path: Path)
     assert page.complaints == []
 
 
+def test_pictures_are_coarser_only_where_that_makes_them_quicker(new_page: Any, tmp_path: Path) -> None:
+    page = opened(new_page, sharp_model("yang4d"), tmp_path / "scene.html")
+    paced = """([fixed, pixel]) => {
+        const pace = new Pace(), full = 960 * 554;
+        let coarse = 2;
+        for (let i = 0; i < 40; i++) {
+            const pixels = full / coarse ** 2;
+            pace.note(pixels, fixed + pixel * pixels);
+            coarse = pace.coarse(full, coarse);
+        }
+        return coarse;
+    }"""
+    assert page.run(paced, [0.001, 1e-9]) == 1, "a graphics card"
+    pixels = 960 * 554 / page.run(paced, [0.001, 1e-6]) ** 2
+    assert pixels * 1e-6 == pytest.approx(1 / 15, rel=0.1), "what pixels cost is saved"
+    assert page.run(paced, [0.12, 5e-8]) < 1.2, "what Gaussians cost is not"
+
+
 def test_names_with_markup_stay_text(new_page: Any, tmp_path: Path) -> None:
     page = new_page()
     asked: list[str] = []
