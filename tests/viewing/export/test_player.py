@@ -102,7 +102,11 @@ def test_pictures_of_other_times_and_cameras_would_not_pass(new_page: Any, tmp_p
     assert psnr(here, rasterized(model, 1, TIMES[1])["color"]) < 28
 
 
-def test_harmonics_and_cosines_in_time_and_a_sky_are_drawn(new_page: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("bits", [8, 5])
+def test_harmonics_and_cosines_in_time_and_a_sky_are_drawn(
+    new_page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bits: int
+) -> None:
+    monkeypatch.setattr("d2_plugin.viewing.export.coded_scene.HARMONIC_BITS", (bits,))
     plain = sharp_model("yang4d")
     rows = {name: value.detach() for name, value in plain.gaussians.parameters.items()}
     generator = torch.Generator().manual_seed(3)
