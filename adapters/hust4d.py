@@ -88,15 +88,18 @@ class Hust4DAdapter(InriaAdapter):
 
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] from the harmonics as the field leaves them: it deforms those too, unless `no_dshs` is set."""
-        model, features = self.gaussians, self._coefficients()
-        if self.stage == "fine" and len(self):
-            times = model._xyz.new_full((len(self), 1), view.time)
-            raw = model._xyz, model._scaling, model._rotation, model._opacity
-            features = self.gaussians._deformation(*raw, features, times)[4]
-        degree = int(getattr(model, "active_sh_degree", 0))
+        features = self._features_at(view.time) if self.stage == "fine" and len(self) else self._coefficients()
+        degree = int(getattr(self.gaussians, "active_sh_degree", 0))
         centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
         chosen = features[splats.rows, : channel_count(degree, 0)]
         return harmonic_colors(chosen, splats.means - centre, None, degree, 0)
+
+    def _features_at(self, time: float) -> Tensor:
+        """Harmonics [N, C, 3] of all rows in the fine stage."""
+        model, times = self.gaussians, self.gaussians._xyz.new_full((len(self), 1), time)
+        raw = model._xyz, model._scaling, model._rotation, model._opacity
+        features: Tensor = model._deformation(*raw, self._coefficients(), times)[4]
+        return features
 
     def _field(
         self, positions: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, time: float
