@@ -19,6 +19,8 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
 from d2_plugin.gaussians.slicing import unit_quaternions
+from d2_plugin.gaussians.spherical_harmonics import channel_count
+from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from .inria import InriaAdapter, RenderedCamera
@@ -83,6 +85,21 @@ class Hust4DAdapter(InriaAdapter):
         factors = rotation_matrices_3d(unit_quaternions(rotations)) * log_scales.T.exp()
         rows = torch.arange(len(self), device=positions.device)
         return Splats(positions, covariances_from_factors(factors), torch.sigmoid(logits.squeeze(-1)), rows)
+
+    def colors(self, view: View, splats: Splats) -> Tensor:
+        """RGB [M, 3] from the harmonics as the field leaves them: it deforms those too, unless `no_dshs` is set."""
+        features = self._features_at(view.time) if self.stage == "fine" and len(self) else self._coefficients()
+        degree = int(getattr(self.gaussians, "active_sh_degree", 0))
+        centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
+        chosen = features[splats.rows, : channel_count(degree, 0)]
+        return harmonic_colors(chosen, splats.means - centre, None, degree, 0)
+
+    def _features_at(self, time: float) -> Tensor:
+        """Harmonics [N, C, 3] of all rows in the fine stage."""
+        model, times = self.gaussians, self.gaussians._xyz.new_full((len(self), 1), time)
+        raw = model._xyz, model._scaling, model._rotation, model._opacity
+        features: Tensor = model._deformation(*raw, self._coefficients(), times)[4]
+        return features
 
     def _field(
         self, positions: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, time: float

@@ -44,6 +44,17 @@ class Swift4DAdapter(Hust4DAdapter):
         moved = self._moved(*(part[moving] for part in raw), time=time)
         return tuple(part.index_copy(0, moving, now) for part, now in zip(raw, moved))
 
+    def _features_at(self, time: float) -> Tensor:
+        """Harmonics [N, C, 3] of all rows in the fine stage; rows that do not move keep theirs."""
+        model, features = self.gaussians, self._coefficients()
+        moving = torch.nonzero(self._moves(model._dynamic)).squeeze(-1)
+        if not len(moving):
+            return features
+        raw = model._xyz, model._scaling, model._rotation, model._opacity, features
+        times = model._xyz.new_full((len(moving), 1), time)
+        now = model._FDhash(*(part[moving] for part in raw), times)[4]
+        return features.index_copy(0, moving, now.to(features))
+
     def _moved(self, *raw: Tensor, time: float) -> list[Tensor]:
         """What the hash grid makes of raw attributes; tiny-cuda-nn computes in half precision, the model does not."""
         positions = raw[0]

@@ -47,6 +47,7 @@ def write_ply(
     harmonics: Tensor | None = None,
     moving: Mapping[str, Tensor] | None = None,
     comments: Sequence[str] = ("SplatRenderMode: default",),
+    shapes: tuple[Tensor, Tensor] | None = None,
 ) -> int:
     """Write Gaussians as one row of float32 each; returns how many were written.
 
@@ -59,16 +60,17 @@ def write_ply(
         harmonics: [M, C, 3] coefficients of the view-dependent colour without the constant one, C = 3, 8 or 15.
         moving: further columns [M] by name, for formats that are a PLY with more.
         comments: of the header.
+        shapes: what `scales_and_rotations(covariances)` returns, where it is known already: it is what takes long.
 
     Gaussians below an opacity of 1/255 and those that are not finite are left out.
     """
     count = len(means)
-    shapes = {
+    expected_shapes = {
         "covariances": (covariances, (count, 6)),
         "colors": (colors, (count, 3)),
         "opacities": (opacities, (count,)),
     }
-    for name, (values, expected) in shapes.items():
+    for name, (values, expected) in expected_shapes.items():
         if tuple(values.shape) != expected:
             raise D2Error(f"{name} of a PLY have shape {tuple(values.shape)}, expected {expected}: one row per mean")
     means, covariances, colors, opacities = (
@@ -79,7 +81,7 @@ def write_ply(
     added = [rest.transpose(1, 2).flatten(1), *(values.detach().double().cpu()[:, None] for values in more.values())]
     finite = torch.isfinite(torch.cat([means, covariances, colors, opacities[:, None], *added], dim=1)).all(dim=1)
     kept = finite & (opacities >= ALPHA_MIN)
-    scales, quaternions = scales_and_rotations(covariances[kept])
+    scales, quaternions = scales_and_rotations(covariances[kept]) if shapes is None else (p[kept] for p in shapes)
     columns = [
         means[kept],
         torch.zeros_like(means[kept]),  # normals, which readers expect and ignore

@@ -10,18 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from mimics import fudan, spacetime
+from viewing.hostile import emptied, of_another_version, still_training
 
-from d2_plugin.captures import open_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import make_view
-from d2_plugin.viewing.checkpoints import FUDAN, open_subject, read_ply
 from d2_plugin.viewing.films.film import RenderSettings, run
 from d2_plugin.viewing.films.plan import Wishes, plan_film
-from d2_plugin.viewing.look import look
 from d2_plugin.viewing.panels import KINDS, Shot
 from d2_plugin.viewing.paths import pose_of
 from d2_plugin.viewing.subject import Subject
@@ -197,10 +194,7 @@ class TestSentences:
         assert "there is no depth prior of camera test0" in refused(capsys, trained, "--show", "sigma")
 
     def test_a_run_that_still_trains(self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        copy = tmp_path / "<script>alert(1)</script>".replace("/", "_")
-        shutil.copytree(trained, copy)
-        state = torch.load(copy / "checkpoint.pt", weights_only=True)
-        torch.save(state | {"step": 33}, copy / "checkpoint.pt")
+        copy = still_training(trained, tmp_path / "<script>alert(1)</script>".replace("/", "_"), 33)
         assert main(["render", str(copy), "--output", str(tmp_path / "a.mp4")]) == 0
         assert f"{copy.name} still trains: this is step 33 of 40" in capsys.readouterr().out
         (copy / "checkpoint.pt").unlink()
@@ -215,148 +209,5 @@ class TestSentences:
     def test_an_empty_run_and_one_of_another_version(
         self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        copy = tmp_path / "copy"
-        shutil.copytree(trained, copy)
-        state = torch.load(copy / "checkpoint.pt", weights_only=True)
-        state["model"] = {
-            "parameters": {name: value[:0] for name, value in state["model"]["parameters"].items()},
-            "statistics": {name: value[:0] for name, value in state["model"]["statistics"].items()},
-            "optimizer": state["model"]["optimizer"] | {"state": {}},
-        }
-        torch.save(state, copy / "checkpoint.pt")
-        assert "has no Gaussian left at step 40" in refused(capsys, copy)
-        table = json.loads((copy / "run.json").read_text())
-        plain = {name: value for name, value in table.items() if name not in ("format", "seal")}
-        (copy / "run.json").write_text(json.dumps(plain | {"version": 99}))
-        assert "version 99" in refused(capsys, copy)
-
-
-class TestOfficialTrainers:
-    @staticmethod
-    def checkpoint(path: Path) -> fudan.GaussianModel:
-        """A checkpoint as fudan saves it, its extent a number of numpy's."""
-        model, _ = fudan.make()
-        values = {name: getattr(model, name, None) for name in FUDAN} | {"active_sh_degree": 0, "active_sh_degree_t": 0}
-        values |= {"spatial_lr_scale": np.float32(2.0), "optimizer": {"state": {}, "param_groups": []}, "rot_4d": True}
-        torch.save((tuple(values.values()), 30000), path)
-        return model
-
-    def test_a_checkpoint_of_fudan_is_shown_as_its_adapter_slices_it(self, room: Path, tmp_path: Path) -> None:
-        from d2_plugin.adapters.fudan import FudanAdapter
-
-        model = self.checkpoint(tmp_path / "chkpnt30000.pth")
-        found = open_subject(tmp_path / "chkpnt30000.pth", room, ["train0", "train1"])
-        assert found.test_cameras == ("train2", "test0")
-        view = found.view(pose_of(found.capture.cameras["train0"]), 0.1, (96, 54))
-        assert torch.equal(look(found.backbone, view).color, look(FudanAdapter(model), view).color)
-        with pytest.raises(D2Error, match="name its recording with --capture"):
-            open_subject(tmp_path / "chkpnt30000.pth")
-
-    def test_a_checkpoint_of_gsplat_stands_still(self, room: Path, tmp_path: Path) -> None:
-        count = 20
-        splats = {
-            "means": torch.randn(count, 3),
-            "scales": torch.full((count, 3), -1.0),
-            "quats": torch.randn(count, 4),
-            "opacities": torch.zeros(count),
-            "sh0": torch.rand(count, 1, 3),
-            "shN": torch.zeros(count, 15, 3),
-        }
-        torch.save({"step": 6999, "splats": splats}, tmp_path / "ckpt_6999_rank0.pt")
-        found = open_subject(tmp_path / "ckpt_6999_rank0.pt", room)
-        view = found.view(pose_of(found.capture.cameras["train0"]), 0.1, (96, 54))
-        drawn = found.backbone.slice_at(view)
-        assert torch.equal(drawn.means, splats["means"])
-        assert torch.allclose(found.backbone.colors(view, drawn), 0.5 + 0.2820948 * splats["sh0"][:, 0], atol=1e-5)
-
-    @pytest.mark.parametrize(
-        ("name", "value", "said"),
-        [
-            ("quats", torch.zeros(20, 3), "cannot read checkpoint"),
-            ("scales", torch.zeros(7, 3), "cannot read checkpoint"),
-            ("means", "text", "cannot read checkpoint"),
-            ("sh0", torch.zeros(20, 3), "cannot read checkpoint"),
-            ("opacities", None, "cannot read checkpoint"),
-            ("means", torch.full((20, 3), torch.nan), "numbers that are not finite"),
-        ],
-    )
-    def test_a_checkpoint_whose_tensors_do_not_fit_is_one_sentence(
-        self, room: Path, tmp_path: Path, name: str, value: object, said: str
-    ) -> None:
-        splats = {
-            "means": torch.randn(20, 3),
-            "scales": torch.full((20, 3), -1.0),
-            "quats": torch.randn(20, 4),
-            "opacities": torch.zeros(20),
-            "sh0": torch.rand(20, 1, 3),
-            "shN": torch.zeros(20, 15, 3),
-        }
-        torch.save({"step": 1, "splats": splats | {name: value}}, tmp_path / "a.pt")
-        with pytest.raises(D2Error, match=said) as caught:
-            open_subject(tmp_path / "a.pt", room)
-        assert "\n" not in str(caught.value)
-
-    def test_a_point_cloud_of_spacetime_gaussians_moves_with_the_recording(self, room: Path, tmp_path: Path) -> None:
-        from d2_plugin.adapters.spacetime import SpacetimeAdapter
-
-        gaussians = spacetime.make()[0]
-        generator = torch.Generator().manual_seed(4)
-        gaussians._motion = 0.2 * torch.randn(gaussians._motion.shape, generator=generator)
-        columns = {
-            **{axis: gaussians._xyz[:, i] for i, axis in enumerate("xyz")},
-            "trbf_center": gaussians._trbf_center[:, 0],
-            "trbf_scale": gaussians._trbf_scale[:, 0],
-            "opacity": gaussians._opacity[:, 0],
-        }
-        many = {"motion": gaussians._motion, "f_dc": gaussians._features_dc[:, :3], "omega": gaussians._omega}
-        for name, values in (many | {"scale": gaussians._scaling, "rot": gaussians._rotation}).items():
-            columns |= {f"{name}_{i}": values[:, i] for i in range(values.shape[1])}
-        head = [f"property float {name}" for name in columns]
-        begin = ["ply", "format binary_little_endian 1.0", f"element vertex {len(gaussians._xyz)}"]
-        head = [*begin, *head, "end_header\n"]
-        rows = torch.stack([value.detach() for value in columns.values()], 1).numpy().astype("<f4")
-        (tmp_path / "point_cloud.ply").write_bytes("\n".join(head).encode() + rows.tobytes())
-        found = open_subject(tmp_path / "point_cloud.ply", room)
-        # Frame 2 of 4 is at the trainer's time 0.5.
-        view = found.view(pose_of(found.capture.cameras["train0"]), found.capture.seconds(2), (96, 54))
-        assert view.time == pytest.approx(0.5)
-        expected = SpacetimeAdapter(gaussians, 4).slice_at(view)
-        assert torch.allclose(found.backbone.slice_at(view).means, expected.means, atol=1e-6)
-        assert torch.allclose(found.backbone.slice_at(view).opacities, expected.opacities, atol=1e-6)
-
-    def test_a_point_cloud_is_shown_as_the_run_that_wrote_it(
-        self, trained: Path, room: Path, subject: Subject, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(subject.backbone.model, "background", None)  # a point cloud has none
-        [first, *_] = Run.load(trained).export_ply()
-        found = open_subject(first, room)
-        view = subject.view(pose_of(subject.capture.cameras["train1"]), 0.0, (96, 54))
-        difference = (look(found.backbone, view).color - look(subject.backbone, view).color).abs()
-        assert difference.max() < 0.02
-        assert {"x", "opacity", "rot_3"} <= set(read_ply(first))
-
-    def test_what_only_their_own_code_can_read_is_refused_by_name(self, room: Path, tmp_path: Path) -> None:
-        (tmp_path / "deform").mkdir()
-        with pytest.raises(D2Error, match="Deformable-3D-Gaussians, whose motion lies in a network"):
-            open_subject(tmp_path, room)
-        cloud = tmp_path / "point_cloud" / "iteration_7" / "point_cloud.ply"
-        cloud.parent.mkdir(parents=True)
-        cloud.write_bytes(b"ply\n")
-        with pytest.raises(D2Error, match="show it from inside its train.py"):
-            open_subject(cloud, room)
-
-    def test_a_file_that_is_no_checkpoint(self, room: Path, tmp_path: Path) -> None:
-        path = tmp_path / "a.pth"
-        path.write_bytes(b"nothing")
-        with pytest.raises(D2Error, match="cannot be read as a checkpoint"):
-            open_subject(path, room)
-        torch.save({"weights": torch.zeros(3)}, path)
-        with pytest.raises(D2Error, match="is no checkpoint that can be shown"):
-            open_subject(path, room)
-        (tmp_path / "a.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex -1\nend_header\n")
-        with pytest.raises(D2Error, match="it says -1 vertices"):
-            open_subject(tmp_path / "a.ply", room)
-        (tmp_path / "a.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
-        with pytest.raises(D2Error, match="no readable point cloud"):
-            open_subject(tmp_path / "a.ply", room)
-        assert open_capture(room).frames == (0, 1, 2, 3)
+        assert "has no Gaussian left at step 40" in refused(capsys, emptied(trained, tmp_path / "empty"))
+        assert "version 99" in refused(capsys, of_another_version(trained, tmp_path / "later"))

@@ -12,10 +12,13 @@ import numpy as np
 import pytest
 import torch
 from tiny import ALL_HOOKS, make_trainer, parameters, same
+from viewing.hostile import emptied, of_another_version, still_training
 
 from d2_plugin.commands.cli import main
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.runs.run import Run
+from d2_plugin.runs.settings import RunSettings
 from d2_plugin.viewing.live import Viewer
 from d2_plugin.viewing.live.cloud import cloud_of
 from d2_plugin.viewing.live.pace import Resolution, Share
@@ -203,6 +206,24 @@ def test_a_moving_picture_is_as_large_as_fits_its_time() -> None:
     assert resolution.size(1.0, 360, 0.06) == (72, 72)
 
 
+def test_pictures_of_many_gaussians_are_not_made_small_for_nothing() -> None:
+    """What Gaussians cost before the first pixel does not get less with fewer pixels."""
+
+    def seconds(size: tuple[int, int]) -> float:
+        return 0.15 + 1e-7 * size[0] * size[1]
+
+    resolution = Resolution()
+    moving = (0, 0)
+    for _ in range(5):
+        for _ in range(3):
+            moving = resolution.size(16 / 9, 360, 0.06)
+            resolution.drew(moving[0] * moving[1], seconds(moving))
+        still = resolution.size(16 / 9, 360)
+        resolution.drew(still[0] * still[1], seconds(still))
+    assert moving[1] > 300
+    assert seconds(moving) < 1.2 * seconds((128, 72))
+
+
 def test_a_share_pays_off_what_was_spent_and_saves_little() -> None:
     share = Share(0.1)
     assert share.due
@@ -279,6 +300,24 @@ class TestSentences:
         assert "no such capture" in self.refused(capsys, tmp_path / "none")
         (tmp_path / "store.json").write_text('{"format": 1}')
         assert "has format 1 but this version reads format" in self.refused(capsys, tmp_path)
+
+    def test_a_run_that_still_trains_an_empty_one_and_one_of_another_version(
+        self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        young = subject_at(ViewSettings(still_training(trained, tmp_path / "<script>alert(1)<", 33)))
+        assert young.note == "<script>alert(1)< still trains: this is step 33 of 40"
+        assert "has no Gaussian left at step 40" in self.refused(capsys, emptied(trained, tmp_path / "empty"))
+        assert "version 99" in self.refused(capsys, of_another_version(trained, tmp_path / "later"))
+
+    def test_a_run_without_a_prior_has_no_points_to_show(self, room: Path, tmp_path: Path) -> None:
+        Run(RunSettings(str(room), ("train0", "train1"), iterations=2, hooks=()), tmp_path / "bare").train()
+        bare = subject_at(ViewSettings(tmp_path / "bare"))
+        assert bare.store is None
+        client = looker()
+        page = Page(client, bare, None, 48, lambda: None)
+        page.build()
+        assert "cloud" not in page.controls
+        assert page.controls["marked"].value is False
 
     def test_a_prior_of_another_recording(self, trained: Path, tmp_path: Path, room: Path) -> None:
         found = subject_at(ViewSettings(trained / "priors", capture=room))

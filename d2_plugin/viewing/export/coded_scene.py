@@ -11,6 +11,7 @@ costs no precision inside. Keys have positions, and shapes and opacities of the 
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -22,13 +23,15 @@ from torch import Tensor
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
 
-from .codes import Coded, decode, encode, morton_order
+from .codes import BLOCK, COMPRESSION, Coded, decode, encode, morton_order
 from .keys import ALPHA_MIN, Keys, Offset, State, cholesky
 
 MARGINAL_REACH = math.sqrt(-2 * math.log(MARGINAL_CUT))
 """Standard deviations from mu_t at which a Gaussian is cut off: F = `MARGINAL_CUT`."""
-HARMONIC_BITS = 8
-"""Of all coefficients of a colour but the constant one."""
+HARMONIC_BITS = (8, 6, 5, 4, 3)
+"""Of all coefficients of a colour but the constant one: the first that fits."""
+SAMPLED = 16
+"""One block in so many tells how far harmonics can be compressed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +45,10 @@ class CodedScene:
     """Which of the model's Gaussians each one is."""
 
 
-def code_lines(gaussians: MovingGaussians, duration: float) -> CodedScene:
-    """Gaussians on straight lines, or standing still; those that are never seen in the clip are left out."""
+def code_lines(gaussians: MovingGaussians, duration: float, most_bytes: float = math.inf) -> CodedScene:
+    """Gaussians on straight lines, or standing still; those that are never seen in the clip are left out.
+
+    Harmonics are coded as coarsely as keeps all arrays, compressed, below `most_bytes`."""
     rows = seen_rows(gaussians, duration)
     rows = rows[torch.from_numpy(morton_order(gaussians.positions[rows].numpy()))]
     chosen = gaussians.select(rows)
@@ -56,7 +61,9 @@ def code_lines(gaussians: MovingGaussians, duration: float) -> CodedScene:
         positions = positions + velocities * (anchors - chosen.motion.times)[:, None]
         arrays.append(encode("reaches", (velocities * spans[:, None]).numpy()))
     state = State(positions, cholesky(chosen.covariances), chosen.opacities)
-    arrays += [*_code_state(state), *_code_colors(chosen.harmonics)]
+    arrays += _code_state(state)
+    left = most_bytes - sum(len(array.data) for array in arrays) - 6 * len(chosen)
+    arrays += _code_colors(chosen.harmonics, left)
     motion = "none" if chosen.motion is None else "lines"
     return CodedScene(tuple(arrays), _facts(len(chosen), motion, chosen.harmonics, None), rows)
 
@@ -149,12 +156,27 @@ def _code_state(state: State) -> list[Coded]:
     ]
 
 
-def _code_colors(harmonics: Harmonics) -> list[Coded]:
+def _code_colors(harmonics: Harmonics, most_bytes: float = math.inf) -> list[Coded]:
+    """The constant colours, and the harmonics above them in at most `most_bytes` if need be."""
     coefficients = harmonics.coefficients
     arrays = [encode("colors", coefficients[:, 0].numpy())]
     if coefficients.shape[1] > 1:
-        arrays.append(encode("harmonics", coefficients[:, 1:].flatten(1).numpy(), HARMONIC_BITS))
+        more = coefficients[:, 1:].flatten(1).numpy()
+        arrays.append(encode("harmonics", more, _bits_that_fit(more, most_bytes)))
     return arrays
+
+
+def _bits_that_fit(values: np.ndarray, most_bytes: float) -> int:
+    """By a sample of the blocks, compressed."""
+    blocks = np.arange(len(values)) // BLOCK
+    rows = blocks % SAMPLED == 0 if len(values) > 4 * SAMPLED * BLOCK else blocks >= 0
+    for bits in HARMONIC_BITS[:-1]:
+        if values.nbytes // 8 <= most_bytes:
+            return bits
+        size = len(zlib.compress(encode("sample", values[rows], bits).data, COMPRESSION))
+        if size * len(values) / rows.sum() <= most_bytes:
+            return bits
+    return HARMONIC_BITS[-1]
 
 
 def _facts(count: int, motion: str, harmonics: Harmonics, keys: dict[str, Any] | None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Numbers as 16-bit (or 8-bit) codes between the least and the largest of their block, and back.
+"""Numbers as 16-bit codes (or 8-bit and coarser ones) between the least and the largest of their block, and back.
 
 Rows are coded in blocks of 256, each column with its own range in each block. Neighbours in space stand in one block
 (`morton_order`), so that the step is small, and a Gaussian far out costs precision in its own block only.
@@ -34,7 +34,7 @@ class Coded:
 
 
 def encode(name: str, values: np.ndarray, bits: int = 16) -> Coded:
-    """Code `values` [N, C] (or [N]); all finite."""
+    """Code `values` [N, C] (or [N]); all finite. Codes have 16 bits, or at most 8."""
     values = np.asarray(values, np.float64)
     values = values[:, None] if values.ndim == 1 else values
     rows, columns = values.shape
@@ -47,7 +47,7 @@ def encode(name: str, values: np.ndarray, bits: int = 16) -> Coded:
     share = (padded - low) / np.where(high > low, high - low, 1)
     codes = np.clip(np.rint(share * steps), 0, steps).astype(np.uint16)
     planes = codes.reshape(blocks * BLOCK, columns)[:rows].T
-    parts = [planes >> 8, planes & 255] if bits == 16 else [planes]
+    parts = [planes >> 8, planes & 255] if bits > 8 else [planes]
     body = np.stack(parts, axis=1).astype(np.uint8).tobytes()
     return Coded(name, ranges.tobytes() + body, rows, columns, bits)
 
@@ -57,12 +57,17 @@ def decode(coded: Coded) -> np.ndarray:
     blocks = -(-coded.rows // BLOCK)
     size = blocks * coded.columns * 8
     ranges = np.frombuffer(coded.data[:size], "<f4").reshape(blocks, coded.columns, 2).astype(np.float64)
-    kinds = coded.bits // 8
+    kinds = planes_of(coded.bits)
     planes = np.frombuffer(coded.data[size:], np.uint8).reshape(coded.columns, kinds, coded.rows).astype(np.float64)
     codes = planes[:, 0] * 256 + planes[:, 1] if kinds == 2 else planes[:, 0]
     block = np.arange(coded.rows) // BLOCK
     low, high = ranges[block, :, 0], ranges[block, :, 1]
     return low + codes.T * (high - low) / ((1 << coded.bits) - 1)
+
+
+def planes_of(bits: int) -> int:
+    """How many bytes a code takes; one of fewer than 8 bits takes a whole one, which then compresses well."""
+    return 2 if bits > 8 else 1
 
 
 def packed(arrays: Sequence[Coded]) -> tuple[list[dict[str, Any]], bytes]:
@@ -75,12 +80,14 @@ def packed(arrays: Sequence[Coded]) -> tuple[list[dict[str, Any]], bytes]:
     return contents, gzip.compress(b"".join(array.data for array in arrays), COMPRESSION, mtime=0)
 
 
-def unpacked(contents: Sequence[Mapping[str, Any]], data: bytes) -> dict[str, np.ndarray]:
-    """The values of every array by its name, from what `packed` made."""
+def unpacked(contents: Sequence[Mapping[str, Any]], data: bytes, without: Sequence[str] = ()) -> dict[str, np.ndarray]:
+    """The values of every array by its name, from what `packed` made; those named in `without` are left out."""
     raw, found = gzip.decompress(data), {}
     for entry in contents:
+        if entry["name"] in without:
+            continue
         rows, columns, bits = entry["rows"], entry["columns"], entry["bits"]
-        size = -(-rows // BLOCK) * columns * 8 + rows * columns * bits // 8
+        size = -(-rows // BLOCK) * columns * 8 + rows * columns * planes_of(bits)
         body = raw[entry["offset"] : entry["offset"] + size]
         found[entry["name"]] = decode(Coded(entry["name"], body, rows, columns, bits))
     return found

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
+from torch import Tensor
+
 from d2_plugin.durable import make_folder, remove_leftovers
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import MovingGaussians
@@ -15,15 +17,20 @@ from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.gaussian_ply import write_ply
 from d2_plugin.runs.run import Run
-from d2_plugin.settings import Count, Positional, Positive, Settings
+from d2_plugin.settings import AtLeastOne, Count, Positional, Positive, Settings
+from d2_plugin.viewing.checkpoints import is_output_folder
 
 from .coded_scene import seen_rows
 from .curves import fit_curves
 from .linear_files import read_ftgs, read_splatv, write_ftgs, write_splatv
+from .of_checkpoint import scene_of_checkpoint
 from .page import write_page
 from .rounding import rounding, states_of
 from .scene import ExportScene, scene_of
 from .spz import write_spz
+
+Shapes = tuple[Tensor, Tensor]
+"""Scales [M, 3] and quaternions [M, 4]."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +38,7 @@ class Export(Settings):
     """Which run is exported, as what."""
 
     run_folder: Annotated[Path, Positional()]
-    """The --output of `d2 train`."""
+    """The --output of `d2 train`; or what an official trainer wrote, with --capture."""
     format: Literal["html", "ply", "spz", "splatv", "ftgs"] = "html"
     """html: one page that plays the scene without a network. ply, spz: a file for each frame. splatv: the moving scene
     for splaTV and gsplat.js. ftgs: the same without loss, as .ftgs.ply; 4D Gaussians only."""
@@ -40,9 +47,15 @@ class Export(Settings):
     frames: tuple[Count, ...] | None = None
     """first:last or first:last:step, the last one included, of ply and spz; all frames if not given."""
     megabytes: Positive = 40.0
-    """Size that the key times of a deformation field may bring an html page to."""
+    """Size of an html page that key times of a deformation field, or harmonics in 8 bits, may bring it to."""
     unfinished: bool = False
     """Export a run that has not been trained to its end."""
+    capture: Path | None = None
+    """The recording of a checkpoint of an official trainer."""
+    train_cameras: tuple[str, ...] | None = None
+    """Cameras that such a checkpoint was trained with; all but these are held out."""
+    downscale: AtLeastOne = 1
+    """For such a checkpoint: the recording's cameras with pictures this many times smaller."""
 
 
 class Made(NamedTuple):
@@ -59,14 +72,26 @@ class Made(NamedTuple):
 
 def run(settings: Export) -> str:
     """Write the export; returns what was written, how large it is, and how far off."""
-    scene = scene_of(Run.load(settings.run_folder), settings.unfinished)
+    scene, note = _scene(settings)
     if settings.frames is not None and settings.format not in FRAME_FORMATS:
         raise D2Error(
             f"--frames is for {' and '.join(FRAME_FORMATS)}: {settings.format} holds the whole clip, leave it out"
         )
-    made = export_scene(scene, settings, settings.output or settings.run_folder / "export")
+    made = export_scene(scene, settings, settings.output or _beside(settings.run_folder) / "export")
     what = str(made.paths[0]) if len(made.paths) == 1 else f"{len(made.paths)} files in {made.paths[0].parent}"
-    return "\n".join([f"{what} ({made.size / 1e6:.1f} MB)", *made.notes])
+    return "\n".join([f"{what} ({made.size / 1e6:.1f} MB)", *([note] if note else []), *made.notes])
+
+
+def _scene(settings: Export) -> tuple[ExportScene, str]:
+    """What is exported, and what a person should know of it."""
+    path = settings.run_folder
+    if path.is_file() or is_output_folder(path):
+        return scene_of_checkpoint(path, settings.capture, settings.train_cameras, settings.downscale)
+    return scene_of(Run.load(path), settings.unfinished), ""
+
+
+def _beside(path: Path) -> Path:
+    return path.parent if path.is_file() else path
 
 
 def export_scene(scene: ExportScene, settings: Export, folder: Path) -> Made:
@@ -113,10 +138,10 @@ def _ftgs(scene: ExportScene, settings: Export, folder: Path) -> Made:
 
 
 def _ply(scene: ExportScene, settings: Export, folder: Path) -> Made:
-    def write(path: Path, shown: MovingGaussians) -> None:
+    def write(path: Path, shown: MovingGaussians, shapes: Shapes) -> None:
         coefficients = shown.harmonics.coefficients
-        colors = SH_C0 * coefficients[:, 0] + 0.5
-        write_ply(path, shown.positions, shown.covariances, colors, shown.opacities, coefficients[:, 1:])
+        parts = shown.positions, shown.covariances, SH_C0 * coefficients[:, 0] + 0.5, shown.opacities
+        write_ply(path, *parts, coefficients[:, 1:], shapes=shapes)
 
     return _each_frame(scene, settings, folder, write)
 
@@ -126,7 +151,7 @@ def _spz(scene: ExportScene, settings: Export, folder: Path) -> Made:
 
 
 def _each_frame(
-    scene: ExportScene, settings: Export, folder: Path, write: Callable[[Path, MovingGaussians], object]
+    scene: ExportScene, settings: Export, folder: Path, write: Callable[[Path, MovingGaussians, Shapes], object]
 ) -> Made:
     clip = scene.clip if settings.frames is None else scene.restricted(settings.frames)
     make_folder(folder / settings.format)
@@ -134,7 +159,8 @@ def _each_frame(
     with progress_bar(settings.format, len(clip.frames)) as bar:
         for frame, time in zip(clip.frames, clip.seconds):
             paths.append(folder / settings.format / f"frame_{frame:05d}.{settings.format}")
-            write(paths[-1], scene.still_at(time))
+            splats = scene.splats_at(time)
+            write(paths[-1], scene.still(splats, time), scene.shapes(splats))
             bar.update(len(paths))
     return Made(tuple(paths))
 

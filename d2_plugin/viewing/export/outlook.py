@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from d2_plugin.captures import Camera
-from d2_plugin.protocol import View
+from d2_plugin.protocol import Splats, View
 from d2_plugin.rasterizer import rasterize
 
 from .scene import ExportScene
@@ -35,9 +35,10 @@ def look_around(scene: ExportScene) -> Outlook:
     cameras = scene.train_cameras[:: -(-len(scene.train_cameras) // CAMERAS)]
     seconds = scene.clip.seconds
     times = sorted({seconds[0], seconds[len(seconds) // 2], seconds[-1]})
+    drawn = [(time, scene.splats_at(time)) for time in times]  # once for all cameras: a large field takes long
     depths, looked_at = [np.zeros(0)], []
     for camera in cameras:
-        seen = [_depths(scene, camera, time) for time in times]
+        seen = [_depths(scene, camera, time, splats) for time, splats in drawn]
         depths += [depth for depth, _ in seen]
         looked_at.append(camera.centre + camera.T_camera_world[2, :3] * float(np.median([ahead for _, ahead in seen])))
     every = np.concatenate(depths)
@@ -48,7 +49,7 @@ def look_around(scene: ExportScene) -> Outlook:
 
 
 @torch.no_grad()
-def _depths(scene: ExportScene, camera: Camera, time: float) -> tuple[np.ndarray, float]:
+def _depths(scene: ExportScene, camera: Camera, time: float, splats: Splats) -> tuple[np.ndarray, float]:
     """Depths of the solid pixels, and the median in the middle of the picture (of all, or 1, where nothing is)."""
     scale = min(SIDE / max(camera.width, camera.height), 1.0)
     width, height = max(int(camera.width * scale), 1), max(int(camera.height * scale), 1)
@@ -57,7 +58,6 @@ def _depths(scene: ExportScene, camera: Camera, time: float) -> tuple[np.ndarray
     intrinsics[1] *= height / camera.height
     pose = torch.tensor(camera.T_camera_world, dtype=torch.float32)
     view = View(camera.name, 0, time, pose, intrinsics, width, height)
-    splats = scene.splats_at(time)
     render = rasterize(splats, torch.zeros(len(splats.means), 1), view, scene.raster)
     solid = render.alpha > SOLID
     depth = torch.where(solid, render.depth_sum / render.alpha.clamp(min=SOLID), torch.nan).numpy()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -19,13 +19,14 @@ from d2_plugin.captures import Camera
 from d2_plugin.durable import write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
+from d2_plugin.gaussians.spherical_harmonics import colors
 from d2_plugin.reading import parse_json, parsing, read_text
 from d2_plugin.runs.drawing import color_scale
 from d2_plugin.values import checked_arguments, shown
 
 from .coded_scene import MARGINAL_REACH, CodedScene, code_keys, code_lines, read_harmonics, read_state
-from .codes import BLOCK, packed, to_json, unpacked
-from .keys import Keys, Offset, State, bake
+from .codes import BLOCK, decode, packed, to_json, unpacked
+from .keys import SAMPLE, Keys, Offset, State, bake
 from .outlook import look_around
 from .rounding import rounding, states_of
 from .scene import ExportScene
@@ -38,7 +39,7 @@ TEXT_PER_BYTE = 4 / 3
 """Base64."""
 BYTES_AT_REST, BYTES_OF_POSITION, BYTES_OF_SHAPE = 28, 6, 16
 """Per Gaussian, with 16-bit codes and before compression, without harmonics."""
-PAGE_SCRIPTS = ("scene.js", "shaders.js", "renderer.js", "controls.js", "player.js")
+PAGE_SCRIPTS = ("scene.js", "shaders.js", "renderer.js", "controls.js", "pace.js", "player.js")
 WORKER_SCRIPTS = ("scene.js", "sorter.js")
 
 
@@ -50,10 +51,13 @@ class Page(NamedTuple):
 
 
 def write_page(scene: ExportScene, path: Path, megabytes: float = 40.0) -> Page:
-    """Write the page; a scene that is no set of straight lines is baked at as many key times as `megabytes` allow."""
+    """Write the page in about `megabytes`: straight lines round their harmonics to fit if need be, any other scene is
+    baked at as many key times as fit."""
     coded, keys = _coded(scene, megabytes)
     contents, data = packed(coded.arrays)
-    about = _about(scene, coded, keys, _rounding(scene, coded, keys))
+    # What a reader of this data finds; harmonics are large and do not move.
+    arrays = unpacked(contents, data, without=("harmonics",))
+    about = _about(scene, coded, keys, _rounding(scene, coded, keys, arrays))
     header = _header(scene, coded) | {"arrays": contents, "about": about}
     write_text(path, _assembled(scene.name, header, data))
     return Page(path.stat().st_size, tuple(about))
@@ -96,7 +100,7 @@ def read_page(path: Path) -> ReadPage:
 
 def _coded(scene: ExportScene, megabytes: float) -> tuple[CodedScene, Keys | None]:
     if scene.moving is not None:
-        return code_lines(scene.moving, scene.clip.duration), None
+        return code_lines(scene.moving, scene.clip.duration, megabytes * 1e6 / TEXT_PER_BYTE), None
     count = len(scene.harmonics.coefficients)
     at_rest = count * (BYTES_AT_REST + 3 * (scene.harmonics.coefficients.shape[1] - 1))
 
@@ -108,8 +112,7 @@ def _coded(scene: ExportScene, megabytes: float) -> tuple[CodedScene, Keys | Non
     return code_keys(keys, scene.harmonics), keys
 
 
-def _rounding(scene: ExportScene, coded: CodedScene, keys: Keys | None) -> Offset:
-    arrays = unpacked(*packed(coded.arrays))
+def _rounding(scene: ExportScene, coded: CodedScene, keys: Keys | None, arrays: Mapping[str, np.ndarray]) -> Offset:
     if keys is None:
         assert scene.moving is not None
         true_at = states_of(scene.moving.select(coded.rows))
@@ -125,6 +128,12 @@ def _about(scene: ExportScene, coded: CodedScene, keys: Keys | None, rounding: O
         f"{coded.facts['count']:,} Gaussians, {frames} frame{plural} at {scene.clip.fps:g} per second",
         f"16-bit codes: off by {rounding}",
     ]
+    bits = {array.name: array.bits for array in coded.arrays}.get("harmonics", 8)
+    if bits < 8:
+        off = _color_error(scene, coded)
+        lines.append(
+            f"harmonics in {bits} bits, so that the page is no larger: colours off by {off:.1f} of 255 in the mean"
+        )
     if keys is not None:
         times, moving, changing = len(keys.times), keys.moving, keys.changing
         lines.append(
@@ -136,6 +145,20 @@ def _about(scene: ExportScene, coded: CodedScene, keys: Keys | None, rounding: O
     if scene.background is not None:
         lines.append("behind the Gaussians the learnt background, in every direction; its colours are not rounded")
     return [*lines, f"made by d2-4dgs {d2_plugin.__version__}; no network is used"]
+
+
+def _color_error(scene: ExportScene, coded: CodedScene) -> float:
+    """Mean difference of the colours that the first training camera sees, of 255; of up to `SAMPLE` Gaussians."""
+    assert scene.moving is not None
+    every = -(-len(coded.rows) // SAMPLE)
+    [told] = [decode(array) for array in coded.arrays if array.name == "harmonics"]
+    chosen = scene.moving.select(coded.rows[::every])
+    true, harmonics = chosen.harmonics.coefficients, chosen.harmonics
+    rounded = torch.cat([true[:, :1], torch.from_numpy(told[::every]).unflatten(1, (-1, 3))], 1)
+    toward = chosen.positions - torch.as_tensor(scene.train_cameras[0].centre)
+    phase = torch.zeros(len(true)).double()
+    seen = [colors(part, toward, phase, harmonics.degree, harmonics.time_degree) for part in (true, rounded)]
+    return 255 * float((seen[0] - seen[1]).abs().mean())
 
 
 def _header(scene: ExportScene, coded: CodedScene) -> dict[str, Any]:

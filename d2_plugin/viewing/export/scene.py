@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -12,7 +13,9 @@ from torch import Tensor
 from d2_plugin.captures import Camera
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
+from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import RasterSettings, Splats, View
+from d2_plugin.runs.gaussian_ply import scales_and_rotations
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.start import make_view
 
@@ -67,7 +70,10 @@ class ExportScene:
 
     def still_at(self, time: float) -> MovingGaussians:
         """The Gaussians of one instant, with the colours of that instant."""
-        splats = self.splats_at(time)
+        return self.still(self.splats_at(time), time)
+
+    def still(self, splats: Splats, time: float) -> MovingGaussians:
+        """See `still_at`, of the Gaussians of that instant."""
         rows = splats.rows.cpu()
         own = self.harmonics._replace(coefficients=self.harmonics.coefficients[rows])
         phase = None
@@ -76,6 +82,18 @@ class ExportScene:
         still = Harmonics(own.without_time(phase), own.degree)
         means, covariances, opacities = (part.double() for part in splats[:3])
         return MovingGaussians(means, covariances, opacities, still)
+
+    def shapes(self, splats: Splats) -> tuple[Tensor, Tensor]:
+        """Scales [M, 3] and quaternions [M, 4] of the Gaussians of one instant."""
+        if self._lasting_shapes is None:
+            return scales_and_rotations(splats.covariances.double())
+        scales, rotations = self._lasting_shapes
+        return scales[splats.rows], rotations[splats.rows]
+
+    @cached_property
+    def _lasting_shapes(self) -> tuple[Tensor, Tensor] | None:
+        """Those of all Gaussians where they are the same at all times: finding them takes as long as all else."""
+        return None if self.moving is None else scales_and_rotations(self.moving.covariances)
 
     def restricted(self, frames: Sequence[int]) -> Clip:
         """The clip's frames with these numbers."""
@@ -117,7 +135,7 @@ def scene_of_model(model: Any, run: Run) -> ExportScene:
     raster = getattr(getattr(model, "settings", None), "raster", RasterSettings())
     moving = model.moving() if hasattr(model, "moving") else None
     slice_at = slicer(model, view)
-    harmonics = _harmonics(model, view, slice_at)
+    harmonics = _harmonics(model, view)
     return ExportScene(
         capture.name, clip, tuple(train), tuple(test), raster, harmonics, slice_at, moving, background_of(model)
     )
@@ -133,14 +151,16 @@ def slicer(model: Any, view: View) -> Callable[[float], Splats]:
     return splats_at
 
 
-@torch.no_grad()
-def _harmonics(model: Any, view: View, splats_at: Callable[[float], Splats]) -> Harmonics:
-    """The model's own; for a model that tells none, the colours that the first camera sees, for every direction."""
-    if hasattr(model, "harmonics"):
-        own: Harmonics = model.harmonics()
-        return own._replace(coefficients=own.coefficients.detach().double().cpu())
-    from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
+def _harmonics(model: Any, view: View) -> Harmonics:
+    if not hasattr(model, "harmonics"):
+        return harmonics_as_seen(model, view)
+    own: Harmonics = model.harmonics()
+    return own._replace(coefficients=own.coefficients.detach().double().cpu())
 
+
+@torch.no_grad()
+def harmonics_as_seen(model: Any, view: View) -> Harmonics:
+    """Of a model that tells none: the colours that one camera sees, for every direction."""
     splats = model.slice_at(view)
     colors = torch.zeros(len(model), 3)
     colors[splats.rows.cpu()] = model.colors(view, splats).detach().cpu()

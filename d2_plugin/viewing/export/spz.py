@@ -25,19 +25,24 @@ from .ply_files import covariances_from
 
 MAGIC, VERSION = 0x5053474E, 3
 MOST_FRACTION_BITS = 12
+COMPRESSION = 6
+"""The default of 9 takes three times as long and saves one byte in a hundred."""
 FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
 """Signs of the harmonics above the constant one when y and z change theirs."""
 HEADER = np.dtype([("magic", "<u4"), ("version", "<u4"), ("count", "<u4"), ("rest", "u1", 4)])
 
 
-def write_spz(path: Path, gaussians: MovingGaussians) -> int:
-    """Write what does not move of the Gaussians; returns how many were written. Those below 1/255 are left out."""
-    shown = gaussians.select((gaussians.opacities >= 1 / 255).nonzero()[:, 0])
+def write_spz(path: Path, gaussians: MovingGaussians, shapes: tuple[Tensor, Tensor] | None = None) -> int:
+    """Write what does not move of the Gaussians; returns how many were written. Those below 1/255 are left out.
+
+    `shapes` are scales and quaternions of all of them, where they are known already."""
+    kept = (gaussians.opacities >= 1 / 255).nonzero()[:, 0]
+    shown = gaussians.select(kept)
     positions = shown.positions.numpy() * (1, -1, -1)
     largest = float(np.abs(positions).max(initial=1e-6))
     bits = int(np.clip(np.floor(np.log2((2**23 - 1) / largest)), 0, MOST_FRACTION_BITS))
     fixed = np.clip(np.rint(positions * 2**bits), -(2**23), 2**23 - 1).astype(np.int64) & 0xFFFFFF
-    scales, quaternions = scales_and_rotations(shown.covariances)
+    scales, quaternions = scales_and_rotations(shown.covariances) if shapes is None else (part[kept] for part in shapes)
     coefficients, degree = shown.harmonics.without_time().numpy(), shown.harmonics.degree
     planes = [
         np.stack([fixed & 255, fixed >> 8 & 255, fixed >> 16], -1),
@@ -48,7 +53,7 @@ def write_spz(path: Path, gaussians: MovingGaussians) -> int:
     body = [np.clip(np.rint(plane), 0, 255).astype(np.uint8).tobytes() for plane in planes]
     body += [_rotation_words(quaternions.numpy()).tobytes(), _harmonic_bytes(coefficients[:, 1:]).tobytes()]
     header = np.array([(MAGIC, VERSION, len(shown), (degree, bits, 0, 0))], HEADER)
-    write(path, gzip.compress(header.tobytes() + b"".join(body), mtime=0), synced=False)
+    write(path, gzip.compress(header.tobytes() + b"".join(body), COMPRESSION, mtime=0), synced=False)
     return len(shown)
 
 

@@ -7,25 +7,44 @@ from dataclasses import dataclass
 SMALLEST = 72
 """Height in pixels below which no picture is drawn, however slow."""
 FIXED = 4e-3
-"""Seconds of a picture that do not depend on its size, before any was drawn."""
+"""Seconds of a picture that do not depend on its size, before that was measured."""
+KEPT = 0.85
+"""What a measurement still weighs when the next one comes."""
+APART = 0.2
+"""Spread of sizes, relative to their mean, from which both costs of a picture can be told apart."""
 
 
 @dataclass
 class Resolution:
-    """Learns what a pixel costs, so that a moving picture is as large as fits its time."""
+    """Learns what a picture and a pixel cost, so that a moving picture is as large as fits its time."""
 
     seconds_per_pixel: float = 1e-7
+    fixed: float = FIXED
+    """Seconds of a picture however small: what many Gaussians cost before the first pixel."""
+    _sums: tuple[float, ...] = (0.0,) * 5
 
     def drew(self, pixels: int, seconds: float) -> None:
-        """Note a picture; one odd measurement changes little."""
-        found = seconds / max(pixels, 1)
-        self.seconds_per_pixel += 0.25 * (found - self.seconds_per_pixel)
+        """Note a picture: a straight line through the last measurements, where their sizes differ."""
+        new = (1.0, pixels, seconds, pixels * pixels, pixels * seconds)
+        self._sums = tuple(KEPT * old + added for old, added in zip(self._sums, new, strict=True))
+        _, x, y, xx, xy = (part / self._sums[0] for part in self._sums)
+        spread = xx - x * x
+        slope = (xy - x * y) / spread if spread > (APART * x) ** 2 else 0.0
+        if slope > 0:
+            self.seconds_per_pixel, self.fixed = slope, max(y - slope * x, 0.0)
+        elif spread > (APART * x) ** 2:  # smaller ones took longer: the machine has other work now
+            self.seconds_per_pixel, self.fixed = max(y - FIXED, 1e-6) / max(x, 1), FIXED
+        else:
+            self.seconds_per_pixel = max(y - self.fixed, 1e-6) / max(x, 1)
 
     def size(self, aspect: float, most: int, seconds: float | None = None) -> tuple[int, int]:
-        """Width and height, at most `most` pixels high, that take about `seconds`; None is as large as allowed."""
+        """Width and height, at most `most` pixels high, that take about `seconds`; None is as large as allowed.
+
+        Where a picture costs as much however small, half as much goes into its pixels: fewer would gain little."""
         height = most
         if seconds is not None:
-            height = int((max(seconds - FIXED, FIXED) / self.seconds_per_pixel / max(aspect, 1e-3)) ** 0.5)
+            left = max(seconds - self.fixed, 0.5 * self.fixed, 1e-3)
+            height = int((left / self.seconds_per_pixel / max(aspect, 1e-3)) ** 0.5)
         height = max(min(height, most), min(SMALLEST, most))
         return max(round(height * aspect), 1), height
 

@@ -11,7 +11,7 @@ from d2_plugin.captures import open_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.settings import AtLeastOne, Positional, Range, Settings
-from d2_plugin.viewing.checkpoints import open_subject
+from d2_plugin.viewing.checkpoints import is_output_folder, open_subject
 from d2_plugin.viewing.live.viewer import Viewer
 from d2_plugin.viewing.stand_in import subject_of_store
 from d2_plugin.viewing.subject import Subject, subject_of_capture, with_priors
@@ -24,7 +24,7 @@ class ViewSettings(Settings):
     """What is shown, and who may look."""
 
     shown: Annotated[Path, Positional()]
-    """Folder of a run, a recording or a depth prior; or a checkpoint of an official trainer, with --capture."""
+    """Folder of a run, a recording or a depth prior; or what an official trainer wrote, with --capture."""
     host: str = "127.0.0.1"
     """Address to listen at; the default is this machine alone, and 0.0.0.0 lets everybody in."""
     port: Annotated[int, Range(1, 65535)] = 8080
@@ -66,7 +66,7 @@ def subject_at(settings: ViewSettings) -> Subject:
         if settings.capture is None:
             return subject_of_store(PriorStore.open(path))
         return with_priors(subject_of_capture(open_capture(settings.capture, downscale=settings.downscale)), path)
-    if path.is_file() or (path / "run.json").is_file():
+    if path.is_file() or (path / "run.json").is_file() or is_output_folder(path):
         return open_subject(path, settings.capture, settings.train_cameras, settings.downscale)
     if path.is_dir() and not any(path.iterdir()):
         raise D2Error(f"{path} is empty: give the folder of a run, a recording or a depth prior")

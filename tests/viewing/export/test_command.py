@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
 import torch
+from viewing.hostile import emptied, of_another_version, still_training
 
 from d2_plugin.captures.export.folder import save_capture
 from d2_plugin.captures.synthetic.room import synthetic_capture
@@ -16,7 +16,6 @@ from d2_plugin.commands.cli import main
 from d2_plugin.runs.run import Run
 from d2_plugin.viewing.export.export import FORMATS, Export
 from d2_plugin.viewing.export.page import read_page
-from d2_plugin.viewing.export.scene import scene_of
 
 
 @pytest.fixture(scope="module")
@@ -81,9 +80,7 @@ class TestOneSentence:
         assert "holds no checkpoint yet" in complaint(capsys, str(copy))
 
     def test_a_run_that_still_trains(self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        copy = Path(shutil.copytree(trained / "yang4d", tmp_path / "run"))
-        state = torch.load(copy / "checkpoint.pt", weights_only=True)
-        torch.save(state | {"step": 3}, copy / "checkpoint.pt")
+        copy = still_training(trained / "yang4d", tmp_path / "run", 3)
         assert "is at step 3 of 4: wait for `d2 train` to end, or add --unfinished" in complaint(capsys, str(copy))
         assert main(["export", str(copy), "--unfinished"]) == 0
 
@@ -92,20 +89,19 @@ class TestOneSentence:
         (copy / "checkpoint.pt").write_bytes((copy / "checkpoint.pt").read_bytes()[:1000])
         assert "is damaged" in complaint(capsys, str(copy))
 
-    def test_a_run_of_another_version(self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        copy = Path(shutil.copytree(trained / "yang4d", tmp_path / "run"))
-        table = json.loads((copy / "run.json").read_text())
-        plain = {name: value for name, value in table.items() if name not in ("format", "seal")}
-        (copy / "run.json").write_text(json.dumps(plain | {"version": 99}))
-        assert "version 99" in complaint(capsys, str(copy))
+    def test_a_run_of_another_version_and_one_without_gaussians(
+        self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert "version 99" in complaint(capsys, str(of_another_version(trained / "yang4d", tmp_path / "later")))
+        said = complaint(capsys, str(emptied(trained / "yang4d", tmp_path / "empty")))
+        assert "has no Gaussians: nothing is left to export" in said
 
-    def test_a_run_without_gaussians(self, trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        run = Run.load(trained / "yang4d")
-        trainer = run.trained()
-        trainer.model.select(torch.zeros(0, dtype=torch.int64))
-        monkeypatch.setattr(run, "trained", lambda: trainer)
-        with pytest.raises(ValueError, match="has no Gaussians: nothing is left to export"):
-            scene_of(run)
+    def test_a_run_without_a_prior_and_with_a_name_of_markup(self, trained: Path, tmp_path: Path) -> None:
+        """No hook ran, so there is no prior; the page needs none."""
+        copy = Path(shutil.copytree(trained / "yang4d", tmp_path / "<script>alert(1)<"))
+        assert not (copy / "priors").exists()
+        assert main(["export", str(copy)]) == 0
+        assert (copy / "export" / "scene.html").is_file()
 
     def test_frames_that_are_not_there(self, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
         run = str(trained / "yang4d")

@@ -12,6 +12,7 @@ import pytest
 import torch
 from viewing.export.scenes import DURATION, make_scene, sharp_model
 
+from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.slicing import slice_gaussians
@@ -69,7 +70,7 @@ class TestCodes:
     def test_a_code_is_within_half_a_step_of_its_block(self) -> None:
         rng = np.random.default_rng(0)
         values = rng.normal(size=(1000, 3)) * [1, 100, 1e-6] + [0, 5, 0]
-        for bits in (8, 16):
+        for bits in (3, 5, 8, 16):
             found = decode(encode("a", values, bits))
             for start in range(0, 1000, 256):
                 block = values[start : start + 256]
@@ -98,6 +99,24 @@ class TestCodes:
 
 
 class TestThePage:
+    def test_harmonics_are_coarser_where_the_page_must_be_small(self, tmp_path: Path) -> None:
+        plain = sharp_model("yang4d", 2000)
+        rows = {name: value.detach() for name, value in plain.gaussians.parameters.items()}
+        rows["harmonics"] = 0.2 * torch.randn(len(plain), 15, 3, generator=torch.Generator().manual_seed(3))
+        scene = make_scene(Yang4D(rows, Yang4DSettings(sh_degree=3, background=False), 2.0, DURATION))
+        fine, coarse = tmp_path / "fine.html", tmp_path / "coarse.html"
+        assert not any("harmonics in" in line for line in write_page(scene, fine).about)
+        most = 0.85e-6 * fine.stat().st_size
+        [said] = [line for line in write_page(scene, coarse, most).about if "harmonics in" in line]
+        assert coarse.stat().st_size < 1e6 * most
+        pages = read_page(fine), read_page(coarse)
+        bits = [{entry["name"]: entry["bits"] for entry in page.header["arrays"]}["harmonics"] for page in pages]
+        assert bits[0] == 8 > bits[1]
+        assert f"in {bits[1]} bits" in said
+        off = (pages[0].coefficients - pages[1].coefficients).abs()
+        assert off[:, 0].max() == 0, "the constant colour keeps its 16 bits"
+        assert 0 < off.max() < 2 / (2 ** bits[1] - 1), "half a step of a block, which spans less than two"
+
     @pytest.mark.parametrize("backbone", ["yang4d", "hexplane"])
     def test_our_reader_finds_the_gaussians_within_a_hundredth_of_a_pixel(self, tmp_path: Path, backbone: str) -> None:
         model = sharp_model(backbone)

@@ -102,7 +102,11 @@ def test_pictures_of_other_times_and_cameras_would_not_pass(new_page: Any, tmp_p
     assert psnr(here, rasterized(model, 1, TIMES[1])["color"]) < 28
 
 
-def test_harmonics_and_cosines_in_time_and_a_sky_are_drawn(new_page: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize("bits", [8, 5])
+def test_harmonics_and_cosines_in_time_and_a_sky_are_drawn(
+    new_page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bits: int
+) -> None:
+    monkeypatch.setattr("d2_plugin.viewing.export.coded_scene.HARMONIC_BITS", (bits,))
     plain = sharp_model("yang4d")
     rows = {name: value.detach() for name, value in plain.gaussians.parameters.items()}
     generator = torch.Generator().manual_seed(3)
@@ -153,6 +157,24 @@ def test_the_slider_and_the_play_button_move_time(new_page: Any, tmp_path: Path)
     page.page.locator("#back").click()
     assert page.run("d2.then((player) => player.camera.moved)") is False
     assert page.complaints == []
+
+
+def test_pictures_are_coarser_only_where_that_makes_them_quicker(new_page: Any, tmp_path: Path) -> None:
+    page = opened(new_page, sharp_model("yang4d"), tmp_path / "scene.html")
+    paced = """([fixed, pixel]) => {
+        const pace = new Pace(), full = 960 * 554;
+        let coarse = 2;
+        for (let i = 0; i < 40; i++) {
+            const pixels = full / coarse ** 2;
+            pace.note(pixels, fixed + pixel * pixels);
+            coarse = pace.coarse(full, coarse);
+        }
+        return coarse;
+    }"""
+    assert page.run(paced, [0.001, 1e-9]) == 1, "a graphics card"
+    pixels = 960 * 554 / page.run(paced, [0.001, 1e-6]) ** 2
+    assert pixels * 1e-6 == pytest.approx(1 / 15, rel=0.1), "what pixels cost is saved"
+    assert page.run(paced, [0.12, 5e-8]) < 1.2, "what Gaussians cost is not"
 
 
 def test_names_with_markup_stay_text(new_page: Any, tmp_path: Path) -> None:

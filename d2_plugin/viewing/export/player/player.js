@@ -2,8 +2,6 @@
 "use strict";
 
 const byId = (id) => document.getElementById(id);
-const SLOW = 1 / 15, QUICK = 1 / 40;  // seconds a picture may take while something moves, before it is made coarser
-const COARSEST = 6;
 
 class Player {
   constructor(header, raw) {
@@ -17,6 +15,7 @@ class Player {
     this.playing = false;
     this.busy = false;       // the worker sorts
     this.wanted = true;      // something changed since the last picture
+    this.pace = new Pace();
     this.coarse = 2;         // pixels of the screen per pixel of the picture, while something moves
     this.drawnSharp = false; // the last picture has all pixels of the screen
     this.pictures = 0;       // drawn so far
@@ -164,18 +163,17 @@ class Player {
       this.renderer.gl.finish();
       this.waiting();
       this.waiting = null;
-    } else if (this.playing || !this.drawnSharp) {
-      this.adapt(start);
+    } else {
+      this.adapt(view.size[0] * view.size[1], start);
     }
   }
 
   // A machine without a graphics card draws fewer pixels while something moves; at rest it draws all.
-  adapt(start) {
+  adapt(pixels, start) {
     this.renderer.gl.readPixels(0, 0, 1, 1, this.renderer.gl.RGBA, this.renderer.gl.UNSIGNED_BYTE, new Uint8Array(4));
-    const seconds = (performance.now() - start) / 1000;
-    const factor = Math.sqrt(seconds / SLOW);
-    if (seconds > SLOW) this.coarse = Math.min(this.coarse * Math.min(factor, 2), COARSEST);
-    else if (seconds < QUICK) this.coarse = Math.max(this.coarse / 1.1, 1);
+    this.pace.note(pixels, (performance.now() - start) / 1000);
+    const { size } = this.screenView(1);
+    this.coarse = this.pace.coarse(size[0] * size[1], this.coarse);
   }
 
   // The picture of a camera of the recording at a time, in the camera's own size, as the address of a PNG.

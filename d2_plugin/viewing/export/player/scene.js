@@ -24,7 +24,7 @@ class Scene {
     const block = this.header.block, blocks = Math.ceil(rows / block);
     const ranges = new Float32Array(this.raw.slice(offset, offset + blocks * columns * 8));
     const bytes = new Uint8Array(this.raw, offset + blocks * columns * 8);
-    const values = new Float32Array(rows * columns), kinds = bits / 8, steps = 2 ** bits - 1;
+    const values = new Float32Array(rows * columns), kinds = bits > 8 ? 2 : 1, steps = 2 ** bits - 1;
     for (let column = 0; column < columns; column++) {
       const high = column * kinds * rows, low = high + rows;
       for (let row = 0; row < rows; row++) {

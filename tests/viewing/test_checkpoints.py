@@ -1,0 +1,419 @@
+"""Checkpoints of official trainers are shown as their own code draws them, and none of that code is run."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from mimics import fudan, spacetime
+from torch import Tensor
+from viewing import official
+
+from d2_plugin.commands.cli import main
+from d2_plugin.errors import D2Error
+from d2_plugin.runs.run import Run
+from d2_plugin.viewing.checkpoints import open_subject
+from d2_plugin.viewing.checkpoints.files import read_options, read_ply
+from d2_plugin.viewing.checkpoints.hexplanes import PlaneField
+from d2_plugin.viewing.checkpoints.networks import MotionNetwork
+from d2_plugin.viewing.checkpoints.tuples import FOUR_C, FOUR_C_STATIC, FUDAN, PLANES, STATIC
+from d2_plugin.viewing.export.page import read_page
+from d2_plugin.viewing.live.show import ViewSettings, subject_at
+from d2_plugin.viewing.look import look
+from d2_plugin.viewing.paths import pose_of
+from d2_plugin.viewing.subject import Subject
+
+SIZE = (96, 54)
+
+
+def seen(subject: Subject, time: float, camera: str = "train0") -> Any:
+    """The subject's view of a camera of the recording."""
+    return subject.view(pose_of(subject.capture.cameras[camera]), time, SIZE)
+
+
+def close(a: Tensor, b: Any, within: float = 2e-5) -> bool:
+    return torch.allclose(a, torch.as_tensor(b, dtype=a.dtype), atol=within, rtol=1e-5)
+
+
+class TestTuples:
+    @staticmethod
+    def checkpoint(path: Path, layout: tuple[str, ...] = FUDAN) -> fudan.GaussianModel:
+        """A checkpoint as fudan and 4C4D save it, its extent a number of numpy's."""
+        model, _ = fudan.make()
+        values = {name: getattr(model, name, None) for name in layout} | {"active_sh_degree": 0}
+        values |= {"spatial_lr_scale": np.float32(2.0), "optimizer": {"state": {}, "param_groups": []}}
+        if "rot_4d" in layout:
+            values |= {"rot_4d": True, "active_sh_degree_t": 0}
+        if "coefficient" in layout:
+            values |= {"coef_optimizer": {"state": {}}, "coefficient": {"layer.weight": torch.ones(2, 2)}}
+        torch.save((tuple(values.values()), 30000), path)
+        return model
+
+    @pytest.mark.parametrize("layout", [FUDAN, FOUR_C], ids=["fudan", "4C4D"])
+    def test_4d_gaussians_are_shown_as_their_adapter_slices_them(
+        self, room: Path, tmp_path: Path, layout: tuple[str, ...]
+    ) -> None:
+        from d2_plugin.adapters.fudan import FudanAdapter
+
+        model = self.checkpoint(tmp_path / "chkpnt30000.pth", layout)
+        found = open_subject(tmp_path / "chkpnt30000.pth", room, ["train0", "train1"])
+        assert found.test_cameras == ("train2", "test0")
+        view = seen(found, 0.1)
+        assert torch.equal(look(found.backbone, view).color, look(FudanAdapter(model), view).color)
+        assert found.note == "times are taken to be seconds since the first frame"
+        with pytest.raises(D2Error, match="name its recording with --capture"):
+            open_subject(tmp_path / "chkpnt30000.pth")
+
+    @pytest.mark.parametrize("layout", [STATIC, FOUR_C_STATIC], ids=["3DGS", "4C4D without time"])
+    def test_without_time_they_stand_still(self, room: Path, tmp_path: Path, layout: tuple[str, ...]) -> None:
+        self.checkpoint(tmp_path / "chkpnt7000.pth", layout)
+        found = open_subject(tmp_path / "chkpnt7000.pth", room)
+        assert found.note == "3D Gaussians stand still"
+        early, late = (found.backbone.slice_at(seen(found, time)) for time in (0.0, 0.2))
+        assert torch.equal(early.means, late.means)
+
+    @pytest.mark.parametrize("core", [b"numpy.core", b"numpy._core"])
+    def test_the_extent_is_a_number_of_any_numpy(self, room: Path, tmp_path: Path, core: bytes) -> None:
+        """The repositories pin numpy 1, whose numbers carry another module's name."""
+        path = tmp_path / "chkpnt1.pth"
+        self.checkpoint(path)
+        with_own = np.float32(0).__reduce__()[0].__module__.encode()
+        rewritten(path, with_own + b"\n", core + b".multiarray\n")
+        assert len(open_subject(path, room).backbone)
+
+    def test_another_number_of_entries_is_refused_by_name(self, room: Path, tmp_path: Path) -> None:
+        torch.save((tuple(range(40)), 1), tmp_path / "chkpnt1.pth")
+        with pytest.raises(D2Error, match=r"has 40 entries, expected 19 \(fudan\), 21 \(4C4D\).*Viewer\(d2\)"):
+            open_subject(tmp_path / "chkpnt1.pth", room)
+
+
+def rewritten(path: Path, old: bytes, new: bytes) -> None:
+    """Replace bytes in the pickle inside a file of torch.save."""
+    import zipfile
+
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    [pickled] = [name for name in parts if name.endswith("data.pkl")]
+    assert old in parts[pickled]
+    parts[pickled] = parts[pickled].replace(old, new)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in parts.items():
+            archive.writestr(name, data)
+
+
+class TestDeformable3D:
+    """point_cloud/iteration_N/point_cloud.ply and deform/iteration_N/deform.pth."""
+
+    @pytest.mark.parametrize("variant", list(official.DEFORMED))
+    def test_the_network_is_the_repositorys_own(self, variant: str) -> None:
+        network = MotionNetwork(official.motion_network(variant), Path("deform.pth"))
+        found = network.step(official.POINTS, torch.full((3, 1), official.TIME))
+        assert network.is_6dof == (variant == "is_6dof")
+        for told, true in zip(found, official.DEFORMED[variant], strict=True):
+            assert close(told.flatten(1), true)
+
+    @staticmethod
+    def output(folder: Path, variant: str = "plain") -> dict[str, Tensor]:
+        """What its train.py leaves after 20000 and 40000 iterations; the network of the earlier one is another's."""
+        model = official.inria_columns(40)
+        for iteration in (9000, 40000):
+            official.write_inria_ply(folder / "point_cloud" / f"iteration_{iteration}" / "point_cloud.ply", model)
+            weights = folder / "deform" / f"iteration_{iteration}" / "deform.pth"
+            weights.parent.mkdir(parents=True)
+            torch.save(official.motion_network(variant if iteration == 40000 else "is_blender"), weights)
+        return model
+
+    def test_its_output_folder_is_shown_at_the_last_iteration(self, room: Path, tmp_path: Path) -> None:
+        model = self.output(tmp_path)
+        found = open_subject(tmp_path, room)
+        half = found.duration / 2
+        assert seen(found, half).time == pytest.approx(0.5)
+        drawn = found.backbone.slice_at(seen(found, official.TIME * found.duration))
+        expected = torch.tensor(official.DEFORMED["plain"][0])
+        assert close(drawn.means[:3] - official.POINTS, expected)
+        # Offsets of scales come after exp; quaternions are not normalised again.
+        scales = model["_scaling"][:3].exp() + torch.tensor(official.DEFORMED["plain"][2])
+        q = torch.nn.functional.normalize(model["_rotation"][:3]) + torch.tensor(official.DEFORMED["plain"][1])
+        trace = drawn.covariances[:3, [0, 3, 5]].sum(1)
+        # Of a quaternion of length |q| the columns of Inria's matrix are not unit vectors.
+        w, x, y, z = q.unbind(1)
+        first = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1).square().sum(1)
+        second = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1).square().sum(1)
+        third = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1).square().sum(1)
+        assert close(trace, (torch.stack([first, second, third], -1) * scales**2).sum(1), 1e-2)
+        assert found.backbone.colors(seen(found, half), drawn).shape == (40, 3)
+
+    def test_a_point_cloud_without_its_network_is_refused(self, room: Path, tmp_path: Path) -> None:
+        self.output(tmp_path)
+        (tmp_path / "deform" / "iteration_40000" / "deform.pth").unlink()
+        with pytest.raises(D2Error, match="a point cloud of Deformable-3D-Gaussians moves by it, copy both"):
+            open_subject(tmp_path, room)
+
+    def test_another_network_is_refused(self, room: Path, tmp_path: Path) -> None:
+        self.output(tmp_path)
+        torch.save({"layer.weight": torch.zeros(3)}, tmp_path / "deform" / "iteration_40000" / "deform.pth")
+        with pytest.raises(D2Error, match=r"has no linear\.0\.weight: it is no network of Deformable-3D-Gaussians"):
+            open_subject(tmp_path, room)
+
+    def test_d2_view_takes_the_folder_for_a_checkpoint_and_not_for_a_recording(
+        self, room: Path, tmp_path: Path
+    ) -> None:
+        self.output(tmp_path)
+        assert len(subject_at(ViewSettings(tmp_path, capture=room)).backbone) == 40
+        with pytest.raises(D2Error, match=r"point_cloud\.ply does not say where its cameras stood"):
+            subject_at(ViewSettings(tmp_path))
+
+
+class Test4DGaussians:
+    """point_cloud/iteration_N/{point_cloud.ply, deformation.pth} with the options in cfg_args; chkpnt_fine_N.pth."""
+
+    @pytest.mark.parametrize("name", list(official.BENT))
+    def test_the_field_is_the_repositorys_own(self, name: str) -> None:
+        changed, *true = official.BENT[name]
+        options = official.OPTIONS | changed
+        field = PlaneField(official.plane_field(changed.get("defor_depth", 1)), options, Path("deformation.pth"))
+        *found, harmonics = field(official.POINTS, *official.RAW, torch.full((3, 1), official.TIME))
+        for told, expected in zip([*found, harmonics[:, [0, 15]].flatten(1)], true, strict=True):
+            assert close(told, expected)
+
+    @staticmethod
+    def output(folder: Path, **changed: Any) -> dict[str, Tensor]:
+        """What its train.py leaves: the coarse stage at 3000 iterations, the fine one at 14000."""
+        model = official.inria_columns(40)
+        model |= dict(zip(("_scaling", "_rotation", "_opacity"), official.RAW)) if changed.pop("few", False) else {}
+        for stage in ("coarse_iteration_3000", "iteration_14000"):
+            place = folder / "point_cloud" / stage
+            official.write_inria_ply(place / "point_cloud.ply", model)
+            torch.save(official.plane_field(changed.get("defor_depth", 1)), place / "deformation.pth")
+            torch.save(torch.ones(40, dtype=torch.bool), place / "deformation_table.pth")
+        (folder / "cfg_args").write_text(official.options_text(**changed))
+        return model
+
+    def test_its_output_folder_is_shown_as_the_field_moves_it(self, room: Path, tmp_path: Path) -> None:
+        model = self.output(tmp_path)
+        found = open_subject(tmp_path, room)
+        # Frame 2 of 4 is at its time 2 / 4: readers of several cameras divide by the number of frames.
+        assert seen(found, found.capture.seconds(2)).time == pytest.approx(0.5)
+        at = seen(found, official.TIME * 4 / found.capture.fps)
+        drawn = found.backbone.slice_at(at)
+        assert close(drawn.means[:3], official.BENT["as by default"][1])
+        assert close(drawn.opacities, torch.sigmoid(model["_opacity"][:, 0]))
+
+    def test_colours_are_deformed_where_the_options_say_so(self, room: Path, tmp_path: Path) -> None:
+        colors = {}
+        for name, still in (("still", True), ("deformed", False)):
+            self.output(tmp_path / name, no_dshs=still)
+            found = open_subject(tmp_path / name, room)
+            early, late = (seen(found, time) for time in (0.0, found.duration))
+            means = found.backbone.slice_at(early)  # the same directions for both
+            colors[name] = [found.backbone.colors(view, means) for view in (early, late)]
+        assert torch.equal(*colors["still"])
+        assert not torch.allclose(*colors["deformed"], atol=1e-2)
+
+    def test_a_checkpoint_of_the_fine_stage_is_the_same(self, room: Path, tmp_path: Path) -> None:
+        model = self.output(tmp_path) | {"deformation": official.plane_field(), "active_sh_degree": 3}
+        values = [model.get(name, torch.zeros(1)) for name in PLANES]
+        torch.save((tuple(values), 14000), tmp_path / "chkpnt_fine_14000.pth")
+        both = [open_subject(path, room) for path in (tmp_path, tmp_path / "chkpnt_fine_14000.pth")]
+        views = [seen(found, 0.1) for found in both]
+        pictures = [look(found.backbone, view) for found, view in zip(both, views, strict=True)]
+        assert torch.equal(pictures[0].color, pictures[1].color)
+        torch.save((tuple(values), 3000), tmp_path / "chkpnt_coarse_3000.pth")
+        still = open_subject(tmp_path / "chkpnt_coarse_3000.pth", room)
+        assert close(still.backbone.slice_at(seen(still, 0.1)).means, model["_xyz"])
+
+    def test_without_its_options_it_is_refused(self, room: Path, tmp_path: Path) -> None:
+        self.output(tmp_path)
+        (tmp_path / "cfg_args").unlink()
+        with pytest.raises(D2Error, match="cfg_args is not there: it says how the trainer was set"):
+            open_subject(tmp_path, room)
+
+    def test_options_that_are_not_known_are_refused(self, room: Path, tmp_path: Path) -> None:
+        self.output(tmp_path, static_mlp=True)
+        with pytest.raises(D2Error, match=r"was trained with static_mlp.*Viewer\(d2\)"):
+            open_subject(tmp_path, room)
+
+    def test_options_are_read_and_not_run(self, tmp_path: Path) -> None:
+        path = tmp_path / "cfg_args"
+        path.write_text(f"Namespace(no_do=True, bad=open({str(tmp_path / 'made')!r}, 'w'), name='</script>')")
+        assert read_options(path) == {"no_do": True, "name": "</script>"}
+        assert not (tmp_path / "made").exists()
+        path.write_text("no options")
+        with pytest.raises(D2Error, match="is no list of options"):
+            read_options(path)
+
+
+class TestClouds:
+    def test_a_checkpoint_of_gsplat_stands_still(self, room: Path, tmp_path: Path) -> None:
+        count = 20
+        splats = {
+            "means": torch.randn(count, 3),
+            "scales": torch.full((count, 3), -1.0),
+            "quats": torch.randn(count, 4),
+            "opacities": torch.zeros(count),
+            "sh0": torch.rand(count, 1, 3),
+            "shN": torch.zeros(count, 15, 3),
+        }
+        kept = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in splats.items()}).state_dict()
+        path = tmp_path / "ckpt_6999_rank0.pt"
+        torch.save({"step": 6999, "scene_id": "garden", "splats": kept}, path)
+        found = open_subject(path, room)
+        view = seen(found, 0.1)
+        drawn = found.backbone.slice_at(view)
+        assert torch.equal(drawn.means, splats["means"])
+        assert torch.allclose(found.backbone.colors(view, drawn), 0.5 + 0.2820948 * splats["sh0"][:, 0], atol=1e-5)
+
+    def test_a_point_cloud_of_spacetime_gaussians_moves_with_the_recording(self, room: Path, tmp_path: Path) -> None:
+        from d2_plugin.adapters.spacetime import SpacetimeAdapter
+
+        gaussians = spacetime.make()[0]
+        generator = torch.Generator().manual_seed(4)
+        gaussians._motion = 0.2 * torch.randn(gaussians._motion.shape, generator=generator)
+        columns = {
+            **{axis: gaussians._xyz[:, i] for i, axis in enumerate("xyz")},
+            "trbf_center": gaussians._trbf_center[:, 0],
+            "trbf_scale": gaussians._trbf_scale[:, 0],
+            "opacity": gaussians._opacity[:, 0],
+        }
+        many = {"motion": gaussians._motion, "f_dc": gaussians._features_dc[:, :3], "omega": gaussians._omega}
+        for name, values in (many | {"scale": gaussians._scaling, "rot": gaussians._rotation}).items():
+            columns |= {f"{name}_{i}": values[:, i] for i in range(values.shape[1])}
+        official.write_ply(tmp_path / "point_cloud.ply", columns)
+        found = open_subject(tmp_path / "point_cloud.ply", room)
+        # Frame 2 of 4 is at the trainer's time 0.5.
+        view = seen(found, found.capture.seconds(2))
+        assert view.time == pytest.approx(0.5)
+        expected = SpacetimeAdapter(gaussians, 4).slice_at(view)
+        assert torch.allclose(found.backbone.slice_at(view).means, expected.means, atol=1e-6)
+        assert torch.allclose(found.backbone.slice_at(view).opacities, expected.opacities, atol=1e-6)
+
+    def test_a_point_cloud_is_shown_as_the_run_that_wrote_it(
+        self, trained: Path, room: Path, subject: Subject, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(subject.backbone.model, "background", None)  # a point cloud has none
+        [first, *_] = Run.load(trained).export_ply()
+        found = open_subject(first, room)
+        view = seen(subject, 0.0, "train1")
+        difference = (look(found.backbone, view).color - look(subject.backbone, view).color).abs()
+        assert difference.max() < 0.02
+        assert {"x", "opacity", "rot_3"} <= set(read_ply(first))
+
+    def test_an_output_folder_of_3d_gaussians_is_its_last_point_cloud(self, room: Path, tmp_path: Path) -> None:
+        for iteration, seed in ((7000, 1), (30000, 2)):
+            place = tmp_path / "point_cloud" / f"iteration_{iteration}"
+            official.write_inria_ply(place / "point_cloud.ply", official.inria_columns(9, seed))
+        found = open_subject(tmp_path, room)
+        assert close(found.backbone.slice_at(seen(found, 0.1)).means, official.inria_columns(9, 2)["_xyz"])
+        (tmp_path / "empty" / "point_cloud").mkdir(parents=True)
+        with pytest.raises(D2Error, match="has no iteration_N/point_cloud"):
+            open_subject(tmp_path / "empty", room)
+
+
+class Harm:
+    """An object that does something when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return (Path.touch, (self.path,))
+
+
+class TestRefused:
+    def test_no_code_in_a_file_is_run(self, room: Path, tmp_path: Path) -> None:
+        torch.save(((Harm(tmp_path / "made"),), 1), tmp_path / "chkpnt1.pth")
+        (tmp_path / "ckpt_1.pt").write_bytes(pickle.dumps(Harm(tmp_path / "made")))
+        TestDeformable3D.output(tmp_path / "def")
+        torch.save(Harm(tmp_path / "made"), tmp_path / "def" / "deform" / "iteration_40000" / "deform.pth")
+        for path in (tmp_path / "chkpnt1.pth", tmp_path / "ckpt_1.pt", tmp_path / "def"):
+            with pytest.raises(D2Error, match="cannot be read as a checkpoint of tensors"):
+                open_subject(path, room)
+        assert not (tmp_path / "made").exists()
+
+    def test_a_file_that_is_no_checkpoint(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        path = tmp_path / "a.pth"
+        path.write_bytes(b"nothing")
+        with pytest.raises(D2Error, match="cannot be read as a checkpoint"):
+            open_subject(path, room)
+        torch.save({"weights": torch.zeros(3)}, path)
+        with pytest.raises(D2Error, match="is no checkpoint that can be shown"):
+            open_subject(path, room)
+        (tmp_path / "a.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex -1\nend_header\n")
+        with pytest.raises(D2Error, match="it says -1 vertices"):
+            open_subject(tmp_path / "a.ply", room)
+        (tmp_path / "a.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
+        with pytest.raises(D2Error, match="no readable point cloud"):
+            open_subject(tmp_path / "a.ply", room)
+        assert main(["render", str(path), "--capture", str(room)]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+    @pytest.mark.parametrize(
+        ("name", "value", "said"),
+        [
+            ("quats", torch.zeros(20, 3), "cannot read checkpoint"),
+            ("scales", torch.zeros(7, 3), "cannot read checkpoint"),
+            ("means", "text", "cannot read checkpoint"),
+            ("sh0", torch.zeros(20, 3), "cannot read checkpoint"),
+            ("opacities", None, "cannot read checkpoint"),
+            ("means", torch.full((20, 3), torch.nan), "numbers that are not finite"),
+        ],
+    )
+    def test_a_checkpoint_whose_tensors_do_not_fit_is_one_sentence(
+        self, room: Path, tmp_path: Path, name: str, value: object, said: str
+    ) -> None:
+        splats = {
+            "means": torch.randn(20, 3),
+            "scales": torch.full((20, 3), -1.0),
+            "quats": torch.randn(20, 4),
+            "opacities": torch.zeros(20),
+            "sh0": torch.rand(20, 1, 3),
+            "shN": torch.zeros(20, 15, 3),
+        }
+        torch.save({"step": 1, "splats": splats | {name: value}}, tmp_path / "a.pt")
+        with pytest.raises(D2Error, match=said) as caught:
+            open_subject(tmp_path / "a.pt", room)
+        assert "\n" not in str(caught.value)
+
+
+class TestExport:
+    """`d2 export` of a checkpoint: straight lines exactly where it has them, baked key times where not."""
+
+    def test_4d_gaussians_become_the_same_straight_lines(
+        self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        from d2_plugin.adapters.fudan import FudanAdapter
+
+        path = tmp_path / "chkpnt30000.pth"
+        model = TestTuples.checkpoint(path)
+        assert main(["export", str(path), "--capture", str(room), "--train-cameras", "train0,train1"]) == 0
+        said = capsys.readouterr().out
+        assert "times are taken to be seconds since the first frame" in said
+        assert "moves on a straight line and fades in time, exactly as it was trained" in said
+        page = read_page(tmp_path / "export" / "scene.html")
+        assert [camera["held_out"] for camera in page.header["cameras"]] == [False, False, True, True]
+        for time in (0.0, 0.1, 0.25):
+            true = FudanAdapter(model).slice_at(seen(open_subject(path, room), time))
+            told = page.at(time)
+            drawn = told.positions[told.opacities >= 1 / 255]
+            assert torch.cdist(true.means[true.opacities >= 1 / 255].double(), drawn).amin(1).max() < 1e-3
+
+    def test_a_network_is_baked(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        Test4DGaussians.output(tmp_path)
+        assert main(["export", str(tmp_path), "--capture", str(room)]) == 0
+        assert "a deformation field at" in capsys.readouterr().out
+        found = open_subject(tmp_path, room)
+        page = read_page(tmp_path / "export" / "scene.html")
+        assert page.coefficients.shape[1:] == (16, 3)
+        at = found.capture.seconds(found.capture.frames[-1])
+        true, told = found.backbone.slice_at(seen(found, at)), page.at(at)
+        drawn = told.positions[told.opacities >= 1 / 255]
+        assert torch.cdist(true.means[true.opacities >= 1 / 255].double(), drawn).amin(1).max() < 1e-3
+
+    def test_without_its_recording_it_is_refused(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        TestTuples.checkpoint(tmp_path / "chkpnt1.pth")
+        assert main(["export", str(tmp_path / "chkpnt1.pth")]) == 2
+        assert "name its recording with --capture" in capsys.readouterr().err
