@@ -26,6 +26,8 @@ from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
 
+from .keys import ViewsByPose
+
 ROWS = "d2_rows"
 """The column in the strategy's state: the number of each row plus one, since gsplat marks what is new with zeros."""
 
@@ -46,6 +48,7 @@ class GsplatAdapter:
         state: the strategy's state; without it, only appended rows are understood (MCMC's `sample_add`), and anything
             else resets what hooks count, with a warning.
         view: from the trainer's camera to a `View`; not needed where the trainer passes views.
+        parser: of gsplat's examples, in the place of `view`: items of its data sets are then told by their poses.
         slice_at: the 3D Gaussians of a view, for models that change over time; by default the parameters as they are.
         new_rows: raw rows of further parameters (velocities, times, ...) for inserted points.
         settings: constants of the rasterizer; by default gsplat's, whose near plane is .01.
@@ -58,6 +61,7 @@ class GsplatAdapter:
         state: MutableMapping[str, Any] | None = None,
         *,
         view: Callable[[object], View] | None = None,
+        parser: Any = None,
         slice_at: SliceOf | None = None,
         new_rows: RowsOf | None = None,
         settings: RasterSettings | None = None,
@@ -67,7 +71,8 @@ class GsplatAdapter:
                 raise D2Error(f"parameters have {', '.join(parameters)} but no '{name}', which gsplat's names include")
         self.parameters, self.optimizers, self.state = parameters, optimizers, state
         self.settings = settings or RasterSettings(near=0.01)
-        self._view, self._slice, self._new_rows = view, slice_at, new_rows
+        self._view = view if parser is None else ViewsByPose(parser)
+        self._slice, self._new_rows = slice_at, new_rows
         self._listeners: list[ResizeListener] = []
         self._known = 0
         self._renumber()
