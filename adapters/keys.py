@@ -130,9 +130,7 @@ class ViewsByPose:
         tolerance: how far two poses may lie apart to be the same, in the world's unit per unit of distance.
     """
 
-    def __init__(
-        self, parser: Any, key: Callable[[str], PriorKey] = key_from_picture, tolerance: float = 1e-4
-    ) -> None:
+    def __init__(self, parser: Any, key: Callable[[str], PriorKey] = key_from_picture, tolerance: float = 1e-4) -> None:
         self.poses = torch.as_tensor(parser.camtoworlds).double().cpu()
         self.keys, self.tolerance = [key(name) for name in parser.image_names], tolerance
 
@@ -148,8 +146,8 @@ class ViewsByPose:
         near = torch.nonzero(distances < self.tolerance * max(1.0, float(pose.abs().max()))).squeeze(-1)
         if len(near) != 1:
             raise D2Error(
-                f"{len(near)} pictures have the pose of this view: gsplat's pictures are told by their poses, so give it "
-                "one instant of the recording (`d2 export-capture --format colmap`), and no pose_opt or pose_noise"
+                f"{len(near)} pictures have the pose of this view: gsplat's pictures are told by their poses, so give "
+                "it one instant of the recording (`d2 export-capture --format gsplat`), and no pose_opt or pose_noise"
             )
         key = self.keys[int(near)]
         return View(key.camera, key.frame, 0.0, torch.linalg.inv(pose), K, int(width), int(height))

@@ -8,7 +8,9 @@ view is known by its pose among those that the script's `Parser` read.
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import logging
+import sys
 from collections.abc import Callable, Mapping
 from functools import wraps
 from typing import Any, NamedTuple
@@ -36,14 +38,50 @@ class Model(NamedTuple):
     optimizers: Mapping[str, torch.optim.Optimizer]
 
 
+def put_in_place() -> None:
+    """Ours where gsplat's kernels are missing, and one process instead of one for each GPU."""
+    stand_in = "d2_plugin.compat.gsplat"
+    if getattr(sys.modules.get("gsplat.csrc"), "__name__", "") == stand_in:
+        ours = importlib.import_module(stand_in)
+        for module, attribute in PLACES:
+            setattr(importlib.import_module(module), attribute, ours.rasterization)
+        log.warning("gsplat.rasterization: %s stands in for it", stand_in)
+    importlib.import_module("gsplat.distributed").cli = _one_process
+    _without_lpips()
+
+
+def _one_process(main: Callable[..., Any], settings: Any, verbose: bool = False) -> bool:
+    if torch.cuda.device_count() > 1:
+        raise D2Error(
+            f"gsplat would train on {torch.cuda.device_count()} GPUs, and D2 follows one: set CUDA_VISIBLE_DEVICES=0"
+        )
+    main(0, 0, 1, settings)
+    return True
+
+
+def _without_lpips() -> None:
+    """simple_trainer.py makes its LPIPS before it trains, and that needs torchvision and a download."""
+    if importlib.util.find_spec("torchvision") is not None and not _is_stand_in("torchvision"):
+        return
+    module = importlib.import_module("torchmetrics.image.lpip")
+    module.LearnedPerceptualImagePatchSimilarity = importlib.import_module("d2_plugin.compat.vision").NoLpips
+    log.warning("torchvision is missing: LPIPS is not measured, its values are NaN")
+
+
+def _is_stand_in(package: str) -> bool:
+    spec = importlib.util.find_spec(package)
+    return spec is not None and spec.origin is None and not spec.submodule_search_locations
+
+
 def remember_gsplat(recipe: Recipe, objects: Objects) -> None:
-    """As `session.remember`: the parser of the data, the parameters, the strategy's state and the settings."""
+    """As `session.remember`: the parser of the data, the parameters, and the settings of the script."""
     remember(recipe, objects)
     strategies = importlib.import_module("gsplat.strategy")
     for name in STRATEGIES:
         kind = getattr(strategies, name)
         kind.check_sanity = _keeping_model(kind.check_sanity, objects)
-    _on_one_device(objects)
+    distributed = importlib.import_module("gsplat.distributed")
+    distributed.cli = _keeping_settings(distributed.cli, objects)
 
 
 def _keeping_model(check_sanity: Callable[..., Any], objects: Objects) -> Callable[..., Any]:
@@ -55,28 +93,23 @@ def _keeping_model(check_sanity: Callable[..., Any], objects: Objects) -> Callab
     return keeping
 
 
-def _on_one_device(objects: Objects) -> None:
-    """`gsplat.distributed.cli` starts a process per GPU and insists on one; here it calls the script's main."""
-    distributed = importlib.import_module("gsplat.distributed")
-
-    def cli(main: Callable[..., Any], settings: Any, verbose: bool = False) -> bool:
-        if torch.cuda.device_count() > 1:
-            raise D2Error(
-                f"gsplat would train on {torch.cuda.device_count()} GPUs, and D2 follows one: set CUDA_VISIBLE_DEVICES=0"
-            )
+def _keeping_settings(cli: Callable[..., Any], objects: Objects) -> Callable[..., Any]:
+    @wraps(cli)
+    def keeping(main: Callable[..., Any], settings: Any, *arguments: Any, **named: Any) -> Any:
         objects.options = settings
-        main(0, 0, 1, settings)
-        return True
+        return cli(main, settings, *arguments, **named)
 
-    distributed.cli = cli
+    return keeping
 
 
 class GsplatSession(Session):
     """One run of simple_trainer.py with D2 attached; steps are counted from 1."""
 
+    remember = staticmethod(remember_gsplat)
+
     def wrap(self) -> None:
         """Override the choke points; call before the script runs."""
-        remember_gsplat(self.recipe, self.objects)
+        self.remember(self.recipe, self.objects)
         strategies = importlib.import_module("gsplat.strategy")
         for name in STRATEGIES:
             kind = getattr(strategies, name)

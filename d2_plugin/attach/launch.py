@@ -17,11 +17,15 @@ from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 
 from .cpu import run_on_cpu
+from .gsplat import GsplatSession, put_in_place
 from .originals import provide
 from .packages import stand_in_for
 from .recipes import RECIPES, Recipe, recipe
 from .repairs import repair
 from .session import Session
+
+SESSIONS: dict[str, type[Session]] = {"trainer": Session, "gsplat": GsplatSession}
+"""By the kind of a recipe, what follows its run."""
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +48,7 @@ def launch(options: argparse.Namespace, command: Sequence[str]) -> Session | Non
     found = prepare(options, command)
     session = None
     if options.d2 is not None:
-        session = Session(found, options.d2, exported=options.exported)
+        session = SESSIONS[found.kind](found, options.d2, exported=options.exported)
         session.wrap()
     runpy.run_path(command[0], run_name="__main__")
     return session
@@ -67,6 +71,8 @@ def prepare(options: argparse.Namespace, command: Sequence[str]) -> Recipe:
     provide(found.originals, script.parent, options.cpu)
     if options.cpu:
         run_on_cpu()
+    if found.kind == "gsplat":
+        put_in_place()
     os.execv = _refuse_restart  # type: ignore[assignment]
     return found
 

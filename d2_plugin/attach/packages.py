@@ -51,6 +51,8 @@ STAND_INS = {
     ),
     "open3d": StandIn({}, "the trainer imports it and calls nothing of it"),
     "lpips": StandIn({}, "the trainer imports it and calls nothing of it while training"),
+    "nerfview": StandIn({}, "gsplat's script imports it for its viewer: give --disable_viewer"),
+    "viser": StandIn({}, "gsplat's script imports it for its viewer: give --disable_viewer"),
     "pointops2_cuda": StandIn({}, "it is built in CUDA and called for lambda_rigid > 0 alone"),
 }
 """By the name that is imported. A new one is a row here."""
@@ -192,6 +194,10 @@ class _NotCallable:
         if name.startswith("__"):
             raise AttributeError(name)
         return _NotCallable(f"{self._name}.{name}")
+
+    def __mro_entries__(self, bases: tuple[Any, ...]) -> tuple[type, ...]:
+        """A class of the trainer's may derive from it."""
+        return (object,)
 
     def __call__(self, *_: Any, **__: Any) -> Any:
         package = self._name.split(".")[0]

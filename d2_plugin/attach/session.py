@@ -92,9 +92,12 @@ class Session:
         self._iteration, self._told = 0, False
         self._drawn, self._batch = 0, 0
 
+    remember = staticmethod(remember)
+    """How this kind of script's own objects are kept; for a bare run as well."""
+
     def wrap(self) -> None:
         """Override the choke points of the repository's modules; call before its script runs."""
-        remember(self.recipe, self.objects)
+        self.remember(self.recipe, self.objects)
         for place in self.recipe.models:
             model = _found(*place)
             model.training_setup = self._attaching(model.training_setup)

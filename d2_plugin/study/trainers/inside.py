@@ -26,9 +26,8 @@ from d2_plugin.reading import json_text
 
 def main(words: list[str]) -> int:
     """Run the trainer; the exit code of the launcher."""
-    from d2_plugin.attach.launch import parsed, prepare
+    from d2_plugin.attach.launch import SESSIONS, parsed, prepare
     from d2_plugin.attach.recipes import Objects
-    from d2_plugin.attach.session import Session, remember
     from d2_plugin.errors import D2Error
 
     logging.basicConfig(level=logging.INFO, format="d2: %(message)s")
@@ -37,8 +36,9 @@ def main(words: list[str]) -> int:
     objects = Objects()
     try:
         found = prepare(options, command)
-        remember(found, objects)
-        session = None if options.d2 is None else Session(found, options.d2, exported=options.exported)
+        kind = SESSIONS[found.kind]
+        kind.remember(found, objects)
+        session = None if options.d2 is None else kind(found, options.d2, exported=options.exported)
         if session is not None:
             session.wrap()
         start = time.process_time()
@@ -62,13 +62,14 @@ def main(words: list[str]) -> int:
 
 def tensors(model: Any) -> Iterator[tuple[str, Tensor]]:
     """Everything that is trained, by name: parameters of the object, and those of the networks that it holds."""
+    if hasattr(model, "splats"):
+        yield from ((name, value.detach()) for name, value in sorted(model.splats.items()))
+        return
     for name, value in sorted(vars(model).items()):
         if isinstance(value, torch.nn.Module):
             yield from ((f"{name}.{inner}", tensor) for inner, tensor in value.state_dict().items())
         elif isinstance(value, torch.nn.Parameter):
             yield name, value.detach()
-    if isinstance(model, torch.nn.Module):
-        yield from sorted(model.state_dict().items())
 
 
 def digest(models: Iterable[Any]) -> str:

@@ -197,6 +197,17 @@ def _ex4dgs(job: Job) -> list[str]:
     return [*words, "--test_iterations", *job.reports, "--port", free_port()]
 
 
+def _gsplat(job: Job) -> list[str]:
+    third = str(job.share(1 / 3))
+    return [
+        *("default", "--disable_viewer", "--disable_video", "--no-normalize_world_space", "--no-load_exposure"),
+        *("--data_dir", str(job.data), "--data_factor", "1", "--result_dir", str(job.model), "--test_every", "2"),
+        *("--max_steps", str(job.iterations), "--eval_steps", *job.reports, "--tb_every", "0"),
+        *("--strategy.refine_start_iter", str(job.share(0.2)), "--strategy.refine_every", str(job.share(0.1))),
+        *("--strategy.refine_stop_iter", str(job.share(0.8)), "--sh_degree_interval", third),
+    ]
+
+
 TRIALS = {
     "fudan": Trial("fudan-zvg/4d-gaussian-splatting", "transforms", HELD_OUT, _fudan, seeded=True),
     "4c4d": Trial("yangzf-1023/4C4D", "transforms", HELD_OUT, _4c4d, seeded=True),
@@ -215,6 +226,11 @@ TRIALS = {
     ),
     "ex4dgs": Trial(
         "juno181/Ex4DGS", "colmap_frames", HELD_OUT[:1], _ex4dgs, scored_on="the first held-out camera", points=300
+    ),
+    "gsplat": Trial(
+        *("nerfstudio-project/gsplat", "gsplat", HELD_OUT, _gsplat, gsplat_stats),
+        scored_on="all held-out cameras at the first frame",
+        script="examples/simple_trainer.py",
     ),
 }
 """By the name that the launcher knows it by."""
