@@ -1,4 +1,4 @@
-"""`d2 bench trainers FOLDER`: the official trainers, unedited: bare, with D2 attached without hooks, and with all hooks.
+"""`d2 bench trainers FOLDER`: the official trainers, unedited: bare, with D2 without hooks, and with all.
 
 FOLDER holds one checkout per repository, named as its repository is. Each runs its own script for some hundred
 iterations on recordings that `d2 export-capture` wrote in its layout, and is judged by its own report of held-out

@@ -56,7 +56,7 @@ def main(words: list[str]) -> int:
     places[0].write_text(json_text(outcome, str(places[0])), encoding="utf-8")
     if options.repository in SCORERS:
         psnr = SCORERS[options.repository](objects, *places[1:])
-        print(f"[held out] iteration {objects.options.iterations}: PSNR {psnr}")
+        sys.stdout.write(f"\n[held out] iteration {objects.options.iterations}: PSNR {psnr}\n")
     return 0
 
 

@@ -97,7 +97,10 @@ def worst(bare: Sequence[Row], attached: Sequence[Row]) -> str:
         for row, other in pairs(bare, attached)
         for number in row["psnr"].keys() & other["psnr"].keys()
     ]
-    return "{0:+.2f} at {1}".format(*min(gains)) if gains else "-"
+    if not gains:
+        return "-"
+    gain, number = min(gains)
+    return f"{gain:+.2f} at {number}"
 
 
 def _spread(values: Sequence[float], sign: str = "") -> str:

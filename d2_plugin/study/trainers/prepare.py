@@ -33,7 +33,7 @@ class Recording:
     @property
     def seconds(self) -> float:
         """Length of the clip: one frame more than its last begins."""
-        opened = open_capture(self.capture, frames=(0, self.frames - 1))
+        opened = open_capture(self.capture)
         return self.frames / opened.fps
 
 
@@ -64,7 +64,7 @@ def _exported(
     if not output.is_dir():
         asked = CaptureExport(
             *(recording.capture, trial.layout, output, trained, held_out),  # type: ignore[arg-type]  # a known layout
-            frames=(0, recording.frames - 1),
+            frames=tuple(range(recording.frames)),
             downscale=recording.downscale,
             points=trial.points,
         )

@@ -52,7 +52,7 @@ class Job:
     @property
     def reports(self) -> list[str]:
         """The iterations at which a trainer is asked for its report."""
-        return [str(self.share(part)) for part in (0.1, 0.25, 0.5, 0.75, 1.0)]
+        return [str(self.share(part)) for part in (0.25, 0.5, 0.75, 1.0)]
 
 
 def free_port() -> str:
