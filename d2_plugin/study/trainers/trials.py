@@ -15,7 +15,6 @@ from typing import Any
 
 from d2_plugin.reading import json_text, parse_json
 
-
 TRAINED, HELD_OUT = ("00", "02", "05", "07"), ("01", "03", "04", "06")
 """Cameras of the recordings."""
 
