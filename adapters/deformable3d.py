@@ -31,7 +31,10 @@ class Deformable3DAdapter(InriaAdapter):
     Args:
         gaussians: the model, after `training_setup`.
         deform: its `DeformModel`.
-        warm_up: iteration from which the field is used (opt.warm_up).
+        warm_up: iteration from which the field is used (opt.warm_up); hooks wait for it.
+        in_warm_up: whether hooks run before it all the same. Until then the trainer fits one still scene to all
+            instants, which the prior of anything that moves contradicts; and its own reports are already drawn with
+            the untrained field, whose random offsets of about .03 units small Gaussians do not bear.
         is_6dof: whether the field returns rigid motions [N, 4, 4] (dataset.is_6dof); read from the network by default.
         settings: constants of its rasterizer, where they were changed.
         key: finds the prior of a camera; needed where the picture's name does not say camera and frame
@@ -44,12 +47,13 @@ class Deformable3DAdapter(InriaAdapter):
         deform: Any,
         *,
         warm_up: int = 3000,
+        in_warm_up: bool = False,
         is_6dof: bool | None = None,
         settings: RasterSettings | None = None,
         key: KeyOf | None = None,
     ) -> None:
         super().__init__(gaussians, settings, key)
-        self.deform, self.warm_up = deform, warm_up
+        self.deform, self.warm_up, self.in_warm_up = deform, warm_up, in_warm_up
         self.is_6dof = bool(getattr(deform.deform, "is_6dof", False)) if is_6dof is None else is_6dof
         self.inversion: Inversion | None = None
 
@@ -62,6 +66,10 @@ class Deformable3DAdapter(InriaAdapter):
     def deforms(self) -> bool:
         """Whether the field is used in the present step, the one given to `begin_step`."""
         return self._step >= self.warm_up
+
+    def active(self, step: int) -> bool:
+        """Whether the model can follow time at this step, so that the prior of an instant fits it."""
+        return self.in_warm_up or step >= self.warm_up
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable in the model's and in the field's parameters."""

@@ -81,7 +81,7 @@ def commit_of(checkout: Path) -> str | None:
     """The commit of a checkout, with + where files differ from it; None where git knows nothing of the folder."""
     found = [
         subprocess.run(["git", "-C", str(checkout), *words], capture_output=True, text=True, check=False)
-        for words in (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
+        for words in (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "--untracked-files=no", "--", "*.py"))
     ]
     if any(result.returncode for result in found):
         return None

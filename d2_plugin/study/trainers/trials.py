@@ -159,7 +159,7 @@ def _hust4d(job: Job) -> list[str]:
     }
     planes = {"grid_dimensions": 2, "input_coordinate_dim": 4, "output_coordinate_dim": 16}
     hidden = {
-        "kplanes_config": planes | {"resolution": [64, 64, 64, max(2, job.frames // 2)]},
+        "kplanes_config": planes | {"resolution": [64, 64, 64, max(4, job.frames // 2)]},
         **{"multires": [1, 2], "defor_depth": 0, "net_width": 64, "plane_tv_weight": 0.0002},
         **{"time_smoothness_weight": 0.001, "l1_time_planes": 0.0001},
     }
