@@ -119,6 +119,10 @@ class GsplatSession(Session):
             found = importlib.import_module(module)
             setattr(found, attribute, self._drawing(getattr(found, attribute)))
 
+    def _source(self) -> str | None:
+        """What the script's parser reads."""
+        return getattr(self.objects.scene, "data_dir", None)
+
     def _attaching_to(self, initialize_state: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(initialize_state)
         def attaching(*arguments: Any, **named: Any) -> Any:

@@ -140,13 +140,17 @@ class Session:
 
     def _export_read(self, config: D2Config) -> Path | None:
         """The export of the prior's capture that the trainer reads, by the folder that its Scene was given."""
-        arguments, _ = self.objects.given.get("scene", ((), {}))
-        source = getattr(arguments[0], "source_path", None) if arguments else None
+        source = self._source()
         if source is None or config.prior is None or config.exported is not None or self.store is not None:
             return None
         from d2_plugin.priors.disk.exported import export_read
 
         return export_read(Path(config.prior), Path(source))
+
+    def _source(self) -> str | None:
+        """The folder that the trainer reads."""
+        arguments, _ = self.objects.given.get("scene", ((), {}))
+        return getattr(arguments[0], "source_path", None) if arguments else None
 
     def _listening(self, update_learning_rate: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(update_learning_rate)

@@ -38,7 +38,8 @@ import torch
 from tiny import make_views
 
 class Parser:
-    def __init__(self):
+    def __init__(self, data_dir="data"):
+        self.data_dir = data_dir
         views = make_views()[:3]
         self.camtoworlds = torch.stack([torch.linalg.inv(v.T_camera_world) for v in views]).double().numpy()
         self.image_names = [f"{v.camera}_{v.frame:04d}.png" for v in views]
@@ -149,6 +150,19 @@ def test_hooks_insert_remove_and_pull_on_depth() -> None:
     assert {entry.hook for entry in session.hooks.trace} == {"densify", "prune", "depth_loss"}
     assert session.objects.options.max_steps == 40
     assert session._iteration == 40
+
+
+@pytest.mark.usefixtures("checkout")
+def test_the_export_that_the_parser_reads_renames_the_cameras(tmp_path: Path, monkeypatch) -> None:
+    """As a run of the real script showed: its pictures are called cam05 where the prior says 01."""
+    from d2_plugin.priors.disk import exported
+
+    read: list[Path] = []
+    monkeypatch.setattr(exported, "export_read", lambda prior, source: read.append(source))
+    session = GsplatSession(recipe("gsplat"), D2Config(prior="prior"))
+    session.objects.scene = SimpleNamespace(data_dir=str(tmp_path))
+    assert session._configured(40) == D2Config(prior="prior")
+    assert read == [tmp_path]
 
 
 @pytest.mark.usefixtures("checkout")

@@ -56,7 +56,8 @@ def main(words: list[str]) -> int:
     places[0].write_text(json_text(outcome, str(places[0])), encoding="utf-8")
     if options.repository in SCORERS:
         psnr = SCORERS[options.repository](objects, *places[1:])
-        sys.stdout.write(f"\n[held out] iteration {objects.options.iterations}: PSNR {psnr}\n")
+        assert sys.__stdout__ is not None  # the trainers' safe_state puts another sys.stdout into its place
+        sys.__stdout__.write(f"\n[held out] iteration {objects.options.iterations}: PSNR {psnr}\n")
     return 0
 
 

@@ -176,7 +176,7 @@ def _spacetime(job: Job) -> list[str]:
         **{"densification_interval": job.share(0.1), "position_lr_max_steps": job.iterations},
     }
     return [
-        *("--quiet", "--eval", "--source_path", str(job.data / "colmap_0"), "--model_path", str(job.model)),
+        *("--eval", "--source_path", str(job.data / "colmap_0"), "--model_path", str(job.model)),
         *("--configpath", job.write("config.json", json_text(config, "config.json")), "--densify", "3"),
         *("--iterations", str(job.iterations), "--save_iterations", str(job.iterations)),
     ]
@@ -192,7 +192,7 @@ def _ex4dgs(job: Job) -> list[str]:
         **{"position_lr_max_steps": job.iterations, "dynamic_position_lr_max_steps": job.iterations},
     }
     path = job.write("config.json", json_text(config, "config.json"))
-    words = ["--quiet", "-s", str(job.data), "-m", str(job.model), "--configpath", path]
+    words = ["-s", str(job.data), "-m", str(job.model), "--configpath", path]
     return [*words, "--test_iterations", *job.reports, "--port", free_port()]
 
 
