@@ -13,6 +13,7 @@ so a column of row numbers in there shows afterwards what became of each row.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -90,7 +91,8 @@ class GsplatAdapter:
             raise D2Error(
                 f"a camera of type {type(camera).__name__} is no View: pass views, or give the adapter `view`"
             )
-        return self._view(camera)
+        seen, like = self._view(camera), self.parameters["means"]  # data sets leave their items on the CPU
+        return replace(seen, T_camera_world=seen.T_camera_world.to(like), K=seen.K.to(like))
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable."""

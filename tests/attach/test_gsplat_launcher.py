@@ -1,4 +1,4 @@
-"""gsplat's simple_trainer through the launcher: its modules in small, its rasterizer stood in for, its cameras by pose."""
+"""gsplat's simple_trainer through the launcher: its modules in small, a stand-in to draw, cameras told by pose."""
 
 from __future__ import annotations
 

@@ -42,8 +42,8 @@ def test_what_a_script_needs_is_read_from_the_files_it_reaches(script: Path) -> 
 
 def test_what_an_option_imports_is_stood_in_for_but_not_asked_for(script: Path, monkeypatch) -> None:
     """gsplat's script imports torch_dgx for `--backend dgx`, 4DGaussians' mmcv for `--configs`."""
-    text = "if __name__ == '__main__':\n    import absent_three\n    if torch.option == 'dgx':\n        import absent_four\n"
-    script.write_text(f"import torch\n{text}")
+    option = "    if torch.option == 'dgx':\n        import absent_four\n"
+    script.write_text(f"import torch\nif __name__ == '__main__':\n    import absent_three\n{option}")
     assert set(needed(script)) == {"torch", "absent_three", "absent_four"}
     assert set(needed(script, conditional=False)) == {"torch", "absent_three"}
     with pytest.raises(D2Error, match="run `pip install absent_three`"):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -182,25 +184,26 @@ def test_a_checkout_is_known_by_its_commit(tmp_path: Path) -> None:
 
 CHECKOUTS = os.environ.get("D2_CHECKOUTS")
 ITERATIONS = int(os.environ.get("D2_CHECKOUT_ITERATIONS", "60"))
-STUDIO = Path(os.environ.get("D2_CAPTURES", TESTS.parents[1] / "shared" / "data")) / "studio"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TRIALS)
-def test_the_official_trainer_bare_without_hooks_and_attached(name: str, tmp_path: Path) -> None:
+def test_the_official_trainer_bare_without_hooks_and_attached(
+    name: str, tmp_path: Path, shared_data: Callable[[str], Path], capsys: pytest.CaptureFixture
+) -> None:
     """D2_CHECKOUTS is a folder with a checkout of each repository; D2_CHECKOUT_ITERATIONS how long each run is."""
     if CHECKOUTS is None:
         pytest.skip("D2_CHECKOUTS is not set: give a folder with one checkout per repository")
     if not (Path(CHECKOUTS) / TRIALS[name].folder).is_dir():
         pytest.skip(f"no {TRIALS[name].folder} in {CHECKOUTS}")
-    if not STUDIO.is_dir():
-        pytest.skip(f"no {STUDIO}: give the folder of the captures as D2_CAPTURES")
     scale = 1 if name == "fudan" else 2  # its report measures MS-SSIM, which needs pictures more than 160 pixels high
     settings = TrainersBench(
-        Path(CHECKOUTS), (STUDIO,), (name,), iterations=ITERATIONS, frames=3, downscale=scale,
+        Path(CHECKOUTS), (shared_data("studio"),), (name,), iterations=ITERATIONS, frames=3, downscale=scale,
         work=tmp_path / "work", output=tmp_path / "rows.jsonl",
     )  # fmt: skip
-    print(run(settings))
+    text = run(settings)
+    with capsys.disabled():
+        sys.stdout.write(f"\n{text}\n")
     bare, without, attached = read_rows(settings.output)
     assert [row["failed"] for row in (bare, without, attached)] == [None] * 3
     assert bare["psnr"].keys() == attached["psnr"].keys() != set()
