@@ -7,6 +7,7 @@ d2.step(iteration)                                                              
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import torch
@@ -18,6 +19,8 @@ from d2_plugin.protocol import Points, RasterSettings, Splats, View
 from .inria import InriaAdapter
 from .inverse_deformation import Inversion, invert_at_times
 from .keys import KeyOf
+
+log = logging.getLogger(__name__)
 
 
 class Deformable3DAdapter(InriaAdapter):
@@ -54,6 +57,8 @@ class Deformable3DAdapter(InriaAdapter):
     ) -> None:
         super().__init__(gaussians, settings, key)
         self.deform, self.warm_up, self.in_warm_up = deform, warm_up, in_warm_up
+        if warm_up > 1 and not in_warm_up:
+            log.info("the trainer uses its field from iteration %d on: hooks wait until then", warm_up)
         self.is_6dof = bool(getattr(deform.deform, "is_6dof", False)) if is_6dof is None else is_6dof
         self.inversion: Inversion | None = None
 
