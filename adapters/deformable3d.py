@@ -7,6 +7,7 @@ d2.step(iteration)                                                              
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import torch
@@ -18,6 +19,8 @@ from d2_plugin.protocol import Points, RasterSettings, Splats, View
 from .inria import InriaAdapter
 from .inverse_deformation import Inversion, invert_at_times
 from .keys import KeyOf
+
+log = logging.getLogger(__name__)
 
 
 class Deformable3DAdapter(InriaAdapter):
@@ -31,7 +34,10 @@ class Deformable3DAdapter(InriaAdapter):
     Args:
         gaussians: the model, after `training_setup`.
         deform: its `DeformModel`.
-        warm_up: iteration from which the field is used (opt.warm_up).
+        warm_up: iteration from which the field is used (opt.warm_up); hooks wait for it.
+        in_warm_up: whether hooks run before it all the same. Until then the trainer fits one still scene to all
+            instants, which the prior of anything that moves contradicts; and its own reports are already drawn with
+            the untrained field, whose random offsets of about .03 units small Gaussians do not bear.
         is_6dof: whether the field returns rigid motions [N, 4, 4] (dataset.is_6dof); read from the network by default.
         settings: constants of its rasterizer, where they were changed.
         key: finds the prior of a camera; needed where the picture's name does not say camera and frame
@@ -44,12 +50,15 @@ class Deformable3DAdapter(InriaAdapter):
         deform: Any,
         *,
         warm_up: int = 3000,
+        in_warm_up: bool = False,
         is_6dof: bool | None = None,
         settings: RasterSettings | None = None,
         key: KeyOf | None = None,
     ) -> None:
         super().__init__(gaussians, settings, key)
-        self.deform, self.warm_up = deform, warm_up
+        self.deform, self.warm_up, self.in_warm_up = deform, warm_up, in_warm_up
+        if warm_up > 1 and not in_warm_up:
+            log.info("the trainer uses its field from iteration %d on: hooks wait until then", warm_up)
         self.is_6dof = bool(getattr(deform.deform, "is_6dof", False)) if is_6dof is None else is_6dof
         self.inversion: Inversion | None = None
 
@@ -62,6 +71,10 @@ class Deformable3DAdapter(InriaAdapter):
     def deforms(self) -> bool:
         """Whether the field is used in the present step, the one given to `begin_step`."""
         return self._step >= self.warm_up
+
+    def active(self, step: int) -> bool:
+        """Whether the model can follow time at this step, so that the prior of an instant fits it."""
+        return self.in_warm_up or step >= self.warm_up
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable in the model's and in the field's parameters."""

@@ -13,6 +13,7 @@ so a column of row numbers in there shows afterwards what became of each row.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -25,6 +26,8 @@ from d2_plugin.gaussians.slicing import unit_quaternions
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
+
+from .keys import ViewsByPose
 
 ROWS = "d2_rows"
 """The column in the strategy's state: the number of each row plus one, since gsplat marks what is new with zeros."""
@@ -46,6 +49,7 @@ class GsplatAdapter:
         state: the strategy's state; without it, only appended rows are understood (MCMC's `sample_add`), and anything
             else resets what hooks count, with a warning.
         view: from the trainer's camera to a `View`; not needed where the trainer passes views.
+        parser: of gsplat's examples, in the place of `view`: items of its data sets are then told by their poses.
         slice_at: the 3D Gaussians of a view, for models that change over time; by default the parameters as they are.
         new_rows: raw rows of further parameters (velocities, times, ...) for inserted points.
         settings: constants of the rasterizer; by default gsplat's, whose near plane is .01.
@@ -58,6 +62,7 @@ class GsplatAdapter:
         state: MutableMapping[str, Any] | None = None,
         *,
         view: Callable[[object], View] | None = None,
+        parser: Any = None,
         slice_at: SliceOf | None = None,
         new_rows: RowsOf | None = None,
         settings: RasterSettings | None = None,
@@ -67,7 +72,8 @@ class GsplatAdapter:
                 raise D2Error(f"parameters have {', '.join(parameters)} but no '{name}', which gsplat's names include")
         self.parameters, self.optimizers, self.state = parameters, optimizers, state
         self.settings = settings or RasterSettings(near=0.01)
-        self._view, self._slice, self._new_rows = view, slice_at, new_rows
+        self._view = view if parser is None else ViewsByPose(parser)
+        self._slice, self._new_rows = slice_at, new_rows
         self._listeners: list[ResizeListener] = []
         self._known = 0
         self._renumber()
@@ -85,7 +91,8 @@ class GsplatAdapter:
             raise D2Error(
                 f"a camera of type {type(camera).__name__} is no View: pass views, or give the adapter `view`"
             )
-        return self._view(camera)
+        seen, like = self._view(camera), self.parameters["means"]  # data sets leave their items on the CPU
+        return replace(seen, T_camera_world=seen.T_camera_world.to(like), K=seen.K.to(like))
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable."""

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.protocol import View
 
 
 class PriorKey(NamedTuple):
@@ -118,3 +119,35 @@ class KeysByPose:
                 f"{self.names[nearest]}, differs by {float(distances[nearest]):.3g}): give poses in the trainer's world"
             )
         return PriorKey(self.names[nearest], self.frame(camera))
+
+
+class ViewsByPose:
+    """Views of gsplat's data sets, whose items have no names: camera and frame are those of the picture at that pose.
+
+    Args:
+        parser: `datasets.colmap.Parser` of gsplat's examples: `camtoworlds` [P, 4, 4] and `image_names`.
+        key: from the name of a picture to its key.
+        tolerance: how far two poses may lie apart to be the same, in the world's unit per unit of distance.
+    """
+
+    def __init__(self, parser: Any, key: Callable[[str], PriorKey] = key_from_picture, tolerance: float = 1e-4) -> None:
+        self.poses = torch.as_tensor(parser.camtoworlds).double().cpu()
+        self.keys, self.tolerance = [key(name) for name in parser.image_names], tolerance
+
+    def __call__(self, item: Any) -> View:
+        """The view of an item or a batch of one: camtoworld [4, 4], K [3, 3], and image [H, W, 3] or width and height.
+
+        Raises:
+            D2Error: no picture has that pose, or several have.
+        """
+        pose, K = item["camtoworld"].detach().reshape(4, 4), item["K"].detach().reshape(3, 3)
+        height, width = item["image"].shape[-3:-1] if "image" in item else (item["height"], item["width"])
+        distances = (self.poses - pose.double().cpu()).abs().flatten(1).amax(1)
+        near = torch.nonzero(distances < self.tolerance * max(1.0, float(pose.abs().max()))).squeeze(-1)
+        if len(near) != 1:
+            raise D2Error(
+                f"{len(near)} pictures have the pose of this view: gsplat's pictures are told by their poses, so give "
+                "it one instant of the recording (`d2 export-capture --format gsplat`), and no pose_opt or pose_noise"
+            )
+        key = self.keys[int(near)]
+        return View(key.camera, key.frame, 0.0, torch.linalg.inv(pose), K, int(width), int(height))

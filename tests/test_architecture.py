@@ -42,7 +42,7 @@ ROOMS = {
     "plugin": "ground config hooks (priors)",
     "runs": "ground config plugin hooks priors captures gaussians rasterizer",
     "viewing": "ground config plugin hooks priors captures gaussians rasterizer runs",
-    "study": "ground config plugin hooks priors captures gaussians rasterizer runs viewing testing",
+    "study": "ground config plugin hooks priors captures gaussians rasterizer runs viewing testing (attach)",
     "commands": "ground config plugin hooks priors captures gaussians rasterizer runs viewing study testing (attach)",
     "testing": "ground config plugin hooks rasterizer gaussians",
     "compat": "ground gaussians rasterizer",

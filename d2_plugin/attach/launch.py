@@ -17,11 +17,15 @@ from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 
 from .cpu import run_on_cpu
+from .gsplat import GsplatSession, put_in_place
 from .originals import provide
 from .packages import stand_in_for
-from .recipes import RECIPES, recipe
+from .recipes import RECIPES, Recipe, recipe
 from .repairs import repair
 from .session import Session
+
+SESSIONS: dict[str, type[Session]] = {"trainer": Session, "gsplat": GsplatSession}
+"""By the kind of a recipe, what follows its run."""
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +34,7 @@ def main(arguments: Sequence[str]) -> int:
     """Run a script with D2 attached; a mistake in the input is one sentence on stderr and exit code 2."""
     logging.basicConfig(level=logging.INFO, format="d2: %(message)s")
     try:
-        session = launch(*_parsed(arguments))
+        session = launch(*parsed(arguments))
     except D2Error as error:
         sys.stderr.write(f"d2: {error}\n")
         return 2
@@ -41,10 +45,23 @@ def main(arguments: Sequence[str]) -> int:
 
 def launch(options: argparse.Namespace, command: Sequence[str]) -> Session | None:
     """Prepare the process for the repository and run `command`, its script and arguments, inside it."""
+    found = prepare(options, command)
+    session = None
+    if options.d2 is not None:
+        session = SESSIONS[found.kind](found, options.d2, exported=options.exported)
+        session.wrap()
+    runpy.run_path(command[0], run_name="__main__")
+    return session
+
+
+def prepare(options: argparse.Namespace, command: Sequence[str]) -> Recipe:
+    """All that has to be done before the script runs, but D2 itself: paths, stand-ins, repairs; returns the recipe."""
     script = Path(command[0])
     if not script.is_file():
         raise D2Error(f"no script at {script}: give the repository's train.py and its arguments after --")
     _check_device(options.cpu)
+    if options.d2 is not None:
+        D2Config.from_toml(options.d2)  # a mistake is told now, not when the trainer has read its pictures
     sys.argv = list(command)
     found = recipe(options.repository)
     folder = script.resolve().parent
@@ -54,14 +71,10 @@ def launch(options: argparse.Namespace, command: Sequence[str]) -> Session | Non
     provide(found.originals, script.parent, options.cpu)
     if options.cpu:
         run_on_cpu()
-    session = None
-    if options.d2 is not None:
-        D2Config.from_toml(options.d2)  # a mistake is told now, not when the trainer has read its pictures
-        session = Session(found, options.d2, exported=options.exported)
-        session.wrap()
+    if found.kind == "gsplat":
+        put_in_place()
     os.execv = _refuse_restart  # type: ignore[assignment]
-    runpy.run_path(str(script), run_name="__main__")
-    return session
+    return found
 
 
 def _check_device(cpu: bool) -> None:
@@ -80,7 +93,8 @@ def _refuse_restart(path: str, arguments: Sequence[str]) -> NoReturn:
     )
 
 
-def _parsed(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+def parsed(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+    """Options of the launcher, and the command after `--`."""
     arguments = list(arguments)
     at = arguments.index("--") if "--" in arguments else len(arguments)
     options, command = _parser().parse_args(arguments[:at]), arguments[at + 1 :]

@@ -23,8 +23,13 @@ def needs(repository: str, path: Path) -> str:
     if not script.is_file():
         raise D2Error(f"no {found.script} in {path}: give the folder of {repository}'s repository, or its script")
     replaced = {original.name for original in found.originals}
-    absent = missing(script, replaced)
-    to_install = [name for name in absent if name not in STAND_INS]
+    beside = [script.parent / name for name in found.folders]  # gsplat's examples import gsplat, one folder up
+    absent = {
+        name: where for name, where in missing(script, replaced).items() if not any((f / name).is_dir() for f in beside)
+    }
+    certain = needed(script, conditional=False)
+    to_install = [name for name in absent if name not in STAND_INS and name in certain]
+    perhaps = [name for name in absent if name not in STAND_INS and name not in certain]
     lines = [f"{repository}: {script} imports {len(needed(script))} packages at once"]
     lines += [f"{name:{WIDTH}}missing ({absent[name]}): run `{pip_command([name])}`" for name in to_install]
     lines += [
@@ -32,6 +37,7 @@ def needs(repository: str, path: Path) -> str:
         for name in absent
         if name in STAND_INS
     ]
+    lines += [f"{name:{WIDTH}}missing ({absent[name]}): some options alone import it" for name in perhaps]
     lines += [_built(original, script.parent) for original in found.originals]
     if not torch.cuda.is_available():
         lines.append(f"{'GPU':{WIDTH}}none: give the launcher --cpu, which is slow")

@@ -51,6 +51,8 @@ STAND_INS = {
     ),
     "open3d": StandIn({}, "the trainer imports it and calls nothing of it"),
     "lpips": StandIn({}, "the trainer imports it and calls nothing of it while training"),
+    "nerfview": StandIn({}, "gsplat's script imports it for its viewer: give --disable_viewer"),
+    "viser": StandIn({}, "gsplat's script imports it for its viewer: give --disable_viewer"),
     "pointops2_cuda": StandIn({}, "it is built in CUDA and called for lambda_rigid > 0 alone"),
 }
 """By the name that is imported. A new one is a row here."""
@@ -64,10 +66,11 @@ def _standard_library() -> frozenset[str]:
     return getattr(sys, "stdlib_module_names", frozenset())
 
 
-def needed(script: Path) -> dict[str, str]:
+def needed(script: Path, conditional: bool = True) -> dict[str, str]:
     """Packages that `script` and the files of its repository import at once, and where first; from the files alone.
 
     Imports inside functions and inside `try` wait or may fail, so they are left out, and so is the standard library.
+    Those under an `if` depend on options; they are left out unless `conditional`.
     """
     found: dict[str, str] = {}
     root, seen, waiting = script.parent, set[Path](), [script]
@@ -77,7 +80,7 @@ def needed(script: Path) -> dict[str, str]:
             continue
         seen.add(file)
         roots = (root, file.parent, *(folder for folder in file.parents if root in folder.parents))
-        for name, line in _imports(file):
+        for name, line in _imports(file, conditional):
             inside = next((place for base in roots for place in _inside(base, name)), None)
             top = name.split(".")[0]
             if inside is not None:
@@ -100,11 +103,12 @@ def stand_in_for(script: Path, replaced: set[str]) -> None:
         D2Error: packages are missing that nothing stands in for; one sentence with the pip command.
     """
     absent = missing(script, replaced)
-    unknown = [name for name in absent if name not in STAND_INS]
+    certain = needed(script, conditional=False)
+    unknown = [name for name in absent if name not in STAND_INS and name in certain]
     if unknown:
         places = ", ".join(f"{name} ({absent[name]})" for name in unknown)
         raise D2Error(f"the trainer imports what is not installed: {places}; run `{pip_command(unknown)}`")
-    for name in absent:
+    for name in absent.keys() & STAND_INS.keys():
         sys.meta_path.append(_Finder(name))
         log.warning("%s is missing: D2 stands in for what training calls of it (%s)", name, STAND_INS[name].why)
 
@@ -123,21 +127,22 @@ def _is_there(name: str) -> bool:
         return False
 
 
-def _imports(file: Path) -> Iterator[tuple[str, int]]:
+def _imports(file: Path, conditional: bool) -> Iterator[tuple[str, int]]:
     """Absolute names that a file imports when it is loaded, with lines; `from a import b` gives a.b and a."""
-    for node in _at_once(ast.parse(file.read_text(encoding="utf-8", errors="replace"))):
+    for node in _at_once(ast.parse(file.read_text(encoding="utf-8", errors="replace")), conditional):
         if isinstance(node, ast.Import):
             yield from ((alias.name, node.lineno) for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
             yield from ((f"{node.module}.{alias.name}", node.lineno) for alias in node.names)
 
 
-def _at_once(node: ast.AST) -> Iterator[ast.AST]:
+def _at_once(node: ast.AST, conditional: bool) -> Iterator[ast.AST]:
     """Statements that run when the module is loaded and whose failure is not caught."""
     for child in ast.iter_child_nodes(node):
-        if not isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.Try)):
+        depends = isinstance(child, ast.If) and "__name__" not in ast.dump(child.test) and not conditional
+        if not depends and not isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.Try)):
             yield child
-            yield from _at_once(child)
+            yield from _at_once(child, conditional)
 
 
 def _inside(root: Path, name: str) -> Iterator[Path]:
@@ -192,6 +197,10 @@ class _NotCallable:
         if name.startswith("__"):
             raise AttributeError(name)
         return _NotCallable(f"{self._name}.{name}")
+
+    def __mro_entries__(self, bases: tuple[Any, ...]) -> tuple[type, ...]:
+        """A class of the trainer's may derive from it."""
+        return (object,)
 
     def __call__(self, *_: Any, **__: Any) -> Any:
         package = self._name.split(".")[0]

@@ -21,7 +21,10 @@ class Objects:
     model: Any = None
     options: Any = None
     """What `training_setup` was given: the optimization parameters."""
+    state: Any = None
+    """Of gsplat's strategy."""
     scene: Any = None
+    """What knows the cameras."""
     deform: Any = None
     given: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = field(default_factory=dict)
     """By the name of the field, what its instance was made from: arguments, and named ones."""
@@ -54,6 +57,8 @@ class Recipe:
     """Classes that the repository may train, where they are imported from."""
     renderers: tuple[tuple[str, str], ...] = (("gaussian_renderer", "render"),)
     """Functions that draw a training view."""
+    kind: str = "trainer"
+    """`trainer`: a GaussianModel with training_setup; `gsplat`: dicts and a strategy."""
     script: str = "train.py"
     """What trains, relative to the repository."""
     folders: tuple[str, ...] = ()
@@ -94,6 +99,10 @@ def _spacetime(adapter: Adapter, objects: Objects) -> Backbone:
 def _ex4dgs(adapter: Adapter, objects: Objects) -> Backbone:
     dataset = objects.given["scene"][0][0]
     return adapter(objects.model, near=dataset.near, far=dataset.far)
+
+
+def _gsplat(adapter: Adapter, objects: Objects) -> Backbone:
+    return adapter(*objects.model, objects.state, parser=objects.scene)
 
 
 _SPLATTING = "thirdparty.gaussian_splatting"
@@ -150,6 +159,16 @@ RECIPES = {
         _ex4dgs,
         (Original("diff_gaussian_rasterization_df", "d2_plugin.compat.ex4dgs"), _KNN),
         models=(("scene.c_gaussian_model", "CGaussianModel"),),
+    ),
+    "gsplat": Recipe(
+        "gsplat",
+        _gsplat,
+        (Original("gsplat.csrc", "d2_plugin.compat.gsplat"),),
+        kind="gsplat",
+        models=(),
+        script="examples/simple_trainer.py",
+        folders=("..",),
+        seen={"scene": ("datasets.colmap", "Parser")},
     ),
 }
 

@@ -23,6 +23,37 @@ from .recipes import Objects, Recipe, adapter_of
 log = logging.getLogger(__name__)
 
 
+def remember(recipe: Recipe, objects: Objects) -> None:
+    """Keep the trainer's own objects as they come into being; what they compute is not touched."""
+    for name, place in recipe.seen.items():
+        _keep_instances(_found(*place), name, objects)
+    for place in recipe.models:
+        model = _found(*place)
+        model.training_setup = _keeping(model.training_setup, objects)
+
+
+def _keep_instances(kind: type, name: str, objects: Objects) -> None:
+    original = kind.__init__  # type: ignore[misc]
+
+    @wraps(original)
+    def remembering(instance: Any, *arguments: Any, **named: Any) -> None:
+        # Before the call: a scene builds its model inside, and may be asked for before it returns.
+        setattr(objects, name, instance)
+        objects.given[name] = arguments, named
+        original(instance, *arguments, **named)
+
+    kind.__init__ = remembering  # type: ignore[misc]  # a foreign class, overridden for all its instances
+
+
+def _keeping(training_setup: Callable[..., Any], objects: Objects) -> Callable[..., Any]:
+    @wraps(training_setup)
+    def keeping(model: Any, options: Any, *arguments: Any, **named: Any) -> Any:
+        objects.model, objects.options = model, options
+        return training_setup(model, options, *arguments, **named)
+
+    return keeping
+
+
 class AddGradient(torch.autograd.Function):
     """The picture unchanged; its backward pass also sends `weight` into `term`, as if weight * term were in the loss.
 
@@ -61,10 +92,12 @@ class Session:
         self._iteration, self._told = 0, False
         self._drawn, self._batch = 0, 0
 
+    remember = staticmethod(remember)
+    """How this kind of script's own objects are kept; for a bare run as well."""
+
     def wrap(self) -> None:
         """Override the choke points of the repository's modules; call before its script runs."""
-        for name, place in self.recipe.seen.items():
-            self._remember(_found(*place), name)
+        self.remember(self.recipe, self.objects)
         for place in self.recipe.models:
             model = _found(*place)
             model.training_setup = self._attaching(model.training_setup)
@@ -86,23 +119,10 @@ class Session:
         else:
             self.hooks.telling.end()
 
-    def _remember(self, kind: type, name: str) -> None:
-        original = kind.__init__  # type: ignore[misc]
-
-        @wraps(original)
-        def remembering(instance: Any, *arguments: Any, **named: Any) -> None:
-            # Before the call: a scene builds its model inside, and may be asked for before it returns.
-            setattr(self.objects, name, instance)
-            self.objects.given[name] = arguments, named
-            original(instance, *arguments, **named)
-
-        kind.__init__ = remembering  # type: ignore[misc]  # a foreign class, overridden for all its instances
-
     def _attaching(self, training_setup: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(training_setup)
         def attaching(model: Any, options: Any, *arguments: Any, **named: Any) -> Any:
             result = training_setup(model, options, *arguments, **named)
-            self.objects.model, self.objects.options = model, options
             backbone = self.recipe.build(adapter_of(self.recipe), self.objects)
             iterations = getattr(options, "iterations", None)
             self.hooks = D2Hooks(self._configured(iterations), backbone, self.store)
@@ -120,13 +140,17 @@ class Session:
 
     def _export_read(self, config: D2Config) -> Path | None:
         """The export of the prior's capture that the trainer reads, by the folder that its Scene was given."""
-        arguments, _ = self.objects.given.get("scene", ((), {}))
-        source = getattr(arguments[0], "source_path", None) if arguments else None
+        source = self._source()
         if source is None or config.prior is None or config.exported is not None or self.store is not None:
             return None
         from d2_plugin.priors.disk.exported import export_read
 
         return export_read(Path(config.prior), Path(source))
+
+    def _source(self) -> str | None:
+        """The folder that the trainer reads."""
+        arguments, _ = self.objects.given.get("scene", ((), {}))
+        return getattr(arguments[0], "source_path", None) if arguments else None
 
     def _listening(self, update_learning_rate: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(update_learning_rate)

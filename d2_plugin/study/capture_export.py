@@ -20,7 +20,7 @@ class CaptureExport(Settings):
 
     capture: Annotated[Path, Positional()]
     """Folder of the recording, in any layout that d2 reads."""
-    format: Literal["transforms", "n3dv", "multipleview", "colmap", "colmap_frames"]
+    format: Literal["transforms", "n3dv", "multipleview", "colmap", "colmap_frames", "gsplat"]
     """Layout to write; docs/attach says which repository reads which."""
     output: Path
     """Folder that does not exist or is empty."""

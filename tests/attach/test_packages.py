@@ -40,6 +40,27 @@ def test_what_a_script_needs_is_read_from_the_files_it_reaches(script: Path) -> 
     assert set(missing(script, {"absent_one.part"})) == {"absent_two"}
 
 
+def test_what_an_option_imports_is_stood_in_for_but_not_asked_for(script: Path, monkeypatch) -> None:
+    """gsplat's script imports torch_dgx for `--backend dgx`, 4DGaussians' mmcv for `--configs`."""
+    option = "    if torch.option == 'dgx':\n        import absent_four\n"
+    script.write_text(f"import torch\nif __name__ == '__main__':\n    import absent_three\n{option}")
+    assert set(needed(script)) == {"torch", "absent_three", "absent_four"}
+    assert set(needed(script, conditional=False)) == {"torch", "absent_three"}
+    with pytest.raises(D2Error, match="run `pip install absent_three`"):
+        stand_in_for(script, set())
+    assert "absent_four                                     missing" in needs("fudan", script)
+    assert needs("fudan", script).splitlines()[-1] == "install what is missing: `pip install absent_three`"
+    monkeypatch.setitem(STAND_INS, "absent_four", StandIn({}, "it is made up"))
+    monkeypatch.setitem(STAND_INS, "absent_three", StandIn({}, "it is made up"))
+    stand_in_for(script, set())
+    import absent_four
+
+    class Derived(absent_four.Viewer):
+        """As gsplat's script derives its viewer from nerfview's."""
+
+    assert Derived.__mro__[1:] == (object,)
+
+
 def test_what_nothing_stands_in_for_is_one_sentence_with_the_command(script: Path) -> None:
     sentence = r"absent_one \(thirdparty.*:2\), absent_two .*run `pip install absent_one absent_two`"
     with pytest.raises(D2Error, match=sentence):

@@ -166,6 +166,7 @@ class Trainer:
     """The callbacks that matter, in the order of their priorities."""
 
     BATCH_SIZE = 2
+    NUM_ITERATIONS = 100
 
     def __init__(self, gaussians: Gaussians, dataset: list[NerficgView]) -> None:
         self.model, self.dataset = SimpleNamespace(gaussians=gaussians), dataset
@@ -224,7 +225,7 @@ def training(gaussians: Gaussians, dataset, checkpoint=None, stop: int = 10**9) 
     trainer.setup_gaussians(checkpoint[0] if checkpoint else None)
     if checkpoint:
         trainer.restore(checkpoint[0])
-    for iteration in range(checkpoint[1] if checkpoint else 0, min(100, stop)):
+    for iteration in range(checkpoint[1] if checkpoint else 0, min(Trainer.NUM_ITERATIONS, stop)):
         trainer.before(iteration)
         trainer.training_iteration(iteration)
     return SimpleNamespace(gaussians=gaussians, trainer=trainer, d2=getattr(trainer, "d2", None))

@@ -144,6 +144,7 @@ def train_step(item, params, optimizers, hexplane, deform_net, hex_optimizer, st
 
 def training(params, optimizers, hexplane, deform_net, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
     dataset, first, parser = items(), 0, SimpleNamespace(times=[0.0, 0.5])
+    cfg = SimpleNamespace(coarse_steps=20, fine_steps=80)
     hex_optimizer = torch.optim.Adam([*hexplane.parameters(), *deform_net.parameters()], lr=1e-3)
     strategy = DynamicStrategy()
     state = strategy.initialize_state(scene_scale=1.0, num_gaussians=len(params["means"]))

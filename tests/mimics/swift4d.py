@@ -134,14 +134,14 @@ def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, 
 
 
 def scene_reconstruction(gaussians, scene, stage, opt, checkpoint, stop, args=None) -> SimpleNamespace:
-    dataset, first_iter = SimpleNamespace(white_background=False), 0
+    dataset, first_iter, train_iter = SimpleNamespace(white_background=False), 0, opt.iterations
     gaussians.training_setup(opt, args)
     if checkpoint:
         (model_params, first_iter) = checkpoint
         gaussians.restore(model_params, opt)
 
     bg_color = [1, 1, 1] if dataset.white_background else [0, 0, 0]
-    for iteration in range(first_iter + 1, min(opt.iterations, stop) + 1):
+    for iteration in range(first_iter + 1, min(train_iter, stop) + 1):
         torch.manual_seed(iteration)
         stack = scene.getTrainCameras()
         viewpoint_cams = [stack[i] for i in shuffled(len(stack), iteration)[: opt.batch_size]]

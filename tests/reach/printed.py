@@ -46,8 +46,8 @@ def pages() -> list[str]:
 
 
 def printed(page: str) -> str:
-    """The first diff on a page as a patch; an empty line of context may have lost its space."""
-    text = re.search(r"```diff\n(.*?)```", (PAGES / f"{page}.md").read_text(), re.DOTALL)
+    """The first diff of a file on a page as a patch; an empty line of context may have lost its space."""
+    text = re.search(r"```diff\n(--- a/.*?)```", (PAGES / f"{page}.md").read_text(), re.DOTALL)
     assert text, f"{page}.md prints no diff"
     return "".join(f"{line or ' '}\n" for line in text[1].splitlines())
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,10 +42,10 @@ class Export:
         """The cameras that are not held out, in the capture's order."""
         return tuple(name for name in self.capture.cameras if name not in self.test_cameras)
 
-    def write_pictures(self, place: Callable[[str, int], Path]) -> None:
-        """Every frame of every camera as a lossless PNG at `place(camera, frame)`."""
+    def write_pictures(self, place: Callable[[str, int], Path], frames: Sequence[int] | None = None) -> None:
+        """Every frame (or those given) of every camera as a lossless PNG at `place(camera, frame)`."""
         for camera in self.capture.cameras:
-            for frame in self.capture.frames:
+            for frame in self.capture.frames if frames is None else frames:
                 target = place(camera, frame)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 write_png(target, self.capture.image(camera, frame))

@@ -5,6 +5,7 @@
     multipleview hustvl/4DGaussians, its layout for own recordings: sparse_/, camNN/frame_NNNNN.jpg
     colmap       everything that reads a COLMAP model: sparse/0, images/
     colmap_frames oppo-us-research/SpacetimeGaussians, juno181/Ex4DGS: colmap_N/ folders, camNN/N.png
+    gsplat       nerfstudio-project/gsplat's examples: sparse/0, images/, one instant
 
 `export.json` beside the pictures says which camera and which frame of the source became which of the export.
 """
@@ -21,6 +22,7 @@ from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.captures.export.base import Export, Written, refuse_skew, whole_folder
 from d2_plugin.captures.export.colmap import write_colmap, write_multipleview
 from d2_plugin.captures.export.colmap_frames import write_colmap_frames
+from d2_plugin.captures.export.gsplat import write_gsplat
 from d2_plugin.captures.export.n3dv import write_n3dv
 from d2_plugin.captures.export.ply import PointCloud
 from d2_plugin.captures.export.transforms_json import write_transforms
@@ -39,6 +41,7 @@ WRITERS: dict[str, Writer] = {
     "multipleview": write_multipleview,
     "colmap": write_colmap,
     "colmap_frames": write_colmap_frames,
+    "gsplat": write_gsplat,
 }
 """By the name of the layout. A new layout is one module beside this one and one row here."""
 

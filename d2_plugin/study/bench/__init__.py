@@ -22,6 +22,9 @@ BENCHMARKS = {
     "scaling": Benchmark("d2_plugin.study.bench.scaling", "ScalingBench", "priors and training over more frames"),
     "stereo": Benchmark("d2_plugin.study.bench.stereo", "StereoBench", "geometric depth: matchers and settings"),
     "training": Benchmark("d2_plugin.study.training.bench", "TrainingBench", "D², backbone and rivals at equal time"),
+    "trainers": Benchmark(
+        "d2_plugin.study.trainers.bench", "TrainersBench", "official trainers bare, without hooks, and attached"
+    ),
     "training-step": Benchmark(
         "d2_plugin.study.bench.training_step", "TrainingStepBench", "one optimizer step beside the rasterizer's part"
     ),

@@ -1,0 +1,88 @@
+"""Exports and priors that the trials share: made once in the working folder, used again by every run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from d2_plugin.captures import open_capture
+from d2_plugin.captures.export.export import EXPORT_FILE
+from d2_plugin.errors import D2Error
+from d2_plugin.study.capture_export import CaptureExport
+from d2_plugin.study.capture_export import run as export
+
+from .trials import HELD_OUT, TRAINED, Trial
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What of a capture is trained on."""
+
+    capture: Path
+    frames: int
+    """From the first."""
+    downscale: int
+
+    @property
+    def name(self) -> str:
+        """For folders of the working folder."""
+        return f"{self.capture.name}-{self.frames}-{self.downscale}"
+
+    @property
+    def seconds(self) -> float:
+        """Length of the clip: one frame more than its last begins."""
+        opened = open_capture(self.capture)
+        return self.frames / opened.fps
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """One recording as one trainer reads it."""
+
+    recording: Recording
+    data: Path
+    held_out: Path | None
+    """A second export, of the cameras that are not trained on, for a repository that has no other way to test."""
+    prior: Path
+
+
+def prepare(recording: Recording, trial: Trial, work: Path) -> Prepared:
+    """Export the recording in the trainer's layout and build its prior, where they are not there yet."""
+    named = f"{recording.name}-{trial.layout}-{len(trial.held_out)}-{trial.points}"
+    data = _exported(recording, trial, work / "exports" / named, TRAINED, trial.held_out)
+    held_out = None
+    if trial.also_held_out:
+        held_out = _exported(recording, trial, work / "exports" / f"{named}-held-out", HELD_OUT, ())
+    return Prepared(recording, data, held_out, _prior(recording, work / "priors" / recording.name))
+
+
+def _exported(
+    recording: Recording, trial: Trial, output: Path, trained: tuple[str, ...], held_out: tuple[str, ...]
+) -> Path:
+    if not output.is_dir():
+        asked = CaptureExport(
+            *(recording.capture, trial.layout, output, trained, held_out),  # type: ignore[arg-type]  # a known layout
+            frames=tuple(range(recording.frames)),
+            downscale=recording.downscale,
+            points=trial.points,
+        )
+        try:
+            export(asked)
+        except D2Error:
+            if not (output / EXPORT_FILE).is_file():  # a run beside this one wrote it meanwhile
+                raise
+    return output.resolve()
+
+
+def _prior(recording: Recording, output: Path) -> Path:
+    """Built by the command that a user has; a finished one is used again."""
+    if (output / "store.json").is_file():
+        return output.resolve()
+    words = ["priors", str(recording.capture), "--train-cameras", ",".join(TRAINED), "--output", str(output)]
+    words += ["--frames", f"0:{recording.frames - 1}", "--downscale", str(recording.downscale)]
+    done = subprocess.run([sys.executable, "-m", "d2_plugin.commands.cli", *words], check=False)
+    if done.returncode != 0:
+        raise D2Error(f"`d2 {' '.join(words)}` ended with code {done.returncode}: its output above says why")
+    return output.resolve()

@@ -1,0 +1,280 @@
+"""gsplat's simple_trainer through the launcher: its modules in small, a stand-in to draw, cameras told by pose."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from splat_scenes import random_scene
+from tiny import TinyStore, make_views
+
+from d2_plugin import D2Config, D2Error
+from d2_plugin.adapters.gsplat_dict import GsplatAdapter
+from d2_plugin.adapters.keys import ViewsByPose
+from d2_plugin.attach.gsplat import GsplatSession, put_in_place
+from d2_plugin.attach.recipes import recipe
+from d2_plugin.captures.export.gsplat import test_every as every_nth
+from d2_plugin.compat import gsplat as stand_in
+from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
+from d2_plugin.protocol import RasterSettings
+from d2_plugin.rasterizer import reference
+
+FILES = {
+    "gsplat/__init__.py": "from .rendering import rasterization\n",
+    "gsplat/csrc.py": "",
+    "gsplat/rendering.py": "def rasterization(*_, **__):\n    raise AssertionError('this needs a GPU')\n",
+    "gsplat/strategy.py": "from mimics.gsplat import DefaultStrategy as Kept\n"
+    "class DefaultStrategy(Kept): pass\nclass MCMCStrategy(Kept): pass\n",
+    "gsplat/distributed.py": "def cli(main, settings, verbose=False):\n    raise AssertionError('CUDA is required')\n",
+    "torchmetrics/image/lpip.py": "class LearnedPerceptualImagePatchSimilarity: pass\n",
+    "datasets/colmap.py": """
+import torch
+from tiny import make_views
+
+class Parser:
+    def __init__(self, data_dir="data"):
+        self.data_dir = data_dir
+        views = make_views()[:3]
+        self.camtoworlds = torch.stack([torch.linalg.inv(v.T_camera_world) for v in views]).double().numpy()
+        self.image_names = [f"{v.camera}_{v.frame:04d}.png" for v in views]
+""",
+    "simple_trainer.py": """
+import torch
+from datasets.colmap import Parser
+from gsplat.distributed import cli
+from gsplat.rendering import rasterization
+from gsplat.strategy import DefaultStrategy
+from mimics import gsplat as mimic
+from tiny import TinyFrames
+from types import SimpleNamespace
+
+class Runner:
+    def __init__(self, rank, world_rank, world_size, settings):
+        self.parser, self.settings, self.frames = Parser(), settings, TinyFrames()
+        self.splats, self.optimizers, _ = mimic.make()
+        self.strategy = DefaultStrategy()
+        self.strategy.check_sanity(self.splats, self.optimizers)
+        self.strategy_state = self.strategy.initialize_state(scene_scale=2.0)
+    def train(self):
+        for step in range(self.settings.max_steps):
+            index = step % 3
+            view, p = self.frames.views[index], self.splats
+            colors, alphas, info = rasterization(
+                means=p["means"], quats=p["quats"], scales=p["scales"].exp(), opacities=torch.sigmoid(p["opacities"]),
+                colors=torch.cat([p["sh0"], p["shN"]], 1), viewmats=view.T_camera_world[None], Ks=view.K[None],
+                width=view.width, height=view.height, sh_degree=1, packed=False)
+            info["means2d"].retain_grad()
+            (colors[0] - self.frames.image(index)).abs().mean().backward()
+            for optimizer in self.optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+            seen = SimpleNamespace(offsets=SimpleNamespace(grad=info["means2d"].grad[0]))
+            self.strategy.step_post_backward(self.splats, self.optimizers, self.strategy_state, step, seen)
+
+def main(local_rank, world_rank, world_size, settings):
+    global runner
+    runner = Runner(local_rank, world_rank, world_size, settings)
+    runner.train()
+
+def start():
+    cli(main, SimpleNamespace(max_steps=40))
+    return runner
+""",
+}
+
+
+@pytest.fixture
+def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """gsplat's modules in small, with a renderer and a launcher that fail as they do without a GPU."""
+    for name, text in FILES.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    tops = {"gsplat", "torchmetrics", "datasets", "simple_trainer"}
+    kept = {name: module for name, module in sys.modules.items() if name.split(".")[0] in tops}
+    for name in kept:
+        del sys.modules[name]
+    importlib.invalidate_caches()
+    sys.modules["gsplat.csrc"] = stand_in
+    yield tmp_path
+    for name in [name for name in sys.modules if name.split(".")[0] in tops]:
+        del sys.modules[name]
+    sys.modules.update(kept)
+
+
+def trained(config: D2Config | None) -> tuple[dict[str, torch.Tensor], GsplatSession | None]:
+    """Parameters after the script, and what followed it."""
+    torch.manual_seed(0)
+    put_in_place()
+    session = None
+    if config is not None:
+        session = GsplatSession(recipe("gsplat"), config, TinyStore())
+        session.wrap()
+    runner = importlib.import_module("simple_trainer").start()
+    return {name: value.detach() for name, value in runner.splats.items()}, session
+
+
+HOOKS = D2Config(
+    densify=DensifyConfig(start=3, stop=30, every=5, budget_per_view=15),
+    prune=PruneConfig(start=5, stop=30, every=5, patience=2, tau_p=0.6),
+    depth_loss=DepthLossConfig(every=1, weight=0.2),
+)
+
+
+def same(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
+    return all(torch.equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.usefixtures("checkout")
+def test_without_hooks_the_script_ends_with_the_same_bits() -> None:
+    bare, _ = trained(None)
+    del sys.modules["simple_trainer"]
+    assert same(bare, trained(D2Config())[0])
+
+
+@pytest.mark.usefixtures("checkout")
+def test_hooks_insert_remove_and_pull_on_depth() -> None:
+    bare, _ = trained(None)
+    del sys.modules["simple_trainer"]
+    attached, session = trained(HOOKS)
+    telling = session.hooks.telling
+    assert telling.inserted > 0
+    assert len(attached["means"]) == len(session.hooks.backbone) != len(bare["means"])
+    assert {entry.hook for entry in session.hooks.trace} == {"densify", "prune", "depth_loss"}
+    assert session.objects.options.max_steps == 40
+    assert session._iteration == 40
+
+
+@pytest.mark.usefixtures("checkout")
+def test_the_export_that_the_parser_reads_renames_the_cameras(tmp_path: Path, monkeypatch) -> None:
+    """As a run of the real script showed: its pictures are called cam05 where the prior says 01."""
+    from d2_plugin.priors.disk import exported
+
+    read: list[Path] = []
+    monkeypatch.setattr(exported, "export_read", lambda prior, source: read.append(source))
+    session = GsplatSession(recipe("gsplat"), D2Config(prior="prior"))
+    session.objects.scene = SimpleNamespace(data_dir=str(tmp_path))
+    assert session._configured(40) == D2Config(prior="prior")
+    assert read == [tmp_path]
+
+
+@pytest.mark.usefixtures("checkout")
+def test_several_gpus_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    with pytest.raises(D2Error, match="train on 2 GPUs, and D2 follows one: set CUDA_VISIBLE_DEVICES=0"):
+        trained(None)
+
+
+class TestViewsByPose:
+    PARSER = SimpleNamespace(
+        camtoworlds=np.stack([np.linalg.inv(v.T_camera_world.double().numpy()) for v in make_views()[:3]]),
+        image_names=[f"{v.camera}_{v.frame:04d}.png" for v in make_views()[:3]],
+    )
+
+    @pytest.mark.parametrize("index", [0, 1, 2])
+    def test_an_item_of_the_data_set_is_told_by_its_pose(self, index: int) -> None:
+        view = make_views()[index]
+        item = {"camtoworld": torch.linalg.inv(view.T_camera_world)[None], "K": view.K[None]}
+        found = ViewsByPose(self.PARSER)(item | {"image": torch.zeros(1, 24, 32, 3)})
+        assert (found.camera, found.frame, found.width, found.height) == (view.camera, view.frame, 32, 24)
+        torch.testing.assert_close(found.T_camera_world, view.T_camera_world)
+
+    def test_a_pose_of_two_pictures_or_of_none_is_refused(self) -> None:
+        view = make_views()[0]
+        item = {"camtoworld": torch.linalg.inv(view.T_camera_world), "K": view.K, "width": 32, "height": 24}
+        twice = SimpleNamespace(
+            camtoworlds=np.repeat(self.PARSER.camtoworlds[:1], 2, 0), image_names=["cam0_0000.png", "cam0_0001.png"]
+        )
+        with pytest.raises(D2Error, match="2 pictures have the pose of this view"):
+            ViewsByPose(twice)(item)
+        item["camtoworld"] = item["camtoworld"] + 0.5
+        with pytest.raises(D2Error, match="0 pictures have the pose of this view"):
+            ViewsByPose(self.PARSER)(item)
+
+    def test_the_adapter_takes_the_parser(self) -> None:
+        from mimics import gsplat
+
+        view = make_views()[1]
+        adapter = GsplatAdapter(*gsplat.make()[:2], {}, parser=self.PARSER)
+        item = {"camtoworld": torch.linalg.inv(view.T_camera_world), "K": view.K, "width": 32, "height": 24}
+        assert adapter.view(item).camera == "cam1"
+
+
+class TestRasterization:
+    @pytest.fixture
+    def given(self) -> tuple[dict, object]:
+        scene = random_scene(3, 40, 24, 16)
+        generator = torch.Generator().manual_seed(2)
+        quats = torch.randn(40, 4, generator=generator)
+        scales = 0.02 + 0.2 * torch.rand(40, 3, generator=generator)
+        view = scene.view
+        named = {"means": scene.means.float(), "quats": quats, "scales": scales, "opacities": scene.opacities.float()}
+        named |= {
+            "viewmats": view.T_camera_world.float()[None],
+            "Ks": view.K.float()[None],
+            "colors": scene.colors.float(),
+        }
+        return named | {"width": view.width, "height": view.height, "near_plane": 0.01}, view
+
+    def test_it_draws_what_the_reference_draws(self, given: tuple[dict, object]) -> None:
+        named, view = given
+        picture, alpha, _ = stand_in.rasterization(**named, render_mode="RGB+D", packed=False)
+        adapter = GsplatAdapter(
+            {"means": named["means"], "scales": named["scales"].log(), "quats": named["quats"],
+             "opacities": torch.logit(named["opacities"])}, {},
+        )  # fmt: skip
+        splats = adapter.slice_at(view)
+        settings = RasterSettings(near=0.01, alpha_max=stand_in.ALPHA_MAX)
+        expected = reference.rasterize(splats, named["colors"], view, settings)
+        torch.testing.assert_close(picture[0, ..., :3], expected.color, atol=2e-5, rtol=1e-4)
+        torch.testing.assert_close(picture[0, ..., 3], expected.depth_sum, atol=2e-4, rtol=1e-4)
+        torch.testing.assert_close(alpha[0, ..., 0], expected.alpha, atol=2e-5, rtol=1e-4)
+        assert expected.alpha.max() > 0.5
+
+    def test_centres_get_the_gradient_in_pixels_packed_or_not(self, given: tuple[dict, object]) -> None:
+        named, view = given
+        full, packed = ({**named, "packed": flag} for flag in (False, True))
+        target = torch.rand(1, view.height, view.width, 3, generator=torch.Generator().manual_seed(5))
+        found = []
+        for arguments in (full, packed):
+            picture, _, meta = stand_in.rasterization(**arguments)
+            meta["means2d"].retain_grad()
+            (picture - target).square().sum().backward()
+            found.append(meta)
+        dense, sparse = found
+        assert dense["means2d"].grad.abs().max() > 0
+        torch.testing.assert_close(dense["means2d"].grad[0, sparse["gaussian_ids"]], sparse["means2d"].grad)
+        assert torch.equal(dense["radii"][0, sparse["gaussian_ids"]], sparse["radii"])
+        moved = named | {"means": named["means"] + 0.0}
+        picture, _, meta = stand_in.rasterization(**moved, packed=False)
+        homogeneous = torch.cat([named["means"], torch.ones(40, 1)], 1) @ view.T_camera_world.float().T
+        pixels = (homogeneous[:, :3] @ view.K.float().T)[:, :2] / homogeneous[:, 2:3]
+        torch.testing.assert_close(meta["means2d"][0].detach(), pixels, atol=1e-3, rtol=1e-4)
+
+    def test_what_needs_its_kernels_is_refused_by_name(self, given: tuple[dict, object]) -> None:
+        with pytest.raises(D2Error, match="absgrad of gsplat's rasterization needs its own kernels"):
+            stand_in.rasterization(**given[0], absgrad=True)
+        with pytest.raises(D2Error, match="render_mode 'RGB-Ed'"):
+            stand_in.rasterization(**given[0], render_mode="RGB-Ed")
+        with pytest.raises(D2Error, match="camera_model 'fisheye'"):
+            stand_in.rasterization(**given[0], camera_model="fisheye")
+
+
+@pytest.mark.parametrize(("trained_on", "held_out", "every"), [(4, 1, 5), (4, 4, 2), (7, 1, 8), (8, 2, 9), (6, 3, 4)])
+def test_every_nth_picture_is_held_out(trained_on: int, held_out: int, every: int) -> None:
+    assert every_nth(trained_on, held_out) == every
+    assert len([i for i in range(trained_on + held_out) if i % every == 0]) == held_out
+
+
+def test_a_number_of_cameras_that_the_parser_cannot_hold_out_is_refused() -> None:
+    with pytest.raises(D2Error, match=r"no N gives 4 of 6"):
+        every_nth(2, 4)
+    with pytest.raises(D2Error, match=r"no N gives 0 of 4"):
+        every_nth(4, 0)

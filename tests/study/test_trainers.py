@@ -1,0 +1,231 @@
+"""The bench of the official trainers: its table from rows, what it asks each script for, and one run of a mimic."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mimics.workplace import furnish
+
+from d2_plugin import D2Error
+from d2_plugin.attach.recipes import RECIPES
+from d2_plugin.study.trainers import prepare, trial_run
+from d2_plugin.study.trainers.bench import TrainersBench, run
+from d2_plugin.study.trainers.page import read_rows, replaced, table
+from d2_plugin.study.trainers.prepare import Prepared, Recording
+from d2_plugin.study.trainers.trials import TRIALS, Job, Trial, gsplat_stats, reported, scored_after
+
+TESTS = Path(__file__).parents[1]
+
+
+def job(folder: Path) -> Job:
+    folder.mkdir(exist_ok=True)
+    return Job(folder / "data", folder, iterations=200, seed=7, frames=5, seconds=0.25)
+
+
+def row(method: str, psnr: dict, seed: int | None = 0, **more: object) -> dict:
+    common = {"repository": "fudan", "capture": "studio", "frames": 3, "downscale": 2, "iterations": 200, "seed": seed}
+    counts = {"gaussians": 1000, "inserted": 0, "removed": 0, "digest": "a", "failed": None}
+    return common | counts | {"method": method, "psnr": psnr} | more
+
+
+ROWS = [
+    row("bare", {"50": 20.0, "200": 21.0}),
+    row("no hooks", {"50": 20.0, "200": 21.0}),
+    row("attached", {"50": 19.5, "200": 24.0}, gaussians=1500, inserted=600, removed=100, digest="b"),
+]
+
+
+class TestTable:
+    def test_a_line_has_the_last_scores_and_the_worst_gain_on_the_way(self) -> None:
+        line = table(ROWS).splitlines()[-1]
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        assert cells[:3] == ["fudan", "studio", "200"]
+        assert cells[3:] == ["21.00", "the same bits", "24.00", "+3.00", "1000 → 1500", "600 / 100", "-0.50 at 50"]
+
+    def test_one_other_bit_without_hooks_is_seen(self) -> None:
+        assert "DIFFERS" in table([ROWS[0], ROWS[1] | {"digest": "c"}, ROWS[2]])
+        assert "DIFFERS" in table([ROWS[0], ROWS[1] | {"psnr": {"50": 20.0, "200": 21.0001}}, ROWS[2]])
+
+    def test_several_seeds_are_a_mean_and_a_deviation(self) -> None:
+        more = [row("bare", {"200": 22.0}, 1), row("attached", {"200": 26.0}, 1)]
+        text = table([*ROWS, *more])
+        assert "21.50 ± 0.71" in text
+        assert "+3.50 ± 0.71" in text
+
+    def test_what_did_not_run_is_named_below(self) -> None:
+        text = table([row("bare", {}, failed="ended with code 2: no wheel")])
+        assert text.endswith("- fudan on studio, bare: ended with code 2: no wheel")
+
+    def test_of_the_same_run_the_later_row_counts(self, tmp_path: Path) -> None:
+        path = tmp_path / "rows.jsonl"
+        path.write_text("".join(json.dumps(r) + "\n" for r in (row("bare", {}, failed="once"), ROWS[0])))
+        assert read_rows(path) == [ROWS[0]]
+
+    def test_the_page_changes_between_its_marks_alone(self) -> None:
+        assert replaced("a\n<!-- rows -->\nold\n<!-- end -->\nb\n", "new", "page") == (
+            "a\n<!-- rows -->\n\nnew\n\n<!-- end -->\nb\n"
+        )
+        with pytest.raises(D2Error, match="page needs one line <!-- rows -->"):
+            replaced("a", "new", "page")
+
+
+class TestTrials:
+    def test_every_recipe_of_the_launcher_has_a_trial(self) -> None:
+        assert set(TRIALS) == set(RECIPES)
+        assert all(RECIPES[name].script == trial.script for name, trial in TRIALS.items())
+
+    @pytest.mark.parametrize("name", TRIALS)
+    def test_its_script_is_told_data_length_and_place(self, name: str, tmp_path: Path) -> None:
+        asked = job(tmp_path)
+        words = TRIALS[name].words(asked)
+        told = " ".join([*words, *(path.read_text() for path in tmp_path.iterdir() if path.is_file())])
+        assert str(asked.data) in told
+        assert str(asked.model) in told
+        assert "200" in told
+        assert not asked.model.exists(), "4C4D refuses a folder that is there"
+
+    def test_scores_are_read_where_each_leaves_them(self, tmp_path: Path) -> None:
+        printed = "x\n[ITER 50] Evaluating test: L1 0.05 PSNR 20.5 [22/11]\n[ITER 50] Evaluating train: L1 0 PSNR 30\n"
+        assert reported(job(tmp_path), printed) == {50: 20.5}
+        assert scored_after(job(tmp_path), "\n[held out] iteration 200: PSNR 19.25\n") == {200: 19.25}
+        stats = tmp_path / "model" / "stats"
+        stats.mkdir(parents=True)
+        (stats / "val_step0199.json").write_text('{"psnr": 18.5, "lpips": NaN}'.replace("NaN", "null"))
+        assert gsplat_stats(job(tmp_path), "") == {200: 18.5}
+
+
+TRAIN = """
+from gaussian_renderer import render
+from scene import Scene
+from scene.gaussian_model import GaussianModel
+from mimics import fudan
+from mimics.inria import cameras_of, default_options, initial_points
+
+fudan.render = render
+gaussians = GaussianModel()
+gaussians.create_from_pcd(*initial_points())
+scene = Scene(cameras_of(timestamp=lambda view: view.time))
+fudan.training(gaussians, scene, default_options(iterations=30, densify_until_iter=0))
+print("[ITER 30] Evaluating test: L1 0.1 PSNR 20.125")
+"""
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """fudan's modules in small."""
+    folder = tmp_path / "checkouts" / "4d-gaussian-splatting"
+    for name, text in {
+        "scene/__init__.py": "from mimics import fudan\nclass Scene(fudan.Scene): pass\n",
+        "scene/gaussian_model.py": "from mimics import fudan\nclass GaussianModel(fudan.GaussianModel): pass\n",
+        "gaussian_renderer/__init__.py": "from mimics.fudan import render\n",
+        "train.py": TRAIN,
+    }.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_a_trainer_runs_in_its_own_process_and_leaves_rows_and_a_table(
+    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prior = furnish(tmp_path, monkeypatch) / "prior"
+
+    def prepared(recording: Recording, trial: Trial, work: Path) -> Prepared:
+        return Prepared(recording, tmp_path, None, prior)
+
+    monkeypatch.setattr("d2_plugin.study.trainers.bench.prepare", prepared)
+    monkeypatch.setattr(Recording, "seconds", 0.1)
+    monkeypatch.setenv("PYTHONPATH", str(TESTS))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    page = tmp_path / "page.md"
+    page.write_text("<!-- rows -->\n<!-- end -->\n")
+    settings = TrainersBench(
+        checkout.parent, (tmp_path / "tiny",), only=("fudan", "4c4d"), methods=("bare", "no hooks"), iterations=30,
+        work=tmp_path / "work", output=tmp_path / "rows.jsonl", page=page,
+    )  # fmt: skip
+    text = run(settings)
+    bare, without = read_rows(settings.output)
+    assert bare["failed"] is None, bare["failed"]
+    assert bare["psnr"] == without["psnr"] == {"30": 20.125}
+    assert bare["digest"] == without["digest"]
+    assert bare["gaussians"] == 60
+    assert "command" in bare
+    assert str(tmp_path) not in json.dumps(bare), "no path of this machine"
+    assert "| fudan | tiny | 30 | 20.12 | the same bits |" in page.read_text()
+    assert "4c4d: no folder 4C4D, left out" in text
+    (checkout / "train.py").write_text("raise SystemExit('no luck')")
+    (failed,) = [row for row in _again(settings) if row["method"] == "bare"]
+    assert failed["failed"] == "ended with code 1: no luck"
+
+
+def _again(settings: TrainersBench) -> list[dict]:
+    run(settings)
+    return read_rows(settings.output)
+
+
+def test_mistakes_are_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(D2Error, match="unknown repository 'fudam'.*did you mean 'fudan'"):
+        run(TrainersBench(only=("fudam",)))
+    with pytest.raises(D2Error, match="unknown method 'nohooks'"):
+        run(TrainersBench(methods=("nohooks",)))
+    (tmp_path / "4C4D").mkdir()
+    with pytest.raises(D2Error, match="no recording to train on"):
+        run(TrainersBench(tmp_path, only=("4c4d",)))
+
+
+def test_a_checkout_is_known_by_its_commit(tmp_path: Path) -> None:
+    assert trial_run.commit_of(tmp_path) is None
+
+
+CHECKOUTS = os.environ.get("D2_CHECKOUTS")
+ITERATIONS = int(os.environ.get("D2_CHECKOUT_ITERATIONS", "60"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TRIALS)
+def test_the_official_trainer_bare_without_hooks_and_attached(
+    name: str, tmp_path: Path, shared_data: Callable[[str], Path], capsys: pytest.CaptureFixture
+) -> None:
+    """D2_CHECKOUTS is a folder with a checkout of each repository; D2_CHECKOUT_ITERATIONS how long each run is."""
+    if CHECKOUTS is None:
+        pytest.skip("D2_CHECKOUTS is not set: give a folder with one checkout per repository")
+    if not (Path(CHECKOUTS) / TRIALS[name].folder).is_dir():
+        pytest.skip(f"no {TRIALS[name].folder} in {CHECKOUTS}")
+    scale = 1 if name == "fudan" else 2  # its report measures MS-SSIM, which needs pictures more than 160 pixels high
+    settings = TrainersBench(
+        Path(CHECKOUTS), (shared_data("studio"),), (name,), iterations=ITERATIONS, frames=3, downscale=scale,
+        work=tmp_path / "work", output=tmp_path / "rows.jsonl",
+    )  # fmt: skip
+    text = run(settings)
+    with capsys.disabled():
+        sys.stdout.write(f"\n{text}\n")
+    bare, without, attached = read_rows(settings.output)
+    assert [row["failed"] for row in (bare, without, attached)] == [None] * 3
+    assert bare["psnr"].keys() == attached["psnr"].keys() != set()
+    assert (bare["digest"], bare["psnr"]) == (without["digest"], without["psnr"])
+    assert bare["digest"] != attached["digest"]
+    assert attached["inserted"] > 0
+
+
+def test_exports_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames are a range: a pair of numbers is two frames, and a trainer that is told of three then misses one."""
+    asked = []
+
+    def export(settings: object) -> str:
+        asked.append(settings)
+        settings.output.mkdir(parents=True)
+        return ""
+
+    monkeypatch.setattr(prepare, "export", export)
+    (tmp_path / "priors" / "studio-4-2").mkdir(parents=True)
+    (tmp_path / "priors" / "studio-4-2" / "store.json").touch()
+    recording = Recording(tmp_path / "studio", 4, 2)
+    first, second = (prepare.prepare(recording, TRIALS["hust4d"], tmp_path) for _ in range(2))
+    assert first == second
+    assert [settings.frames for settings in asked] == [(0, 1, 2, 3)] * 2
+    assert [settings.train_cameras[0] for settings in asked] == ["00", "01"]
