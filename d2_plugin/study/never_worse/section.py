@@ -40,7 +40,8 @@ def never_worse_text(rows: Sequence[Row]) -> str:
 
 def table(rows: Sequence[Row]) -> Table:
     """A row per capture and method, in the order of measurement; what is not worse than the backbone stands out."""
-    cells, fine = [], []
+    cells: list[tuple[str, ...]] = []
+    fine: list[tuple[int, int]] = []
     for case, mine in cases_of(rows).items():
         methods = _by_method(mine)
         for name, runs in methods.items():
