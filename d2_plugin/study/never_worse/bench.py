@@ -155,9 +155,8 @@ class _Template:
 
     def _build(self, settings: RunSettings, store: Path) -> str:
         """The prior of one method, with the geometric depth of the full one; what it became, in a line."""
-        stereo = store / "cache" / "stereo"
-        if not stereo.exists():
-            shutil.copytree(self.shared.priors / "cache" / "stereo", stereo)
+        if not store.exists():
+            shutil.copytree(self.shared.priors, store, ignore=shutil.ignore_patterns("priors", "matches", "mono"))
         points = TimedPoints.load(self.shared.points).positions
         settings = check(settings)
         return build_priors_for(settings, Scene.open(settings), points, store).headline()
