@@ -22,7 +22,7 @@ from d2_plugin.runs.prior import build_priors_for
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings, check, prior_settings
 from d2_plugin.runs.start import TimedPoints
-from d2_plugin.settings import AtLeastOne, Positional, Range, Seed, Settings
+from d2_plugin.settings import AtLeastOne, Count, Positional, Range, Seed, Settings
 from d2_plugin.study.ablation.job import Job
 from d2_plugin.study.ablation.presets import PRESETS, Preset
 from d2_plugin.study.command_line import command_line
@@ -53,6 +53,8 @@ class NeverWorseBench(Settings):
     """Seeds."""
     backbone: str = "yang4d"
     """Name of a registered backbone."""
+    frames: tuple[Count, ...] | None = None
+    """Numbers of the frames, in every capture; all if not given."""
     downscale: AtLeastOne = 1
     """Make pictures this many times smaller along each side."""
     mono_onnx: str | None = None
@@ -95,7 +97,8 @@ def _all_of(works: Sequence[Work]) -> Line:
 
 def _works(settings: NeverWorseBench, text: str) -> Iterator[Work]:
     """Every run of a case; points and priors are made here, one after the other."""
-    base = RunSettings("", (), backbone=settings.backbone, iterations=settings.steps, downscale=settings.downscale)
+    shown = {name: getattr(settings, name) for name in ("backbone", "frames", "downscale")}
+    base = RunSettings("", (), iterations=settings.steps, **shown)
     network = replace(base, mono_onnx=settings.mono_onnx, mono_kind=settings.mono_kind)
     case = case_of(text, base)
     own = _own(case, network)
@@ -130,7 +133,8 @@ def _with_maps(
         given = replace(case.settings, mono_onnx=network.mono_onnx, mono_kind=network.mono_kind)
         return None if network.mono_onnx is None or own.mono_onnx is not None else given
     assert maps in SPOILED
-    path = spoiled_capture(Path(own.capture), own.train_cameras, maps, folder / "maps" / maps, prior_settings(own))
+    shown = Path(own.capture), own.train_cameras, own.frames
+    path = spoiled_capture(*shown, maps, folder / "maps" / maps, prior_settings(own))
     return replace(case.settings, capture=str(path))
 
 
@@ -139,7 +143,7 @@ class _Template:
 
     def __init__(self, settings: NeverWorseBench, case: str, shared: Shared) -> None:
         self.settings, self.case, self.shared = settings, case, shared
-        listed = {name: ",".join(map(str, getattr(settings, name))) for name in ("maps", "seeds")}
+        listed = {name: ",".join(map(str, getattr(settings, name) or ())) for name in ("maps", "seeds", "frames")}
         self.command = command_line("bench never-worse", settings, False, **listed)
 
     def works(self, method: str, base: RunSettings, preset: Preset) -> Iterator[Work]:
@@ -147,7 +151,7 @@ class _Template:
         name = method.replace(" ", "_")
         store = self.shared.folder / "priors" / name
         used = replace(base, hooks=preset.hooks, overrides=preset.merged(base.overrides), priors=str(store))
-        about = {"prior": self._build(used, store) if preset.hooks else None}
+        about = {"prior": self._build(used, store) if preset.hooks else None, "frames": base.frames}
         for seed in self.settings.seeds:
             folder = self.shared.folder / "runs" / name / f"{base.iterations}steps" / f"seed{seed}"
             job = Job(preset.name, base.backbone, seed, replace(used, seed=seed), folder)

@@ -31,12 +31,19 @@ Predicted = Callable[[str, int], np.ndarray]
 """(camera, frame) -> the map that belongs to that picture."""
 
 
-def spoiled_capture(path: Path, cameras: Sequence[str], kind: Spoiled, folder: Path, prior: PriorSettings) -> Path:
+def spoiled_capture(
+    path: Path,
+    cameras: Sequence[str],
+    frames: Sequence[int] | None,
+    kind: Spoiled,
+    folder: Path,
+    prior: PriorSettings,
+) -> Path:
     """A copy of the recording at `path` with other maps, in `folder`; pictures and all else are links to it.
 
     Args:
         path: the recording.
-        cameras: those that train; no other camera gets a map.
+        cameras, frames: those that train; no other picture gets a map.
         kind: what the maps become.
         folder: where it is made; named as the recording, since rows have that name.
         prior: names the network that predicts where the recording has no maps of its own.
@@ -47,7 +54,7 @@ def spoiled_capture(path: Path, cameras: Sequence[str], kind: Spoiled, folder: P
     made = folder / path.resolve().name
     if (made / "mono" / "mono.json").is_file():
         return made
-    capture = open_capture(path)
+    capture = open_capture(path, frames=frames)
     for entry in path.resolve().iterdir():
         if entry.name != "mono" and not (make_folder(made) / entry.name).exists():
             (made / entry.name).symlink_to(entry)
