@@ -28,7 +28,7 @@ from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.cache import DepthCache, StoredDepth
 from d2_plugin.protocol import Label
 
-CONSTRUCTION_VERSION = 8  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 9  # raise it when alignment or fusion change what they return
 
 NO_GEOMETRY = "no geometric depth survived the filter"
 NO_MAP = "there is no monocular map of this frame"
@@ -178,7 +178,8 @@ class Construction:
             return AlignedMap(aligned, alignment)
         depth = corrected_depth(aligned, geometric, self.settings.align)
         known = self.settings.uncertainty and anchors.size > 0
-        uncertainty = monocular_uncertainty(aligned, geometric, self.settings.align, sure) if known else None
+        asked = aligned, geometric, self.settings.align, sure, self.mono.kind
+        uncertainty = monocular_uncertainty(*asked) if known else None
         return AlignedMap(depth, alignment, "", uncertainty, aligned_inverse(prediction, alignment))
 
     def _fit(self, prediction: np.ndarray, geometric: np.ndarray, kind: MonoKind) -> Alignment:
