@@ -64,6 +64,5 @@ def _parted(
     for place in (depth, held):
         value = place**sign
         moved = (fit.scale * value + fit.shift) / value
-        ratios.append(np.where(moved > 0, sign * np.log(np.where(moved > 0, moved, 1)), np.inf))
-    apart = np.full(depth.shape, np.inf)
-    return np.abs(np.subtract(*ratios, out=apart, where=np.isfinite(ratios[0]) & np.isfinite(ratios[1])))
+        ratios.append(np.where(moved > 0, np.log(np.where(moved > 0, moved, 1)), np.nan))
+    return np.nan_to_num(np.abs(ratios[0] - ratios[1]), nan=np.inf)

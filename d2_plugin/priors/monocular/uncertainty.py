@@ -8,9 +8,10 @@ picture to picture; that one number, the scale, is measured in each picture.
 
     sigma^2 = (K scale)^2 (f0^2 + fd^2 d + (fg g)^2 + (fe e)^2 + (fw e')^2 + (fr r)^2) + S(D)^2
 
-with S how far the line may be off beyond the anchors' depths (`extrapolation`), d the distance to the nearest anchor (picture widths), g = |log(D / D of that anchor)|, e and e' the span of log D
-within 0.5 % and 2 % of the width, r = log(D / median anchor) where it is positive. A pixel without an anchor is harder
-than an anchor that was left out (no texture, an edge, seen once): K = 1.3 on all recordings with truth.
+with d the distance to the nearest anchor (picture widths), g = |log(D / D of that anchor)|, e and e' the span of log D
+within 0.5 % and 2 % of the width, r = log(D / median anchor) where it is positive, and S how far the line may be off
+beyond the depths of the anchors (`extrapolation`). A pixel without an anchor is harder than an anchor that was left out
+(no texture, an edge, seen once): K = 1.3 on all recordings with truth.
 
 A map that mostly holds but is far off at some things (a weak network) shows it in the tail of these errors, and the
 things it misses are those without anchors: the 98 % quantile, where it goes beyond the usual, enlarges all its sigma.
