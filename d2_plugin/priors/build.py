@@ -88,6 +88,7 @@ class _Builder:
         _refuse_other_pictures(capture, names, output)
         self.capture, self.names, self.settings = capture, _ordered(names, output), settings
         self.notes: list[str] = []
+        self._block_keys: dict[int, str] = {}
         self.cameras = {name: capture.cameras[name] for name in self.names}
         self.bounds: DepthBounds | None = None
         maps = output / "cache" / "mono"  # one for all sets of cameras: a map depends on its own picture alone
@@ -98,7 +99,7 @@ class _Builder:
         self.confidence = ConfidenceMaps.beside(capture.path if settings.uncertainty else None, OF_MONO, self.names)
         self.store = PriorStore.create(output, self.names, capture.frames, describe_capture(capture))
         geometric = None if self.source is None else DepthCache(self.source, cache / "stereo")
-        self.construction = Construction(self.cameras, self.mono, geometric, possible, self.confidence)
+        self.construction = Construction(self.cameras, self.mono, geometric, possible, self.confidence, self.block)
 
     def _geometric_source(self, points: np.ndarray | None, matches: Path) -> GeometricSource | None:
         """Depth on disk where there is any, else matching, or None where nothing is matched; sets the depth range."""
@@ -141,6 +142,11 @@ class _Builder:
     def read(self, number: int) -> Frame:
         """The pictures of one frame."""
         return Frame.read(self.capture, self.names, number)
+
+    def block(self, number: int) -> list[Frame]:
+        """The pictures of all frames that are built in order with this one."""
+        blocks = frame_blocks(self.capture.frames, self.settings.stereo)
+        return [self.read(frame) for frame in next(block for block in blocks if number in block)]
 
     def build(self, number: int) -> Iterator[tuple[str, dict[str, Any], bool]]:
         """(camera, record, whether it was built now) for every camera of one frame."""
@@ -185,7 +191,17 @@ class _Builder:
             geometric,
             [settings.agreement, *maps.values()] if self.construction.agrees else None,
         )
-        return {name: hash_of(*common, maps.get(name)) for name in self.names}
+        block = self._block_key(frame.number) if settings.align.together else None
+        return {name: hash_of(*common, block, maps.get(name)) for name in self.names}
+
+    def _block_key(self, number: int) -> str:
+        """Hash of what the alignments of a block depend on, which those of each of its frames do."""
+        if number not in self._block_keys:
+            frames = self.block(number)
+            stereo = [None if self.source is None else self.source.key(frame) for frame in frames]
+            maps = [self._mono_key(name, frame) for frame in frames for name in self.names]
+            self._block_keys |= dict.fromkeys((frame.number for frame in frames), hash_of(stereo, maps))
+        return self._block_keys[number]
 
 
 def _ordered(names: list[str], output: Path) -> list[str]:

@@ -6,8 +6,9 @@ A further map per pixel is a field of `FusedPrior` that `Construction._view` fil
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +24,14 @@ from d2_plugin.priors.monocular.align import Alignment, align, aligned_depth, al
 from d2_plugin.priors.monocular.correct import corrected_depth
 from d2_plugin.priors.monocular.far import far_pixels
 from d2_plugin.priors.monocular.maps import MonoSource
+from d2_plugin.priors.monocular.together import Seen, aligned_together
 from d2_plugin.priors.monocular.uncertainty import Skill, Uncertainty, monocular_uncertainty
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.cache import DepthCache, StoredDepth
+from d2_plugin.priors.stereo.reuse import changed
 from d2_plugin.protocol import Label
 
-CONSTRUCTION_VERSION = 8  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 9  # raise it when alignment or fusion change what they return
 
 NO_GEOMETRY = "no geometric depth survived the filter"
 NO_MAP = "there is no monocular map of this frame"
@@ -82,6 +85,7 @@ class Construction:
         geometric: geometric depth, None where there is none.
         settings: of the construction; `variant` is one that the sources allow.
         confidence: what the monocular maps say of themselves; nothing where None.
+        block: reads the frames that are aligned together with one; each stands alone where None.
     """
 
     def __init__(
@@ -91,9 +95,11 @@ class Construction:
         geometric: DepthCache | None,
         settings: PriorSettings,
         confidence: ConfidenceMaps | None = None,
+        block: Callable[[int], Sequence[Frame]] | None = None,
     ) -> None:
         self.confidence = ConfidenceMaps(Path(), ()) if confidence is None else confidence
         self.cameras, self.mono, self.geometric, self.settings = cameras, mono, geometric, settings
+        self.block, self._together = block, dict[int, dict[str, Alignment]]()
         several = geometric is not None and len(cameras) > 1
         self.agrees = settings.agreement > 0 and settings.variant == "dual" and several
 
@@ -158,17 +164,13 @@ class Construction:
         nothing = np.zeros_like(geometric)
         if self.mono is None:
             return AlignedMap(nothing, refused="" if geometric.any() else NO_GEOMETRY)
-        prediction = self.mono.map(name, frame)
+        sure = self.confidence.of(self.cameras[name], frame.number)
+        prediction = self._prediction(name, frame)
         if prediction is None:
             return AlignedMap(nothing, refused=NO_MAP)
-        if self.settings.mono_along == "ray":
-            prediction = planar(prediction, self.cameras[name])
-        sure = self.confidence.of(self.cameras[name], frame.number)
-        if sure is not None:
-            prediction = np.where(sure > 0, prediction, np.float32(np.nan))
         if self.geometric is None and self.mono.kind == "relative":
             return AlignedMap(nothing, refused=SCALE_UNKNOWN)
-        alignment = self._fit(prediction, geometric, self.mono.kind)
+        alignment = self._fit(name, frame, prediction, geometric, self.mono.kind)
         if not alignment.accepted:
             return AlignedMap(nothing, alignment, alignment.status.value)
         anchors = geometric[geometric > 0]
@@ -178,14 +180,49 @@ class Construction:
             return AlignedMap(aligned, alignment)
         depth = corrected_depth(aligned, geometric, self.settings.align)
         known = self.settings.uncertainty and anchors.size > 0
-        uncertainty = monocular_uncertainty(aligned, geometric, self.settings.align, sure) if known else None
+        asked = aligned, geometric, self.settings.align, sure, self.mono.kind
+        uncertainty = monocular_uncertainty(*asked) if known else None
         return AlignedMap(depth, alignment, "", uncertainty, aligned_inverse(prediction, alignment))
 
-    def _fit(self, prediction: np.ndarray, geometric: np.ndarray, kind: MonoKind) -> Alignment:
+    def _prediction(self, name: str, frame: Frame) -> np.ndarray | None:
+        """The monocular map [H, W], planar and NaN where it says nothing of itself; None where there is none."""
+        prediction = None if self.mono is None else self.mono.map(name, frame)
+        if prediction is None:
+            return None
+        if self.settings.mono_along == "ray":
+            prediction = planar(prediction, self.cameras[name])
+        sure = self.confidence.of(self.cameras[name], frame.number)
+        return prediction if sure is None else np.where(sure > 0, prediction, np.float32(np.nan))
+
+    def _fit(
+        self, name: str, frame: Frame, prediction: np.ndarray, geometric: np.ndarray, kind: MonoKind
+    ) -> Alignment:
         """The alignment; a metric map is taken as it is where there is no geometric depth to fit it to."""
         if self.geometric is None or self.settings.variant == "dual_unaligned":
             return not_aligned(kind)
+        if self.settings.align.together and self.block is not None:
+            if frame.number not in self._together:
+                self._together = self._aligned_together(self.block(frame.number), self.geometric, kind)
+            return self._together[frame.number][name]
         return align(prediction, geometric, kind=kind, settings=self.settings.align)
+
+    def _aligned_together(
+        self, frames: Sequence[Frame], geometric: DepthCache, kind: MonoKind
+    ) -> dict[int, dict[str, Alignment]]:
+        """The alignments of a block, by frame and camera."""
+        found: dict[int, dict[str, Alignment]] = {frame.number: {} for frame in frames}
+        for name in self.cameras:
+            seen = {}
+            for frame in frames:
+                mono = self._prediction(name, frame)
+                if mono is not None:
+                    recorded = frame.recorded.get(name)
+                    depth = geometric.depths(frame)[name].depth * (1 if recorded is None else recorded)
+                    seen[frame.number] = Seen(frame.images[name], mono, depth)
+            change = partial(changed, settings=self.settings.stereo)
+            for number, alignment in aligned_together(seen, kind, self.settings.align, change).items():
+                found[number][name] = alignment
+        return found
 
 
 def _within(maps: FusedPrior, recorded: np.ndarray) -> FusedPrior:

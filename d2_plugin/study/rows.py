@@ -29,6 +29,7 @@ KINDS = {
     "raster": "99.9th percentile of the colour's deviation from float64, 0..1",
     "training": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
     "quality": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
+    "never_worse": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
     "ablation": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
     "stability": "as each case defines it",
     "plan": "loss of what is left out, as each decision defines it",

@@ -106,3 +106,11 @@ def test_the_gradient_is_that_of_the_grey_value_whatever_its_direction() -> None
     np.testing.assert_allclose(grey_gradient(ramp)[inside], expected, rtol=0.02)
     np.testing.assert_allclose(grey_gradient(np.ascontiguousarray(ramp.T)).T[inside], expected, rtol=0.02)
     assert grey_gradient(np.full((9, 9), 7, np.uint8)).max() < 1e-6
+
+
+def test_a_flat_part_beside_a_textured_one_has_a_gradient() -> None:
+    picture = np.zeros((180, 320), np.uint8)
+    picture[:, :107] = np.random.default_rng(2).integers(0, 255, (180, 107))
+    gradient = grey_gradient(picture)
+    assert np.isfinite(gradient).all()
+    assert gradient[:, 150:].max() < 1e-6

@@ -52,5 +52,9 @@ class AlignSettings(Settings):
     40 % leverage outliers. The certificate then holds for the anchors that were kept. Measured (`d2 bench align`): with
     20 to 60 % wrong anchors the error of the line is .001 to .003 with, .007 to .16 without, in the same time. Off,
     because filtered anchors are wrong at 1 % (studio) and the guard has not been measured on recordings."""
+    together: bool = False
+    """Fit the lines of all frames of a block (`stereo.reuse_block`) together: aligned maps must agree where the picture
+    did not change. Off: what it gains in steadiness (a tenth before, a twentieth after the local correction) it has on
+    studio alone, and errors do not fall; docs/priors.md, "Alignment", has the figures."""
     seed: Seed = 0
     """Seed of the subsampling and of the leverage guard."""

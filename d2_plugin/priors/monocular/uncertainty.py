@@ -6,11 +6,12 @@ recording measured: they grow with the distance to the nearest anchor, with how 
 (the map extrapolates), and at the edges of the map. How large they are differs from network to network and from
 picture to picture; that one number, the scale, is measured in each picture.
 
-    sigma = K scale sqrt(f0^2 + fd^2 d + (fg g)^2 + (fe e)^2 + (fw e')^2 + (fr r)^2)
+    sigma^2 = (K scale)^2 (f0^2 + fd^2 d + (fg g)^2 + (fe e)^2 + (fw e')^2 + (fr r)^2) + S(D)^2
 
 with d the distance to the nearest anchor (picture widths), g = |log(D / D of that anchor)|, e and e' the span of log D
-within 0.5 % and 2 % of the width, r = log(D / median anchor) where it is positive. A pixel without an anchor is harder
-than an anchor that was left out (no texture, an edge, seen once): K = 1.3 on all recordings with truth.
+within 0.5 % and 2 % of the width, r = log(D / median anchor) where it is positive, and S how far the line may be off
+beyond the depths of the anchors (`extrapolation`). A pixel without an anchor is harder than an anchor that was left out
+(no texture, an edge, seen once): K = 1.3 on all recordings with truth.
 
 A map that mostly holds but is far off at some things (a weak network) shows it in the tail of these errors, and the
 things it misses are those without anchors: the 98 % quantile, where it goes beyond the usual, enlarges all its sigma.
@@ -26,9 +27,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from d2_plugin.captures.capture import MonoKind
 from d2_plugin.priors.disk.confidence import divided
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.monocular.correct import corrected_depth
+from d2_plugin.priors.monocular.extrapolation import extrapolation_error
 from d2_plugin.priors.settings import AlignSettings
 
 FLOOR, DISTANCE, GAP, EDGE, WIDE_EDGE, BEYOND = 0.051, 1.19, 0.79, 2.76, 0.16, 0.086
@@ -52,9 +55,10 @@ NIL = 0.8
 maps 1, a right map of a narrow pair (where anchors are dense and a constant bends as well) .9 to 2.8, others above."""
 LEAST = 200
 """With fewer left-out anchors in all, the scale is not known."""
-USUAL, EVIDENCE = 0.12, 1000
+USUAL, EVIDENCE = 0.12, 3000
 """The scale of most maps, and how many anchors (at `WIDTH`) weigh as much: a few that lie together are held from near
-by, and do not make a map surer than usual. Measured on plaza, two views, 400 anchors: scale .03 where .1 is true."""
+by, and do not make a map surer than usual. Measured on plaza, two views, 400 anchors: scale .03 where .1 is true; 2600
+anchors of another pair there: .065 where .1 is true."""
 IN_TAIL, USUAL_TAIL = 0.98, 3.0
 """A quantile far out, and where it lies in maps that belong to their pictures, in units of the scale (2.33 if errors
 were normal). Measured in these units: 2.3 to 2.9, once 3.4; PyDNet, or the maps of another camera, 5 to 6. There errors
@@ -99,7 +103,11 @@ class Uncertainty(NamedTuple):
 
 
 def monocular_uncertainty(
-    aligned: np.ndarray, geometric: np.ndarray, settings: AlignSettings, confidence: np.ndarray | None = None
+    aligned: np.ndarray,
+    geometric: np.ndarray,
+    settings: AlignSettings,
+    confidence: np.ndarray | None = None,
+    kind: MonoKind = "relative",
 ) -> Uncertainty:
     """How wrong the corrected map may be, from the anchors that can be left out.
 
@@ -109,6 +117,7 @@ def monocular_uncertainty(
         settings: of the local correction.
         confidence: the map's own, 0..1 [H, W]: errors are spread as 1 / confidence besides, and how large they are is
             measured as ever. None is 1 everywhere.
+        kind: what the map is: its line is one in inverse depth or in depth.
     """
     small, anchors = _shrunk(aligned), _shrunk(geometric)
     sure = None if confidence is None else _relative(_shrunk(confidence))
@@ -117,7 +126,8 @@ def monocular_uncertainty(
     if not np.isfinite(skill.scale):
         return Uncertainty(unknown, unknown, skill)
     corrected = corrected_depth(small, anchors, settings)
-    sigma = _enlarged(HARDER * skill.tail * skill.scale * divided(error_shape(corrected, anchors), sure), aligned.shape)
+    between = HARDER * skill.tail * skill.scale * divided(error_shape(corrected, anchors), sure)
+    sigma = _enlarged(np.hypot(between, extrapolation_error(small, anchors, kind, settings)), aligned.shape)
     left_out = divided(error_shape(corrected, anchors, left_out=True), sure)
     at_anchors = _enlarged(AT_ANCHORS * skill.tail * skill.scale * left_out, aligned.shape)
     told = (aligned > 0) & (sigma < HOPELESS) & (not skill.nil)

@@ -75,7 +75,8 @@ def grey_gradient(gray: np.ndarray) -> np.ndarray:
     cv2: Any = opencv("the precision of geometric depth")
     smooth = cv2.GaussianBlur(gray.astype(np.float32) / 255, (0, 0), BLUR)
     across, down = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
-    return np.sqrt(cv2.blur(across * across + down * down, (AROUND, AROUND)))
+    # Running sums of float32 end a hair below zero beside strong edges.
+    return np.sqrt(np.maximum(cv2.blur(across * across + down * down, (AROUND, AROUND)), 0))
 
 
 def plane_scatter(depth: np.ndarray, window: int = WINDOW) -> np.ndarray:

@@ -17,6 +17,9 @@ class Benchmark(NamedTuple):
 BENCHMARKS = {
     "align": Benchmark("d2_plugin.study.bench.align", "AlignBench", "the fit of monocular to geometric depth"),
     "gpu": Benchmark("d2_plugin.study.bench.gpu.proof", "GpuBench", "everything that a GPU has to show, in 25 minutes"),
+    "never-worse": Benchmark(
+        "d2_plugin.study.never_worse.bench", "NeverWorseBench", "D² with wrong monocular maps against the backbone"
+    ),
     "priors": Benchmark("d2_plugin.study.bench.priors", "PriorsBench", "declared against true error of the prior"),
     "raster": Benchmark("d2_plugin.study.bench.raster", "RasterBench", "the rasterizer: time, memory, precision"),
     "scaling": Benchmark("d2_plugin.study.bench.scaling", "ScalingBench", "priors and training over more frames"),

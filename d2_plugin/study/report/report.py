@@ -13,6 +13,7 @@ from d2_plugin.locks import only_writer
 from d2_plugin.reading import parsing
 from d2_plugin.runs.tables import read_metrics
 from d2_plugin.settings import Positional, Settings
+from d2_plugin.study.never_worse.section import never_worse
 from d2_plugin.study.rows import Row, read_rows
 from d2_plugin.study.training_rows import method_of, picture_of, training_rows
 
@@ -28,7 +29,10 @@ from .versions import versions
 
 BUILDERS: dict[str, Callable[[Sequence[Row]], Section]] = {
     build.__name__: build
-    for build in (training, quality, ablation, alignment, stereo, priors, raster, step, gpu, stability, plan, scaling)
+    for build in (
+        *(training, quality, never_worse, ablation),
+        *(alignment, stereo, priors, raster, step, gpu, stability, plan, scaling),
+    )
 }
 """The function that makes a section from the rows of a kind, in the order of the page."""
 

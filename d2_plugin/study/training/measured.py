@@ -32,6 +32,8 @@ class Work:
     """What the run is meant for: `30 s`, `2000 steps`, or `TRY`."""
     about: Mapping[str, Any] = field(default_factory=dict)
     """Further fields of the row."""
+    kind: str = "quality"
+    """Of the row."""
 
     @property
     def key(self) -> tuple[str, str]:
@@ -97,4 +99,4 @@ def _row(work: Work, **found: Any) -> Row:
     about |= work.about
     setting = f"{settings.iterations} steps, seed {settings.seed}"
     about["fingerprint"] = fingerprint(work.job)
-    return make_row("quality", work.case, work.method, setting, command=work.command, **found, **about)
+    return make_row(work.kind, work.case, work.method, setting, command=work.command, **found, **about)

@@ -1,0 +1,68 @@
+"""What a map says beyond the depths that its anchors have: how far the line that aligns it may be off there.
+
+A pair of cameras measures what is near, and the line that its anchors give is drawn on to what is far. Left-out
+regions do not show what that may cost: they lie within the range of depths that the others have. So the line is fitted
+without the nearest and without the farthest third of the anchors, and where those two leave the line of all of them
+says how sure it is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from d2_plugin.captures.capture import MonoKind
+from d2_plugin.priors.monocular.align import align
+from d2_plugin.priors.monocular.settings import AlignSettings
+
+THIRD = 1 / 3
+"""Share of the anchors that are left out, the nearest or the farthest. Measured on plaza with the cameras 03 and 04, of
+whose monocular pixels a third lie beyond the anchors: 53 and 70 % of the errors within sigma and 2 sigma before, 61 and
+87 % with this; in recordings whose anchors span the scene nothing changes."""
+RANGE = (0.02, 0.98)
+"""Quantiles of the anchors' depths between which a map does not extrapolate."""
+
+
+def extrapolation_error(
+    aligned: np.ndarray, anchors: np.ndarray, kind: MonoKind, settings: AlignSettings
+) -> np.ndarray:
+    """Relative standard deviation of the line beyond the anchors' depths, [H, W]; 0 between them.
+
+        S(D)^2 = (1 - q) / q sum over both thirds of (log D_k(D) / D  -  log D_k(C) / C)^2
+
+    with D_k the depth that the line fitted without a third gives where all anchors give D, and C the nearest depth to D
+    that the anchors have: how far the lines part on the way from there; (1 - q) / q is the factor of a jackknife that
+    leaves out the share q = 1/3. Infinite where a line ends before it reaches D.
+
+    Args:
+        aligned: aligned monocular depth [H, W], 0 where it has none.
+        anchors: D^g [H, W], 0 where there are none.
+        kind: what the map was before: relative ones are lines in inverse depth.
+        settings: of the fit.
+    """
+    known = (anchors > 0) & (aligned > 0)
+    if not known.any():
+        return np.zeros(aligned.shape)
+    depth = np.where(aligned > 0, aligned, np.median(aligned[known])).astype(np.float64)
+    held = np.clip(depth, *np.quantile(depth[known], RANGE))
+    near, far = np.quantile(anchors[known], (THIRD, 1 - THIRD))
+    parted = [
+        _parted(depth, held, np.where(rest, anchors, 0), kind, settings) for rest in (anchors > near, anchors < far)
+    ]
+    return np.where(depth == held, 0, np.sqrt((1 - THIRD) / THIRD) * np.hypot(*parted))
+
+
+def _parted(
+    depth: np.ndarray, held: np.ndarray, rest: np.ndarray, kind: MonoKind, settings: AlignSettings
+) -> np.ndarray:
+    """|log| [H, W] by which the line of the remaining anchors and that of all part between `held` and `depth`."""
+    values = 1 / depth if kind == "relative" else depth
+    fit = align(values, rest, kind=kind, settings=settings)
+    if not fit.scale > 0:
+        return np.full(depth.shape, np.inf)
+    sign = -1 if kind == "relative" else 1
+    ratios = []
+    for place in (depth, held):
+        value = place**sign
+        moved = (fit.scale * value + fit.shift) / value
+        ratios.append(np.where(moved > 0, np.log(np.where(moved > 0, moved, 1)), np.nan))
+    return np.nan_to_num(np.abs(ratios[0] - ratios[1]), nan=np.inf)

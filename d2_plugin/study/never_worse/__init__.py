@@ -1,0 +1,1 @@
+"""D² against the backbone where the monocular maps are wrong."""

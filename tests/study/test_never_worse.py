@@ -1,0 +1,114 @@
+"""`d2 bench never-worse`: maps are spoiled as said, all else is the same recording, and what is worse is called so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from d2_plugin.captures import open_capture
+from d2_plugin.captures.export.folder import save_capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.study.never_worse.bench import NeverWorseBench, run
+from d2_plugin.study.never_worse.maps import SPOILED, Spoiled, spoiled_capture
+from d2_plugin.study.never_worse.section import BACKBONE, STEREO, never_worse, table
+from d2_plugin.study.report.page import markdown
+from d2_plugin.study.rows import Row, make_row, read_rows
+
+pytest.importorskip("cv2")
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    capture = synthetic_capture(2, held_out=1, frames=2, width=64, height=36)
+    return save_capture(capture, tmp_path_factory.mktemp("recordings") / "room")
+
+
+@pytest.mark.parametrize("kind", SPOILED)
+def test_a_spoiled_recording_differs_in_its_maps_alone(room: Path, tmp_path: Path, kind: Spoiled) -> None:
+    before = open_capture(room)
+    cameras = list(before.cameras)[:2]
+    after = open_capture(spoiled_capture(room, cameras, None, kind, tmp_path, PriorSettings()))
+    assert after.name == before.name
+    assert after.mono_kind == before.mono_kind
+    assert after.mono_emulated == before.mono_emulated
+    for camera in cameras:
+        for frame in before.frames:
+            assert np.array_equal(after.image(camera, frame), before.image(camera, frame))
+            assert np.array_equal(after.depth(camera, frame), before.depth(camera, frame))
+            assert not np.array_equal(after.mono(camera, frame), before.mono(camera, frame))
+    assert after.mono(list(before.cameras)[2], before.frames[0]) is None, "a camera that does not train needs no map"
+
+
+def test_each_map_is_what_its_name_says(room: Path, tmp_path: Path) -> None:
+    before = open_capture(room)
+    cameras = list(before.cameras)[:2]
+
+    def spoiled(kind: Spoiled, frames: tuple[int, ...] | None = None, folder: str = "all") -> np.ndarray:
+        path = spoiled_capture(room, cameras, frames, kind, tmp_path / folder, PriorSettings())
+        return open_capture(path).mono(cameras[0], 0)
+
+    assert np.ptp(spoiled("constant")) == 0
+    assert np.std(np.diff(spoiled("noise", folder="noise"))) > 2 * np.std(np.diff(spoiled("smooth", folder="smooth")))
+    other = spoiled("other", folder="other")
+    assert np.allclose(other, before.mono(cameras[0], before.frames[1]), atol=1e-2)
+    alone = spoiled("other", (0,), "one frame")
+    assert np.allclose(alone, before.mono(cameras[1], 0), atol=1e-2), "with one frame it is another camera's"
+
+
+def test_a_recording_without_maps_needs_a_network(room: Path, tmp_path: Path) -> None:
+    capture = synthetic_capture(2, held_out=0, frames=1, width=32, height=18)
+    path = save_capture(capture, tmp_path / "den")
+    for map_ in path.glob("mono/*/*"):
+        map_.unlink()
+    for folder in (*path.glob("mono/*"), path / "mono"):
+        folder.rmdir() if folder.is_dir() else folder.unlink()
+    with pytest.raises(D2Error, match="--mono-onnx"):
+        spoiled_capture(path, list(capture.cameras), None, "other", tmp_path / "out", PriorSettings())
+
+
+def row(method: str, psnr: float, seed: int = 0) -> Row:
+    scores = {"psnr": psnr, "ssim1": 0.8, "depth_absrel": 0.1}
+    setting = f"10 steps, seed {seed}"
+    return make_row("never_worse", "room", method, setting, error=0.1, seconds=1.0, scores=scores, seed=seed)
+
+
+def test_what_is_below_the_backbone_is_named_and_what_is_not_stands_out() -> None:
+    rows = [row(BACKBONE, 20.0), row(STEREO, 21.0), row("own", 22.0), row("noise", 19.95), row("constant", 19.85)]
+    found = table(rows)
+    column = found.header.index("over the backbone")
+    assert [cells[column] for cells in found.rows] == ["-", "+1.00 dB", "+2.00 dB", "-0.05 dB", "-0.15 dB"]
+    assert found.best == {(2, column), (3, column)}, "a tenth of a decibel is allowed"
+    section = never_worse(rows)
+    assert section.headlines == ("room: worse than the backbone alone with constant",)
+    assert "19.85" in markdown([section], "")
+    assert never_worse(rows[:4]).headlines == ("room: not worse than the backbone alone with any of own, noise",)
+
+
+def test_a_seed_that_was_repeated_counts_once() -> None:
+    rows = [row(BACKBONE, 20.0), row(BACKBONE, 22.0, 1), row("own", 1.0), row("own", 25.0), row("own", 25.0, 1)]
+    assert [cells[2:4] for cells in table(rows).rows] == [("two seeds", "21.00"), ("two seeds", "25.00")]
+
+
+@pytest.mark.slow
+def test_rows_are_written_once_and_a_rerun_does_nothing(room: Path, tmp_path: Path) -> None:
+    names = list(open_capture(room).cameras)
+    given = f"{room}@{names[0]}+{names[1]}@{names[2]}"
+    settings = NeverWorseBench((given,), maps=("own", "noise"), steps=3, jobs=1, output=tmp_path)
+    told = run(settings)
+    rows = read_rows([tmp_path / "never-worse.jsonl"])
+    assert [r["method"] for r in rows] == [BACKBONE, STEREO, "own", "noise"]
+    assert all(r["failed"] is None for r in rows)
+    assert rows[0]["prior"] is None
+    assert "usable" in rows[3]["prior"]
+    assert "over stereo" in told
+    run(settings)
+    assert read_rows([tmp_path / "never-worse.jsonl"]) == rows
+
+
+def test_a_capture_is_asked_for_by_an_example(tmp_path: Path) -> None:
+    with pytest.raises(D2Error, match="PATH@00"):
+        run(NeverWorseBench(output=tmp_path))
