@@ -13,8 +13,10 @@ from mimics import fudan, spacetime
 from torch import Tensor
 from viewing import official
 
+from d2_plugin import registry
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
+from d2_plugin.protocol import View
 from d2_plugin.runs.run import Run
 from d2_plugin.viewing.checkpoints import open_subject
 from d2_plugin.viewing.checkpoints.files import read_options, read_ply
@@ -417,3 +419,30 @@ class TestExport:
         TestTuples.checkpoint(tmp_path / "chkpnt1.pth")
         assert main(["export", str(tmp_path / "chkpnt1.pth")]) == 2
         assert "name its recording with --capture" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["hust4d", "swift4d"])
+def test_live_colours_are_those_that_the_field_leaves(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Configurations for several cameras deform harmonics (no_dshs=False); Swift4D those of what moves alone."""
+    from mimics import hust4d, swift4d
+
+    trainer = {"hust4d": hust4d, "swift4d": swift4d}[name]
+    model, scene = trainer.make()
+    model.training_setup(trainer.default_options(), *([None] if name == "swift4d" else []))
+    adapter: Any = registry.load(registry.ADAPTERS, name)(model, scene, "coarse")
+    view = View("a", 0, 0.2, torch.eye(4), torch.eye(3), 4, 4)
+    splats = adapter.slice_at(view)
+    before = adapter.colors(view, splats)
+    adapter.enter_stage("fine")
+    field = type(model._FDhash if name == "swift4d" else model._deformation)
+    forward = field.forward
+
+    def brighter(self: Any, *raw: Tensor) -> tuple[Tensor, ...]:
+        *moved, harmonics = forward(self, *raw)
+        return *moved, harmonics + 0.5
+
+    assert torch.equal(adapter.colors(view, splats), before), "this field leaves them alone"
+    monkeypatch.setattr(field, "forward", brighter)
+    changed = (adapter.colors(view, splats) - before).amax(1) > 0.1
+    moves = model._dynamic[:, 0] > model.dynamic_thro if name == "swift4d" else torch.ones_like(changed)
+    assert torch.equal(changed, moves)

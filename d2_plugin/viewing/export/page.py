@@ -100,16 +100,21 @@ def read_page(path: Path) -> ReadPage:
 
 def _coded(scene: ExportScene, megabytes: float) -> tuple[CodedScene, Keys | None]:
     if scene.moving is not None:
-        return code_lines(scene.moving, scene.clip.duration, megabytes * 1e6 / TEXT_PER_BYTE), None
+        return code_lines(scene.moving, scene.clip.duration, _bytes_for_data(megabytes)), None
     count = len(scene.harmonics.coefficients)
     at_rest = count * (BYTES_AT_REST + 3 * (scene.harmonics.coefficients.shape[1] - 1))
 
     def most_keys(moving: int, changing: int) -> int:
         each = moving * BYTES_OF_POSITION + changing * BYTES_OF_SHAPE
-        return max(int((megabytes * 1e6 / TEXT_PER_BYTE - at_rest) / max(1.05 * each, 1)), 2)
+        return max(int((_bytes_for_data(megabytes) - at_rest) / max(1.05 * each, 1)), 2)
 
     keys = bake(scene.splats_at, count, scene.clip.seconds, scene.pixels_per_unit, most_keys)
     return code_keys(keys, scene.harmonics), keys
+
+
+def _bytes_for_data(megabytes: float) -> float:
+    """What a page of this size leaves for its arrays, beside the player."""
+    return (megabytes * 1e6 - len(_assembled("", {}, b""))) / TEXT_PER_BYTE
 
 
 def _rounding(scene: ExportScene, coded: CodedScene, keys: Keys | None, arrays: Mapping[str, np.ndarray]) -> Offset:
