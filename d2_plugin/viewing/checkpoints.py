@@ -65,6 +65,8 @@ def open_subject(
     """
     if path.is_dir():
         _refuse_networks(path)
+        if capture is not None or train_cameras or downscale != 1:
+            raise D2Error(f"{path} is a folder of a run, which knows its recording: leave out what is for checkpoints")
         return subject_of_run(path)
     if not path.is_file():
         raise D2Error(f"no run at {path}: give the --output folder of `d2 train`, or a trainer's checkpoint")
