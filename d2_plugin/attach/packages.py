@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin.errors import D2Error
+from d2_plugin.reading import read_bytes, said
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +34,10 @@ class StandIn:
 
 
 VISION = "d2_plugin.compat.vision"
+
+SCRIPT = "give the trainer's repository or its script"
+MOST_SCRIPT = 1 << 24
+"""Bytes of a script, at most."""
 
 STAND_INS = {
     "torchvision": StandIn(
@@ -129,7 +134,12 @@ def _is_there(name: str) -> bool:
 
 def _imports(file: Path, conditional: bool) -> Iterator[tuple[str, int]]:
     """Absolute names that a file imports when it is loaded, with lines; `from a import b` gives a.b and a."""
-    for node in _at_once(ast.parse(file.read_text(encoding="utf-8", errors="replace")), conditional):
+    source = read_bytes(file, SCRIPT, MOST_SCRIPT).decode(errors="replace")
+    try:
+        tree = ast.parse(source)
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as failure:
+        raise D2Error(f"{file} is no Python that this version reads ({said(failure)}): {SCRIPT}") from None
+    for node in _at_once(tree, conditional):
         if isinstance(node, ast.Import):
             yield from ((alias.name, node.lineno) for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:

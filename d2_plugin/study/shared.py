@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.durable import Kind, read_table, write_table
+from d2_plugin.durable import Kind, make_folder, read_table, write_table
 from d2_plugin.runs.prior import build_priors_for
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, prior_settings
@@ -61,11 +61,10 @@ def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None
     path = folder / "shared.json"
     if path.is_file():
         return Shared(folder, **read_table(path, SHARED))
-    folder.mkdir(parents=True, exist_ok=True)
     full = check(replace(settings, hooks=HOOK_NAMES, overrides=_with(settings.overrides, "priors", variant=FULL)))
     start, cpu = time.monotonic(), time.process_time()
     scene = Scene.open(full)
-    points = folder / "points.npz"
+    points = make_folder(folder) / "points.npz"
     if not points.is_file():
         triangulated_points(scene.capture, scene.train_cameras).save(points)
     store = folder / "priors" / FULL

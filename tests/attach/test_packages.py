@@ -130,3 +130,11 @@ def test_the_doctor_lists_what_a_trainer_lacks(script: Path, monkeypatch) -> Non
 
 def test_logging_is_not_touched_by_importing(caplog) -> None:
     assert logging.getLogger("d2_plugin.attach").handlers == []
+
+
+def test_a_script_that_is_no_python_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "train.py").write_text("root:x:0:0:root:/root:/bin/bash")
+    with pytest.raises(
+        D2Error, match=r"train\.py is no Python that this version reads .* give the trainer's repository"
+    ):
+        needs("fudan", tmp_path / "train.py")

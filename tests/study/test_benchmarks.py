@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from d2_plugin.commands.cli import main
+from d2_plugin.errors import D2Error
 from d2_plugin.settings import Settings, declared
 from d2_plugin.study.bench import BENCHMARKS
 from d2_plugin.study.rows import begin_rows
@@ -49,3 +50,11 @@ def test_the_table_is_read_without_importing_torch() -> None:
     code = "import sys, d2_plugin.study.bench; print('torch' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "False"
+
+
+def test_a_step_too_small_to_be_measured_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    from d2_plugin.study.bench import training_step
+
+    monkeypatch.setattr(training_step, "timed", lambda *_: {training_step.RASTER: {"cpu_ms": 0.0}})
+    with pytest.raises(D2Error, match="took no CPU time that can be measured: give more --gaussians"):
+        training_step.measure(training_step.StepCase(5, 16, 16, 1), 0.0, memory=False)

@@ -186,6 +186,12 @@ class TestSentences:
         assert "no run at" in refused(capsys, tmp_path / "none")
         assert "d2 render needs RUN" in refused(capsys)
 
+    def test_a_run_knows_its_recording(self, trained: Path, room: Path, tmp_path: Path, capsys) -> None:
+        for more in (["--capture", str(room)], ["--train-cameras", "train0"], ["--downscale", "2"]):
+            words = ["render", str(trained), "--output", str(tmp_path / "a.mp4"), *more]
+            assert main(words) == 2
+            assert "is a folder of a run, which knows its recording" in capsys.readouterr().err
+
     def test_an_unknown_path_picture_or_camera(self, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "did you mean 'orbit'?" in refused(capsys, trained, "--path", "orbti")
         assert "did you mean 'depth'?" in refused(capsys, trained, "--show", "rgb,deph")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,15 @@ from d2_plugin.captures.videos.files import VIDEO_SUFFIXES, videos_below
 from d2_plugin.captures.videos.settings import ImportSettings
 from d2_plugin.durable import Kind, is_leftover, read_table, write_table
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import opened, shown_path
+from d2_plugin.reading import opened, reaching, shown_path
 
 STEPS = "import"
 """Folder of what each step found."""
 
 KIND = Kind("step of an import", 1, "delete it, it will be made again")
+
+MOST_FILES = 1000
+"""Of a calibration that is a folder."""
 
 ENDS = 1 << 20
 """Bytes at either end of a file that stand for it."""
@@ -94,10 +98,21 @@ def kept(folder: Path, step: str, find: Callable[[], dict[str, Any]]) -> dict[st
     return read_table(path, KIND)
 
 
+def _files_below(folder: Path) -> list[Path]:
+    """All files of a calibration that is a folder; not those of a disk."""
+    with reaching(folder, "give the calibration file itself"):
+        found = list(islice((one for one in folder.rglob("*") if one.is_file()), MOST_FILES + 1))
+    if len(found) > MOST_FILES:
+        raise D2Error(
+            f"{folder} holds more than {MOST_FILES} files, which is no calibration: give the calibration file itself"
+        )
+    return sorted(found)
+
+
 def _fingerprint(path: Path) -> str:
     """SHA-256 of the size and both ends of a file, or of all files of a folder."""
     digest = hashlib.sha256()
-    files = sorted(one for one in path.rglob("*") if one.is_file()) if path.is_dir() else [path]
+    files = _files_below(path) if path.is_dir() else [path]
     for file in files:
         with opened(file, "give the file that is there") as stream:
             size = stream.seek(0, 2)

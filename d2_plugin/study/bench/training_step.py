@@ -16,6 +16,7 @@ from typing import Annotated, Any, NamedTuple
 
 import torch
 
+from d2_plugin.errors import D2Error
 from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.settings import AtATime, Range, Settings
 from d2_plugin.study.command_line import command_line
@@ -83,6 +84,8 @@ def measure(case: StepCase, seconds: float, memory: bool = True, command: str = 
     works = works_of(case.scene())
     times = timed(works, torch.device("cpu"), seconds)
     peaks = {name: in_fresh_process(_steps, case, name).result if memory else None for name in works}
+    if times[RASTER]["cpu_ms"] <= 0:
+        raise D2Error("the rasterizer took no CPU time that can be measured: give more --gaussians or larger --sizes")
     where = f"{case.gaussians} Gaussians at {case.width}x{case.height}, {case.frames} frames"
     return [
         make_row(

@@ -41,6 +41,8 @@ def open_subject(
         D2Error: one sentence for what cannot be opened, and why.
     """
     if path.is_dir() and not is_output_folder(path):
+        if capture is not None or train_cameras or downscale != 1:
+            raise D2Error(f"{path} is a folder of a run, which knows its recording: leave out what is for checkpoints")
         return subject_of_run(path)
     return open_checkpoint(path, capture, train_cameras, downscale)[0]
 

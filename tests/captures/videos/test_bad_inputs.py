@@ -261,3 +261,16 @@ def test_a_video_that_moved_since_it_was_imported(given: Filmed, tmp_path: Path,
     assert "the video of camera 03 is not at" in capsys.readouterr().err
     short = select_frames(replace(open_capture(folder, cameras=["02"]), frames=(0, 1)), (0, 1))
     assert len(short.frames) == 2
+
+
+def test_a_calibration_folder_is_not_searched_without_end(
+    given: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("d2_plugin.captures.videos.claimed.MOST_FILES", 5)
+    (tmp_path / "home").mkdir()
+    for number in range(6):
+        (tmp_path / "home" / f"{number}.txt").write_text("")
+    words = ["import", str(given.videos), "--calibration", str(tmp_path / "home"), "--output", str(tmp_path / "out")]
+    assert main(words) == 2
+    assert "home holds more than 5 files, which is no calibration" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
