@@ -127,7 +127,7 @@ def _fudan(job: Job) -> list[str]:
         "PipelineParams": {"env_map_res": 0, "eval_shfs_4d": True},
         "OptimizationParams": {
             **{"iterations": job.iterations, "position_lr_max_steps": job.iterations, "lambda_rigid": 0.0},
-            **{"densification_interval": job.share(0.1), "densify_from_iter": job.share(0.2)},
+            **{"densification_interval": job.share(0.25), "densify_from_iter": job.share(0.4)},
             **{"densify_until_iter": job.share(0.8), "sh_increase_interval": job.share(0.25)},
         },
     }
