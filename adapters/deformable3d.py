@@ -36,8 +36,8 @@ class Deformable3DAdapter(InriaAdapter):
         deform: its `DeformModel`.
         warm_up: iteration from which the field is used (opt.warm_up); hooks wait for it.
         in_warm_up: whether hooks run before it all the same. Until then the trainer fits one still scene to all
-            instants, which the prior of anything that moves contradicts; and its own reports are already drawn with
-            the untrained field, whose random offsets of about .03 units small Gaussians do not bear.
+            instants, which the prior of anything that moves contradicts; and its own reports are drawn with the
+            untrained field all the time, which widens every Gaussian by about .04 units and hides what hooks gain.
         is_6dof: whether the field returns rigid motions [N, 4, 4] (dataset.is_6dof); read from the network by default.
         settings: constants of its rasterizer, where they were changed.
         key: finds the prior of a camera; needed where the picture's name does not say camera and frame

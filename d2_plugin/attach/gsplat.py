@@ -46,7 +46,8 @@ def put_in_place() -> None:
         for module, attribute in PLACES:
             setattr(importlib.import_module(module), attribute, ours.rasterization)
         log.warning("gsplat.rasterization: %s stands in for it", stand_in)
-    importlib.import_module("gsplat.distributed").cli = _one_process
+    distributed: Any = importlib.import_module("gsplat.distributed")
+    distributed.cli = _one_process
     _without_lpips()
 
 
@@ -63,7 +64,7 @@ def _without_lpips() -> None:
     """simple_trainer.py makes its LPIPS before it trains, and that needs torchvision and a download."""
     if importlib.util.find_spec("torchvision") is not None and not _is_stand_in("torchvision"):
         return
-    module = importlib.import_module("torchmetrics.image.lpip")
+    module: Any = importlib.import_module("torchmetrics.image.lpip")
     module.LearnedPerceptualImagePatchSimilarity = importlib.import_module("d2_plugin.compat.vision").NoLpips
     log.warning("torchvision is missing: LPIPS is not measured, its values are NaN")
 
@@ -80,7 +81,7 @@ def remember_gsplat(recipe: Recipe, objects: Objects) -> None:
     for name in STRATEGIES:
         kind = getattr(strategies, name)
         kind.check_sanity = _keeping_model(kind.check_sanity, objects)
-    distributed = importlib.import_module("gsplat.distributed")
+    distributed: Any = importlib.import_module("gsplat.distributed")
     distributed.cli = _keeping_settings(distributed.cli, objects)
 
 

@@ -95,7 +95,7 @@ class TestTrials:
         assert scored_after(job(tmp_path), "\n[held out] iteration 200: PSNR 19.25\n") == {200: 19.25}
         stats = tmp_path / "model" / "stats"
         stats.mkdir(parents=True)
-        (stats / "val_step0199.json").write_text('{"psnr": 18.5, "lpips": NaN}'.replace("NaN", "null"))
+        (stats / "val_step0199.json").write_text('{"psnr": 18.5, "ssim": 0.5, "lpips": NaN}')
         assert gsplat_stats(job(tmp_path), "") == {200: 18.5}
 
 

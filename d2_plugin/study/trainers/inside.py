@@ -93,10 +93,10 @@ def score_hust4d(objects: Any, held_out: Path) -> float:
     """PSNR in dB of 4DGaussians over a folder of its layout `multipleview`, by its own reader, renderer and metric."""
     from argparse import Namespace
 
-    from gaussian_renderer import render  # type: ignore[import-not-found]  # the repository's
-    from scene.dataset import FourDGSdataset  # type: ignore[import-not-found]
-    from scene.dataset_readers import sceneLoadTypeCallbacks  # type: ignore[import-not-found]
-    from utils.image_utils import psnr  # type: ignore[import-not-found]
+    from gaussian_renderer import render
+    from scene.dataset import FourDGSdataset
+    from scene.dataset_readers import sceneLoadTypeCallbacks
+    from utils.image_utils import psnr
 
     kind = "MultipleView"
     pictures = sceneLoadTypeCallbacks[kind](str(held_out)).train_cameras
@@ -118,8 +118,8 @@ def score_spacetime(objects: Any) -> float:
     """
     from argparse import Namespace
 
-    from helper_train import getrenderpip, trbfunction  # type: ignore[import-not-found]  # the repository's
-    from thirdparty.gaussian_splatting.utils.image_utils import psnr  # type: ignore[import-not-found]
+    from helper_train import getrenderpip, trbfunction
+    from thirdparty.gaussian_splatting.utils.image_utils import psnr
 
     render, settings, rasterizer = getrenderpip("train_ours_lite")
     pipe = Namespace(convert_SHs_python=False, compute_cov3D_python=False, debug=False)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from d2_plugin.reading import json_text, parse_json
+from d2_plugin.reading import json_text
 
 TRAINED, HELD_OUT = ("00", "02", "05", "07"), ("01", "03", "04", "06")
 """Cameras of the recordings."""
@@ -79,13 +79,13 @@ def scored_after(job: Job, printed: str) -> dict[int, float]:
 
 
 def gsplat_stats(job: Job, printed: str) -> dict[int, float]:
-    """stats/val_stepNNNN.json, whose steps count from 0."""
-    return {
-        int(path.stem.removeprefix("val_step")) + 1: float(
-            parse_json(path.read_text(), str(path), "run it again")["psnr"]
-        )
-        for path in sorted((job.model / "stats").glob("val_step*.json"))
-    }
+    """stats/val_stepNNNN.json, whose steps count from 0; LPIPS in there may be NaN, which is no JSON."""
+    found = {}
+    for path in sorted((job.model / "stats").glob("val_step*.json")):
+        psnr = re.search(r'"psnr": ([\d.]+)', path.read_text(encoding="utf-8"))
+        if psnr:
+            found[int(path.stem.removeprefix("val_step")) + 1] = float(psnr[1])
+    return found
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def _fudan(job: Job) -> list[str]:
         "PipelineParams": {"env_map_res": 0, "eval_shfs_4d": True},
         "OptimizationParams": {
             **{"iterations": job.iterations, "position_lr_max_steps": job.iterations, "lambda_rigid": 0.0},
-            **{"densification_interval": job.share(0.1), "densify_from_iter": job.share(0.2)},
+            **{"densification_interval": job.share(0.25), "densify_from_iter": job.share(0.4)},
             **{"densify_until_iter": job.share(0.8), "sh_increase_interval": job.share(0.25)},
         },
     }
