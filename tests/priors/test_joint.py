@@ -16,16 +16,19 @@ EPSILON = 0.02
 def recording(
     frames: int, anchors: int, ties: int, noise: float = 0.01, wrong: float = 0.0, seed: int = 0
 ) -> tuple[list[Anchors], list[Tie], np.ndarray]:
-    """Frames of one still picture, each with a line of its own; (anchors, ties, true scales)."""
+    """Frames of one still picture, each with a line of its own; (anchors, ties, true scales).
+
+    Noise is that of the anchors: that of ties would make the lines flatter (`together` averages it out).
+    """
     rng = np.random.default_rng(seed)
     scales, shifts = rng.uniform(0.5, 2, frames), rng.uniform(-0.2, 0.2, frames)
     inverse = rng.uniform(0.1, 1, 2000)
-    maps = [(inverse - shift) / scale + rng.normal(0, noise, 2000) for scale, shift in zip(scales, shifts)]
+    maps = [(inverse - shift) / scale for scale, shift in zip(scales, shifts)]
     known = []
     for map_ in maps:
         rows = rng.permutation(2000)[:anchors]
         y = np.where(rng.random(anchors) < wrong, rng.uniform(0.1, 1, anchors), inverse[rows])
-        known.append(Anchors(map_[rows], y, 1 / y))
+        known.append(Anchors(map_[rows] + rng.normal(0, noise, anchors), y, 1 / y))
     pairs = [Tie(f, f + 1, maps[f][:ties], maps[f + 1][:ties], 2.0) for f in range(frames - 1)] if ties else []
     return known, pairs, scales
 

@@ -19,8 +19,11 @@ from d2_plugin.priors.monocular.align import Alignment, align, predicted
 from d2_plugin.priors.monocular.joint import Anchors, Tie, fit_joint
 from d2_plugin.priors.monocular.settings import AlignSettings
 
-ANCHORS, STATIC = 2000, 1000
+ANCHORS, STATIC = 2000, 5000
 """Anchors per frame and static pixels per pair of frames that are used; all lie evenly over the picture."""
+GROUPS = 50
+"""Static pixels are averaged in so many groups of like predictions: noise of the maps makes lines that must agree
+flatter, and its mean does not."""
 
 Changed = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(grey picture, the one before) -> pixels whose neighbourhood changed, bool [H, W]."""
@@ -87,8 +90,11 @@ def _tie(place: int, first: Seen, second: Seen, weight: float, changed: Changed)
     before, after = (cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY) for frame in (first, second))
     still = ~changed(after, before) & predicted(first.mono) & predicted(second.mono)
     rows = _spread(still, STATIC)
-    x_first, x_second = (frame.mono.ravel()[rows].astype(np.float64) for frame in (first, second))
-    return Tie(place, place + 1, x_first, x_second, weight)
+    x = np.stack([frame.mono.ravel()[rows].astype(np.float64) for frame in (first, second)])
+    spreads = np.maximum(x.std(axis=1), np.finfo(float).tiny) if len(rows) else np.ones(2)
+    groups = np.array_split(np.argsort((x / spreads[:, None]).sum(axis=0)), min(GROUPS, max(len(rows), 1)))
+    means = np.stack([x[:, group].mean(axis=1) for group in groups], axis=1) if len(rows) else x
+    return Tie(place, place + 1, means[0], means[1], weight)
 
 
 def _spread(mask: np.ndarray, count: int) -> np.ndarray:
