@@ -49,7 +49,12 @@ def identity(settings: ImportSettings, paths: Mapping[str, Path]) -> dict[str, A
     """What makes two imports the same one."""
     table = {name: _plain(value) for name, value in asdict(settings).items()}
     del table["output"], table["videos"]
-    table["calibration"] = _fingerprint(settings.calibration)
+    for name in ("calibration", "intrinsics", "stills"):
+        path = getattr(settings, name)
+        if path is not None:
+            table[name] = _fingerprint(path)
+        else:
+            del table[name]
     return {**table, "videos": {name: _fingerprint(path) for name, path in paths.items()}}
 
 
