@@ -64,7 +64,6 @@ class Board:
         pairs = zip(identities.ravel().tolist(), corners.reshape(-1, 2), strict=True)
         return {number: corner + 0.5 for number, corner in pairs}
 
-
     @classmethod
     def parsed(cls, text: str) -> Board:
         """The board of charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY] or checkerboard:COLUMNSxROWS:SQUARE.

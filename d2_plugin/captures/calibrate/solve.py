@@ -98,9 +98,7 @@ def _joined(matches: Matches, more: Matches) -> Matches:
     return {pair: np.concatenate([pairs, more[pair]]) if pair in more else pairs for pair, pairs in matches.items()}
 
 
-def _likely_focal(
-    matches: Matches, features: Mapping[str, Features], known: Mapping[str, Camera]
-) -> dict[str, Camera]:
+def _likely_focal(matches: Matches, features: Mapping[str, Features], known: Mapping[str, Camera]) -> dict[str, Camera]:
     """The cameras with the focal length, one for all, with which the most matches agree on a motion."""
 
     def cameras(factor: float) -> dict[str, Camera]:

@@ -1,4 +1,4 @@
-"""From videos, with a calibration or without, to a recording: each step is kept in its folder, so a stopped import goes on.
+"""From videos, calibrated or not, to a recording: each step is kept in its folder, so a stopped import goes on.
 
 import/import.json    what is imported, with checksums: another import into the same folder is refused
 import/clocks.json    when each camera began
@@ -98,9 +98,7 @@ def import_videos(settings: ImportSettings, told: Told = lambda line: None) -> I
     return Imported(capture, clocks, folder)
 
 
-def _solved(
-    settings: ImportSettings, folder: Path, found: Mapping[str, VideoFile], told: Told
-) -> dict[str, Any]:
+def _solved(settings: ImportSettings, folder: Path, found: Mapping[str, VideoFile], told: Told) -> dict[str, Any]:
     """The calibration that the videos give, now or when it was found before; nothing is written yet."""
     if (folder / claimed.STEPS / "rig.json").is_file():
         return claimed.kept(folder, "rig", dict)

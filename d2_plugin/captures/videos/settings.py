@@ -41,12 +41,11 @@ class ImportChoices(Settings):
     refine_poses: bool = False
     """Correct the poses of the calibration by features of all cameras; kept as they are where that mends nothing."""
 
-
     intrinsics: Path | None = None
     """Without a calibration: a file with the lenses alone, in any of its formats; its poses are not looked at."""
     focal: tuple[str, ...] = ("shared",)
-    """Without a calibration and intrinsics: focal lengths in pixels of the upright video, one number or NAME=PIXELS,...;
-    or how they are found: shared (one for all cameras, as of phones of one model) or each."""
+    """Without a calibration and intrinsics: focal lengths in pixels of the upright video, one number or NAME=PIXELS,
+    joined by commas; or how they are found: shared (one for all cameras, as of phones of one model) or each."""
     stills: Path | None = None
     """Without a calibration: a folder of pictures of the same scene from places between the cameras, which connect
     cameras that see too little in common. Called CAMERA_NUMBER where the cameras' lenses differ."""
