@@ -27,7 +27,7 @@ from d2_plugin.captures.calibration import pinhole
 from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import D2Error
 
-LARGEST_DOUBT = (0.5, 0.02)
+LARGEST_DOUBT = (0.2, 0.01)
 """Degrees, and share of the rig's width, that two halves of the pictures may differ by about a camera."""
 
 LARGEST_FOCAL_DOUBT = 0.03
