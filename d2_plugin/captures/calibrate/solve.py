@@ -27,6 +27,9 @@ from d2_plugin.captures.calibration import pinhole
 from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import D2Error
 
+FINE = (*SCHEDULE, (1.0, 0.1), (0.5, 0.05))
+"""Rounds of the adjustment for features that were moved to better places."""
+
 LARGEST_DOUBT = (0.2, 0.01)
 """Degrees, and share of the rig's width, that two halves of the pictures may differ by about a camera."""
 
@@ -88,8 +91,9 @@ def solve_features(
     if found is None or lost:
         raise D2Error(f"the pictures do not settle where camera {', '.join(lost)} stands: {ADD}")
     features, tracks = sharpened(features, tracks.within(found.cameras), found.cameras)
-    found = bundled(found.cameras, features, tracks, SCHEDULE, focal) or found
-    doubt, focals = _doubt(found, tracks, features, focal)
+    schedule = SCHEDULE if any(features[name].greys is None for name in tracks.names) else FINE
+    found = bundled(found.cameras, features, tracks, schedule, focal) or found
+    doubt, focals = _doubt(found, tracks, features, schedule, focal)
     _refuse_unsure(doubt, focals, wanted)
     return SolvedRig.of(found, features, doubt, focals, tuple(wanted))
 
@@ -115,11 +119,15 @@ def _likely_focal(matches: Matches, features: Mapping[str, Features], known: Map
 
 
 def _doubt(
-    found: Bundle, tracks: Tracks, features: Mapping[str, Features], focal: str | None
+    found: Bundle,
+    tracks: Tracks,
+    features: Mapping[str, Features],
+    schedule: Sequence[tuple[float, float]],
+    focal: str | None,
 ) -> tuple[dict[str, tuple[float, float]], dict[str, float]]:
     """What two halves of the pictures differ by about poses and focal lengths; nothing where one does not hold."""
     halves = _halves(tracks, features, found.cameras)
-    one, other = (bundled(found.cameras, features, half, SCHEDULE, focal) for half in halves)
+    one, other = (bundled(found.cameras, features, half, schedule, focal) for half in halves)
     if one is None or other is None:
         return {}, {}
     doubt = differences(one.cameras, other.cameras)
