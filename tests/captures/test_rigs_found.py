@@ -158,7 +158,7 @@ class TestPlaces:
 
 @pytest.fixture(scope="module")
 def large(shared_data: Callable[[str], Path]) -> Capture:
-    return open_capture(shared_data("plaza") / ".." / "plaza_large")
+    return open_capture(shared_data("plaza_large"))
 
 
 @pytest.fixture(scope="module")
