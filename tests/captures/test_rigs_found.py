@@ -137,7 +137,7 @@ class TestPlaces:
         better, kept = sharpened({"a": one, "b": two}, tracks, {"a": camera, "b": camera})
         assert len(kept.seen) > 0.9 * len(rows)
         off = better["b"].pixels[kept.seen[:, 1]] - expected[kept.seen[:, 0]]
-        assert np.median(np.linalg.norm(off, axis=1)) < 0.02
+        assert np.median(np.linalg.norm(off, axis=1)) < 0.06  # of half a pixel; OpenCV warps by 32nds of a pixel
         assert np.array_equal(better["a"].pixels, one.pixels)
 
     def test_what_stands_still_is_one_witness(self) -> None:
@@ -184,8 +184,8 @@ def test_videos_become_a_recording_without_a_calibration(near: Filmed, large: Ca
     assert rig_width(found) == pytest.approx(rig_width(truth), rel=0.005)
     told = json.loads((tmp_path / "c" / "calibration.json").read_text())
     assert {"verdict", "reprojection_error", "points", "doubt_degrees"} <= told["cameras"][0].keys()
-    capture = open_capture(tmp_path / "c")
-    assert any("poses were found from the videos" in note for note in capture.notes)
+    assert "note  poses were found from the videos; the scale of the world is from the distance" in said
+    assert open_capture(tmp_path / "c").frames == (0, 12)
     before = (tmp_path / "c" / "calibration.json").read_bytes()
     assert main(words) == 0  # the same import is read, not solved again
     assert "camera 03: 0." not in capsys.readouterr().out
