@@ -253,8 +253,8 @@ class SplatModel(ABC):
     def state_dict(self) -> dict[str, Any]:
         """Parameters, statistics and optimizer: enough for a bitwise continuation."""
         parts = {"background": self.background, "appearance": self.appearance, "dropout": self.dropout}
-        parts |= {"clocks": self.clocks}
-        return self.gaussians.state_dict() | {name: part.state_dict() for name, part in parts.items() if part}
+        clocks = {} if self.clocks is None else {"clocks": self.clocks.state_dict()}
+        return clocks | self.gaussians.state_dict() | {name: part.state_dict() for name, part in parts.items() if part}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`; the state says whether there is a background and an appearance."""

@@ -107,8 +107,8 @@ def _found(pictures: Sequence[np.ndarray], masks: Sequence[np.ndarray | None]) -
         descriptors.append(np.sqrt(found / np.maximum(found.sum(axis=1, keepdims=True), 1e-12)))
         shapes.append(np.array([(point.size, np.deg2rad(point.angle)) for point in points]))
         moments.append(np.full(len(points), moment))
-    parts = (np.concatenate(part) for part in (pixels, descriptors, moments, shapes))
-    return Features(*parts, greys=tuple(greys))
+    places, kinds = (np.concatenate(pixels), np.concatenate(descriptors)), np.concatenate(shapes)
+    return Features(*places, np.concatenate(moments), kinds, tuple(greys))
 
 
 def match_all(features: Mapping[str, Features]) -> Matches:
