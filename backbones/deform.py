@@ -24,6 +24,7 @@ from d2_plugin.gaussians.slicing import slice_gaussians, unit_quaternions
 from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import NotNegative, Positive, Seed, Share
 
+from .clocks import Clocks
 from .deform_fields import Box, Field, HexPlaneField, HexPlaneSettings, MlpField, MlpSettings, Offsets
 from .model import SplatModel, SplatSettings, decayed_rate, shared_rates
 from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, refuse_temporal
@@ -71,6 +72,7 @@ class Deform(SplatModel):
         self.field: Field | None = None
         self.deforms = False
         self._noise = 0.0
+        self._instants: list[tuple[str, Tensor]] = []
         if settings.temporal:
             self.field = make_field(settings, box, self._generator).to(rows["positions"])
             self.field_optimizer = Adam(self.field.parameter_groups(), eps=1e-15, fused=True)
@@ -98,12 +100,27 @@ class Deform(SplatModel):
             raise D2Error(f"the time of camera '{view.camera}', frame {view.frame} is NaN: give every view a time")
         raw = self._canonical()
         noise = self._noise if torch.is_grad_enabled() else 0.0
-        offsets = self.offsets(raw["positions"], view.time + noise)
+        time = view.time if self.clocks is None else self._instant(self.clocks, view)
+        offsets = self.offsets(raw["positions"], time + noise)
         if offsets is not None:
             raw["positions"] = raw["positions"] + offsets.positions
             raw["log_scales"] = raw["log_scales"] + offsets.log_scales
             raw["left"] = raw["left"] + offsets.rotations
         return slice_gaussians(raw)
+
+    def _instant(self, clocks: Clocks, view: View) -> Tensor:
+        """The time of a view by its camera's clock, whose gradient `feel_time` wants."""
+        time = torch.tensor(clocks.time_of(view), dtype=torch.float64, requires_grad=torch.is_grad_enabled())
+        if time.requires_grad:
+            self._instants.append((view.camera, time))
+        return time
+
+    def feel_time(self, clocks: Clocks, view: View) -> None:
+        """See `SplatModel.feel_time`: what all slices of the camera's views in this step say."""
+        felt = [time.grad for camera, time in self._instants if camera == view.camera and time.grad is not None]
+        if felt:
+            clocks.feel(view.camera, torch.stack(felt).sum())
+        self._instants.clear()
 
     def _canonical(self) -> dict[str, Tensor]:
         g = self.gaussians
@@ -114,7 +131,7 @@ class Deform(SplatModel):
         still = self.field is None or not self.deforms
         return moving_gaussians(self._canonical(), self.harmonics()) if still else None
 
-    def offsets(self, positions: Tensor, time: float) -> Offsets | None:
+    def offsets(self, positions: Tensor, time: float | Tensor) -> Offsets | None:
         """What the field adds at canonical `positions` [K, 3]; None where nothing is deformed (warm-up, no time)."""
         if self.field is None or not self.deforms or not len(positions):
             return None

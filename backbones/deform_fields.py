@@ -113,14 +113,17 @@ class Field(nn.Module, ABC):
         self.register_buffer("reach", box.reach.detach().clone())
         self.unit = box.unit
 
-    def forward(self, positions: Tensor, fraction: float) -> Offsets:
-        """Offsets of `positions` [N, 3] (world; no gradient) at `fraction` of the duration, clamped to 0..1."""
+    def forward(self, positions: Tensor, fraction: float | Tensor) -> Offsets:
+        """Offsets of `positions` [N, 3] (world; no gradient) at `fraction` of the duration, clamped to 0..1.
+
+        A fraction that is a tensor, a scalar, has a gradient.
+        """
         columns = self.columns((positions.detach() - self.centre) / self.reach, min(max(fraction, 0.0), 1.0))
         place, turn, size = columns.split(SPLITS, -1)
         return Offsets(self.unit * place, turn, size)
 
     @abstractmethod
-    def columns(self, places: Tensor, fraction: float) -> Tensor:
+    def columns(self, places: Tensor, fraction: float | Tensor) -> Tensor:
         """The last layer [N, 10] for places [N, 3] in units of the box, -1..1 inside."""
 
     @abstractmethod
@@ -147,10 +150,10 @@ class MlpField(Field):
         self.instant = nn.ModuleList(linear(instant, width, generator) for _ in self.place)
         self.heads = zero_linear(width, sum(SPLITS))
 
-    def columns(self, places: Tensor, fraction: float) -> Tensor:
+    def columns(self, places: Tensor, fraction: float | Tensor) -> Tensor:
         """See `Field.columns`; the encoded time enters as one row that all Gaussians share."""
         place = octaves(places, self.settings.position_octaves)
-        instant = octaves(places.new_tensor([2 * fraction - 1]), self.settings.time_octaves)
+        instant = octaves(_one(2 * fraction - 1, places), self.settings.time_octaves)
         enters = [at_place(place) + at_time(instant) for at_place, at_time in zip(self.place, self.instant)]
         state = F.relu(enters[0])
         for i, layer in enumerate(self.hidden):
@@ -176,7 +179,7 @@ class HexPlaneField(Field):
         self.features = linear(channels * len(settings.resolutions), settings.width, generator)
         self.heads = zero_linear(settings.width, sum(SPLITS))
 
-    def columns(self, places: Tensor, fraction: float) -> Tensor:
+    def columns(self, places: Tensor, fraction: float | Tensor) -> Tensor:
         """See `Field.columns`; outside the box the planes keep their border values."""
         inside = places.clamp(-1, 1).T.contiguous()
         levels = [self._level(space, time, inside, fraction) for space, time in zip(self.space, self.time)]
@@ -200,7 +203,7 @@ class HexPlaneField(Field):
         return s.smooth_space * space + s.smooth_time * time + s.still * still
 
     @staticmethod
-    def _level(space: Tensor, time: Tensor, places: Tensor, fraction: float) -> Tensor:
+    def _level(space: Tensor, time: Tensor, places: Tensor, fraction: float | Tensor) -> Tensor:
         """Features [C, N] of places [3, N] in -1..1, from planes [3, C, R, R] and [3, C, T, R]."""
         pairs = torch.stack([torch.stack([places[b], places[a]], -1) for a, b in SPACE_PAIRS])
         planes = F.grid_sample(space, pairs[:, None], align_corners=True, padding_mode="border")[:, :, 0]
@@ -210,17 +213,23 @@ class HexPlaneField(Field):
         return x * y * z
 
 
+def _one(value: float | Tensor, like: Tensor) -> Tensor:
+    """A number, or a scalar with a gradient, as [1]."""
+    return value.to(like).reshape(1) if isinstance(value, Tensor) else like.new_tensor([value])
+
+
 def octaves(values: Tensor, count: int) -> Tensor:
     """[..., D * (1 + 2 count)]: the values, and sine and cosine of pi times 1, 2, 4, ... of each; values [..., D]."""
     angles = (values[..., None] * (math.pi * 2.0 ** torch.arange(count, device=values.device))).flatten(-2)
     return torch.cat([values, angles.sin(), angles.cos()], -1)
 
 
-def at_instant(planes: Tensor, fraction: float) -> Tensor:
+def at_instant(planes: Tensor, fraction: float | Tensor) -> Tensor:
     """Lines [3, C, R]: planes [3, C, T, R] interpolated at `fraction` (0..1) of their time."""
     last = planes.shape[2] - 1
     before = min(int(fraction * last), max(last - 1, 0))
     weight = fraction * last - before
+    weight = weight.to(planes) if isinstance(weight, Tensor) else weight
     return torch.lerp(planes[:, :, before], planes[:, :, min(before + 1, last)], weight)
 
 

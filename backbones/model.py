@@ -20,6 +20,7 @@ from d2_plugin.settings import NotNegative, Positive, Range, Settings
 
 from .appearance import Appearance
 from .background import Background
+from .clocks import Clocks, ClockSettings
 from .densify import DensifySettings, densify
 from .dropout import Dropout
 from .early_stop import EarlyStopSettings
@@ -69,6 +70,8 @@ class SplatSettings(Settings):
     """Whether each training camera has an affine change of colour of its own. `d2 train` switches it on where the
     cameras' exposures differ.
     Studio with gains from .8 to 1.2, alone, 500 steps, one seed: 20.83 dB without, 23.88 with."""
+    clocks: ClockSettings = field(default_factory=ClockSettings)
+    """Shifts in time that cameras learn."""
     raster: RasterSettings = field(default_factory=RasterSettings)
     """Constants of the rasterizer."""
     densify: DensifySettings = field(default_factory=DensifySettings)
@@ -106,6 +109,7 @@ class SplatModel(ABC):
         self.background = Background(self.gaussians.device) if settings.background else None
         self.appearance = Appearance(self.gaussians.device) if settings.appearance else None
         self.dropout = Dropout(settings.dropout) if settings.dropout else None
+        self.clocks = Clocks(settings.clocks) if settings.clocks.learn and settings.temporal else None
         self.observers: list[Observer] = []
         self.screen_offsets: Tensor | None = None
         self._drawn: Tensor | None = None
@@ -170,9 +174,11 @@ class SplatModel(ABC):
         return render if self.appearance is None else self.appearance.seen_by(view.camera, render)
 
     def look_at(self, views: Sequence[View], pictures: Callable[[int], Tensor]) -> None:
-        """What the model takes from the training pictures before the first step: the colours of its background."""
+        """What the model takes from the training pictures before the first step: background colours, frame rates."""
         if self.background is not None:
             self.background.start_from(views, pictures)
+        if self.clocks is not None:
+            self.clocks.look_at(views)
 
     def regularization(self) -> Tensor | float:
         """A term of the training loss that concerns no picture; 0.0 where there is none."""
@@ -184,11 +190,17 @@ class SplatModel(ABC):
             total = total + s.scale_weight / self.extent * self.gaussians["log_scales"].exp().mean()
         return total
 
+    @abstractmethod
+    def feel_time(self, clocks: Clocks, view: View) -> None:
+        """After backward: tell the clocks how the loss changes with the time of the view."""
+
     @torch.no_grad()
     def accumulate(self, view: View) -> None:
         """After backward: add the last render's screen-space gradient, in units of half the image, per Gaussian."""
         if self.screen_offsets is None or self.screen_offsets.grad is None or self._drawn is None:
             raise D2Error("there is no screen-space gradient yet: render a view and go backward before accumulate")
+        if self.clocks is not None:
+            self.feel_time(self.clocks, view)
         gradient, statistics = self.screen_offsets.grad, self.gaussians.statistics
         if can_draw(gradient, *statistics.values()):
             sums = statistics["screen_gradient"], statistics["seen"]
@@ -207,6 +219,8 @@ class SplatModel(ABC):
             self.background.optimize()
         if self.appearance is not None:
             self.appearance.optimize()
+        if self.clocks is not None:
+            self.clocks.optimize(step, iterations)
         if self.dropout is not None:
             self.dropout.advance(step, iterations)
         s = self.settings
@@ -239,7 +253,8 @@ class SplatModel(ABC):
     def state_dict(self) -> dict[str, Any]:
         """Parameters, statistics and optimizer: enough for a bitwise continuation."""
         parts = {"background": self.background, "appearance": self.appearance, "dropout": self.dropout}
-        return self.gaussians.state_dict() | {name: part.state_dict() for name, part in parts.items() if part}
+        clocks = {} if self.clocks is None else {"clocks": self.clocks.state_dict()}
+        return clocks | self.gaussians.state_dict() | {name: part.state_dict() for name, part in parts.items() if part}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`; the state says whether there is a background and an appearance."""
@@ -249,6 +264,8 @@ class SplatModel(ABC):
             self.background.load_state_dict(state["background"])
         if self.dropout is not None:
             self.dropout.load_state_dict(state["dropout"])
+        if self.clocks is not None:
+            self.clocks.load_state_dict(state["clocks"])
         self.appearance = Appearance(self.gaussians.device) if "appearance" in state else None
         if self.appearance is not None:
             self.appearance.load_state_dict(state["appearance"])

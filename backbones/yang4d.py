@@ -22,6 +22,7 @@ from d2_plugin.gaussians.slicing import slice_gaussians, unit_quaternions
 from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Count, NotNegative
 
+from .clocks import Clocks
 from .model import SplatModel, SplatSettings, shared_rates
 from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, refuse_temporal
 from .trainer import Trainer, TrainSettings
@@ -79,7 +80,14 @@ class Yang4D(SplatModel):
         """
         if self.settings.temporal and math.isnan(view.time):
             raise D2Error(f"the time of camera '{view.camera}', frame {view.frame} is NaN: give every view a time")
-        return slice_gaussians(self._raw(), view.time)
+        time = view.time if self.clocks is None else self.clocks.time_of(view)
+        return slice_gaussians(self._raw(), time)
+
+    def feel_time(self, clocks: Clocks, view: View) -> None:
+        """See `SplatModel.feel_time`: only differences of times count, so a later view is as good as earlier means."""
+        gradient = self.gaussians["times"].grad
+        if gradient is not None:
+            clocks.feel(view.camera, -gradient.sum())
 
     def _raw(self) -> dict[str, Tensor]:
         parameters = self.gaussians.parameters
@@ -97,7 +105,8 @@ class Yang4D(SplatModel):
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] of the sliced Gaussians as seen in `view`, at its time."""
         degree = _time_degree(self.settings)
-        phase = (view.time - self.gaussians["times"][splats.rows]) / self.duration if degree else None
+        time = view.time if self.clocks is None else self.clocks.time_of(view)
+        phase = (time - self.gaussians["times"][splats.rows]) / self.duration if degree else None
         return self.harmonic_colors(view, splats, phase, degree)
 
     def harmonics(self) -> Harmonics:

@@ -1,4 +1,4 @@
-"""Turn videos and a calibration into a recording: one clock for all cameras, pictures, exposures."""
+"""Turn videos into a recording: where the cameras stand, one clock for all of them, pictures, exposures."""
 
 from __future__ import annotations
 

@@ -95,7 +95,10 @@ def _refuse_videos(path: Path) -> None:
     from d2_plugin.captures.videos.files import videos_below
 
     if path.is_dir() and not any(layout.recognised(path) for layout in LAYOUTS.values()) and videos_below(path):
-        raise D2Error(f"{path} holds videos and no calibration that goes with them: give it with --calibration FILE")
+        raise D2Error(
+            f"{path} holds videos and no calibration that goes with them: give it with --calibration FILE, or let "
+            "`d2 import` find one first"
+        )
 
 
 def _live(run: Run) -> LiveRun:

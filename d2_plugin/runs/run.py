@@ -174,6 +174,7 @@ class Run:
             "retired": self.retired,
             "background": getattr(trainer.model, "background", None) is not None,
             "appearance": getattr(trainer.model, "appearance", None) is not None,
+            "clocks": None if getattr(trainer.model, "clocks", None) is None else trainer.model.clocks.in_frames(),
             "prior": self.prior,
             "plan": scene.plan.as_dict(),
             "capture": scene.capture.name,

@@ -5,6 +5,7 @@ Everything runs on the CPU, with pycolmap and OpenCV (`calibration` extra), and 
 
 from d2_plugin.captures.calibrate.boards import Board, scaled_by_board
 from d2_plugin.captures.calibrate.refine import RefinedPoses, refine
-from d2_plugin.captures.calibrate.solve import SolvedRig, solve_rig
+from d2_plugin.captures.calibrate.rig import SolvedRig
+from d2_plugin.captures.calibrate.solve import solve_rig
 
 __all__ = ["Board", "RefinedPoses", "SolvedRig", "refine", "scaled_by_board", "solve_rig"]

@@ -1,19 +1,21 @@
-"""A board that several cameras saw at the same moment says how large the world is.
+"""A board that several cameras saw at the same moment: matches that no descriptor is needed for, and the scale.
 
 Boards are ChArUco or plain checkerboards, found by OpenCV. Pictures are undistorted.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Annotated, Any
 
 import numpy as np
 
 from d2_plugin.captures.calibrate.bundle import Tracks, fitting, triangulate
-from d2_plugin.captures.calibrate.features import Features
-from d2_plugin.captures.calibrate.solve import SolvedRig
+from d2_plugin.captures.calibrate.features import Features, Matches
+from d2_plugin.captures.calibrate.rig import SolvedRig
 from d2_plugin.captures.pictures import checked_picture, opencv
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Positive, Range, Settings
@@ -81,6 +83,68 @@ class Board(Settings):
             return {}
         pairs = zip(identities.ravel().tolist(), corners.reshape(-1, 2), strict=True)
         return {number: corner + 0.5 for number, corner in pairs}
+
+    @classmethod
+    def parsed(cls, text: str) -> Board:
+        """The board of charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY] or checkerboard:COLUMNSxROWS:SQUARE.
+
+        Columns and rows count squares, as printed; sides are in metres.
+        """
+        kind, *parts = text.split(":")
+        match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", parts[0]) if parts else None
+        sides = [_side(part) for part in parts[1:3]]
+        wanted = {"charuco": (2, 3), "checkerboard": (1, 1)}.get(kind)
+        fits = wanted is not None and wanted[0] <= len(parts) - 1 <= wanted[1] and all(sides[: wanted[0]])
+        fits = fits and (len(sides) < 2 or sides[1] < sides[0])
+        if match is None or not fits or min(int(match[1]), int(match[2])) < 3:
+            raise D2Error(
+                f"--board says '{text}', expected charuco:COLUMNSxROWS:SQUARE:MARKER such as charuco:7x5:0.04:0.03, or "
+                "checkerboard:COLUMNSxROWS:SQUARE: count squares, 3 at least, and give their sides in metres"
+            )
+        marker, names = (sides[1], parts[3:]) if kind == "charuco" else (None, [])
+        return cls(int(match[1]), int(match[2]), sides[0], marker, *names)
+
+
+def _side(text: str) -> float:
+    """Metres, 0 for what is none."""
+    try:
+        side = float(text)
+    except ValueError:
+        return 0.0
+    return side if 0 < side < np.inf else 0.0
+
+
+def board_matches(
+    features: Mapping[str, Features], pictures: Mapping[str, Sequence[np.ndarray]], board: Board
+) -> tuple[dict[str, Features], Matches]:
+    """(the features with the corners of the board behind them, which corners two cameras saw at the same moment)."""
+    seen = {name: _corners_seen(board, taken) for name, taken in pictures.items()}
+    more = {name: _with_corners(features[name], corners) for name, corners in seen.items()}
+    matches = {}
+    for one, other in combinations(seen, 2):
+        begin, start = len(features[one].pixels), len(features[other].pixels)
+        places = {key: place for place, key in enumerate(seen[other])}
+        pairs = [(begin + i, start + places[key]) for i, key in enumerate(seen[one]) if key in places]
+        matches[one, other] = np.array(pairs, int).reshape(-1, 2)
+    return {**features, **more}, matches
+
+
+def _corners_seen(board: Board, taken: Sequence[np.ndarray]) -> dict[tuple[int, int], np.ndarray]:
+    """(moment, number of the corner) -> its pixel."""
+    found = [(moment, board.corners(picture)) for moment, picture in enumerate(taken, start=1)]  # 0 is the still
+    return {(moment, number): corner for moment, corners in found for number, corner in corners.items()}
+
+
+def _with_corners(features: Features, corners: Mapping[tuple[int, int], np.ndarray]) -> Features:
+    """Corners have no descriptor, so nothing else is taken for one; a size of 0 says that they stay where they are."""
+    count = len(corners)
+    return replace(
+        features,
+        pixels=np.concatenate([features.pixels, np.array(list(corners.values())).reshape(-1, 2)]),
+        descriptors=np.concatenate([features.descriptors, np.zeros((count, 128), np.float32)]),
+        moments=np.concatenate([features.moments, np.array([moment for moment, _ in corners], int)]),
+        shapes=np.concatenate([features.shapes, np.zeros((count, 2))]),
+    )
 
 
 @checked_arguments

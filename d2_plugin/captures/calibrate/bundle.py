@@ -129,36 +129,42 @@ def fitting(bundle: Bundle, features: Mapping[str, Features], pixels: float) -> 
     return Bundle(bundle.cameras, bundle.points[kept], Tracks(bundle.tracks.names, seen[kept]))
 
 
-def adjust(bundle: Bundle, features: Mapping[str, Features], scale: float, focal: bool = False) -> Bundle:
+def adjust(bundle: Bundle, features: Mapping[str, Features], scale: float, focal: str | None = None) -> Bundle:
     """Poses and points that make the reprojection errors least, with the gauge held by two cameras.
 
-    The loss is Cauchy's with `scale` pixels: what misses by much more hardly counts. `focal` frees the focal length of
-    each camera as well, one for both axes.
+    The loss is Cauchy's with `scale` pixels: what misses by much more hardly counts. `focal` frees focal lengths
+    as well, one for both axes: "each" camera its own, or one that is "shared".
     """
     pycolmap = pycolmap_module("adjusting poses")
     numbers = {name: number for number, name in enumerate(bundle.cameras, start=1)}
     rec = pycolmap.Reconstruction()
     for name, number in numbers.items():
-        _add_camera(pycolmap, rec, bundle.cameras[name], number, features[name].pixels, focal)
+        lens = 1 if focal == "shared" else number
+        _add_camera(pycolmap, rec, bundle.cameras[name], (number, lens), features[name].pixels, focal is not None)
     columns = [(numbers[name], place) for place, name in enumerate(bundle.tracks.names) if name in numbers]
     for point, seen in zip(bundle.points, bundle.tracks.seen.tolist(), strict=True):
         elements = [pycolmap.TrackElement(number, seen[place]) for number, place in columns if seen[place] >= 0]
         rec.add_point3D(point, pycolmap.Track(elements))
     identities = sorted(rec.points3D)
-    _solve(pycolmap, rec, scale, focal)
-    cameras = {name: _moved(bundle.cameras[name], rec, number, focal) for name, number in numbers.items()}
+    _solve(pycolmap, rec, scale, focal is not None)
+    cameras = {name: _moved(bundle.cameras[name], rec, number, focal is not None) for name, number in numbers.items()}
     points = np.array([rec.points3D[i].xyz for i in identities]).reshape(-1, 3)
     return Bundle(cameras, points, bundle.tracks)
 
 
-def _add_camera(pycolmap: ModuleType, rec: Any, camera: Camera, number: int, pixels: np.ndarray, focal: bool) -> None:
+def _add_camera(
+    pycolmap: ModuleType, rec: Any, camera: Camera, numbers: tuple[int, int], pixels: np.ndarray, focal: bool
+) -> None:
+    """Add a picture with (its number, that of its lens), and the lens where it is not there yet."""
+    number, lens = numbers
     K = camera.K
     values = [K[0, 0], K[0, 2], K[1, 2]] if focal else [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
     model = "SIMPLE_PINHOLE" if focal else "PINHOLE"
-    rec.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=number, model=model, width=camera.width, height=camera.height, params=values)
-    )
-    image = pycolmap.Image(name=camera.name, keypoints=pixels.reshape(-1, 2), camera_id=number, image_id=number)
+    if lens not in rec.cameras:
+        rec.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=lens, model=model, width=camera.width, height=camera.height, params=values)
+        )
+    image = pycolmap.Image(name=camera.name, keypoints=pixels.reshape(-1, 2), camera_id=lens, image_id=number)
     T = camera.T_camera_world
     rec.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(T[:3, :3]), T[:3, 3]))
 
@@ -179,6 +185,6 @@ def _moved(camera: Camera, rec: Any, number: int, focal: bool) -> Camera:
     found = rec.images[number].cam_from_world()
     K = camera.K
     if focal:
-        length = float(rec.cameras[number].params[0])
+        length = float(rec.images[number].camera.params[0])
         K = pinhole(length, length, K[0, 2], K[1, 2])
     return replace(camera, K=K, T_camera_world=rigid(found.rotation.matrix(), np.asarray(found.translation)))

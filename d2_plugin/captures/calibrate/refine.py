@@ -14,7 +14,8 @@ import numpy as np
 
 from d2_plugin.captures.calibrate.align import aligned, differences
 from d2_plugin.captures.calibrate.bundle import Bundle, Tracks, adjust, fitting, join_matches, triangulate
-from d2_plugin.captures.calibrate.features import Features, Matches, find_features, match_all, pixel_error, sampson
+from d2_plugin.captures.calibrate.features import Features, Matches, match_all, of_a_still_camera, pixel_error, sampson
+from d2_plugin.captures.calibrate.sharpen import sharpened
 from d2_plugin.captures.calibrate.verify import verified
 from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.errors import D2Error
@@ -91,7 +92,7 @@ def look(capture: Capture, cameras: Sequence[str], moments: int = MOMENTS) -> di
     chosen = np.unique(np.linspace(0, len(capture.frames) - 1, moments).round().astype(int))
     frames = [capture.frames[i] for i in chosen]
     return {
-        name: find_features([capture.image(name, frame) for frame in frames], capture.recorded(name))
+        name: of_a_still_camera([capture.image(name, frame) for frame in frames], capture.recorded(name))
         for name in cameras
     }
 
@@ -101,12 +102,13 @@ def refine_poses(given: Mapping[str, Camera], features: Mapping[str, Features]) 
     diagonal = max(float(np.hypot(camera.width, camera.height)) for camera in given.values())
     matches = verified(match_all(features), features, given, REACH * diagonal)
     names = tuple(given)
+    features, tracks_of_all = sharpened(features, join_matches(matches, names), given)
     halves = [halved(matches, features, given, which) for which in (0, 1)]
     tracks = [join_matches(half, names) for half in halves]
     lost = _undetermined(given, tracks)
     if lost:
         return _kept(given, lost)
-    whole = bundled(given, features, join_matches(matches, names))
+    whole = bundled(given, features, tracks_of_all)
     parts = [bundled(given, features, half) for half in tracks]
     if whole is None or parts[0] is None or parts[1] is None:
         return _kept(given, "the poses stay: the points that the cameras share do not hold them")
@@ -121,15 +123,16 @@ def bundled(
     features: Mapping[str, Features],
     tracks: Tracks,
     schedule: Sequence[tuple[float, float]] = SCHEDULE,
+    focal: str | None = None,
 ) -> Bundle | None:
-    """The bundle that starts at `given`; None where a camera is left without points."""
+    """The bundle that starts at `given`; None where a camera is left without points. `focal` as `adjust` has it."""
     cameras = dict(given)
     bundle = None
     for limit, scale in schedule:
         bundle = fitting(triangulate(cameras, features, tracks), features, limit)
         if min(bundle.tracks.counts(given), default=0) < FEWEST_SEEN:
             return None
-        bundle = adjust(bundle, features, scale * min(pixel_error(camera) for camera in given.values()))
+        bundle = adjust(bundle, features, scale * min(pixel_error(camera) for camera in given.values()), focal)
         cameras = bundle.cameras
     return bundle
 

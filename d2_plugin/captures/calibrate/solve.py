@@ -1,48 +1,45 @@
-"""The poses of a rig from its pictures alone, with known intrinsics: never one that the pictures do not settle.
+"""The poses of a rig from its pictures alone: never one that the pictures do not settle.
 
 Pairs of cameras give essential matrices, the best pair a start, and the other cameras are added one by one, each time
-with a bundle adjustment. Then the pictures are cut into two halves that must find the same rig by themselves. Each
-camera has one pose, over all moments and stills. The scale is arbitrary until a board or a distance says it.
+with a bundle adjustment. Features are then moved to where their surroundings match best, and the pictures are cut into
+two halves that must find the same rig by themselves. Each camera has one pose, over all moments and stills. The scale
+is arbitrary until a board or a distance says it. A focal length that is not known is looked for where most matches
+agree with one motion, and bundled with the poses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from d2_plugin.captures.calibrate.align import differences, rig_width
-from d2_plugin.captures.calibrate.bundle import Bundle, Tracks, fitting, join_matches, project, triangulate
-from d2_plugin.captures.calibrate.features import (
-    Features,
-    Matches,
-    Pair,
-    find_features,
-    match_all,
-    pixel_error,
-    pycolmap_module,
-)
-from d2_plugin.captures.calibrate.refine import bundled, halved
-from d2_plugin.captures.calibrate.verify import as_colmap, essential_pose, verified
-from d2_plugin.captures.calibration import rigid
+from d2_plugin.captures.calibrate.align import differences
+from d2_plugin.captures.calibrate.boards import Board, board_matches
+from d2_plugin.captures.calibrate.bundle import Bundle, Tracks, join_matches
+from d2_plugin.captures.calibrate.features import Features, Matches, find_features, match_all, of_a_still_camera
+from d2_plugin.captures.calibrate.grow import grown
+from d2_plugin.captures.calibrate.refine import CELLS, SCHEDULE, bundled
+from d2_plugin.captures.calibrate.rig import SolvedRig
+from d2_plugin.captures.calibrate.sharpen import sharpened
+from d2_plugin.captures.calibrate.verify import verified
+from d2_plugin.captures.calibration import pinhole
 from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.pictures import checked_picture
 from d2_plugin.errors import D2Error
 from d2_plugin.values import checked_arguments
 
-STARTS = 2
-"""Pairs of cameras that are tried as a start, the most promising first."""
+FINE = (*SCHEDULE, (1.0, 0.1), (0.5, 0.05))
+"""Rounds of the adjustment for features that were moved to better places."""
 
-FEWEST_SEEN = 12
-"""Points that settle a camera, at least, and as a share of those it should see."""
-LEAST_SHARE = 0.25
-
-GROWING = ((8.0, 1.3), (4.0, 0.4))
-"""Rounds of the adjustment while cameras are added, as `refine.SCHEDULE`."""
-
-LARGEST_DOUBT = (0.5, 0.02)
+LARGEST_DOUBT = (0.15, 0.006)
 """Degrees, and share of the rig's width, that two halves of the pictures may differ by about a camera."""
+
+LARGEST_FOCAL_DOUBT = 0.03
+"""Share that they may differ by about a focal length."""
+
+FOCALS = np.geomspace(0.45, 2.4, 9)
+"""Focal lengths that are tried where none is known, in longer sides of the picture: 96 to 24 degrees across."""
 
 ADD = (
     "add stills on the way between the cameras (at most 20 degrees apart), bring neighbouring cameras closer together, "
@@ -50,54 +47,13 @@ ADD = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class SolvedRig:
-    """A rig that was found; the first camera's axes are the world's, and the width of the rig is 1."""
-
-    cameras: dict[str, Camera]
-    pixels: dict[str, float]
-    """Camera -> median reprojection error in pixels."""
-    seen: dict[str, int]
-    """Camera -> points that it sees."""
-    doubt: dict[str, tuple[float, float]]
-    """Camera -> (degrees, share of the rig's width) that two halves of the pictures differ by: about two standard
-    deviations."""
-    scale: str = "arbitrary: give the distance of two cameras, or film a board"
-
-    def verdicts(self) -> dict[str, str]:
-        """A sentence per camera."""
-        return {
-            name: f"{self.pixels[name]:.2f} pixels over {self.seen[name]} points, known to {self.doubt[name][0]:.2g} "
-            f"degrees and {self.doubt[name][1]:.2%} of the rig's width"
-            for name in self.cameras
-        }
-
-    @checked_arguments
-    def scaled(self, one: str, other: str, distance: float) -> SolvedRig:
-        """The same rig with `distance` between two of its cameras."""
-        if not distance > 0 or one == other or one not in self.cameras or other not in self.cameras:
-            raise D2Error(
-                f"a distance of {distance:g} between {one} and {other} says no scale: name two cameras of "
-                f"{', '.join(self.cameras)} and how far they stand apart, above 0"
-            )
-        found = float(np.linalg.norm(self.cameras[one].centre - self.cameras[other].centre))
-        return self.times(distance / found, f"from the distance {distance:g} of {one} and {other}")
-
-    def times(self, factor: float, why: str) -> SolvedRig:
-        """The same rig, `factor` times as large; `why` says how that is known."""
-        cameras = {}
-        for name, camera in self.cameras.items():
-            T = camera.T_camera_world.copy()
-            T[:3, 3] *= factor
-            cameras[name] = replace(camera, T_camera_world=T)
-        return replace(self, cameras=cameras, scale=why)
-
-
 @checked_arguments
 def solve_rig(
     pictures: Mapping[str, Sequence[np.ndarray]],
     intrinsics: Mapping[str, Camera],
     stills: Mapping[str, np.ndarray] | None = None,
+    board: Board | None = None,
+    focal: str | None = None,
 ) -> SolvedRig:
     """The poses of cameras that stand still.
 
@@ -105,6 +61,8 @@ def solve_rig(
         pictures: camera -> its pictures RGB uint8 [H, W, 3] at moments that are the same for all cameras, undistorted.
         intrinsics: camera -> its size and K, for the stills too; the poses in it are not looked at.
         stills: more pictures of the same scene, a camera each: they connect cameras that see too little in common.
+        board: corners of this board, where cameras saw it at the same moment, are matches too.
+        focal: "shared" or "each" where focal lengths are not known: those of `intrinsics` are not looked at then.
 
     Raises:
         D2Error: the pictures do not settle the pose of every camera; the sentence names those, and what to add.
@@ -112,150 +70,116 @@ def solve_rig(
     unknown = [name for name in (*pictures, *(stills or {})) if name not in intrinsics]
     if unknown or not pictures:
         raise D2Error(f"no intrinsics for camera {unknown[0] if unknown else 'any'}: give size and K of every camera")
-    features = {name: find_features(_moments(name, taken)) for name, taken in pictures.items()}
+    features = {name: of_a_still_camera(_of_one_size(name, taken)) for name, taken in pictures.items()}
     features |= {name: find_features([picture]) for name, picture in (stills or {}).items()}
-    return solve_features(features, intrinsics, tuple(pictures))
+    features, corners = (features, {}) if board is None else board_matches(features, pictures, board)
+    return solve_features(features, intrinsics, tuple(pictures), corners, focal)
 
 
 def solve_features(
-    features: Mapping[str, Features], intrinsics: Mapping[str, Camera], wanted: Sequence[str]
+    features: Mapping[str, Features],
+    intrinsics: Mapping[str, Camera],
+    wanted: Sequence[str],
+    corners: Matches | None = None,
+    focal: str | None = None,
 ) -> SolvedRig:
-    """`solve_rig` for features that were found already; `wanted` are the cameras that must be settled."""
+    """`solve_rig` for features that were found already.
+
+    `wanted` are the cameras that must be settled, `corners` matches that are known beside those of descriptors.
+    """
     known = {name: replace(intrinsics[name], T_camera_world=np.eye(4)) for name in features}
-    matches = verified(match_all(features), features, known)
+    matched = _joined(match_all(features), corners or {})
+    known = known if focal is None else _likely_focal(matched, features, known)
+    matches = verified(matched, features, known)
     tracks = join_matches(matches, tuple(features))
-    grown = [_grow(pair, matches, tracks, features, known) for pair in _starts(matches, features, known)]
-    found = max((bundle for bundle in grown if bundle is not None), key=_worth, default=None)
+    found = grown(matches, tracks, features, known)
     lost = list(wanted) if found is None else [name for name in wanted if name not in found.cameras]
     if found is None or lost:
         raise D2Error(f"the pictures do not settle where camera {', '.join(lost)} stands: {ADD}")
-    found = bundled(found.cameras, features, tracks) or found
-    doubt = _doubt(found, matches, features)
+    features, tracks = sharpened(features, tracks.within(found.cameras), found.cameras)
+    schedule = SCHEDULE if any(features[name].greys is None for name in tracks.names) else FINE
+    found = bundled(found.cameras, features, tracks, schedule, focal) or found
+    doubt, focals = _doubt(found, tracks, features, schedule, focal)
+    _refuse_unsure(doubt, focals, wanted)
+    return SolvedRig.of(found, features, doubt, focals, tuple(wanted))
+
+
+def _of_one_size(name: str, taken: Sequence[np.ndarray]) -> Sequence[np.ndarray]:
+    shapes = {checked_picture(picture, f"a picture of camera {name}").shape for picture in taken}
+    if len(shapes) != 1:
+        raise D2Error(f"camera {name} has pictures of {len(shapes)} sizes, expected one: give pictures of one size")
+    return taken
+
+
+def _joined(matches: Matches, more: Matches) -> Matches:
+    return {pair: np.concatenate([pairs, more[pair]]) if pair in more else pairs for pair, pairs in matches.items()}
+
+
+def _likely_focal(matches: Matches, features: Mapping[str, Features], known: Mapping[str, Camera]) -> dict[str, Camera]:
+    """The cameras with the focal length, one for all, with which the most matches agree on a motion."""
+
+    def cameras(factor: float) -> dict[str, Camera]:
+        lengths = {name: factor * max(camera.width, camera.height) for name, camera in known.items()}
+        return {
+            name: replace(camera, K=pinhole(lengths[name], lengths[name], camera.K[0, 2], camera.K[1, 2]))
+            for name, camera in known.items()
+        }
+
+    def agreeing(factor: float) -> int:
+        return sum(len(pairs) for pairs in verified(matches, features, cameras(factor)).values())
+
+    return cameras(float(max(FOCALS, key=agreeing)))
+
+
+def _doubt(
+    found: Bundle,
+    tracks: Tracks,
+    features: Mapping[str, Features],
+    schedule: Sequence[tuple[float, float]],
+    focal: str | None,
+) -> tuple[dict[str, tuple[float, float]], dict[str, float]]:
+    """What two halves of the pictures differ by about poses and focal lengths; nothing where one does not hold."""
+    halves = _halves(tracks, features, found.cameras)
+    one, other = (bundled(found.cameras, features, half, schedule, focal) for half in halves)
+    if one is None or other is None:
+        return {}, {}
+    doubt = differences(one.cameras, other.cameras)
+    if focal is None:
+        return doubt, {}
+    lengths = {name: (one.cameras[name].K[0, 0], other.cameras[name].K[0, 0]) for name in doubt}
+    return doubt, {name: abs(float(np.log(a / b))) for name, (a, b) in lengths.items()}
+
+
+def _halves(tracks: Tracks, features: Mapping[str, Features], cameras: Mapping[str, Camera]) -> list[Tracks]:
+    """Tracks by the cell, of alternating ones, in which the first camera that has them sees them."""
+    first = (tracks.seen >= 0).argmax(axis=1)
+    which = np.zeros(len(first), int)
+    for column, name in enumerate(tracks.names):
+        rows = np.flatnonzero(first == column)
+        if len(rows):
+            size = np.array([cameras[name].width, cameras[name].height])
+            cells = np.floor(features[name].pixels[tracks.seen[rows, column]] / size * CELLS).astype(int)
+            which[rows] = cells.sum(axis=1) % 2
+    return [Tracks(tracks.names, tracks.seen[which == half]) for half in (0, 1)]
+
+
+def _refuse_unsure(
+    doubt: Mapping[str, tuple[float, float]], focals: Mapping[str, float], wanted: Sequence[str]
+) -> None:
     unsure = [name for name in wanted if name not in doubt or not _sure(doubt[name])]
     if unsure:
         raise D2Error(
             f"two halves of the pictures disagree about where camera {', '.join(unsure)} stands, so that is not known: "
             f"{ADD}"
         )
-    return _result(found, features, doubt, wanted)
-
-
-def _moments(name: str, taken: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """What a camera sees where nothing moves, which stills see as well, then every picture."""
-    shapes = {checked_picture(picture, f"a picture of camera {name}").shape for picture in taken}
-    if len(shapes) != 1:
-        raise D2Error(f"camera {name} has pictures of {len(shapes)} sizes, expected one: give pictures of one size")
-    still = np.median(np.stack(taken), axis=0).astype(np.uint8) if len(taken) > 2 else taken[0]
-    return [still, *taken]
-
-
-def _starts(matches: Matches, features: Mapping[str, Features], known: Mapping[str, Camera]) -> list[Pair]:
-    """The pairs with the most points at a good angle, best first."""
-    worth = {}
-    for (a, b), pairs in matches.items():
-        rig = _pair_rig((a, b), pairs, features, known)
-        if rig is not None:
-            worth[a, b] = len(triangulate(rig, features, join_matches({(a, b): pairs}, (a, b))).points)
-    return sorted(worth, key=lambda pair: -worth[pair])[:STARTS]
-
-
-def _pair_rig(
-    pair: Pair, pairs: np.ndarray, features: Mapping[str, Features], known: Mapping[str, Camera]
-) -> dict[str, Camera] | None:
-    """Two cameras, a unit apart, by their essential matrix."""
-    pose = essential_pose(pair, pairs, features, known)
-    if pose is None:
-        return None
-    return {pair[0]: known[pair[0]], pair[1]: replace(known[pair[1]], T_camera_world=pose)}
-
-
-def _grow(
-    start: Pair, matches: Matches, tracks: Tracks, features: Mapping[str, Features], known: Mapping[str, Camera]
-) -> Bundle | None:
-    """A bundle from two cameras on, with all the cameras that can be added."""
-    rig = _pair_rig(start, matches[start], features, known)
-    bundle = None if rig is None else bundled(rig, features, tracks, GROWING)
-    while bundle is not None:
-        added = _add(bundle, tracks, features, known)
-        larger = None if added is None else bundled({**bundle.cameras, added.name: added}, features, tracks, GROWING)
-        if larger is None:
-            return bundle
-        bundle = larger
-    return None
-
-
-def _add(
-    bundle: Bundle, tracks: Tracks, features: Mapping[str, Features], known: Mapping[str, Camera]
-) -> Camera | None:
-    """The camera that sees the most points of the bundle, where they settle its pose."""
-    points = fitting(triangulate(bundle.cameras, features, tracks), features, GROWING[-1][0])
-    place = {key: i for i, row in enumerate(points.tracks.seen) for key in _keys(row, tracks.names, bundle.cameras)}
-    seen: dict[str, list[tuple[int, int]]] = {}
-    for row in tracks.seen:
-        of = next((place[key] for key in _keys(row, tracks.names, bundle.cameras) if key in place), None)
-        for name, index in zip(tracks.names, row.tolist(), strict=True):
-            if of is not None and index >= 0 and name not in bundle.cameras:
-                seen.setdefault(name, []).append((index, of))
-    for name in sorted(seen, key=lambda name: -len(seen[name])):
-        camera = _resect(known[name], features[name], np.array(seen[name]), points.points)
-        if camera is not None:
-            return camera
-    return None
-
-
-def _keys(row: np.ndarray, names: Sequence[str], cameras: Mapping[str, Camera]) -> list[tuple[str, int]]:
-    """The features (camera, index) of a track in `cameras`."""
-    return [(name, index) for name, index in zip(names, row.tolist(), strict=True) if index >= 0 and name in cameras]
-
-
-def _resect(camera: Camera, features: Features, seen: np.ndarray, points: np.ndarray) -> Camera | None:
-    """The camera at the pose that explains enough of the points it sees."""
-    if len(seen) < FEWEST_SEEN:
-        return None
-    pycolmap = pycolmap_module("finding cameras")
-    options = pycolmap.AbsolutePoseEstimationOptions()
-    options.ransac.max_error, options.ransac.random_seed = 2 * pixel_error(camera), 0
-    pixels, there = features.pixels[seen[:, 0]], points[seen[:, 1]]
-    found = pycolmap.estimate_and_refine_absolute_pose(pixels, there, as_colmap(camera), options)
-    if found is None or found["num_inliers"] < max(FEWEST_SEEN, LEAST_SHARE * len(seen)):
-        return None
-    pose = found["cam_from_world"]
-    placed = replace(camera, T_camera_world=rigid(pose.rotation.matrix(), np.asarray(pose.translation)))
-    errors = np.linalg.norm(project(placed, there) - pixels, axis=1)
-    return placed if np.isfinite(errors).any() else None
-
-
-def _worth(bundle: Bundle) -> tuple[int, int]:
-    return len(bundle.cameras), int((bundle.tracks.seen >= 0).sum())
-
-
-def _doubt(found: Bundle, matches: Matches, features: Mapping[str, Features]) -> dict[str, tuple[float, float]]:
-    """What two halves of the pictures differ by; nothing where one of them does not hold the rig."""
-    inside = {pair: pairs for pair, pairs in matches.items() if set(pair) <= found.cameras.keys()}
-    names = tuple(found.cameras)
-    halves = [join_matches(halved(inside, features, found.cameras, which), names) for which in (0, 1)]
-    parts = [bundled(found.cameras, features, half) for half in halves]
-    if parts[0] is None or parts[1] is None:
-        return {}
-    return differences(parts[0].cameras, parts[1].cameras)
+    vague = [name for name in wanted if focals.get(name, 0.0) > LARGEST_FOCAL_DOUBT]
+    if vague:
+        share = max(focals[name] for name in vague)
+        raise D2Error(
+            f"two halves of the pictures disagree about the focal length of camera {', '.join(vague)} by {share:.0%}: "
+            "say it (--focal PIXELS, --intrinsics FILE), or film a board and calibrate the lens with another tool"
+        )
 
 
 def _sure(doubt: tuple[float, float]) -> bool:
     return all(value <= limit for value, limit in zip(doubt, LARGEST_DOUBT, strict=True))
-
-
-def _result(
-    found: Bundle, features: Mapping[str, Features], doubt: dict[str, tuple[float, float]], wanted: Sequence[str]
-) -> SolvedRig:
-    errors = found.errors(features)
-    first = np.linalg.inv(found.cameras[wanted[0]].T_camera_world)
-    poses = {name: found.cameras[name].T_camera_world @ first for name in wanted}
-    cameras = {name: replace(found.cameras[name], T_camera_world=pose) for name, pose in poses.items()}
-    by_camera = {name: errors[:, found.tracks.names.index(name)] for name in wanted}
-    rig = SolvedRig(
-        cameras,
-        {name: float(np.nanmedian(missed)) for name, missed in by_camera.items()},
-        {name: int(np.isfinite(missed).sum()) for name, missed in by_camera.items()},
-        {name: doubt[name] for name in wanted},
-    )
-    return replace(rig.times(1 / rig_width(cameras), ""), scale=rig.scale)

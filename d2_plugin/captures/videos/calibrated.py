@@ -29,6 +29,8 @@ def calibrated(
     settings: ImportSettings, videos: Mapping[str, VideoFile]
 ) -> tuple[dict[str, VideoFile], dict[str, CalibratedCamera], tuple[str, ...]]:
     """(videos turned as the calibration has them, their cameras, notes)."""
+    if settings.calibration is None:
+        raise D2Error("a calibration is needed here: give it with --calibration FILE")
     turned, read, notes = _oriented(settings.calibration, videos)
     said = tuple(note for note in read.notes if "scale" not in note) if settings.unit else read.notes
     cameras = scaled(read.cameras, UNITS[settings.unit]) if settings.unit else read.cameras

@@ -11,7 +11,7 @@ from typing import Any
 
 from d2_plugin.captures.calibration import check_name
 from d2_plugin.captures.videos.files import VIDEO_SUFFIXES, videos_below
-from d2_plugin.captures.videos.settings import ImportSettings
+from d2_plugin.captures.videos.settings import OF_A_SOLVED_RIG, ImportSettings
 from d2_plugin.durable import Kind, is_leftover, read_table, write_table
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import opened, reaching, shown_path
@@ -53,7 +53,12 @@ def identity(settings: ImportSettings, paths: Mapping[str, Path]) -> dict[str, A
     """What makes two imports the same one."""
     table = {name: _plain(value) for name, value in asdict(settings).items()}
     del table["output"], table["videos"]
-    table["calibration"] = _fingerprint(settings.calibration)
+    for name, nothing in {"calibration": None, **OF_A_SOLVED_RIG}.items():
+        value = getattr(settings, name)
+        if value == nothing:
+            del table[name]  # so that recordings of versions without these settings stay the same import
+        elif isinstance(value, Path):
+            table[name] = _fingerprint(value)
     return {**table, "videos": {name: _fingerprint(path) for name, path in paths.items()}}
 
 

@@ -1,7 +1,9 @@
-"""From videos and a calibration to a recording: each step is kept in its folder, so a stopped import goes on.
+"""From videos, calibrated or not, to a recording: each step is kept in its folder, so a stopped import goes on.
 
 import/import.json    what is imported, with checksums: another import into the same folder is refused
 import/clocks.json    when each camera began
+import/rig.json       where the cameras stand, found from the videos where no calibration was given
+calibration.json      the same for --calibration of other takes, with reprojection errors and a verdict per camera
 import/poses.json     what --refine-poses found
 images/CAMERA/*.png   the pictures, each written whole or not at all
 import/exposures.json
@@ -18,7 +20,9 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.captures.calibrate import refine
+from d2_plugin.captures.calibrate.from_videos import Evidence, calibration_table, rig_of_videos, said_of
 from d2_plugin.captures.calibrations import CalibratedCamera
+from d2_plugin.captures.calibrations.cameras_json import read_entry
 from d2_plugin.captures.capture import Capture, Exposure
 from d2_plugin.captures.export.folder import described
 from d2_plugin.captures.masks import VALID_FOLDER, as_picture
@@ -31,7 +35,13 @@ from d2_plugin.captures.videos.clocks import METHODS, Clock, common_clock, given
 from d2_plugin.captures.videos.exposure import measured_exposures
 from d2_plugin.captures.videos.files import VideoFile, read_video
 from d2_plugin.captures.videos.grid import Grid, grid_of
-from d2_plugin.captures.videos.settings import ImportSettings, check_names, cut_of
+from d2_plugin.captures.videos.settings import (
+    OF_A_SOLVED_RIG,
+    ImportSettings,
+    check_calibration,
+    check_names,
+    cut_of,
+)
 from d2_plugin.captures.videos.source import Cut, Upright, VideosSource
 from d2_plugin.durable import make_folder, remove_leftovers, write, write_table, write_text
 from d2_plugin.locks import only_writer
@@ -68,11 +78,16 @@ def import_videos(settings: ImportSettings, told: Told = lambda line: None) -> I
     identity = claimed.identity(settings, paths)
     claimed.refuse_another(folder, identity)
     found = {name: read_video(path) for name, path in paths.items()}
-    videos, cameras, notes = calibrated(settings, found)
+    check_calibration(settings)
+    solved = _solved(settings, folder, found, told) if settings.calibration is None else None
+    videos, cameras, notes = calibrated(settings, found) if solved is None else (found, *_read(solved, found))
     cuts = {name: cut_of(settings, name, (camera.width, camera.height)) for name, camera in cameras.items()}
     with only_writer(make_folder(folder)):
         claimed.claim(folder, identity)
         remove_leftovers(folder)
+        if solved is not None:
+            claimed.kept(folder, "rig", lambda: solved)
+            write_text(folder / "calibration.json", json_text(solved, "calibration.json", indent=1) + "\n")
         clocks = _clocks(settings, folder, videos, cameras)
         told(_said_of_clocks(clocks, videos))
         grid = grid_of(videos, clocks, settings.rate, settings.times, settings.frames)
@@ -83,6 +98,27 @@ def import_videos(settings: ImportSettings, told: Told = lambda line: None) -> I
         capture = _exposures(settings, folder, capture, told)
         _finish(settings, folder, capture)
     return Imported(capture, clocks, folder)
+
+
+def _solved(settings: ImportSettings, folder: Path, found: Mapping[str, VideoFile], told: Told) -> dict[str, Any]:
+    """The calibration that the videos give, now or when it was found before; nothing is written yet."""
+    if (folder / claimed.STEPS / "rig.json").is_file():
+        return claimed.kept(folder, "rig", dict)
+    evidence = Evidence(**{name: getattr(settings, name) for name in OF_A_SOLVED_RIG})
+    cameras, rig = rig_of_videos(found, evidence, settings.offsets)
+    for line in said_of(rig):
+        told(line)
+    return calibration_table(cameras, rig)
+
+
+def _read(
+    solved: Mapping[str, Any], found: Mapping[str, VideoFile]
+) -> tuple[dict[str, CalibratedCamera], tuple[str, ...]]:
+    """(cameras by name, notes) of a calibration that was found."""
+    entries = [read_entry(entry, "the solved calibration") for entry in solved["cameras"]]
+    cameras = {entry.name: entry.recorded(None, "the solved calibration") for entry in entries}
+    note = f"poses were found from the videos; the scale of the world is {solved['scale']}"
+    return {name: cameras[name] for name in found}, (note,)
 
 
 def _clocks(

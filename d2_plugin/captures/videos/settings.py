@@ -41,6 +41,24 @@ class ImportChoices(Settings):
     refine_poses: bool = False
     """Correct the poses of the calibration by features of all cameras; kept as they are where that mends nothing."""
 
+    intrinsics: Path | None = None
+    """Without a calibration: a file with the lenses alone, in any of its formats; its poses are not looked at."""
+    focal: tuple[str, ...] = ("shared",)
+    """Without a calibration and intrinsics: focal lengths in pixels of the upright video, one number or NAME=PIXELS,
+    joined by commas; or how they are found: shared (one for all cameras, as of phones of one model) or each."""
+    stills: Path | None = None
+    """Without a calibration: a folder of pictures of the same scene from places between the cameras, which connect
+    cameras that see too little in common. Called CAMERA_NUMBER where the cameras' lenses differ."""
+    board: str | None = None
+    """Without a calibration: a board that was filmed, charuco:COLUMNSxROWS:SQUARE:MARKER or
+    checkerboard:COLUMNSxROWS:SQUARE, in squares and metres. It says how large the world is."""
+    distance: tuple[str, ...] | None = None
+    """Without a calibration: how far two cameras stand apart, CAMERA,CAMERA,METRES."""
+
+
+OF_A_SOLVED_RIG = {"intrinsics": None, "focal": ("shared",), "stills": None, "board": None, "distance": None}
+"""What only an import without a calibration takes, and what says nothing."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSettings(ImportChoices):
@@ -48,10 +66,22 @@ class ImportSettings(ImportChoices):
 
     videos: Annotated[tuple[Path, ...], Positional()]
     """Videos, one per camera and called like it; or the folder that holds them."""
-    calibration: Path
-    """Calibration of the cameras, in any format of docs/calibration.md."""
+    calibration: Path | None = None
+    """Calibration of the cameras, in any format of docs/calibration.md; without one it is found from the videos."""
     output: Path
     """Folder of the recording; an import in it that was stopped is continued."""
+
+
+def check_calibration(settings: ImportSettings) -> None:
+    """Refuse a calibration together with what would find one."""
+    given = [name for name, nothing in OF_A_SOLVED_RIG.items() if getattr(settings, name) != nothing]
+    if settings.calibration is not None and given:
+        raise D2Error(
+            f"--calibration and --{given[0]} are both given, and a rig is either known or found from the videos: leave "
+            "one out"
+        )
+    if settings.calibration is None and settings.unit is not None:
+        raise D2Error("--unit says what a calibration is in, and none is given: give --distance or --board for a scale")
 
 
 def cut_of(choices: ImportChoices, name: str, size: tuple[int, int]) -> Cut:

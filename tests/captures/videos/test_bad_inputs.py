@@ -108,6 +108,24 @@ def wrong_focal(given: Filmed) -> None:
     change(given, lambda c: [c[name].update(fx=3 * c[name]["fx"], fy=3 * c[name]["fy"]) for name in ("03",)])
 
 
+def left_handed(given: Filmed) -> None:
+    """All poses as a tool with left-handed axes writes them."""
+    flip = np.diag([1.0, 1.0, -1.0])
+    change(given, lambda c: [c[name].update(R=(np.array(c[name]["R"]) @ flip).tolist()) for name in NAMES])
+
+
+def of_another_rig(given: Filmed) -> None:
+    """A calibration of cameras with the same names and sizes, which stood wider apart."""
+
+    def edit(cameras: dict[str, Any]) -> None:
+        for angle, name in zip((-0.35, 0.0, 0.35), NAMES):
+            cosine, sine = np.cos(angle), np.sin(angle)
+            R = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+            cameras[name].update(R=R.tolist(), t=[0.1, 0.05, 4.0])
+
+    change(given, edit)
+
+
 def no_number(given: Filmed) -> None:
     change(given, lambda c: c["03"].update(t=[float("nan"), 0, 0]))
 
@@ -167,6 +185,8 @@ CASES: list[tuple[Callable[[Filmed], None], list[str], str]] = [
     (turned_away, ["--offsets", "none"], r"03"),
     (wrong_focal, [], r"does not fit the videos: .*03"),
     (mirrored, [], r"camera 03 .*mirrored.*right-handed"),
+    (left_handed, [], r"camera 02 .*mirrored.*right-handed"),
+    (of_another_rig, [], r"does not fit the videos: "),
     (no_number, [], r"(NaN|not finite)"),
     (other_aspect, [], r"another aspect"),
     (millimetres, [], r"up to \d+ apart, which is no metres: say what it is with --unit mm"),
