@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,45 +18,42 @@ from d2_plugin.priors.stereo.pyramid import NO_MATCH, LevelView
 from d2_plugin.priors.stereo.settings import StereoSettings
 
 KERNELS = Path(__file__).parent / "kernels"
-FLAGS = ("-fopenmp-simd", "-ffp-contract=fast")
+FLAGS = ("-fopenmp-simd", "-ffp-contract=off")
+"""No contraction: the kernels say themselves what is fused, so that all devices return the same bits."""
+
+HEADERS = [KERNELS / name for name in ("numbers.h", "lanes.h", "planes.h", "matching.h", "spread.h")]
 
 CONSENSUS_RADIUS = 3
 """Half the side of the window over which planes are averaged, pixels."""
 
 
-class _Picture(ctypes.Structure):
-    _fields_ = (("width", ctypes.c_int32), ("height", ctypes.c_int32), ("gray", ctypes.c_void_p))
+_float, _int, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_void_p
 
 
-class _Source(ctypes.Structure):
+class Source(ctypes.Structure):
+    """d2::Source of kernels/matching.h: a view as the reference sees it."""
+
     _fields_ = (
-        ("width", ctypes.c_int32),
-        ("height", ctypes.c_int32),
-        ("quads", ctypes.c_void_p),
-        ("A", ctypes.c_float * 9),
-        ("k", ctypes.c_float * 3),
-        ("back_A", ctypes.c_float * 9),
-        ("back_k", ctypes.c_float * 3),
-        ("depth", ctypes.c_void_p),
+        *((name, _int) for name in ("width", "height", "first")),
+        ("A", _float * 9),
+        ("k", _float * 3),
+        ("back_A", _float * 9),
+        ("back_k", _float * 3),
     )
 
 
-class _Task(ctypes.Structure):
+class Task(ctypes.Structure):
+    """d2::Task of kernels/spread.h: what the planes of one reference view spread by."""
+
     _fields_ = (
-        ("reference", _Picture),
-        ("intrinsics", ctypes.c_float * 4),
-        ("source_count", ctypes.c_int32),
-        ("sources", ctypes.POINTER(_Source)),
-        ("inverse_far", ctypes.c_float),
-        ("inverse_near", ctypes.c_float),
-        ("contrast", ctypes.c_float),
-        ("geometric_weight", ctypes.c_float),
-        ("rounds", ctypes.c_int32),
-        ("draw_planes", ctypes.c_int32),
-        ("explore", ctypes.c_int32),
-        ("threads", ctypes.c_int32),
+        ("intrinsics", _float * 4),
+        *((name, _int) for name in ("width", "height", "source_count", "rounds", "draw_planes", "explore", "threads")),
         ("seed", ctypes.c_uint32),
-        ("wanted", ctypes.c_void_p),
+        *((name, _float) for name in ("inverse_far", "inverse_near", "per_gray", "geometric_weight")),
+        *(
+            (name, _pointer)
+            for name in ("gray", "wanted", "sources", "quads", "depths", "planes", "costs", "views")
+        ),
     )
 
 
@@ -74,8 +73,7 @@ class PatchMatchKernel:
         self.sources = sources
         self.depth_range = depth_range
         self.settings = settings
-        headers = [KERNELS / "planes.h", KERNELS / "matching.h"]
-        self.library = load_library("patchmatch", [KERNELS / "patchmatch.cpp"], headers, FLAGS)
+        self.library = load_library("patchmatch", [KERNELS / "patchmatch.cpp"], HEADERS, FLAGS)
 
     def match(
         self,
@@ -94,69 +92,90 @@ class PatchMatchKernel:
         view, sources = views[index], self.sources[index]
         if not sources:
             return
-        near, far = self.depth_range
-        found = [_source(view, views[other], None if depths is None else depths[other]) for other in sources]
-        task = _Task(
-            _picture(view.gray),
-            _intrinsics(view.camera),
-            len(sources),
-            (_Source * len(sources))(*found),
-            1 / far,
-            1 / near,
-            self.settings.patchmatch_contrast,
-            0 if depths is None else self.settings.patchmatch_geometric_weight,
-            rounds,
-            stage == 0,
-            explore,
-            torch.get_num_threads(),
-            int(np.random.SeedSequence([self.settings.seed, stage, index]).generate_state(1)[0]),
-            None if view.wanted is None else view.wanted.ctypes.data,
-        )
-        chosen = np.zeros(view.gray.shape, np.uint32)
-        self.library.d2_patchmatch(ctypes.byref(task), _pointer(view.planes), _pointer(view.cost), _pointer(chosen))
+        task, _kept_alive = self.task(views, index, stage, rounds, explore, depths)
+        self.library.d2_patchmatch(ctypes.byref(task))
         view.known |= view.cost < NO_MATCH
+
+    def task(
+        self,
+        views: Sequence[LevelView],
+        index: int,
+        stage: int,
+        rounds: int,
+        explore: bool,
+        depths: Sequence[np.ndarray] | None,
+    ) -> tuple[Task, list[Any]]:
+        """What the kernel is given, and what must outlive its call."""
+        view, chosen = views[index], [views[other] for other in self.sources[index]]
+        first = np.cumsum([0, *(source.gray.size for source in chosen)])
+        sources = (Source * len(chosen))(*(_source(view, *pair) for pair in zip(chosen, first.tolist())))
+        quads = np.concatenate([source.quads.ravel() for source in chosen])
+        asked = None
+        if depths is not None:
+            asked = np.concatenate([depths[other].ravel() for other in self.sources[index]])
+        near, far = self.depth_range
+        task = Task(
+            intrinsics=_intrinsics(view.camera),
+            width=view.gray.shape[1],
+            height=view.gray.shape[0],
+            source_count=len(chosen),
+            rounds=rounds,
+            draw_planes=stage == 0,
+            explore=explore,
+            threads=torch.get_num_threads(),
+            seed=int(np.random.SeedSequence([self.settings.seed, stage, index]).generate_state(1)[0]),
+            inverse_far=1 / far,
+            inverse_near=1 / near,
+            per_gray=per_squared_gray(self.settings),
+            geometric_weight=0 if depths is None else self.settings.patchmatch_geometric_weight,
+            gray=view.gray.ctypes.data,
+            wanted=None if view.wanted is None else view.wanted.ctypes.data,
+            sources=ctypes.cast(sources, _pointer),
+            quads=quads.ctypes.data,
+            depths=None if asked is None else asked.ctypes.data,
+            planes=view.planes.ctypes.data,
+            costs=view.cost.ctypes.data,
+            views=view.chosen.ctypes.data,
+        )
+        return task, [sources, quads, asked]
 
     def average(self, view: LevelView) -> None:
         """Replace each plane by the mean of those around it that agree with it."""
-        picture = _picture(view.gray)
         for _ in range(self.settings.patchmatch_consensus_passes):
             averaged = np.empty_like(view.planes)
-            self.library.d2_consensus(
-                ctypes.byref(picture),
-                ctypes.c_float(self.settings.patchmatch_contrast),
-                CONSENSUS_RADIUS,
-                ctypes.c_float(self.settings.patchmatch_consensus_tolerance),
-                torch.get_num_threads(),
-                None if view.wanted is None else _pointer(view.wanted),
-                _pointer(view.planes),
-                _pointer(averaged),
+            task = Task(
+                width=view.gray.shape[1],
+                height=view.gray.shape[0],
+                threads=torch.get_num_threads(),
+                per_gray=per_squared_gray(self.settings),
+                gray=view.gray.ctypes.data,
+                wanted=None if view.wanted is None else view.wanted.ctypes.data,
+                planes=view.planes.ctypes.data,
             )
+            tolerance = _float(self.settings.patchmatch_consensus_tolerance)
+            self.library.d2_consensus(ctypes.byref(task), CONSENSUS_RADIUS, tolerance, _pointer(averaged.ctypes.data))
             view.planes = averaged
 
 
-def _pointer(array: np.ndarray) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)
-
-
-def _picture(gray: np.ndarray) -> _Picture:
-    return _Picture(gray.shape[1], gray.shape[0], gray.ctypes.data)
+def per_squared_gray(settings: StereoSettings) -> float:
+    """log2 of the bilateral weight per squared grey difference, grey values in 0..255 (`sample_weight`)."""
+    return -0.5 * math.log2(math.e) / (255 * settings.patchmatch_contrast) ** 2
 
 
 def _intrinsics(camera: Camera) -> ctypes.Array:
     K = index_intrinsics(camera)
-    return (ctypes.c_float * 4)(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    return (_float * 4)(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
-def _source(reference: LevelView, source: LevelView, depth: np.ndarray | None) -> _Source:
+def _source(reference: LevelView, source: LevelView, first: int) -> Source:
     forth, back = view_pair(reference.camera, source.camera), view_pair(source.camera, reference.camera)
-    nine, three = ctypes.c_float * 9, ctypes.c_float * 3
-    return _Source(
+    nine, three = _float * 9, _float * 3
+    return Source(
         source.camera.width,
         source.camera.height,
-        source.quads.ctypes.data,
+        first,
         nine(*forth.A.ravel()),
         three(*forth.k),
         nine(*back.A.ravel()),
         three(*back.k),
-        None if depth is None else depth.ctypes.data,
     )

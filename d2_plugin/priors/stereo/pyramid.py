@@ -27,7 +27,8 @@ class LevelView:
     quads: np.ndarray  # uint32 [H, W]
     planes: np.ndarray  # float32 [H, W, 3]
     known: np.ndarray  # bool [H, W], whether anything matched here, at this or a coarser resolution
-    cost: np.ndarray  # float32 [H, W]
+    cost: np.ndarray  # float32 [H, W], of the coarser resolution before anything is matched here
+    chosen: np.ndarray  # uint32 [H, W], bit s says that its source s sees the pixel
     wanted: np.ndarray | None  # bool [H, W], where a match is asked for; everywhere where None
 
 
@@ -48,13 +49,16 @@ def at_resolution(
         smaller = torch.nn.functional.interpolate(pixels, (camera.height, camera.width), mode="area")
         gray = smaller[0, 0].round().to(torch.uint8).numpy()
     gray = np.ascontiguousarray(gray)
-    cost = np.full(gray.shape, NO_MATCH, np.float32)
+    mask = None if wanted is None else _any_within(wanted, gray.shape)
     if coarser is None:
+        cost, chosen = np.full(gray.shape, NO_MATCH, np.float32), np.zeros(gray.shape, np.uint32)
         planes, known = np.zeros((*gray.shape, 3), np.float32), np.zeros(gray.shape, bool)
     else:
-        planes, known = refined_planes(coarser.planes, gray.shape), _nearest(coarser.known, gray.shape)
-    mask = None if wanted is None else _any_within(wanted, gray.shape)
-    return LevelView(camera, gray, _quads(gray), planes, known, cost, mask)
+        planes = refined_planes(coarser.planes, gray.shape)
+        known, cost, chosen = (_nearest(map_, gray.shape) for map_ in (coarser.known, coarser.cost, coarser.chosen))
+        if mask is not None:
+            cost[~mask] = NO_MATCH
+    return LevelView(camera, gray, _quads(gray), planes, known, cost, chosen, mask)
 
 
 def _any_within(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
