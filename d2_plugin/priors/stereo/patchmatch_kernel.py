@@ -110,6 +110,7 @@ class PatchMatchKernel:
         first = np.cumsum([0, *(source.gray.size for source in chosen)])
         sources = (Source * len(chosen))(*(_source(view, *pair) for pair in zip(chosen, first.tolist())))
         quads = np.concatenate([source.quads.ravel() for source in chosen])
+        selected = np.zeros(view.gray.shape, np.uint32)
         asked = None
         if depths is not None:
             asked = np.concatenate([depths[other].ravel() for other in self.sources[index]])
@@ -135,9 +136,9 @@ class PatchMatchKernel:
             depths=None if asked is None else asked.ctypes.data,
             planes=view.planes.ctypes.data,
             costs=view.cost.ctypes.data,
-            views=view.chosen.ctypes.data,
+            views=selected.ctypes.data,
         )
-        return task, [sources, quads, asked]
+        return task, [sources, quads, asked, selected]
 
     def average(self, view: LevelView) -> None:
         """Replace each plane by the mean of those around it that agree with it."""

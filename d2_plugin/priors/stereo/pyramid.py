@@ -27,8 +27,7 @@ class LevelView:
     quads: np.ndarray  # uint32 [H, W]
     planes: np.ndarray  # float32 [H, W, 3]
     known: np.ndarray  # bool [H, W], whether anything matched here, at this or a coarser resolution
-    cost: np.ndarray  # float32 [H, W], of the coarser resolution before anything is matched here
-    chosen: np.ndarray  # uint32 [H, W], bit s says that its source s sees the pixel
+    cost: np.ndarray  # float32 [H, W]
     wanted: np.ndarray | None  # bool [H, W], where a match is asked for; everywhere where None
 
 
@@ -49,16 +48,13 @@ def at_resolution(
         smaller = torch.nn.functional.interpolate(pixels, (camera.height, camera.width), mode="area")
         gray = smaller[0, 0].round().to(torch.uint8).numpy()
     gray = np.ascontiguousarray(gray)
-    mask = None if wanted is None else _any_within(wanted, gray.shape)
+    cost = np.full(gray.shape, NO_MATCH, np.float32)
     if coarser is None:
-        cost, chosen = np.full(gray.shape, NO_MATCH, np.float32), np.zeros(gray.shape, np.uint32)
         planes, known = np.zeros((*gray.shape, 3), np.float32), np.zeros(gray.shape, bool)
     else:
-        planes = refined_planes(coarser.planes, gray.shape)
-        known, cost, chosen = (_nearest(map_, gray.shape) for map_ in (coarser.known, coarser.cost, coarser.chosen))
-        if mask is not None:
-            cost[~mask] = NO_MATCH
-    return LevelView(camera, gray, _quads(gray), planes, known, cost, chosen, mask)
+        planes, known = refined_planes(coarser.planes, gray.shape), _nearest(coarser.known, gray.shape)
+    mask = None if wanted is None else _any_within(wanted, gray.shape)
+    return LevelView(camera, gray, _quads(gray), planes, known, cost, mask)
 
 
 def _any_within(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -84,7 +80,7 @@ def refined_planes(planes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 def _nearest(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """`values` [h, w, ...] at [H, W], each fine pixel taking what the coarse pixel around its centre has."""
     rows, columns = _parents(values.shape[:2], shape)
-    return values[rows][:, columns]
+    return values[rows[:, None], columns]  # in C order, which an index per axis does not give
 
 
 def _parents(coarse: tuple[int, int], fine: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

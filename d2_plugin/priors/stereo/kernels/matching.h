@@ -50,14 +50,14 @@ struct Warp {
 };
 
 template <class S>
-D2_FN Warp<S> warp_of(const S (&A)[9], const S (&k)[3], S width, S height, S a, S b, S c, float u, float v) {
-  const S pixel_u = all<S>(u), pixel_v = all<S>(v), zero = all<S>(0.f);
+D2_FN Warp<S> warp_of(const S (&A)[9], const S (&k)[3], S width, S height, S a, S b, S c, S u, S v) {
+  const S zero = all<S>(0.f);
   const S h0 = mad(k[0], a, A[0]), h1 = mad(k[0], b, A[1]), h2 = mad(k[0], c, A[2]);
   const S h3 = mad(k[1], a, A[3]), h4 = mad(k[1], b, A[4]), h5 = mad(k[1], c, A[5]);
   const S h6 = mad(k[2], a, A[6]), h7 = mad(k[2], b, A[7]), h8 = mad(k[2], c, A[8]);
-  const S z = mad(h6, pixel_u, mad(h7, pixel_v, h8)), inverse = 1.f / larger(z, all<S>(1e-6f));
-  const S found_x = mad(h0, pixel_u, mad(h1, pixel_v, h2)) * inverse;
-  const S found_y = mad(h3, pixel_u, mad(h4, pixel_v, h5)) * inverse;
+  const S z = mad(h6, u, mad(h7, v, h8)), inverse = 1.f / larger(z, all<S>(1e-6f));
+  const S found_x = mad(h0, u, mad(h1, v, h2)) * inverse;
+  const S found_y = mad(h3, u, mad(h4, v, h5)) * inverse;
   const auto inside = (found_x >= 0.f) & (found_y >= 0.f) & (found_x <= width - 1.f) & (found_y <= height - 1.f);
   const auto seen = (z > 1e-6f) & inside;
   const S factor = pick(seen, inverse, zero);  // nothing but zeros where there is nothing to see
@@ -76,12 +76,11 @@ struct Sums {
   // Adds one sample, read from quads[first + row * stride + column]. The division is a series: what it leaves out is the
   // fourth power of the relative change of depth over half a window, .0005 pixels at a tenth.
   template <class I>
-  D2_FN void add(const unsigned* quads, I first, I stride, S last_x, S last_y, const Warp<S>& warp, float du, float dv,
-                 float weight, float weighted) {
-    const S u = all<S>(du), v = all<S>(dv);
-    const S e = mad(warp.zu, u, warp.zv * v), rest = 1.f - e, scale = mad(e * e, rest, rest);
-    const S column = smaller(larger(mad(mad(warp.xu, u, warp.xv * v), scale, warp.x), all<S>(0.f)), last_x);
-    const S row = smaller(larger(mad(mad(warp.yu, u, warp.yv * v), scale, warp.y), all<S>(0.f)), last_y);
+  D2_FN void add(const unsigned* quads, I first, I stride, S last_x, S last_y, const Warp<S>& warp, S du, S dv,
+                 S weight, S weighted) {
+    const S e = mad(warp.zu, du, warp.zv * dv), rest = 1.f - e, scale = mad(e * e, rest, rest);
+    const S column = smaller(larger(mad(mad(warp.xu, du, warp.xv * dv), scale, warp.x), all<S>(0.f)), last_x);
+    const S row = smaller(larger(mad(mad(warp.yu, du, warp.yv * dv), scale, warp.y), all<S>(0.f)), last_y);
     const I left = whole(column), top = whole(row);
     const I quad = look_up(quads, first + top * stride + left);  // one access brings all four neighbours
     const S g00 = real(quad & 255), g01 = real(quad >> 8 & 255), g10 = real(quad >> 16 & 255);
@@ -91,13 +90,13 @@ struct Sums {
     const S part = weight * value;
     mean += part;
     square = mad(part, value, square);
-    product = mad(all<S>(weighted), value, product);
+    product = mad(weighted, value, product);
   }
 
   // 1 - NCC in 0..2; variance is that of the reference.
-  D2_FN S cost(float variance, S seen) const {
+  D2_FN S cost(S variance, S seen) const {
     const S theirs = mad(-mean, mean, square), worst = all<S>(kNoMatch);
-    const auto told = (seen > 0.f) & (theirs >= kMinVariance);
+    const auto told = (seen > 0.f) & (theirs >= kMinVariance) & (variance >= kMinVariance);
     const S ncc = product / root(pick(told, theirs * variance, all<S>(1.f)));
     return pick(told, smaller(larger(1.f - ncc, all<S>(0.f)), worst), worst);
   }

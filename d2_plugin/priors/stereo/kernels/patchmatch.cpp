@@ -42,7 +42,8 @@ struct Table {
   alignas(64) float width[kMostMatches], height[kMostMatches], last_x[kMostMatches], last_y[kMostMatches];
   alignas(64) int first[kMostMatches], stride[kMostMatches];
   alignas(64) float du[kSamples], dv[kSamples], log2_weight[kSamples];
-  ptrdiff_t offset[kSamples];
+  ptrdiff_t offset[kSamples];                     // of the samples, in pixels
+  ptrdiff_t neighbour[kRegions][kMostPlaces];  // of the places of a region
 
   explicit Table(const Task& t) {
     for (int n = 0; n < kMostMatches; n++) {
@@ -58,8 +59,34 @@ struct Table {
       log2_weight[n] = log2_spatial(sample_du(n), sample_dv(n));
       offset[n] = ptrdiff_t(sample_dv(n)) * t.width + sample_du(n);
     }
+    for (int region = 0; region < kRegions; region++) {
+      for (int n = 0; n < region_size(region); n++) {
+        int dx, dy;
+        region_place(region, n, dx, dy);
+        neighbour[region][n] = ptrdiff_t(dy) * t.width + dx;
+      }
+    }
   }
 };
+
+// The costs of kLanes matches from number `from` of the table on. weight(n) and weighted(n) are those of sample n.
+template <class Weight, class Weighted>
+D2_FN Floats match_lanes(const Task& task, const Table& t, int from, Floats a, Floats b, Floats c, Floats u, Floats v,
+                         Floats variance, const Weight& weight, const Weighted& weighted) {
+  Floats A[9], k[3];
+  for (int e = 0; e < 9; e++) A[e] = load<Floats>(t.A[e] + from);
+  for (int e = 0; e < 3; e++) k[e] = load<Floats>(t.k[e] + from);
+  const Floats width = load<Floats>(t.width + from), height = load<Floats>(t.height + from);
+  const Warp<Floats> warp = warp_of(A, k, width, height, a, b, c, u, v);
+  const Floats last_x = load<Floats>(t.last_x + from), last_y = load<Floats>(t.last_y + from);
+  const Integers first = load<Integers>(t.first + from), stride = load<Integers>(t.stride + from);
+  Sums<Floats> sums = {};
+  for (int n = 0; n < kSamples; n++) {
+    const Floats du = all<Floats>(t.du[n]), dv = all<Floats>(t.dv[n]);
+    sums.add(task.quads, first, stride, last_x, last_y, warp, du, dv, weight(n), weighted(n));
+  }
+  return sums.cost(variance, warp.seen);
+}
 
 // The window around one pixel, and its matches.
 class Patch {
@@ -99,18 +126,48 @@ class Patch {
   // Costs [count, source_count] of planes.
   void match(const Plane* planes, int count, float* costs) const {
     const int sources = task_.source_count, matches = count * sources;
-    if (variance < kMinVariance) return void(std::fill_n(costs, matches, kNoMatch));
     alignas(64) float a[kMostMatches], b[kMostMatches], c[kMostMatches];
     int n = 0;
     for (int p = 0; p < count; p++) {
       for (int s = 0; s < sources; s++, n++) a[n] = planes[p].a, b[n] = planes[p].b, c[n] = planes[p].c;
     }
     for (; n % kLanes; n++) a[n] = b[n] = c[n] = 0;
+    const Floats u = all<Floats>(u_), v = all<Floats>(v_);
+    const auto weight = [&](int k) { return all<Floats>(weight_[k]); };
+    const auto weighted = [&](int k) { return all<Floats>(weighted_[k]); };
     alignas(64) float found[kLanes];
     for (int from = 0; from < matches; from += kLanes) {
-      store(found, match_lanes(from, load<Floats>(a + from), load<Floats>(b + from), load<Floats>(c + from)));
+      const Floats planes_a = load<Floats>(a + from), planes_b = load<Floats>(b + from), planes_c = load<Floats>(c + from);
+      const Floats reference = all<Floats>(variance);
+      store(found, match_lanes(task_, table_, from, planes_a, planes_b, planes_c, u, v, reference, weight, weighted));
       std::copy_n(found, std::min(kLanes, matches - from), costs + from);
     }
+  }
+
+  float weight(int n) const { return weight_[n]; }
+  float weighted(int n) const { return weighted_[n]; }
+
+  void believe(const float* costs, int count, float* beliefs) const {
+    alignas(64) float part[kLanes] = {};
+    for (int from = 0; from < count; from += kLanes) {
+      std::copy_n(costs + from, std::min(kLanes, count - from), part);
+      store(part, belief_of(load<Floats>(part)));
+      std::copy_n(part, std::min(kLanes, count - from), beliefs + from);
+    }
+  }
+
+  // cheapest_of, without looking for the border where that is far.
+  long long cheapest(int x, int y, int region) const {
+    const bool inner = std::min(x, y) >= kFarthest && x + kFarthest < task_.width && y + kFarthest < task_.height;
+    if (!inner) return cheapest_of(task_, x, y, region);
+    const float* costs = task_.costs + size_t(y) * task_.width + x;
+    float lowest = 1e9f;
+    ptrdiff_t found = 0;
+    for (int n = 0; n < region_size(region); n++) {
+      const ptrdiff_t place = table_.neighbour[region][n];
+      if (costs[place] < lowest) lowest = costs[place], found = place;
+    }
+    return found ? costs + found - task_.costs : -1;
   }
 
  private:
@@ -129,34 +186,63 @@ class Patch {
     return *gray;
   }
 
-  Floats match_lanes(int from, Floats a, Floats b, Floats c) const {
-    const Table& t = table_;
-    Floats A[9], k[3];
-    for (int e = 0; e < 9; e++) A[e] = load<Floats>(t.A[e] + from);
-    for (int e = 0; e < 3; e++) k[e] = load<Floats>(t.k[e] + from);
-    const Floats width = load<Floats>(t.width + from), height = load<Floats>(t.height + from);
-    const Warp<Floats> warp = warp_of(A, k, width, height, a, b, c, u_, v_);
-    const Floats last_x = load<Floats>(t.last_x + from), last_y = load<Floats>(t.last_y + from);
-    const Integers first = load<Integers>(t.first + from), stride = load<Integers>(t.stride + from);
-    Sums<Floats> sums = {};
-    for (int n = 0; n < kSamples; n++)
-      sums.add(task_.quads, first, stride, last_x, last_y, warp, t.du[n], t.dv[n], weight_[n], weighted_[n]);
-    return sums.cost(variance, warp.seen);
-  }
-
   const Task& task_;
   const Table& table_;
   float u_ = 0, v_ = 0;
   alignas(64) float weight_[kSamples], weighted_[kSamples];
 };
 
-void begin_row(const Task& t, const Table& table, int y) {
-  Patch patch(t, table);
-  for (int x = 0; x < t.width; x++) {
-    if (!wanted(t, size_t(y) * t.width + x)) continue;
-    patch.place(x, y);
-    begin(t, patch, x, y);
+// Windows of several pixels and their own planes, against as many sources as there are lanes: at the start each pixel has
+// few matches.
+class Pack {
+ public:
+  Pack(const Task& task, const Table& table) : task_(task), table_(table), patch_(task, table) {}
+
+  // For begin: the plane of the pixel that was given last waits until the lanes are full.
+  void add(int x, int y) {
+    patch_.place(x, y);
+    const Plane plane = drawn_plane(task_, x, y);
+    for (int s = 0; s < task_.source_count; s++) {
+      const int lane = count_++;
+      a_[lane] = plane.a, b_[lane] = plane.b, c_[lane] = plane.c;
+      u_[lane] = float(x), v_[lane] = float(y), variance_[lane] = patch_.variance;
+      for (int n = 0; n < kSamples; n++) weight_[n][lane] = patch_.weight(n), weighted_[n][lane] = patch_.weighted(n);
+    }
+    places_[waiting_++] = size_t(y) * task_.width + x;
+    if (count_ + task_.source_count > kPacked) flush();
   }
+
+  void flush() {
+    for (int lane = count_; lane % kLanes; lane++) a_[lane] = b_[lane] = c_[lane] = u_[lane] = v_[lane] = variance_[lane] = 0;
+    alignas(64) float costs[kPacked];
+    for (int from = 0; from < count_; from += kLanes) {
+      const auto weight = [&](int n) { return load<Floats>(weight_[n] + from); };
+      const auto weighted = [&](int n) { return load<Floats>(weighted_[n] + from); };
+      store(costs + from, match_lanes(task_, table_, from, load<Floats>(a_ + from), load<Floats>(b_ + from),
+                                      load<Floats>(c_ + from), load<Floats>(u_ + from), load<Floats>(v_ + from),
+                                      load<Floats>(variance_ + from), weight, weighted));
+    }
+    for (int n = 0; n < waiting_; n++) begin(task_, costs + n * task_.source_count, places_[n]);
+    count_ = waiting_ = 0;
+  }
+
+ private:
+  static constexpr int kPacked = (kMaxSources + 15) / 16 * 16;  // lanes: at least all sources of one pixel
+  const Task& task_;
+  const Table& table_;
+  Patch patch_;
+  int count_ = 0, waiting_ = 0;
+  size_t places_[kPacked];
+  alignas(64) float a_[kPacked], b_[kPacked], c_[kPacked], u_[kPacked], v_[kPacked], variance_[kPacked];
+  alignas(64) float weight_[kSamples][kPacked] = {}, weighted_[kSamples][kPacked] = {};
+};
+
+void begin_row(const Task& t, const Table& table, int y) {
+  Pack pack(t, table);
+  for (int x = 0; x < t.width; x++) {
+    if (wanted(t, size_t(y) * t.width + x)) pack.add(x, y);
+  }
+  pack.flush();
 }
 
 void update_row(const Task& t, const Table& table, int y, int colour, int round) {
@@ -235,11 +321,12 @@ void average_row(const Task& t, const Fields& f, float tolerance, int y, float* 
 
 extern "C" {
 
-// Match one view: see Task. Its planes, costs and views are improved in place, after drawing them where it says so.
+// Match one view: see Task. Its planes are improved in place, after drawing them where it says so; costs and views are
+// written.
 void d2_patchmatch(const Task* task) {
   const Task& t = *task;
   const std::unique_ptr<const Table> table(new Table(t));
-  if (t.draw_planes) parallel_rows(t.height, t.threads, [&](int y) { begin_row(t, *table, y); });
+  parallel_rows(t.height, t.threads, [&](int y) { begin_row(t, *table, y); });
   for (int round = 0; round < t.rounds; round++) {
     for (int colour = 0; colour < 2; colour++) {
       parallel_rows(t.height, t.threads, [&](int y) { update_row(t, *table, y, colour, round); });

@@ -10,7 +10,7 @@ namespace d2 {
 
 // S is one number, or a vector of them on the CPU (lanes.h); a scalar in every lane.
 template <class S>
-D2_FN S all(float a) { return S{} + a; }
+D2_FN S all(float a) { return a - S{}; }  // not a sum, which loses the sign of -0
 
 // 2^x for x <= 0, to 2e-7 of it; 2^-126 below -126.
 template <class S>

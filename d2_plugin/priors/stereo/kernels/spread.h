@@ -55,7 +55,8 @@ D2_FN void put(const Task& t, long long i, const Plane& p) {
 
 // Regions that a candidate may come from: the pixel with the lowest cost is taken. All places are an odd number of steps
 // away, that is of the other colour of the checkerboard. Even regions are strips, odd ones a small V; two to a side.
-D2_FN int region_size(int region) { return region % 2 ? 7 : 11; }
+constexpr int kFarthest = 23, kMostPlaces = 11;
+D2_FN int region_size(int region) { return region % 2 ? 7 : kMostPlaces; }
 D2_FN void region_place(int region, int k, int& dx, int& dy) {
   const int side = region / 2, x = side == 0 ? -1 : side == 1 ? 1 : 0, y = side == 2 ? -1 : side == 3 ? 1 : 0;
   const int step = region % 2 ? (k + 1) / 2 : 0, across = k % 2 ? -step : step;
@@ -65,21 +66,28 @@ D2_FN void region_place(int region, int k, int& dx, int& dy) {
   dy = y ? y * forward : middle ? 0 : across;
 }
 
-// The pixel's own plane first, then the cheapest plane of each region, none of them twice; how many there are.
-D2_FN int gather(const Task& t, int x, int y, Plane* planes) {
+// The cheapest pixel of a region, negative where all of it lies outside of the picture.
+D2_FN long long cheapest_of(const Task& t, int x, int y, int region) {
   const long long i = (long long)y * t.width + x;
+  float lowest = 1e9f;
+  long long found = -1;
+  for (int k = 0; k < region_size(region); k++) {
+    int dx, dy;
+    region_place(region, k, dx, dy);
+    if (x + dx < 0 || y + dy < 0 || x + dx >= t.width || y + dy >= t.height) continue;
+    const long long j = i + (long long)dy * t.width + dx;
+    if (t.costs[j] < lowest) lowest = t.costs[j], found = j;
+  }
+  return found;
+}
+
+// The pixel's own plane first, then the cheapest plane of each region, none of them twice; how many there are.
+template <class Device>
+D2_FN int gather(const Task& t, const Device& device, int x, int y, Plane* planes) {
   int count = 0;
-  planes[count++] = plane_at(t, i);
+  planes[count++] = plane_at(t, (long long)y * t.width + x);
   for (int region = 0; region < kRegions; region++) {
-    float lowest = 1e9f;
-    long long cheapest = -1;
-    for (int k = 0; k < region_size(region); k++) {
-      int dx, dy;
-      region_place(region, k, dx, dy);
-      if (x + dx < 0 || y + dy < 0 || x + dx >= t.width || y + dy >= t.height) continue;
-      const long long j = i + (long long)dy * t.width + dx;
-      if (t.costs[j] < lowest) lowest = t.costs[j], cheapest = j;
-    }
+    const long long cheapest = device.cheapest(x, y, region);
     if (cheapest < 0) continue;
     const Plane plane = plane_at(t, cheapest);
     bool fresh = in_range(t, plane.inverse_depth(float(x), float(y)));
@@ -88,6 +96,9 @@ D2_FN int gather(const Task& t, int x, int y, Plane* planes) {
   }
   return count;
 }
+
+template <class S>
+D2_FN S belief_of(S cost) { return exp2_of(cost * cost * (-kLog2E / .18f)); }
 
 // How far the four neighbours believe in a source.
 D2_FN float neighbours_use(const Task& t, int source, int x, int y) {
@@ -116,9 +127,11 @@ D2_FN void normalise(const Task& t, Selection& selection, float total) {
 }
 
 // Joint view selection (ACMH, section 3.2): a source is weighted by how many candidates match it well, and by whether
-// the neighbours use it; one that most candidates contradict is left out. costs [count, source_count].
-D2_FN Selection select_views(const Task& t, const float* costs, int count, int x, int y, int round) {
+// the neighbours use it; one that most candidates contradict is left out. costs [count, source_count], and belief
+// exp(-cost^2 / .18) of each.
+D2_FN Selection select_views(const Task& t, const float* costs, const float* belief, int count, int x, int y, int round) {
   const float threshold = .8f * exp_of(-float(round * round) / 90.f);
+  const float faint = exp_of(-threshold * threshold * (1 / .32f));
   const float share = count / 8.f;  // the published counts are for eight candidates
   Selection selection;
   float total = 0;
@@ -127,12 +140,12 @@ D2_FN Selection select_views(const Task& t, const float* costs, int count, int x
     int good = 0, bad = 0;
     for (int k = 0; k < count; k++) {
       const float cost = costs[k * t.source_count + s];
-      if (cost < threshold) likelihood += exp_of(-cost * cost * (1 / .18f)), good++;
+      if (cost < threshold) likelihood += belief[k * t.source_count + s], good++;
       if (cost > 1.2f) bad++;
     }
     if (bad >= 3 * share) likelihood = 0;
     else if (good > 2 * share) likelihood /= good;
-    else likelihood = exp_of(-threshold * threshold * (1 / .32f));
+    else likelihood = faint;
     selection.weight[s] = likelihood * neighbours_use(t, s, x, y);
     total += selection.weight[s];
   }
@@ -174,7 +187,7 @@ D2_FN int draw_anywhere(const Task& t, const Plane& best, float u, float v, Rand
   return trials.count;
 }
 
-// Changes that shrink with every round.
+// Changes that shrink with every round. None builds on another, so that all are matched at once.
 D2_FN int draw_nearby(const Task& t, const Plane& best, float u, float v, int round, Random& random, Plane* planes) {
   Trials trials{t, u, v, planes, 0};
   const Intrinsics& k = t.intrinsics;
@@ -185,6 +198,8 @@ D2_FN int draw_nearby(const Task& t, const Plane& best, float u, float v, int ro
   trials.add(q * (1 + random.uniform(-step, step)), normal);
   const float finer = .25f * random.uniform(-step, step);
   trials.add(q * (1 + finer), jittered_normal(k, u, v, normal, .25f * turn, random));
+  trials.add(q * (1 + .1f * random.uniform(-step, step)), normal);
+  trials.add(q, jittered_normal(k, u, v, normal, .25f * turn, random));
   return trials.count;
 }
 
@@ -210,17 +225,20 @@ struct Best {
   }
 };
 
-// One pixel in one round. The device holds the window around it: device.match(planes, count, costs) writes the cost of
-// each plane against each source, [count, source_count].
+// One pixel in one round. The device holds the window around it:
+//   device.match(planes, count, costs)       writes the cost of each plane against each source, [count, source_count]
+//   device.believe(costs, count, beliefs)    writes belief_of(cost)
+//   device.cheapest(x, y, region)            is cheapest_of
 template <class Device>
 D2_FN void update(const Task& t, Device& device, int x, int y, int round) {
   const long long i = (long long)y * t.width + x;
   const float u = float(x), v = float(y);
   Plane planes[kMaxCandidates];
-  float costs[kMaxCandidates * kMaxSources];
-  const int count = gather(t, x, y, planes);
+  float costs[kMaxCandidates * kMaxSources], beliefs[kMaxCandidates * kMaxSources];
+  const int count = gather(t, device, x, y, planes);
   device.match(planes, count, costs);
-  const Selection selection = select_views(t, costs, count, x, y, round);
+  device.believe(costs, count * t.source_count, beliefs);
+  const Selection selection = select_views(t, costs, beliefs, count, x, y, round);
   Best<Device> best{t, device, selection, x, y, planes[0], 1e9f};
   best.compare(planes, costs, count);
   Random random(t.seed, unsigned(i), unsigned(round));
@@ -231,29 +249,31 @@ D2_FN void update(const Task& t, Device& device, int x, int y, int round) {
   t.views[i] = selection.views;
 }
 
-// The start of one pixel: a random plane, and what it costs in the better half of the sources.
-template <class Device>
-D2_FN void begin(const Task& t, Device& device, int x, int y) {
+// The plane that a pixel starts with: its own, or a random one where the task says so.
+D2_FN Plane drawn_plane(const Task& t, int x, int y) {
   const long long i = (long long)y * t.width + x;
-  Random random(t.seed, unsigned(i), ~0u);
-  const Vector normal = random_normal(t.intrinsics, float(x), float(y), random);
-  const float q = random.uniform(t.inverse_far, t.inverse_near);
-  const Plane plane = plane_through(t.intrinsics, float(x), float(y), q, normal);
-  float costs[kMaxSources], total = 0;
-  device.match(&plane, 1, costs);
-  unsigned chosen = 0;
+  if (t.draw_planes) {
+    Random random(t.seed, unsigned(i), ~0u);
+    const Vector normal = random_normal(t.intrinsics, float(x), float(y), random);
+    const float q = random.uniform(t.inverse_far, t.inverse_near);
+    put(t, i, plane_through(t.intrinsics, float(x), float(y), q, normal));
+  }
+  return plane_at(t, i);
+}
+
+// The start of a pixel: what its plane costs in the better half of the sources. costs [source_count].
+D2_FN void begin(const Task& t, const float* costs, long long i) {
+  unsigned chosen = 0, views = 0;
+  float total = 0;
   const int half = (t.source_count + 1) / 2;  // the others may be occluded
   for (int n = 0; n < half; n++) {
     int best = -1;
     for (int s = 0; s < t.source_count; s++)
       if (!(chosen >> s & 1) && (best < 0 || costs[s] < costs[best])) best = s;
     chosen |= 1u << best;
+    if (costs[best] < kNoMatch) views |= 1u << best;
     total += costs[best];
   }
-  unsigned views = 0;
-  for (int s = 0; s < t.source_count; s++)
-    if ((chosen >> s & 1) && costs[s] < kNoMatch) views |= 1u << s;
-  put(t, i, plane);
   t.costs[i] = total / half;
   t.views[i] = views;
 }
