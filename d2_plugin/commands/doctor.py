@@ -88,7 +88,7 @@ def _device() -> str:
 
 
 def _cuda_kernels() -> str:
-    from d2_plugin.rasterizer import nvrtc
+    from d2_plugin.compiler import nvrtc
 
     try:
         nvrtc.library()

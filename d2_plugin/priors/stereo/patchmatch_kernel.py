@@ -6,13 +6,14 @@ import ctypes
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from d2_plugin.captures.capture import Camera
-from d2_plugin.compiler import load_library
+from d2_plugin.compiler import NoCompiler, find_compiler, load_library
+from d2_plugin.compiler.prebuilt import find as find_prebuilt
+from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import index_intrinsics, view_pair
 from d2_plugin.priors.stereo.pyramid import NO_MATCH, LevelView
 from d2_plugin.priors.stereo.settings import StereoSettings
@@ -21,7 +22,11 @@ KERNELS = Path(__file__).parent / "kernels"
 FLAGS = ("-fopenmp-simd", "-ffp-contract=off")
 """No contraction: the kernels say themselves what is fused, so that all devices return the same bits."""
 
+SOURCES = [KERNELS / "patchmatch.cpp"]
 HEADERS = [KERNELS / name for name in ("numbers.h", "lanes.h", "planes.h", "matching.h", "spread.h")]
+
+MOST_PIXELS = 2**31 - 1
+"""Of all sources together: their places are 32-bit integers."""
 
 CONSENSUS_RADIUS = 3
 """Half the side of the window over which planes are averaged, pixels."""
@@ -57,6 +62,21 @@ class Task(ctypes.Structure):
     )
 
 
+def compiles() -> bool:
+    """Whether the CPU kernels came compiled, or there is a compiler for them."""
+    if find_prebuilt("patchmatch", SOURCES, HEADERS, FLAGS) is not None:
+        return True
+    try:
+        find_compiler()
+    except NoCompiler:
+        return False
+    return True
+
+
+Arrays = dict[str, np.ndarray]
+"""What the pointers of a task point to, by their names."""
+
+
 class PatchMatchKernel:
     """The compiled kernels with what stays the same for all views and levels.
 
@@ -70,10 +90,11 @@ class PatchMatchKernel:
     """
 
     def __init__(self, sources: list[list[int]], depth_range: tuple[float, float], settings: StereoSettings) -> None:
-        self.sources = sources
-        self.depth_range = depth_range
-        self.settings = settings
-        self.library = load_library("patchmatch", [KERNELS / "patchmatch.cpp"], HEADERS, FLAGS)
+        self.sources, self.depth_range, self.settings = sources, depth_range, settings
+        self._start()
+
+    def _start(self) -> None:
+        self.library = load_library("patchmatch", SOURCES, HEADERS, FLAGS)
 
     def match(
         self,
@@ -89,78 +110,79 @@ class PatchMatchKernel:
         `stage` also tells apart the random numbers of calls for the same view. With `depths`, a map per view, planes
         are asked to agree with them as well.
         """
-        view, sources = views[index], self.sources[index]
-        if not sources:
+        if not self.sources[index]:
             return
-        task, _kept_alive = self.task(views, index, stage, rounds, explore, depths)
-        self.library.d2_patchmatch(ctypes.byref(task))
-        view.known |= view.cost < NO_MATCH
-
-    def task(
-        self,
-        views: Sequence[LevelView],
-        index: int,
-        stage: int,
-        rounds: int,
-        explore: bool,
-        depths: Sequence[np.ndarray] | None,
-    ) -> tuple[Task, list[Any]]:
-        """What the kernel is given, and what must outlive its call."""
-        view, chosen = views[index], [views[other] for other in self.sources[index]]
-        first = np.cumsum([0, *(source.gray.size for source in chosen)])
-        sources = (Source * len(chosen))(*(_source(view, *pair) for pair in zip(chosen, first.tolist())))
-        quads = np.concatenate([source.quads.ravel() for source in chosen])
-        selected = np.zeros(view.gray.shape, np.uint32)
-        asked = None
+        view = views[index]
+        task = self._task(view)
+        task.rounds, task.draw_planes, task.explore = rounds, stage == 0, explore
+        task.seed = int(np.random.SeedSequence([self.settings.seed, stage, index]).generate_state(1)[0])
+        arrays = self._view_arrays(view)
+        arrays["views"] = np.zeros(view.gray.shape, np.uint32)
+        arrays |= self._source_arrays(view, [views[other] for other in self.sources[index]])
         if depths is not None:
-            asked = np.concatenate([depths[other].ravel() for other in self.sources[index]])
-        near, far = self.depth_range
-        task = Task(
-            intrinsics=_intrinsics(view.camera),
-            width=view.gray.shape[1],
-            height=view.gray.shape[0],
-            source_count=len(chosen),
-            rounds=rounds,
-            draw_planes=stage == 0,
-            explore=explore,
-            threads=torch.get_num_threads(),
-            seed=int(np.random.SeedSequence([self.settings.seed, stage, index]).generate_state(1)[0]),
-            inverse_far=1 / far,
-            inverse_near=1 / near,
-            per_gray=per_squared_gray(self.settings),
-            geometric_weight=0 if depths is None else self.settings.patchmatch_geometric_weight,
-            gray=view.gray.ctypes.data,
-            wanted=None if view.wanted is None else view.wanted.ctypes.data,
-            sources=ctypes.cast(sources, _pointer),
-            quads=quads.ctypes.data,
-            depths=None if asked is None else asked.ctypes.data,
-            planes=view.planes.ctypes.data,
-            costs=view.cost.ctypes.data,
-            views=selected.ctypes.data,
-        )
-        return task, [sources, quads, asked, selected]
+            task.geometric_weight = self.settings.patchmatch_geometric_weight
+            arrays["depths"] = np.concatenate([depths[other].ravel() for other in self.sources[index]])
+        task.source_count = len(self.sources[index])
+        self._spread(task, arrays)
+        view.known |= view.cost < NO_MATCH
 
     def average(self, view: LevelView) -> None:
         """Replace each plane by the mean of those around it that agree with it."""
+        view.planes = self._average(self._task(view), self._view_arrays(view))
+
+    def _spread(self, task: Task, arrays: Arrays) -> None:
+        """Let planes spread; writes the arrays `planes` and `costs`."""
+        self.library.d2_patchmatch(ctypes.byref(_pointed(task, arrays)))
+
+    def _average(self, task: Task, arrays: Arrays) -> np.ndarray:
+        """The planes after all passes of the consensus."""
+        tolerance = _float(self.settings.patchmatch_consensus_tolerance)
+        planes, averaged = arrays["planes"], np.empty_like(arrays["planes"])
         for _ in range(self.settings.patchmatch_consensus_passes):
-            averaged = np.empty_like(view.planes)
-            task = Task(
-                width=view.gray.shape[1],
-                height=view.gray.shape[0],
-                threads=torch.get_num_threads(),
-                per_gray=per_squared_gray(self.settings),
-                gray=view.gray.ctypes.data,
-                wanted=None if view.wanted is None else view.wanted.ctypes.data,
-                planes=view.planes.ctypes.data,
+            call = ctypes.byref(_pointed(task, arrays | {"planes": planes}))
+            self.library.d2_consensus(call, CONSENSUS_RADIUS, tolerance, _pointer(averaged.ctypes.data))
+            planes, averaged = averaged, np.empty_like(planes)
+        return planes
+
+    def _task(self, view: LevelView) -> Task:
+        """What is the same of all calls for one view of one resolution."""
+        near, far = self.depth_range
+        return Task(
+            intrinsics=_intrinsics(view.camera),
+            width=view.gray.shape[1],
+            height=view.gray.shape[0],
+            threads=torch.get_num_threads(),
+            inverse_far=1 / far,
+            inverse_near=1 / near,
+            per_gray=per_squared_gray(self.settings.patchmatch_contrast),
+        )
+
+    def _view_arrays(self, view: LevelView) -> Arrays:
+        arrays = {"gray": view.gray, "planes": view.planes, "costs": view.cost}
+        return arrays if view.wanted is None else arrays | {"wanted": view.wanted}
+
+    def _source_arrays(self, view: LevelView, chosen: Sequence[LevelView]) -> Arrays:
+        first = np.cumsum([0, *(source.gray.size for source in chosen)])
+        if first[-1] > MOST_PIXELS:
+            raise D2Error(
+                f"the pictures that a view is matched with have {first[-1]} pixels together, at most {MOST_PIXELS} are "
+                "possible: lower max_pixels"
             )
-            tolerance = _float(self.settings.patchmatch_consensus_tolerance)
-            self.library.d2_consensus(ctypes.byref(task), CONSENSUS_RADIUS, tolerance, _pointer(averaged.ctypes.data))
-            view.planes = averaged
+        sources = (Source * len(chosen))(*(_source(view, *pair) for pair in zip(chosen, first.tolist())))
+        quads = np.concatenate([source.quads.ravel() for source in chosen])
+        return {"sources": np.frombuffer(sources, np.uint8), "quads": quads}
 
 
-def per_squared_gray(settings: StereoSettings) -> float:
-    """log2 of the bilateral weight per squared grey difference, grey values in 0..255 (`sample_weight`)."""
-    return -0.5 * math.log2(math.e) / (255 * settings.patchmatch_contrast) ** 2
+def _pointed(task: Task, arrays: Arrays) -> Task:
+    """The task with its pointers; the arrays must outlive its use."""
+    for name, array in arrays.items():
+        setattr(task, name, array.ctypes.data)
+    return task
+
+
+def per_squared_gray(contrast: float) -> float:
+    """log2 of the bilateral weight per squared difference of grey values in 0..255; `contrast` is in 0..1."""
+    return -0.5 * math.log2(math.e) / (255 * contrast) ** 2
 
 
 def _intrinsics(camera: Camera) -> ctypes.Array:

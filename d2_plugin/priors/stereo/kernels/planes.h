@@ -40,9 +40,18 @@ D2_FN Vector normalised(Vector p) {
 
 struct Intrinsics {
   float fx, fy, cx, cy;
-
-  D2_FN Vector ray(float u, float v) const { return {(u - cx) / fx, (v - cy) / fy, 1.f}; }
 };
+
+// How the camera sees a pixel.
+struct Sight {
+  float u, v;
+  Vector ray, direction;  // through the pixel: with z = 1, and of length 1
+};
+
+D2_FN Sight sight_of(const Intrinsics& k, float u, float v) {
+  const Vector ray = {(u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.f};
+  return {u, v, ray, normalised(ray)};
+}
 
 struct Plane {
   float a, b, c;
@@ -51,9 +60,9 @@ struct Plane {
   D2_FN bool operator==(const Plane& other) const { return a == other.a && b == other.b && c == other.c; }
 };
 
-// The plane with normal n through pixel (u, v) at inverse depth q: n.X = d, hence 1/z = n.ray / d.
-D2_FN Plane plane_through(const Intrinsics& k, float u, float v, float q, Vector n) {
-  const float scale = q / dot(n, k.ray(u, v));
+// The plane with normal n through a pixel at inverse depth q: n.X = d, hence 1/z = n.ray / d.
+D2_FN Plane plane_through(const Intrinsics& k, const Sight& sight, float q, Vector n) {
+  const float scale = q / dot(n, sight.ray);
   const float a = n.x * scale / k.fx, b = n.y * scale / k.fy;
   return {a, b, mad(-b, k.cy, mad(-a, k.cx, n.z * scale))};
 }
@@ -65,7 +74,7 @@ D2_FN Vector normal_of(const Intrinsics& k, const Plane& p) {
 }
 
 // Cosine of the angle between the normal and the direction back to the camera.
-D2_FN float facing(const Intrinsics& k, Vector n, float u, float v) { return -dot(n, normalised(k.ray(u, v))); }
+D2_FN float facing(Vector n, const Sight& sight) { return -dot(n, sight.direction); }
 
 // Random numbers of one pixel in one round: they depend on nothing else, so any number of threads draws the same.
 class Random {
@@ -94,24 +103,24 @@ class Random {
 };
 
 // A random direction towards the camera, at most 75 degrees from the viewing ray (Marsaglia's disk method).
-D2_FN Vector random_normal(const Intrinsics& k, float u, float v, Random& random) {
+D2_FN Vector random_normal(const Sight& sight, Random& random) {
   for (;;) {
     const float s = random.uniform(-1, 1), t = random.uniform(-1, 1), square = mad(s, s, t * t);
     if (square >= 1) continue;
     const float scale = 2 * root(1 - square);
     Vector n{s * scale, t * scale, 1 - 2 * square};
-    float cosine = facing(k, n, u, v);
+    float cosine = facing(n, sight);
     if (cosine < 0) n = {-n.x, -n.y, -n.z}, cosine = -cosine;
     if (cosine > .25f) return n;
   }
 }
 
 // `n` turned by a random amount; the old one where four draws all turn it away from the camera.
-D2_FN Vector jittered_normal(const Intrinsics& k, float u, float v, Vector n, float amount, Random& random) {
+D2_FN Vector jittered_normal(const Sight& sight, Vector n, float amount, Random& random) {
   for (int attempt = 0; attempt < 4; attempt++, amount *= .5f) {
     const float x = random.uniform(-1, 1), y = random.uniform(-1, 1), z = random.uniform(-1, 1);
     const Vector turned = normalised({mad(amount, x, n.x), mad(amount, y, n.y), mad(amount, z, n.z)});
-    if (facing(k, turned, u, v) > .15f) return turned;
+    if (facing(turned, sight) > .15f) return turned;
   }
   return n;
 }

@@ -10,7 +10,11 @@
 
 namespace d2 {
 
+#if defined(D2_MAX_SOURCES)
+constexpr int kMaxSources = D2_MAX_SOURCES;
+#else
 constexpr int kMaxSources = 32;    // one bit each
+#endif
 constexpr int kMaxCandidates = 9;  // the pixel's own plane and one from each region
 constexpr int kRegions = 8;
 
@@ -169,37 +173,36 @@ D2_FN float total_cost(const Task& t, const Selection& selection, const float* c
 // Planes that a pixel tries besides those of its neighbours.
 struct Trials {
   const Task& task;
-  float u, v;
+  const Sight& sight;
   Plane* planes;
   int count;
 
   D2_FN void add(float q, Vector normal) {
-    if (in_range(task, q)) planes[count++] = plane_through(task.intrinsics, u, v, q, normal);
+    if (in_range(task, q)) planes[count++] = plane_through(task.intrinsics, sight, q, normal);
   }
 };
 
 // Random depths, random normals, both.
-D2_FN int draw_anywhere(const Task& t, const Plane& best, float u, float v, Random& random, Plane* planes) {
-  Trials trials{t, u, v, planes, 0};
-  const Vector drawn = random_normal(t.intrinsics, u, v, random);
+D2_FN int draw_anywhere(const Task& t, const Sight& sight, const Plane& best, Random& random, Plane* planes) {
+  Trials trials{t, sight, planes, 0};
+  const Vector drawn = random_normal(sight, random);
   const float q = random.uniform(t.inverse_far, t.inverse_near);
-  trials.add(q, normal_of(t.intrinsics, best)), trials.add(best.inverse_depth(u, v), drawn), trials.add(q, drawn);
+  trials.add(q, normal_of(t.intrinsics, best)), trials.add(best.inverse_depth(sight.u, sight.v), drawn), trials.add(q, drawn);
   return trials.count;
 }
 
 // Changes that shrink with every round. None builds on another, so that all are matched at once.
-D2_FN int draw_nearby(const Task& t, const Plane& best, float u, float v, int round, Random& random, Plane* planes) {
-  Trials trials{t, u, v, planes, 0};
-  const Intrinsics& k = t.intrinsics;
-  const Vector normal = normal_of(k, best);
-  const float q = best.inverse_depth(u, v), halved = bits_float((127 - round) << 23);
+D2_FN int draw_nearby(const Task& t, const Sight& sight, const Plane& best, int round, Random& random, Plane* planes) {
+  Trials trials{t, sight, planes, 0};
+  const Vector normal = normal_of(t.intrinsics, best);
+  const float q = best.inverse_depth(sight.u, sight.v), halved = bits_float((127 - round) << 23);
   const float step = larger(.04f * halved, .003f), turn = larger(.3f * halved, .02f);
-  trials.add(q, jittered_normal(k, u, v, normal, turn, random));
+  trials.add(q, jittered_normal(sight, normal, turn, random));
   trials.add(q * (1 + random.uniform(-step, step)), normal);
   const float finer = .25f * random.uniform(-step, step);
-  trials.add(q * (1 + finer), jittered_normal(k, u, v, normal, .25f * turn, random));
+  trials.add(q * (1 + finer), jittered_normal(sight, normal, .25f * turn, random));
   trials.add(q * (1 + .1f * random.uniform(-step, step)), normal);
-  trials.add(q, jittered_normal(k, u, v, normal, .25f * turn, random));
+  trials.add(q, jittered_normal(sight, normal, .25f * turn, random));
   return trials.count;
 }
 
@@ -232,7 +235,7 @@ struct Best {
 template <class Device>
 D2_FN void update(const Task& t, Device& device, int x, int y, int round) {
   const long long i = (long long)y * t.width + x;
-  const float u = float(x), v = float(y);
+  const Sight sight = sight_of(t.intrinsics, float(x), float(y));
   Plane planes[kMaxCandidates];
   float costs[kMaxCandidates * kMaxSources], beliefs[kMaxCandidates * kMaxSources];
   const int count = gather(t, device, x, y, planes);
@@ -242,8 +245,8 @@ D2_FN void update(const Task& t, Device& device, int x, int y, int round) {
   Best<Device> best{t, device, selection, x, y, planes[0], 1e9f};
   best.compare(planes, costs, count);
   Random random(t.seed, unsigned(i), unsigned(round));
-  if (t.explore) best.attempt(planes, costs, draw_anywhere(t, best.plane, u, v, random, planes));
-  best.attempt(planes, costs, draw_nearby(t, best.plane, u, v, round, random, planes));
+  if (t.explore) best.attempt(planes, costs, draw_anywhere(t, sight, best.plane, random, planes));
+  best.attempt(planes, costs, draw_nearby(t, sight, best.plane, round, random, planes));
   put(t, i, best.plane);
   t.costs[i] = best.cost;
   t.views[i] = selection.views;
@@ -254,9 +257,9 @@ D2_FN Plane drawn_plane(const Task& t, int x, int y) {
   const long long i = (long long)y * t.width + x;
   if (t.draw_planes) {
     Random random(t.seed, unsigned(i), ~0u);
-    const Vector normal = random_normal(t.intrinsics, float(x), float(y), random);
-    const float q = random.uniform(t.inverse_far, t.inverse_near);
-    put(t, i, plane_through(t.intrinsics, float(x), float(y), q, normal));
+    const Sight sight = sight_of(t.intrinsics, float(x), float(y));
+    const Vector normal = random_normal(sight, random);
+    put(t, i, plane_through(t.intrinsics, sight, random.uniform(t.inverse_far, t.inverse_near), normal));
   }
   return plane_at(t, i);
 }
