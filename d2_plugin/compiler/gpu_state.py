@@ -60,5 +60,7 @@ def _nvrtc() -> str:
             told += f", compiles for {compiler.architecture_for(10 * major + minor)} at first use"
     except nvrtc.NoCuda as error:
         needed = torch.version.cuda is not None
-        return f"missing: {error}" if needed else "none, which only a GPU needs: builds of torch with CUDA bring it along"
+        return (
+            f"missing: {error}" if needed else "none, which only a GPU needs: builds of torch with CUDA bring it along"
+        )
     return told

@@ -26,6 +26,7 @@ from d2_plugin.errors import D2Error
 
 logger = logging.getLogger(__name__)
 
+
 class NoCuda(D2Error):
     """The kernels are not available on this GPU; a caller with a slower way takes it."""
 
@@ -101,8 +102,8 @@ class Nvrtc:
             array = ctypes.c_char_p * len(options)
             if self._library.nvrtcCompileProgram(program, len(options), array(*options)):
                 raise CompileError(
-                    f"NVRTC {self.version[0]}.{self.version[1]} failed on {code.source.name} for {architecture}; please "
-                    f"report what it said:\n{self._read(program, 'ProgramLog').decode(errors='replace').strip(chr(0))}"
+                    f"NVRTC {self.version[0]}.{self.version[1]} failed on {code.source.name} for {architecture}; "
+                    f"please report what it said:\n{self._read(program, 'ProgramLog').decode(errors='replace').strip(chr(0))}"
                 )
             return self._read(program, "CUBIN" if architecture.startswith("sm_") else "PTX")
         finally:

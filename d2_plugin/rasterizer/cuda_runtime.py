@@ -1,4 +1,4 @@
-"""The kernels of `kernels/gpu.cu` on a CUDA device: compiled by NVRTC for each number of colors, launched by the driver."""
+"""The kernels of `kernels/gpu.cu` on a CUDA device: compiled for each number of colors, launched by the driver."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -67,7 +67,7 @@ def use_shim(monkeypatch: pytest.MonkeyPatch, order: int = 0) -> ShimLauncher:
 
 
 @pytest.fixture(params=["shim", pytest.param("cuda", marks=pytest.mark.cuda)])
-def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where `patchmatch_device = 'cuda'` runs."""
     if request.param == "cuda" and not torch.cuda.is_available():
         pytest.skip("no CUDA device (torch.cuda.is_available() is False)")
@@ -77,7 +77,6 @@ def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
         pytest.skip(str(error))
     if request.param == "shim":
         use_shim(monkeypatch)
-    yield
 
 
 def pictures(rig: Rig) -> list[np.ndarray]:

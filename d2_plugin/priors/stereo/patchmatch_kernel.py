@@ -55,10 +55,7 @@ class Task(ctypes.Structure):
         *((name, _int) for name in ("width", "height", "source_count", "rounds", "draw_planes", "explore", "threads")),
         ("seed", ctypes.c_uint32),
         *((name, _float) for name in ("inverse_far", "inverse_near", "per_gray", "geometric_weight")),
-        *(
-            (name, _pointer)
-            for name in ("gray", "wanted", "sources", "quads", "depths", "planes", "costs", "views")
-        ),
+        *((name, _pointer) for name in ("gray", "wanted", "sources", "quads", "depths", "planes", "costs", "views")),
     )
 
 

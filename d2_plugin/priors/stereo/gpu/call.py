@@ -1,4 +1,4 @@
-"""What the host and the kernels of `kernels/patchmatch.cu` share: its files, its constants, its Call, and who launches."""
+"""What the host and the kernels of `kernels/patchmatch.cu` share: files, constants, its Call, and who launches."""
 
 from __future__ import annotations
 

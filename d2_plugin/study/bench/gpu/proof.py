@@ -139,7 +139,7 @@ def _stereo(device: str) -> Callable[[GpuBench], list[str]]:
     return words
 
 
-SHIM = ("-k", "shim", *(f"tests/{name}.py" for name in ("rasterizer/test_rasterizer_cuda", "priors/test_patchmatch_gpu")))
+SHIM = ("-k", "shim", "tests/rasterizer/test_rasterizer_cuda.py", "tests/priors/test_patchmatch_gpu.py")
 STEPS = {
     "static": Step(100, (_program("nvcc"),), None),
     "tests": Step(180, (_device, _tests), _pytest("-m", "cuda", "tests")),

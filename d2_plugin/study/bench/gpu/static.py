@@ -73,9 +73,7 @@ def _kernels(nvcc: str, program: Program, flags: Sequence[str]) -> dict[str, dic
         result = subprocess.run(words, capture_output=True, text=True, check=False)
         if result.returncode:
             said = result.stderr[:4000]
-            raise D2Error(
-                f"nvcc refused {program.source.name} ({flags[0]}); please report what it said:\n{said}"
-            )
+            raise D2Error(f"nvcc refused {program.source.name} ({flags[0]}); please report what it said:\n{said}")
         counts = instructions(cubin.read_bytes())
     return {name: {**found, "instructions": counts[name]} for name, found in resources(result.stderr).items()}
 
