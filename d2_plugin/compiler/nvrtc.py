@@ -101,9 +101,10 @@ class Nvrtc:
             options = [option.encode() for option in (f"--gpu-architecture={architecture}", *flags)]
             array = ctypes.c_char_p * len(options)
             if self._library.nvrtcCompileProgram(program, len(options), array(*options)):
+                said = self._read(program, "ProgramLog").decode(errors="replace").strip(chr(0))
                 raise CompileError(
                     f"NVRTC {self.version[0]}.{self.version[1]} failed on {code.source.name} for {architecture}; "
-                    f"please report what it said:\n{self._read(program, 'ProgramLog').decode(errors='replace').strip(chr(0))}"
+                    f"please report what it said:\n{said}"
                 )
             return self._read(program, "CUBIN" if architecture.startswith("sm_") else "PTX")
         finally:
