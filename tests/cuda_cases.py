@@ -23,16 +23,16 @@ THRESHOLD_MARGIN = 1e-4
 
 
 class ShimLauncher:
-    """Runs the kernels on the CPU; `descending` runs warps and blocks in the opposite order."""
+    """Runs the kernels on the CPU, with blocks, warps and lanes in an order of `cuda_shim.h`."""
 
-    def __init__(self, descending: bool = False) -> None:
-        self.descending = descending
+    def __init__(self, order: int = 0) -> None:
+        self.order = order
         self.launched: list[str] = []
 
     def launch(self, kernel: str, blocks: int, frame: cuda_frame.Frame, rows: int = 1) -> None:
         self.launched.append(kernel)
         run = shim_library(frame.channels or 3).d2_shim_launch
-        error = run(kernel.encode(), blocks, rows, self.descending, ctypes.byref(frame))
+        error = run(kernel.encode(), blocks, rows, self.order, ctypes.byref(frame))
         assert error is None, error.decode()
 
 

@@ -66,35 +66,18 @@ def report() -> str:
     """A few lines a person can paste into an issue."""
     import torch
 
+    from d2_plugin.compiler.gpu_state import gpu_state
     from d2_plugin.priors.colmap import mvs as colmap_mvs
 
     lines = [
         f"d2-4dgs {__version__}, Python {platform.python_version()}, torch {torch.__version__}, {os.cpu_count()} cores",
-        f"device      {_device()}",
+        *(f"{part:12}{state}" for part, state in gpu_state()),
         f"compiler    {_compiler()}",
         f"cache       {compiler.cache_folder()}",
         f"backbones   {', '.join(registry.names(registry.BACKBONES))}",
     ]
     lines += [f"{module:12}{_state(module, extra, purpose)}" for module, (extra, purpose) in OPTIONAL.items()]
     return "\n".join([*lines, f"{'COLMAP':12}{colmap_mvs.why_not_usable() or 'PatchMatch on CUDA'}"])
-
-
-def _device() -> str:
-    import torch
-
-    if torch.cuda.is_available():
-        return f"{torch.cuda.get_device_name()}; {_cuda_kernels()}"
-    return "CPU only: no CUDA device found"
-
-
-def _cuda_kernels() -> str:
-    from d2_plugin.rasterizer import nvrtc
-
-    try:
-        nvrtc.library()
-    except nvrtc.NoCuda as error:
-        return f"no CUDA kernels: {error}"
-    return "CUDA kernels compile through NVRTC at first use"
 
 
 def _compiler() -> str:

@@ -1,7 +1,7 @@
 """The kernels on the GPU: `kernels/gpu.cu`, what they need in memory, and in which order they run.
 
 The same functions as in `native`, on float32 tensors of one device; `ops` registers them for CUDA. How a kernel gets to
-run is a `Launcher`'s business: `nvrtc` compiles and `cuda_runtime` launches through the driver; the tests have a
+run is a `Launcher`'s business: `cuda_runtime` has NVRTC compile and the driver launch them; the tests have a
 launcher that runs the very same kernels on the CPU.
 
 Everything is enqueued on torch's current stream. `rasterize` and `survey` wait for the device once, to learn how many
@@ -17,13 +17,13 @@ import warnings
 import torch
 from torch import Tensor
 
+from d2_plugin.compiler.nvrtc import NoCuda
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Survey
 
 from .cuda_frame import GATHERERS, MOMENTS, STATISTICS, THREADS, TILE, WARP, Frame, Launcher
 from .cuda_runtime import CudaLauncher
 from .frame import RECORD
-from .nvrtc import NoCuda
 
 MOST_PAIRS = 2**31 - 1
 """Slots are 32-bit integers."""
@@ -34,7 +34,7 @@ def launcher(device: torch.device) -> Launcher:
     """The launcher of a CUDA device; `device` has an index.
 
     Raises:
-        d2_plugin.rasterizer.nvrtc.NoCuda: no driver, no NVRTC, or an architecture that it does not know.
+        d2_plugin.compiler.nvrtc.NoCuda: no driver, no NVRTC, or an architecture that it does not know.
     """
     return CudaLauncher(device)
 

@@ -37,12 +37,12 @@ const Kernel* find(const char* name) {
 }  // namespace
 
 // Runs a kernel by its name; returns null, or what went wrong.
-extern "C" const char* d2_shim_launch(const char* name, int blocks, int rows, int descending, const d2::Frame* frame) {
+extern "C" const char* d2_shim_launch(const char* name, int blocks, int rows, unsigned order, const d2::Frame* frame) {
   static std::string error;
   const Kernel* kernel = find(name);
   if (!kernel) return "no such kernel";
   try {
-    shim::launch(kernel->run, {unsigned(blocks), unsigned(rows), 1}, d2::THREADS, descending != 0, *frame);
+    shim::launch(kernel->run, {unsigned(blocks), unsigned(rows), 1}, d2::THREADS, order, *frame);
     return nullptr;
   } catch (const std::exception& caught) {
     error = std::string(name) + ": " + caught.what();
@@ -99,7 +99,7 @@ CUresult cuLaunchKernel(CUfunction function, unsigned blocks_x, unsigned blocks_
   const d2::Frame& frame = *static_cast<const d2::Frame*>(parameters[0]);
   last_stream = stream;
   try {
-    shim::launch(reinterpret_cast<const Kernel*>(function)->run, grid, int(threads_x), false, frame);
+    shim::launch(reinterpret_cast<const Kernel*>(function)->run, grid, int(threads_x), 0, frame);
   } catch (const std::exception&) {
     return CUDA_ERROR_LAUNCH_FAILED;
   }

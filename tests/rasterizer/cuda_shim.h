@@ -2,8 +2,8 @@
 // fibre (a stack of its own, switched by hand) for every thread of a block. Blocks are one-dimensional.
 //
 // A fibre runs until it must wait for the others of its warp (shuffles, votes) or of its block (barriers). What hardware
-// leaves open is a choice here: `descending` runs warps and blocks in the opposite order, so that code whose result
-// depends on the order shows it. A barrier that not all threads reach is an error, not a hang. Not covered: memory
+// leaves open is a choice here: `order` runs blocks, warps and lanes as they are numbered (0), in the opposite order (1),
+// or in a new random order every time (any other number is its seed), so that code whose result depends on it shows it. A barrier that not all threads reach is an error, not a hang. Not covered: memory
 // shared between blocks that run at the same time, and the order in which the warps of real hardware interleave.
 #pragma once
 
@@ -14,6 +14,7 @@
 #include <functional>
 #include <memory>
 #include <stdexcept>
+#include <utility>
 #include <vector>
 #if !defined(__x86_64__)
 #include <ucontext.h>
@@ -115,6 +116,27 @@ struct Fiber {
   bool done = false;
 };
 
+// Orders of 0 .. count - 1.
+class Order {
+ public:
+  explicit Order(unsigned kind) : kind_(kind), state_(kind | 1u) {}
+
+  const std::vector<int>& of(int count, std::vector<int>& places) {
+    places.resize(count);
+    for (int i = 0; i < count; i++) places[i] = kind_ == 1 ? count - 1 - i : i;
+    if (kind_ > 1)
+      for (int i = count - 1; i > 0; i--) std::swap(places[i], places[draw() % unsigned(i + 1)]);
+    return places;
+  }
+
+ private:
+  unsigned draw() {
+    state_ ^= state_ << 13, state_ ^= state_ >> 17, state_ ^= state_ << 5;
+    return state_;
+  }
+  unsigned kind_, state_;
+};
+
 struct Block {
   std::vector<Fiber> fibers;
   std::vector<Meeting> warps;
@@ -150,10 +172,11 @@ inline void run_fiber() {
 }
 
 // One turn of every unfinished fibre of a warp; whether anything came of it.
-inline bool run_warp(int warp) {
+inline bool run_warp(int warp, Order& order) {
   const unsigned before = block.warps[warp].generation + block.all.generation;
   const int arrived = block.warps[warp].arrived + block.all.arrived, members = block.all.members;
-  for (int lane = 0; lane < WARP; lane++) {
+  std::vector<int> lanes;
+  for (int lane : order.of(WARP, lanes)) {
     block.current = warp * WARP + lane;
     if (block.current >= int(block.fibers.size()) || block.fibers[block.current].done) continue;
     Context::change(block.scheduler, block.fibers[block.current].context);
@@ -162,7 +185,7 @@ inline bool run_warp(int warp) {
          block.warps[warp].arrived + block.all.arrived != arrived;
 }
 
-inline void run_block(const std::function<void()>& body, dim3 index, int count, dim3 grid, bool descending) {
+inline void run_block(const std::function<void()>& body, dim3 index, int count, dim3 grid, Order& order) {
   const int warps = (count + WARP - 1) / WARP;
   block.fibers.resize(count);
   block.warps.assign(warps, Meeting());
@@ -175,19 +198,22 @@ inline void run_block(const std::function<void()>& body, dim3 index, int count, 
   }
   while (block.all.members > 0) {
     bool progress = false;
-    for (int i = 0; i < warps; i++)
-      while (block.all.members > 0 && run_warp(descending ? warps - 1 - i : i)) progress = true;
+    std::vector<int> places;
+    for (int warp : order.of(warps, places))
+      while (block.all.members > 0 && run_warp(warp, order)) progress = true;
     if (!progress) throw std::runtime_error("threads wait for others that will never come (diverged barrier or shuffle)");
   }
 }
 
 template <class Kernel, class... Arguments>
-void launch(Kernel kernel, dim3 grid, int threads, bool descending, const Arguments&... arguments) {
+void launch(Kernel kernel, dim3 grid, int threads, unsigned kind, const Arguments&... arguments) {
   const std::function<void()> body = [&] { kernel(arguments...); };
   const unsigned count = grid.x * grid.y * grid.z;
-  for (unsigned i = 0; i < count; i++) {
-    const unsigned b = descending ? count - 1 - i : i;
-    run_block(body, {b % grid.x, b / grid.x % grid.y, b / (grid.x * grid.y)}, threads, grid, descending);
+  Order order(kind);
+  std::vector<int> places;
+  for (int place : order.of(int(count), places)) {
+    const unsigned b = unsigned(place);
+    run_block(body, {b % grid.x, b / grid.x % grid.y, b / (grid.x * grid.y)}, threads, grid, order);
   }
 }
 

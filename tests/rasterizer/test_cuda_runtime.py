@@ -23,8 +23,8 @@ from cuda_cases import (
 )
 
 from d2_plugin import D2Error
-from d2_plugin.compiler import NoCompiler
-from d2_plugin.rasterizer import cuda, cuda_frame, nvrtc
+from d2_plugin.compiler import NoCompiler, driver, nvrtc
+from d2_plugin.rasterizer import cuda
 from d2_plugin.rasterizer import cuda_runtime as runtime
 
 
@@ -41,7 +41,7 @@ def test_nvrtc_compiles_the_kernels_without_a_toolkit(
     compiler: nvrtc.Nvrtc, capability: int, channels: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("D2_CACHE", str(tmp_path))
-    code, architecture = nvrtc.build(capability, channels)
+    code, architecture = runtime.binary_for(capability, channels)
     assert architecture == f"sm_{capability}"
     assert code.startswith(b"\x7fELF")
     twice = ("render", "backward", "survey")
@@ -61,18 +61,18 @@ def test_the_cache_serves_what_it_has_and_rebuilds_what_is_damaged(
     compiler: nvrtc.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("D2_CACHE", str(tmp_path))
-    first = nvrtc.build(90, 3)
+    first = runtime.binary_for(90, 3)
     (entry,) = tmp_path.iterdir()
     compiled = []
     compile_kernels = nvrtc.Nvrtc.compile
     monkeypatch.setattr(nvrtc.Nvrtc, "compile", lambda *a: compiled.append(1) or compile_kernels(*a))
-    assert nvrtc.build(90, 3) == first
+    assert runtime.binary_for(90, 3) == first
     assert not compiled
     entry.write_bytes(entry.read_bytes()[:1000])
-    assert nvrtc.build(90, 3) == first
+    assert runtime.binary_for(90, 3) == first
     assert compiled
-    nvrtc.build(90, 2)
-    nvrtc.build(80, 3)
+    runtime.binary_for(90, 2)
+    runtime.binary_for(80, 3)
     assert len(list(tmp_path.iterdir())) == 3
 
 
@@ -81,36 +81,32 @@ def test_a_cache_that_cannot_be_written_only_costs_time(
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("D2_CACHE", str(tmp_path / "file" / "below"))
-    assert nvrtc.build(90, 3).code.startswith(b"\x7fELF")
+    assert runtime.binary_for(90, 3).code.startswith(b"\x7fELF")
     assert "cannot use the cache" in caplog.text
 
 
 def test_a_gpu_newer_than_nvrtc_gets_ptx_and_an_older_one_a_sentence(compiler: nvrtc.Nvrtc) -> None:
     known = compiler.architectures()
     assert compiler.architecture_for(999) == f"compute_{known[-1]}"
-    assert b".target" in compiler.compile("compute_80", (*nvrtc.FLAGS, "-DD2_CHANNELS=3", frame_size()))
+    assert b".target" in compiler.compile(runtime.PROGRAM, "compute_80", runtime.flags_for(3))
     with pytest.raises(nvrtc.NoCuda, match=rf"the GPU is sm_35, but NVRTC \d+\.\d+ compiles for sm_{known[0]}"):
         compiler.architecture_for(35)
 
 
 def test_nvrtcs_own_words_are_in_the_error(compiler: nvrtc.Nvrtc) -> None:
     with pytest.raises(D2Error, match="Frame differs between"):
-        compiler.compile("sm_90", (*nvrtc.FLAGS, "-DD2_CHANNELS=3", "-DD2_FRAME_SIZE=1"))
-
-
-def frame_size() -> str:
-    return f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda_frame.Frame)}"
+        compiler.compile(runtime.PROGRAM, "sm_90", (*runtime.FLAGS, "-DD2_CHANNELS=3", "-DD2_FRAME_SIZE=1"))
 
 
 def test_without_nvrtc_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nvrtc, "_files", lambda: iter(()))
-    monkeypatch.setattr(runtime.ctypes, "CDLL", no_library)
+    monkeypatch.setattr(ctypes, "CDLL", no_library)
     with pytest.raises(nvrtc.NoCuda, match=r"NVRTC.*not found: run `pip install 'd2-4dgs\[cuda\]'`"):
         nvrtc.Nvrtc()
 
 
 def test_without_a_driver_splatting_falls_back_with_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runtime.ctypes, "CDLL", no_library)
+    monkeypatch.setattr(ctypes, "CDLL", no_library)
     cuda.launcher.cache_clear()
     cuda.available.cache_clear()
     with pytest.warns(UserWarning, match=r"NVIDIA driver .* not found.* plain torch"):
@@ -126,21 +122,21 @@ def no_library(*_: object, **__: object) -> None:
 
 
 @pytest.fixture
-def driver(compiler: nvrtc.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ctypes.CDLL:
+def shim_driver(compiler: nvrtc.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ctypes.CDLL:
     """The shim's CUDA driver in place of the real one, with stream 77 current."""
     try:
         shim = shim_library(3)
     except NoCompiler as error:
         pytest.skip(str(error))
     monkeypatch.setenv("D2_CACHE", str(tmp_path))
-    monkeypatch.setattr(runtime, "_load_driver", lambda: shim)
+    monkeypatch.setattr(driver, "load_driver", lambda: shim)
     monkeypatch.setattr(torch.cuda, "init", lambda: None)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (9, 0))
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: SimpleNamespace(cuda_stream=77))
     return shim
 
 
-def test_the_launcher_talks_to_the_driver(driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_launcher_talks_to_the_driver(shim_driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
     """Context, module, functions, frame and stream arrive; the kernels themselves run in the shim."""
     launcher = runtime.CudaLauncher(torch.device("cuda", 0))
     monkeypatch.setattr(cuda, "launcher", lambda device: launcher)
@@ -150,12 +146,12 @@ def test_the_launcher_talks_to_the_driver(driver: ctypes.CDLL, monkeypatch: pyte
     assert_same_image(scene, render_kernels(scene, cpu)[1], render)
     assert_same_gradients(gradients_of_kernels(scene, cpu, upstream), expected)
     assert survey_kernels(scene, make_prior(scene), cpu).hits.any()
-    assert driver.d2_shim_stream() == 77
-    assert driver.d2_shim_contexts() == 0
+    assert shim_driver.d2_shim_stream() == 77
+    assert shim_driver.d2_shim_contexts() == 0
 
 
-def test_a_driver_that_refuses_the_kernels_is_named(driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runtime, "build", lambda *_: nvrtc.Binary(b"no cubin", "sm_90"))
+def test_a_driver_that_refuses_the_kernels_is_named(shim_driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime, "binary_for", lambda *_: nvrtc.Binary(b"no cubin", "sm_90"))
     with pytest.raises(nvrtc.NoCuda, match=r"refuses kernels for sm_90 .*NO_BINARY.*: update the NVIDIA driver"):
         runtime.CudaLauncher(torch.device("cuda", 0))
-    assert driver.d2_shim_contexts() == 0
+    assert shim_driver.d2_shim_contexts() == 0

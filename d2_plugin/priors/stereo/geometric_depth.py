@@ -8,14 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from d2_plugin import compiler
 from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.colmap import mvs
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera
 from d2_plugin.priors.stereo.filter import GeometricDepth, filter_depths
+from d2_plugin.priors.stereo.gpu import kernel as gpu
 from d2_plugin.priors.stereo.patchmatch import patchmatch
+from d2_plugin.priors.stereo.patchmatch_kernel import compiles as patchmatch_compiles
 from d2_plugin.priors.stereo.reuse import MatchMemory, widened
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.priors.stereo.sweep import sweep
@@ -95,11 +96,7 @@ def choose_matcher(name: str) -> str:
         return name
     if not mvs.why_not_usable():
         return "colmap"
-    try:
-        compiler.find_compiler()
-    except compiler.NoCompiler:
-        return "sweep"
-    return "patchmatch"
+    return "patchmatch" if gpu.why_not_usable() is None or patchmatch_compiles() else "sweep"
 
 
 def gray(image: np.ndarray) -> np.ndarray:

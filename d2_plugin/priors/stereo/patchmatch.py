@@ -1,7 +1,7 @@
-"""PatchMatch multi-view stereo on the CPU, compiled at first use: geometric depth without a GPU.
+"""PatchMatch multi-view stereo on the GPU or the CPU, compiled at first use: the same planes on both.
 
 Each pixel carries a plane, linear in inverse depth over the picture, and keeps the best of what it draws at random and
-of what its neighbours found (`kernels/patchmatch.cpp`). Resolution doubles from level to level, and planes are carried
+of what its neighbours found (`kernels/spread.h`). Resolution doubles from level to level, and planes are carried
 over exactly. In the end each plane has fitted the noise of its own window; averaging those that agree takes that out.
 Coordinates are array indices, as in `d2_plugin.priors.geometry`.
 """
@@ -15,6 +15,7 @@ import numpy as np
 from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import check_depth_range, check_views
+from d2_plugin.priors.stereo.gpu import kernel as gpu
 from d2_plugin.priors.stereo.patchmatch_kernel import PatchMatchKernel
 from d2_plugin.priors.stereo.pyramid import LevelView, at_resolution, levels, plane_depth
 from d2_plugin.priors.stereo.settings import StereoSettings
@@ -48,14 +49,14 @@ def patchmatch(
 
     Raises:
         D2Error: fewer than two views, a picture of another size or type, an inverted depth range.
-        NoCompiler: there is no C++ compiler; `d2_plugin.priors.stereo.sweep` needs none.
+        NoCompiler: there is neither a GPU nor a C++ compiler; `d2_plugin.priors.stereo.sweep` needs none.
     """
     settings = settings or StereoSettings()
     check_views(grays, cameras)
     near, far = check_depth_range(depth_range)
     _check(grays)
     sources = [choose_sources(index, cameras, (near, far), settings) for index in range(len(cameras))]
-    kernel = PatchMatchKernel(sources, (near, far), settings)
+    kernel = _kernel(settings)(sources, (near, far), settings)
     masks: Sequence[np.ndarray | None] = [None] * len(cameras) if wanted is None else wanted
     views: list[LevelView] = []
     for level, (divisor, rounds) in enumerate(levels(cameras, settings.patchmatch_rounds)):
@@ -63,7 +64,7 @@ def patchmatch(
         views = [at_resolution(*view, divisor) for view in zip(grays, cameras, coarser, masks)]
         for index in range(len(views)):
             # Once planes are handed down from a coarser level, random ones are hardly ever better.
-            kernel.match(views, index, level, rounds, explore=divisor > 1 or level == 0)
+            kernel.match(views, index, level, rounds, explore=divisor > 2 or level == 0)
     for extra in range(settings.patchmatch_geometric_rounds):
         depths = [plane_depth(view) for view in views]
         for index in range(len(views)):
@@ -71,6 +72,18 @@ def patchmatch(
     for view in views:
         kernel.average(view)
     return [(plane_depth(view), view.cost) for view in views]
+
+
+def _kernel(settings: StereoSettings) -> type[PatchMatchKernel]:
+    """Where planes spread: on the GPU where there is one, unless the settings say otherwise."""
+    if settings.patchmatch_device == "cpu":
+        return PatchMatchKernel
+    why_not = gpu.why_not_usable()
+    if why_not is None:
+        return gpu.CudaPatchMatchKernel
+    if settings.patchmatch_device == "cuda":
+        raise D2Error(f"patchmatch_device = 'cuda', but {why_not}: set it to 'auto' or 'cpu'")
+    return PatchMatchKernel
 
 
 def _check(grays: Sequence[np.ndarray]) -> None:

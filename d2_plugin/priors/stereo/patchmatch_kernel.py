@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,52 +11,67 @@ import numpy as np
 import torch
 
 from d2_plugin.captures.capture import Camera
-from d2_plugin.compiler import load_library
+from d2_plugin.compiler import NoCompiler, find_compiler, load_library
+from d2_plugin.compiler.prebuilt import find as find_prebuilt
+from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import index_intrinsics, view_pair
 from d2_plugin.priors.stereo.pyramid import NO_MATCH, LevelView
 from d2_plugin.priors.stereo.settings import StereoSettings
 
 KERNELS = Path(__file__).parent / "kernels"
-FLAGS = ("-fopenmp-simd", "-ffp-contract=fast")
+FLAGS = ("-fopenmp-simd", "-ffp-contract=off")
+"""No contraction: the kernels say themselves what is fused, so that all devices return the same bits."""
+
+SOURCES = [KERNELS / "patchmatch.cpp"]
+HEADERS = [KERNELS / name for name in ("numbers.h", "lanes.h", "planes.h", "matching.h", "spread.h")]
+
+MOST_PIXELS = 2**31 - 1
+"""Of all sources together: their places are 32-bit integers."""
 
 CONSENSUS_RADIUS = 3
 """Half the side of the window over which planes are averaged, pixels."""
 
 
-class _Picture(ctypes.Structure):
-    _fields_ = (("width", ctypes.c_int32), ("height", ctypes.c_int32), ("gray", ctypes.c_void_p))
+_float, _int, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_void_p
 
 
-class _Source(ctypes.Structure):
+class Source(ctypes.Structure):
+    """d2::Source of kernels/matching.h: a view as the reference sees it."""
+
     _fields_ = (
-        ("width", ctypes.c_int32),
-        ("height", ctypes.c_int32),
-        ("quads", ctypes.c_void_p),
-        ("A", ctypes.c_float * 9),
-        ("k", ctypes.c_float * 3),
-        ("back_A", ctypes.c_float * 9),
-        ("back_k", ctypes.c_float * 3),
-        ("depth", ctypes.c_void_p),
+        *((name, _int) for name in ("width", "height", "first")),
+        ("A", _float * 9),
+        ("k", _float * 3),
+        ("back_A", _float * 9),
+        ("back_k", _float * 3),
     )
 
 
-class _Task(ctypes.Structure):
+class Task(ctypes.Structure):
+    """d2::Task of kernels/spread.h: what the planes of one reference view spread by."""
+
     _fields_ = (
-        ("reference", _Picture),
-        ("intrinsics", ctypes.c_float * 4),
-        ("source_count", ctypes.c_int32),
-        ("sources", ctypes.POINTER(_Source)),
-        ("inverse_far", ctypes.c_float),
-        ("inverse_near", ctypes.c_float),
-        ("contrast", ctypes.c_float),
-        ("geometric_weight", ctypes.c_float),
-        ("rounds", ctypes.c_int32),
-        ("draw_planes", ctypes.c_int32),
-        ("explore", ctypes.c_int32),
-        ("threads", ctypes.c_int32),
+        ("intrinsics", _float * 4),
+        *((name, _int) for name in ("width", "height", "source_count", "rounds", "draw_planes", "explore", "threads")),
         ("seed", ctypes.c_uint32),
-        ("wanted", ctypes.c_void_p),
+        *((name, _float) for name in ("inverse_far", "inverse_near", "per_gray", "geometric_weight")),
+        *((name, _pointer) for name in ("gray", "wanted", "sources", "quads", "depths", "planes", "costs", "views")),
     )
+
+
+def compiles() -> bool:
+    """Whether the CPU kernels came compiled, or there is a compiler for them."""
+    if find_prebuilt("patchmatch", SOURCES, HEADERS, FLAGS) is not None:
+        return True
+    try:
+        find_compiler()
+    except NoCompiler:
+        return False
+    return True
+
+
+Arrays = dict[str, np.ndarray]
+"""What the pointers of a task point to, by their names."""
 
 
 class PatchMatchKernel:
@@ -71,11 +87,11 @@ class PatchMatchKernel:
     """
 
     def __init__(self, sources: list[list[int]], depth_range: tuple[float, float], settings: StereoSettings) -> None:
-        self.sources = sources
-        self.depth_range = depth_range
-        self.settings = settings
-        headers = [KERNELS / "planes.h", KERNELS / "matching.h"]
-        self.library = load_library("patchmatch", [KERNELS / "patchmatch.cpp"], headers, FLAGS)
+        self.sources, self.depth_range, self.settings = sources, depth_range, settings
+        self._start()
+
+    def _start(self) -> None:
+        self.library = load_library("patchmatch", SOURCES, HEADERS, FLAGS)
 
     def match(
         self,
@@ -91,72 +107,95 @@ class PatchMatchKernel:
         `stage` also tells apart the random numbers of calls for the same view. With `depths`, a map per view, planes
         are asked to agree with them as well.
         """
-        view, sources = views[index], self.sources[index]
-        if not sources:
+        if not self.sources[index]:
             return
-        near, far = self.depth_range
-        found = [_source(view, views[other], None if depths is None else depths[other]) for other in sources]
-        task = _Task(
-            _picture(view.gray),
-            _intrinsics(view.camera),
-            len(sources),
-            (_Source * len(sources))(*found),
-            1 / far,
-            1 / near,
-            self.settings.patchmatch_contrast,
-            0 if depths is None else self.settings.patchmatch_geometric_weight,
-            rounds,
-            stage == 0,
-            explore,
-            torch.get_num_threads(),
-            int(np.random.SeedSequence([self.settings.seed, stage, index]).generate_state(1)[0]),
-            None if view.wanted is None else view.wanted.ctypes.data,
-        )
-        chosen = np.zeros(view.gray.shape, np.uint32)
-        self.library.d2_patchmatch(ctypes.byref(task), _pointer(view.planes), _pointer(view.cost), _pointer(chosen))
+        view = views[index]
+        task = self._task(view)
+        task.rounds, task.draw_planes, task.explore = rounds, stage == 0, explore
+        task.seed = int(np.random.SeedSequence([self.settings.seed, stage, index]).generate_state(1)[0])
+        arrays = self._view_arrays(view)
+        arrays["views"] = np.zeros(view.gray.shape, np.uint32)
+        arrays |= self._source_arrays(view, [views[other] for other in self.sources[index]])
+        if depths is not None:
+            task.geometric_weight = self.settings.patchmatch_geometric_weight
+            arrays["depths"] = np.concatenate([depths[other].ravel() for other in self.sources[index]])
+        task.source_count = len(self.sources[index])
+        self._spread(task, arrays)
         view.known |= view.cost < NO_MATCH
 
     def average(self, view: LevelView) -> None:
         """Replace each plane by the mean of those around it that agree with it."""
-        picture = _picture(view.gray)
+        view.planes = self._average(self._task(view), self._view_arrays(view))
+
+    def _spread(self, task: Task, arrays: Arrays) -> None:
+        """Let planes spread; writes the arrays `planes` and `costs`."""
+        self.library.d2_patchmatch(ctypes.byref(_pointed(task, arrays)))
+
+    def _average(self, task: Task, arrays: Arrays) -> np.ndarray:
+        """The planes after all passes of the consensus."""
+        tolerance = _float(self.settings.patchmatch_consensus_tolerance)
+        planes, averaged = arrays["planes"], np.empty_like(arrays["planes"])
         for _ in range(self.settings.patchmatch_consensus_passes):
-            averaged = np.empty_like(view.planes)
-            self.library.d2_consensus(
-                ctypes.byref(picture),
-                ctypes.c_float(self.settings.patchmatch_contrast),
-                CONSENSUS_RADIUS,
-                ctypes.c_float(self.settings.patchmatch_consensus_tolerance),
-                torch.get_num_threads(),
-                None if view.wanted is None else _pointer(view.wanted),
-                _pointer(view.planes),
-                _pointer(averaged),
+            call = ctypes.byref(_pointed(task, arrays | {"planes": planes}))
+            self.library.d2_consensus(call, CONSENSUS_RADIUS, tolerance, _pointer(averaged.ctypes.data))
+            planes, averaged = averaged, np.empty_like(planes)
+        return planes
+
+    def _task(self, view: LevelView) -> Task:
+        """What is the same of all calls for one view of one resolution."""
+        near, far = self.depth_range
+        return Task(
+            intrinsics=_intrinsics(view.camera),
+            width=view.gray.shape[1],
+            height=view.gray.shape[0],
+            threads=torch.get_num_threads(),
+            inverse_far=1 / far,
+            inverse_near=1 / near,
+            per_gray=per_squared_gray(self.settings.patchmatch_contrast),
+        )
+
+    def _view_arrays(self, view: LevelView) -> Arrays:
+        arrays = {"gray": view.gray, "planes": view.planes, "costs": view.cost}
+        return arrays if view.wanted is None else arrays | {"wanted": view.wanted}
+
+    def _source_arrays(self, view: LevelView, chosen: Sequence[LevelView]) -> Arrays:
+        first = np.cumsum([0, *(source.gray.size for source in chosen)])
+        if first[-1] > MOST_PIXELS:
+            raise D2Error(
+                f"the pictures that a view is matched with have {first[-1]} pixels together, at most {MOST_PIXELS} are "
+                "possible: lower max_pixels"
             )
-            view.planes = averaged
+        sources = (Source * len(chosen))(*(_source(view, *pair) for pair in zip(chosen, first.tolist())))
+        quads = np.concatenate([source.quads.ravel() for source in chosen])
+        return {"sources": np.frombuffer(sources, np.uint8), "quads": quads}
 
 
-def _pointer(array: np.ndarray) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)
+def _pointed(task: Task, arrays: Arrays) -> Task:
+    """The task with its pointers; the arrays must outlive its use."""
+    for name, array in arrays.items():
+        setattr(task, name, array.ctypes.data)
+    return task
 
 
-def _picture(gray: np.ndarray) -> _Picture:
-    return _Picture(gray.shape[1], gray.shape[0], gray.ctypes.data)
+def per_squared_gray(contrast: float) -> float:
+    """log2 of the bilateral weight per squared difference of grey values in 0..255; `contrast` is in 0..1."""
+    return -0.5 * math.log2(math.e) / (255 * contrast) ** 2
 
 
 def _intrinsics(camera: Camera) -> ctypes.Array:
     K = index_intrinsics(camera)
-    return (ctypes.c_float * 4)(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    return (_float * 4)(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
-def _source(reference: LevelView, source: LevelView, depth: np.ndarray | None) -> _Source:
+def _source(reference: LevelView, source: LevelView, first: int) -> Source:
     forth, back = view_pair(reference.camera, source.camera), view_pair(source.camera, reference.camera)
-    nine, three = ctypes.c_float * 9, ctypes.c_float * 3
-    return _Source(
+    nine, three = _float * 9, _float * 3
+    return Source(
         source.camera.width,
         source.camera.height,
-        source.quads.ctypes.data,
+        first,
         nine(*forth.A.ravel()),
         three(*forth.k),
         nine(*back.A.ravel()),
         three(*back.k),
-        None if depth is None else depth.ctypes.data,
     )

@@ -80,7 +80,7 @@ def refined_planes(planes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 def _nearest(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """`values` [h, w, ...] at [H, W], each fine pixel taking what the coarse pixel around its centre has."""
     rows, columns = _parents(values.shape[:2], shape)
-    return values[rows][:, columns]
+    return values[rows[:, None], columns]  # in C order, which an index per axis does not give
 
 
 def _parents(coarse: tuple[int, int], fine: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -35,6 +35,8 @@ class StereoSettings(Settings):
     """Pictures with more pixels are matched at a half, a third, ... of their size; depth comes back at full size.
     Windows of 11 pixels see more of a wall at half size. Measured on n3dv_sear_steak_t0 (1352x1014, 4 views): at half
     size 35 % verified in 14 CPU seconds, in full 28 % in 47, with the same median deviation from SIFT points."""
+    patchmatch_device: Literal["auto", "cuda", "cpu"] = "auto"
+    """Where patchmatch runs: `auto` takes the GPU where torch sees one. Both return the same depth."""
     patchmatch_rounds: tuple[Count, ...] = (4, 2, 2, 1)
     """Red-black sweeps at each resolution, coarsest first; each resolution is twice the one before, the last is full.
     A second sweep at full resolution fits noise. Measured: it costs half as much again."""

@@ -26,19 +26,18 @@ def choose_sources(
     """
     grid = scaled_camera(cameras[index], 12, 8)
     u, v = pixel_grid(grid)
+    inverse = np.linspace(1 / depth_range[1], 1 / depth_range[0], 8, dtype=np.float32)
+    depth = np.broadcast_to((1 / inverse)[:, None, None], (8, grid.height, grid.width))
     worth = {}
     for other, source in enumerate(cameras):
         if other == index:
             continue
         pair = view_pair(grid, source)
-        worth[other] = 0.0
-        for inverse in np.linspace(1 / depth_range[1], 1 / depth_range[0], 8):
-            depth = np.full((grid.height, grid.width), 1 / inverse, np.float32)
-            at = pair.project(u, v, depth)
-            seen = (at.z > 0) & (at.x > -0.5) & (at.y > -0.5) & (at.x < source.width) & (at.y < source.height)
-            angle = np.rad2deg(triangulation_angle(grid, pair, depth))
-            useful = seen & (angle > settings.min_angle) & (angle < settings.max_angle)
-            ratio = np.log(np.where(useful, angle, BEST_ANGLE) / BEST_ANGLE) / np.log(3)
-            worth[other] += float((useful * np.exp(-0.5 * ratio**2)).sum())
+        at = pair.project(u, v, depth)
+        seen = (at.z > 0) & (at.x > -0.5) & (at.y > -0.5) & (at.x < source.width) & (at.y < source.height)
+        angle = np.rad2deg(triangulation_angle(grid, pair, depth))
+        useful = seen & (angle > settings.min_angle) & (angle < settings.max_angle)
+        ratio = np.log(np.where(useful, angle, BEST_ANGLE) / BEST_ANGLE) / np.log(3)
+        worth[other] = float((useful * np.exp(-0.5 * ratio**2)).sum())
     ranked = sorted((other for other in worth if worth[other] > 0), key=lambda other: -worth[other])
     return ranked[: settings.patchmatch_sources]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 
@@ -51,6 +51,8 @@ class StereoBench(Settings):
     """Matchings per row; times are medians, CPU seconds."""
     threads: AtATime = 1
     """CPU threads."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where PatchMatch runs. Times are CPU seconds either way; rows of a GPU also have wall seconds."""
     output: Path = Path("bench-stereo")
     """Folder of the results."""
 
@@ -67,6 +69,7 @@ def run(settings: StereoBench) -> str:
         width=settings.width,
         widen=settings.widen,
         repeats=settings.repeats,
+        device=settings.device,
         command=command_line("bench stereo", settings),
     )
     return f"{table(rows)}\nstereo.jsonl (rows), stereo.md (this table) and stereo.svg (plot) are in {settings.output}"
@@ -82,6 +85,7 @@ def bench_stereo(
     width: int = 320,
     widen: float = 1.0,
     repeats: int = 1,
+    device: Literal["cpu", "cuda"] = "cpu",
     command: str = "",
 ) -> list[Row]:
     """Measure and write `stereo.jsonl`, `stereo.md` and `stereo.svg` into `output`.
@@ -95,12 +99,13 @@ def bench_stereo(
         width: of rendered pictures, pixels.
         widen: how many times too wide the depth range is at both ends.
         repeats: of every matching; times are medians.
+        device: where PatchMatch runs.
         command: how this was started, for the captions.
 
     Returns:
         One row per method and rig.
     """
-    chosen = _chosen(makers, defaults_only)
+    chosen = [_on(method, device) for method in _chosen(makers, defaults_only)]
     loaded = [load_rigs(name, data, width) for name in rigs]
     output.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
@@ -108,12 +113,16 @@ def bench_stereo(
     for group in loaded:
         for method in chosen:
             row = measure(method, group, widen, repeats)
-            rows.append(_row(row, widen=widen, repeats=repeats, command=command))
+            rows.append(_row(row, device=device, widen=widen, repeats=repeats, command=command))
             append_rows(output / "stereo.jsonl", rows[-1:])
             logger.info("%s (%s) on %s is measured", method.name, method.setting, row["rig"])
     (output / "stereo.md").write_text(table(rows))
     (output / "stereo.svg").write_text(plot(rows))
     return rows
+
+
+def _on(method: Method, device: Literal["cpu", "cuda"]) -> Method:
+    return replace(method, settings=replace(method.settings, patchmatch_device=device))
 
 
 def _row(found: dict[str, Any], **more: Any) -> Row:

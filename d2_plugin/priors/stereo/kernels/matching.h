@@ -1,145 +1,127 @@
 // How well a plane explains the pictures: bilaterally weighted NCC between a window of the reference and a source.
 #pragma once
 
-#include <algorithm>
-#include <cmath>
-#include <cstdint>
-#include <cstdlib>
-
 #include "planes.h"
 
 namespace d2 {
 
-constexpr int kSamples = 32;            // of a window: two AVX-512, four AVX2 or eight SSE vectors
+constexpr int kSamples = 32;            // of a window: a 6 x 6 grid over 11 x 11 pixels without its corners
+constexpr int kPartials = 16;           // sums over a window are added up in this many places, then in pairs
 constexpr float kNoMatch = 2.f;         // the worst 1 - NCC: outside of the source, behind it, or without texture
 constexpr float kMinVariance = 0.65f;   // grey levels squared (1e-5 in 0..1): below it NCC correlates rounding errors
-constexpr float kWindowSigma = 3.f;     // of the weight over distance, pixels
+constexpr float kPerSquare = -kLog2E / 18.f;  // log2 of the weight per squared distance: standard deviation 3 pixels
 constexpr float kMaxReprojection = 3.f; // pixels; farther off does not count as worse
 
 extern "C" {
 
-struct Picture {
-  int32_t width, height;
-  const uint8_t* gray;
-};
-
 // A source view as the reference sees it: pixel p of the reference at inverse depth q is at A p + k q in the source.
 struct Source {
-  int32_t width, height;
-  const uint32_t* quads;  // per pixel the grey values of itself, its right, lower and lower right neighbour
+  int width, height;
+  int first;                   // its first place in Task.quads and Task.depths
   float A[9], k[3];
   float back_A[9], back_k[3];  // the same from the source to the reference
-  const float* depth;          // of the source, or null where no geometric term is wanted
 };
 
 }  // extern "C"
 
-// Weights over grey value and distance, and the sampling pattern: a 6 x 6 grid over 11 x 11 pixels without its corners.
-struct Window {
-  float color[256];
-  float spatial[kSamples];
-  int du[kSamples], dv[kSamples];
+// Column and row of sample k relative to the middle: odd numbers from -5 to 5, row by row.
+D2_FN int sample_place(int k) { return k < 4 ? k + 1 : k < 28 ? k + 2 : k + 3; }  // in the 6 x 6 grid
+D2_FN int sample_du(int k) { return 2 * (sample_place(k) % 6) - 5; }
+D2_FN int sample_dv(int k) { return 2 * (sample_place(k) / 6) - 5; }
 
-  explicit Window(float contrast) {
-    for (int level = 0; level < 256; level++) {
-      const float d = level / (255 * contrast);
-      color[level] = std::exp(-.5f * d * d);
-    }
-    int n = 0;
-    for (int y = -5; y <= 5; y += 2) {
-      for (int x = -5; x <= 5; x += 2) {
-        if (std::abs(x) == 5 && std::abs(y) == 5) continue;
-        du[n] = x, dv[n] = y;
-        spatial[n++] = std::exp(-(x * x + y * y) / (2 * kWindowSigma * kWindowSigma));
-      }
-    }
-  }
-};
+// log2 of a sample's weight over distance. Divided by their sum, weights over distance and grey value are those of the
+// window: 2^(log2 over distance + per_gray difference^2).
+D2_FN float log2_spatial(int du, int dv) { return float(du * du + dv * dv) * kPerSquare; }
 
-// The window around one pixel of the reference; weights sum to 1.
-struct Patch {
-  alignas(64) float u[kSamples], v[kSamples];
-  alignas(64) float weight[kSamples], weighted[kSamples];  // weight, and weight times (grey value - mean)
-  float variance;
-
-  Patch(const Window& window, const Picture& picture, int x, int y) {
-    const int centre = picture.gray[size_t(y) * picture.width + x];
-    float value[kSamples], total = 0, mean = 0;
-    for (int k = 0; k < kSamples; k++) {
-      const int column = x + window.du[k], row = y + window.dv[k];
-      const bool inside = column >= 0 && row >= 0 && column < picture.width && row < picture.height;
-      const int level = inside ? picture.gray[size_t(row) * picture.width + column] : centre;
-      u[k] = float(column), v[k] = float(row), value[k] = float(level);
-      weight[k] = inside ? window.spatial[k] * window.color[std::abs(level - centre)] : 0.f;
-      total += weight[k];
-    }
-    for (int k = 0; k < kSamples; k++) weight[k] /= total, mean += weight[k] * value[k];
-    variance = 0;
-    for (int k = 0; k < kSamples; k++) {
-      weighted[k] = weight[k] * (value[k] - mean);
-      variance += weighted[k] * (value[k] - mean);
-    }
-  }
-};
-
-// 1 - NCC in 0..2 between the patch around (u, v) and what `plane` makes the source show of it.
-inline float match(const Source& source, const Patch& patch, const Plane& plane, float u, float v) {
-  float H[9];  // the homography A + k (a b c) of the plane
-  for (int row = 0; row < 3; row++) {
-    H[3 * row] = source.A[3 * row] + source.k[row] * plane.a;
-    H[3 * row + 1] = source.A[3 * row + 1] + source.k[row] * plane.b;
-    H[3 * row + 2] = source.A[3 * row + 2] + source.k[row] * plane.c;
-  }
-  const float z = H[6] * u + H[7] * v + H[8];
-  if (!(z > 1e-6f) || patch.variance < kMinVariance) return kNoMatch;
-  const float x = (H[0] * u + H[1] * v + H[2]) / z, y = (H[3] * u + H[4] * v + H[5]) / z;
-  if (!(x >= 0 && y >= 0 && x <= float(source.width - 1) && y <= float(source.height - 1))) return kNoMatch;
-
-  const float last_x = std::max(source.width - 1.001f, 0.f), last_y = std::max(source.height - 1.001f, 0.f);
-  const int stride = source.width;
-  const uint32_t* quads = source.quads;
-  float mean = 0, square = 0, product = 0;
-#pragma omp simd reduction(+ : mean, square, product)
-  for (int k = 0; k < kSamples; k++) {
-    const float scale = 1.f / (H[6] * patch.u[k] + H[7] * patch.v[k] + H[8]);
-    float column = (H[0] * patch.u[k] + H[1] * patch.v[k] + H[2]) * scale;
-    float row = (H[3] * patch.u[k] + H[4] * patch.v[k] + H[5]) * scale;
-    // The order of the operands sends NaN (a sample behind the source) to the border.
-    column = std::min(std::max(0.f, column), last_x);
-    row = std::min(std::max(0.f, row), last_y);
-    const int left = int(column), top = int(row);
-    const uint32_t quad = quads[top * stride + left];  // one gather brings all four neighbours
-    const float g00 = float(int(quad & 255)), g01 = float(int(quad >> 8 & 255));
-    const float g10 = float(int(quad >> 16 & 255)), g11 = float(int(quad >> 24));
-    const float right = column - float(left), down = row - float(top);
-    const float upper = g00 + right * (g01 - g00), lower = g10 + right * (g11 - g10);
-    const float value = upper + down * (lower - upper) - 128.f;  // centred: float32 keeps its digits in the variance
-    mean += patch.weight[k] * value;
-    square += patch.weight[k] * value * value;
-    product += patch.weighted[k] * value;
-  }
-  const float variance = square - mean * mean;
-  if (!(variance >= kMinVariance)) return kNoMatch;
-  return std::min(kNoMatch, std::max(0.f, 1.f - product / std::sqrt(variance * patch.variance)));
+D2_FN float sum_of_partials(const float* part) {
+  float sum[kPartials];
+  for (int k = 0; k < kPartials; k++) sum[k] = part[k];
+  for (int half = kPartials / 2; half > 0; half /= 2)
+    for (int k = 0; k < half; k++) sum[k] += sum[k + half];
+  return sum[0];
 }
 
+// Where a plane puts the window around a pixel in a source: (x, y) for its middle, and for a sample at (du, dv)
+//   (x, y) + (xu du + xv dv, yu du + yv dv) / (1 + zu du + zv dv).
+template <class S>
+struct Warp {
+  S x, y, xu, xv, yu, yv, zu, zv;
+  S seen;  // 1, or 0 where the middle lies behind or outside of the source
+};
+
+template <class S>
+D2_FN Warp<S> warp_of(const S (&A)[9], const S (&k)[3], S width, S height, S a, S b, S c, S u, S v) {
+  const S zero = all<S>(0.f);
+  const S h0 = mad(k[0], a, A[0]), h1 = mad(k[0], b, A[1]), h2 = mad(k[0], c, A[2]);
+  const S h3 = mad(k[1], a, A[3]), h4 = mad(k[1], b, A[4]), h5 = mad(k[1], c, A[5]);
+  const S h6 = mad(k[2], a, A[6]), h7 = mad(k[2], b, A[7]), h8 = mad(k[2], c, A[8]);
+  const S z = mad(h6, u, mad(h7, v, h8)), inverse = 1.f / larger(z, all<S>(1e-6f));
+  const S found_x = mad(h0, u, mad(h1, v, h2)) * inverse;
+  const S found_y = mad(h3, u, mad(h4, v, h5)) * inverse;
+  const auto inside = (found_x >= 0.f) & (found_y >= 0.f) & (found_x <= width - 1.f) & (found_y <= height - 1.f);
+  const auto seen = (z > 1e-6f) & inside;
+  const S factor = pick(seen, inverse, zero);  // nothing but zeros where there is nothing to see
+  const S x = pick(seen, found_x, zero), y = pick(seen, found_y, zero), zu = h6 * factor, zv = h7 * factor;
+  return {x, y, mad(-zu, x, h0 * factor), mad(-zv, x, h1 * factor), mad(-zu, y, h3 * factor), mad(-zv, y, h4 * factor),
+          zu, zv, pick(seen, all<S>(1.f), zero)};
+}
+
+D2_FN int look_up(const unsigned* quads, int place) { return int(quads[place]); }
+
+// Sums over a window of the source.
+template <class S>
+struct Sums {
+  S mean, square, product;
+
+  // Adds one sample, read from quads[first + row * stride + column]. The division is a series: what it leaves out is the
+  // fourth power of the relative change of depth over half a window, .0005 pixels at a tenth.
+  template <class I>
+  D2_FN void add(const unsigned* quads, I first, I stride, S last_x, S last_y, const Warp<S>& warp, S du, S dv,
+                 S weight, S weighted) {
+    const S e = mad(warp.zu, du, warp.zv * dv), rest = 1.f - e, scale = mad(e * e, rest, rest);
+    const S column = smaller(larger(mad(mad(warp.xu, du, warp.xv * dv), scale, warp.x), all<S>(0.f)), last_x);
+    const S row = smaller(larger(mad(mad(warp.yu, du, warp.yv * dv), scale, warp.y), all<S>(0.f)), last_y);
+    const I left = whole(column), top = whole(row);
+    const I quad = look_up(quads, first + top * stride + left);  // one access brings all four neighbours
+    const S g00 = real(quad & 255), g01 = real(quad >> 8 & 255), g10 = real(quad >> 16 & 255);
+    const S g11 = real(quad >> 24 & 255), right = column - real(left), down = row - real(top);
+    const S upper = mad(right, g01 - g00, g00), lower = mad(right, g11 - g10, g10);
+    const S value = mad(down, lower - upper, upper) - 128.f;  // centred: float32 keeps its digits in the variance
+    const S part = weight * value;
+    mean += part;
+    square = mad(part, value, square);
+    product = mad(weighted, value, product);
+  }
+
+  // 1 - NCC in 0..2; variance is that of the reference.
+  D2_FN S cost(S variance, S seen) const {
+    const S theirs = mad(-mean, mean, square), worst = all<S>(kNoMatch);
+    const auto told = (seen > 0.f) & (theirs >= kMinVariance) & (variance >= kMinVariance);
+    const S ncc = product / root(pick(told, theirs * variance, all<S>(1.f)));
+    return pick(told, smaller(larger(1.f - ncc, all<S>(0.f)), worst), worst);
+  }
+};
+
+// The largest column or row that a sample is read at: its right and lower neighbour lie in its quad.
+D2_FN float last_place(int size) { return larger(float(size) - 1.001f, 0.f); }
+
 // Forward-backward error in pixels: to the source by the plane, back by the source's own depth.
-inline float reprojection_error(const Source& source, const Plane& plane, float u, float v) {
+D2_FN float reprojection_error(const Source& source, const float* depths, const Plane& plane, float u, float v) {
   const float q = plane.inverse_depth(u, v);
   const float* A = source.A;
-  const float z = A[6] * u + A[7] * v + A[8] + source.k[2] * q;
+  const float z = mad(source.k[2], q, mad(A[6], u, mad(A[7], v, A[8])));
   if (!(q > 0 && z > 1e-6f)) return kMaxReprojection;
-  const float x = (A[0] * u + A[1] * v + A[2] + source.k[0] * q) / z;
-  const float y = (A[3] * u + A[4] * v + A[5] + source.k[1] * q) / z;
+  const float x = mad(source.k[0], q, mad(A[0], u, mad(A[1], v, A[2]))) / z;
+  const float y = mad(source.k[1], q, mad(A[3], u, mad(A[4], v, A[5]))) / z;
   const float right = source.width - .5f, bottom = source.height - .5f;
   if (!(x > -.5f && y > -.5f && x < right && y < bottom)) return kMaxReprojection;
-  const float depth = source.depth[size_t(int(y + .5f)) * source.width + int(x + .5f)];
+  const float depth = depths[source.first + int(y + .5f) * source.width + int(x + .5f)];
   const float* B = source.back_A;
-  const float back_z = (B[6] * x + B[7] * y + B[8]) * depth + source.back_k[2];
+  const float back_z = mad(mad(B[6], x, mad(B[7], y, B[8])), depth, source.back_k[2]);
   if (!(depth > 0 && back_z > 1e-6f)) return kMaxReprojection;
-  const float du = ((B[0] * x + B[1] * y + B[2]) * depth + source.back_k[0]) / back_z - u;
-  const float dv = ((B[3] * x + B[4] * y + B[5]) * depth + source.back_k[1]) / back_z - v;
-  return std::min(kMaxReprojection, std::sqrt(du * du + dv * dv));
+  const float du = mad(mad(B[0], x, mad(B[1], y, B[2])), depth, source.back_k[0]) / back_z - u;
+  const float dv = mad(mad(B[3], x, mad(B[4], y, B[5])), depth, source.back_k[1]) / back_z - v;
+  return smaller(root(mad(du, du, dv * dv)), kMaxReprojection);
 }
 
 }  // namespace d2

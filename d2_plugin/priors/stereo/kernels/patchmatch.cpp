@@ -1,80 +1,22 @@
-// PatchMatch multi-view stereo on the CPU: one inverse-depth plane per pixel of a reference view.
-//
-// Planes spread over a red-black checkerboard, each pixel trying the best planes of eight regions around it (ACMH,
-// Xu and Tao 2019) and a few random changes; which sources see a pixel is decided jointly from how all candidates match.
-// Pixels of one colour read only planes of the other, and random numbers belong to the pixel, so the result does not
-// depend on the number of threads.
+// PatchMatch multi-view stereo on the CPU: the pixels of spread.h in threads, and the matches of one pixel (candidates
+// times sources) in the lanes of vectors, so that no sum runs across a vector.
 #include <algorithm>
 #include <atomic>
-#include <cmath>
+#include <cstddef>
 #include <cstdint>
+#include <memory>
 #include <system_error>
 #include <thread>
 #include <vector>
 
-#include "matching.h"
-#include "planes.h"
+#include "lanes.h"  // before spread.h: templates find what is declared before them
+#include "spread.h"
 
 namespace d2 {
-
-constexpr int kMaxSources = 32;     // one bit each
-constexpr int kMaxCandidates = 9;   // the pixel's own plane and one from each region
-constexpr int kRowsAtOnce = 4;      // that a thread takes from the queue
-
-extern "C" {
-
-struct Task {
-  Picture reference;
-  Intrinsics intrinsics;
-  int32_t source_count;
-  const Source* sources;
-  float inverse_far, inverse_near;  // planes outside of this range are not tried
-  float contrast;                   // standard deviation of the bilateral weight, grey values in 0..1
-  float geometric_weight;           // cost per pixel of forward-backward error; 0 switches the term off
-  int32_t rounds;                   // red-black sweeps
-  int32_t draw_planes;              // start from random planes instead of those passed in
-  int32_t explore;                  // try random depths and normals besides small changes
-  int32_t threads;
-  uint32_t seed;
-  const uint8_t* wanted;  // [H, W]: where it is 0 nothing is matched; null wants all
-};
-
-}  // extern "C"
-
 namespace {
 
-// Pixels that a candidate may come from, relative to (0, 0): the one with the lowest cost is taken. All are an odd
-// number of steps away, that is of the other colour of the checkerboard.
-struct Region {
-  int count;
-  int dx[11], dy[11];
-};
-
-struct Regions {
-  Region all[8];
-
-  Regions() {
-    for (int side = 0; side < 4; side++) {
-      const int x = side == 0 ? -1 : side == 1 ? 1 : 0, y = side == 2 ? -1 : side == 3 ? 1 : 0;
-      Region& far = all[2 * side];
-      far.count = 0;
-      for (int step = 3; step <= 23; step += 2) add(far, x * step, y * step);
-      Region& near = all[2 * side + 1];
-      near.count = 0;
-      add(near, x, y);
-      for (int step = 1; step <= 3; step++) {
-        for (int across = -step; across <= step; across += 2 * step) {
-          add(near, x ? x * (1 + step) : across, y ? y * (1 + step) : across);
-        }
-      }
-    }
-  }
-
-  static void add(Region& region, int dx, int dy) {
-    region.dx[region.count] = dx;
-    region.dy[region.count++] = dy;
-  }
-};
+constexpr int kRowsAtOnce = 4;  // that a thread takes from the queue
+constexpr int kMostMatches = (kMaxCandidates * kMaxSources + 15) / 16 * 16;
 
 template <class Work>
 void parallel_rows(int rows, int threads, const Work& work) {
@@ -94,267 +36,309 @@ void parallel_rows(int rows, int threads, const Work& work) {
   for (std::thread& other : others) other.join();
 }
 
-// Everything that is known about one reference view while its planes spread.
-class Matcher {
- public:
-  Matcher(const Task& task, Plane* planes, float* costs, uint32_t* views)
-      : task_(task), window_(task.contrast), width_(task.reference.width), height_(task.reference.height),
-        planes_(planes), costs_(costs), views_(views) {}
+// What the lanes need of the sources: match n is of plane n / sources with source n % sources.
+struct Table {
+  alignas(64) float A[9][kMostMatches], k[3][kMostMatches];
+  alignas(64) float width[kMostMatches], height[kMostMatches], last_x[kMostMatches], last_y[kMostMatches];
+  alignas(64) int first[kMostMatches], stride[kMostMatches];
+  alignas(64) float du[kSamples], dv[kSamples], log2_weight[kSamples];
+  ptrdiff_t offset[kSamples];                     // of the samples, in pixels
+  ptrdiff_t neighbour[kRegions][kMostPlaces];  // of the places of a region
 
-  void initialise_row(int y) {
-    for (int x = 0; x < width_; x++) initialise(x, y);
+  explicit Table(const Task& t) {
+    for (int n = 0; n < kMostMatches; n++) {
+      const Source& source = t.sources[n % t.source_count];
+      for (int e = 0; e < 9; e++) A[e][n] = source.A[e];
+      for (int e = 0; e < 3; e++) k[e][n] = source.k[e];
+      width[n] = float(source.width), height[n] = float(source.height);
+      last_x[n] = last_place(source.width), last_y[n] = last_place(source.height);
+      first[n] = source.first, stride[n] = source.width;
+    }
+    for (int n = 0; n < kSamples; n++) {
+      du[n] = float(sample_du(n)), dv[n] = float(sample_dv(n));
+      log2_weight[n] = log2_spatial(sample_du(n), sample_dv(n));
+      offset[n] = ptrdiff_t(sample_dv(n)) * t.width + sample_du(n);
+    }
+    for (int region = 0; region < kRegions; region++) {
+      for (int n = 0; n < region_size(region); n++) {
+        int dx, dy;
+        region_place(region, n, dx, dy);
+        neighbour[region][n] = ptrdiff_t(dy) * t.width + dx;
+      }
+    }
+  }
+};
+
+// The costs of kLanes matches from number `from` of the table on. weight(n) and weighted(n) are those of sample n.
+template <class Weight, class Weighted>
+D2_FN Floats match_lanes(const Task& task, const Table& t, int from, Floats a, Floats b, Floats c, Floats u, Floats v,
+                         Floats variance, const Weight& weight, const Weighted& weighted) {
+  Floats A[9], k[3];
+  for (int e = 0; e < 9; e++) A[e] = load<Floats>(t.A[e] + from);
+  for (int e = 0; e < 3; e++) k[e] = load<Floats>(t.k[e] + from);
+  const Floats width = load<Floats>(t.width + from), height = load<Floats>(t.height + from);
+  const Warp<Floats> warp = warp_of(A, k, width, height, a, b, c, u, v);
+  const Floats last_x = load<Floats>(t.last_x + from), last_y = load<Floats>(t.last_y + from);
+  const Integers first = load<Integers>(t.first + from), stride = load<Integers>(t.stride + from);
+  Sums<Floats> sums = {};
+  for (int n = 0; n < kSamples; n++) {
+    const Floats du = all<Floats>(t.du[n]), dv = all<Floats>(t.dv[n]);
+    sums.add(task.quads, first, stride, last_x, last_y, warp, du, dv, weight(n), weighted(n));
+  }
+  return sums.cost(variance, warp.seen);
+}
+
+// The window around one pixel, and its matches.
+class Patch {
+ public:
+  Patch(const Task& task, const Table& table) : task_(task), table_(table) {}
+
+  float variance = 0;
+
+  void place(int x, int y) {
+    alignas(64) float value[kSamples], inside[kSamples];
+    const float centre = read(x, y, value, inside);
+    alignas(64) float total[kPartials], mean[kPartials], squares[kPartials];
+    for (int l = 0; l < kPartials; l += kLanes) {
+      Floats sum = {}, sum_mean = {};
+      for (int n = l; n < kSamples; n += kPartials) {
+        const Floats level = load<Floats>(value + n), off = level - centre;
+        const Floats log2_weight = mad(off * off, all<Floats>(task_.per_gray), load<Floats>(table_.log2_weight + n));
+        const Floats w = load<Floats>(inside + n) * exp2_of(log2_weight);
+        store(weight_ + n, w);
+        sum += w, sum_mean = mad(w, level, sum_mean);
+      }
+      store(total + l, sum), store(mean + l, sum_mean);
+    }
+    const float scale = 1.f / sum_of_partials(total), middle = sum_of_partials(mean) * scale;
+    for (int l = 0; l < kPartials; l += kLanes) {
+      Floats sum = {};
+      for (int n = l; n < kSamples; n += kPartials) {
+        const Floats w = load<Floats>(weight_ + n) * scale, off = load<Floats>(value + n) - middle, weighted = w * off;
+        store(weight_ + n, w), store(weighted_ + n, weighted);
+        sum = mad(weighted, off, sum);
+      }
+      store(squares + l, sum);
+    }
+    u_ = float(x), v_ = float(y), variance = sum_of_partials(squares);
   }
 
-  void update_row(int y, int colour, int round) {
-    for (int x = (y + colour) & 1; x < width_; x += 2) update(x, y, round);
+  // Costs [count, source_count] of planes.
+  void match(const Plane* planes, int count, float* costs) const {
+    const int sources = task_.source_count, matches = count * sources;
+    alignas(64) float a[kMostMatches], b[kMostMatches], c[kMostMatches];
+    int n = 0;
+    for (int p = 0; p < count; p++) {
+      for (int s = 0; s < sources; s++, n++) a[n] = planes[p].a, b[n] = planes[p].b, c[n] = planes[p].c;
+    }
+    for (; n % kLanes; n++) a[n] = b[n] = c[n] = 0;
+    const Floats u = all<Floats>(u_), v = all<Floats>(v_);
+    const auto weight = [&](int k) { return all<Floats>(weight_[k]); };
+    const auto weighted = [&](int k) { return all<Floats>(weighted_[k]); };
+    alignas(64) float found[kLanes];
+    for (int from = 0; from < matches; from += kLanes) {
+      const Floats planes_a = load<Floats>(a + from), planes_b = load<Floats>(b + from), planes_c = load<Floats>(c + from);
+      const Floats reference = all<Floats>(variance);
+      store(found, match_lanes(task_, table_, from, planes_a, planes_b, planes_c, u, v, reference, weight, weighted));
+      std::copy_n(found, std::min(kLanes, matches - from), costs + from);
+    }
+  }
+
+  float weight(int n) const { return weight_[n]; }
+  float weighted(int n) const { return weighted_[n]; }
+
+  void believe(const float* costs, int count, float* beliefs) const {
+    alignas(64) float part[kLanes] = {};
+    for (int from = 0; from < count; from += kLanes) {
+      std::copy_n(costs + from, std::min(kLanes, count - from), part);
+      store(part, belief_of(load<Floats>(part)));
+      std::copy_n(part, std::min(kLanes, count - from), beliefs + from);
+    }
+  }
+
+  // cheapest_of, without looking for the border where that is far.
+  long long cheapest(int x, int y, int region) const {
+    const bool inner = std::min(x, y) >= kFarthest && x + kFarthest < task_.width && y + kFarthest < task_.height;
+    if (!inner) return cheapest_of(task_, x, y, region);
+    const float* costs = task_.costs + size_t(y) * task_.width + x;
+    float lowest = 1e9f;
+    ptrdiff_t found = 0;
+    for (int n = 0; n < region_size(region); n++) {
+      const ptrdiff_t place = table_.neighbour[region][n];
+      if (costs[place] < lowest) lowest = costs[place], found = place;
+    }
+    return found ? costs + found - task_.costs : -1;
   }
 
  private:
-  // Candidates of one pixel and what each costs against each source.
-  struct Candidates {
-    int count = 0;
-    Plane planes[kMaxCandidates];
-    float costs[kMaxCandidates][kMaxSources];
-  };
-
-  struct Selection {
-    float weight[kMaxSources];
-    uint32_t views = 0;
-  };
-
-  bool wanted(size_t i) const { return !task_.wanted || task_.wanted[i]; }
-
-  void initialise(int x, int y) {
-    const size_t i = size_t(y) * width_ + x;
-    if (!wanted(i)) {
-      costs_[i] = kNoMatch;
-      return;
+  // Grey values of the window and 1 where there is a pixel, 0 outside of the picture; that of the middle.
+  float read(int x, int y, float* value, float* inside) const {
+    const uint8_t* gray = task_.gray + size_t(y) * task_.width + x;
+    if (x >= 5 && y >= 5 && x + 5 < task_.width && y + 5 < task_.height) {
+      for (int n = 0; n < kSamples; n++) value[n] = gray[table_.offset[n]], inside[n] = 1;
+      return *gray;
     }
-    const Patch patch(window_, task_.reference, x, y);
-    if (task_.draw_planes) {
-      Random random(task_.seed, uint32_t(i), ~0u);
-      const Vector normal = random_normal(task_.intrinsics, x, y, random);
-      const float q = random.uniform(task_.inverse_far, task_.inverse_near);
-      planes_[i] = plane_through(task_.intrinsics, x, y, q, normal);
+    for (int n = 0; n < kSamples; n++) {
+      const int column = x + sample_du(n), row = y + sample_dv(n);
+      inside[n] = column >= 0 && row >= 0 && column < task_.width && row < task_.height;
+      value[n] = inside[n] > 0 ? gray[table_.offset[n]] : *gray;
     }
-    float costs[kMaxSources], sorted[kMaxSources];
-    const int count = task_.source_count, half = (count + 1) / 2;
-    for (int s = 0; s < count; s++) costs[s] = sorted[s] = match(task_.sources[s], patch, planes_[i], x, y);
-    std::sort(sorted, sorted + count);
-    float total = 0;
-    for (int s = 0; s < half; s++) total += sorted[s];  // the other half may be occluded
-    costs_[i] = total / half;
-    views_[i] = 0;
-    for (int s = 0; s < count; s++) {
-      if (costs[s] <= sorted[half - 1] && costs[s] < kNoMatch) views_[i] |= 1u << s;
-    }
+    return *gray;
   }
-
-  void update(int x, int y, int round) {
-    const size_t i = size_t(y) * width_ + x;
-    if (!wanted(i)) return;
-    const Patch patch(window_, task_.reference, x, y);
-    if (patch.variance < kMinVariance) {
-      costs_[i] = kNoMatch;
-      return;
-    }
-    Candidates candidates = gather(x, y);
-    for (int k = 0; k < candidates.count; k++) {
-      for (int s = 0; s < task_.source_count; s++) {
-        candidates.costs[k][s] = match(task_.sources[s], patch, candidates.planes[k], x, y);
-      }
-    }
-    const Selection selection = select(candidates, x, y, round);
-    int best = 0;
-    float lowest = 1e9f;
-    for (int k = 0; k < candidates.count; k++) {
-      const float total = selected_cost(selection, candidates.costs[k], candidates.planes[k], x, y);
-      if (total < lowest) lowest = total, best = k;
-    }
-    planes_[i] = candidates.planes[best];
-    costs_[i] = lowest;
-    views_[i] = selection.views;
-    refine(patch, selection, x, y, round);
-  }
-
-  // The pixel's own plane first, then the cheapest plane of each region, none of them twice.
-  Candidates gather(int x, int y) const {
-    Candidates found;
-    found.planes[found.count++] = planes_[size_t(y) * width_ + x];
-    for (const Region& region : regions_.all) {
-      float lowest = 1e9f;
-      const Plane* cheapest = nullptr;
-      for (int k = 0; k < region.count; k++) {
-        const int column = x + region.dx[k], row = y + region.dy[k];
-        if (column < 0 || row < 0 || column >= width_ || row >= height_) continue;
-        const size_t j = size_t(row) * width_ + column;
-        if (costs_[j] < lowest) lowest = costs_[j], cheapest = &planes_[j];
-      }
-      if (!cheapest || !in_range(cheapest->inverse_depth(x, y))) continue;
-      if (std::find(found.planes, found.planes + found.count, *cheapest) == found.planes + found.count) {
-        found.planes[found.count++] = *cheapest;
-      }
-    }
-    return found;
-  }
-
-  // Joint view selection (ACMH, section 3.2): a source is weighted by how many candidates match it well, and by whether
-  // the neighbours use it; one that most candidates contradict is left out.
-  Selection select(const Candidates& candidates, int x, int y, int round) const {
-    const float threshold = .8f * std::exp(-float(round * round) / 90.f);
-    const float share = candidates.count / 8.f;  // the published counts are for eight candidates
-    Selection selection;
-    float total = 0;
-    for (int s = 0; s < task_.source_count; s++) {
-      float likelihood = 0;
-      int good = 0, bad = 0;
-      for (int k = 0; k < candidates.count; k++) {
-        const float cost = candidates.costs[k][s];
-        if (cost < threshold) likelihood += std::exp(-cost * cost / .18f), good++;
-        if (cost > 1.2f) bad++;
-      }
-      if (bad >= 3 * share) likelihood = 0;
-      else if (good > 2 * share) likelihood /= good;
-      else likelihood = std::exp(-threshold * threshold / .32f);
-      selection.weight[s] = likelihood * neighbours_use(s, x, y);
-      total += selection.weight[s];
-    }
-    normalise(selection, total);
-    return selection;
-  }
-
-  float neighbours_use(int source, int x, int y) const {
-    float belief = 0;
-    const auto ask = [&](int column, int row) {
-      if (column < 0 || row < 0 || column >= width_ || row >= height_) return;
-      belief += views_[size_t(row) * width_ + column] >> source & 1 ? .9f : .1f;
-    };
-    ask(x - 1, y), ask(x + 1, y), ask(x, y - 1), ask(x, y + 1);
-    return belief;
-  }
-
-  // Weights that sum to 1; sources with next to none are dropped, which saves matching them again.
-  void normalise(Selection& selection, float total) const {
-    float kept = 0;
-    for (int s = 0; s < task_.source_count; s++) {
-      float& weight = selection.weight[s];
-      weight = total > 0 ? weight / total : 1.f / task_.source_count;
-      if (weight < 1.f / 30) weight = 0;
-      kept += weight;
-    }
-    for (int s = 0; s < task_.source_count; s++) {
-      selection.weight[s] /= kept;
-      if (selection.weight[s] > 0) selection.views |= 1u << s;
-    }
-  }
-
-  float geometric_cost(int source, const Plane& plane, int x, int y) const {
-    if (!(task_.geometric_weight > 0)) return 0;
-    return task_.geometric_weight * reprojection_error(task_.sources[source], plane, x, y);
-  }
-
-  float selected_cost(const Selection& selection, const float* costs, const Plane& plane, int x, int y) const {
-    float total = 0;
-    for (int s = 0; s < task_.source_count; s++) {
-      if (selection.weight[s] > 0) total += selection.weight[s] * (costs[s] + geometric_cost(s, plane, x, y));
-    }
-    return total;
-  }
-
-  // Random planes, and changes that shrink with every round; a trial ends as soon as it costs more than the best.
-  void refine(const Patch& patch, const Selection& selection, int x, int y, int round) {
-    const size_t i = size_t(y) * width_ + x;
-    const Intrinsics& k = task_.intrinsics;
-    Random random(task_.seed, uint32_t(i), uint32_t(round));
-    float q = planes_[i].inverse_depth(x, y);
-    Vector normal = normal_of(k, planes_[i]);
-    const auto attempt = [&](float new_q, Vector new_normal) {
-      if (!in_range(new_q)) return;
-      const Plane plane = plane_through(k, x, y, new_q, new_normal);
-      float total = 0;
-      for (int s = 0; s < task_.source_count && total < costs_[i]; s++) {
-        if (!(selection.weight[s] > 0)) continue;
-        const float cost = match(task_.sources[s], patch, plane, x, y) + geometric_cost(s, plane, x, y);
-        total += selection.weight[s] * cost;
-      }
-      if (!(total < costs_[i])) return;
-      costs_[i] = total, planes_[i] = plane, q = new_q, normal = new_normal;
-    };
-    if (task_.explore) {
-      const Vector drawn = random_normal(k, x, y, random);
-      const float drawn_q = random.uniform(task_.inverse_far, task_.inverse_near);
-      attempt(drawn_q, normal), attempt(q, drawn), attempt(drawn_q, drawn);
-    }
-    const float halved = std::pow(.5f, float(round));
-    const float step = std::max(.003f, .04f * halved), turn = std::max(.02f, .3f * halved);
-    attempt(q, jittered_normal(k, x, y, normal, turn, random));
-    attempt(q * (1 + random.uniform(-step, step)), normal);
-    attempt(q * (1 + .25f * random.uniform(-step, step)), jittered_normal(k, x, y, normal, .25f * turn, random));
-  }
-
-  bool in_range(float q) const { return q >= task_.inverse_far && q <= task_.inverse_near; }
 
   const Task& task_;
-  const Window window_;
-  const Regions regions_;
-  const int width_, height_;
-  Plane* planes_;
-  float* costs_;
-  uint32_t* views_;  // bit s: source s was selected
+  const Table& table_;
+  float u_ = 0, v_ = 0;
+  alignas(64) float weight_[kSamples], weighted_[kSamples];
 };
 
-// The mean of the neighbours' planes that pass within `tolerance` of the pixel's own inverse depth, weighted by
-// similarity of grey value: each neighbour measured the surface with its own window and its own noise.
-Plane consensus(const Picture& picture, const Window& window, const Plane* planes, int radius, float tolerance, int x,
-                int y) {
-  const size_t i = size_t(y) * picture.width + x;
-  const float own = planes[i].inverse_depth(x, y);
-  const int centre = picture.gray[i];
-  float total = 0, a = 0, b = 0, q = 0;
-  for (int row = std::max(0, y - radius); row <= std::min(picture.height - 1, y + radius); row++) {
-    for (int column = std::max(0, x - radius); column <= std::min(picture.width - 1, x + radius); column++) {
-      const size_t j = size_t(row) * picture.width + column;
-      const float predicted = planes[j].inverse_depth(x, y);
-      const bool agrees = std::abs(predicted - own) < tolerance * own;
-      const float weight = agrees ? window.color[std::abs(picture.gray[j] - centre)] : 0.f;
-      total += weight, a += weight * planes[j].a, b += weight * planes[j].b, q += weight * predicted;
+// Windows of several pixels and their own planes, against as many sources as there are lanes: at the start each pixel has
+// few matches.
+class Pack {
+ public:
+  Pack(const Task& task, const Table& table) : task_(task), table_(table), patch_(task, table) {}
+
+  // For begin: the plane of the pixel that was given last waits until the lanes are full.
+  void add(int x, int y) {
+    patch_.place(x, y);
+    const Plane plane = drawn_plane(task_, x, y);
+    for (int s = 0; s < task_.source_count; s++) {
+      const int lane = count_++;
+      a_[lane] = plane.a, b_[lane] = plane.b, c_[lane] = plane.c;
+      u_[lane] = float(x), v_[lane] = float(y), variance_[lane] = patch_.variance;
+      for (int n = 0; n < kSamples; n++) weight_[n][lane] = patch_.weight(n), weighted_[n][lane] = patch_.weighted(n);
+    }
+    places_[waiting_++] = size_t(y) * task_.width + x;
+    if (count_ + task_.source_count > kPacked) flush();
+  }
+
+  void flush() {
+    for (int lane = count_; lane % kLanes; lane++) a_[lane] = b_[lane] = c_[lane] = u_[lane] = v_[lane] = variance_[lane] = 0;
+    alignas(64) float costs[kPacked];
+    for (int from = 0; from < count_; from += kLanes) {
+      const auto weight = [&](int n) { return load<Floats>(weight_[n] + from); };
+      const auto weighted = [&](int n) { return load<Floats>(weighted_[n] + from); };
+      store(costs + from, match_lanes(task_, table_, from, load<Floats>(a_ + from), load<Floats>(b_ + from),
+                                      load<Floats>(c_ + from), load<Floats>(u_ + from), load<Floats>(v_ + from),
+                                      load<Floats>(variance_ + from), weight, weighted));
+    }
+    for (int n = 0; n < waiting_; n++) begin(task_, costs + n * task_.source_count, places_[n]);
+    count_ = waiting_ = 0;
+  }
+
+ private:
+  static constexpr int kPacked = (kMaxSources + 15) / 16 * 16;  // lanes: at least all sources of one pixel
+  const Task& task_;
+  const Table& table_;
+  Patch patch_;
+  int count_ = 0, waiting_ = 0;
+  size_t places_[kPacked];
+  alignas(64) float a_[kPacked], b_[kPacked], c_[kPacked], u_[kPacked], v_[kPacked], variance_[kPacked];
+  alignas(64) float weight_[kSamples][kPacked] = {}, weighted_[kSamples][kPacked] = {};
+};
+
+void begin_row(const Task& t, const Table& table, int y) {
+  Pack pack(t, table);
+  for (int x = 0; x < t.width; x++) {
+    if (wanted(t, size_t(y) * t.width + x)) pack.add(x, y);
+  }
+  pack.flush();
+}
+
+void update_row(const Task& t, const Table& table, int y, int colour, int round) {
+  Patch patch(t, table);
+  for (int x = (y + colour) & 1; x < t.width; x += 2) {
+    const size_t i = size_t(y) * t.width + x;
+    if (!wanted(t, i)) continue;
+    patch.place(x, y);
+    if (patch.variance < kMinVariance) t.costs[i] = kNoMatch;
+    else update(t, patch, x, y, round);
+  }
+}
+
+// Planes with one array per field, and a margin of planes that agree with nothing, so that a row of pixels is a row of
+// vectors.
+struct Fields {
+  int radius, stride;
+  std::vector<float> a, b, c, level;
+
+  Fields(const Task& t, int margin, const float* planes)
+      : radius(margin), stride(t.width + 2 * margin + kLanes), a(size_t(stride) * t.height), b(a.size()),
+        c(a.size(), -1.f), level(a.size()) {
+    for (int y = 0; y < t.height; y++) {
+      for (int x = 0; x < t.width; x++) {
+        const size_t i = size_t(y) * t.width + x, j = at(x, y);
+        a[j] = planes[3 * i], b[j] = planes[3 * i + 1], c[j] = planes[3 * i + 2], level[j] = t.gray[i];
+      }
     }
   }
-  if (!(total > 0)) return planes[i];  // only where the pixel's own inverse depth is not positive
-  a /= total, b /= total, q /= total;
-  return {a, b, q - a * x - b * y};
+  size_t at(int x, int y) const { return size_t(y) * stride + radius + x; }
+};
+
+// The sums of kLanes pixels from (x, y) on.
+Consensus<Floats> consensus(const Fields& f, int height, float per_gray, float tolerance, int x, int y) {
+  alignas(64) float columns[kLanes];
+  for (int l = 0; l < kLanes; l++) columns[l] = float(x + l);
+  const Floats u = load<Floats>(columns), v = all<Floats>(float(y));
+  const size_t here = f.at(x, y);
+  const auto predicted = [&](size_t j) {
+    return mad(load<Floats>(&f.a[j]), u, mad(load<Floats>(&f.b[j]), v, load<Floats>(&f.c[j])));
+  };
+  const Floats own = predicted(here), level = load<Floats>(&f.level[here]);
+  Consensus<Floats> sums = {};
+  for (int row = std::max(0, y - f.radius); row <= std::min(height - 1, y + f.radius); row++) {
+    for (size_t j = f.at(x, row) - f.radius; j <= f.at(x, row) + f.radius; j++) {
+      const Floats difference = load<Floats>(&f.level[j]) - level;
+      sums.add(own, tolerance, difference, per_gray, load<Floats>(&f.a[j]), load<Floats>(&f.b[j]), predicted(j));
+    }
+  }
+  return sums;
+}
+
+void average_row(const Task& t, const Fields& f, float tolerance, int y, float* averaged) {
+  for (int left = 0; left < t.width; left += kLanes) {
+    const int count = std::min(kLanes, t.width - left);
+    const size_t start = size_t(y) * t.width + left;
+    bool asked = !t.wanted;
+    for (int n = 0; n < count; n++) asked |= wanted(t, start + n);
+    alignas(64) float total[kLanes] = {}, a[kLanes], b[kLanes], q[kLanes];
+    if (asked) {
+      const Consensus<Floats> sums = consensus(f, t.height, t.per_gray, tolerance, left, y);
+      store(total, sums.total), store(a, sums.a), store(b, sums.b), store(q, sums.q);
+    }
+    for (int n = 0; n < count; n++) {
+      const size_t i = start + n;
+      // None where the pixel's own inverse depth is not positive.
+      const bool told = total[n] > 0 && wanted(t, i);
+      const Plane mean = mean_plane({told ? total[n] : 1.f, a[n], b[n], q[n]}, float(left + n), float(y));
+      const Plane plane = told ? mean : plane_at(t, i);
+      averaged[3 * i] = plane.a, averaged[3 * i + 1] = plane.b, averaged[3 * i + 2] = plane.c;
+    }
+  }
 }
 
 }  // namespace
 
 extern "C" {
 
-// Match one view. planes [H, W, 3] are read unless task.draw_planes, then written; costs [H, W] are written: 1 - NCC in
-// 0..2, plus the geometric term where there is one. views [H, W] is zeros, for the sources that each pixel selects.
-void d2_patchmatch(const Task* task, float* planes, float* costs, uint32_t* views) {
-  Matcher matcher(*task, reinterpret_cast<Plane*>(planes), costs, views);
-  const int rows = task->reference.height;
-  parallel_rows(rows, task->threads, [&](int y) { matcher.initialise_row(y); });
-  for (int round = 0; round < task->rounds; round++) {
+// Match one view: see Task. Its planes are improved in place, after drawing them where it says so; costs and views are
+// written.
+void d2_patchmatch(const Task* task) {
+  const Task& t = *task;
+  const std::unique_ptr<const Table> table(new Table(t));
+  parallel_rows(t.height, t.threads, [&](int y) { begin_row(t, *table, y); });
+  for (int round = 0; round < t.rounds; round++) {
     for (int colour = 0; colour < 2; colour++) {
-      parallel_rows(rows, task->threads, [&](int y) { matcher.update_row(y, colour, round); });
+      parallel_rows(t.height, t.threads, [&](int y) { update_row(t, *table, y, colour, round); });
     }
   }
 }
 
-// Average each plane with those of its neighbours that agree; planes and averaged [H, W, 3] must not overlap. Where
-// `wanted` [H, W] is 0 the plane stays as it is; null wants all.
-void d2_consensus(const Picture* picture, float contrast, int32_t radius, float tolerance, int32_t threads,
-                  const uint8_t* wanted, const float* planes, float* averaged) {
-  const Window window(contrast);
-  const Plane* from = reinterpret_cast<const Plane*>(planes);
-  Plane* to = reinterpret_cast<Plane*>(averaged);
-  parallel_rows(picture->height, threads, [&](int y) {
-    for (int x = 0; x < picture->width; x++) {
-      const size_t i = size_t(y) * picture->width + x;
-      to[i] = wanted && !wanted[i] ? from[i] : consensus(*picture, window, from, radius, tolerance, x, y);
-    }
-  });
+// Average each plane of a task with those of its neighbours that agree, into averaged [H, W, 3]. Where nothing is wanted
+// the plane stays as it is.
+void d2_consensus(const Task* task, int32_t radius, float tolerance, float* averaged) {
+  const Fields fields(*task, radius, task->planes);
+  parallel_rows(task->height, task->threads, [&](int y) { average_row(*task, fields, tolerance, y, averaged); });
 }
 
 }  // extern "C"

@@ -131,19 +131,28 @@ def _profile(settings: GpuBench) -> list[str]:
     return ["ncu", *options, *raster]
 
 
-SHIM = ("-k", "shim", "tests/rasterizer/test_rasterizer_cuda.py", "tests/rasterizer/test_cuda_runtime.py")
+def _stereo(device: str) -> Callable[[GpuBench], list[str]]:
+    def words(settings: GpuBench) -> list[str]:
+        kind = ("--makers", "patchmatch", "--defaults-only", "--rigs", "synthetic4", "--width", "640")
+        return _d2("bench", "stereo", *kind, "--device", device, "--output", str(settings.output / f"stereo-{device}"))
+
+    return words
+
+
+SHIM = ("-k", "shim", "tests/rasterizer/test_rasterizer_cuda.py", "tests/priors/test_patchmatch_gpu.py")
 STEPS = {
-    "static": Step(90, (_program("nvcc"),), None),
+    "static": Step(100, (_program("nvcc"),), None),
     "tests": Step(180, (_device, _tests), _pytest("-m", "cuda", "tests")),
     "memcheck": _sanitizer("memcheck"),
     "racecheck": _sanitizer("racecheck"),
     "initcheck": _sanitizer("initcheck"),
     "raster": Step(240, (_device,), _raster),
+    "stereo-cuda": Step(60, (_device,), _stereo("cuda")),
     "train-cuda": Step(150, (_device, _capture), _train("cuda")),
     "train-cpu": Step(150, (_device, _capture), _train("cpu")),
     "compare": Step(20, (_device, _capture, _trained), _compare),
-    "profile": Step(120, (_device, _program("ncu")), _profile),
-    "shim": Step(180, (_tests,), _pytest(*SHIM)),
+    "profile": Step(100, (_device, _program("ncu")), _profile),
+    "shim": Step(140, (_tests,), _pytest(*SHIM)),
 }
 """In the order in which they are worth the time."""
 

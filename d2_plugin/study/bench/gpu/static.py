@@ -1,26 +1,27 @@
 """What the GPU kernels take, told by the compiler: no device is needed, and nothing here is a time on one.
 
-nvcc compiles `gpu.cu` for an architecture; ptxas says registers, spills and shared memory of each kernel, and the
+nvcc compiles the sources for an architecture; ptxas says registers, spills and shared memory of each kernel, and the
 binary says how many instructions it has. Rows of this are called "static analysis" and never more.
 """
 
 from __future__ import annotations
 
-import ctypes
 import re
 import struct
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from d2_plugin.compiler.nvrtc import Program
 from d2_plugin.errors import D2Error
-from d2_plugin.rasterizer.cuda_frame import SOURCE, Frame
-from d2_plugin.rasterizer.nvrtc import FLAGS
+from d2_plugin.priors.stereo.gpu import call as patchmatch
+from d2_plugin.rasterizer import cuda_runtime as rasterizer
 from d2_plugin.study.rows import Row, make_row
 
-ARCHITECTURES = ("sm_90", "sm_120")
-"""H100, and the consumer GPUs of its successor."""
+ARCHITECTURES = ("sm_80", "sm_90", "sm_120")
+"""A100, H100, and the consumer GPUs of their successor."""
 
 INSTRUCTION_BYTES = 16
 """Of one machine instruction, since sm_70."""
@@ -33,6 +34,13 @@ ENTRY = re.compile(
 )
 
 
+PROGRAMS = (
+    (rasterizer.PROGRAM, rasterizer.flags_for(3)),
+    (patchmatch.PROGRAM, patchmatch.flags_for(4)),
+)
+"""What is compiled and the flags: splatting of three colors, PatchMatch of four sources."""
+
+
 def static_analysis(nvcc: str, architecture: str, command: str = "") -> list[Row]:
     """One row per kernel: registers, bytes spilled, bytes of shared memory, instructions.
 
@@ -42,29 +50,32 @@ def static_analysis(nvcc: str, architecture: str, command: str = "") -> list[Row
         command: how this was started.
 
     Raises:
-        D2Error: nvcc refuses the source.
+        D2Error: nvcc refuses a source.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        cubin = Path(folder) / "gpu.cubin"
-        defines = ("-DD2_CHANNELS=3", f"-DD2_FRAME_SIZE={ctypes.sizeof(Frame)}")
-        options = [f"-arch={architecture}", *FLAGS, *defines, "-Xptxas", "-v"]
-        words = [nvcc, "-cubin", *options, "-o", str(cubin), str(SOURCE)]
-        result = subprocess.run(words, capture_output=True, text=True, check=False)
-        if result.returncode:
-            said = result.stderr[:4000]
-            raise D2Error(f"nvcc refused gpu.cu for {architecture}; please report what it said:\n{said}")
-        counts = instructions(cubin.read_bytes())
     return [
         make_row(
             *("gpu", f"static analysis of {kernel}", "d2", architecture),
             error=None,
             seconds=None,
             command=command,
-            instructions=counts[kernel],
             **found,
         )
-        for kernel, found in resources(result.stderr).items()
+        for program, flags in PROGRAMS
+        for kernel, found in _kernels(nvcc, program, (f"-arch={architecture}", *flags)).items()
     ]
+
+
+def _kernels(nvcc: str, program: Program, flags: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """What the compiler says of each kernel of a program."""
+    with tempfile.TemporaryDirectory() as folder:
+        cubin = Path(folder) / "kernels.cubin"
+        words = [nvcc, "-cubin", *flags, "-Xptxas", "-v", "-o", str(cubin), str(program.source)]
+        result = subprocess.run(words, capture_output=True, text=True, check=False)
+        if result.returncode:
+            said = result.stderr[:4000]
+            raise D2Error(f"nvcc refused {program.source.name} ({flags[0]}); please report what it said:\n{said}")
+        counts = instructions(cubin.read_bytes())
+    return {name: {**found, "instructions": counts[name]} for name, found in resources(result.stderr).items()}
 
 
 def resources(told: str) -> dict[str, dict[str, Any]]:

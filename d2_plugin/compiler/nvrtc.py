@@ -24,16 +24,18 @@ from d2_plugin.cache import cache_folder, check_private, is_trusted, private_cac
 from d2_plugin.compiler import CompileError
 from d2_plugin.errors import D2Error
 
-from .cuda_frame import HEADERS, SOURCE, Frame
-
 logger = logging.getLogger(__name__)
-
-FLAGS = ("--std=c++17", "--fmad=false")
-"""No contraction: the forward and the backward pass must decide alike which fragments count; splat.h asks for fma."""
 
 
 class NoCuda(D2Error):
     """The kernels are not available on this GPU; a caller with a slower way takes it."""
+
+
+class Program(NamedTuple):
+    """A CUDA source and the headers that it includes, by their bare names."""
+
+    source: Path
+    headers: tuple[Path, ...]
 
 
 class Binary(NamedTuple):
@@ -83,25 +85,26 @@ class Nvrtc:
             )
         return f"compute_{older[-1]}"
 
-    def compile(self, architecture: str, flags: Sequence[str]) -> bytes:
-        """gpu.cu as a cubin (``sm_90``) or as PTX (``compute_90``).
+    def compile(self, code: Program, architecture: str, flags: Sequence[str]) -> bytes:
+        """A program as a cubin (``sm_90``) or as PTX (``compute_90``).
 
         Raises:
             CompileError: NVRTC refused it; the message carries its words.
         """
-        names = [header.name.encode() for header in HEADERS]
-        texts = [header.read_bytes() for header in HEADERS]
-        array = ctypes.c_char_p * len(HEADERS)
+        names = [header.name.encode() for header in code.headers]
+        texts = [header.read_bytes() for header in code.headers]
+        array = ctypes.c_char_p * len(names)
         program = ctypes.c_void_p()
-        arguments = (SOURCE.read_bytes(), SOURCE.name.encode(), len(HEADERS), array(*texts), array(*names))
+        arguments = (code.source.read_bytes(), code.source.name.encode(), len(names), array(*texts), array(*names))
         self._check(self._library.nvrtcCreateProgram(ctypes.byref(program), *arguments))
         try:
             options = [option.encode() for option in (f"--gpu-architecture={architecture}", *flags)]
             array = ctypes.c_char_p * len(options)
             if self._library.nvrtcCompileProgram(program, len(options), array(*options)):
+                said = self._read(program, "ProgramLog").decode(errors="replace").strip(chr(0))
                 raise CompileError(
-                    f"NVRTC {self.version[0]}.{self.version[1]} failed on {SOURCE.name} for {architecture}; please "
-                    f"report what it said:\n{self._read(program, 'ProgramLog').decode(errors='replace').strip(chr(0))}"
+                    f"NVRTC {self.version[0]}.{self.version[1]} failed on {code.source.name} for {architecture}; "
+                    f"please report what it said:\n{said}"
                 )
             return self._read(program, "CUBIN" if architecture.startswith("sm_") else "PTX")
         finally:
@@ -129,9 +132,14 @@ def library() -> Nvrtc:
     return Nvrtc()
 
 
-def build(capability: int, channels: int) -> Binary:
-    """The kernels for GPUs of compute capability `capability` (90 is sm_90) and `channels` colors, from the cache
-    where they are there already.
+def build(name: str, code: Program, flags: Sequence[str], capability: int) -> Binary:
+    """A program for GPUs of compute capability `capability` (90 is sm_90), from the cache where it is there already.
+
+    Args:
+        name: what it is called in the cache.
+        code: what is compiled.
+        flags: of NVRTC, without the architecture.
+        capability: of the GPU.
 
     Raises:
         NoCuda: no NVRTC, or it does not know the GPU.
@@ -139,17 +147,16 @@ def build(capability: int, channels: int) -> Binary:
     """
     compiler = library()
     architecture = compiler.architecture_for(capability)
-    flags = (*FLAGS, f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(Frame)}")
-    digest = hashlib.sha256(repr((flags, architecture, compiler.version)).encode())
-    for path in (SOURCE, *HEADERS):
+    digest = hashlib.sha256(repr((tuple(flags), architecture, compiler.version)).encode())
+    for path in (code.source, *code.headers):
         digest.update(hashlib.sha256(path.read_bytes()).digest())
-    entry = cache_folder() / f"rasterizer-{architecture}-{digest.hexdigest()[:20]}.cubin"
-    if (code := _read_entry(entry)) is None:
+    entry = cache_folder() / f"{name}-{architecture}-{digest.hexdigest()[:20]}.cubin"
+    if (binary := _read_entry(entry)) is None:
         start = time.perf_counter()
-        code = compiler.compile(architecture, flags)
+        binary = compiler.compile(code, architecture, flags)
         logger.info("compiled %s in %.1f s", entry.name, time.perf_counter() - start)
-        _write_entry(entry, code)
-    return Binary(code, architecture)
+        _write_entry(entry, binary)
+    return Binary(binary, architecture)
 
 
 def _read_entry(entry: Path) -> bytes | None:

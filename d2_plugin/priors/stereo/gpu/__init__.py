@@ -1,0 +1,1 @@
+"""PatchMatch on a CUDA device, through NVRTC."""

@@ -1,0 +1,124 @@
+"""The kernels of PatchMatch on a CUDA device: the same planes as on the CPU, from the same mathematics.
+
+`kernels/spread.h` holds the mathematics once. Where the CPU fuses multiplications and additions, as every one since
+2013 does, both devices return the same bits.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+
+import numpy as np
+import torch
+
+from d2_plugin.compiler.driver import Driver
+from d2_plugin.compiler.nvrtc import NoCuda, build
+from d2_plugin.priors.stereo.patchmatch_kernel import CONSENSUS_RADIUS, Arrays, PatchMatchKernel, Task
+
+from .call import PROGRAM, THREADS, Call, Launcher, flags_for
+
+LEAST_SOURCES = 2
+"""The kernels compiled for so many sources also average planes, which needs none."""
+
+
+class CudaLauncher:
+    """Launches the kernels on one CUDA device, on torch's current stream (`call.Launcher`)."""
+
+    def __init__(self, device: torch.device) -> None:
+        """Compile (or find) the kernels and load them.
+
+        Raises:
+            NoCuda: no driver, no NVRTC, or an architecture that it does not know.
+        """
+        self._driver = Driver(device)
+        self._functions: dict[tuple[str, int], ctypes.c_void_p] = {}
+        self._modules: dict[int, ctypes.c_void_p] = {}
+        self._module(LEAST_SOURCES)
+
+    def launch(self, kernel: str, sources: int, blocks: int, call: Call) -> None:
+        """See `Launcher.launch`; returns before the kernel has run."""
+        key = (kernel, sources)
+        if key not in self._functions:
+            self._functions[key] = self._driver.function(self._module(sources), kernel)
+        self._driver.launch(self._functions[key], (blocks, 1), THREADS, call)
+
+    def _module(self, sources: int) -> ctypes.c_void_p:
+        if sources not in self._modules:
+            binary = build("patchmatch", PROGRAM, flags_for(sources), self._driver.capability)
+            self._modules[sources] = self._driver.module(binary)
+        return self._modules[sources]
+
+
+@functools.cache
+def launcher(device: torch.device) -> Launcher:
+    """The launcher of a CUDA device; `device` has an index.
+
+    Raises:
+        NoCuda: no driver, no NVRTC, or an architecture that it does not know.
+    """
+    return CudaLauncher(device)
+
+
+@functools.cache
+def why_not_usable() -> str | None:
+    """Why planes do not spread on a GPU here, in one sentence; None where they do."""
+    if not torch.cuda.is_available():
+        return "torch sees no CUDA device"
+    try:
+        launcher(current_device())
+    except NoCuda as error:
+        return str(error)
+    return None
+
+
+class CudaPatchMatchKernel(PatchMatchKernel):
+    """`PatchMatchKernel` on torch's current CUDA device; maps come from and return to the CPU's memory.
+
+    Raises:
+        NoCuda: no driver, no NVRTC, or an architecture that it does not know.
+    """
+
+    def _start(self) -> None:
+        self.device = current_device()
+        self._launcher = launcher(self.device)
+
+    def _spread(self, task: Task, arrays: Arrays) -> None:
+        on_device = self._moved(task, arrays)
+        call = Call(task=task)
+        pixels, half = task.width * task.height, -(-task.width // 2) * task.height
+        self._launcher.launch("d2_patchmatch_begin", task.source_count, _blocks(pixels), call)
+        for call.round in range(task.rounds):
+            for call.colour in (0, 1):
+                self._launcher.launch("d2_patchmatch_update", task.source_count, _blocks(half), call)
+        for name in ("planes", "costs"):
+            arrays[name][...] = on_device[name].cpu().numpy()
+
+    def _average(self, task: Task, arrays: Arrays) -> np.ndarray:
+        on_device = self._moved(task, arrays)
+        planes, averaged = on_device["planes"], torch.empty_like(on_device["planes"])
+        for _ in range(self.settings.patchmatch_consensus_passes):
+            task.planes = planes.data_ptr()
+            call = Call(task=task, radius=CONSENSUS_RADIUS, averaged=averaged.data_ptr())
+            call.tolerance = self.settings.patchmatch_consensus_tolerance
+            self._launcher.launch("d2_patchmatch_average", LEAST_SOURCES, _blocks(task.width * task.height), call)
+            planes, averaged = averaged, planes
+        return planes.cpu().numpy()
+
+    def _moved(self, task: Task, arrays: Arrays) -> dict[str, torch.Tensor]:
+        """Copies of the arrays on the device, which the task points to then; they must outlive its use."""
+        tensors = {}
+        for name, array in arrays.items():
+            plain = array.view(np.int32) if array.dtype == np.uint32 else array  # torch's unsigned integers are young
+            tensors[name] = torch.from_numpy(plain.copy()).to(self.device)
+            setattr(task, name, tensors[name].data_ptr())
+        return tensors
+
+
+def current_device() -> torch.device:
+    """Torch's current CUDA device, with its index."""
+    return torch.device("cuda", torch.cuda.current_device())
+
+
+def _blocks(threads: int) -> int:
+    return -(-threads // THREADS)

@@ -1,0 +1,181 @@
+"""PatchMatch on the GPU: the same .cu source on the CPU (fibre shim) and, where there is one, on a GPU.
+
+Both must return the bits of the CPU's kernels: they share `kernels/spread.h`, and every sum has one order.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from d2_plugin.captures.capture import Camera
+from d2_plugin.compiler import NoCompiler, load_library, nvrtc
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.stereo.geometric_depth import choose_matcher, gray
+from d2_plugin.priors.stereo.gpu import kernel as gpu
+from d2_plugin.priors.stereo.gpu.call import PROGRAM, Call, flags_for
+from d2_plugin.priors.stereo.patchmatch import patchmatch
+from d2_plugin.study.bench.stereo_rigs import Rig, textured_rig
+
+HERE = Path(__file__).parent
+SETTINGS = StereoSettings()
+CPU = replace(SETTINGS, patchmatch_device="cpu")
+
+
+class ShimLauncher:
+    """Runs the kernels on the CPU, with blocks, warps and lanes in an order of `cuda_shim.h`."""
+
+    def __init__(self, order: int = 0) -> None:
+        self.order = order
+        self.launched: set[str] = set()
+
+    def launch(self, kernel: str, sources: int, blocks: int, call: Call) -> None:
+        self.launched.add(kernel)
+        error = shim_library(sources).d2_shim_launch(kernel.encode(), blocks, self.order, ctypes.byref(call))
+        assert error is None, error.decode()
+
+
+@functools.cache
+def shim_library(sources: int) -> ctypes.CDLL:
+    shim = HERE.parent / "rasterizer" / "cuda_shim.h"
+    flags = (*(flag for flag in flags_for(sources) if flag.startswith("-D")), "-ffp-contract=off")
+    headers = (shim, PROGRAM.source, *PROGRAM.headers)
+    library = load_library("patchmatch-shim", (HERE / "patchmatch_shim.cpp",), headers, flags)
+    library.d2_shim_launch.restype = ctypes.c_char_p
+    return library
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return textured_rig(3, width=64, height=37, seed=3)
+
+
+def use_shim(monkeypatch: pytest.MonkeyPatch, order: int = 0) -> ShimLauncher:
+    launcher = ShimLauncher(order)
+    monkeypatch.setattr(gpu, "why_not_usable", lambda: None)
+    monkeypatch.setattr(gpu, "current_device", lambda: torch.device("cpu"))
+    monkeypatch.setattr(gpu, "launcher", lambda device: launcher)
+    return launcher
+
+
+@pytest.fixture(params=["shim", pytest.param("cuda", marks=pytest.mark.cuda)])
+def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where `patchmatch_device = 'cuda'` runs."""
+    if request.param == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device (torch.cuda.is_available() is False)")
+    try:
+        shim_library(2)
+    except NoCompiler as error:
+        pytest.skip(str(error))
+    if request.param == "shim":
+        use_shim(monkeypatch)
+
+
+def pictures(rig: Rig) -> list[np.ndarray]:
+    return [gray(image) for image in rig.images]
+
+
+Maps = Sequence[tuple[np.ndarray, np.ndarray]]
+
+
+def assert_same(found: Maps, expected: Maps) -> None:
+    for (depth, cost), (other_depth, other_cost) in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(depth, other_depth)
+        np.testing.assert_array_equal(cost, other_cost)
+
+
+@pytest.mark.parametrize("views", [2, 3])
+def test_the_gpu_returns_the_bits_of_the_cpu(backend: None, rig: Rig, views: int) -> None:
+    images, cameras = pictures(rig)[:views], rig.cameras[:views]
+    on_gpu, on_cpu = (
+        patchmatch(images, cameras, rig.depth_range, replace(SETTINGS, patchmatch_device=device))
+        for device in ("cuda", "cpu")
+    )
+    assert (on_gpu[0][0] > 0).mean() > 0.9
+    assert_same(on_gpu, on_cpu)
+
+
+def test_wanted_pixels_and_geometric_rounds_as_well(backend: None, rig: Rig) -> None:
+    wanted = [np.zeros(picture.shape, bool) for picture in pictures(rig)]
+    for mask in wanted:
+        mask[5:31, 10:40] = True
+    dense = replace(SETTINGS, patchmatch_geometric_rounds=1)
+    found, expected = (
+        patchmatch(pictures(rig), rig.cameras, rig.depth_range, replace(dense, patchmatch_device=device), wanted)
+        for device in ("cuda", "cpu")
+    )
+    assert_same(found, expected)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (13, 11)])
+def test_pictures_smaller_than_a_window(backend: None, size: tuple[int, int]) -> None:
+    K = np.array([[140.0, 0, size[0] / 2], [0, 140.0, size[1] / 2], [0, 0, 1]])
+    moved = np.eye(4)
+    moved[0, 3] = -0.7
+    cameras = [Camera("a", *size, K, np.eye(4)), Camera("b", *size, K, moved)]
+    random = np.random.default_rng(0)
+    images = [random.integers(0, 255, size[::-1]).astype(np.uint8) for _ in cameras]
+    assert_same(patchmatch(images, cameras, (3.0, 5.0), SETTINGS), patchmatch(images, cameras, (3.0, 5.0), CPU))
+
+
+def test_no_result_depends_on_the_order_of_blocks_warps_and_lanes(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    results = []
+    for order in (0, 1, 2):
+        try:
+            launcher = use_shim(monkeypatch, order)
+            results.append(patchmatch(pictures(rig)[:2], rig.cameras[:2], rig.depth_range, SETTINGS))
+        except NoCompiler as error:
+            pytest.skip(str(error))
+        assert launcher.launched == {f"d2_patchmatch_{name}" for name in ("begin", "update", "average")}
+    for other in results[1:]:
+        assert_same(other, results[0])
+
+
+def test_a_missing_gpu_is_one_sentence(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    gpu.why_not_usable.cache_clear()
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    asked = replace(SETTINGS, patchmatch_device="cuda")
+    with pytest.raises(D2Error, match="patchmatch_device = 'cuda', but torch sees no CUDA device: set it to") as error:
+        patchmatch(pictures(rig), rig.cameras, rig.depth_range, asked)
+    assert "\n" not in str(error.value)
+    gpu.why_not_usable.cache_clear()
+
+
+def test_a_gpu_matches_where_there_is_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CXX", "/nowhere/c++")
+    assert choose_matcher("auto") == "sweep"
+    monkeypatch.setattr(gpu, "why_not_usable", lambda: None)
+    assert choose_matcher("auto") == "patchmatch"
+
+
+@pytest.mark.parametrize("capability", [80, 90, 120])
+def test_nvrtc_compiles_the_kernels_without_a_toolkit(
+    capability: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("D2_CACHE", str(tmp_path))
+    try:
+        binary = nvrtc.build("patchmatch", PROGRAM, flags_for(4), capability)
+    except nvrtc.NoCuda as error:
+        pytest.skip(str(error))
+    assert binary.code.startswith(b"\x7fELF")
+    assert b"d2_patchmatch_update" in binary.code
+
+
+def test_as_many_sources_as_there_may_be_are_refused_by_number_of_pixels(rig: Rig) -> None:
+    """Places in all sources together are 32-bit integers."""
+    from d2_plugin.priors.stereo import patchmatch_kernel
+
+    limit = patchmatch_kernel.MOST_PIXELS
+    assert limit == 2**31 - 1
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(patchmatch_kernel, "MOST_PIXELS", 1000)
+        with pytest.raises(D2Error, match="pixels together, at most 1000 are possible: lower max_pixels"):
+            patchmatch(pictures(rig), rig.cameras, rig.depth_range, CPU)

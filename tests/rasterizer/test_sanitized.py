@@ -1,0 +1,82 @@
+"""The GPU kernels under AddressSanitizer, in the fibre shim: no access outside of any array, in any order."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).resolve().parents[1]
+SANITIZED = "-O1 -g -fsanitize=address -fno-omit-frame-pointer"
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Kernels are compiled with the sanitizer, whose library is loaded before Python."""
+    compiler = shutil.which("g++")
+    if compiler is None or sys.platform != "linux":
+        pytest.skip("g++ on Linux is needed, whose AddressSanitizer can be loaded before Python")
+    library = subprocess.run([compiler, "-print-file-name=libasan.so"], capture_output=True, text=True, check=True)
+    if not Path(library.stdout.strip()).is_file():
+        pytest.skip("g++ came without AddressSanitizer (libasan.so)")
+    return {
+        **os.environ,
+        "LD_PRELOAD": library.stdout.strip(),
+        "ASAN_OPTIONS": "detect_leaks=0:detect_stack_use_after_return=0",
+        "CXX": compiler,
+        "D2_CXXFLAGS": SANITIZED,
+        "D2_CACHE": str(tmp_path_factory.mktemp("sanitized")),
+        "PYTHONPATH": os.pathsep.join(map(str, (TESTS, TESTS / "priors", TESTS / "rasterizer"))),
+    }
+
+
+def run(words: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *words], cwd=TESTS.parent, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize(
+    ("module", "chosen"),
+    [
+        ("rasterizer/test_rasterizer_cuda.py", "shim and (1x1 or 15x33 or without_gaussians or survey_is) or order_of"),
+        ("priors/test_patchmatch_gpu.py", "shim and (window or bits) or order_of"),
+    ],
+)
+def test_no_kernel_leaves_its_arrays(module: str, chosen: str, environment: dict[str, str]) -> None:
+    done = run(
+        ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", f"tests/{module}", "-k", chosen], environment
+    )
+    said = (done.stdout + done.stderr)[-4000:]
+    assert done.returncode == 0, said
+    assert " passed" in done.stdout, said
+    assert "AddressSanitizer" not in said, said
+
+
+BEYOND = """
+import ctypes
+import numpy as np
+from test_patchmatch_gpu import shim_library
+from d2_plugin.priors.stereo.gpu.call import Call
+from d2_plugin.priors.stereo.patchmatch_kernel import Task
+
+gray, planes = np.zeros((8, 8), np.uint8), np.ones((8, 8, 3), np.float32)
+averaged = np.zeros(8 * 8 * 3 - 1, np.float32)  # one too few
+task = Task(width=8, height=8, gray=gray.ctypes.data, planes=planes.ctypes.data)
+call = Call(task=task, radius=1, tolerance=0.1, averaged=averaged.ctypes.data)
+shim_library(2).d2_shim_launch(b"d2_patchmatch_average", 1, 0, ctypes.byref(call))
+"""
+
+
+def test_one_number_too_far_is_found(environment: dict[str, str]) -> None:
+    """The test above can fail."""
+    done = run(["-c", BEYOND], environment)
+    assert done.returncode != 0
+    assert "heap-buffer-overflow" in done.stderr
+    assert "patchmatch.cu" in done.stderr
