@@ -326,6 +326,18 @@ class Harm:
 
 
 class TestRefused:
+    @pytest.mark.parametrize(
+        ("name", "trainer"), [("dynamic_point_cloud.ply", "Ex4DGS or CEM-4DGS"), ("FDHash.pth", "Swift4D")]
+    )
+    def test_the_still_part_of_a_model_is_not_shown_as_the_whole(
+        self, room: Path, tmp_path: Path, name: str, trainer: str
+    ) -> None:
+        place = tmp_path / "point_cloud" / "iteration_30000"
+        official.write_inria_ply(place / "point_cloud.ply", official.inria_columns(9))
+        (place / name).write_bytes(b"")
+        with pytest.raises(D2Error, match=rf"is of {trainer}, whose motion lies in {name}.*Viewer\(d2\)"):
+            open_subject(tmp_path, room)
+
     def test_no_code_in_a_file_is_run(self, room: Path, tmp_path: Path) -> None:
         torch.save(((Harm(tmp_path / "made"),), 1), tmp_path / "chkpnt1.pth")
         (tmp_path / "ckpt_1.pt").write_bytes(pickle.dumps(Harm(tmp_path / "made")))

@@ -17,6 +17,8 @@ from .loaded import Loaded, frozen, gsplat_model, harmonics_of, planes_model, wi
 from .networks import MotionNetwork
 
 CLOUD = "point_cloud.ply"
+ELSEWHERE = {"dynamic_point_cloud.ply": "Ex4DGS or CEM-4DGS", "FDHash.pth": "Swift4D"}
+"""Files beside a point cloud that say that it is a part of a model which is not read here."""
 
 
 def newest_cloud(folder: Path) -> Path:
@@ -41,6 +43,7 @@ def of_cloud(path: Path, capture: Capture) -> Loaded:
     Raises:
         D2Error: no Gaussians, or a network without what belongs to it.
     """
+    _refuse_parts(path.parent)
     rows = read_ply(path)
     missing = [name for name in ("x", "opacity", "scale_0", "rot_0", "f_dc_0") if name not in rows]
     if missing:
@@ -53,6 +56,15 @@ def of_cloud(path: Path, capture: Capture) -> Loaded:
     if path.parent.parent.name == "point_cloud" and (output / "deform").is_dir():
         return _of_network(rows, output / "deform" / path.parent.name / "deform.pth", capture)
     return _of_one_instant(rows)
+
+
+def _refuse_parts(folder: Path) -> None:
+    for name, trainer in ELSEWHERE.items():
+        if (folder / name).exists():
+            raise D2Error(
+                f"{folder} is of {trainer}, whose motion lies in {name}, which is not read here: show it from inside its "
+                "train.py with Viewer(d2)"
+            )
 
 
 def _harmonics(rows: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
