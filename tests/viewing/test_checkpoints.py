@@ -304,6 +304,21 @@ class TestClouds:
         assert difference.max() < 0.02
         assert {"x", "opacity", "rot_3"} <= set(read_ply(first))
 
+    def test_a_point_cloud_of_4c4d_has_its_time(self, room: Path, tmp_path: Path) -> None:
+        from d2_plugin.adapters.fudan import FudanAdapter
+
+        model = fudan.make()[0]
+        columns = {f"{axis}": model._xyz[:, i] for i, axis in enumerate("xyz")} | {"opacity": model._opacity[:, 0]}
+        parts = {"f_dc": model._features_dc[:, 0], "scale": model._scaling, "rot": model._rotation}
+        parts |= {"t": model._t, "scale_t": model._scaling_t, "rot_r": model._rotation_r}
+        columns |= {f"{name}_{i}": part[:, i] for name, part in parts.items() for i in range(part.shape[1])}
+        official.write_ply(tmp_path / "point_cloud.ply", columns)
+        found = open_subject(tmp_path / "point_cloud.ply", room)
+        for time in (0.0, 0.2):
+            true, told = FudanAdapter(model).slice_at(seen(found, time)), found.backbone.slice_at(seen(found, time))
+            assert close(told.means, true.means)
+            assert close(told.opacities, true.opacities)
+
     def test_an_output_folder_of_3d_gaussians_is_its_last_point_cloud(self, room: Path, tmp_path: Path) -> None:
         for iteration, seed in ((7000, 1), (30000, 2)):
             place = tmp_path / "point_cloud" / f"iteration_{iteration}"

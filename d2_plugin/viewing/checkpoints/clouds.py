@@ -15,6 +15,7 @@ from .files import columns, read_options, read_ply, read_state
 from .hexplanes import PlaneField
 from .loaded import Loaded, frozen, gsplat_model, harmonics_of, planes_model, with_adapter
 from .networks import MotionNetwork
+from .tuples import of_values
 
 CLOUD = "point_cloud.ply"
 ELSEWHERE = {"dynamic_point_cloud.ply": "Ex4DGS or CEM-4DGS", "FDHash.pth": "Swift4D"}
@@ -50,6 +51,8 @@ def of_cloud(path: Path, capture: Capture) -> Loaded:
         raise D2Error(f"{path} has no {', '.join(missing)}: it is no point cloud of Gaussians")
     if "trbf_center" in rows:
         return _of_spacetime(rows, capture)
+    if "scale_t_0" in rows:
+        return _of_4c4d(rows, capture)
     if (path.parent / "deformation.pth").is_file():
         return _of_planes(rows, path, capture)
     output = path.parent.parent.parent
@@ -62,8 +65,8 @@ def _refuse_parts(folder: Path) -> None:
     for name, trainer in ELSEWHERE.items():
         if (folder / name).exists():
             raise D2Error(
-                f"{folder} is of {trainer}, whose motion lies in {name}, which is not read here: show it from inside its "
-                "train.py with Viewer(d2)"
+                f"{folder} is of {trainer}, whose motion lies in {name}, which is not read here: show it from inside "
+                "its train.py with Viewer(d2)"
             )
 
 
@@ -97,6 +100,13 @@ def _inria_values(rows: dict[str, Tensor]) -> dict[str, Any]:
         "_features_rest": rest,
         "active_sh_degree": round((1 + rest.shape[1]) ** 0.5) - 1,
     }
+
+
+def _of_4c4d(rows: dict[str, Tensor], capture: Capture) -> Loaded:
+    """4C4D writes time beside the columns of 3D Gaussian Splatting, and its harmonics without those of time."""
+    values = _inria_values(rows) | {"_scaling_t": columns(rows, "scale_t"), "_rotation_r": columns(rows, "rot_r")}
+    times = rows["t"][:, None] if "t" in rows else columns(rows, "t")
+    return of_values(values | {"_t": times, "rot_4d": True, "active_sh_degree_t": 0}, capture, timed=True)
 
 
 def _of_planes(rows: dict[str, Tensor], path: Path, capture: Capture) -> Loaded:
