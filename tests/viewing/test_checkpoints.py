@@ -308,9 +308,10 @@ class TestClouds:
         from d2_plugin.adapters.fudan import FudanAdapter
 
         model = fudan.make()[0]
-        columns = {f"{axis}": model._xyz[:, i] for i, axis in enumerate("xyz")} | {"opacity": model._opacity[:, 0]}
+        columns = {axis: model._xyz[:, i] for i, axis in enumerate("xyz")} | {"opacity": model._opacity[:, 0]}
         parts = {"f_dc": model._features_dc[:, 0], "scale": model._scaling, "rot": model._rotation}
-        parts |= {"t": model._t, "scale_t": model._scaling_t, "rot_r": model._rotation_r}
+        parts |= {"rot_r": model._rotation_r}
+        columns |= {"t": model._t[:, 0], "scale_t": model._scaling_t[:, 0]}
         columns |= {f"{name}_{i}": part[:, i] for name, part in parts.items() for i in range(part.shape[1])}
         official.write_ply(tmp_path / "point_cloud.ply", columns)
         found = open_subject(tmp_path / "point_cloud.ply", room)

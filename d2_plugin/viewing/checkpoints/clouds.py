@@ -51,7 +51,7 @@ def of_cloud(path: Path, capture: Capture) -> Loaded:
         raise D2Error(f"{path} has no {', '.join(missing)}: it is no point cloud of Gaussians")
     if "trbf_center" in rows:
         return _of_spacetime(rows, capture)
-    if "scale_t_0" in rows:
+    if "scale_t" in rows:
         return _of_4c4d(rows, capture)
     if (path.parent / "deformation.pth").is_file():
         return _of_planes(rows, path, capture)
@@ -104,9 +104,9 @@ def _inria_values(rows: dict[str, Tensor]) -> dict[str, Any]:
 
 def _of_4c4d(rows: dict[str, Tensor], capture: Capture) -> Loaded:
     """4C4D writes time beside the columns of 3D Gaussian Splatting, and its harmonics without those of time."""
-    values = _inria_values(rows) | {"_scaling_t": columns(rows, "scale_t"), "_rotation_r": columns(rows, "rot_r")}
-    times = rows["t"][:, None] if "t" in rows else columns(rows, "t")
-    return of_values(values | {"_t": times, "rot_4d": True, "active_sh_degree_t": 0}, capture, timed=True)
+    values = _inria_values(rows) | {"_t": rows["t"][:, None], "_scaling_t": rows["scale_t"][:, None]}
+    values |= {"_rotation_r": columns(rows, "rot_r"), "rot_4d": True, "active_sh_degree_t": 0}
+    return of_values(values, capture, timed=True)
 
 
 def _of_planes(rows: dict[str, Tensor], path: Path, capture: Capture) -> Loaded:
