@@ -81,7 +81,8 @@ def write_ply(
     added = [rest.transpose(1, 2).flatten(1), *(values.detach().double().cpu()[:, None] for values in more.values())]
     finite = torch.isfinite(torch.cat([means, covariances, colors, opacities[:, None], *added], dim=1)).all(dim=1)
     kept = finite & (opacities >= ALPHA_MIN)
-    scales, quaternions = scales_and_rotations(covariances[kept]) if shapes is None else (p[kept] for p in shapes)
+    found = scales_and_rotations(covariances[kept]) if shapes is None else (shapes[0][kept], shapes[1][kept])
+    scales, quaternions = found
     columns = [
         means[kept],
         torch.zeros_like(means[kept]),  # normals, which readers expect and ignore

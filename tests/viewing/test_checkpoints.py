@@ -304,6 +304,22 @@ class TestClouds:
         assert difference.max() < 0.02
         assert {"x", "opacity", "rot_3"} <= set(read_ply(first))
 
+    def test_a_point_cloud_of_4c4d_has_its_time(self, room: Path, tmp_path: Path) -> None:
+        from d2_plugin.adapters.fudan import FudanAdapter
+
+        model = fudan.make()[0]
+        columns = {axis: model._xyz[:, i] for i, axis in enumerate("xyz")} | {"opacity": model._opacity[:, 0]}
+        parts = {"f_dc": model._features_dc[:, 0], "scale": model._scaling, "rot": model._rotation}
+        parts |= {"rot_r": model._rotation_r}
+        columns |= {"t": model._t[:, 0], "scale_t": model._scaling_t[:, 0]}
+        columns |= {f"{name}_{i}": part[:, i] for name, part in parts.items() for i in range(part.shape[1])}
+        official.write_ply(tmp_path / "point_cloud.ply", columns)
+        found = open_subject(tmp_path / "point_cloud.ply", room)
+        for time in (0.0, 0.2):
+            true, told = FudanAdapter(model).slice_at(seen(found, time)), found.backbone.slice_at(seen(found, time))
+            assert close(told.means, true.means)
+            assert close(told.opacities, true.opacities)
+
     def test_an_output_folder_of_3d_gaussians_is_its_last_point_cloud(self, room: Path, tmp_path: Path) -> None:
         for iteration, seed in ((7000, 1), (30000, 2)):
             place = tmp_path / "point_cloud" / f"iteration_{iteration}"
@@ -326,6 +342,18 @@ class Harm:
 
 
 class TestRefused:
+    @pytest.mark.parametrize(
+        ("name", "trainer"), [("dynamic_point_cloud.ply", "Ex4DGS or CEM-4DGS"), ("FDHash.pth", "Swift4D")]
+    )
+    def test_the_still_part_of_a_model_is_not_shown_as_the_whole(
+        self, room: Path, tmp_path: Path, name: str, trainer: str
+    ) -> None:
+        place = tmp_path / "point_cloud" / "iteration_30000"
+        official.write_inria_ply(place / "point_cloud.ply", official.inria_columns(9))
+        (place / name).write_bytes(b"")
+        with pytest.raises(D2Error, match=rf"is of {trainer}, whose motion lies in {name}.*Viewer\(d2\)"):
+            open_subject(tmp_path, room)
+
     def test_no_code_in_a_file_is_run(self, room: Path, tmp_path: Path) -> None:
         torch.save(((Harm(tmp_path / "made"),), 1), tmp_path / "chkpnt1.pth")
         (tmp_path / "ckpt_1.pt").write_bytes(pickle.dumps(Harm(tmp_path / "made")))

@@ -7,6 +7,7 @@
 | chkpnt_fine_*.pth; a point cloud with deformation.pth beside it | 4DGaussians | planes and decoder, see `hexplanes` |
 | a point cloud with deform/iteration_N/deform.pth | Deformable-3D-Gaussians | its network, see `networks` |
 | ckpt_*.pt with "splats" | gsplat's simple_trainer | one instant |
+| *.ply with scale_t | 4C4D; without cosines in time of its colours | 4D Gaussians |
 | *.ply with trbf_center | SpacetimeGaussians; of the full model without its decoder | moving |
 | *.ply | 3D Gaussian Splatting and all that write its format | one instant |
 

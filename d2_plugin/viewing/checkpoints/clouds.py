@@ -15,8 +15,11 @@ from .files import columns, read_options, read_ply, read_state
 from .hexplanes import PlaneField
 from .loaded import Loaded, frozen, gsplat_model, harmonics_of, planes_model, with_adapter
 from .networks import MotionNetwork
+from .tuples import of_values
 
 CLOUD = "point_cloud.ply"
+ELSEWHERE = {"dynamic_point_cloud.ply": "Ex4DGS or CEM-4DGS", "FDHash.pth": "Swift4D"}
+"""Files beside a point cloud that say that it is a part of a model which is not read here."""
 
 
 def newest_cloud(folder: Path) -> Path:
@@ -41,18 +44,30 @@ def of_cloud(path: Path, capture: Capture) -> Loaded:
     Raises:
         D2Error: no Gaussians, or a network without what belongs to it.
     """
+    _refuse_parts(path.parent)
     rows = read_ply(path)
     missing = [name for name in ("x", "opacity", "scale_0", "rot_0", "f_dc_0") if name not in rows]
     if missing:
         raise D2Error(f"{path} has no {', '.join(missing)}: it is no point cloud of Gaussians")
     if "trbf_center" in rows:
         return _of_spacetime(rows, capture)
+    if "scale_t" in rows:
+        return _of_4c4d(rows, capture)
     if (path.parent / "deformation.pth").is_file():
         return _of_planes(rows, path, capture)
     output = path.parent.parent.parent
     if path.parent.parent.name == "point_cloud" and (output / "deform").is_dir():
         return _of_network(rows, output / "deform" / path.parent.name / "deform.pth", capture)
     return _of_one_instant(rows)
+
+
+def _refuse_parts(folder: Path) -> None:
+    for name, trainer in ELSEWHERE.items():
+        if (folder / name).exists():
+            raise D2Error(
+                f"{folder} is of {trainer}, whose motion lies in {name}, which is not read here: show it from inside "
+                "its train.py with Viewer(d2)"
+            )
 
 
 def _harmonics(rows: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
@@ -85,6 +100,13 @@ def _inria_values(rows: dict[str, Tensor]) -> dict[str, Any]:
         "_features_rest": rest,
         "active_sh_degree": round((1 + rest.shape[1]) ** 0.5) - 1,
     }
+
+
+def _of_4c4d(rows: dict[str, Tensor], capture: Capture) -> Loaded:
+    """4C4D writes time beside the columns of 3D Gaussian Splatting, and its harmonics without those of time."""
+    values = _inria_values(rows) | {"_t": rows["t"][:, None], "_scaling_t": rows["scale_t"][:, None]}
+    values |= {"_rotation_r": columns(rows, "rot_r"), "rot_4d": True, "active_sh_degree_t": 0}
+    return of_values(values, capture, timed=True)
 
 
 def _of_planes(rows: dict[str, Tensor], path: Path, capture: Capture) -> Loaded:

@@ -99,6 +99,7 @@ def columns(rows: dict[str, Tensor], name: str) -> Tensor:
     """The columns name_0, name_1, ... as [N, count]; x, y and z for xyz."""
     if name == "xyz":
         return torch.stack([rows[axis] for axis in "xyz"], 1)
-    count = sum(column.startswith(f"{name}_") for column in rows)
+    # By number: rot_r_0 is none of the rotations.
+    count = sum(column.startswith(f"{name}_") and column[len(name) + 1 :].isdigit() for column in rows)
     found = [rows[f"{name}_{i}"] for i in range(count)]
     return torch.stack(found, 1) if found else rows["x"].new_zeros(len(rows["x"]), 0)

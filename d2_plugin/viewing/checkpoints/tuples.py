@@ -48,9 +48,12 @@ def of_tuple(stored: Sequence[Any], path: Path, capture: Capture) -> Loaded:
             f"{path} has {len(stored)} entries, expected {len(FUDAN)} (fudan), {len(FOUR_C)} (4C4D), {len(PLANES)} "
             f"(4DGaussians) or {len(STATIC)} (3DGS): show another trainer's model from inside it, with Viewer(d2)"
         )
-    values = dict(zip(names, stored, strict=True))
+    return of_values(dict(zip(names, stored, strict=True)), capture, timed=names in WITH_TIME)
+
+
+def of_values(values: dict[str, Any], capture: Capture, timed: bool) -> Loaded:
+    """Gaussians by the names of fudan's model, of 4D or standing still."""
     model = frozen(values)
-    timed = names in WITH_TIME
     model.gaussian_dim = 4 if timed else 3
     model.time_duration = [0.0, max(capture.seconds(capture.frames[-1]), 1e-9)]
     note = "times are taken to be seconds since the first frame" if timed else "3D Gaussians stand still"

@@ -42,7 +42,8 @@ def write_spz(path: Path, gaussians: MovingGaussians, shapes: tuple[Tensor, Tens
     largest = float(np.abs(positions).max(initial=1e-6))
     bits = int(np.clip(np.floor(np.log2((2**23 - 1) / largest)), 0, MOST_FRACTION_BITS))
     fixed = np.clip(np.rint(positions * 2**bits), -(2**23), 2**23 - 1).astype(np.int64) & 0xFFFFFF
-    scales, quaternions = scales_and_rotations(shown.covariances) if shapes is None else (part[kept] for part in shapes)
+    found = scales_and_rotations(shown.covariances) if shapes is None else (shapes[0][kept], shapes[1][kept])
+    scales, quaternions = found
     coefficients, degree = shown.harmonics.without_time().numpy(), shown.harmonics.degree
     planes = [
         np.stack([fixed & 255, fixed >> 8 & 255, fixed >> 16], -1),
