@@ -169,7 +169,7 @@ def test_the_unsynchronised_camera_of_coffee_martini_is_named(tmp_path: Path) ->
 def test_a_file_that_is_no_video_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
     np.save(tmp_path / "poses_bounds.npy", ROW[None])
     (tmp_path / "cam00.mp4").write_bytes(b"not a video")
-    with pytest.raises(D2Error, match=r"cam00\.mp4 cannot be opened"):
+    with pytest.raises(D2Error, match=r"cam00\.mp4 is no video in an MP4"):
         open_capture(tmp_path)
 
 
