@@ -50,6 +50,7 @@ class GsplatAdapter:
             else resets what hooks count, with a warning.
         view: from the trainer's camera to a `View`; not needed where the trainer passes views.
         parser: of gsplat's examples, in the place of `view`: items of its data sets are then told by their poses.
+        scene: gsplat 1.6's `GaussianScene`, which keeps a component for every row.
         slice_at: the 3D Gaussians of a view, for models that change over time; by default the parameters as they are.
         new_rows: raw rows of further parameters (velocities, times, ...) for inserted points.
         settings: constants of the rasterizer; by default gsplat's, whose near plane is .01.
@@ -63,6 +64,7 @@ class GsplatAdapter:
         *,
         view: Callable[[object], View] | None = None,
         parser: Any = None,
+        scene: Any = None,
         slice_at: SliceOf | None = None,
         new_rows: RowsOf | None = None,
         settings: RasterSettings | None = None,
@@ -73,7 +75,7 @@ class GsplatAdapter:
         self.parameters, self.optimizers, self.state = parameters, optimizers, state
         self.settings = settings or RasterSettings(near=0.01)
         self._view = view if parser is None else ViewsByPose(parser)
-        self._slice, self._new_rows = slice_at, new_rows
+        self._slice, self._new_rows, self.scene = slice_at, new_rows, scene
         self._listeners: list[ResizeListener] = []
         self._known = 0
         self._renumber()
@@ -131,6 +133,8 @@ class GsplatAdapter:
         index[self._count :] = -1
         for name in self.parameters:
             self._replace(name, partial(_appended, rows[name]), new_moments=rows[name])
+        if self.scene is not None:
+            self.scene.on_sample_add(index.new_zeros(count))
         self._change_state(lambda old: torch.cat([old, old.new_zeros(count, *old.shape[1:])]), index)
         return count
 
@@ -141,6 +145,8 @@ class GsplatAdapter:
         index = torch.nonzero(~mask).squeeze(-1)
         for name in self.parameters:
             self._replace(name, lambda old: old[index])
+        if self.scene is not None:
+            self.scene.on_remove(mask)
         self._change_state(lambda old: old[index], index)
 
     def on_resize(self, listener: ResizeListener) -> None:

@@ -22,7 +22,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
 
 from .recipes import Objects, Recipe, adapter_of
-from .session import AddGradient, Session, remember
+from .session import AddGradient, Session, keep_instances, remember
 
 log = logging.getLogger(__name__)
 
@@ -77,6 +77,8 @@ def _is_stand_in(package: str) -> bool:
 def remember_gsplat(recipe: Recipe, objects: Objects) -> None:
     """As `session.remember`: the parser of the data, the parameters, and the settings of the script."""
     remember(recipe, objects)
+    if importlib.util.find_spec("gsplat.scene") is not None:  # since 1.6
+        keep_instances(importlib.import_module("gsplat.scene").GaussianScene, "gaussians", objects)
     strategies = importlib.import_module("gsplat.strategy")
     for name in STRATEGIES:
         kind = getattr(strategies, name)

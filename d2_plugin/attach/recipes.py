@@ -25,6 +25,8 @@ class Objects:
     """Of gsplat's strategy."""
     scene: Any = None
     """What knows the cameras."""
+    gaussians: Any = None
+    """gsplat 1.6's GaussianScene."""
     deform: Any = None
     given: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = field(default_factory=dict)
     """By the name of the field, what its instance was made from: arguments, and named ones."""
@@ -102,7 +104,7 @@ def _ex4dgs(adapter: Adapter, objects: Objects) -> Backbone:
 
 
 def _gsplat(adapter: Adapter, objects: Objects) -> Backbone:
-    return adapter(*objects.model, objects.state, parser=objects.scene)
+    return adapter(*objects.model, objects.state, parser=objects.scene, scene=objects.gaussians)
 
 
 _SPLATTING = "thirdparty.gaussian_splatting"

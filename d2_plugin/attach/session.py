@@ -26,13 +26,14 @@ log = logging.getLogger(__name__)
 def remember(recipe: Recipe, objects: Objects) -> None:
     """Keep the trainer's own objects as they come into being; what they compute is not touched."""
     for name, place in recipe.seen.items():
-        _keep_instances(_found(*place), name, objects)
+        keep_instances(_found(*place), name, objects)
     for place in recipe.models:
         model = _found(*place)
         model.training_setup = _keeping(model.training_setup, objects)
 
 
-def _keep_instances(kind: type, name: str, objects: Objects) -> None:
+def keep_instances(kind: type, name: str, objects: Objects) -> None:
+    """Keep the latest instance of a class, and what it was made from, under `name`."""
     original = kind.__init__  # type: ignore[misc]
 
     @wraps(original)

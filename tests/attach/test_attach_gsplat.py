@@ -180,3 +180,24 @@ def test_a_parameter_of_unknown_start_is_named() -> None:
     assert adapter.insert(some_points(2)) == 2
     with pytest.raises(D2Error, match="have means but no 'scales'"):
         GsplatAdapter({"means": splats["means"]}, optimizers)
+
+
+def test_a_scene_is_told_of_rows_that_come_and_go() -> None:
+    """gsplat 1.6 keeps a component per row beside the parameters, and its own split fails where one is missing."""
+    splats, optimizers, _ = gsplat.make()
+
+    class Scene:
+        component_index = torch.zeros(60, dtype=torch.long)
+
+        def on_sample_add(self, sampled: Tensor) -> None:
+            self.component_index = torch.cat([self.component_index, self.component_index[sampled]])
+
+        def on_remove(self, mask: Tensor) -> None:
+            self.component_index = self.component_index[~mask]
+
+    scene = Scene()
+    adapter = GsplatAdapter(splats, optimizers, {}, scene=scene)
+    adapter.insert(some_points(4))
+    assert len(scene.component_index) == 64
+    adapter.remove(torch.arange(64) % 2 == 0)
+    assert len(scene.component_index) == 32 == len(splats["means"])

@@ -54,24 +54,21 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def _line(case: tuple, rows: list[Row]) -> tuple[str, ...]:
-    by_method = {
-        name: [row for row in rows if row["method"] == name and row["psnr"]] for name in (BARE, NO_HOOKS, ATTACHED)
-    }
-    bare, attached = ([last(row) for row in by_method[name]] for name in (BARE, ATTACHED))
-    gains = [last(other) - last(row) for row, other in pairs(by_method[BARE], by_method[ATTACHED])]
+    finished = [row for row in rows if not row["failed"]]
+    without = [row for row in finished if row["method"] == NO_HOOKS]
+    bare, attached = ([row for row in finished if row["method"] == name and row["psnr"]] for name in (BARE, ATTACHED))
+    gains = [last(other) - last(row) for row, other in pairs(bare, attached)]
     return (
         *(str(case[0]), str(case[1]), str(case[4])),
-        *(_spread(bare), same(by_method[BARE], by_method[NO_HOOKS]), _spread(attached), _spread(gains, sign="+")),
-        " → ".join(
-            str(round(mean(row["gaussians"] for row in by_method[name])))
-            for name in (BARE, ATTACHED)
-            if by_method[name]
-        ),
-        " / ".join(str(round(mean(row[name] for row in by_method[ATTACHED]))) for name in ("inserted", "removed"))
-        if by_method[ATTACHED]
-        else "-",
-        worst(by_method[BARE], by_method[ATTACHED]),
+        *(_spread([last(row) for row in bare]), same(bare, without), _spread([last(row) for row in attached])),
+        *(_spread(gains, sign="+"), " → ".join(_mean(some, "gaussians") for some in (bare, attached))),
+        " / ".join(_mean(attached, name) for name in ("inserted", "removed")),
+        worst(bare, attached),
     )
+
+
+def _mean(rows: Sequence[Row], name: str) -> str:
+    return str(round(mean(row[name] for row in rows))) if rows else "-"
 
 
 def last(row: Row) -> float:
@@ -86,7 +83,10 @@ def pairs(first: Sequence[Row], second: Sequence[Row]) -> list[tuple[Row, Row]]:
 
 def same(bare: Sequence[Row], without: Sequence[Row]) -> str:
     """Whether every run without hooks ended with the trained numbers of the bare one, bit for bit."""
-    found = [row["digest"] == other["digest"] and row["psnr"] == other["psnr"] for row, other in pairs(bare, without)]
+    found = [
+        row["digest"] == other["digest"] and (not other["psnr"] or row["psnr"] == other["psnr"])
+        for row, other in pairs(bare, without)
+    ]
     return "-" if not found else "the same bits" if all(found) else "DIFFERS"
 
 

@@ -82,7 +82,7 @@ def _prior(recording: Recording, output: Path) -> Path:
         return output.resolve()
     words = ["priors", str(recording.capture), "--train-cameras", ",".join(TRAINED), "--output", str(output)]
     words += ["--frames", f"0:{recording.frames - 1}", "--downscale", str(recording.downscale)]
-    done = subprocess.run([sys.executable, "-m", "d2_plugin.commands.cli", *words], check=False)
+    done = subprocess.run([str(Path(sys.executable).with_name("d2")), *words], check=False)
     if done.returncode != 0:
         raise D2Error(f"`d2 {' '.join(words)}` ended with code {done.returncode}: its output above says why")
     return output.resolve()
