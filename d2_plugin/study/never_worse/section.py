@@ -82,6 +82,8 @@ def _worse(methods: dict[str, list[Row]], runs: Sequence[Row]) -> bool:
 def _headline(case: str, rows: Sequence[Row]) -> str:
     methods = _by_method(rows)
     guided = {name: runs for name, runs in methods.items() if name not in (BACKBONE, STEREO)}
+    if not guided or BACKBONE not in methods:
+        return ""
     worse = [name for name, runs in guided.items() if _worse(methods, runs)]
     if worse:
         return f"{case}: worse than the backbone alone with {', '.join(worse)}"
