@@ -25,7 +25,7 @@ TOGETHER = PriorSettings(stereo=STEREO, align=AlignSettings(together=True))
 
 @pytest.fixture(scope="module")
 def room() -> Capture:
-    return synthetic_capture(cameras=3, held_out=0, frames=3, width=192, height=108)
+    return synthetic_capture(cameras=3, held_out=0, frames=3, width=128, height=72, arc_degrees=20)
 
 
 def nothing_moves(image: np.ndarray, before: np.ndarray) -> np.ndarray:
