@@ -20,12 +20,14 @@ from d2_plugin.priors.store import PriorStore
 pytest.importorskip("cv2")
 
 STEREO = StereoSettings(matcher="sweep", reuse_block=2)
-TOGETHER = PriorSettings(stereo=STEREO, align=AlignSettings(together=True))
+ANY = {"min_anchors": 5, "min_t": 0.0, "min_correlation": -1.0, "wrong_kind_correlation": -1.0, "min_inliers": 0.0}
+"""So small a room has few anchors; here they need not be enough."""
+TOGETHER = PriorSettings(stereo=STEREO, align=AlignSettings(together=True, **ANY))
 
 
 @pytest.fixture(scope="module")
 def room() -> Capture:
-    return synthetic_capture(cameras=3, held_out=0, frames=3, width=192, height=108)
+    return synthetic_capture(cameras=3, held_out=0, frames=3, width=128, height=72, arc_degrees=20)
 
 
 def nothing_moves(image: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -96,10 +98,10 @@ def test_shards_make_the_store_that_a_single_build_makes(room: Capture, tmp_path
             assert whole.record(name, frame)["key"] == parts.record(name, frame)["key"]
             assert (whole.prior(name, frame).depth == parts.prior(name, frame).depth).all()
     first, second, third = (whole.record(names[0], frame)["alignment"] for frame in room.frames)
-    assert first["status"] == second["status"] == third["status"] == "ok"
+    assert {first["status"], second["status"], third["status"]} == {"ok"}
     assert first["objective"] == second["objective"] != third["objective"], "frames of one block are one fit"
     assert build_priors(room, names, tmp_path / "whole", TOGETHER).built == 0
-    alone = replace(TOGETHER, align=AlignSettings())
+    alone = replace(TOGETHER, align=AlignSettings(**ANY))
     assert build_priors(room, names, tmp_path / "whole", alone).kept == 0
 
 

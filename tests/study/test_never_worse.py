@@ -88,6 +88,11 @@ def test_what_is_below_the_backbone_is_named_and_what_is_not_stands_out() -> Non
     assert never_worse(rows[:4]).headlines == ("room: not worse than the backbone alone with any of own, noise",)
 
 
+def test_nothing_is_claimed_of_what_was_not_run() -> None:
+    assert never_worse([row(BACKBONE, 20.0), row(STEREO, 21.0)]).headlines == ("",)
+    assert never_worse([row("own", 20.0)]).headlines == ("",)
+
+
 def test_a_seed_that_was_repeated_counts_once() -> None:
     rows = [row(BACKBONE, 20.0), row(BACKBONE, 22.0, 1), row("own", 1.0), row("own", 25.0), row("own", 25.0, 1)]
     assert [cells[2:4] for cells in table(rows).rows] == [("two seeds", "21.00"), ("two seeds", "25.00")]

@@ -54,7 +54,7 @@ class AlignSettings(Settings):
     because filtered anchors are wrong at 1 % (studio) and the guard has not been measured on recordings."""
     together: bool = False
     """Fit the lines of all frames of a block (`stereo.reuse_block`) together: aligned maps must agree where the picture
-    did not change. Off: on studio and plaza errors stay the same and maps are steadier by a hundredth, for which it reads
-    every picture twice; docs/priors.md, "Alignment", has the figures."""
+    did not change. Off: on studio and plaza errors stay the same and maps are steadier by a hundredth, while pictures
+    are read twice; docs/priors.md, "Alignment", has the figures."""
     seed: Seed = 0
     """Seed of the subsampling and of the leverage guard."""

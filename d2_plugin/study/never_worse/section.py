@@ -20,14 +20,15 @@ HEADER = ("capture", "monocular maps", "seeds", "PSNR", "over the backbone", "ov
 
 def never_worse(rows: Sequence[Row]) -> Section:
     """One table: every kind of map against the backbone alone and against stereo alone."""
+    found = table(scored(rows))
     return Section(
-        "never-worse",
+        "never_worse",
         "Never worse than without",
         "Held-out scores where the monocular maps are not what they should be: `noise` is a random value at every "
         "pixel, `smooth` random blobs, `constant` one value, `other` the map of another frame (of another camera "
         "where there is one frame), `network` a small network that runs on phones. `stereo alone` uses no monocular "
         f"map. Not worse is at most {ALLOWED} dB below the backbone alone; what is stands out.",
-        tables=(("Held-out scores by monocular maps", table(scored(rows))),),
+        tables=(("Held-out scores by monocular maps", found),) if found.rows else (),
         sources=sources_of(rows),
         headlines=tuple(_headline(case, mine) for case, mine in cases_of(scored(rows)).items()),
     )
@@ -82,6 +83,8 @@ def _worse(methods: dict[str, list[Row]], runs: Sequence[Row]) -> bool:
 def _headline(case: str, rows: Sequence[Row]) -> str:
     methods = _by_method(rows)
     guided = {name: runs for name, runs in methods.items() if name not in (BACKBONE, STEREO)}
+    if not guided or BACKBONE not in methods:
+        return ""
     worse = [name for name, runs in guided.items() if _worse(methods, runs)]
     if worse:
         return f"{case}: worse than the backbone alone with {', '.join(worse)}"
