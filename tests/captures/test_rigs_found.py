@@ -168,6 +168,7 @@ def near(large: Capture, tmp_path_factory: pytest.TempPathFactory) -> Filmed:
     return film(chosen, tmp_path_factory.mktemp("near"), {name: Shooting() for name in NEIGHBOURS})
 
 
+@pytest.mark.slow
 def test_videos_become_a_recording_without_a_calibration(near: Filmed, large: Capture, tmp_path: Path, capsys) -> None:
     truth = {name: large.cameras[name] for name in NEIGHBOURS}
     apart = float(np.linalg.norm(truth["02"].centre - truth["05"].centre))
