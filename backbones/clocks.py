@@ -26,8 +26,9 @@ class ClockSettings(Settings):
 
     learn: bool = False
     """Whether it is learnt. Off is right where cameras are triggered together, and where their offsets are known."""
-    rate: Positive = 0.02
-    """Learning rate in frames: a camera that is a frame off takes some fifty of its own steps."""
+    rate: Positive = 0.05
+    """Learning rate in frames. One of four cameras a frame late, half-size pictures, one seed: studio finds .7 of it
+    in 900 steps at 0.05, .10 in 300 steps at 0.02; plaza, wider and with smaller movers, finds none of it."""
     last_rate: NotNegative = 0.1
     """Learning rate at the last step, as a share of `rate`; exponential in between."""
     begin: Share = 0.1

@@ -15,7 +15,7 @@ from d2_plugin.protocol import View
 
 FRAMES, LATE = 9, {"cam0": 0.0, "cam1": 0.0, "cam2": 1.0}
 """How many frames later than they are named the pictures of a camera were taken."""
-LEARN = ClockSettings(learn=True)
+LEARN = ClockSettings(learn=True, rate=0.02)
 
 
 def views() -> list[View]:

@@ -32,7 +32,7 @@ from d2_plugin.values import checked_arguments
 FINE = (*SCHEDULE, (1.0, 0.1), (0.5, 0.05))
 """Rounds of the adjustment for features that were moved to better places."""
 
-LARGEST_DOUBT = (0.15, 0.006)
+LARGEST_DOUBT = (0.2, 0.006)
 """Degrees, and share of the rig's width, that two halves of the pictures may differ by about a camera."""
 
 LARGEST_FOCAL_DOUBT = 0.03
