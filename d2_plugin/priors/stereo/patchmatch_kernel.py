@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from d2_plugin import compiler
 from d2_plugin.captures.capture import Camera
-from d2_plugin.compiler import NoCompiler, find_compiler, load_library
 from d2_plugin.compiler.prebuilt import find as find_prebuilt
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import index_intrinsics, view_pair
@@ -64,8 +64,8 @@ def compiles() -> bool:
     if find_prebuilt("patchmatch", SOURCES, HEADERS, FLAGS) is not None:
         return True
     try:
-        find_compiler()
-    except NoCompiler:
+        compiler.find_compiler()
+    except compiler.NoCompiler:
         return False
     return True
 
@@ -91,7 +91,7 @@ class PatchMatchKernel:
         self._start()
 
     def _start(self) -> None:
-        self.library = load_library("patchmatch", SOURCES, HEADERS, FLAGS)
+        self.library = compiler.load_library("patchmatch", SOURCES, HEADERS, FLAGS)
 
     def match(
         self,
