@@ -23,7 +23,10 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"d2_plugin": "d2_plugin", "d2_plugin.backbones": "backbones", "d2_plugin.adapters": "adapters"}
 MOST_MODULES, MOST_LINES = 15, 300
 
-GROUND = "errors older settings values reading arrays protocol registry progress compiler cache durable locks __init__"
+GROUND = (
+    "errors older settings values reading arrays protocol registry progress compiler cache durable locks "
+    "__init__"
+)
 """What everybody may use: sentences, declarations, plain data, names, progress, the compiler of kernels and its cache,
 files that are kept, and locks."""
 
