@@ -149,7 +149,9 @@ def _informed(
     return replace(prior, depth=depths, labels=labels, sigma=sigmas)
 
 
-def _ask(points: _Points, name: str, views: Mapping[str, _View], cameras: Mapping[str, Camera]) -> _Answer:
+def _ask(
+    points: _Points, name: str, views: Mapping[str, _View], cameras: Mapping[str, Camera]
+) -> _Answer:
     count = len(points.depth)
     depth, sigma = np.zeros(count), np.full(count, np.inf)
     difference, seen = np.full(count, np.inf), np.zeros(count, bool)
@@ -257,7 +259,9 @@ def _step(points: _Points, pair: ViewPair, surface: np.ndarray, depth: np.ndarra
     return np.clip(np.where(usable, -miss / np.where(usable, slope, 1), 0), -0.2, 0.2)
 
 
-def _miss(points: _Points, pair: ViewPair, surface: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _miss(
+    points: _Points, pair: ViewPair, surface: np.ndarray, depth: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """(log of the points' depth in the other view over the surface's there [K], where that is known [K])."""
     at = pair.project(points.columns, points.rows, depth)
     inside = at.z > 0
