@@ -34,10 +34,9 @@ class Deformable3DAdapter(InriaAdapter):
     Args:
         gaussians: the model, after `training_setup`.
         deform: its `DeformModel`.
-        warm_up: iteration from which the field is used (opt.warm_up); hooks wait for it.
-        in_warm_up: whether hooks run before it all the same. Until then the trainer fits one still scene to all
-            instants, which the prior of anything that moves contradicts; and its own reports are drawn with the
-            untrained field all the time, which widens every Gaussian by about .04 units and hides what hooks gain.
+        warm_up: iteration from which the field is used (opt.warm_up).
+        in_warm_up: whether hooks run before it. The trainer's own reports are drawn with the untrained field until
+            then, which widens every Gaussian by about .04 units and hides what hooks gain (docs/results/attach.md).
         is_6dof: whether the field returns rigid motions [N, 4, 4] (dataset.is_6dof); read from the network by default.
         settings: constants of its rasterizer, where they were changed.
         key: finds the prior of a camera; needed where the picture's name does not say camera and frame
@@ -50,7 +49,7 @@ class Deformable3DAdapter(InriaAdapter):
         deform: Any,
         *,
         warm_up: int = 3000,
-        in_warm_up: bool = False,
+        in_warm_up: bool = True,
         is_6dof: bool | None = None,
         settings: RasterSettings | None = None,
         key: KeyOf | None = None,

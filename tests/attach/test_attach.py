@@ -298,14 +298,15 @@ def jitter(model) -> None:
             value += 0.4 * torch.randn(value.shape, generator=generator)
 
 
-def test_hooks_wait_for_the_field_of_a_warm_up(workplace: Path) -> None:
+def test_hooks_may_wait_for_the_field_of_a_warm_up(workplace: Path) -> None:
     """Until iteration 30 the mimic fits one still scene to all instants, as Deformable-3D-Gaussians until 3000."""
-    source = attached(deformable3d, "deformable3d")
+    source = attached(deformable3d, "deformable3d", "d2.backbone.in_warm_up = False")
     bare, waiting = run(deformable3d, stop=29), run(deformable3d, source, stop=29)
     assert same(snapshot(bare.gaussians), snapshot(waiting.gaussians))
     assert not waiting.d2.trace
     going = run(deformable3d, source, stop=45)
     assert min(entry.step for entry in going.d2.trace) == 30
     assert not same(snapshot(run(deformable3d, stop=45).gaussians), snapshot(going.gaussians))
-    adapter = Deformable3DAdapter(*deformable3d.make()[:2], warm_up=30, in_warm_up=True)
-    assert adapter.active(1)
+    models = deformable3d.make()[:2]
+    assert Deformable3DAdapter(*models, warm_up=30).active(1)
+    assert not Deformable3DAdapter(*models, warm_up=30, in_warm_up=False).active(29)
