@@ -167,7 +167,7 @@ class PatchMatchKernel:
             )
         sources = (Source * len(chosen))(*(_source(view, *pair) for pair in zip(chosen, first.tolist())))
         quads = np.concatenate([source.quads.ravel() for source in chosen])
-        return {"sources": np.frombuffer(sources, np.uint8), "quads": quads}
+        return {"sources": np.frombuffer(bytes(sources), np.uint8), "quads": quads}
 
 
 def _pointed(task: Task, arrays: Arrays) -> Task:
