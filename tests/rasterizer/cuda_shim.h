@@ -19,6 +19,9 @@
 #if !defined(__x86_64__)
 #include <ucontext.h>
 #endif
+#if defined(__SANITIZE_ADDRESS__)
+#include <sanitizer/asan_interface.h>
+#endif
 
 #define __global__
 #define __device__
@@ -193,6 +196,10 @@ inline void run_block(const std::function<void()>& body, dim3 index, int count, 
   block.index = index, block.threads = count, block.grid = grid, block.body = &body;
   for (int i = 0; i < count; i++) {
     block.fibers[i].done = false;
+#if defined(__SANITIZE_ADDRESS__)
+    // The fibre that had this stack before never returned, so its variables still count as out of scope.
+    __asan_unpoison_memory_region(block.fibers[i].stack.get(), STACK);
+#endif
     block.fibers[i].context.start(block.fibers[i].stack.get(), run_fiber);
     block.warps[i / WARP].members++, block.all.members++;
   }

@@ -22,18 +22,24 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     compiler = shutil.which("g++")
     if compiler is None or sys.platform != "linux":
         pytest.skip("g++ on Linux is needed, whose AddressSanitizer can be loaded before Python")
-    library = subprocess.run([compiler, "-print-file-name=libasan.so"], capture_output=True, text=True, check=True)
-    if not Path(library.stdout.strip()).is_file():
+    # The C++ library as well: the sanitizer looks for its exceptions when it starts, before torch brings it.
+    libraries = [_library(compiler, name) for name in ("libasan.so", "libstdc++.so.6")]
+    if not all(Path(library).is_file() for library in libraries):
         pytest.skip("g++ came without AddressSanitizer (libasan.so)")
     return {
         **os.environ,
-        "LD_PRELOAD": library.stdout.strip(),
+        "LD_PRELOAD": " ".join(libraries),
         "ASAN_OPTIONS": "detect_leaks=0:detect_stack_use_after_return=0",
         "CXX": compiler,
         "D2_CXXFLAGS": SANITIZED,
         "D2_CACHE": str(tmp_path_factory.mktemp("sanitized")),
         "PYTHONPATH": os.pathsep.join(map(str, (TESTS, TESTS / "priors", TESTS / "rasterizer"))),
     }
+
+
+def _library(compiler: str, name: str) -> str:
+    words = [compiler, f"-print-file-name={name}"]
+    return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def run(words: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
@@ -51,7 +57,7 @@ def run(words: list[str], environment: dict[str, str]) -> subprocess.CompletedPr
 )
 def test_no_kernel_leaves_its_arrays(module: str, chosen: str, environment: dict[str, str]) -> None:
     done = run(
-        ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", f"tests/{module}", "-k", chosen], environment
+        ["-m", "pytest", "-s", "-q", "-n", "0", "-p", "no:cacheprovider", f"tests/{module}", "-k", chosen], environment
     )
     said = (done.stdout + done.stderr)[-4000:]
     assert done.returncode == 0, said
