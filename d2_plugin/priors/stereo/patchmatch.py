@@ -63,8 +63,8 @@ def patchmatch(
         coarser: Sequence[LevelView | None] = views or [None] * len(cameras)
         views = [at_resolution(*view, divisor) for view in zip(grays, cameras, coarser, masks)]
         for index in range(len(views)):
-            # Once planes are handed down from a coarser level, random ones are hardly ever better.
-            kernel.match(views, index, level, rounds, explore=divisor > 2 or level == 0)
+            # At full size random planes are hardly ever better than those handed down.
+            kernel.match(views, index, level, rounds, explore=divisor > 1 or level == 0)
     for extra in range(settings.patchmatch_geometric_rounds):
         depths = [plane_depth(view) for view in views]
         for index in range(len(views)):
