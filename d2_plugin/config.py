@@ -38,7 +38,7 @@ else:  # one field per row of the table of hooks
 
 @dataclass(frozen=True)
 class D2Config(_HookTables):
-    """The prior to use and the hooks to build, one table each; a hook without a table is never built."""
+    """The prior and the hooks, one table each; without one a hook is not built."""
 
     prior: str | None = None
     """Folder of the depth prior, as `d2 priors` writes it."""

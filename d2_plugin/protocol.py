@@ -160,7 +160,7 @@ class CameraRecord(NamedTuple):
 
 @dataclass(frozen=True)
 class RasterSettings(Settings):
-    """Constants of splatting; the defaults are those of the Inria rasterizer, which most backbones were tuned with."""
+    """Constants of splatting, by default the Inria rasterizer's."""
 
     near: Annotated[float, Range(0, unit="world units", open_low=True)] = 0.2
     """Gaussians with a view depth z <= near are not drawn."""

@@ -90,7 +90,7 @@ class TestHelp:
         told = capsys.readouterr().out
         assert all(f"{name:13} {benchmark.help}" in told for name, benchmark in BENCHMARKS.items())
         assert main(["bench"]) == 2
-        assert "have align, gpu, priors, raster, scaling, stereo" in capsys.readouterr().err
+        assert "have align, gpu, never-worse, priors, raster, scaling, stereo" in capsys.readouterr().err
         assert main(["bench", "sterio"]) == 2
         assert "did you mean 'stereo'?" in capsys.readouterr().err
 

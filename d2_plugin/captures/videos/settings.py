@@ -17,7 +17,7 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 @dataclass(frozen=True)
 class ImportChoices(Settings):
-    """How videos become a recording: what is taken of them, and how they are brought onto one clock."""
+    """How videos become a recording on one clock."""
 
     offsets: tuple[str, ...] = ("auto",)
     """How the cameras' start is found: auto (timecode, then sound, then motion), timecode, sound, motion, none (they

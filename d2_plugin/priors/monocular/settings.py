@@ -12,7 +12,7 @@ Correlation = Annotated[float, Range(-1, 1)]
 
 @dataclass(frozen=True)
 class AlignSettings(Settings):
-    """Alignment of one monocular map to one geometric map, and when to refuse it (docs/priors.md, "Alignment")."""
+    """Alignment of monocular to geometric depth (docs/priors.md)."""
 
     residual: Literal["relative", "absolute"] = "relative"
     """`absolute` is the paper's a D^m + b - D^g; `relative` divides it by D^g, as verification does. What passes the

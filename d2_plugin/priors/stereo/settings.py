@@ -21,7 +21,7 @@ Side = Annotated[int, Range(1, unit="pixels")]
 
 @dataclass(frozen=True)
 class StereoSettings(Settings):
-    """Geometric depth: how views are matched and which depths survive (docs/priors.md, "Geometric depth")."""
+    """Geometric depth: matching and filter (docs/priors.md)."""
 
     matcher: MatcherName = "auto"
     """Matchers: `patchmatch` (compiled), `sweep` (OpenCV), `colmap` (needs CUDA). Depth that lies on disk: `sensor`,
