@@ -147,11 +147,10 @@ def measured(capture: Capture, names: list[str], path: Path) -> Calibration:
 
 
 def check(found: Calibration) -> None:
-    """The target is 60 to 80 % and 90 %; a few frames may be a little beside it (the small room has 86 % of its monocular
-    pixels within sigma, other textures 84), agreed depth is too cautious."""
+    """The target is 60 to 80 % and 90 %; a few frames may be a little beside it, agreed depth is too cautious."""
     for label, held in found.labels.items():
         if held.share >= 0.01:
-            assert 0.55 <= held.within <= (0.9 if label == Label.AGREED else 0.87), f"{label.name}: {found}"
+            assert 0.55 <= held.within <= (0.9 if label == Label.AGREED else 0.85), f"{label.name}: {found}"
             assert held.within_two >= 0.88, f"{label.name}: {found}"
 
 
