@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hypothesis
@@ -28,3 +28,13 @@ def shared_data() -> Callable[[str], Path]:
         return path
 
     return locate
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """A test may set torch's number of threads."""
+    import torch  # after the environment is set above
+
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)

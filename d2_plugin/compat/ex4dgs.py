@@ -15,12 +15,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from d2_plugin.protocol import Splats
 from d2_plugin.rasterizer import rasterize
 
-from .inria import SETTINGS, colors_of, covariances_of, draw, exactly_one, given, in_front, shape_given, view_of
+from .inria import SETTINGS, StandIn, colors_of, covariances_of, draw, exactly_one, given, shape_given, view_of
 
 FRUSTUM = 1.3
 """Gaussians whose centre projects beyond this multiple of the half picture are not drawn (auxiliary.h, in_frustum)."""
@@ -47,16 +47,10 @@ class GaussianRasterizationSettings(NamedTuple):
     debug: bool = False
 
 
-class GaussianRasterizer(nn.Module):
+class GaussianRasterizer(StandIn):
     """The original's module: construct it with settings for every image, call it with the Gaussians."""
 
-    def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
-        super().__init__()
-        self.raster_settings = raster_settings
-
-    def markVisible(self, positions: Tensor) -> Tensor:
-        """bool [N]: which positions [N, 3] lie before the near plane."""
-        return in_front(positions, self.raster_settings.viewmatrix)
+    raster_settings: GaussianRasterizationSettings
 
     def forward(
         self,

@@ -6,13 +6,13 @@ import math
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_4d, time_row
 from d2_plugin.protocol import Splats
 
-from .inria import colors_of, covariances_of, draw, exactly_one, given, harmonics, in_front, shape_given
+from .inria import StandIn, colors_of, covariances_of, draw, exactly_one, given, harmonics, shape_given
 
 MARGINAL_MIN = 0.05
 """Gaussians whose temporal factor is not above this are skipped (forward.cu, computeCov3D_conditional)."""
@@ -41,16 +41,10 @@ class GaussianRasterizationSettings(NamedTuple):
     debug: bool = False
 
 
-class GaussianRasterizer(nn.Module):
+class GaussianRasterizer(StandIn):
     """The original's module: construct it with settings for every image, call it with the Gaussians."""
 
-    def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
-        super().__init__()
-        self.raster_settings = raster_settings
-
-    def markVisible(self, positions: Tensor) -> Tensor:
-        """bool [N]: which positions [N, 3] lie before the near plane."""
-        return in_front(positions, self.raster_settings.viewmatrix)
+    raster_settings: GaussianRasterizationSettings
 
     def forward(
         self,

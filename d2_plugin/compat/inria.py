@@ -6,7 +6,7 @@ import logging
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
@@ -24,6 +24,18 @@ SETTINGS = RasterSettings()
 
 TILE = 16
 """Side of Inria's tiles in pixels; a Gaussian that touches none has radius 0."""
+
+
+class StandIn(nn.Module):
+    """What all of Inria's heirs call GaussianRasterizer: it is made anew for every image."""
+
+    def __init__(self, raster_settings: Any) -> None:
+        super().__init__()
+        self.raster_settings = raster_settings
+
+    def markVisible(self, positions: Tensor) -> Tensor:
+        """bool [N]: which positions [N, 3] lie before the near plane."""
+        return in_front(positions, self.raster_settings.viewmatrix)
 
 
 class Drawn(NamedTuple):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Splats
 
-from .inria import Drawn, colors_of, covariances_of, draw, exactly_one, given, in_front, shape_given
+from .inria import Drawn, StandIn, colors_of, covariances_of, draw, exactly_one, given, shape_given
 
 
 class GaussianRasterizationSettings(NamedTuple):
@@ -31,20 +31,17 @@ class GaussianRasterizationSettings(NamedTuple):
     antialiasing: bool = False
 
 
-class GaussianRasterizer(nn.Module):
+class GaussianRasterizer(StandIn):
     """The original's module: construct it with settings for every image, call it with the Gaussians."""
 
+    raster_settings: GaussianRasterizationSettings
+
     def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
-        super().__init__()
         if raster_settings.antialiasing:
             raise D2Error(
                 "antialiasing needs the original rasterizer, this stand-in has none: switch it off or build it"
             )
-        self.raster_settings = raster_settings
-
-    def markVisible(self, positions: Tensor) -> Tensor:
-        """bool [N]: which positions [N, 3] lie before the near plane."""
-        return in_front(positions, self.raster_settings.viewmatrix)
+        super().__init__(raster_settings)
 
     def forward(
         self,

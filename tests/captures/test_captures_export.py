@@ -167,7 +167,8 @@ def test_what_a_layout_cannot_hold_is_refused_by_camera(uneven: Capture, layout:
 
 
 def test_mistakes_are_one_sentence(original: Capture, tmp_path: Path) -> None:
-    with pytest.raises(D2Error, match="unknown layout 'blender': have colmap, colmap_frames, gsplat, multipleview, n3dv"):
+    known = "colmap, colmap_frames, gsplat, multipleview, n3dv"
+    with pytest.raises(D2Error, match=f"unknown layout 'blender': have {known}"):
         export_capture(original, "blender", tmp_path / "a")
     with pytest.raises(D2Error, match="all cameras of .* are held out"):
         export_capture(original, "colmap", tmp_path / "a", test_cameras=list(original.cameras))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import io
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -21,13 +20,6 @@ RATES = [1e-2, 3e-4, 1.0, 5e-2, 1e-3]
 def compiled() -> None:
     if native_adam.library() is None:
         pytest.skip("there is no C++ compiler")
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def start(kind: type, dtype: torch.dtype = torch.float32, **options: object) -> torch.optim.Optimizer:

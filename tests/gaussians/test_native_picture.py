@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -24,13 +23,6 @@ SIZES = [(32, 24), (1, 1), (40, 40), (81, 7), (100, 33), (320, 45)]
 def compiled() -> None:
     if kernel.library() is None:
         pytest.skip("there is no C++ compiler")
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def view_of(width: int, height: int) -> View:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import pytest
 import torch
@@ -133,13 +133,6 @@ def test_nothing_drawn_gives_empty_splats_and_zero_gradients(count: int) -> None
 def test_no_gaussians_without_time_are_no_splats() -> None:
     outputs, _ = slice_with_gradients(native_slice, random_rows(0, False), torch.float32)
     assert [len(output) for output in outputs] == [0, 0, 0, 0]
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.usefixtures("threads")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -96,13 +95,6 @@ def test_equal_pictures_have_no_loss_and_no_gradient() -> None:
     loss, gradient = loss_with_gradient(photometric_loss, target, target, torch.float32)
     assert abs(loss) < 1e-7
     assert gradient.abs().max() * gradient.numel() < 1e-4
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.usefixtures("threads")

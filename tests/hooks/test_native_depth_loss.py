@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -19,13 +18,6 @@ from d2_plugin.hooks.prior import KnownPixels
 def compiled() -> None:
     if kernel.library() is None:
         pytest.skip("there is no C++ compiler")
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def case(height: int = 90, width: int = 130, known: float = 0.8) -> tuple[Tensor, Tensor, KnownPixels]:

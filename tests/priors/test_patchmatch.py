@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -39,13 +38,6 @@ DEFAULT = Method("patchmatch", "default", MATCHERS["patchmatch"], SETTINGS)
 @pytest.fixture(scope="module")
 def rig() -> Rig:
     return textured_rig(3, width=160, height=90, seed=3)
-
-
-@pytest.fixture
-def threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 def grays(rig: Rig) -> list[np.ndarray]:
