@@ -166,7 +166,8 @@ class TestTorchWithoutOperators:
 
 def test_the_command_line_says_which_python_it_needs() -> None:
     """`d2` is for the environment where priors are built; a trainer's may be older and needs the three lines alone."""
-    older = "import sys; sys.version_info = (3, 9, 2, 'final', 0)"
+    older = "import sys, tomllib; sys.version_info = (3, 9, 2, 'final', 0)"
+    older += "; sys.modules['tomli'] = tomllib"  # which the package requires there
     ask = f"{older}; from d2_plugin.commands.cli import main; sys.exit(main())"
     done = subprocess.run([sys.executable, "-c", ask, "plan"], capture_output=True, text=True, env=os.environ)
     assert done.returncode == 2
