@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import zlib  # noqa: F401  before pycolmap, whose own copy of zlib would otherwise be bound
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hypothesis
 import pytest
+
+with contextlib.suppress(ImportError):
+    # Its import takes over what happens at a crash, and would hide it in captured output: before pytest, which then
+    # names the test and its line.
+    import pycolmap  # noqa: F401
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch is imported; see d2_plugin.commands.cli.main
 

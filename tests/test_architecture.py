@@ -24,7 +24,7 @@ PACKAGES = {"d2_plugin": "d2_plugin", "d2_plugin.backbones": "backbones", "d2_pl
 MOST_MODULES, MOST_LINES = 15, 300
 
 GROUND = (
-    "errors older settings values reading arrays protocol registry progress compiler cache durable locks "
+    "errors older settings values reading arrays protocol registry progress extras compiler cache durable locks "
     "__init__"
 )
 """What everybody may use: sentences, declarations, plain data, names, progress, the compiler of kernels and its cache,

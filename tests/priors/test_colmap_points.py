@@ -152,7 +152,7 @@ def test_a_missing_pycolmap_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> 
 )
 def test_compression_works_after_pycolmap_was_imported(later: str) -> None:
     """pycolmap exports its own zlib; imported before the system's, it makes every later compression abort."""
-    first = "from d2_plugin.priors.colmap import points; points.import_pycolmap('a test')"
+    first = "from d2_plugin.extras import import_pycolmap; import_pycolmap('a test', 'stereo')"
     code = f"{first}; import io, zlib, numpy as np; {later}; print('alive')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout.strip()) == (0, "alive"), done.stderr

@@ -38,7 +38,7 @@ def test_case_42_compression_survives_pycolmap_whatever_is_imported_first(order:
     imports = {
         "torch": "import torch",
         "zlib": "import zlib",
-        "colmap": "from d2_plugin.priors.colmap import points; points.import_pycolmap('a test')",
+        "colmap": "from d2_plugin.extras import import_pycolmap; import_pycolmap('a test', 'stereo')",
     }
     code = "\n".join([*(imports[name] for name in order.split(", ")), "zlib.compress(bytes(10**5)); print('alive')"])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.captures.calibrate.features import Features, Matches, pixel_error, pycolmap_module
+from d2_plugin.captures.calibrate.features import Features, Matches, pixel_error, silent_pycolmap
 from d2_plugin.captures.calibration import pinhole, rigid
 from d2_plugin.captures.capture import Camera
 
@@ -135,7 +135,7 @@ def adjust(bundle: Bundle, features: Mapping[str, Features], scale: float, focal
     The loss is Cauchy's with `scale` pixels: what misses by much more hardly counts. `focal` frees focal lengths
     as well, one for both axes: "each" camera its own, or one that is "shared".
     """
-    pycolmap = pycolmap_module("adjusting poses")
+    pycolmap = silent_pycolmap("adjusting poses")
     numbers = {name: number for number, name in enumerate(bundle.cameras, start=1)}
     rec = pycolmap.Reconstruction()
     for name, number in numbers.items():

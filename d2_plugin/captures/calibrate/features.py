@@ -7,7 +7,6 @@ are undistorted, and pixel i has its centre at i + 0.5.
 
 from __future__ import annotations
 
-import zlib  # noqa: F401  (pycolmap brings a zlib of its own that breaks PNG where it comes first)
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -17,7 +16,7 @@ import numpy as np
 
 from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.pictures import checked_picture, opencv
-from d2_plugin.errors import missing_extra
+from d2_plugin.extras import import_pycolmap
 
 MOST_FEATURES = 4000
 """Per picture."""
@@ -57,12 +56,9 @@ class Features:
     """The pictures uint8 [H, W] by moment, where features may be moved to better places."""
 
 
-def pycolmap_module(purpose: str) -> ModuleType:
+def silent_pycolmap(purpose: str) -> ModuleType:
     """The module pycolmap, silent; `purpose` completes the sentence "<purpose> needs pycolmap"."""
-    try:
-        import pycolmap
-    except ImportError:
-        raise missing_extra("pycolmap", "calibration", purpose) from None
+    pycolmap = import_pycolmap(purpose, "calibration")
     pycolmap.logging.minloglevel = 2
     return pycolmap
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from d2_plugin.captures.calibrate.bundle import Bundle, Tracks, fitting, join_matches, project, triangulate
-from d2_plugin.captures.calibrate.features import Features, Matches, Pair, pixel_error, pycolmap_module
+from d2_plugin.captures.calibrate.features import Features, Matches, Pair, pixel_error, silent_pycolmap
 from d2_plugin.captures.calibrate.refine import bundled
 from d2_plugin.captures.calibrate.verify import as_colmap, essential_pose
 from d2_plugin.captures.calibration import rigid
@@ -96,7 +96,7 @@ def _resect(camera: Camera, features: Features, seen: np.ndarray, points: np.nda
     """The camera at the pose that explains enough of the points it sees."""
     if len(seen) < FEWEST_SEEN:
         return None
-    pycolmap = pycolmap_module("finding cameras")
+    pycolmap = silent_pycolmap("finding cameras")
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error, options.ransac.random_seed = 2 * pixel_error(camera), 0
     pixels, there = features.pixels[seen[:, 0]], points[seen[:, 1]]

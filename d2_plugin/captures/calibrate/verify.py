@@ -13,8 +13,8 @@ from d2_plugin.captures.calibrate.features import (
     Matches,
     Pair,
     pixel_error,
-    pycolmap_module,
     sampson,
+    silent_pycolmap,
 )
 from d2_plugin.captures.calibration import rigid
 from d2_plugin.captures.capture import Camera
@@ -69,7 +69,7 @@ def _ransac(
 ) -> dict[str, Any] | None:
     if len(pairs) < ENOUGH_MATCHES:
         return None
-    pycolmap = pycolmap_module("verifying matches")
+    pycolmap = silent_pycolmap("verifying matches")
     one, other = (cameras[name] for name in pair)
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed, options.min_inlier_ratio = pixel_error(one), 0, LEAST_INLIERS
@@ -81,7 +81,7 @@ def _ransac(
 def as_colmap(camera: Camera) -> Any:
     """A pinhole camera as pycolmap has it; both put the centre of the first pixel at 0.5."""
     K = camera.K
-    return pycolmap_module("calibrating").Camera(
+    return silent_pycolmap("calibrating").Camera(
         camera_id=1,
         model="PINHOLE",
         width=camera.width,

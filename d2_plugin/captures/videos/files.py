@@ -18,7 +18,8 @@ import numpy as np
 
 from d2_plugin.captures.pictures import MOST_PIXELS
 from d2_plugin.captures.videos.plain import check_container
-from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.errors import D2Error
+from d2_plugin.extras import import_av
 from d2_plugin.reading import parsing, said, shown_path
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".360", ".lrv")
@@ -99,16 +100,8 @@ class VideoFile:
 
 
 def pyav() -> ModuleType:
-    """The module av.
-
-    Raises:
-        MissingExtra: where it is not installed.
-    """
-    try:
-        import av
-    except ImportError:
-        raise missing_extra("PyAV", "video", "reading videos with their time stamps") from None
-    return av
+    """The module av."""
+    return import_av("reading videos with their time stamps")
 
 
 @contextmanager

@@ -24,9 +24,9 @@ import numpy as np
 from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.rotations import quaternion_of_rotation
 from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.extras import import_pycolmap
 from d2_plugin.priors.colmap.dense_arrays import read_dense_array
 from d2_plugin.priors.colmap.mvs_process import OPTIONS
-from d2_plugin.priors.colmap.points import import_pycolmap
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import check_depth_range, check_views, index_intrinsics
 from d2_plugin.priors.stereo.pyramid import NO_MATCH
@@ -50,7 +50,7 @@ def why_not_usable() -> str:
     `pycolmap.has_cuda` alone only tells how pycolmap was compiled: it is True without any device.
     """
     try:
-        pycolmap = import_pycolmap("COLMAP's PatchMatch")
+        pycolmap = import_pycolmap("COLMAP's PatchMatch", "stereo")
     except MissingExtra:
         return "pycolmap is not installed"
     if not pycolmap.has_cuda:

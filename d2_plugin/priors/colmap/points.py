@@ -2,7 +2,7 @@
 
 COLMAP would estimate the geometry of every pair of pictures anew to tell good matches from bad ones. The poses are
 known here, so a match is kept when it lies on its epipolar line: no random sampling, and pairs with a handful of
-matches still count. No other module imports pycolmap into this process.
+matches still count.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import itertools
 import math
 import os
 import tempfile
-import zlib  # noqa: F401  before pycolmap, whose own copy of zlib would otherwise be bound and crash later calls
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -23,7 +22,8 @@ import numpy as np
 
 from d2_plugin.arrays import read_array
 from d2_plugin.captures.capture import Camera, Capture
-from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.errors import D2Error
+from d2_plugin.extras import import_pycolmap
 from d2_plugin.priors.colmap.matching import Features, epipolar_matches, fundamental_matrix, same_spot
 from d2_plugin.settings import Angle, Positive, Range, Settings, Share
 
@@ -127,7 +127,7 @@ def triangulate(
     if len(images) != len(cameras):
         raise D2Error(f"{len(images)} pictures for {len(cameras)} cameras: give one picture per camera")
     settings = settings or TriangulationSettings()
-    pycolmap = import_pycolmap("triangulating sparse points")
+    pycolmap = import_pycolmap("triangulating sparse points", "stereo")
     with _quiet(pycolmap), tempfile.TemporaryDirectory(prefix="d2_sparse_") as folder:
         features = [_extract(pycolmap, image, settings) for image in images]
         pairs = _matched_pairs(features, cameras, settings)
@@ -150,19 +150,6 @@ def triangulate_frames(
         images = [capture.image(name, frame) for name in cameras]
         parts.append(triangulate(images, calibrations, frame, settings))
     return SparsePoints.joined(parts)
-
-
-def import_pycolmap(purpose: str) -> ModuleType:
-    """The `pycolmap` module, imported after zlib; `purpose` completes the sentence "<purpose> needs pycolmap".
-
-    Raises:
-        MissingExtra: where it is not installed.
-    """
-    try:
-        import pycolmap
-    except ImportError:
-        raise missing_extra("pycolmap", "stereo", purpose) from None
-    return pycolmap
 
 
 @contextmanager

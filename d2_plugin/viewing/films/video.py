@@ -19,7 +19,8 @@ import numpy as np
 
 from d2_plugin.captures.pictures import checked_picture, write_png
 from d2_plugin.durable import LEFTOVER, make_folder, remove_leftovers, writing
-from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.errors import D2Error
+from d2_plugin.extras import import_av
 from d2_plugin.locks import one_of_many
 from d2_plugin.reading import said
 from d2_plugin.values import checked_arguments
@@ -36,16 +37,8 @@ class Film(Protocol):
 
 
 def pyav() -> ModuleType:
-    """The module av.
-
-    Raises:
-        MissingExtra: where it is not installed.
-    """
-    try:
-        import av
-    except ImportError:
-        raise missing_extra("PyAV", "video", "writing videos") from None
-    return av
+    """The module av."""
+    return import_av("writing videos")
 
 
 @checked_arguments

@@ -1,0 +1,43 @@
+"""Packages of the extras that more than one room uses, imported where they are needed."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+import zlib  # noqa: F401  before pycolmap, whose own copy of zlib would otherwise be bound and crash later calls
+from types import ModuleType
+
+from d2_plugin.errors import missing_extra
+
+
+def import_pycolmap(purpose: str, extra: str) -> ModuleType:
+    """The module pycolmap; `purpose` completes the sentence "<purpose> needs pycolmap".
+
+    Its import makes SIGTERM print a stack trace of C++ and abort; this takes that back, in the main thread.
+
+    Raises:
+        MissingExtra: where it is not installed; the sentence names `extra`, the extra of this package that brings it.
+    """
+    first = "pycolmap" not in sys.modules
+    try:
+        import pycolmap
+    except ImportError:
+        raise missing_extra("pycolmap", extra, purpose) from None
+    before = signal.getsignal(signal.SIGTERM)
+    if first and before is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)
+    return pycolmap
+
+
+def import_av(purpose: str) -> ModuleType:
+    """The module av (PyAV, FFmpeg); `purpose` completes the sentence "<purpose> needs PyAV".
+
+    Raises:
+        MissingExtra: where it is not installed.
+    """
+    try:
+        import av
+    except ImportError:
+        raise missing_extra("PyAV", "video", purpose) from None
+    return av
