@@ -8,7 +8,7 @@ from typing import Any
 from d2_plugin.durable import Damaged, Kind, read_table
 from d2_plugin.errors import D2Error
 
-RUN = Kind("table of settings", 1, "give another --output, or remove that folder", since_seals=False)
+RUN = Kind("table of settings", 1, "run `d2 train` with another --output, or remove that folder", since_seals=False)
 """run.json."""
 
 METRICS = Kind("table of scores", 1, "run `d2 eval` on that folder", since_seals=False)
