@@ -114,9 +114,10 @@ class Band {
   }
 
  private:
-  // The target's rows that this band looks at, as numbers.
+  // The target's rows that this band looks at, as numbers. Rows are blurred ROWS together, so it looks at up to
+  // ROWS - 1 more than it needs.
   const float* numbers(std::vector<float>& memory) const {
-    const int64_t last = std::min(p_.height, end_ + 2 * RADIUS), count = (last - first_) * length_;
+    const int64_t last = std::min(p_.height, end_ + 2 * RADIUS + ROWS - 1), count = (last - first_) * length_;
     memory.resize(size_t(count));
     const uint8_t* from = p_.bytes + first_ * length_;
     float* to = memory.data();
