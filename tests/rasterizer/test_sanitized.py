@@ -1,4 +1,4 @@
-"""The GPU kernels under AddressSanitizer, in the fibre shim: no access outside of any array, in any order."""
+"""All kernels under AddressSanitizer, the GPU's in the fibre shim and in any order: no access outside of any array."""
 
 from __future__ import annotations
 
@@ -63,6 +63,29 @@ def test_no_kernel_leaves_its_arrays(module: str, chosen: str, environment: dict
     assert done.returncode == 0, said
     assert " passed" in done.stdout, said
     assert "AddressSanitizer" not in said, said
+
+
+WHOLE = """
+import sys
+import torch
+from d2_plugin.captures.export.folder import save_capture
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.commands.cli import main
+
+torch.set_num_threads(3)
+room = synthetic_capture(cameras=3, held_out=1, frames=2, width=133, height=99, arc_degrees=25)
+save_capture(room, sys.argv[1] + "/c")
+words = ["train", sys.argv[1] + "/c", "--train-cameras", "train0,train1,train2", "--output", sys.argv[1] + "/run"]
+sys.exit(main([*words, "--iterations", "30"]))
+"""
+
+
+def test_a_prior_and_a_training_stay_inside_their_arrays(tmp_path: Path, environment: dict[str, str]) -> None:
+    """The CPU's kernels, with more threads than one: stereo, rasterizer, losses, slices, optimizer."""
+    done = run(["-c", WHOLE, str(tmp_path)], environment)
+    assert done.returncode == 0, (done.stdout + done.stderr)[-4000:]
+    assert "PSNR" in done.stdout
+    assert {path.name.split("-")[0] for path in Path(environment["D2_CACHE"]).glob("*.so")} >= {"ssim", "adam"}
 
 
 BEYOND = """
