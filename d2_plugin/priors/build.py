@@ -185,7 +185,7 @@ class _Builder:
         common = (
             CONSTRUCTION_VERSION,
             settings.variant,
-            [settings.uncertainty, settings.conflict_sigmas, settings.tau_c],
+            [settings.uncertainty, settings.conflict_sigmas, settings.most_vetoed, settings.tau_c],
             [settings.z_far_factor, settings.hanging_limit, settings.far, settings.mono_along],
             asdict(settings.align),
             geometric,

@@ -31,7 +31,7 @@ from d2_plugin.priors.stereo.cache import DepthCache, StoredDepth
 from d2_plugin.priors.stereo.reuse import changed
 from d2_plugin.protocol import Label
 
-CONSTRUCTION_VERSION = 9  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 10  # raise it when alignment or fusion change what they return
 
 NO_GEOMETRY = "no geometric depth survived the filter"
 NO_MAP = "there is no monocular map of this frame"
@@ -155,6 +155,7 @@ class Construction:
             tau_c=settings.tau_c if variant == "dual_unaligned" else allowed,
             variant=variant,
             hanging=hanging,
+            most_vetoed=settings.most_vetoed if variant == "dual" else 1.0,
             sigma_mono=alone,
             sigma_geometric=stereo.sigma,
         )

@@ -88,6 +88,7 @@ def fuse(
     tau_c: float | np.ndarray,
     variant: Variant = "dual",
     hanging: np.ndarray | None = None,
+    most_vetoed: float = 1.0,
     sigma_mono: np.ndarray | None = None,
     sigma_geometric: np.ndarray | None = None,
 ) -> FusedPrior:
@@ -101,6 +102,8 @@ def fuse(
         tau_c: largest relative discrepancy of a verified pixel, one number or a map [H, W].
         variant: one of `VARIANTS`; `dual_unaligned` fuses like `dual` and expects the unaligned map as `mono`.
         hanging: bool [H, W], pixels whose monocular depth may verify but is left out where it would stand alone.
+        most_vetoed: where more than this share of the geometric depths disagree, the monocular map is wrong, and all of
+            them are verified; 1 is the paper.
         sigma_mono, sigma_geometric: relative standard deviations [H, W] of the two. Where they are left out, those of
             the paper: 0 at verified pixels and infinite elsewhere.
 
@@ -119,7 +122,10 @@ def fuse(
     elif variant == "dual_unverified":
         verified = geometric > 0
     else:
+        known = geometric > 0
         verified = verified_region(cross_source_discrepancy(mono, geometric), tau_c)
+        if np.count_nonzero(known & ~verified) > most_vetoed * np.count_nonzero(known):
+            verified = known
     depth, labels = _labelled(alone, geometric, verified)
     if sigma_mono is None or sigma_geometric is None:
         return FusedPrior(depth, labels, np.where(labels == Label.VERIFIED, 0, np.inf).astype(np.float32))

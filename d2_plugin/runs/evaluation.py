@@ -12,6 +12,7 @@ from torch import Tensor
 
 from d2_plugin.captures.capture import Capture
 from d2_plugin.captures.pictures import write_png
+from d2_plugin.durable import make_folder
 from d2_plugin.errors import D2Error
 from d2_plugin.runs import metrics
 from d2_plugin.runs.drawing import Panel, color_scale, colorize, side_by_side
@@ -87,7 +88,7 @@ def evaluate(
     if not views:
         raise D2Error("nothing to evaluate: give at least one camera and one frame")
     if output is not None:
-        output.mkdir(parents=True, exist_ok=True)
+        make_folder(output)
     rows: list[dict[str, Any]] = []
     networks = {"lpips": lpips, "lpips_vgg": lpips_vgg}
     still: np.ndarray | None = None  # what the camera sees where nothing moves

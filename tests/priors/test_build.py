@@ -187,7 +187,7 @@ def test_a_build_that_is_up_to_date_reads_each_monocular_map_once(
     ("strict", "loose"),
     [
         ({"uncertainty": False}, {"uncertainty": False, "tau_c": 0.5}),
-        ({"conflict_sigmas": 0.5}, {"conflict_sigmas": 3.0}),
+        ({"conflict_sigmas": 0.5, "most_vetoed": 1.0}, {"conflict_sigmas": 3.0, "most_vetoed": 1.0}),
     ],
 )
 def test_other_fusion_settings_reuse_the_stereo_cache(

@@ -57,6 +57,20 @@ def test_verification_by_a_map_judges_each_pixel_by_its_own_tolerance() -> None:
     np.testing.assert_array_equal(labels, [[Label.CONFLICT, Label.VERIFIED, Label.CONFLICT, Label.MONO, Label.EMPTY]])
 
 
+@pytest.mark.parametrize(("wrong", "kept"), [(1, False), (2, True)])
+def test_a_map_that_contradicts_more_than_stereo_is_ever_wrong_has_no_veto(wrong: int, kept: bool) -> None:
+    """PyDNet does not see who walks through studio: it contradicted half of the stereo there, of which 90 % was right."""
+    geometric = np.full((1, 150), 2.0, np.float32)
+    geometric[0, 100:] = 0
+    mono = np.full_like(geometric, 2.0)
+    mono[0, :wrong] = 5
+    prior = fuse(mono, geometric, tau_c=0.1, most_vetoed=0.01)
+    assert (prior.labels[0, :wrong] == (Label.VERIFIED if kept else Label.CONFLICT)).all()
+    assert (prior.labels[0, wrong:100] == Label.VERIFIED).all()
+    assert (prior.labels[0, 100:] == Label.MONO).all()
+    assert (fuse(mono, geometric, tau_c=0.1).labels[0, :wrong] == Label.CONFLICT).all(), "the paper's map may"
+
+
 @pytest.mark.parametrize(
     ("variant", "depth", "labels"),
     [

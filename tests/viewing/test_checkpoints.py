@@ -378,6 +378,11 @@ class TestRefused:
         (tmp_path / "a.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
         with pytest.raises(D2Error, match="no readable point cloud"):
             open_subject(tmp_path / "a.ply", room)
+        head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty " + b"f" * 5000 + b" x\nend_header\n"
+        (tmp_path / "a.ply").write_bytes(head)
+        with pytest.raises(D2Error) as refusal:
+            open_subject(tmp_path / "a.ply", room)
+        assert len(str(refusal.value)) < 1000
         assert main(["render", str(path), "--capture", str(room)]) == 2
         assert capsys.readouterr().err.count("\n") == 1
 

@@ -13,6 +13,7 @@ from typing import Annotated, Any, NamedTuple, get_args
 import torch
 
 from d2_plugin.captures.capture import MonoKind
+from d2_plugin.durable import make_folder
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.provenance import provenance
@@ -104,7 +105,7 @@ def bench_align(
         One row per method and case: `error` is F / F* - 1, `depth_error` the median relative error of aligned depth.
     """
     chosen = _chosen(names)
-    output.mkdir(parents=True, exist_ok=True)
+    make_folder(output)
     (output / "align.jsonl").unlink(missing_ok=True)
     rows: list[Row] = []
     for case in (AlignCase(*values) for values in _product(kinds, anchors, outliers)):

@@ -12,6 +12,7 @@ from typing import TypeVar
 import torch
 
 from d2_plugin.captures.checks.memory import BYTES_PER_PIXEL, check_bytes
+from d2_plugin.durable import make_folder
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.provenance import provenance
@@ -114,7 +115,7 @@ def bench_raster(
         One row per implementation, scene and size; the file also has one per setting of the thresholds, where errors
         are measured.
     """
-    output.mkdir(parents=True, exist_ok=True)
+    make_folder(output)
     names = [*scenes, *(["garden"] if garden and "garden" not in scenes else [])]
     cases = [Case(name, *parse_size(size), garden) for name in names for size in sizes]
     rows = []

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 import torch
 
+from d2_plugin.durable import make_folder
 from d2_plugin.errors import unknown_name
 from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.provenance import provenance
@@ -107,7 +108,7 @@ def bench_stereo(
     """
     chosen = [_on(method, device) for method in _chosen(makers, defaults_only)]
     loaded = [load_rigs(name, data, width) for name in rigs]
-    output.mkdir(parents=True, exist_ok=True)
+    make_folder(output)
     rows: list[Row] = []
     (output / "stereo.jsonl").unlink(missing_ok=True)
     for group in loaded:

@@ -20,6 +20,7 @@ from typing import Annotated, NamedTuple
 
 import torch
 
+from d2_plugin.durable import make_folder
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.settings import Range, Settings
@@ -162,7 +163,7 @@ def run(settings: GpuBench) -> str:
     unknown = [name for name in settings.steps if name not in STEPS]
     if unknown:
         raise D2Error(f"unknown step '{unknown[0]}': have {', '.join(STEPS)}")
-    settings.output.mkdir(parents=True, exist_ok=True)
+    make_folder(settings.output)
     command = command_line("bench gpu", settings)
     rows = []
     for name in settings.steps or STEPS:
