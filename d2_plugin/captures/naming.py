@@ -97,6 +97,9 @@ def by_camera(shots: Mapping[str, Shot], files: Mapping[str, Path]) -> dict[str,
 
 
 def _parts(name: str) -> list[str]:
-    *folders, last = PurePosixPath(name.replace("\\", "/")).parts
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    if not parts:
+        raise D2Error(f"a picture is called '{name}': every picture needs the name of its file")
+    *folders, last = parts
     stem = last[: -len(suffix)] if (suffix := PurePosixPath(last).suffix).lower() in PICTURE_SUFFIXES else last
     return [folder for folder in folders if folder not in (".", "..", "/", "images")] + [stem]

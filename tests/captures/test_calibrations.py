@@ -14,10 +14,11 @@ import zlib  # noqa: F401  (pycolmap brings a zlib of its own that must not come
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
 
-from calibration_writers import CASES, Known, anipose, cameras_json, easymocap, panoptic, pose2sim, rig
+from calibration_writers import CASES, Known, anipose, cameras_json, easymocap, panoptic, pose2sim, rig, transforms
 
 from d2_plugin.captures.calibrations import CalibratedCamera, open_calibration, read_calibration, scaled
 from d2_plugin.captures.calibrations.cameras_json import to_json
+from d2_plugin.captures.naming import arrange
 from d2_plugin.errors import D2Error
 
 POINTS = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3))
@@ -161,6 +162,33 @@ class TestRefusals:
         text = path.read_text().replace("pinhole" if change == "omni" else "radtan", change)
         path.write_text(text)
         self.refused(path, f"cam0 .* model {change}, .*pinhole-equi or pinhole-radtan")
+
+
+class TestDamaged:
+    """What 2,000 mutations of each format found."""
+
+    def test_a_camera_without_its_label_is_named_by_its_pictures(self, tmp_path: Path) -> None:
+        path = transforms(tmp_path, rig())
+        content = json.loads(path.read_text())
+        del content["frames"][1]["camera_label"]
+        path.write_text(json.dumps(content))
+        assert sorted(camera.name for camera in read_calibration(path)) == ["cam_0", "cam_1", "cam_2"]
+
+    @pytest.mark.parametrize("name", ["", "."])
+    def test_a_picture_without_a_name(self, name: str, tmp_path: Path) -> None:
+        (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
+        (tmp_path / "images.txt").write_text(f"1 1 0 0 0 0 0 0 1 {name}\n\n")
+        with pytest.raises(D2Error):
+            read_calibration(tmp_path)
+        with pytest.raises(D2Error, match="every picture needs the name of its file"):
+            arrange([name], lambda group: True)
+
+    def test_a_model_of_a_thousand_letters_is_told_in_a_few(self, tmp_path: Path) -> None:
+        (tmp_path / "cameras.txt").write_text(f"1 {'P' * 9000} 64 48 50 50 32 24\n")
+        (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 cam0/0.png\n\n")
+        with pytest.raises(D2Error) as refusal:
+            read_calibration(tmp_path)
+        assert len(str(refusal.value)) < 1000
 
 
 class TestNames:

@@ -37,10 +37,8 @@ def read(document: Document) -> list[Entry]:
     content = document.table()
     common = {key: value for key, value in content.items() if key != "frames"}
     listed = [_picture(frame, document.place) for frame in content["frames"]]
-    labels = {str(frame.get("camera_label", "")) for frame in content["frames"]}
-    if len(labels) == len(listed):  # one picture per camera, which says whose it is
-        named = {str(frame["camera_label"]): pair for frame, pair in zip(content["frames"], listed)}
-    else:
+    named = {str(frame["camera_label"]): (frame, matrix) for frame, matrix in listed if "camera_label" in frame}
+    if len(named) < len(listed):  # not one picture per camera, which says whose it is
         named = _cameras(listed)
     return [
         read_entry(name, {**common, **frame}, matrix, None, document.place) for name, (frame, matrix) in named.items()

@@ -17,7 +17,7 @@ import numpy as np
 from d2_plugin.captures.calibration import LARGEST_NUMBER, pinhole, rigid
 from d2_plugin.captures.lens import Lens, opencv_lens
 from d2_plugin.captures.rotations import rotation_of_quaternion
-from d2_plugin.errors import D2Error
+from d2_plugin.errors import LONGEST_NAME, D2Error
 from d2_plugin.reading import read_bytes, read_text, said
 
 MODELS = (
@@ -55,8 +55,8 @@ class ColmapCamera(NamedTuple):
         if kind in (("SIMPLE_RADIAL_FISHEYE", 4), ("RADIAL_FISHEYE", 5)):
             return Lens(pinhole(p[0], p[0], p[1], p[2]), p[3:], fisheye=True)
         raise D2Error(
-            f"{where} has a camera of model {self.model} with {len(p)} parameters, which cannot be undistorted here: "
-            "run `colmap image_undistorter` and give its output folder"
+            f"{where} has a camera of model {self.model[:LONGEST_NAME]} with {len(p)} parameters, which cannot be "
+            "undistorted here: run `colmap image_undistorter` and give its output folder"
         )
 
 

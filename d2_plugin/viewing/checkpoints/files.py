@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import read_bytes
-from d2_plugin.values import checked_arguments, shown
+from d2_plugin.reading import read_bytes, said
+from d2_plugin.values import checked_arguments
 
 MOST_PLY = 1 << 33
 """Bytes of a point cloud, at most."""
@@ -91,7 +91,7 @@ def read_ply(path: Path) -> dict[str, Tensor]:
         fields = [line.split()[1:] for line in head if line.startswith("property") and " list " not in line]
         table = np.frombuffer(data, np.dtype([(name, KINDS[kind]) for kind, name in fields]), count, end)
     except (ValueError, KeyError, IndexError, StopIteration, UnicodeDecodeError) as error:
-        raise D2Error(f"{path} is no readable point cloud ({shown(str(error))}): export it again") from None
+        raise D2Error(f"{path} is no readable point cloud ({said(error)}): export it again") from None
     return {name: torch.from_numpy(table[name].astype(np.float32)) for name in table.dtype.names or ()}
 
 
