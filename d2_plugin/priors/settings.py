@@ -49,8 +49,8 @@ class PriorSettings(Settings):
     """Where a map contradicts more than this share of a view's geometric depths, the map is wrong, and all of them stay
     (`dual` with `uncertainty`): .1 to 1 % of filtered stereo are off by over 5 %. 1 lets every map veto. Measured: maps
     that belong to their pictures contradict .1 to .6 % (studio, plaza, a room; two to four views), PyDNet 1.7 to 2.8 %,
-    and of those 85 to 99 % are right, people who walk above all. Studio with PyDNet, 5 frames, 500 steps, two seeds:
-    26.8 dB (of what moves 20.5) where it may veto, 28.0 (23.6) where not; plaza 19.0 and 19.1."""
+    and of those 85 to 99 % are right, people who walk above all. Studio with PyDNet, 5 frames, 500 steps, three seeds:
+    26.7 dB (of what moves 20.5) where it may veto, 28.0 (23.6) where not; plaza, one seed, 19.0 and 19.1."""
     tau_c: NotNegative = 0.1
     """A geometric depth is verified when aligned monocular depth differs by less than this share of it (without
     `uncertainty`). Measured on studio at .05, .1, .15: verified 33.2, 33.8, 34.1 % of the pixels, of which .1, .4, .7 %
