@@ -20,7 +20,7 @@ pytest.importorskip("cv2")
 @pytest.fixture(scope="module")
 def pose2sim(shared_data: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Filmed:
     capture = open_capture(shared_data("pose2sim_single"))
-    cut = select_frames(capture, capture.frames[:8])
+    cut = select_frames(capture, capture.frames[:20])
     return film(cut, tmp_path_factory.mktemp("pose2sim"), {name: Shooting() for name in capture.cameras})
 
 
