@@ -87,7 +87,8 @@ def import_videos(settings: ImportSettings, told: Told = lambda line: None) -> I
         remove_leftovers(folder)
         if solved is not None:
             claimed.kept(folder, "rig", lambda: solved)
-            write_text(folder / "calibration.json", json_text(solved, "calibration.json", indent=1) + "\n")
+            table = json_text(solved, "calibration.json", indent=1, sort_keys=True)  # as the one that is kept has them
+            write_text(folder / "calibration.json", table + "\n")
         clocks = _clocks(settings, folder, videos, cameras)
         told(_said_of_clocks(clocks, videos))
         grid = grid_of(videos, clocks, settings.rate, settings.times, settings.frames)
