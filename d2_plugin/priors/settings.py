@@ -48,7 +48,7 @@ class PriorSettings(Settings):
     most_vetoed: Share = 0.01
     """Where a map contradicts more than this share of a view's geometric depths, the map is wrong, and all of them stay
     (`dual` with `uncertainty`): .1 to 1 % of filtered stereo are off by over 5 %. 1 lets every map veto. Measured: maps
-    that belong to their pictures contradict .1 to .6 % (studio, plaza, a room; two to four views), PyDNet 1.7 to 2.8 %,
+    that belong to their pictures contradict 0 to .6 % (studio, plaza, a room; two to four views), PyDNet 1.7 to 2.8 %,
     and of those 85 to 99 % are right, people who walk above all. Studio with PyDNet, 5 frames, 500 steps, three seeds:
     26.7 dB (of what moves 20.5) where it may veto, 28.0 (23.6) where not; plaza, one seed, 19.0 and 19.1."""
     tau_c: NotNegative = 0.1

@@ -59,7 +59,7 @@ def test_verification_by_a_map_judges_each_pixel_by_its_own_tolerance() -> None:
 
 @pytest.mark.parametrize(("wrong", "kept"), [(1, False), (2, True)])
 def test_a_map_that_contradicts_more_than_stereo_is_ever_wrong_has_no_veto(wrong: int, kept: bool) -> None:
-    """PyDNet does not see who walks through studio, and contradicted half of the stereo there: 90 % of it was right."""
+    """PyDNet contradicted half of the stereo on who walks through studio; 90 % of all it contradicted was right."""
     geometric = np.full((1, 150), 2.0, np.float32)
     geometric[0, 100:] = 0
     mono = np.full_like(geometric, 2.0)
