@@ -49,6 +49,8 @@ DARK = 20
 """Of 255: a darker pixel does not tell how differently two cameras are exposed."""
 FEWEST = 100
 """Nor do fewer pixels than this that both verified."""
+COMPARED = 8000
+"""About how many verified pixels are compared for it, evenly over the picture."""
 STEPS = 3
 """Secant steps along the ray."""
 MET = 3e-3
@@ -234,6 +236,8 @@ def _as_seen_by(points: _Points, gain: np.ndarray) -> _Points:
 def _gain(ours: _View, theirs: _View, pair: ViewPair) -> np.ndarray:
     """How much brighter the other camera shows what both verified, per channel [3]; 1 where that is too little."""
     rows, columns = np.nonzero(ours.surface)
+    every = max(len(rows) // COMPARED, 1)
+    rows, columns = rows[::every], columns[::every]
     if ours.colors is None or theirs.colors is None or len(rows) < FEWEST:
         return np.ones(3, np.float32)
     depth, mine = ours.surface[rows, columns].astype(np.float64), ours.colors[rows, columns].astype(np.float32)
