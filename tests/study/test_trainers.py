@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from mimics.workplace import furnish
 
 from d2_plugin import D2Error
 from d2_plugin.attach.recipes import RECIPES
-from d2_plugin.study.trainers import prepare, trial_run
+from d2_plugin.study.trainers import inside, prepare, trial_run
 from d2_plugin.study.trainers.bench import TrainersBench, run
 from d2_plugin.study.trainers.page import read_rows, replaced, table
 from d2_plugin.study.trainers.prepare import Prepared, Recording
@@ -24,7 +27,7 @@ TESTS = Path(__file__).parents[1]
 
 def job(folder: Path) -> Job:
     folder.mkdir(exist_ok=True)
-    return Job(folder / "data", folder, iterations=200, seed=7, frames=5, seconds=0.25)
+    return Job(folder / "data", folder, iterations=200, frames=5, seconds=0.25)
 
 
 def row(method: str, psnr: dict, seed: int | None = 0, **more: object) -> dict:
@@ -51,11 +54,11 @@ class TestTable:
         assert "DIFFERS" in table([ROWS[0], ROWS[1] | {"digest": "c"}, ROWS[2]])
         assert "DIFFERS" in table([ROWS[0], ROWS[1] | {"psnr": {"50": 20.0, "200": 21.0001}}, ROWS[2]])
 
-    def test_several_seeds_are_a_mean_and_a_deviation(self) -> None:
+    def test_several_seeds_are_a_mean_and_its_standard_error(self) -> None:
         more = [row("bare", {"200": 22.0}, 1), row("attached", {"200": 26.0}, 1)]
         text = table([*ROWS, *more])
-        assert "21.50 ± 0.71" in text
-        assert "+3.50 ± 0.71" in text
+        assert "21.50 ± 0.50" in text
+        assert "+3.50 ± 0.50" in text
 
     def test_what_did_not_run_is_named_below(self) -> None:
         text = table([row("bare", {}, failed="ended with code 2: no wheel")])
@@ -180,6 +183,24 @@ def test_mistakes_are_one_sentence(tmp_path: Path) -> None:
 
 def test_a_checkout_is_known_by_its_commit(tmp_path: Path) -> None:
     assert trial_run.commit_of(tmp_path) is None
+
+
+def test_a_script_that_sets_its_own_seed_gets_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, name in ((random, "seed"), (np.random, "seed"), (torch, "manual_seed")):
+        monkeypatch.setattr(module, name, getattr(module, name))
+
+    def drawn() -> list[float]:
+        random.seed(0), np.random.seed(0), torch.manual_seed(0)  # as the trainers' safe_state does
+        return [random.random(), np.random.rand(), torch.rand(()).item()]
+
+    with torch.random.fork_rng():
+        plain = drawn()
+        inside.move_seeds(0)
+        assert drawn() == plain
+        inside.move_seeds(3)
+        moved = drawn()
+        assert all(a != b for a, b in zip(plain, moved, strict=True))
+        assert drawn() == moved
 
 
 CHECKOUTS = os.environ.get("D2_CHECKOUTS")

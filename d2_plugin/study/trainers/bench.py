@@ -43,7 +43,7 @@ class TrainersBench(Settings):
     iterations: Annotated[int, Range(10, unit="iterations")] = 300
     """Length of each run."""
     seeds: tuple[Seed, ...] = (0,)
-    """Of the repositories whose seed is an option; the others set their own and run once."""
+    """Added to every seed that a script sets; 0 is the script as it is. A claim needs three."""
     frames: Annotated[int, Range(2)] = 9
     """Frames of each recording, from the first."""
     downscale: Annotated[int, Range(1)] = 2
@@ -90,7 +90,7 @@ def rows_of(name: str, settings: TrainersBench) -> Iterator[Row]:
     command = command_line("bench trainers", settings)
     for capture in settings.captures:
         prepared = prepare(Recording(capture.resolve(), settings.frames, settings.downscale), trial, settings.work)
-        for seed in settings.seeds if trial.seeded else settings.seeds[:1]:
+        for seed in settings.seeds:
             for method in settings.methods:
                 folder = settings.work / "runs" / f"{name}-{capture.name}-{method.replace(' ', '-')}-{seed}"
                 checkout = settings.checkouts / trial.folder

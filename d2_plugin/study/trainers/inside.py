@@ -1,16 +1,17 @@
 """The process of one official trainer: the launcher's work, and afterwards what cannot be asked from outside.
 
-    python -m d2_plugin.study.trainers.inside OUTCOME [HELD_OUT] -- fudan --cpu --d2 d2.toml -- train.py ...
+    python -m d2_plugin.study.trainers.inside OUTCOME SEED [HELD_OUT] -- fudan --cpu --d2 d2.toml -- train.py ...
 
-writes how many Gaussians there are and a digest of all trained numbers to OUTCOME (JSON), so that two runs can be told
-to be the same to the last bit. Two repositories print no report of held-out cameras; for them it prints one line, of
-pictures that their own code reads, draws and compares.
+adds SEED to every seed that the script sets, and writes how many Gaussians there are and a digest of all trained numbers
+to OUTCOME (JSON), so that two runs can be told to be the same to the last bit. Two repositories print no report of
+held-out cameras; for them it prints one line, of pictures that their own code reads, draws and compares.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
+import random
 import runpy
 import sys
 import time
@@ -18,6 +19,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,8 +34,10 @@ def main(words: list[str]) -> int:
 
     logging.basicConfig(level=logging.INFO, format="d2: %(message)s")
     at = words.index("--")
-    places, (options, command) = [Path(word) for word in words[:at]], parsed(words[at + 1 :])
+    outcome_file, seed, *held_out = words[:at]
+    options, command = parsed(words[at + 1 :])
     objects = Objects()
+    move_seeds(int(seed))
     try:
         found = prepare(options, command)
         kind = SESSIONS[found.kind]
@@ -53,12 +57,23 @@ def main(words: list[str]) -> int:
         session.end()
         telling = session.hooks.telling
         outcome |= {"inserted": telling.inserted, "removed": telling.removed}
-    places[0].write_text(json_text(outcome, str(places[0])), encoding="utf-8")
+    Path(outcome_file).write_text(json_text(outcome, outcome_file), encoding="utf-8")
     if options.repository in SCORERS:
-        psnr = SCORERS[options.repository](objects, *places[1:])
+        psnr = SCORERS[options.repository](objects, *map(Path, held_out))
         assert sys.__stdout__ is not None  # the trainers' safe_state puts another sys.stdout into its place
         sys.__stdout__.write(f"\n[held out] iteration {objects.options.iterations}: PSNR {psnr}\n")
     return 0
+
+
+def move_seeds(by: int) -> None:
+    """From now on random, numpy and torch take every seed plus `by`: most trainers set a constant."""
+
+    def moved(original: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda seed=None, *more: original(seed if seed is None else seed + by, *more)
+
+    if by:
+        for module, name in ((random, "seed"), (np.random, "seed"), (torch, "manual_seed")):
+            setattr(module, name, moved(getattr(module, name)))
 
 
 def tensors(model: Any) -> Iterator[tuple[str, Tensor]]:

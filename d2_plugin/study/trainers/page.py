@@ -104,10 +104,11 @@ def worst(bare: Sequence[Row], attached: Sequence[Row]) -> str:
 
 
 def _spread(values: Sequence[float], sign: str = "") -> str:
+    """Mean and its standard error; of one value no error is known."""
     if not values:
         return "-"
     text = f"{mean(values):{sign}.2f}"
-    return f"{text} ± {stdev(values):.2f}" if len(values) > 1 else text
+    return f"{text} ± {stdev(values) / len(values) ** 0.5:.2f}" if len(values) > 1 else text
 
 
 def replaced(text: str, tables: str, where: str) -> str:

@@ -35,12 +35,12 @@ def trial_row(
     recording = prepared.recording
     row: Row = {"repository": name, "source": trial.source, "checkout": commit_of(checkout)}
     row |= {"capture": recording.capture.name, "frames": recording.frames, "downscale": recording.downscale}
-    row |= {"method": method, "iterations": iterations, "seed": seed if trial.seeded else None}
+    row |= {"method": method, "iterations": iterations, "seed": seed}
     row |= {"scored_on": trial.scored_on, "psnr": {}, "failed": None}
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    job = Job(prepared.data, folder.resolve(), iterations, seed, recording.frames, recording.seconds)
-    code, printed = _run(_words(name, trial, job, prepared, method), checkout, job.output / "log.txt")
+    job = Job(prepared.data, folder.resolve(), iterations, recording.frames, recording.seconds)
+    code, printed = _run(_words(name, trial, job, prepared, method, seed), checkout, job.output / "log.txt")
     outcome = job.output / "outcome.json"
     if code != 0 or not outcome.is_file():
         last = [line for line in printed.splitlines() if line.strip()][-1:]
@@ -49,8 +49,8 @@ def trial_row(
     return row | parse_json(read_text(outcome, "run it again"), str(outcome), "run it again")
 
 
-def _words(name: str, trial: Trial, job: Job, prepared: Prepared, method: str) -> list[str]:
-    words = ["-m", "d2_plugin.study.trainers.inside", str(job.output / "outcome.json")]
+def _words(name: str, trial: Trial, job: Job, prepared: Prepared, method: str, seed: int) -> list[str]:
+    words = ["-m", "d2_plugin.study.trainers.inside", str(job.output / "outcome.json"), str(seed)]
     words += [str(prepared.held_out)] if prepared.held_out is not None else []
     words += ["--", name, *(() if _has_gpu() else ("--cpu",))]
     if method in CONFIGURATIONS:
