@@ -2,9 +2,9 @@
 
     python -m d2_plugin.study.trainers.inside OUTCOME SEED [HELD_OUT] -- fudan --cpu --d2 d2.toml -- train.py ...
 
-adds SEED to every seed that the script sets, and writes how many Gaussians there are and a digest of all trained numbers
-to OUTCOME (JSON), so that two runs can be told to be the same to the last bit. Two repositories print no report of
-held-out cameras; for them it prints one line, of pictures that their own code reads, draws and compares.
+adds SEED to every seed that the script sets, and writes how many Gaussians there are and a digest of all trained
+numbers to OUTCOME (JSON), so that two runs can be told to be the same to the last bit. Two repositories print no report
+of held-out cameras; for them it prints one line, of pictures that their own code reads, draws and compares.
 """
 
 from __future__ import annotations
