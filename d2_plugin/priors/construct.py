@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,8 @@ from d2_plugin.priors.disk.stored import planar
 from d2_plugin.priors.evidence import with_evidence
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.fuse import FusedPrior, empty_prior, fuse, hanging_pixels
-from d2_plugin.priors.monocular.align import Alignment, align, aligned_depth, aligned_inverse, not_aligned
+from d2_plugin.priors.monocular.across import Shown, aligned_across
+from d2_plugin.priors.monocular.align import Alignment, AlignStatus, align, aligned_depth, aligned_inverse, not_aligned
 from d2_plugin.priors.monocular.correct import corrected_depth
 from d2_plugin.priors.monocular.far import far_pixels
 from d2_plugin.priors.monocular.maps import MonoSource
@@ -31,7 +32,7 @@ from d2_plugin.priors.stereo.cache import DepthCache, StoredDepth
 from d2_plugin.priors.stereo.reuse import changed
 from d2_plugin.protocol import Label
 
-CONSTRUCTION_VERSION = 10  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 11  # raise it when alignment or fusion change what they return
 
 NO_GEOMETRY = "no geometric depth survived the filter"
 NO_MAP = "there is no monocular map of this frame"
@@ -76,6 +77,16 @@ class AlignedMap:
     """Aligned inverse depth [H, W], also where it is no depth: 0 and below is infinitely far."""
 
 
+class Sources(NamedTuple):
+    """What there is of one view before anything is made of it."""
+
+    stereo: StoredDepth
+    prediction: np.ndarray | None
+    """The monocular map [H, W]; None where there is none."""
+    alignment: Alignment | None
+    """Of that map; None where nothing asks for one."""
+
+
 class Construction:
     """Turns the two depths of a frame into D*.
 
@@ -107,7 +118,10 @@ class Construction:
         """D* of the wanted cameras of one frame; cameras that must agree need each other's, and all come back."""
         geometric = {} if self.geometric is None else self.geometric.depths(frame)
         names = self.cameras if self.agrees else wanted
-        views = {name: self._view(name, frame, geometric.get(name)) for name in names}
+        sources = {name: self._sources(name, frame, geometric.get(name)) for name in names}
+        if self.agrees and self.settings.align.across:
+            sources = self._across(sources)
+        views = {name: self._view(name, frame, found) for name, found in sources.items()}
         if not self.agrees:
             return views
         maps = {name: view.maps for name, view in views.items()}
@@ -115,17 +129,35 @@ class Construction:
         informed = with_evidence(maps, self.cameras, self.settings.agreement, tails)
         return {name: replace(view, maps=informed[name]) for name, view in views.items()}
 
-    def _view(self, name: str, frame: Frame, stereo: StoredDepth | None) -> ViewPrior:
-        """D* of one camera, before it is compared with the others."""
-        image = frame.images[name]
-        nothing = np.zeros(image.shape[:2], np.float32)
+    def _sources(self, name: str, frame: Frame, stereo: StoredDepth | None) -> Sources:
+        """Both depths of one camera and the alignment that they alone give."""
         if stereo is None:
+            nothing = np.zeros(frame.images[name].shape[:2], np.float32)
             stereo = StoredDepth(nothing, np.full_like(nothing, np.inf), {})
         recorded = frame.recorded.get(name)
         if recorded is not None:
             sigma = np.where(recorded, stereo.sigma, np.float32(np.inf))
             stereo = replace(stereo, depth=stereo.depth * recorded, sigma=sigma)
-        mono = self._aligned(name, frame, stereo.depth)
+        prediction = self._prediction(name, frame)
+        if self.mono is None or prediction is None or (self.geometric is None and self.mono.kind == "relative"):
+            return Sources(stereo, prediction, None)
+        return Sources(stereo, prediction, self._fit(name, frame, prediction, stereo.depth, self.mono.kind))
+
+    def _across(self, sources: dict[str, Sources]) -> dict[str, Sources]:
+        """The same, with the alignments that only other cameras' maps can tell."""
+        assert self.mono is not None
+        shown = {
+            name: Shown(self.cameras[name], found.prediction, found.stereo.depth, found.alignment)
+            for name, found in sources.items()
+            if found.prediction is not None and found.alignment is not None
+        }
+        told = aligned_across(shown, self.mono.kind, self.settings.align)
+        return sources | {name: sources[name]._replace(alignment=alignment) for name, alignment in told.items()}
+
+    def _view(self, name: str, frame: Frame, sources: Sources) -> ViewPrior:
+        """D* of one camera, before it is compared with the others."""
+        image, stereo, recorded = frame.images[name], sources.stereo, frame.recorded.get(name)
+        mono = self._aligned(name, frame, sources)
         maps = self._fused(mono, stereo)
         if self.settings.far and self.settings.variant == "dual" and mono.inverse is not None:
             maps = _with_far(maps, far_pixels(mono.inverse, stereo.depth, image), stereo.depth)
@@ -160,18 +192,16 @@ class Construction:
             sigma_geometric=stereo.sigma,
         )
 
-    def _aligned(self, name: str, frame: Frame, geometric: np.ndarray) -> AlignedMap:
+    def _aligned(self, name: str, frame: Frame, sources: Sources) -> AlignedMap:
         """The monocular map in world units, where there is one and its scale can be known."""
+        geometric, prediction, alignment = sources.stereo.depth, sources.prediction, sources.alignment
         nothing = np.zeros_like(geometric)
         if self.mono is None:
             return AlignedMap(nothing, refused="" if geometric.any() else NO_GEOMETRY)
-        sure = self.confidence.of(self.cameras[name], frame.number)
-        prediction = self._prediction(name, frame)
         if prediction is None:
             return AlignedMap(nothing, refused=NO_MAP)
-        if self.geometric is None and self.mono.kind == "relative":
+        if alignment is None:
             return AlignedMap(nothing, refused=SCALE_UNKNOWN)
-        alignment = self._fit(name, frame, prediction, geometric, self.mono.kind)
         if not alignment.accepted:
             return AlignedMap(nothing, alignment, alignment.status.value)
         anchors = geometric[geometric > 0]
@@ -181,8 +211,12 @@ class Construction:
             return AlignedMap(aligned, alignment)
         depth = corrected_depth(aligned, geometric, self.settings.align)
         known = self.settings.uncertainty and anchors.size > 0
+        sure = self.confidence.of(self.cameras[name], frame.number)
         asked = aligned, geometric, self.settings.align, sure, self.mono.kind
         uncertainty = monocular_uncertainty(*asked) if known else None
+        if uncertainty is not None and (alignment.status is AlignStatus.ACROSS or np.isnan(uncertainty.skill.scale)):
+            shared = np.where(depth > 0, np.float32(alignment.across), np.float32(np.inf))
+            uncertainty = uncertainty._replace(sigma=np.fmin(uncertainty.sigma, shared))
         return AlignedMap(depth, alignment, "", uncertainty, aligned_inverse(prediction, alignment))
 
     def _prediction(self, name: str, frame: Frame) -> np.ndarray | None:

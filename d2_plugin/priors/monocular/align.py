@@ -29,6 +29,7 @@ class AlignStatus(StrEnum):
     """Outcome of an alignment; the value is the sentence that a person reads."""
 
     OK = "aligned"
+    ACROSS = "aligned by the surfaces that it shares with other cameras' maps: its own anchors span too little"
     EMPTY = "no pixel has both a monocular and a geometric depth"
     TOO_FEW = "too few pixels have both a monocular and a geometric depth"
     FLAT = "the monocular map is constant where geometric depth is known, so scale and shift cannot be told apart"
@@ -63,11 +64,13 @@ class Alignment:
     inliers: float = 0.0
     t: float = 0.0
     rank_correlation: float = 0.0
+    across: float = float("nan")
+    """Relative standard deviation of the map as other cameras' maps tell it, where they were asked (`across`)."""
 
     @property
     def accepted(self) -> bool:
         """Whether aligned depth may be used at all."""
-        return self.status in (AlignStatus.OK, AlignStatus.NOT_ALIGNED)
+        return self.status in (AlignStatus.OK, AlignStatus.ACROSS, AlignStatus.NOT_ALIGNED)
 
     def as_json(self) -> dict[str, object]:
         """Plain values for the record beside a stored prior; NaN becomes None."""

@@ -56,5 +56,8 @@ class AlignSettings(Settings):
     """Fit the lines of all frames of a block (`stereo.reuse_block`) together: aligned maps must agree where the picture
     did not change. Off: on studio and plaza errors stay the same and maps are steadier by a hundredth, while pictures
     are read twice; docs/priors.md, "Alignment", has the figures."""
+    across: bool = True
+    """Where the anchors of a map span too little of it to tell a slope, take the slope with which it shows the same
+    surfaces as other cameras' maps do (`d2_plugin.priors.monocular.across`); with `agreement` alone."""
     seed: Seed = 0
-    """Seed of the subsampling and of the leverage guard."""
+    """Seed of the subsampling, of the leverage guard and of the samples that are compared between cameras."""
