@@ -1,0 +1,212 @@
+"""Slopes from surfaces that maps share: right where anchors cannot tell them, nothing where maps do not belong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from d2_plugin.captures import open_capture
+from d2_plugin.captures.capture import Camera, Capture, MonoKind
+from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.priors.build import build_priors
+from d2_plugin.priors.monocular.across import Shown, aligned_across, is_open
+from d2_plugin.priors.monocular.align import AlignStatus, align
+from d2_plugin.priors.monocular.settings import AlignSettings
+from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.priors.store import PriorStore
+
+cv2 = pytest.importorskip("cv2")
+
+ALIGN = AlignSettings()
+SIDE = 16
+"""Of the one patch that stereo knows, pixels."""
+
+
+@pytest.fixture(scope="module")
+def room() -> Capture:
+    return synthetic_capture(cameras=3, held_out=0, frames=1, width=160, height=90, arc_degrees=80)
+
+
+def patch(depth: np.ndarray, seed: int, bend: float = 0.0) -> np.ndarray:
+    """The depths of one small square, the flattest of some, as if `bend` off at its ends; 0 elsewhere."""
+    rng = np.random.default_rng(seed)
+    corners = [[rng.integers(0, size - SIDE) for size in depth.shape] for _ in range(100)]
+    squares = [np.s_[row : row + SIDE, column : column + SIDE] for row, column in corners]
+    flattest = min(squares, key=lambda square: depth[square].max() / max(depth[square].min(), 1e-9))
+    known = np.zeros_like(depth)
+    known[flattest] = depth[flattest] * (1 + bend * np.linspace(-1, 1, SIDE))
+    return known
+
+
+def shown(
+    room: Capture,
+    kind: MonoKind = "relative",
+    names: tuple[str, ...] | None = None,
+    turned: Callable[[str, np.ndarray], np.ndarray] | None = None,
+    unit: float = 1.0,
+) -> dict[str, Shown]:
+    """Each camera with a map that is exact but for its line (or `turned`), and one patch of depth, in `unit`s."""
+    views = {}
+    for number, name in enumerate(names or tuple(room.cameras)):
+        depth = room.depth(name, 0).astype(np.float64)
+        mono = ((1 / depth if kind == "relative" else depth) - 0.02 * number) / (0.5 + number)
+        mono = (mono if turned is None else turned(name, mono)).astype(np.float32)
+        pose = np.array(room.cameras[name].T_camera_world)
+        pose[:3, 3] *= unit
+        camera = Camera(name, room.cameras[name].width, room.cameras[name].height, room.cameras[name].K, pose)
+        geometric = (unit * patch(depth, number, 0.004)).astype(np.float32)
+        views[name] = Shown(camera, mono, geometric, align(mono, geometric, kind=kind, settings=ALIGN))
+    return views
+
+
+def error(room: Capture, name: str, view: Shown, scale: float, shift: float, kind: MonoKind = "relative") -> float:
+    """Median relative error of the depth that a line gives."""
+    turned = scale * view.mono.astype(np.float64) + shift
+    depth = 1 / np.maximum(turned, 1e-6) if kind == "relative" else turned
+    return float(np.median(np.abs(depth / room.depth(name, 0) - 1)))
+
+
+@pytest.mark.parametrize("kind", ["relative", "metric"])
+def test_the_slopes_are_found_that_one_patch_of_depth_leaves_open(room: Capture, kind: MonoKind) -> None:
+    views = shown(room, kind)
+    assert all(is_open(view) for view in views.values())
+    found = aligned_across(views, kind, ALIGN)
+    assert set(found) == set(views)
+    before = [error(room, name, view, *line(view.alignment), kind) for name, view in views.items()]
+    after = [error(room, name, views[name], *line(alignment), kind) for name, alignment in found.items()]
+    assert max(after) < 0.03
+    assert max(before) > 2 * max(after)
+    for alignment in found.values():
+        assert alignment.status is AlignStatus.ACROSS
+        assert alignment.accepted
+        assert alignment.across < 0.1
+
+
+def line(alignment: object) -> tuple[float, float]:
+    return alignment.scale, alignment.shift  # type: ignore[attr-defined]
+
+
+@settings(max_examples=6, deadline=None)
+@given(st.floats(-6, 6), st.floats(-6, 6), st.floats(-5, 5))
+def test_neither_the_unit_of_the_world_nor_that_of_a_map_matters(world: float, scale: float, shift: float) -> None:
+    room = synthetic_capture(cameras=2, held_out=0, frames=1, width=96, height=54, arc_degrees=60)
+
+    def other(name: str, mono: np.ndarray) -> np.ndarray:
+        return (mono + shift) * 10**scale
+
+    plain = aligned_across(shown(room), "relative", ALIGN)
+    scaled = aligned_across(shown(room, turned=other, unit=10**world), "relative", ALIGN)
+    assert set(plain) == set(scaled)
+    for name, view in shown(room, turned=other).items():
+        depth = 1 / (scaled[name].scale * view.mono.astype(np.float64) + scaled[name].shift) / 10**world
+        expected = 1 / (plain[name].scale * shown(room)[name].mono + plain[name].shift)
+        assert np.median(np.abs(depth / expected - 1)) < 0.02
+
+
+def test_maps_with_spread_anchors_keep_their_lines_and_help_the_others(room: Capture) -> None:
+    views = shown(room)
+    spread = {}
+    for name, view in views.items():
+        depth = (room.depth(name, 0) * (np.random.default_rng(0).random(view.mono.shape) < 0.05)).astype(np.float32)
+        spread[name] = view._replace(
+            geometric=depth, alignment=align(view.mono, depth, kind="relative", settings=ALIGN)
+        )
+    assert aligned_across(spread, "relative", ALIGN) == {}, "nothing is open"
+    one = next(iter(views))
+    found = aligned_across({**spread, one: views[one]}, "relative", ALIGN)
+    assert error(room, one, views[one], *line(found[one])) < 0.03
+    for name in set(spread) - {one}:
+        assert found[name].status is AlignStatus.OK
+        assert line(found[name]) == line(spread[name].alignment)
+        assert found[name].across < 0.1, "how far the map parts from the others is told as well"
+
+
+def noise(name: str, mono: np.ndarray) -> np.ndarray:
+    lumps = cv2.GaussianBlur(np.random.default_rng(len(name)).random(mono.shape), (0, 0), 5)
+    return mono.min() + np.ptp(mono) * (lumps - lumps.min()) / np.ptp(lumps)
+
+
+@pytest.mark.parametrize("wrong", [noise, lambda name, mono: mono[::-1], lambda name, mono: mono.max() - mono])
+def test_maps_that_show_no_common_surface_are_told_nothing(
+    room: Capture, wrong: Callable[[str, np.ndarray], np.ndarray]
+) -> None:
+    views = shown(room, turned=wrong)
+    assert not [view for view in aligned_across(views, "relative", ALIGN).values() if view.status is AlignStatus.ACROSS]
+
+
+def test_one_wrong_map_is_left_out_and_the_others_are_told(room: Capture) -> None:
+    last = list(room.cameras)[-1]
+    views = shown(room, turned=lambda name, mono: mono[::-1, ::-1] if name == last else mono)
+    found = aligned_across(views, "relative", ALIGN)
+    assert set(found) == set(views) - {last}
+    assert max(error(room, name, views[name], *line(found[name])) for name in found) < 0.05
+
+
+class TestStiff:
+    def test_one_camera_alone_is_told_nothing(self, room: Capture) -> None:
+        assert aligned_across(shown(room, names=tuple(room.cameras)[:1]), "relative", ALIGN) == {}
+
+    def test_a_map_without_anchors_is_left_out(self, room: Capture) -> None:
+        views = shown(room)
+        first = next(iter(views))
+        empty = np.zeros_like(views[first].geometric)
+        bare = views[first]._replace(
+            geometric=empty, alignment=align(views[first].mono, empty, kind="relative", settings=ALIGN)
+        )
+        found = aligned_across(views | {first: bare}, "relative", ALIGN)
+        assert set(found) == set(views) - {first}
+
+    @pytest.mark.parametrize("value", [np.nan, 0.0])
+    def test_pixels_without_a_prediction_are_asked_nothing(self, room: Capture, value: float) -> None:
+        def half(name: str, mono: np.ndarray) -> np.ndarray:
+            holes = np.indices(mono.shape).sum(0) % 2 == 0
+            return np.where(holes, value, mono)
+
+        found = aligned_across(shown(room, turned=half), "relative", ALIGN)
+        assert max(error(room, name, shown(room)[name], *line(found[name])) for name in found) < 0.03
+
+    def test_a_constant_map_is_not_open_and_anchors_of_one_depth_are(self, room: Capture) -> None:
+        view = next(iter(shown(room).values()))
+        constant = np.full_like(view.mono, 0.5)
+        flat = align(constant, view.geometric, kind="relative", settings=ALIGN)
+        assert not is_open(view._replace(mono=constant, alignment=flat))
+        level = np.where(view.geometric > 0, view.geometric.max(), 0).astype(np.float32)
+        alignment = align(view.mono, level, kind="relative", settings=ALIGN)
+        assert is_open(view._replace(geometric=level, alignment=alignment))
+
+    def test_cameras_that_look_away_from_each_other_tell_nothing(self, room: Capture) -> None:
+        views = shown(room, names=tuple(room.cameras)[:2])
+        name, view = list(views.items())[1]
+        back = np.array(view.camera.T_camera_world)
+        back[[0, 2]] *= -1  # about its own vertical axis
+        away = Camera(name, view.camera.width, view.camera.height, view.camera.K, back)
+        assert aligned_across(views | {name: view._replace(camera=away)}, "relative", ALIGN) == {}
+
+
+def test_two_cameras_far_apart_outdoors(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
+    """plaza from 02 and 05, 64 degrees apart: stereo knows a tree and a tower, and the maps all of it."""
+    capture = replace(open_capture(shared_data("plaza")), frames=(10,))
+    errors = {}
+    for across in (False, True):
+        prior = PriorSettings(align=AlignSettings(across=across))
+        build_priors(capture, ["02", "05"], tmp_path / str(across), prior)
+        for camera in ("02", "05"):
+            found = PriorStore.open(tmp_path / str(across)).prior(camera, 10)
+            known, truth = found.depth.numpy() > 0, capture.depth(camera, 10)
+            known &= truth > 0
+            apart = np.abs(found.depth.numpy() / np.where(known, truth, 1) - 1)[known]
+            errors[across, camera] = float(np.median(apart)), known.mean()
+            if across:
+                sigma = found.sigma.numpy()[known]
+                assert np.mean(np.isfinite(sigma)) > 0.9
+                assert np.mean(apart < 2 * sigma) > 0.9
+    assert max(errors[True, camera][0] for camera in ("02", "05")) < 0.12
+    assert min(errors[True, camera][1] for camera in ("02", "05")) > 0.4
+    wrong = [errors[False, camera][0] > 0.5 or errors[False, camera][1] < 0.1 for camera in ("02", "05")]
+    assert all(wrong), "without, one is far off and the other is refused"
