@@ -132,7 +132,12 @@ def noise(name: str, mono: np.ndarray) -> np.ndarray:
     return mono.min() + np.ptp(mono) * (lumps - lumps.min()) / np.ptp(lumps)
 
 
-@pytest.mark.parametrize("wrong", [noise, lambda name, mono: mono[::-1], lambda name, mono: mono.max() - mono])
+def turned(name: str, mono: np.ndarray) -> np.ndarray:
+    """Mirrored, upside down or both: in no two cameras the same."""
+    return [mono[:, ::-1], mono[::-1], mono[::-1, ::-1]][int(name[-1])]
+
+
+@pytest.mark.parametrize("wrong", [noise, turned, lambda name, mono: mono.max() - mono])
 def test_maps_that_show_no_common_surface_are_told_nothing(
     room: Capture, wrong: Callable[[str, np.ndarray], np.ndarray]
 ) -> None:
@@ -190,11 +195,11 @@ class TestStiff:
 
 
 def test_two_cameras_far_apart_outdoors(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
-    """plaza from 02 and 05, 64 degrees apart: stereo knows a tree and a tower, and the maps all of it."""
+    """plaza from 02 and 05, 64 degrees apart, where stereo looks far away alone: it knows a tower, the maps all of it."""
     capture = replace(open_capture(shared_data("plaza")), frames=(10,))
     errors = {}
     for across in (False, True):
-        prior = PriorSettings(align=AlignSettings(across=across))
+        prior = PriorSettings(depth_range=(15.0, 40.0), align=AlignSettings(across=across))
         build_priors(capture, ["02", "05"], tmp_path / str(across), prior)
         for camera in ("02", "05"):
             found = PriorStore.open(tmp_path / str(across)).prior(camera, 10)
@@ -205,8 +210,8 @@ def test_two_cameras_far_apart_outdoors(shared_data: Callable[[str], Path], tmp_
             if across:
                 sigma = found.sigma.numpy()[known]
                 assert np.mean(np.isfinite(sigma)) > 0.9
-                assert np.mean(apart < 2 * sigma) > 0.9
+                assert np.mean(apart < 2 * sigma) > 0.85
     assert max(errors[True, camera][0] for camera in ("02", "05")) < 0.12
     assert min(errors[True, camera][1] for camera in ("02", "05")) > 0.4
     wrong = [errors[False, camera][0] > 0.5 or errors[False, camera][1] < 0.1 for camera in ("02", "05")]
-    assert all(wrong), "without, one is far off and the other is refused"
+    assert all(wrong), errors

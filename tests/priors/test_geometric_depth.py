@@ -129,7 +129,8 @@ def test_the_depth_range_comes_from_points_then_the_data_set_then_the_baselines(
     assert "triangulated" in measured.origin
     declared = depth_bounds([replace(camera, near_far=(2.0, 10.0)) for camera in cameras])
     assert declared[:2] == pytest.approx((1.6, 12.0))
-    wide = depth_bounds([replace(camera, near_far=None) for camera in cameras], points[:5])
+    few = points[:60]  # on one thing, at 3 to 3.2
+    wide = depth_bounds([replace(camera, near_far=None) for camera in cameras], few)
     truth = np.concatenate([pair.depth(name, 0).ravel() for name in pair.cameras])
     assert wide.near < truth.min()
     assert wide.far > truth.max()
@@ -161,7 +162,7 @@ def test_cameras_that_look_at_each_other_across_a_room_have_a_range_that_holds_i
 def test_points_behind_or_beside_the_camera_do_not_count(pair: Capture) -> None:
     cameras = list(pair.cameras.values())
     backwards = -5 * cameras[0].T_camera_world[2, :3]
-    behind = cameras[0].centre + backwards + np.random.default_rng(0).normal(0, 0.1, (100, 3))
+    behind = cameras[0].centre + backwards + np.random.default_rng(0).normal(0, 0.1, (200, 3))
     assert "triangulated" not in depth_bounds(cameras, behind).origin
 
 
