@@ -195,7 +195,7 @@ class TestStiff:
 
 
 def test_two_cameras_far_apart_outdoors(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
-    """plaza from 02 and 05, 64 degrees apart, where stereo looks far away alone: it knows a tower, the maps all of it."""
+    """plaza from 02 and 05, 64 degrees apart, stereo looking far away alone: it knows a tower, the maps know more."""
     capture = replace(open_capture(shared_data("plaza")), frames=(10,))
     errors = {}
     for across in (False, True):
