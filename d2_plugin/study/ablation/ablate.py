@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 
 from d2_plugin import durable
@@ -18,6 +17,7 @@ from d2_plugin.study.ablation.presets import Preset
 from d2_plugin.study.ablation.tables import report
 from d2_plugin.study.rows import Row, as_line, make_row
 from d2_plugin.study.shared import share
+from d2_plugin.study.workers import worker_pool
 
 PRIOR_SECONDS = Kind("time of a prior", 1, "delete it")
 """PRIORS.seconds.json, beside each prior that runs share."""
@@ -61,7 +61,7 @@ def run_jobs(work: Sequence[Job], workers: int) -> dict[Job, Metrics]:
         bar.update(len(results))
         if missing:
             _share(missing)
-        with ProcessPoolExecutor(max(workers, 1), get_context("spawn"), _prepare_worker) as pool:
+        with worker_pool(max(workers, 1), _prepare_worker) as pool:
             started = {pool.submit(_run, job): job for job in missing}
             for future in as_completed(started):
                 job = started[future]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+
+from d2_plugin.study.workers import worker_pool
 
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
@@ -27,7 +27,7 @@ def in_fresh_process(work: Callable[..., Any], *arguments: Any) -> Measured:
     What other work left in memory, and what an earlier one made the peak, does not count.
     """
     # An executor lets its process end by itself: multiprocessing.Pool terminates it, and pycolmap then prints a crash.
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+    with worker_pool(1) as pool:
         return pool.submit(_measured, work, arguments, torch.get_num_threads()).result()
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context
 from typing import Any
 
 from d2_plugin.errors import D2Error
 from d2_plugin.study.rows import Row
+from d2_plugin.study.workers import worker_pool
 
 from .measured import Work, measure
 
@@ -67,7 +66,7 @@ def workers(count: int, scheduler: str | None) -> Iterator[Submit]:
             several runs together.
     """
     if scheduler is None:
-        with ProcessPoolExecutor(count, get_context("spawn")) as pool:
+        with worker_pool(count) as pool:
             try:
                 yield lambda work: pool.submit(measure, work)
             except BaseException:
