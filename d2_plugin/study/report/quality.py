@@ -167,7 +167,8 @@ def _bars(cases: Mapping[str, Sequence[Length]]) -> list[tuple[str, tuple[float,
     for case, lengths in cases.items():
         for method in dict.fromkeys(length.method for length in lengths):
             longest = [length for length in lengths if length.method == method][-1]
-            found.append((f"{case}: {method}", (_prior(longest.rows) / 60, longest.minutes())))
+            name = f"{case}: {method}, {longest.target}"
+            found.append((name, (_prior(longest.rows) / 60, longest.minutes())))
     return found or [("nothing was measured", (0.0, 0.0))]
 
 
