@@ -66,10 +66,11 @@ def main(words: list[str]) -> int:
 
 
 def move_seeds(by: int) -> None:
-    """From now on random, numpy and torch take every seed plus `by`: most trainers set a constant."""
+    """From now on random, numpy and torch take every number for a seed plus `by`: most trainers set a constant."""
 
     def moved(original: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda seed=None, *more: original(seed if seed is None else seed + by, *more)
+        # A loader's workers, which follow torch's seed, give numpy a list.
+        return lambda seed=None, *more: original(seed + by if isinstance(seed, int) else seed, *more)
 
     if by:
         for module, name in ((random, "seed"), (np.random, "seed"), (torch, "manual_seed")):
