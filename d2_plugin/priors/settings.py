@@ -93,7 +93,7 @@ class PriorSettings(Settings):
     def paper(cls, **changes: Any) -> PriorSettings:
         """The paper's construction and nothing else: absolute residuals, one scale and shift, blurred edges kept,
         each camera for itself, depth read at pixels."""
-        align = AlignSettings(residual="absolute", epsilon=0.01, local_scales=())
+        align = AlignSettings(residual="absolute", epsilon=0.01, local_scales=(), across=False)
         changes["stereo"] = replace(changes.get("stereo", StereoSettings()), between_pixels=False)
         return cls(uncertainty=False, hanging_limit=0.0, agreement=0.0, far=False, align=align, **changes)
 

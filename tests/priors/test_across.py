@@ -16,7 +16,7 @@ from d2_plugin.captures.capture import Camera, Capture, MonoKind
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.monocular.across import Shown, aligned_across, is_open
-from d2_plugin.priors.monocular.align import AlignStatus, align
+from d2_plugin.priors.monocular.align import Alignment, AlignStatus, align
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.store import PriorStore
@@ -88,8 +88,8 @@ def test_the_slopes_are_found_that_one_patch_of_depth_leaves_open(room: Capture,
         assert alignment.across < 0.1
 
 
-def line(alignment: object) -> tuple[float, float]:
-    return alignment.scale, alignment.shift  # type: ignore[attr-defined]
+def line(alignment: Alignment) -> tuple[float, float]:
+    return alignment.scale, alignment.shift
 
 
 @settings(max_examples=6, deadline=None)

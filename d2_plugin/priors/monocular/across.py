@@ -10,8 +10,9 @@ with which most pixels of one map, seen by the other camera, lie where its map s
 over even samples of every two maps, both ways. Each line passes through the medians of its anchors, so there is one
 unknown a map. The sum has other maxima, so slopes are tried on a grid, two maps at a time where none is known.
 
-Measured on plaza, two cameras 64 degrees apart, whose stereo knows 1.7 % of the pixels, all of them far: median error
-of one camera's maps 1.6 to 1.8 before, all maps of the other refused.
+Measured at six frames of plaza, two cameras 64 degrees apart, whose stereo knew 1.7 % of the pixels, nearly all of them
+far: median error of one camera's maps 1.4 to 1.8 at five of them and .11 at one, all maps of the other refused; with
+this .06 to .10 for both.
 """
 
 from __future__ import annotations

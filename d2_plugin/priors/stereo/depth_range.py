@@ -15,7 +15,7 @@ from d2_plugin.priors.stereo.settings import StereoSettings
 FEWEST = 100
 """Points that a camera must see for their depths to bound its scene. plaza from two cameras 64 degrees apart has 15, on
 two things that lie 11 and 30 away: with the range of these, 8 to 38, stereo never looked at the half of the pixels that
-is nearer, and one of two cameras had no prior at all."""
+is nearer, and the maps of one camera were refused."""
 
 
 class DepthBounds(NamedTuple):
