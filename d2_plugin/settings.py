@@ -78,6 +78,7 @@ class Declared(NamedTuple):
     """One setting as it was declared."""
 
     name: str
+    """Of the field, or dotted with the names of its tables before it."""
     kind: Any
     """The annotation without what `Annotated` adds: a plain type, a Literal, a union, a tuple or a Settings."""
     default: Any
@@ -85,8 +86,16 @@ class Declared(NamedTuple):
     range: Range
     positional: bool
     """Whether the command line takes it by its place."""
-    help: str
-    """The docstring under the field, its lines joined; for a table without one, the first line of its class."""
+    owner: type
+    """The class whose setting it is."""
+    more: str = ""
+    """What is said after the docstring."""
+
+    @property
+    def help(self) -> str:
+        """The docstring under the field, its lines joined; for a table without one, the first line of its class."""
+        text = _docstrings(self.owner).get(self.name.rpartition(".")[2]) or _first_line(table_of(self.kind))
+        return f"{text} {self.more}".strip()
 
 
 Chosen = TypeVar("Chosen", bound="Settings")
@@ -136,14 +145,13 @@ def declared(kind: Any) -> tuple[Declared, ...]:
 
 @functools.cache
 def _declared(kind: Any) -> tuple[Declared, ...]:
-    hints, helps = hints_of(kind), _docstrings(kind)
+    hints = hints_of(kind)
     found = []
     for entry in fields(kind):
         default = entry.default if entry.default_factory is MISSING else entry.default_factory()
         bare, limits = bare_and_range(hints[entry.name])
         by_place = any(isinstance(extra, Positional) for extra in get_args(hints[entry.name])[1:])
-        text = helps.get(entry.name) or _first_line(table_of(bare))
-        found.append(Declared(entry.name, bare, default, limits, by_place, text))
+        found.append(Declared(entry.name, bare, default, limits, by_place, kind))
     return tuple(found)
 
 

@@ -25,7 +25,7 @@ from d2_plugin.priors.disk.confidence import ConfidenceMaps, divided
 from d2_plugin.priors.disk.stored import SUFFIXES, at_picture_size, planar, stored_numbers
 from d2_plugin.priors.frame import Frame, describe_camera, digest, hash_of
 from d2_plugin.priors.stereo.depth_range import DepthBounds
-from d2_plugin.priors.stereo.filter import GeometricDepth, filter_depths, remove_speckles
+from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths, remove_speckles
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.reading import read_json

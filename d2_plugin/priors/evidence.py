@@ -98,6 +98,8 @@ class _View(NamedTuple):
     sigma: np.ndarray
     colors: np.ndarray | None
     """Mean of 3x3 pixels, uint8 [H, W, 3]; None where there is no picture."""
+    compared: tuple[np.ndarray, np.ndarray]
+    """Rows and columns of some verified pixels, evenly over the picture."""
 
     @classmethod
     def of(cls, prior: FusedPrior) -> _View:
@@ -105,7 +107,9 @@ class _View(NamedTuple):
         verified = prior.labels == Label.VERIFIED
         monocular, surface = (np.where(labelled, prior.depth, 0) for labelled in (mono, verified))
         colors = None if prior.colors is None else opencv("the evidence of other cameras").blur(prior.colors, (3, 3))
-        return cls(monocular, surface, prior.sigma, colors)
+        known = np.flatnonzero(surface)
+        rows, columns = np.divmod(known[:: max(len(known) // COMPARED, 1)], surface.shape[1])
+        return cls(monocular, surface, prior.sigma, colors, (rows, columns))
 
 
 def with_evidence(
@@ -235,9 +239,7 @@ def _as_seen_by(points: _Points, gain: np.ndarray) -> _Points:
 
 def _gain(ours: _View, theirs: _View, pair: ViewPair) -> np.ndarray:
     """How much brighter the other camera shows what both verified, per channel [3]; 1 where that is too little."""
-    rows, columns = np.nonzero(ours.surface)
-    every = max(len(rows) // COMPARED, 1)
-    rows, columns = rows[::every], columns[::every]
+    rows, columns = ours.compared
     if ours.colors is None or theirs.colors is None or len(rows) < FEWEST:
         return np.ones(3, np.float32)
     depth, mine = ours.surface[rows, columns].astype(np.float64), ours.colors[rows, columns].astype(np.float32)

@@ -11,7 +11,7 @@ import numpy as np
 from d2_plugin.captures import Camera, Capture
 from d2_plugin.captures.pictures import shrink_picture
 from d2_plugin.priors.geometry import relative_pose, scaled_camera, view_pair, viewing_rays
-from d2_plugin.priors.stereo.filter import texture_mask
+from d2_plugin.priors.stereo.filtering.filter import texture_mask
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
 

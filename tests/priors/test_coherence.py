@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d2_plugin.priors.stereo.coherence import surface_coherence
+from d2_plugin.priors.stereo.filtering.coherence import surface_coherence
 
 pytest.importorskip("cv2")
 

@@ -24,7 +24,7 @@ from d2_plugin.priors.colmap.mvs import (
     write_workspace,
 )
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo.filter import filter_depths
+from d2_plugin.priors.stereo.filtering.filter import filter_depths
 from d2_plugin.priors.stereo.geometric_depth import MATCHERS, choose_matcher, gray
 from d2_plugin.study.bench.stereo_measure import score
 from d2_plugin.study.bench.stereo_rigs import Rig, textured_rig

@@ -8,7 +8,7 @@ import pytest
 from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.geometry import Projection, viewing_rays
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.priors.stereo.confirm import confirm, sample_nearest, sample_surface
+from d2_plugin.priors.stereo.filtering.confirm import confirm, sample_nearest, sample_surface
 from d2_plugin.priors.stereo.settings import StereoSettings
 
 pytest.importorskip("cv2")

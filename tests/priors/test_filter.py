@@ -10,8 +10,8 @@ import pytest
 from d2_plugin.captures.capture import Capture
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo.confirm import confirm
-from d2_plugin.priors.stereo.filter import filter_depths, remove_speckles, texture_mask
+from d2_plugin.priors.stereo.filtering.confirm import confirm
+from d2_plugin.priors.stereo.filtering.filter import filter_depths, remove_speckles, texture_mask
 from d2_plugin.priors.stereo.geometric_depth import gray
 
 pytest.importorskip("cv2")

@@ -13,7 +13,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo import geometric_depth as stereo
 from d2_plugin.priors.stereo.depth_range import depth_bounds
-from d2_plugin.priors.stereo.filter import GeometricDepth
+from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
 from d2_plugin.priors.stereo.geometric_depth import choose_matcher, enlarged, geometric_depth, gray
 from d2_plugin.priors.stereo.sweep import RunningMinimum
 from d2_plugin.study.bench.stereo_rigs import textured_rig

@@ -17,7 +17,7 @@ from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import pixel_grid, scaled_camera
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo.filter import filter_depths
+from d2_plugin.priors.stereo.filtering.filter import filter_depths
 from d2_plugin.priors.stereo.geometric_depth import MATCHERS, gray
 from d2_plugin.priors.stereo.patchmatch import patchmatch
 from d2_plugin.priors.stereo.pyramid import NO_MATCH, refined_planes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from d2_plugin.priors.stereo.precision import (
+from d2_plugin.priors.stereo.filtering.precision import (
     FLOOR,
     GRAY_NOISE,
     MATCHING,

@@ -10,7 +10,7 @@ import pytest
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo.filter import filter_depths
+from d2_plugin.priors.stereo.filtering.filter import filter_depths
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.study.bench.sgbm import sgbm
 from d2_plugin.study.bench.stereo import StereoBench, bench_stereo, run, table

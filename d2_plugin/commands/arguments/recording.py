@@ -161,7 +161,7 @@ def say_plan(plan: ScenePlan) -> None:
 
 def _spelled(setting: Declared) -> Declared:
     """A setting of a run as a command line takes it."""
-    return setting._replace(help=f"{setting.help} {WRITTEN.get(setting.name, '')}".strip())
+    return setting._replace(more=WRITTEN.get(setting.name, ""))
 
 
 def _backbone(typed: Mapping[str, str]) -> str:

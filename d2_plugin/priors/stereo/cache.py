@@ -12,7 +12,7 @@ import numpy as np
 from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.files import Entry, EntryFolder
 from d2_plugin.priors.frame import Frame
-from d2_plugin.priors.stereo.filter import GeometricDepth
+from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
 from d2_plugin.priors.store import SIGMA, DepthRange, encode_sigma
 
 STEREO_DTYPE = np.dtype([("depth", "<u2"), ("sigma", "u1")])

@@ -13,7 +13,7 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.colmap import mvs
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera
-from d2_plugin.priors.stereo.filter import GeometricDepth, filter_depths
+from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths
 from d2_plugin.priors.stereo.gpu import kernel as gpu
 from d2_plugin.priors.stereo.patchmatch import patchmatch
 from d2_plugin.priors.stereo.patchmatch_kernel import compiles as patchmatch_compiles

@@ -14,7 +14,7 @@ from pathlib import Path
 from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.frame import Frame, describe_camera, hash_of
 from d2_plugin.priors.stereo.depth_range import DepthBounds
-from d2_plugin.priors.stereo.filter import GeometricDepth
+from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
 from d2_plugin.priors.stereo.geometric_depth import WHOLE_PICTURES, choose_matcher, geometric_depth
 from d2_plugin.priors.stereo.reuse import MatchMemory
 from d2_plugin.priors.stereo.settings import StereoSettings

@@ -13,7 +13,7 @@ import numpy as np
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.colmap.mvs import why_not_usable
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo.filter import GeometricDepth, filter_depths
+from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths
 from d2_plugin.priors.stereo.geometric_depth import MATCHERS, Matcher, gray
 
 from .sgbm import sgbm

@@ -20,7 +20,7 @@ from d2_plugin.captures.synthetic.raycast import render_color, render_depth
 from d2_plugin.captures.synthetic.room import arc_cameras, furnished_room
 from d2_plugin.errors import unknown_name
 from d2_plugin.priors.geometry import pixel_grid, view_pair
-from d2_plugin.priors.stereo.confirm import sample_nearest
+from d2_plugin.priors.stereo.filtering.confirm import sample_nearest
 
 STUDIO_CAMERAS = ("00", "02", "05", "07")
 STUDIO_FRAMES = (0, 5, 10, 15, 19)

@@ -17,9 +17,9 @@ import numpy as np
 
 from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.stereo.coherence import surface_coherence
-from d2_plugin.priors.stereo.confirm import confirm
-from d2_plugin.priors.stereo.precision import geometric_sigma, grey_gradient
+from d2_plugin.priors.stereo.filtering.coherence import surface_coherence
+from d2_plugin.priors.stereo.filtering.confirm import confirm
+from d2_plugin.priors.stereo.filtering.precision import geometric_sigma, grey_gradient
 from d2_plugin.priors.stereo.settings import StereoSettings
 
 

@@ -1,0 +1,1 @@
+"""The filter of geometric depth: its tests, and how precise what survives is."""

@@ -1,0 +1,117 @@
+"""The compiled tests of the filter (`kernels/filter.cpp`): the bits of the NumPy code in a sixth of its time.
+
+Compiled at first use; runs on `torch.get_num_threads()` threads, and results are the same bits for any number of them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from d2_plugin.compiler import NoCompiler, load_library
+
+SOURCE = Path(__file__).parent / "kernels" / "filter.cpp"
+_STEREO = Path(__file__).parents[1] / "kernels"
+_RASTERIZER = Path(__file__).parents[3] / "rasterizer" / "kernels"  # no import: only its header is shared
+HEADERS = (_RASTERIZER / "parallel.h", *(_STEREO / name for name in ("lanes.h", "numbers.h")))
+FLAGS = ("-ffp-contract=off",)
+"""No contraction: NumPy has none either."""
+
+_int, _float, _double, _pointer = ctypes.c_int32, ctypes.c_float, ctypes.c_double, ctypes.c_void_p
+
+
+class _Coherence(ctypes.Structure):
+    """d2::Coherence of kernels/filter.cpp."""
+
+    _fields_ = (
+        *((name, _int) for name in ("width", "height", "radius", "stride", "threads")),
+        ("relative", _float),
+        *((name, _pointer) for name in ("gray", "inverse", "slope_x", "slope_y", "weights", "share")),
+    )
+
+
+class _Confirm(ctypes.Structure):
+    """d2::Confirm of kernels/filter.cpp."""
+
+    _fields_ = (
+        *((name, _int) for name in ("width", "height", "their_width", "their_height", "between", "threads")),
+        ("A", _double * 9),
+        ("k", _double * 3),
+        ("back_A", _float * 9),
+        ("back_k", _float * 3),
+        ("direction", _float * 3),
+        *((name, _float) for name in ("continuous", "reprojection_max", "relative_depth_max")),
+        *((name, _float) for name in ("sine_min", "cosine_min", "sine_max", "cosine_max")),
+        *((name, _double) for name in ("nudge", "nudge_squared")),
+        *((name, _pointer) for name in ("rays", "depth", "theirs", "confirming", "information", "difference")),
+    )
+
+
+@functools.cache
+def library() -> ctypes.CDLL | None:
+    """The compiled kernel; None without a compiler: NumPy then does the same.
+
+    Raises:
+        CompileError: see `d2_plugin.compiler.load_library`.
+    """
+    try:
+        kernel = load_library("filter", (SOURCE,), HEADERS, FLAGS)
+    except NoCompiler:
+        return None
+    for name, call in ("coherence", _Coherence), ("confirm", _Confirm):
+        function, size = getattr(kernel, f"d2_{name}"), getattr(kernel, f"d2_{name}_size")
+        function.argtypes, function.restype = (ctypes.POINTER(call),), None
+        size.restype = ctypes.c_int64
+        assert size() == ctypes.sizeof(call), f"the call of {name} differs between kernel.py and filter.cpp"
+    return kernel
+
+
+def coherence(
+    gray: np.ndarray,
+    inverse: np.ndarray,
+    slopes: tuple[np.ndarray, np.ndarray],
+    weights: np.ndarray,
+    radius: int,
+    stride: int,
+    relative: float,
+) -> np.ndarray:
+    """See `coherence.reference_share`; all arrays are contiguous."""
+    share = np.empty_like(inverse)
+    arrays = {"gray": gray, "inverse": inverse, "slope_x": slopes[0], "slope_y": slopes[1], "weights": weights}
+    call = _Coherence(radius=radius, stride=stride, relative=relative)
+    _run("coherence", call, inverse.shape, arrays | {"share": share})
+    return share
+
+
+def confirm(
+    shape: tuple[int, int],
+    numbers: dict[str, Any],
+    vectors: dict[str, np.ndarray],
+    maps: dict[str, np.ndarray],
+) -> None:
+    """See `confirm.confirm`: add what one source says to the sums among `maps`, all contiguous.
+
+    Args:
+        shape: [H, W] of the reference.
+        numbers: fields of d2::Confirm.
+        vectors: its small arrays.
+        maps: the arrays that it points to.
+    """
+    call = _Confirm(**numbers)
+    for name, values in vectors.items():
+        getattr(call, name)[:] = values.ravel().tolist()
+    _run("confirm", call, shape, maps)
+
+
+def _run(name: str, call: Any, shape: tuple[int, ...], arrays: dict[str, np.ndarray]) -> None:
+    call.height, call.width = shape
+    call.threads = torch.get_num_threads()
+    for field, array in arrays.items():
+        assert array.flags.c_contiguous, field
+        setattr(call, field, array.ctypes.data)
+    getattr(library(), f"d2_{name}")(ctypes.byref(call))
