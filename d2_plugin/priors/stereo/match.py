@@ -19,7 +19,7 @@ from d2_plugin.priors.stereo.geometric_depth import WHOLE_PICTURES, choose_match
 from d2_plugin.priors.stereo.reuse import MatchMemory
 from d2_plugin.priors.stereo.settings import StereoSettings
 
-MATCH_VERSION = 6  # raise it when matchers or filter change what they return, so that caches are not trusted
+MATCH_VERSION = 7  # raise it when matchers or filter change what they return, so that caches are not trusted
 
 
 class MatchedDepth:
