@@ -21,17 +21,17 @@ import numpy as np
 
 from d2_plugin.priors.extras import opencv
 
-MATCHING = 0.00295
+MATCHING = 0.00293
 """Error of the best match, pixels: next to nothing, what it is worth is told by the gradient."""
-GRAY_NOISE = 1.31e-3
+GRAY_NOISE = 1.3e-3
 """Error of the grey values (0..1) that a match compares: noise, exposure, resampling."""
-PER_INCOHERENCE = 2.85
+PER_INCOHERENCE = 2.83
 """Further error where none of the neighbours lies on the same surface, pixels."""
-OF_SCATTER = 0.837
+OF_SCATTER = 0.83
 """Times the scatter about the local plane."""
-OF_SPREAD = 0.404
+OF_SPREAD = 0.4
 """Share of the difference to the sources' own depths."""
-FLOOR = 8.17e-4
+FLOOR = 8.1e-4
 """What no map is better than: calibration, resampling, the nearest pixel of a source."""
 FLATTEST = 3e-3
 """Gradients of the grey value are not told from noise below this, per pixel."""
