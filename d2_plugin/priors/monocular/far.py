@@ -42,7 +42,8 @@ def far_pixels(inverse: np.ndarray, geometric: np.ndarray, image: np.ndarray) ->
     cv2: Any = opencv("finding the sky")
     beyond = np.where(np.isfinite(inverse), inverse, np.inf) * np.percentile(anchors, 99.5)
     measured = cv2.dilate((geometric > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    gray = image.astype(np.float32).mean(-1) / 255
+    red, green, blue = np.moveaxis(image.astype(np.float32), -1, 0)
+    gray = (red + green + blue) / 3 / 255
     mean = cv2.blur(gray, (5, 5))
     smooth = np.sqrt(np.maximum(cv2.blur(gray * gray, (5, 5)) - mean * mean, 0)) < SMOOTH
     clear = _large(cv2, (beyond < CLEARLY) & smooth & ~measured, rim=True)
@@ -68,7 +69,8 @@ def _like_around(cv2: Any, image: np.ndarray, clear: np.ndarray) -> np.ndarray:
     sigma = AROUND * clear.shape[1]
     weight = cv2.GaussianBlur(clear.astype(np.float32), (0, 0), sigma)
     mean = cv2.GaussianBlur(image * clear[..., None], (0, 0), sigma) / np.maximum(weight, 1e-6)[..., None]
-    return (weight > 1e-3) & (np.linalg.norm(image - mean, axis=-1) < COLOR)
+    red, green, blue = np.moveaxis(image - mean, -1, 0)
+    return (weight > 1e-3) & (red * red + green * green + blue * blue < COLOR**2)
 
 
 def _touching(cv2: Any, mask: np.ndarray, seeds: np.ndarray) -> np.ndarray:
