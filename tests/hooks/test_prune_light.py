@@ -39,3 +39,9 @@ def test_the_hook_removes_little_by_little() -> None:
         return trainer.d2.telling.removed
 
     assert 0 < after_three(0.05) < after_three(1.0)
+
+
+def test_short_runs_leave_time_between_removals() -> None:
+    """Holes close, and what is misplaced moves, at a pace that counts iterations, not parts of the run."""
+    assert all(PruneConfig.for_iterations(length).every >= 10 for length in (10, 20, 40, 150, 199))
+    assert [PruneConfig.for_iterations(length).every for length in (300, 500, 2000, 30000)] == [15, 25, 100, 100]
