@@ -22,7 +22,7 @@ from .originals import provide
 from .packages import stand_in_for
 from .recipes import RECIPES, Recipe, recipe
 from .repairs import repair
-from .session import Session
+from .session import Session, found_in
 
 SESSIONS: dict[str, type[Session]] = {"trainer": Session, "gsplat": GsplatSession}
 """By the kind of a recipe, what follows its run."""
@@ -73,6 +73,9 @@ def prepare(options: argparse.Namespace, command: Sequence[str]) -> Recipe:
         run_on_cpu()
     if found.kind == "gsplat":
         put_in_place()
+    if found.mend is not None:
+        for place in found.models:
+            found.mend(found_in(*place))
     os.execv = _refuse_restart  # type: ignore[assignment]
     return found
 

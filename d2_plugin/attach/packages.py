@@ -34,6 +34,7 @@ class StandIn:
 
 
 VISION = "d2_plugin.compat.vision"
+KINEMATIC = "d2_plugin.compat.kinematic"
 
 SCRIPT = "give the trainer's repository or its script"
 MOST_SCRIPT = 1 << 24
@@ -54,6 +55,17 @@ STAND_INS = {
         {"mmcv.Config": "d2_plugin.compat.python_config:Config", "mmcv.ops.knn": "d2_plugin.compat.knn:knn"},
         "the version that has Config (below 2) builds on few machines",
     ),
+    "pytorch3d": StandIn(
+        {
+            f"pytorch3d.transforms.{name}": f"{KINEMATIC}:{name}"
+            for name in ("quaternion_apply", "quaternion_invert", "quaternion_multiply")
+        },
+        "it is built for one torch and one CUDA, and the trainer calls three functions of it",
+    ),
+    "faiss": StandIn(
+        {f"faiss.{name}": f"{KINEMATIC}:{name}" for name in ("StandardGpuResources", "GpuIndexFlatL2")},
+        "the build for GPUs is not on the package index, and the trainer asks for one nearest neighbour",
+    ),
     "open3d": StandIn({}, "the trainer imports it and calls nothing of it"),
     "lpips": StandIn({}, "the trainer imports it and calls nothing of it while training"),
     "nerfview": StandIn({}, "gsplat's script imports it for its viewer: give --disable_viewer"),
@@ -62,7 +74,10 @@ STAND_INS = {
 }
 """By the name that is imported. A new one is a row here."""
 
-INSTALL = {"cv2": "opencv-python-headless", "sklearn": "scikit-learn", "PIL": "pillow", "yaml": "pyyaml"}
+INSTALL = {
+    **{"cv2": "opencv-python-headless", "sklearn": "scikit-learn", "skimage": "scikit-image"},
+    **{"PIL": "pillow", "yaml": "pyyaml"},
+}
 """What pip calls a package whose import has another name."""
 
 

@@ -11,6 +11,8 @@ from d2_plugin import registry
 from d2_plugin.errors import unknown_name
 from d2_plugin.protocol import Backbone
 
+from .repairs import saves_parents
+
 Adapter = Callable[..., Backbone]
 
 
@@ -67,6 +69,8 @@ class Recipe:
     """Folders below the script's that it puts on the path itself."""
     averages_gradients: bool = False
     """Whether the trainer divides the gradients of a batch afterwards, instead of each loss before."""
+    mend: Callable[[Any], None] | None = None
+    """Repairs each class of `models` for newer libraries."""
     heard: Callable[[Any, Mapping[str, Any]], None] | None = None
     """Hands the adapter what it needs from the named arguments of each render."""
     seen: dict[str, tuple[str, str]] = field(default_factory=lambda: {"scene": ("scene", "Scene")})
@@ -161,6 +165,17 @@ RECIPES = {
         _ex4dgs,
         (Original("diff_gaussian_rasterization_df", "d2_plugin.compat.ex4dgs"), _KNN),
         models=(("scene.c_gaussian_model", "CGaussianModel"),),
+    ),
+    "cem4dgs": Recipe(
+        "cem4dgs",
+        _ex4dgs,
+        (
+            Original("diff_gaussian_rasterization_df", "d2_plugin.compat.ex4dgs"),
+            Original("lpipsPyTorch", "d2_plugin.compat.vision", "lpipsPyTorch/__init__.py"),
+            _KNN,
+        ),
+        models=(("scene.v_gaussian_model", "VGaussianModel"),),
+        mend=saves_parents,
     ),
     "gsplat": Recipe(
         "gsplat",

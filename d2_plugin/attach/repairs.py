@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from functools import wraps
 from typing import Any
@@ -16,7 +17,7 @@ NUMPY_NAMES = {"NaN": np.nan, "Inf": np.inf, "float": float, "int": int, "object
 
 def repair() -> None:
     """Apply every repair that this environment needs; each is said."""
-    for sentence in (_numpy(), _pillow()):
+    for sentence in (_numpy(), _pillow(), _joblib(), _json()):
         if sentence:
             log.info("%s", sentence)
 
@@ -45,3 +46,44 @@ def _pillow() -> str | None:
 
     Image.fromarray = fromarray
     return f"Pillow {__version__} takes no signed bytes: Image.fromarray reads them as unsigned in this process"
+
+
+def _joblib() -> str | None:
+    """cem-4dgs reads pictures in processes that import its modules again, where no stand-in is (scene/__init__.py)."""
+    try:
+        from joblib import parallel, register_parallel_backend
+    except ImportError:
+        return None
+    register_parallel_backend("loky", parallel.ThreadingBackend)
+    return "joblib's workers are threads of this process, where the stand-ins are"
+
+
+def _json() -> str | None:
+    """cem-4dgs writes scikit-image's SSIM as JSON, which later versions return in single precision (train.py:450)."""
+    original = json.JSONEncoder.default
+
+    @wraps(original)
+    def default(encoder: json.JSONEncoder, o: Any) -> Any:
+        return o.item() if isinstance(o, np.generic) else original(encoder, o)
+
+    json.JSONEncoder.default = default  # type: ignore[method-assign]
+    return None
+
+
+def saves_parents(model: Any) -> None:
+    """cem-4dgs saves -1, the parent of a splat that has none, as unsigned: numpy 2 refuses what numpy 1 wrapped around.
+
+    `model` is its class VGaussianModel, whose `save_ply` then sees the number that numpy 1 wrote.
+    """
+    original = model.save_ply
+
+    @wraps(original)
+    def save_ply(self: Any, *arguments: Any, **named: Any) -> Any:
+        parents = self._parent
+        self._parent = parents.long() & 0xFFFFFFFF
+        try:
+            return original(self, *arguments, **named)
+        finally:
+            self._parent = parents
+
+    model.save_ply = save_ply

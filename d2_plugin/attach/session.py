@@ -26,9 +26,9 @@ log = logging.getLogger(__name__)
 def remember(recipe: Recipe, objects: Objects) -> None:
     """Keep the trainer's own objects as they come into being; what they compute is not touched."""
     for name, place in recipe.seen.items():
-        keep_instances(_found(*place), name, objects)
+        keep_instances(found_in(*place), name, objects)
     for place in recipe.models:
-        model = _found(*place)
+        model = found_in(*place)
         model.training_setup = _keeping(model.training_setup, objects)
 
 
@@ -100,12 +100,12 @@ class Session:
         """Override the choke points of the repository's modules; call before its script runs."""
         self.remember(self.recipe, self.objects)
         for place in self.recipe.models:
-            model = _found(*place)
+            model = found_in(*place)
             model.training_setup = self._attaching(model.training_setup)
             if hasattr(model, "update_learning_rate"):
                 model.update_learning_rate = self._listening(model.update_learning_rate)
         for module, attribute in self.recipe.renderers:
-            setattr(importlib.import_module(module), attribute, self._rendering(_found(module, attribute)))
+            setattr(importlib.import_module(module), attribute, self._rendering(found_in(module, attribute)))
 
     def summary(self) -> str:
         """What D2 did, in one line."""
@@ -211,7 +211,7 @@ class Session:
         self._told, self._drawn, self._batch = False, 0, self._drawn
 
 
-def _found(module: str, attribute: str) -> Any:
+def found_in(module: str, attribute: str) -> Any:
     """An attribute of one of the repository's modules; its own imports may fail with errors of their own."""
     try:
         return getattr(importlib.import_module(module), attribute)

@@ -78,3 +78,8 @@ class NoLpips(torch.nn.Module):
     def forward(self, drawn: Tensor, true: Tensor) -> Tensor:
         """NaN: it was not measured."""
         return drawn.new_tensor(math.nan)
+
+
+def lpips(x: Tensor, y: Tensor, net_type: str = "alex", version: str = "0.1") -> Tensor:
+    """In the place of the module `lpipsPyTorch` of a repository, whose networks are downloaded: NaN for any pair."""
+    return x.new_tensor(math.nan)

@@ -13,9 +13,10 @@ from mimics.inria import Camera
 from rasterizer_arguments import inria_camera
 from splat_scenes import random_scene
 
-from d2_plugin.compat import depth, ex4dgs, spacetime, vision
+from d2_plugin.compat import depth, ex4dgs, kinematic, spacetime, vision
 from d2_plugin.compat.knn import knn
 from d2_plugin.compat.python_config import Config
+from d2_plugin.gaussians.rotation4d import rotation_matrices_3d
 from d2_plugin.protocol import RasterSettings, Splats
 from d2_plugin.rasterizer import reference
 
@@ -137,3 +138,43 @@ class TestPackages:
         assert found.shape == (1, 2, 50)
         assert torch.equal(found[0, 0].long(), torch.arange(50))
         assert torch.equal(found[0, 1].long(), distances.fill_diagonal_(9).argmin(1))
+
+
+class TestKinematic:
+    """What cem-4dgs calls of pytorch3d and of faiss on a GPU."""
+
+    @staticmethod
+    def rotations(seed: int, count: int = 50) -> torch.Tensor:
+        values = torch.randn(count, 4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        return torch.nn.functional.normalize(values, dim=-1)
+
+    def test_quaternions_turn_points_as_their_matrices_do(self) -> None:
+        a, b, points = self.rotations(1), self.rotations(2), self.rotations(3)[:, :3]
+        A, B, AB = (rotation_matrices_3d(q.T).permute(2, 0, 1) for q in (a, b, kinematic.quaternion_multiply(a, b)))
+        torch.testing.assert_close(kinematic.quaternion_apply(a, points), (A @ points[..., None])[..., 0])
+        torch.testing.assert_close(AB, A @ B)
+        assert (kinematic.quaternion_multiply(a, b)[:, 0] >= 0).all()
+        back = kinematic.quaternion_apply(kinematic.quaternion_invert(a), kinematic.quaternion_apply(a, points))
+        torch.testing.assert_close(back, points)
+
+    def test_one_rotation_turns_many_points(self) -> None:
+        points = self.rotations(3)[:, :3]
+        one = self.rotations(1, 1)
+        torch.testing.assert_close(
+            kinematic.quaternion_apply(one, points), kinematic.quaternion_apply(one.expand(50, 4), points)
+        )
+
+    def test_the_nearest_point_is_found(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(kinematic, "PAIRS", 100)  # in several parts
+        points, queries = (self.rotations(seed)[:, :3].float().numpy() for seed in (4, 5))
+        index = kinematic.GpuIndexFlatL2(kinematic.StandardGpuResources(), 3)
+        index.add(points[:20])
+        index.add(points[20:])
+        distances, found = index.search(queries, 1)
+        squared = ((queries[:, None] - points[None]) ** 2).sum(-1)
+        assert np.array_equal(found[:, 0], squared.argmin(1))
+        np.testing.assert_allclose(distances[:, 0], squared.min(1), rtol=1e-4)
+
+
+def test_a_repositorys_own_lpips_is_not_a_number() -> None:
+    assert vision.lpips(torch.zeros(1, 3, 4, 4), torch.zeros(1, 3, 4, 4), net_type="vgg").mean().isnan()

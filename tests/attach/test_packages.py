@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import os
 import sys
 from pathlib import Path
 
@@ -106,6 +108,41 @@ def test_signed_bytes_become_a_picture(monkeypatch) -> None:
     repairs._pillow()
     values = np.array([[[0, 127, 255]]], np.uint8)
     assert np.array_equal(np.array(image.fromarray(values.view(np.int8), "RGB")), values)
+
+
+def test_workers_that_unpickle_the_repositorys_modules_are_threads(monkeypatch) -> None:
+    """cem-4dgs asks for processes, which would import torchvision again, where nothing stands in for it."""
+    joblib = pytest.importorskip("joblib")
+    monkeypatch.setattr(joblib.parallel, "BACKENDS", dict(joblib.parallel.BACKENDS))
+    assert "threads" in repairs._joblib()
+    here = joblib.Parallel(n_jobs=2, backend="loky")(joblib.delayed(os.getpid)() for _ in range(2))
+    assert set(here) == {os.getpid()}
+
+
+def test_numbers_of_numpy_become_json(monkeypatch) -> None:
+    monkeypatch.setattr(json.JSONEncoder, "default", json.JSONEncoder.default)
+    repairs._json()
+    assert json.dumps({"SSIM": np.float32(0.5)}) == '{"SSIM": 0.5}'
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        json.dumps(object())
+
+
+def test_no_parent_is_saved_as_numpy_1_wrote_it() -> None:
+    class Model:
+        def __init__(self) -> None:
+            self._parent = torch.tensor([[-1], [3]])
+            self.saved: list[tuple[int, ...]] = []
+
+        def save_ply(self, path: str) -> None:
+            table = np.empty(2, dtype=[("parent", "u4")])
+            table[:] = list(map(tuple, self._parent.numpy()))
+            self.saved = table.tolist()
+
+    repairs.saves_parents(Model)
+    model = Model()
+    model.save_ply("point_cloud.ply")
+    assert model.saved == [(2**32 - 1,), (3,)]
+    assert model._parent.tolist() == [[-1], [3]]
 
 
 def test_the_number_of_a_gpu_is_the_cpu_too() -> None:

@@ -77,6 +77,18 @@ class TestTable:
             replaced("a", "new", "page")
 
 
+def test_a_model_that_is_a_module_is_counted_and_told_apart() -> None:
+    """cem-4dgs's, whose motions are not drawn."""
+    model = torch.nn.Module()
+    model._xyz = torch.nn.Parameter(torch.zeros(5, 3))
+    model._xyz_motion = torch.nn.Parameter(torch.zeros(2, 3))
+    model._parent = torch.full((7, 1), -1)
+    before = inside.digest([model])
+    assert inside.count(model) == 5
+    model._xyz.data += 1
+    assert inside.digest([model]) != before
+
+
 class TestTrials:
     def test_every_recipe_of_the_launcher_has_a_trial(self) -> None:
         assert set(TRIALS) == set(RECIPES)

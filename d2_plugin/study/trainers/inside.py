@@ -82,6 +82,9 @@ def tensors(model: Any) -> Iterator[tuple[str, Tensor]]:
     if hasattr(model, "splats"):
         yield from ((name, value.detach()) for name, value in sorted(model.splats.items()))
         return
+    if isinstance(model, torch.nn.Module):  # cem-4dgs's
+        yield from ((name, value.detach()) for name, value in sorted(model.named_parameters()))
+        return
     for name, value in sorted(vars(model).items()):
         if isinstance(value, torch.nn.Module):
             yield from ((f"{name}.{inner}", tensor) for inner, tensor in value.state_dict().items())
@@ -99,9 +102,13 @@ def digest(models: Iterable[Any]) -> str:
 
 
 def count(model: Any) -> int:
-    """How many Gaussians are drawn: static ones and, where there are two tables, moving ones."""
+    """How many Gaussians are drawn: static ones and, where there are two tables, moving ones.
+
+    A model with `_parent` keeps motions in its second table, which are not drawn.
+    """
     found = dict(tensors(model))
-    return sum(len(found[name]) for name in ("_xyz", "_xyz_motion", "means") if name in found)
+    drawn = ("_xyz", "means") if hasattr(model, "_parent") else ("_xyz", "_xyz_motion", "means")
+    return sum(len(found[name]) for name in drawn if name in found)
 
 
 @torch.no_grad()

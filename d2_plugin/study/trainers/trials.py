@@ -179,18 +179,22 @@ def _spacetime(job: Job) -> list[str]:
     ]
 
 
-def _ex4dgs(job: Job) -> list[str]:
+def _ex4dgs(job: Job, extraction: str = "extracton_interval") -> list[str]:
     config = {
         **{"loader": "neural3dvideo", "resolution": 1, "iterations": job.iterations, "lazy_loader": True},
         **{"duration": job.frames, "start_duration": job.frames, "end_timestamp": job.frames},
         **{"densify_from_iter": job.share(0.2), "densify_until_iter": job.share(0.8)},
         **{"densification_interval": job.share(0.1), "extract_from_iter": job.share(0.25)},
-        **{"extracton_interval": job.share(0.15), "progressive_growing_steps": 100000},
+        **{extraction: job.share(0.15), "progressive_growing_steps": 100000},
         **{"position_lr_max_steps": job.iterations, "dynamic_position_lr_max_steps": job.iterations},
     }
     path = job.write("config.json", json_text(config, "config.json"))
     words = ["-s", str(job.data), "-m", str(job.model), "--configpath", path]
     return [*words, "--test_iterations", *job.reports, "--port", free_port()]
+
+
+def _cem4dgs(job: Job) -> list[str]:
+    return _ex4dgs(job, "extraction_interval")  # the option's name is spelt right there
 
 
 def _gsplat(job: Job) -> list[str]:
@@ -222,6 +226,9 @@ TRIALS = {
     ),
     "ex4dgs": Trial(
         "juno181/Ex4DGS", "colmap_frames", HELD_OUT[:1], _ex4dgs, scored_on="the first held-out camera", points=300
+    ),
+    "cem4dgs": Trial(
+        "tho-kn/cem-4dgs", "colmap_frames", HELD_OUT[:1], _cem4dgs, scored_on="the first held-out camera", points=300
     ),
     "gsplat": Trial(
         *("nerfstudio-project/gsplat", "gsplat", HELD_OUT, _gsplat, gsplat_stats),
