@@ -66,7 +66,7 @@ def _json() -> str | None:
     def default(encoder: json.JSONEncoder, o: Any) -> Any:
         return o.item() if isinstance(o, np.generic) else original(encoder, o)
 
-    json.JSONEncoder.default = default  # type: ignore[method-assign]
+    json.JSONEncoder.default = default  # type: ignore[method-assign, assignment]
     return None
 
 
