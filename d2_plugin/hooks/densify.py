@@ -56,8 +56,9 @@ class DensifyConfig(HookConfig):
     """Standard deviation in time of a new Gaussian where the picture moves, in intervals from instant to instant, in a
     backbone that has one; none: as it begins there. 1000 steps, seed 0, PSNR of what moves: studio 26.0 dB (none 20.4),
     plaza 20.9 (19.6); a rendered room at 10 and 60 frames a second 21.2 and 20.6, at 6 intervals 20.2 and 20.6, none
-    20.2 and 20.1. New ones stand still: with the velocity that optical flow between two instants gives, what moves gains
-    .1 to .2 dB and the whole picture loses .1 to .2 (studio and plaza, two seeds each); twice the lifetime adds nothing."""
+    20.2 and 20.1. New ones stand still: with the velocity that optical flow between two instants gives, what moves
+    gains .1 to .2 dB and the whole picture loses as much (studio and plaza, two seeds); twice the lifetime adds
+    nothing."""
     cell: Positive = 1.0
     """Side of the frustum cells that keep duplicates out, in units of the distance between samples."""
     occupied_opacity: Share = 0.08
