@@ -85,6 +85,21 @@ def make_row(
     return row | details | circumstances(device) | {"command": command}
 
 
+def told_apart(rows: Sequence[Row]) -> list[Row]:
+    """The rows, with the cameras behind the case where some of one case trained with other ones: their means are not
+    to be mixed. Rows that do not say their `cameras` stay as they are."""
+    cameras: dict[tuple[str, str], set[str]] = {}
+    for row in rows:
+        if row.get("cameras"):
+            cameras.setdefault((row["kind"], row["case"]), set()).add(" ".join(row["cameras"]))
+
+    def told(row: Row) -> Row:
+        several = row.get("cameras") and len(cameras[row["kind"], row["case"]]) > 1
+        return {**row, "case": f"{row['case']}, {' '.join(row['cameras'])}"} if several else row
+
+    return [told(row) for row in rows]
+
+
 def append_rows(path: Path, rows: Iterable[Row]) -> None:
     """Add rows to the end of a file, which is created where absent.
 

@@ -54,6 +54,7 @@ def _row(folder: Path) -> Row:
         seed=settings.get("seed"),
         protocol=settings.get("protocol"),
         frames=settings.get("frames"),
+        cameras=list(metrics["train_cameras"]),
         test_cameras=metrics.get("test_cameras"),
         mono_emulated=metrics.get("mono_emulated", False),
         scores=scores,

@@ -20,7 +20,7 @@ from d2_plugin.study.report.plots import Axis, Plot, Point, Series, number
 from d2_plugin.study.report.report import BUILDERS, ReportSettings, collect, make_report, run
 from d2_plugin.study.report.svg import bars, figure
 from d2_plugin.study.report.work_precision import means, pareto_front, work_precision
-from d2_plugin.study.rows import KINDS, Row, append_rows, make_row, read_rows
+from d2_plugin.study.rows import KINDS, Row, append_rows, make_row, read_rows, told_apart
 from d2_plugin.study.training_rows import training_rows
 
 RUNS = Path(__file__).parents[1] / "data" / "runs.jsonl"
@@ -402,3 +402,14 @@ def test_stacked_bars_are_as_long_as_their_sums() -> None:
 def test_a_table_in_markdown_keeps_its_bars_and_stresses_the_best() -> None:
     text = markdown(Table(("a", "b"), (("1|2", "3"),), frozenset({(0, 1)})))
     assert text.splitlines()[-1] == "| 1\\|2 | **3** |"
+
+
+def test_other_cameras_of_one_recording_are_another_case() -> None:
+    def row(cameras: list[str] | None, kind: str = "quality") -> dict:
+        more = {} if cameras is None else {"cameras": cameras}
+        return {"kind": kind, "case": "plaza, 2 views", **more}
+
+    pairs = told_apart([row(["00", "07"]), row(["01", "03"]), row(None), row(["01", "03"], "training")])
+    names = ["plaza, 2 views, 00 07", "plaza, 2 views, 01 03", "plaza, 2 views", "plaza, 2 views"]
+    assert [each["case"] for each in pairs] == names
+    assert [each["case"] for each in told_apart([row(["00", "07"]), row(["00", "07"])])] == ["plaza, 2 views"] * 2

@@ -145,10 +145,11 @@ def write(results: Mapping[Job, Metrics], presets: Sequence[Preset], output: Pat
 def _row(job: Job, metrics: Metrics, command: str) -> Row:
     scores = metrics["test"] or {}
     psnr = scores.get("psnr")
-    protocol = job.settings.protocol
+    protocol, frames = job.settings.protocol, job.settings.frames
+    further = (f", {len(frames)} frames" if frames else "") + (f", {protocol}" if protocol else "")
     return make_row(
         "ablation",
-        f"{metrics['capture']}, {len(metrics['train_cameras'])} cameras" + (f", {protocol}" if protocol else ""),
+        f"{metrics['capture']}, {len(metrics['train_cameras'])} cameras{further}",
         f"{job.backbone} {job.preset}",
         f"seed {job.seed}",
         error=None if psnr is None else 10 ** (-psnr / 20),
@@ -158,5 +159,6 @@ def _row(job: Job, metrics: Metrics, command: str) -> Row:
         gaussians=metrics["gaussians"],
         iterations=metrics["iterations"],
         prior_seconds=_prior_seconds(job),
+        cameras=list(metrics["train_cameras"]),
         protocol=protocol,
     )

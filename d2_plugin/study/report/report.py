@@ -14,7 +14,7 @@ from d2_plugin.reading import parsing
 from d2_plugin.runs.tables import read_metrics
 from d2_plugin.settings import Positional, Settings
 from d2_plugin.study.never_worse.section import never_worse
-from d2_plugin.study.rows import Row, read_rows
+from d2_plugin.study.rows import Row, read_rows, told_apart
 from d2_plugin.study.training_rows import method_of, picture_of, training_rows
 
 from .ablation import ablation
@@ -77,6 +77,7 @@ def make_report(rows: Sequence[Row], output: Path, pictures: Sequence[Picture] =
     """
     if not rows:
         raise D2Error("there is nothing to report: give a runs.jsonl with rows in it, or the folder of a finished run")
+    rows = told_apart(rows)
     by_kind = {kind: [row for row in rows if row["kind"] == kind] for kind in BUILDERS}
     sections = [_built(kind, mine) for kind, mine in by_kind.items() if mine]
     compared = versions(rows)

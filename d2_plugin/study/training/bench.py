@@ -120,7 +120,7 @@ def _line(settings: TrainingBench, case: Case, shared: Shared, preset: Preset, k
     tried: list[Timed] = [
         (row["iterations"], row["seconds"])
         for row in found.values()
-        if (row["case"], row["method"]) == (case.name, template.method) and row["seconds"]
+        if _same(row, case) and row["method"] == template.method and row["seconds"]
     ]
 
     def missing(works: Sequence[Work]) -> list[Work]:
@@ -149,8 +149,15 @@ def _line(settings: TrainingBench, case: Case, shared: Shared, preset: Preset, k
 
 def _settled(found: dict[tuple[str, str], Row], template: _Template, target: str) -> int | None:
     """The number of steps that an earlier call chose for this time."""
-    mine = (template.case.name, template.method, target)
-    return next((r["iterations"] for r in found.values() if (r["case"], r["method"], r["target"]) == mine), None)
+    mine = template.method, target
+    same = (row for row in found.values() if _same(row, template.case) and (row["method"], row["target"]) == mine)
+    return next((row["iterations"] for row in same), None)
+
+
+def _same(row: Row, case: Case) -> bool:
+    """Whether a row is of that case; one without cameras is of an earlier version, which did not say them."""
+    cameras = list(case.settings.train_cameras)
+    return row["case"] == case.name and row.get("cameras", cameras) == cameras
 
 
 class _Template:

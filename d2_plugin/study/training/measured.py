@@ -96,7 +96,7 @@ def row_of(work: Work, metrics: Mapping[str, Any]) -> Row:
 def _row(work: Work, **found: Any) -> Row:
     settings = work.job.settings
     about: dict[str, Any] = {"target": work.target, "iterations": settings.iterations, "seed": settings.seed}
-    about |= work.about
+    about |= {"cameras": list(settings.train_cameras), **work.about}
     setting = f"{settings.iterations} steps, seed {settings.seed}"
     about["fingerprint"] = fingerprint(work.job)
     return make_row(work.kind, work.case, work.method, setting, command=work.command, **found, **about)
