@@ -20,7 +20,7 @@ AT_LEAST = 10
 place, in some ten steps however long the run is; evaluations that follow each other sooner condemn on one and the same
 evidence, and dig before the hole is closed. Official trainers, 160x90, attached, one seed: 4C4D on studio, 40
 iterations, 20.5 dB with one every 2 steps, 25.1 with none before ten have passed (bare 21.9); gsplat on studio, 20
-iterations, 19.4 and 22.0 (bare 20.9). In 150 iterations every 7 and every 10 are the same within errors (three seeds)."""
+iterations, 19.4 and 22.0 (bare 20.9). In 150 iterations every 7 and every 10 are equal within errors (three seeds)."""
 
 
 @dataclass(frozen=True)
