@@ -111,8 +111,8 @@ def test_a_file_says_its_version_and_another_one_is_refused(tmp_path: Path) -> N
 def test_schedules_fit_the_length_of_a_run(iterations: int) -> None:
     config = for_iterations(HOOKS, iterations)
     assert config.hooks == tuple(HOOKS)
-    every = max(10, min(100, iterations // 20))
-    assert config.densify.every == config.prune.every == every
+    every, pruning = (max(least, min(100, iterations // 20)) for least in (5, 10))
+    assert (config.densify.every, config.prune.every) == (every, pruning)
     assert config.densify.start == max(1, min(every, iterations // 40))
     assert config.densify.budget_per_view == 10 * iterations
     assert config.densify.stop == max(iterations // 2, every + 1)

@@ -59,18 +59,9 @@ class HookConfig(Settings):
         return Window(self.start, self.stop, self.every)
 
 
-AT_LEAST = 10
-"""Steps from one evaluation to the next in a short run. Training closes a hole, and carries what is misplaced to its
-place, in some ten steps however long the run is. Pruning that looks sooner condemns on one and the same evidence, and
-digs before the hole is closed. Official trainers, 160x90, attached, one seed: 4C4D on studio, 40 iterations, 20.5 dB
-with a look every 2 steps, 25.1 with none before ten have passed (bare 21.9); gsplat on studio, 20 iterations, 19.4 and
-22.0 (bare 20.9). And evaluations cost more than steps: with one every 3 steps 60 steps take as long as 90 with one
-every ten, one seed: studio 27.2 and 27.5 dB, plaza 19.5 and 20.3."""
-
-
-def steps_between_evaluations(iterations: int) -> int:
-    """Of hooks that edit structure: a hundred, in short runs a twentieth of the run and ten at least."""
-    return max(AT_LEAST, min(100, iterations // 20))
+def steps_between_evaluations(iterations: int, least: int) -> int:
+    """Of hooks that edit structure: a hundred, in short runs a twentieth of the run and `least` at least."""
+    return max(least, min(100, iterations // 20))
 
 
 def _none_known(_: str) -> Sequence[View]:

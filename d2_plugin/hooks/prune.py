@@ -15,6 +15,12 @@ from d2_plugin.settings import AtLeastOne, Every, Positive, Share, Steps
 from .hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
 from .rendered_depth import EPSILON
 
+AT_LEAST = 10
+"""Steps from one evaluation to the next in a short run. Training closes a hole in some ten steps however long the run
+is; evaluations that follow each other sooner condemn on one and the same evidence, and dig before the hole is closed.
+Official trainers, 160x90, attached, one seed: 4C4D on studio, 40 iterations, 20.5 dB with one every 2 steps, 25.1 with
+none before ten have passed (bare 21.9); gsplat on studio, 20 iterations, 19.4 and 22.0 (bare 20.9)."""
+
 
 @dataclass(frozen=True)
 class PruneConfig(HookConfig):
@@ -57,7 +63,7 @@ class PruneConfig(HookConfig):
     def for_iterations(cls, iterations: int) -> PruneConfig:
         """Pruning from a fifth to two thirds of the run: the last third only refines. Runs of less than about a hundred
         iterations are too short to gather evidence in, and nothing is pruned there."""
-        every = steps_between_evaluations(iterations)
+        every = steps_between_evaluations(iterations, AT_LEAST)
         return cls(start=iterations // 5, stop=2 * iterations // 3, every=every)
 
 
