@@ -143,7 +143,7 @@ def test_a_hook_that_changes_nothing_retires_and_the_scores_say_so(
     config.write_text("[d2]\nretire_after = 2\n[densify]\nmax_gaussians = 0\n")
     hooks = ["--hooks", "densify", "--priors", str(finished / "priors"), "--config", str(config)]
     assert train(capture, tmp_path / "idle", *hooks) == 0
-    assert "densify retired at step 3: it changed next to nothing" in capsys.readouterr().out
+    assert "densify retired at step 6: it changed next to nothing" in capsys.readouterr().out
     assert json.loads((tmp_path / "idle" / "metrics.json").read_text())["retired"] == {"densify": 3}
 
 
