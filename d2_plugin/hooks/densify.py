@@ -19,8 +19,8 @@ from .rendered_depth import relative_discrepancy, rendered_depth
 
 AT_LEAST = 5
 """Steps from one evaluation to the next in a short run: an evaluation costs as much as several steps. sear_steak, 10
-CPU seconds: 21.6 dB in 32 steps with one at every step, 24.4 in 70 with one every five, 25.1 in 80 with one every ten
-(backbone 23.7). But gsplat's trainer, 20 iterations on studio, is at 20.7 dB with ten and at 21.8 with five (bare
+CPU seconds, three seeds: 21.6 dB in 32 steps with one at every step, 25.2 in 78 with one every five (backbone 23.9).
+With ten 25.1; but gsplat's trainer, 20 iterations on studio, one seed, is at 20.7 dB with ten and 21.8 with five (bare
 20.9)."""
 
 

@@ -144,7 +144,7 @@ def test_a_hook_that_changes_nothing_retires_and_the_scores_say_so(
     hooks = ["--hooks", "densify", "--priors", str(finished / "priors"), "--config", str(config)]
     assert train(capture, tmp_path / "idle", *hooks) == 0
     assert "densify retired at step 6: it changed next to nothing" in capsys.readouterr().out
-    assert json.loads((tmp_path / "idle" / "metrics.json").read_text())["retired"] == {"densify": 3}
+    assert json.loads((tmp_path / "idle" / "metrics.json").read_text())["retired"] == {"densify": 6}
 
 
 def test_a_part_is_not_built_on_a_cluster(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
