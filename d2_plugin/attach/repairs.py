@@ -58,7 +58,7 @@ def _joblib() -> str | None:
     return "joblib's workers are threads of this process, where the stand-ins are"
 
 
-def _json() -> str | None:
+def _json() -> str:
     """cem-4dgs writes scikit-image's SSIM as JSON, which later versions return in single precision (train.py:450)."""
     original = json.JSONEncoder.default
 
@@ -67,7 +67,7 @@ def _json() -> str | None:
         return o.item() if isinstance(o, np.generic) else original(encoder, o)
 
     json.JSONEncoder.default = default  # type: ignore[method-assign, assignment]
-    return None
+    return "numbers of numpy are written as JSON like Python's own"
 
 
 def saves_parents(model: Any) -> None:
