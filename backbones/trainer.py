@@ -54,7 +54,8 @@ class Frames(Protocol):
     """The training pictures: views, and the picture [H, W, 3] in 0..1 of each.
 
     Where there is also `picture(index)`, the same as it is kept (uint8, 0..255), the loss is computed from that.
-    It may have `weights(index) -> [H, W] | None` as well: how much each pixel counts, 0..1.
+    It may have `weights(index) -> [H, W] | None` as well: how much each pixel counts, 0..1. It may have `opened(step)`:
+    how many of the views, from the first on, are trained on at a step, where that is not all of them.
     """
 
     views: Sequence[View]
@@ -155,8 +156,14 @@ class Trainer:
         return None if weights is None else weights(index)
 
     def _next_view(self) -> int:
-        """Every view once, in a new random order each time round."""
+        """Every view once, in a new random order each time round; views that join begin a new round."""
+        opened = self._opened(self.step)
         if not self._queue:
             self.early_stop.end_round()
-            self._queue = torch.randperm(len(self.frames.views), generator=self._generator).tolist()
+        if not self._queue or opened > self._opened(max(self.step - 1, 1)):
+            self._queue = torch.randperm(opened, generator=self._generator).tolist()
         return self._queue.pop()
+
+    def _opened(self, step: int) -> int:
+        opened: Callable[[int], int] | None = getattr(self.frames, "opened", None)
+        return len(self.frames.views) if opened is None else opened(step)

@@ -41,7 +41,7 @@ def run(given: Given) -> str:
     from d2_plugin.priors.calibration import frames_with_truth, held_against_truth
     from d2_plugin.priors.sheet import contact_sheet
     from d2_plugin.priors.store import PriorStore
-    from d2_plugin.runs.prior import build_priors_for
+    from d2_plugin.runs.prior.build import build_priors_for
     from d2_plugin.runs.scene import Scene
     from d2_plugin.runs.settings import check
     from d2_plugin.runs.start import triangulated_points

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from d2_plugin.viewing.live.run import LiveRun
 
 OF_THE_RUN = (
-    *("test_cameras", "backbone", "iterations", "hooks", "priors", "accept_empty_prior", "background_weight"),
-    *("seed", "device"),
+    *("test_cameras", "backbone", "iterations", "hooks", "priors", "priors_in_step", "accept_empty_prior"),
+    *("background_weight", "seed", "device"),
 )
 TABLES = ("densify", "prune", "depth_loss", "d2", "priors", "backbone", "plan", "import")
 

@@ -14,10 +14,12 @@ from d2_plugin.captures.capture import Capture
 from d2_plugin.captures.pictures import write_png
 from d2_plugin.durable import make_folder
 from d2_plugin.errors import D2Error
+from d2_plugin.progress import progress_bar
 from d2_plugin.runs import metrics
 from d2_plugin.runs.drawing import Panel, color_scale, colorize, side_by_side
-from d2_plugin.runs.lpips import Lpips
+from d2_plugin.runs.lpips import Lpips, find_lpips
 from d2_plugin.runs.plan import CHANGED, MOVING_SHARE
+from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.start import make_view
 
 RenderView = Callable[[str, int], tuple[Tensor, Tensor | None]]
@@ -50,6 +52,23 @@ def renderer(model: Any, capture: Capture, device: torch.device | str) -> Render
         return color.clamp(0, 1), depth
 
     return render
+
+
+def evaluate_scene(
+    model: Any, scene: Scene, device: torch.device | str, pictures: Path | None = None
+) -> dict[str, Any]:
+    """`evaluate` at the test cameras of a scene; at its training cameras, under `train` instead of `test`, where it has
+    none."""
+    cameras, frames = scene.test_cameras or scene.train_cameras, scene.capture.frames
+    with progress_bar("evaluate", len(cameras) * len(frames)) as bar:
+        scores = evaluate(
+            renderer(model, scene.capture, device),
+            *(scene.capture, cameras, frames, pictures),
+            lpips=find_lpips("alex"),
+            lpips_vgg=find_lpips("vgg"),
+            progress=lambda done, _: bar.update(done),
+        )
+    return scores if scene.test_cameras else {"test": None, "train": scores.pop("test")} | scores
 
 
 def evaluate(

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from d2_plugin.plugin import D2Hooks
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
-from d2_plugin.runs.prior import build_priors_for, refuse_unusable
-from d2_plugin.runs.provenance import circumstances
+from d2_plugin.runs.prior.alongside import OPEN_BY, PriorAlongside, alongside
+from d2_plugin.runs.prior.build import build_priors_for, refuse_unusable
+from d2_plugin.runs.provenance import about
 from d2_plugin.runs.saved.checkpoint import fitting, load_checkpoint, save_checkpoint
 from d2_plugin.runs.saved.claim import claim
 from d2_plugin.runs.saved.finite import Watch, watched, what_diverged
@@ -56,6 +58,7 @@ class Run:
         self.prior: dict[str, Any] | None = None
         """What the depth prior became, as `PriorSummary.as_dict` has it; None without one."""
         self._writes = False
+        self._building: PriorAlongside | None = None
 
     @classmethod
     @checked_arguments
@@ -82,13 +85,15 @@ class Run:
         with self._writing(), self._timed("priors"):
             points = self._points()
             if priors and self.uses_prior:
-                root = Path(self.settings.priors or self.folder / "priors")
-                summary = build_priors_for(self.settings, self.scene, points.positions, root)
-                if told is not None:
-                    told(summary)
-                refuse_unusable(summary, self.settings.accept_empty_prior)
-                self.prior = summary.as_dict()
+                self._take(build_priors_for(self.settings, self.scene, points.positions, self._store), told)
         return points
+
+    def _take(self, summary: PriorSummary, told: Callable[[PriorSummary], None] | None) -> None:
+        """Tell and keep what the prior became; refuse one that is of no use."""
+        if told is not None:
+            told(summary)
+        refuse_unusable(summary, self.settings.accept_empty_prior)
+        self.prior = summary.as_dict()
 
     def train(self, told: Callable[[PriorSummary], None] | None = None, watch: Watch | None = None) -> None:
         """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one.
@@ -99,8 +104,8 @@ class Run:
             D2Error: what `prepare` refuses, another process that writes this run, a damaged file, a disk that is full.
             Diverged: the loss or a parameter is no finite number any more.
         """
-        with self._writing():
-            trainer = self._trainer(self.prepare(told=told))
+        with self._writing(), self._beside():
+            trainer = self._trainer(self.prepare(self._building is None, told))
             self._restore(trainer)
             watching = watch(trainer) if watch else lambda step, loss: None
             iterations = self.settings.iterations
@@ -115,7 +120,10 @@ class Run:
                     until = min((trainer.step // chunk + 1) * chunk, iterations)
                     with self._timed("train"), watched(trainer, self._checkpoint) as finite:
                         trainer.run(until, finite(on_step))
+                    if trainer.step >= OPEN_BY * iterations:
+                        self._finish_prior(told)
                     self._save(trainer)
+                self._finish_prior(told)
             self.retired = {} if trainer.d2 is None else dict(trainer.d2.retired)
 
     def evaluate(self, pictures: bool = True) -> dict[str, Any]:
@@ -124,64 +132,18 @@ class Run:
         Writes metrics.json (per view, per frame, per camera, mean), the same as tables in metrics.md and metrics.tex,
         and pictures/.
         """
+        from d2_plugin.runs.evaluation import evaluate_scene
         from d2_plugin.runs.tables import write_tables
 
         with self._writing():
             trainer = self.trained()
             with self._timed("eval"):
-                scores = self._scores(trainer.model, self.folder / "pictures" if pictures else None)
-            metrics = scores | self._about(trainer)
+                shown = self.folder / "pictures" if pictures else None
+                scores = evaluate_scene(trainer.model, self.scene, self.settings.device, shown)
+            metrics = scores | about(self, trainer)
             write_tables(metrics, self.folder)
             write_table(self.folder / "metrics.json", metrics, METRICS)
         return metrics
-
-    def _scores(self, model: Any, pictures: Path | None) -> dict[str, Any]:
-        """What `evaluate` finds; under `train` instead of `test` where no camera was held out."""
-        from d2_plugin.runs.evaluation import evaluate, renderer
-        from d2_plugin.runs.lpips import find_lpips
-
-        scene = self.scene
-        cameras = scene.test_cameras or scene.train_cameras
-        with progress_bar("evaluate", len(cameras) * len(scene.capture.frames)) as bar:
-            scores = evaluate(
-                renderer(model, scene.capture, self.settings.device),
-                scene.capture,
-                cameras,
-                scene.capture.frames,
-                pictures,
-                lpips=find_lpips("alex"),
-                lpips_vgg=find_lpips("vgg"),
-                progress=lambda done, _: bar.update(done),
-            )
-        if scene.test_cameras:
-            return scores
-        return {"test": None, "train": scores.pop("test")} | scores
-
-    def _about(self, trainer: Any) -> dict[str, Any]:
-        """What metrics.json says beside the scores: the run, its cost, and the machine."""
-        scene = self.scene
-        return {
-            "gaussians": len(trainer.model),
-            "iterations": trainer.step,
-            "seconds": {name: round(value, 3) for name, value in self.seconds.items()},
-            "cpu_seconds": {name: round(value, 3) for name, value in self.cpu_seconds.items()},
-            "train_cameras": list(scene.train_cameras),
-            "test_cameras": list(scene.test_cameras),
-            "protocol": self.settings.protocol,
-            "backbone": self.settings.backbone,
-            "hooks": list(self.settings.hooks),
-            "guidance": None if self.guidance is None else dict(self.guidance.identity()),
-            "retired": self.retired,
-            "background": getattr(trainer.model, "background", None) is not None,
-            "appearance": getattr(trainer.model, "appearance", None) is not None,
-            "clocks": None if getattr(trainer.model, "clocks", None) is None else trainer.model.clocks.in_frames(),
-            "prior": self.prior,
-            "plan": scene.plan.as_dict(),
-            "capture": scene.capture.name,
-            "mono_emulated": scene.capture.mono_emulated,
-            "notes": list(scene.capture.notes),
-            "made": circumstances(),
-        }
 
     def export_ply(self) -> list[Path]:
         """One 3DGS PLY per frame under ply/; a background is left out, for which it has no place."""
@@ -195,7 +157,12 @@ class Run:
     @property
     def priors(self) -> Path:
         """Folder of the depth prior that was built from the training cameras."""
-        return PriorStore.located(self.settings.priors or self.folder / "priors", self.scene.train_cameras)
+        return PriorStore.located(self._store, self.scene.train_cameras)
+
+    @property
+    def _store(self) -> Path:
+        """Folder of the depth priors of all sets of cameras."""
+        return Path(self.settings.priors or self.folder / "priors")
 
     def _points(self) -> TimedPoints:
         """The triangulated points, kept in points.npz."""
@@ -224,7 +191,9 @@ class Run:
         training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
         weight = self.settings.background_weight
         pictures = TrainingFrames(capture, cameras, self.settings.device, background_weight=weight)
-        return backbone.Trainer(model, pictures, training, self._attach if attach and self.uses_prior else None)
+        trainer = backbone.Trainer(model, pictures, training, self._attach if attach and self.uses_prior else None)
+        pictures.awaited = self._building  # only now: what a model begins with needs no prior
+        return trainer
 
     def _needed(self) -> dict[str, Any]:
         """The backbone's settings that the scene needs, those alone: one of somebody else's may not know the names."""
@@ -286,6 +255,25 @@ class Run:
                 yield
             finally:
                 self._writes = False
+
+    @contextmanager
+    def _beside(self) -> Iterator[None]:
+        """Build the prior beside the training, where the settings ask for it."""
+        wanted = self.settings.priors_in_step and self.uses_prior and self.guidance is None
+        begin = partial(alongside, self.settings, self.scene, self._store)
+        with begin(self._points().positions) if wanted else nullcontext() as self._building:
+            try:
+                yield
+            finally:
+                self._building = None
+
+    def _finish_prior(self, told: Callable[[PriorSummary], None] | None) -> None:
+        """Take what the prior that is built beside became."""
+        if self._building is not None:
+            self._take(self._building.finish(), told)
+            self.seconds["priors"] += self._building.seconds
+            self.cpu_seconds["priors"] += self._building.cpu_seconds
+            self._building = None
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:

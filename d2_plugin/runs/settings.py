@@ -66,6 +66,8 @@ class RunSettings(Settings):
     """What the model returns: relative (inverse depth up to scale and shift) or metric (depth)."""
     priors: str | None = None
     """Folder of a finished depth prior; without it the run builds its own."""
+    priors_in_step: bool = False
+    """Begin to train when the first block of frames has its prior; the others join over a fifth of the steps."""
     accept_empty_prior: bool = False
     """Train with hooks even where no view has a usable prior, as the backbone alone would."""
     background_weight: Share = 1.0

@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -113,6 +113,13 @@ def begin_with_exposures(model: Any, capture: Capture, training: Sequence[str], 
         begin(known, training)
 
 
+class Awaited(Protocol):
+    """What the training of a frame waits for: see `d2_plugin.runs.prior.alongside.PriorAlongside`."""
+
+    def opened(self, step: int) -> int: ...
+    def wait_for(self, frame: int) -> None: ...
+
+
 class TrainingFrames:
     """Views and pictures of the training cameras; decoded pictures are kept up to `keep_bytes`, the rest re-read."""
 
@@ -128,7 +135,13 @@ class TrainingFrames:
         self.background_weight = background_weight
         self._recorded = {camera: capture.recorded(camera) for camera in cameras}
         self.views = [make_view(capture, camera, frame, device) for frame in capture.frames for camera in cameras]
+        self.awaited: Awaited | None = None
+        """What is built while these pictures are trained on, if anything is."""
         self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
+
+    def opened(self, step: int) -> int:
+        """How many of `views`, from the first on, are trained on at a step (from 1)."""
+        return len(self.views) if self.awaited is None else self.awaited.opened(step)
 
     def image(self, index: int) -> Tensor:
         """Picture [H, W, 3] in 0..1 of `views[index]`."""
@@ -136,8 +149,10 @@ class TrainingFrames:
 
     def picture(self, index: int) -> Tensor:
         """The same as it is kept: uint8, 0..255."""
+        view = self.views[index]
+        if self.awaited is not None:
+            self.awaited.wait_for(view.frame)
         if index not in self._kept:
-            view = self.views[index]
             self._kept[index] = self.capture.image(view.camera, view.frame)
             while len(self._kept) > 1 and sum(image.nbytes for image in self._kept.values()) > self.keep_bytes:
                 self._kept.popitem(last=False)

@@ -245,7 +245,7 @@ def _train(settings: RunSettings, folder: Path) -> dict[str, Any]:
 def _build(settings: RunSettings, folder: Path) -> dict[str, Any]:
     """Build the priors; the score is the verified share, with the median error of those pixels where truth is known."""
     from d2_plugin.priors.store import PriorStore
-    from d2_plugin.runs.prior import build_priors_for
+    from d2_plugin.runs.prior.build import build_priors_for
     from d2_plugin.runs.start import triangulated_points
 
     scene = Scene.open(settings)

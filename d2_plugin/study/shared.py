@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.durable import Kind, make_folder, read_table, write_table
-from d2_plugin.runs.prior import build_priors_for
+from d2_plugin.runs.prior.build import build_priors_for
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, prior_settings
 from d2_plugin.runs.start import TimedPoints, triangulated_points

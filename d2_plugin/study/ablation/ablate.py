@@ -12,12 +12,12 @@ from d2_plugin.durable import Kind, read_table, write_table, write_text
 from d2_plugin.progress import be_silent, progress_bar
 from d2_plugin.runs.saved.kinds import read_metrics
 from d2_plugin.runs.settings import RunSettings, prior_settings
+from d2_plugin.runs.workers import worker_pool
 from d2_plugin.study.ablation.job import Job, Metrics
 from d2_plugin.study.ablation.presets import Preset
 from d2_plugin.study.ablation.tables import report
 from d2_plugin.study.rows import Row, as_line, make_row
 from d2_plugin.study.shared import share
-from d2_plugin.study.workers import worker_pool
 
 PRIOR_SECONDS = Kind("time of a prior", 1, "delete it")
 """PRIORS.seconds.json, beside each prior that runs share."""

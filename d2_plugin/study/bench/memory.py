@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from d2_plugin.study.workers import worker_pool
+from d2_plugin.runs.workers import worker_pool
 
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 

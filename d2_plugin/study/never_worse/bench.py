@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 
 from d2_plugin.errors import D2Error
 from d2_plugin.progress import progress_bar
-from d2_plugin.runs.prior import build_priors_for
+from d2_plugin.runs.prior.build import build_priors_for
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings, check, prior_settings
 from d2_plugin.runs.start import TimedPoints

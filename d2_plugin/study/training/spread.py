@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from d2_plugin.errors import D2Error
+from d2_plugin.runs.workers import worker_pool
 from d2_plugin.study.rows import Row
-from d2_plugin.study.workers import worker_pool
 
 from .measured import Work, measure
 

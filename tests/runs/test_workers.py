@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from d2_plugin.study.workers import worker_pool
+from d2_plugin.runs.workers import worker_pool
 
 PARENT = """
 import os, time
-from d2_plugin.study.workers import worker_pool
+from d2_plugin.runs.workers import worker_pool
 
 if __name__ == "__main__":
     with worker_pool(1) as pool:

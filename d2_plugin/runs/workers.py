@@ -17,13 +17,18 @@ def worker_pool(count: int, prepare: Callable[[], None] | None = None) -> Proces
     return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin, (prepare,))
 
 
+def end_with_parent() -> None:
+    """Called in a worker: it ends when the process that started it does, however that one ends."""
+    threading.Thread(target=_wait_for_parent, daemon=True).start()
+
+
 def _begin(prepare: Callable[[], None] | None) -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     if prepare is not None:
         prepare()
 
 
-def _end_with_parent() -> None:
+def _wait_for_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,16 +24,20 @@ def build_priors_for(
     *,
     shard: tuple[int, int] | None = None,
     cluster: Mapping[str, Any] | None = None,
+    told: Callable[[int], None] | None = None,
 ) -> PriorSummary:
     """Build what is missing of the depth prior in `folder`; `points` [P, 3] bound the depths that are searched.
 
     `shard` (index from 0, count) builds one part, so that any scheduler can run the parts beside each other. `cluster`
-    (`scheduler` or `workers`) hands the frames to dask.distributed instead.
+    (`scheduler` or `workers`) hands the frames to dask.distributed instead. `told` is called with the number of
+    pictures that are done: all cameras of one frame after the other, the frames in order.
     """
     with progress_bar("priors", len(scene.capture.frames) * len(scene.train_cameras)) as bar:
 
         def report(done: int, total: int, note: str = "") -> None:
             bar.update(done, note)
+            if told is not None:
+                told(done)
 
         if cluster is None:
             build = partial(build_priors, shard=shard)

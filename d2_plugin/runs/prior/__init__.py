@@ -1,0 +1,1 @@
+"""The depth prior of a run: built before it trains, or beside."""

@@ -1,0 +1,137 @@
+"""The depth prior built in step with training: by a process of its own, while this one trains on what is finished.
+
+Frames join the training by its steps and not by the clock, so a run is the same bits however long its prior takes: a
+trainer that is ahead waits. Where the trainer of a backbone draws its views without asking, it waits for their frames
+all the same.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.summary import PriorSummary
+from d2_plugin.progress import be_silent
+from d2_plugin.runs.prior.build import build_priors_for
+from d2_plugin.runs.scene import Scene
+from d2_plugin.runs.settings import RunSettings
+from d2_plugin.runs.workers import end_with_parent
+
+FIRST = 0.25
+"""Share of the frames that training begins with."""
+MOST_FIRST = 30
+"""At most so many: a block of frames that are matched one after the other (`StereoSettings.reuse_block`)."""
+OPEN_BY = 0.2
+"""Share of the steps by which all frames have joined."""
+
+
+def frames_open(step: int, iterations: int, frames: int) -> int:
+    """How many of the frames, from the first on, are trained on at `step` (from 1) of `iterations`."""
+    first = min(math.ceil(FIRST * frames), MOST_FIRST)
+    share = min((step - 1) / (OPEN_BY * iterations), 1.0)
+    return first + math.floor(share * (frames - first))
+
+
+class PriorAlongside:
+    """A process that builds the depth prior of a run, frame after frame.
+
+    Args:
+        settings, scene: of the run.
+        folder: of the store, which others may read meanwhile.
+        points: triangulated points [P, 3], as for `build_priors_for`.
+    """
+
+    def __init__(self, settings: RunSettings, scene: Scene, folder: Path, points: np.ndarray) -> None:
+        self.cameras, self.frames = len(scene.train_cameras), scene.capture.frames
+        self.iterations = settings.iterations
+        self.seconds = self.cpu_seconds = 0.0
+        """What the build took, once it is finished."""
+        self._summary: PriorSummary | None = None
+        self._pictures, self._start = 0, time.monotonic()
+        context = multiprocessing.get_context("spawn")
+        self._told, telling = context.Pipe(duplex=False)
+        self._process = context.Process(target=_build, args=(telling, settings, points, folder), daemon=True)
+        self._process.start()
+        telling.close()  # the other process has it: its end is the end of the pipe
+
+    def opened(self, step: int) -> int:
+        """How many views, frame by frame, are trained on at a step; returns once their prior is there."""
+        count = frames_open(step, self.iterations, len(self.frames))
+        self.wait(count)
+        return count * self.cameras
+
+    def wait_for(self, frame: int) -> None:
+        """Return once the prior of a frame is there."""
+        self.wait(self.frames.index(frame) + 1)
+
+    def wait(self, frames: int) -> None:
+        """Return once the prior of so many frames is there.
+
+        Raises:
+            D2Error: what the build refuses, or its process was killed.
+        """
+        while self._pictures < frames * self.cameras and self._summary is None:
+            self._hear()
+
+    def finish(self) -> PriorSummary:
+        """What the prior became, once all of it is there.
+
+        Raises:
+            D2Error: what the build refuses, or its process was killed.
+        """
+        while self._summary is None:
+            self._hear()
+        return self._summary
+
+    def end(self) -> None:
+        """End the process; the frames that it finished stay."""
+        self._process.terminate()
+        self._process.join()
+
+    def _hear(self) -> None:
+        try:
+            told = self._told.recv()
+        except EOFError:
+            self._process.join()
+            raise D2Error(
+                f"the process that builds the prior ended with code {self._process.exitcode}: the same command goes "
+                "on where it stopped, and without --priors-in-step it builds the prior first"
+            ) from None
+        if isinstance(told, int):
+            self._pictures = told
+        elif isinstance(told, str):
+            raise D2Error(told)
+        else:
+            self._summary, self.cpu_seconds = told
+            self.seconds = time.monotonic() - self._start
+
+
+def _build(telling: Connection, settings: RunSettings, points: np.ndarray, folder: Path) -> None:
+    """What the process does: tells how many pictures are done, at last what the prior became or why it did not."""
+    end_with_parent()
+    be_silent()
+    try:
+        summary = build_priors_for(settings, Scene.open(settings), points, folder, told=telling.send)
+    except D2Error as refusal:
+        telling.send(str(refusal))
+    else:
+        telling.send((summary, time.process_time()))
+
+
+@contextmanager
+def alongside(settings: RunSettings, scene: Scene, folder: Path, points: np.ndarray) -> Iterator[PriorAlongside]:
+    """A `PriorAlongside` that has finished its first frames, and ends with the block."""
+    building = PriorAlongside(settings, scene, folder, points)
+    try:
+        building.opened(1)
+        yield building
+    finally:
+        building.end()
