@@ -113,7 +113,8 @@ class Run:
             with progress_bar("train", iterations) as bar:
 
                 def on_step(step: int, loss: float) -> None:
-                    bar.update(step, f"loss {loss:.4f}")
+                    built = "" if self._building is None else f", prior {self._building.share:.0%}"
+                    bar.update(step, f"loss {loss:.4f}{built}")
                     watching(step, loss)
 
                 while trainer.step < iterations and not getattr(trainer, "stopped", False):

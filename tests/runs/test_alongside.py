@@ -23,7 +23,7 @@ from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TrainingFrames
 
-CAMERAS, FRAMES, STEPS = ("train0", "train1", "train2"), 8, 40
+CAMERAS, FRAMES, STEPS = ("train0", "train1"), 4, 20
 
 
 class TestTheSchedule:
@@ -78,7 +78,7 @@ class TestTheTrainer:
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("cv2", reason="opencv is in the `image` extra")
     pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
-    capture = synthetic_capture(cameras=3, held_out=1, frames=FRAMES, width=96, height=54)
+    capture = synthetic_capture(cameras=2, held_out=1, frames=FRAMES, width=96, height=54, arc_degrees=20)
     return save_capture(capture, tmp_path_factory.mktemp("recording") / "room")
 
 
@@ -115,28 +115,28 @@ class TestARun:
         again.train()
         assert same(model_of(finished), model_of(again))
 
-    @pytest.mark.parametrize("cut", [3, 13])
-    def test_continues_bitwise_where_it_was_cut_off(self, room: Path, finished: Run, tmp_path: Path, cut: int) -> None:
+    def test_continues_bitwise_where_it_was_cut_off(self, room: Path, finished: Run, tmp_path: Path) -> None:
         class Cut(Exception):
             pass
 
         def watch(trainer: object) -> Callable[[int, float], None]:
             def look(step: int, loss: float) -> None:
-                if step == cut:
+                if step == 3:  # a frame joins in the next
                     raise Cut
 
             return look
 
+        priors = str(finished.folder / "priors")
         with pytest.raises(Cut):
-            run_of(room, tmp_path / "cut").train(watch=watch)
+            run_of(room, tmp_path / "cut", priors=priors).train(watch=watch)
         assert not multiprocessing.active_children()
-        resumed = run_of(room, tmp_path / "cut")
+        resumed = run_of(room, tmp_path / "cut", priors=priors)
         resumed.train()
         assert same(model_of(finished), model_of(resumed))
 
     def test_without_a_usable_prior_is_refused(self, tmp_path: Path) -> None:
         pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
-        blind = save_capture(synthetic_capture(cameras=2, frames=4, width=64, height=36), tmp_path / "blind")
+        blind = save_capture(synthetic_capture(cameras=2, frames=2, width=64, height=36), tmp_path / "blind")
         settings = RunSettings(str(blind), ("train0", "train1"), iterations=STEPS, priors_in_step=True)
         run = Run(settings, tmp_path / "run")
         with pytest.raises(D2Error, match="no view has a usable prior"):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.summary import PriorSummary
-from d2_plugin.progress import be_silent
+from d2_plugin.progress import be_silent, progress_bar
 from d2_plugin.runs.prior.build import build_priors_for
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings
@@ -72,14 +72,21 @@ class PriorAlongside:
         """Return once the prior of a frame is there."""
         self.wait(self.frames.index(frame) + 1)
 
-    def wait(self, frames: int) -> None:
-        """Return once the prior of so many frames is there.
+    def wait(self, frames: int, told: Callable[[int], None] | None = None) -> None:
+        """Return once the prior of so many frames is there; `told` is called with the pictures that are done.
 
         Raises:
             D2Error: what the build refuses, or its process was killed.
         """
         while self._pictures < frames * self.cameras and self._summary is None:
             self._hear()
+            if told is not None:
+                told(min(self._pictures, frames * self.cameras))
+
+    @property
+    def share(self) -> float:
+        """How much of the prior is known to be there."""
+        return 1.0 if self._summary is not None else self._pictures / (self.cameras * len(self.frames))
 
     def finish(self) -> PriorSummary:
         """What the prior became, once all of it is there.
@@ -130,8 +137,10 @@ def _build(telling: Connection, settings: RunSettings, points: np.ndarray, folde
 def alongside(settings: RunSettings, scene: Scene, folder: Path, points: np.ndarray) -> Iterator[PriorAlongside]:
     """A `PriorAlongside` that has finished its first frames, and ends with the block."""
     building = PriorAlongside(settings, scene, folder, points)
+    first = frames_open(1, settings.iterations, len(scene.capture.frames))
     try:
-        building.opened(1)
+        with progress_bar("priors of the first frames", first * building.cameras) as bar:
+            building.wait(first, bar.update)
         yield building
     finally:
         building.end()
