@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import signal
@@ -35,10 +36,11 @@ class TestTheSchedule:
 
     @given(iterations=st.integers(1, 10**6), frames=st.integers(1, 3000))
     def test_all_have_joined_after_a_fifth_of_the_steps(self, iterations: int, frames: int) -> None:
-        assert frames_open(1 + int(OPEN_BY * iterations) + 1, iterations, frames) == frames
+        assert frames_open(math.ceil(OPEN_BY * iterations), iterations, frames) == frames
 
     def test_a_long_recording_begins_with_one_block(self) -> None:
         assert frames_open(1, 30_000, 3000) == MOST_FIRST
+        assert frames_open(1, 30_000, 1) == 1
 
 
 class Opening:

@@ -35,9 +35,10 @@ OPEN_BY = 0.2
 
 def frames_open(step: int, iterations: int, frames: int) -> int:
     """How many of the frames, from the first on, are trained on at `step` (from 1) of `iterations`."""
+    if step >= OPEN_BY * iterations:
+        return frames
     first = min(math.ceil(FIRST * frames), MOST_FIRST)
-    share = min((step - 1) / (OPEN_BY * iterations), 1.0)
-    return first + math.floor(share * (frames - first))
+    return first + math.floor((step - 1) / (OPEN_BY * iterations) * (frames - first))
 
 
 class PriorAlongside:
