@@ -185,12 +185,12 @@ def gpu(rows: Sequence[Row]) -> Section:
     kernels = tuple(
         (
             *(row["case"].rpartition(" ")[2], row["setting"], str(row["registers"]), str(row["spill_bytes"])),
-            *(str(row["shared_bytes"]), str(row["instructions"])),
+            *(str(row["shared_bytes"]), str(row["instructions"]), str(row.get("fragment_instructions") or "-")),
         )
         for row in compiled
     )
     steps = tuple((row["case"], row["device"] or "-", row["failed"] or "done") for row in rows if row not in compiled)
-    header = ("kernel", "target", "registers", "spilled bytes", "shared bytes", "instructions")
+    header = ("kernel", "target", "registers", "spilled bytes", "shared bytes", "instructions", "for a fragment")
     return Section(
         "gpu",
         "The GPU kernels",

@@ -226,10 +226,14 @@ def table(rows: list[Row]) -> str:
     lines = tuple((row["case"], f"{row['seconds']:.1f}", row["failed"] or "done") for row in steps)
     parts = [markdown(Table(("step", "s", "outcome"), lines))]
     kernels = [row for row in rows if row["method"] == "d2"]
-    facts = ("registers", "spill_bytes", "shared_bytes", "instructions")
-    cells = tuple((row["case"], row["setting"], *(str(row[fact]) for fact in facts)) for row in kernels)
+    facts = ("registers", "spill_bytes", "shared_bytes", "instructions", "fragment_instructions")
+    cells = tuple((row["case"], row["setting"], *(_plain(row[fact]) for fact in facts)) for row in kernels)
     if cells:
-        head = ("static analysis", "for", "registers", "bytes spilled", "bytes shared", "instructions")
+        head = ("static analysis", "for", "registers", "bytes spilled", "bytes shared", "instructions", "for a fragment")
         named = tuple((cell[0].removeprefix("static analysis of "), *cell[1:]) for cell in cells)
         parts.append(markdown(Table(head, named)))
     return "\n\n".join(parts)
+
+
+def _plain(value: int | None) -> str:
+    return "-" if value is None else str(value)

@@ -1,7 +1,8 @@
 """What the GPU kernels take, told by the compiler: no device is needed, and nothing here is a time on one.
 
 nvcc compiles the sources for an architecture; ptxas says registers, spills and shared memory of each kernel, and the
-binary says how many instructions it has. Rows of this are called "static analysis" and never more.
+binary says how many instructions it has, with nvdisasm also how many for one fragment. Rows of this are called "static
+analysis" and never more.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors.stereo.gpu import call as patchmatch
 from d2_plugin.rasterizer import cuda_runtime as rasterizer
 from d2_plugin.study.rows import Row, make_row
+
+from .loops import fragment_instructions, nvdisasm
 
 ARCHITECTURES = ("sm_80", "sm_90", "sm_120")
 """A100, H100, and the consumer GPUs of their successor."""
@@ -42,7 +45,8 @@ PROGRAMS = (
 
 
 def static_analysis(nvcc: str, architecture: str, command: str = "") -> list[Row]:
-    """One row per kernel: registers, bytes spilled, bytes of shared memory, instructions.
+    """One row per kernel: registers, bytes spilled, bytes of shared memory, instructions, those for one fragment (None
+    where the kernel has none, or there is no nvdisasm).
 
     Args:
         nvcc: the compiler's path.
@@ -74,8 +78,12 @@ def _kernels(nvcc: str, program: Program, flags: Sequence[str]) -> dict[str, dic
         if result.returncode:
             said = result.stderr[:4000]
             raise D2Error(f"nvcc refused {program.source.name} ({flags[0]}); please report what it said:\n{said}")
-        counts = instructions(cubin.read_bytes())
-    return {name: {**found, "instructions": counts[name]} for name, found in resources(result.stderr).items()}
+        counts, disassembler = instructions(cubin.read_bytes()), nvdisasm()
+        fragments = {} if disassembler is None else fragment_instructions(disassembler, cubin)
+    return {
+        name: {**found, "instructions": counts[name], "fragment_instructions": fragments.get(name)}
+        for name, found in resources(result.stderr).items()
+    }
 
 
 def resources(told: str) -> dict[str, dict[str, Any]]:
