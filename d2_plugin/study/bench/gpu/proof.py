@@ -229,7 +229,7 @@ def table(rows: list[Row]) -> str:
     facts = ("registers", "spill_bytes", "shared_bytes", "instructions", "fragment_instructions")
     cells = tuple((row["case"], row["setting"], *(_plain(row[fact]) for fact in facts)) for row in kernels)
     if cells:
-        head = ("static analysis", "for", "registers", "bytes spilled", "bytes shared", "instructions", "for a fragment")
+        head = ("static analysis", "for", "registers", "bytes spilled", "bytes shared", "instructions", "a fragment")
         named = tuple((cell[0].removeprefix("static analysis of "), *cell[1:]) for cell in cells)
         parts.append(markdown(Table(head, named)))
     return "\n\n".join(parts)
