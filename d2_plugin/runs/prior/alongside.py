@@ -44,6 +44,8 @@ def frames_open(step: int, iterations: int, frames: int) -> int:
 class PriorAlongside:
     """A process that builds the depth prior of a run, frame after frame.
 
+    Started from a script of your own it imports that script: put the call under `if __name__ == "__main__":`.
+
     Args:
         settings, scene: of the run.
         folder: of the store, which others may read meanwhile.
@@ -65,6 +67,8 @@ class PriorAlongside:
 
     def opened(self, step: int) -> int:
         """How many views, frame by frame, are trained on at a step; returns once their prior is there."""
+        while self._summary is None and self._told.poll():  # who tells must not wait for us
+            self._hear()
         count = frames_open(step, self.iterations, len(self.frames))
         self.wait(count)
         return count * self.cameras
