@@ -67,10 +67,9 @@ class RunSettings(Settings):
     priors: str | None = None
     """Folder of a finished depth prior; without it the run builds its own."""
     priors_in_step: bool = False
-    """Begin to train when the first block of frames has its prior; the others join over a fifth of the steps. It saves
-    at most their time, and only where a recording has more than 30 frames; what moves loses some tenths of a dB."""
+    """Train while later frames still get their prior."""
     accept_empty_prior: bool = False
-    """Train with hooks even where no view has a usable prior, as the backbone alone would."""
+    """Train even where no view has a usable prior."""
     background_weight: Share = 1.0
     """Weight in the photometric loss of pixels outside the capture's foreground masks; 1 looks at no mask, 0 learns the
     foreground alone."""
