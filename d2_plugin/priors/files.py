@@ -101,6 +101,19 @@ class EntryFolder:
             logger.warning("%s is damaged (%s) and is built again", entry.path, problem)
         return None if problem else entry
 
+    def drop_damaged(self, camera: str, frame: int) -> None:
+        """Forget an entry whose record or header is damaged, and name it in the log: who reads while it is built again
+        finds none."""
+        path = self.location(camera, frame)
+        try:
+            entry = self.find(camera, frame)
+            problem = "" if entry is None else entry.problem()
+        except D2Error as error:
+            problem = str(error)
+        if problem:
+            logger.warning("%s is damaged (%s) and is built again", path, problem)
+            path.with_suffix(".json").unlink(missing_ok=True)
+
     def write(self, camera: str, frame: int, array: np.ndarray, record: dict[str, Any]) -> None:
         """Write the array and its record (see `write_entry`)."""
         write_entry(self.location(camera, frame), array, record)

@@ -242,12 +242,15 @@ class PriorStore:
     def building(self, root: Path) -> Iterator[None]:
         """Write priors beside other processes that do; `root` is the folder that `create` was given.
 
-        Whoever finds nobody else there removes what killed builds left.
+        Whoever finds nobody else there removes what killed builds left, and what is damaged.
         """
 
         def tidy() -> None:
             with in_turn(root):
                 remove_leftovers(root)
+                for camera in self.cameras:
+                    for frame in self.frames:
+                        self.entries.drop_damaged(camera, frame)
 
         with one_of_many(make_folder(root / "priors"), tidy):
             yield

@@ -52,7 +52,7 @@ class Run:
         claim(folder, self._identity())
         self.seconds = {"priors": 0.0, "train": 0.0, "eval": 0.0}
         self.cpu_seconds = dict(self.seconds)
-        """The same in CPU time of this process, which other work on the machine does not change."""
+        """The same in CPU time, of a prior that is built in step that of its own process."""
         self.retired: dict[str, int] = {}
         """Hooks that stopped because they changed next to nothing, and at which step."""
         self.prior: dict[str, Any] | None = None

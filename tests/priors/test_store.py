@@ -143,6 +143,18 @@ def test_a_flipped_bit_is_found_when_the_map_is_read(store: PriorStore) -> None:
     assert not opened.is_current("a", 0, "k")
 
 
+@pytest.mark.parametrize("part", [".npy", ".json"])
+def test_what_is_damaged_can_be_read_around_while_it_is_built_again(store: PriorStore, part: str) -> None:
+    path = array_file(store, "b").with_suffix(part)
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(D2Error, match="damaged"):
+        PriorStore.open(store.path)
+    with store.building(store.path):
+        reader = PriorStore.open(store.path)
+        assert reader.prior("b", 0) is None
+        assert reader.prior("a", 0) is not None
+
+
 def test_a_damaged_record_is_named(store: PriorStore) -> None:
     array_file(store).with_suffix(".json").write_text('{"key": "k", "sha')
     with pytest.raises(D2Error, match=r"00000.json is damaged"):

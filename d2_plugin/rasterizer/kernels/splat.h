@@ -19,7 +19,7 @@ D2_FN float fma(float a, float b, float c) { return fmaf(a, b, c); }
 D2_FN float sqrt(float a) { return sqrtf(a); }
 D2_FN float exp2(float a) {
 #if defined(__CUDA_ARCH__)
-  float power;  // exp2f takes three instructions more for powers below 2^-126, which no fragment has
+  float power;  // exp2f takes three instructions more for powers below 2^-126: here they are 0, and no alpha that counts is one
   asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(power) : "f"(a));
   return power;
 #else
