@@ -51,9 +51,11 @@ def _nearest(
     nearest = np.full(len(queries), -1)
     for start in range(0, len(queries), block):
         similarity = queries[start : start + block] @ candidates.T
-        best = similarity.argmax(axis=1)
-        top_two = np.arccos(np.clip(np.partition(similarity, -2, axis=1)[:, -2:], -1, 1))
-        clear = (top_two[:, 1] <= max_angle) & (top_two[:, 1] <= max_ratio * top_two[:, 0])
+        best, rows = similarity.argmax(axis=1), np.arange(len(similarity))
+        angle = np.arccos(np.clip(similarity[rows, best], -1, 1))
+        similarity[rows, best] = -np.inf
+        second = np.arccos(np.clip(similarity.max(axis=1), -1, 1))
+        clear = (angle <= max_angle) & (angle <= max_ratio * second)
         nearest[start : start + block] = np.where(clear, best, -1)
     return nearest
 
