@@ -4,7 +4,6 @@
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
-#include <memory>
 #include <system_error>
 #include <thread>
 #include <vector>
@@ -15,7 +14,8 @@
 namespace d2 {
 namespace {
 
-constexpr int kRowsAtOnce = 4;  // that a thread takes from the queue
+constexpr int kRowsAtOnce = 4;     // that a thread takes from the queue
+constexpr int kRowsPerThread = 16;  // fewer are not worth starting one
 
 template <class Work>
 void parallel_rows(int rows, int threads, const Work& work) {
@@ -27,7 +27,7 @@ void parallel_rows(int rows, int threads, const Work& work) {
   };
   std::vector<std::thread> others;
   try {
-    for (int t = 1; t < threads; t++) others.emplace_back(run);
+    for (int t = 1; t < std::min(threads, rows / kRowsPerThread); t++) others.emplace_back(run);
   } catch (const std::system_error&) {
     // The system grants no more threads: those there are do all rows.
   }
@@ -68,7 +68,8 @@ struct Windows {
       const Integers read = look_up(row, columns + reference.offset[n]);
       level[n] = pick(read >= 0, real(read), centre);
       const Floats off = level[n] - centre;
-      const Floats log2_weight = mad(off * off, all<Floats>(per_gray), all<Floats>(log2_spatial(sample_du(n), sample_dv(n))));
+      const Floats spatial = all<Floats>(log2_spatial(sample_du(n), sample_dv(n)));
+      const Floats log2_weight = mad(off * off, all<Floats>(per_gray), spatial);
       const Floats w = pick(read >= 0, exp2_of(log2_weight), all<Floats>(0.f));
       store(weight[n], w);
       total[n % kPartials] += w, mean[n % kPartials] = mad(w, level[n], mean[n % kPartials]);
@@ -95,14 +96,14 @@ class Queue {
     for (int k = 0; k < kPacked; k++) pack(packed_[k] + count_, lanes, columns[k]);
     store(last_x_ + count_, all<Floats>(last_place(source.width)));
     store(last_y_ + count_, all<Floats>(last_place(source.height)));
-    store(first_ + count_, (Floats)(Integers{} + source.first)), store(stride_ + count_, (Floats)(Integers{} + source.width));
+    store(first_ + count_, (Floats)(Integers{} + source.first));
+    store(stride_ + count_, (Floats)(Integers{} + source.width));
     count_ += __builtin_popcount(lanes);
     if (count_ < kLanes) return;
     match(kLanes);
     count_ -= kLanes;
-    for (float* column : {packed_[0], packed_[1], packed_[2], packed_[3], packed_[4], packed_[5], packed_[6], packed_[7],
-                          packed_[8], packed_[9], last_x_, last_y_, first_, stride_})
-      store(column, load<Floats>(column + kLanes));
+    for (auto& column : packed_) store(column, load<Floats>(column + kLanes));
+    for (float* column : {last_x_, last_y_, first_, stride_}) store(column, load<Floats>(column + kLanes));
   }
 
   void flush() {
@@ -116,7 +117,8 @@ class Queue {
     const Warp<Floats> warp = {of(0), of(1), of(2), of(3), of(4), of(5), of(6), of(7), all<Floats>(1.f)};
     const Floats last_x = load<Floats>(last_x_), last_y = load<Floats>(last_y_);
     alignas(64) float found[kLanes];
-    store(found, stays_inside(warp, last_x, last_y) ? match<true>(warp, last_x, last_y) : match<false>(warp, last_x, last_y));
+    const bool inside = stays_inside(warp, last_x, last_y);
+    store(found, inside ? match<true>(warp, last_x, last_y) : match<false>(warp, last_x, last_y));
     const Integers place = load<Integers>(packed_[9]);
     for (int l = 0; l < count; l++) costs_[place[l]] = found[l];
   }
@@ -153,7 +155,8 @@ class Queue {
   float* costs_;
   int count_ = 0;
   alignas(64) float packed_[kPacked][2 * kLanes] = {};
-  alignas(64) float last_x_[2 * kLanes] = {}, last_y_[2 * kLanes] = {}, first_[2 * kLanes] = {}, stride_[2 * kLanes] = {};
+  alignas(64) float last_x_[2 * kLanes] = {}, last_y_[2 * kLanes] = {};
+  alignas(64) float first_[2 * kLanes] = {}, stride_[2 * kLanes] = {};  // integers, as they are
 };
 
 // Planes of the pixels whose windows are placed, and what they cost: [kLanes, kMaxCandidates, source_count].
@@ -171,9 +174,9 @@ class Batch {
   Integers columns() const { return columns_; }
   bool textured(int pixel) const { return windows_.variance[pixel] >= kMinVariance; }
 
-  // Asks what planes of a pixel cost in the sources whose bit in `views` is 1.
-  void ask(int pixel, const Plane* planes, int count, unsigned views) {
-    for (int k = 0; k < count; k++, asked_++) {
+  // Asks what the planes of a pixel from number `known` on cost in the sources whose bit in `views` is 1.
+  void ask(int pixel, const Plane* planes, int known, int count, unsigned views) {
+    for (int k = known; k < count; k++, asked_++) {
       a_[asked_] = planes[k].a, b_[asked_] = planes[k].b, c_[asked_] = planes[k].c;
       pixel_[asked_] = pixel, place_[asked_] = int(costs(pixel) - costs_.data()) + k * task_.source_count;
       views_[asked_] = int(views);
@@ -183,7 +186,10 @@ class Batch {
   // Matches all that was asked for.
   void match() {
     const int asked = asked_;
-    for (; asked_ % kLanes; asked_++) a_[asked_] = b_[asked_] = c_[asked_] = 0, pixel_[asked_] = place_[asked_] = views_[asked_] = 0;
+    for (; asked_ % kLanes; asked_++) {
+      a_[asked_] = b_[asked_] = c_[asked_] = 0;
+      pixel_[asked_] = place_[asked_] = views_[asked_] = 0;
+    }
     std::fill(costs_.begin(), costs_.end(), kNoMatch);
     for (int s = 0; s < task_.source_count; s++) match(task_.sources[s], s, asked);
     queue_.flush();
@@ -192,10 +198,11 @@ class Batch {
 
   // belief_of all costs.
   void believe() {
-    for (size_t n = 0; n + kLanes <= costs_.size(); n += kLanes) store(&beliefs_[n], belief_of(load<Floats>(&costs_[n])));
+    for (size_t n = 0; n + kLanes <= costs_.size(); n += kLanes)
+      store(&beliefs_[n], belief_of(load<Floats>(&costs_[n])));
   }
 
-  const float* costs(int pixel) const { return &costs_[size_t(pixel) * kMaxCandidates * task_.source_count]; }
+  float* costs(int pixel) { return &costs_[size_t(pixel) * kMaxCandidates * task_.source_count]; }
   const float* beliefs(int pixel) const { return &beliefs_[size_t(pixel) * kMaxCandidates * task_.source_count]; }
 
  private:
@@ -262,20 +269,25 @@ void wanted_pixels(const Task& t, int y, int first, int step, const Work& work) 
   if (count) work(columns, count);
 }
 
-void begin_row(const Task& t, const Reference& reference, int y) {
+// first_costs [H, W, source_count]: of the planes that the pixels start with.
+void begin_row(const Task& t, const Reference& reference, float* first_costs, int y) {
   Batch batch(t, reference);
   wanted_pixels(t, y, 0, 1, [&](const int* columns, int count) {
     batch.place(columns, count, y);
     for (int n = 0; n < count; n++) {
       const Plane plane = drawn_plane(t, columns[n], y);
-      batch.ask(n, &plane, 1, ~0u);
+      if (batch.textured(n)) batch.ask(n, &plane, 0, 1, ~0u);
     }
     batch.match();
-    for (int n = 0; n < count; n++) begin(t, batch.costs(n), (long long)y * t.width + columns[n]);
+    for (int n = 0; n < count; n++) {
+      const long long i = (long long)y * t.width + columns[n];
+      begin(t, batch.costs(n), i);
+      std::copy_n(batch.costs(n), t.source_count, first_costs + i * t.source_count);
+    }
   });
 }
 
-void update_row(const Task& t, const Reference& reference, int y, int colour, int round) {
+void update_row(const Task& t, const Reference& reference, const float* first_costs, int y, int colour, int round) {
   Batch batch(t, reference);
   std::vector<Turn> turns;
   turns.reserve(kLanes);
@@ -292,23 +304,27 @@ void update_row(const Task& t, const Reference& reference, int y, int colour, in
       turns.emplace_back(t, columns[n], y, round);
     }
     const int turned = int(turns.size());
-    const auto match = [&](bool all_views) {
+    const auto match_selected = [&] {
       for (int n = 0; n < turned; n++)
-        batch.ask(pixel[n], turns[n].planes, turns[n].count, all_views ? ~0u : turns[n].selection.views);
+        batch.ask(pixel[n], turns[n].planes, 0, turns[n].count, turns[n].selection.views);
       batch.match();
     };
     const Cheapest cheapest(t, reference, batch.columns(), y);
     for (int n = 0; n < turned; n++) turns[n].gather([&](int region) { return cheapest.place[region][pixel[n]]; });
-    match(true);
+    const int known = round == 0 ? 1 : 0;  // nobody else has changed the plane that a pixel starts with
+    for (int n = 0; n < turned; n++) batch.ask(pixel[n], turns[n].planes, known, turns[n].count, ~0u);
+    batch.match();
+    for (int n = 0; n < turned * known; n++)
+      std::copy_n(first_costs + turns[n].pixel() * t.source_count, t.source_count, batch.costs(pixel[n]));
     batch.believe();
     for (int n = 0; n < turned; n++) turns[n].choose(batch.costs(pixel[n]), batch.beliefs(pixel[n]));
     if (t.explore) {
       for (Turn& turn : turns) turn.draw_anywhere();
-      match(false);
+      match_selected();
       for (int n = 0; n < turned; n++) turns[n].compare(batch.costs(pixel[n]));
     }
     for (Turn& turn : turns) turn.draw_nearby();
-    match(false);
+    match_selected();
     for (int n = 0; n < turned; n++) turns[n].compare(batch.costs(pixel[n])), turns[n].finish();
   });
 }
@@ -383,10 +399,12 @@ extern "C" {
 void d2_patchmatch(const Task* task) {
   const Task& t = *task;
   const Reference reference(t);
-  parallel_rows(t.height, t.threads, [&](int y) { begin_row(t, reference, y); });
+  std::vector<float> first_costs(size_t(t.width) * t.height * t.source_count);
+  parallel_rows(t.height, t.threads, [&](int y) { begin_row(t, reference, first_costs.data(), y); });
   for (int round = 0; round < t.rounds; round++) {
     for (int colour = 0; colour < 2; colour++) {
-      parallel_rows(t.height, t.threads, [&](int y) { update_row(t, reference, y, colour, round); });
+      const auto update = [&](int y) { update_row(t, reference, first_costs.data(), y, colour, round); };
+      parallel_rows(t.height, t.threads, update);
     }
   }
 }
