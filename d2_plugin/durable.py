@@ -89,8 +89,8 @@ def make_folder(path: Path) -> Path:
 def write(path: Path, *parts: bytes | memoryview, synced: bool = True) -> None:
     """Make `path` hold the parts one after the other; its folder is made where it is missing.
 
-    `synced` waits for the disk, so that a power cut leaves the old file or the new one as well; what nobody reads back
-    need not wait.
+    `synced` waits for the disk, so that a power cut leaves the old file or the new one as well; what nobody reads back,
+    or whoever finds it damaged makes again, need not wait.
 
     Raises:
         CannotWrite: the disk is full, broken or not ours; what was there before is there still.
@@ -107,9 +107,9 @@ def write(path: Path, *parts: bytes | memoryview, synced: bool = True) -> None:
             raise
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str, synced: bool = True) -> None:
     """`write` for text, in UTF-8."""
-    write(path, text.encode())
+    write(path, text.encode(), synced=synced)
 
 
 def append(path: Path, text: str) -> None:
@@ -155,14 +155,14 @@ def is_leftover(path: Path) -> bool:
     return path.name.startswith(".") and path.name.endswith(LEFTOVER)
 
 
-def write_table(path: Path, values: Mapping[str, Any], kind: Kind) -> None:
+def write_table(path: Path, values: Mapping[str, Any], kind: Kind, synced: bool = True) -> None:
     """Write a JSON object with the version of its format and its checksum.
 
     NaN and infinity are refused by the name that leads to them, since JSON has neither.
     """
     sealed = {**values, "format": kind.format}
     sealed["seal"] = _seal(sealed)
-    write_text(path, SEALED + json_text(sealed, str(path), indent=1, sort_keys=True))
+    write_text(path, SEALED + json_text(sealed, str(path), indent=1, sort_keys=True), synced)
 
 
 def read_table(path: Path, kind: Kind) -> dict[str, Any]:

@@ -63,10 +63,10 @@ class Entry:
 
 
 class EntryFolder:
-    """Entries by camera and frame below one folder."""
+    """Entries by camera and frame below one folder; `synced` ones outlive a power cut (`d2_plugin.durable.write`)."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, synced: bool = True) -> None:
+        self.path, self.synced = path, synced
 
     def location(self, camera: str, frame: int) -> Path:
         """Where the array of one view is or would be."""
@@ -114,13 +114,18 @@ class EntryFolder:
             logger.warning("%s is damaged (%s) and is built again", path, problem)
             path.with_suffix(".json").unlink(missing_ok=True)
 
-    def write(self, camera: str, frame: int, array: np.ndarray, record: dict[str, Any]) -> None:
+    def write(self, camera: str, frame: int, array: np.ndarray, record: dict[str, Any]) -> dict[str, Any]:
         """Write the array and its record (see `write_entry`)."""
-        write_entry(self.location(camera, frame), array, record)
+        return write_entry(self.location(camera, frame), array, record, self.synced)
 
 
-def write_entry(path: Path, array: np.ndarray, record: dict[str, Any]) -> None:
+def write_entry(path: Path, array: np.ndarray, record: dict[str, Any], synced: bool = True) -> dict[str, Any]:
     """Array first, record second, each written whole: a record vouches for the array beside it.
+
+    What is not `synced` may be damaged after a power cut, which its checksums tell: for what is made again then.
+
+    Returns:
+        The record as it was written.
 
     Raises:
         CannotWrite: the disk is full, broken or not ours.
@@ -129,9 +134,11 @@ def write_entry(path: Path, array: np.ndarray, record: dict[str, Any]) -> None:
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(plain))
     pixels = plain.reshape(-1).view(np.uint8)
-    write(path, header.getvalue(), pixels.data)
+    write(path, header.getvalue(), pixels.data, synced=synced)
     described = {"shape": list(array.shape), "dtype": str(array.dtype), "checksum": zlib.crc32(pixels.data)}
-    write_table(path.with_suffix(".json"), {**record, **described}, RECORD)
+    written = {**record, **described}
+    write_table(path.with_suffix(".json"), written, RECORD, synced)
+    return written
 
 
 def read_record(path: Path) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.filtering.filter import filter_depths
 from d2_plugin.priors.stereo.geometric_depth import MATCHERS, gray
 from d2_plugin.priors.stereo.patchmatch import patchmatch
-from d2_plugin.priors.stereo.pyramid import NO_MATCH, refined_planes
+from d2_plugin.priors.stereo.pyramid import NO_MATCH, refined_planes, shrunk
 from d2_plugin.priors.stereo.source_views import choose_sources
 from d2_plugin.study.bench.stereo_measure import Method, measure, score
 from d2_plugin.study.bench.stereo_rigs import MIDDLEBURY, Rig, load_rigs, textured_rig
@@ -159,6 +159,22 @@ def test_planes_are_carried_to_a_finer_resolution_exactly(width: int, height: in
     blocks = values(camera, fine).reshape(height, factor, width, factor)
     # The centre of a coarse pixel is the mean of the centres of the fine ones in it, and so is a linear function there.
     np.testing.assert_allclose(blocks.mean(axis=(1, 3)), values(coarse, plane), rtol=1e-5, atol=1e-6)
+
+
+@given(st.integers(0, 2**31), st.integers(1, 60), st.integers(1, 60), st.floats(0, 1), st.floats(0, 1))
+@hypothesis_settings(max_examples=60, deadline=None)
+def test_a_picture_shrinks_to_the_bits_of_torch(seed: int, height: int, width: int, down: float, across: float) -> None:
+    shape = (1 + int(down * (height - 1)), 1 + int(across * (width - 1)))  # hardly ever a divisor: pixels are shared
+    picture = np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
+    pixels = torch.from_numpy(picture)[None, None].to(torch.float32)
+    expected = torch.nn.functional.interpolate(pixels, shape, mode="area")[0, 0].round()
+    np.testing.assert_array_equal(shrunk(picture, shape), expected.numpy())
+
+
+def test_the_mean_of_a_block_is_rounded_half_to_even() -> None:
+    picture = np.array([[0, 1, 255, 254], [0, 1, 255, 254]], np.uint8)
+    np.testing.assert_array_equal(shrunk(picture, (1, 2)), [[0, 254]])
+    np.testing.assert_array_equal(shrunk(np.full((512, 1024), 255, np.uint8), (2, 1)), [[255], [255]])
 
 
 def test_averaging_planes_that_agree_takes_noise_out(rig: Rig) -> None:

@@ -23,6 +23,8 @@ from d2_plugin.priors.stereo.geometric_depth import choose_matcher, gray
 from d2_plugin.priors.stereo.gpu import kernel as gpu
 from d2_plugin.priors.stereo.gpu.call import PROGRAM, Call, flags_for
 from d2_plugin.priors.stereo.patchmatch import patchmatch
+from d2_plugin.priors.stereo.pyramid import NO_MATCH
+from d2_plugin.priors.stereo.source_views import choose_sources
 from d2_plugin.study.bench.stereo_rigs import Rig, textured_rig
 
 HERE = Path(__file__).parent
@@ -124,6 +126,39 @@ def test_pictures_smaller_than_a_window(backend: None, size: tuple[int, int]) ->
     random = np.random.default_rng(0)
     images = [random.integers(0, 255, size[::-1]).astype(np.uint8) for _ in cameras]
     assert_same(patchmatch(images, cameras, (3.0, 5.0), SETTINGS), patchmatch(images, cameras, (3.0, 5.0), CPU))
+
+
+def test_many_sources_and_scattered_pixels(backend: None, rig: Rig) -> None:
+    # Seven sources fill no vector; of the wanted pixels many stand alone, at the border too.
+    cameras, images = [], [pictures(rig)[number % 3] for number in range(10)]
+    for number in range(10):
+        camera, pose = rig.cameras[number % 3], rig.cameras[number % 3].T_camera_world.copy()
+        pose[0, 3] += 0.02 * number
+        cameras.append(replace(camera, name=str(number), T_camera_world=pose))
+    settings = replace(SETTINGS, patchmatch_sources=7, max_angle=170.0, min_angle=1e-4, patchmatch_geometric_rounds=1)
+    wanted = [np.random.default_rng(number).random(image.shape) < 0.1 for number, image in enumerate(images)]
+    for mask in wanted:
+        mask[0], mask[:, -1] = True, True
+    for depth_range in (rig.depth_range, (1e-3, 1e5)):  # the second one draws planes that leave most sources
+        found, expected = (
+            patchmatch(images, cameras, depth_range, replace(settings, patchmatch_device=device), wanted)
+            for device in ("cuda", "cpu")
+        )
+        assert max(len(choose_sources(n, cameras, depth_range, settings)) for n in range(10)) == 7
+        assert_same(found, expected)
+
+
+def test_flat_pixels_among_textured_ones(backend: None, rig: Rig) -> None:
+    images = [image.copy() for image in pictures(rig)]
+    for image in images:
+        image[:, 20:45] = 128
+    found, expected = (
+        patchmatch(images, rig.cameras, rig.depth_range, replace(SETTINGS, patchmatch_device=device))
+        for device in ("cuda", "cpu")
+    )
+    assert (found[0][1][15:22, 28:36] == NO_MATCH).all()
+    assert (found[0][1][:, :12] < NO_MATCH).any()
+    assert_same(found, expected)
 
 
 def test_no_result_depends_on_the_order_of_blocks_warps_and_lanes(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -52,7 +52,7 @@ class MapsFromNetwork:
     """Predictions of an ONNX network, cached at the network's output size."""
 
     def __init__(self, model: MonocularModel, cache: Path) -> None:
-        self.model, self.kind, self.entries = model, model.kind, EntryFolder(cache)
+        self.model, self.kind, self.entries = model, model.kind, EntryFolder(cache, synced=False)
         self.about = f"{model.kind} maps of {model.path.name} on {model.provider}, preprocessing {model.preprocessing}"
         self._fingerprint = model.fingerprint()
 

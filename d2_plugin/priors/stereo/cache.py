@@ -53,9 +53,12 @@ class StoredDepth:
 
 def stored_depth(entry: Entry) -> StoredDepth:
     """What one entry of the cache holds."""
-    codes = entry.array(STEREO_DTYPE)
-    depth = DepthRange(*entry.record["depth_range"]).decode(codes["depth"])
-    return StoredDepth(depth, SIGMA[codes["sigma"]], entry.record)
+    return _decoded(entry.array(STEREO_DTYPE), entry.record)
+
+
+def _decoded(codes: np.ndarray, record: dict[str, Any]) -> StoredDepth:
+    depth = DepthRange(*record["depth_range"]).decode(codes["depth"])
+    return StoredDepth(depth, SIGMA[codes["sigma"]], record)
 
 
 class DepthCache:
@@ -67,14 +70,13 @@ class DepthCache:
     """
 
     def __init__(self, source: GeometricSource, folder: Path) -> None:
-        self.source, self.entries = source, EntryFolder(folder)
+        self.source, self.entries = source, EntryFolder(folder, synced=False)
 
     def depths(self, frame: Frame) -> dict[str, StoredDepth]:
         """D^g by camera name; always what was stored, so that a second build sees the same depth as the first."""
         stored = self._stored(frame)
         if len(stored) < len(self.source.cameras):
-            self._store(frame, self.source.depths(frame))
-            stored = self._stored(frame)
+            return self._store(frame, self.source.depths(frame))
         return stored
 
     def _stored(self, frame: Frame) -> dict[str, StoredDepth]:
@@ -86,7 +88,9 @@ class DepthCache:
                 found[camera.name] = stored_depth(entry)
         return found
 
-    def _store(self, frame: Frame, results: Sequence[GeometricDepth]) -> None:
+    def _store(self, frame: Frame, results: Sequence[GeometricDepth]) -> dict[str, StoredDepth]:
+        """Writes what was computed, and returns it as it would be read back."""
+        stored = {}
         for camera, result in zip(self.source.cameras, results, strict=True):
             depth_range = DepthRange.of(result.depth)
             record = {
@@ -98,4 +102,5 @@ class DepthCache:
             }
             codes = np.empty(result.depth.shape, STEREO_DTYPE)
             codes["depth"], codes["sigma"] = depth_range.encode(result.depth), encode_sigma(result.sigma)
-            self.entries.write(camera.name, frame.number, codes, record)
+            stored[camera.name] = _decoded(codes, self.entries.write(camera.name, frame.number, codes, record))
+        return stored

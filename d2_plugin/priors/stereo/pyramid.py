@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.geometry import pixel_grid, scaled_camera
@@ -44,9 +43,7 @@ def at_resolution(
     """The view with `divisor` times fewer pixels each way, and the planes of the coarser one if there is one."""
     if divisor > 1:
         camera = scaled_camera(camera, round(camera.width / divisor), round(camera.height / divisor))
-        pixels = torch.from_numpy(np.ascontiguousarray(gray))[None, None].to(torch.float32)
-        smaller = torch.nn.functional.interpolate(pixels, (camera.height, camera.width), mode="area")
-        gray = smaller[0, 0].round().to(torch.uint8).numpy()
+        gray = shrunk(gray, (camera.height, camera.width))
     gray = np.ascontiguousarray(gray)
     cost = np.full(gray.shape, NO_MATCH, np.float32)
     if coarser is None:
@@ -57,8 +54,32 @@ def at_resolution(
     return LevelView(camera, gray, _quads(gray), planes, known, cost, mask)
 
 
+def shrunk(gray: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """A grey picture uint8 at a smaller size: each pixel is the mean of those that it touches, rounded half to even."""
+    sums, rows = _sums(gray, shape[0])
+    sums, columns = _sums(sums.T, shape[1])
+    return np.rint(sums.T / rows[:, None] / columns).astype(np.uint8)
+
+
+def _sums(values: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Per row of a picture with `size` rows the sum of those that it touches, and float32 how many there are."""
+    number = np.arange(size)
+    first, end = number * len(values) // size, -(-(number + 1) * len(values) // size)
+    step = len(values) // size
+    sums = np.zeros((size, values.shape[1]), np.float32)  # exact below 2^24, as all sums of grey values here are
+    for offset in range((end - first).max()):
+        if step * size == len(values):
+            sums += values[offset::step]
+        else:
+            touched = first + offset < end
+            sums[touched] += values[(first + offset)[touched]]
+    return sums, (end - first).astype(np.float32)
+
+
 def _any_within(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Coarse pixels of `shape` from which any pixel of a finer mask takes its plane, bool."""
+    if mask.shape == shape:
+        return np.ascontiguousarray(mask)
     rows, columns = _parents(shape, mask.shape)
     y, x = np.nonzero(mask)
     coarse = np.zeros(shape, bool)
@@ -72,15 +93,17 @@ def refined_planes(planes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     The centre of fine pixel u is at s (u + 1/2) - 1/2 in coarse indices, s = w / W, so a u' + b v' + c stays linear.
     """
     scale_v, scale_u = (coarse / fine for coarse, fine in zip(planes.shape[:2], shape))
-    a, b, c = np.moveaxis(_nearest(planes, shape), -1, 0)
-    offset = c + a * (scale_u - 1) / 2 + b * (scale_v - 1) / 2
-    return np.ascontiguousarray(np.stack([a * scale_u, b * scale_v, offset], axis=-1), dtype=np.float32)
+    a, b, c = np.moveaxis(planes, -1, 0)
+    scaled = np.empty(planes.shape, np.float32)
+    scaled[..., 0], scaled[..., 1] = a * scale_u, b * scale_v
+    scaled[..., 2] = c + a * (scale_u - 1) / 2 + b * (scale_v - 1) / 2
+    return _nearest(scaled, shape)
 
 
 def _nearest(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """`values` [h, w, ...] at [H, W], each fine pixel taking what the coarse pixel around its centre has."""
     rows, columns = _parents(values.shape[:2], shape)
-    return values[rows[:, None], columns]  # in C order, which an index per axis does not give
+    return values.take(columns, axis=1).take(rows, axis=0)  # whole rows last
 
 
 def _parents(coarse: tuple[int, int], fine: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

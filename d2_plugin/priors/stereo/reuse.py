@@ -65,7 +65,8 @@ class MatchMemory:
     def save(self, folder: Path, key: str) -> None:
         """Keep the memory on disk, so that a build that is killed goes on with the same matches."""
         for index, view in enumerate(self.views):
-            write_entry(folder / f"{index}.npy", view, {"key": key, "matched_share": self.matched_share})
+            record = {"key": key, "matched_share": self.matched_share}
+            write_entry(folder / f"{index}.npy", view, record, synced=False)
 
     @classmethod
     def load(cls, folder: Path, key: str, count: int) -> MatchMemory | None:

@@ -22,6 +22,7 @@ constexpr int kLanes = 4;
 #endif
 typedef float Floats __attribute__((vector_size(4 * kLanes)));
 typedef int32_t Integers __attribute__((vector_size(4 * kLanes)));
+constexpr unsigned kAllLanes = (1u << kLanes) - 1;
 
 template <class V, class E>
 D2_FN V load(const E* from) {
@@ -44,6 +45,12 @@ D2_FN Floats root(Floats a) { return (Floats)_mm512_sqrt_ps((__m512)a); }
 D2_FN Integers look_up(const unsigned* from, Integers place) {
   return (Integers)_mm512_i32gather_epi32((__m512i)place, from, 4);
 }
+D2_FN Floats look_up(const float* from, Integers place) { return (Floats)_mm512_i32gather_ps((__m512i)place, from, 4); }
+D2_FN Floats reordered(Floats a, Integers lane) { return (Floats)_mm512_permutexvar_ps((__m512i)lane, (__m512)a); }
+D2_FN unsigned bits(Integers yes) { return _mm512_cmplt_epi32_mask((__m512i)yes, _mm512_setzero_si512()); }
+D2_FN void pack(float* to, unsigned lanes, Floats a) {
+  _mm512_storeu_ps(to, _mm512_maskz_compress_ps(__mmask16(lanes), (__m512)a));
+}
 #elif defined(__AVX2__) && defined(__FMA__)
 D2_FN Floats mad(Floats a, Floats b, Floats c) { return (Floats)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c); }
 D2_FN Floats smaller(Floats a, Floats b) { return (Floats)_mm256_min_ps((__m256)a, (__m256)b); }
@@ -52,6 +59,9 @@ D2_FN Floats root(Floats a) { return (Floats)_mm256_sqrt_ps((__m256)a); }
 D2_FN Integers look_up(const unsigned* from, Integers place) {
   return (Integers)_mm256_i32gather_epi32(reinterpret_cast<const int*>(from), (__m256i)place, 4);
 }
+D2_FN Floats look_up(const float* from, Integers place) { return (Floats)_mm256_i32gather_ps(from, (__m256i)place, 4); }
+D2_FN Floats reordered(Floats a, Integers lane) { return (Floats)_mm256_permutevar8x32_ps((__m256)a, (__m256i)lane); }
+D2_FN unsigned bits(Integers yes) { return unsigned(_mm256_movemask_ps((__m256)yes)); }
 #else
 D2_FN Floats mad(Floats a, Floats b, Floats c) {
   Floats v;
@@ -69,6 +79,46 @@ D2_FN Integers look_up(const unsigned* from, Integers place) {
   Integers v;
   for (int l = 0; l < kLanes; l++) v[l] = int(from[place[l]]);
   return v;
+}
+D2_FN Floats look_up(const float* from, Integers place) {
+  Floats v;
+  for (int l = 0; l < kLanes; l++) v[l] = from[place[l]];
+  return v;
+}
+// Lane l takes what is in lane lane[l].
+D2_FN Floats reordered(Floats a, Integers lane) {
+  Floats v;
+  for (int l = 0; l < kLanes; l++) v[l] = a[lane[l]];
+  return v;
+}
+// Bit l says whether lane l of a comparison is true.
+D2_FN unsigned bits(Integers yes) {
+  unsigned found = 0;
+  for (int l = 0; l < kLanes; l++) found |= (yes[l] < 0 ? 1u : 0u) << l;
+  return found;
+}
+#endif
+#if defined(__AVX512BW__)
+// A byte k in the lowest bits of 2^23 is 2^23 + k, and differences of such numbers are exact.
+D2_FN Corners<Floats> corners_of(Integers quad) {
+  const __m512i large = _mm512_set1_epi32(0x4b000000);
+  const auto byte = [&](int k) {
+    const __m512i from = _mm512_add_epi32(_mm512_set4_epi32(12, 8, 4, 0), _mm512_set1_epi32(k));
+    return (Floats)_mm512_mask_shuffle_epi8(large, 0x1111111111111111, (__m512i)quad, from);
+  };
+  const Floats g00 = byte(0), g10 = byte(2), zero = (Floats)large;
+  return {g00 - zero, byte(1) - g00, g10 - zero, byte(3) - g10};
+}
+#else
+D2_FN Corners<Floats> corners_of(Integers quad) {
+  const Floats g00 = real(quad & 255), g01 = real(quad >> 8 & 255), g10 = real(quad >> 16 & 255);
+  return {g00, g01 - g00, g10, real(quad >> 24 & 255) - g10};
+}
+#endif
+#if !defined(__AVX512F__)
+// The lanes whose bit is 1, one after the other; writes kLanes numbers, of which the rest mean nothing.
+D2_FN void pack(float* to, unsigned lanes, Floats a) {
+  for (; lanes; lanes &= lanes - 1) *to++ = a[__builtin_ctz(lanes)];
 }
 #endif
 

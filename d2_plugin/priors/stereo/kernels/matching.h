@@ -33,8 +33,9 @@ D2_FN int sample_dv(int k) { return 2 * (sample_place(k) / 6) - 5; }
 // window: 2^(log2 over distance + per_gray difference^2).
 D2_FN float log2_spatial(int du, int dv) { return float(du * du + dv * dv) * kPerSquare; }
 
-D2_FN float sum_of_partials(const float* part) {
-  float sum[kPartials];
+template <class S>
+D2_FN S sum_of_partials(const S* part) {
+  S sum[kPartials];
   for (int k = 0; k < kPartials; k++) sum[k] = part[k];
   for (int half = kPartials / 2; half > 0; half /= 2)
     for (int k = 0; k < half; k++) sum[k] += sum[k + half];
@@ -66,7 +67,13 @@ D2_FN Warp<S> warp_of(const S (&A)[9], const S (&k)[3], S width, S height, S a, 
           zu, zv, pick(seen, all<S>(1.f), zero)};
 }
 
-D2_FN int look_up(const unsigned* quads, int place) { return int(quads[place]); }
+// What the samples of one row of a window have in common.
+template <class S>
+struct Line {
+  S x, y, z;
+};
+template <class S>
+D2_FN Line<S> line_of(const Warp<S>& warp, S dv) { return {warp.xv * dv, warp.yv * dv, warp.zv * dv}; }
 
 // Sums over a window of the source.
 template <class S>
@@ -74,18 +81,21 @@ struct Sums {
   S mean, square, product;
 
   // Adds one sample, read from quads[first + row * stride + column]. The division is a series: what it leaves out is the
-  // fourth power of the relative change of depth over half a window, .0005 pixels at a tenth.
-  template <class I>
-  D2_FN void add(const unsigned* quads, I first, I stride, S last_x, S last_y, const Warp<S>& warp, S du, S dv,
-                 S weight, S weighted) {
-    const S e = mad(warp.zu, du, warp.zv * dv), rest = 1.f - e, scale = mad(e * e, rest, rest);
-    const S column = smaller(larger(mad(mad(warp.xu, du, warp.xv * dv), scale, warp.x), all<S>(0.f)), last_x);
-    const S row = smaller(larger(mad(mad(warp.yu, du, warp.yv * dv), scale, warp.y), all<S>(0.f)), last_y);
+  // fourth power of the relative change of depth over half a window, .0005 pixels at a tenth. `bounded` says that the
+  // window does not leave the source, so that nothing need be clamped.
+  template <bool bounded, class I>
+  D2_FN void add(const unsigned* quads, I first, I stride, S last_x, S last_y, const Warp<S>& warp, const Line<S>& line,
+                 S du, S weight, S weighted) {
+    const S e = mad(warp.zu, du, line.z), rest = 1.f - e, scale = mad(e * e, rest, rest);
+    S column = mad(mad(warp.xu, du, line.x), scale, warp.x), row = mad(mad(warp.yu, du, line.y), scale, warp.y);
+    if (!bounded) {
+      column = smaller(larger(column, all<S>(0.f)), last_x);
+      row = smaller(larger(row, all<S>(0.f)), last_y);
+    }
     const I left = whole(column), top = whole(row);
-    const I quad = look_up(quads, first + top * stride + left);  // one access brings all four neighbours
-    const S g00 = real(quad & 255), g01 = real(quad >> 8 & 255), g10 = real(quad >> 16 & 255);
-    const S g11 = real(quad >> 24 & 255), right = column - real(left), down = row - real(top);
-    const S upper = mad(right, g01 - g00, g00), lower = mad(right, g11 - g10, g10);
+    const Corners<S> g = corners_of(look_up(quads, first + top * stride + left));  // one access brings all four
+    const S right = column - real(left), down = row - real(top);
+    const S upper = mad(right, g.upper_step, g.upper), lower = mad(right, g.lower_step, g.lower);
     const S value = mad(down, lower - upper, upper) - 128.f;  // centred: float32 keeps its digits in the variance
     const S part = weight * value;
     mean += part;

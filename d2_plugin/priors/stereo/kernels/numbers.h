@@ -33,5 +33,16 @@ D2_FN float pick(bool yes, float a, float b) { return yes ? a : b; }
 D2_FN float smaller(float a, float b) { return a < b ? a : b; }
 D2_FN float larger(float a, float b) { return a > b ? a : b; }
 D2_FN float magnitude(float a) { return a < 0 ? -a : a; }
+D2_FN int look_up(const unsigned* from, int place) { return int(from[place]); }
+
+// The bytes of a quad, from the lowest on: a grey value, what its right neighbour is more, and the same a row below.
+template <class S>
+struct Corners {
+  S upper, upper_step, lower, lower_step;
+};
+D2_FN Corners<float> corners_of(int quad) {
+  const float g00 = real(quad & 255), g01 = real(quad >> 8 & 255), g10 = real(quad >> 16 & 255);
+  return {g00, g01 - g00, g10, real(quad >> 24 & 255) - g10};
+}
 
 }  // namespace d2

@@ -1,10 +1,9 @@
-// PatchMatch multi-view stereo on the CPU: the pixels of spread.h in threads, and the matches of one pixel (candidates
-// times sources) in the lanes of vectors, so that no sum runs across a vector.
+// PatchMatch multi-view stereo on the CPU: the pixels of spread.h in threads, as many of a row at once as a vector has
+// lanes. What they ask for (planes times sources) is matched in the lanes, so that no sum runs across a vector.
 #include <algorithm>
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
-#include <memory>
 #include <system_error>
 #include <thread>
 #include <vector>
@@ -15,8 +14,8 @@
 namespace d2 {
 namespace {
 
-constexpr int kRowsAtOnce = 4;  // that a thread takes from the queue
-constexpr int kMostMatches = (kMaxCandidates * kMaxSources + 15) / 16 * 16;
+constexpr int kRowsAtOnce = 4;     // that a thread takes from the queue
+constexpr int kRowsPerThread = 16;  // fewer are not worth starting one
 
 template <class Work>
 void parallel_rows(int rows, int threads, const Work& work) {
@@ -28,7 +27,7 @@ void parallel_rows(int rows, int threads, const Work& work) {
   };
   std::vector<std::thread> others;
   try {
-    for (int t = 1; t < threads; t++) others.emplace_back(run);
+    for (int t = 1; t < std::min(threads, rows / kRowsPerThread); t++) others.emplace_back(run);
   } catch (const std::system_error&) {
     // The system grants no more threads: those there are do all rows.
   }
@@ -36,224 +35,298 @@ void parallel_rows(int rows, int threads, const Work& work) {
   for (std::thread& other : others) other.join();
 }
 
-// What the lanes need of the sources: match n is of plane n / sources with source n % sources.
-struct Table {
-  alignas(64) float A[9][kMostMatches], k[3][kMostMatches];
-  alignas(64) float width[kMostMatches], height[kMostMatches], last_x[kMostMatches], last_y[kMostMatches];
-  alignas(64) int first[kMostMatches], stride[kMostMatches];
-  alignas(64) float du[kSamples], dv[kSamples], log2_weight[kSamples];
-  ptrdiff_t offset[kSamples];                     // of the samples, in pixels
-  ptrdiff_t neighbour[kRegions][kMostPlaces];  // of the places of a region
+// Grey values of the reference with a margin, so that all windows are read alike, and where other pixels lie.
+struct Reference {
+  static constexpr int kMargin = 5;
+  int stride;
+  std::vector<unsigned> levels;                // -1 outside of the picture
+  int offset[kSamples];                        // of the samples, in `levels`
+  int dx[kRegions][kMostPlaces], dy[kRegions][kMostPlaces];
 
-  explicit Table(const Task& t) {
-    for (int n = 0; n < kMostMatches; n++) {
-      const Source& source = t.sources[n % t.source_count];
-      for (int e = 0; e < 9; e++) A[e][n] = source.A[e];
-      for (int e = 0; e < 3; e++) k[e][n] = source.k[e];
-      width[n] = float(source.width), height[n] = float(source.height);
-      last_x[n] = last_place(source.width), last_y[n] = last_place(source.height);
-      first[n] = source.first, stride[n] = source.width;
-    }
+  explicit Reference(const Task& t)
+      : stride(t.width + 2 * kMargin), levels(size_t(stride) * (t.height + 2 * kMargin), ~0u) {
+    for (int y = 0; y < t.height; y++) std::copy_n(t.gray + size_t(y) * t.width, t.width, &levels[at(0, y)]);
+    for (int n = 0; n < kSamples; n++) offset[n] = sample_dv(n) * stride + sample_du(n);
+    for (int region = 0; region < kRegions; region++)
+      for (int n = 0; n < region_size(region); n++) region_place(region, n, dx[region][n], dy[region][n]);
+  }
+  size_t at(int x, int y) const { return size_t(y + kMargin) * stride + kMargin + x; }
+};
+
+// The windows around as many pixels of a row as there are lanes.
+struct Windows {
+  alignas(64) float weight[kSamples][kLanes], weighted[kSamples][kLanes];
+  Floats u, v, variance;
+
+  // columns: of the pixels.
+  void place(const Reference& reference, float per_gray, Integers columns, int y) {
+    const unsigned* row = &reference.levels[reference.at(0, y)];
+    const Floats centre = real(look_up(row, columns));
+    Floats level[kSamples], total[kPartials], mean[kPartials], squares[kPartials];
+    for (int k = 0; k < kPartials; k++) total[k] = mean[k] = squares[k] = all<Floats>(0.f);
     for (int n = 0; n < kSamples; n++) {
-      du[n] = float(sample_du(n)), dv[n] = float(sample_dv(n));
-      log2_weight[n] = log2_spatial(sample_du(n), sample_dv(n));
-      offset[n] = ptrdiff_t(sample_dv(n)) * t.width + sample_du(n);
+      const Integers read = look_up(row, columns + reference.offset[n]);
+      level[n] = pick(read >= 0, real(read), centre);
+      const Floats off = level[n] - centre;
+      const Floats spatial = all<Floats>(log2_spatial(sample_du(n), sample_dv(n)));
+      const Floats log2_weight = mad(off * off, all<Floats>(per_gray), spatial);
+      const Floats w = pick(read >= 0, exp2_of(log2_weight), all<Floats>(0.f));
+      store(weight[n], w);
+      total[n % kPartials] += w, mean[n % kPartials] = mad(w, level[n], mean[n % kPartials]);
     }
-    for (int region = 0; region < kRegions; region++) {
-      for (int n = 0; n < region_size(region); n++) {
-        int dx, dy;
-        region_place(region, n, dx, dy);
-        neighbour[region][n] = ptrdiff_t(dy) * t.width + dx;
-      }
+    const Floats scale = 1.f / sum_of_partials(total), middle = sum_of_partials(mean) * scale;
+    for (int n = 0; n < kSamples; n++) {
+      const Floats w = load<Floats>(weight[n]) * scale, off = level[n] - middle, product = w * off;
+      store(weight[n], w), store(weighted[n], product);
+      squares[n % kPartials] = mad(product, off, squares[n % kPartials]);
     }
+    u = real(columns), v = all<Floats>(float(y)), variance = sum_of_partials(squares);
   }
 };
 
-// The costs of kLanes matches from number `from` of the table on. weight(n) and weighted(n) are those of sample n.
-template <class Weight, class Weighted>
-D2_FN Floats match_lanes(const Task& task, const Table& t, int from, Floats a, Floats b, Floats c, Floats u, Floats v,
-                         Floats variance, const Weight& weight, const Weighted& weighted) {
-  Floats A[9], k[3];
-  for (int e = 0; e < 9; e++) A[e] = load<Floats>(t.A[e] + from);
-  for (int e = 0; e < 3; e++) k[e] = load<Floats>(t.k[e] + from);
-  const Floats width = load<Floats>(t.width + from), height = load<Floats>(t.height + from);
-  const Warp<Floats> warp = warp_of(A, k, width, height, a, b, c, u, v);
-  const Floats last_x = load<Floats>(t.last_x + from), last_y = load<Floats>(t.last_y + from);
-  const Integers first = load<Integers>(t.first + from), stride = load<Integers>(t.stride + from);
-  Sums<Floats> sums = {};
-  for (int n = 0; n < kSamples; n++) {
-    const Floats du = all<Floats>(t.du[n]), dv = all<Floats>(t.dv[n]);
-    sums.add(task.quads, first, stride, last_x, last_y, warp, du, dv, weight(n), weighted(n));
-  }
-  return sums.cost(variance, warp.seen);
-}
-
-// The window around one pixel, and its matches.
-class Patch {
+// Matches that wait until there are as many as lanes, each with its pixel's number in `windows`, its source, and where
+// its cost belongs.
+class Queue {
  public:
-  Patch(const Task& task, const Table& table) : task_(task), table_(table) {}
+  Queue(const Task& task, const Windows& windows, float* costs) : task_(task), windows_(windows), costs_(costs) {}
 
-  float variance = 0;
-
-  void place(int x, int y) {
-    alignas(64) float value[kSamples], inside[kSamples];
-    const float centre = read(x, y, value, inside);
-    alignas(64) float total[kPartials], mean[kPartials], squares[kPartials];
-    for (int l = 0; l < kPartials; l += kLanes) {
-      Floats sum = {}, sum_mean = {};
-      for (int n = l; n < kSamples; n += kPartials) {
-        const Floats level = load<Floats>(value + n), off = level - centre;
-        const Floats log2_weight = mad(off * off, all<Floats>(task_.per_gray), load<Floats>(table_.log2_weight + n));
-        const Floats w = load<Floats>(inside + n) * exp2_of(log2_weight);
-        store(weight_ + n, w);
-        sum += w, sum_mean = mad(w, level, sum_mean);
-      }
-      store(total + l, sum), store(mean + l, sum_mean);
-    }
-    const float scale = 1.f / sum_of_partials(total), middle = sum_of_partials(mean) * scale;
-    for (int l = 0; l < kPartials; l += kLanes) {
-      Floats sum = {};
-      for (int n = l; n < kSamples; n += kPartials) {
-        const Floats w = load<Floats>(weight_ + n) * scale, off = load<Floats>(value + n) - middle, weighted = w * off;
-        store(weight_ + n, w), store(weighted_ + n, weighted);
-        sum = mad(weighted, off, sum);
-      }
-      store(squares + l, sum);
-    }
-    u_ = float(x), v_ = float(y), variance = sum_of_partials(squares);
-  }
-
-  // Costs [count, source_count] of planes.
-  void match(const Plane* planes, int count, float* costs) const {
-    const int sources = task_.source_count, matches = count * sources;
-    alignas(64) float a[kMostMatches], b[kMostMatches], c[kMostMatches];
-    int n = 0;
-    for (int p = 0; p < count; p++) {
-      for (int s = 0; s < sources; s++, n++) a[n] = planes[p].a, b[n] = planes[p].b, c[n] = planes[p].c;
-    }
-    for (; n % kLanes; n++) a[n] = b[n] = c[n] = 0;
-    const Floats u = all<Floats>(u_), v = all<Floats>(v_);
-    const auto weight = [&](int k) { return all<Floats>(weight_[k]); };
-    const auto weighted = [&](int k) { return all<Floats>(weighted_[k]); };
-    alignas(64) float found[kLanes];
-    for (int from = 0; from < matches; from += kLanes) {
-      const Floats planes_a = load<Floats>(a + from), planes_b = load<Floats>(b + from), planes_c = load<Floats>(c + from);
-      const Floats reference = all<Floats>(variance);
-      store(found, match_lanes(task_, table_, from, planes_a, planes_b, planes_c, u, v, reference, weight, weighted));
-      std::copy_n(found, std::min(kLanes, matches - from), costs + from);
-    }
-  }
-
-  float weight(int n) const { return weight_[n]; }
-  float weighted(int n) const { return weighted_[n]; }
-
-  void believe(const float* costs, int count, float* beliefs) const {
-    alignas(64) float part[kLanes] = {};
-    for (int from = 0; from < count; from += kLanes) {
-      std::copy_n(costs + from, std::min(kLanes, count - from), part);
-      store(part, belief_of(load<Floats>(part)));
-      std::copy_n(part, std::min(kLanes, count - from), beliefs + from);
-    }
-  }
-
-  // cheapest_of, without looking for the border where that is far.
-  long long cheapest(int x, int y, int region) const {
-    const bool inner = std::min(x, y) >= kFarthest && x + kFarthest < task_.width && y + kFarthest < task_.height;
-    if (!inner) return cheapest_of(task_, x, y, region);
-    const float* costs = task_.costs + size_t(y) * task_.width + x;
-    float lowest = 1e9f;
-    ptrdiff_t found = 0;
-    for (int n = 0; n < region_size(region); n++) {
-      const ptrdiff_t place = table_.neighbour[region][n];
-      if (costs[place] < lowest) lowest = costs[place], found = place;
-    }
-    return found ? costs + found - task_.costs : -1;
-  }
-
- private:
-  // Grey values of the window and 1 where there is a pixel, 0 outside of the picture; that of the middle.
-  float read(int x, int y, float* value, float* inside) const {
-    const uint8_t* gray = task_.gray + size_t(y) * task_.width + x;
-    if (x >= 5 && y >= 5 && x + 5 < task_.width && y + 5 < task_.height) {
-      for (int n = 0; n < kSamples; n++) value[n] = gray[table_.offset[n]], inside[n] = 1;
-      return *gray;
-    }
-    for (int n = 0; n < kSamples; n++) {
-      const int column = x + sample_du(n), row = y + sample_dv(n);
-      inside[n] = column >= 0 && row >= 0 && column < task_.width && row < task_.height;
-      value[n] = inside[n] > 0 ? gray[table_.offset[n]] : *gray;
-    }
-    return *gray;
-  }
-
-  const Task& task_;
-  const Table& table_;
-  float u_ = 0, v_ = 0;
-  alignas(64) float weight_[kSamples], weighted_[kSamples];
-};
-
-// Windows of several pixels and their own planes, against as many sources as there are lanes: at the start each pixel has
-// few matches.
-class Pack {
- public:
-  Pack(const Task& task, const Table& table) : task_(task), table_(table), patch_(task, table) {}
-
-  // For begin: the plane of the pixel that was given last waits until the lanes are full.
-  void add(int x, int y) {
-    patch_.place(x, y);
-    const Plane plane = drawn_plane(task_, x, y);
-    for (int s = 0; s < task_.source_count; s++) {
-      const int lane = count_++;
-      a_[lane] = plane.a, b_[lane] = plane.b, c_[lane] = plane.c;
-      u_[lane] = float(x), v_[lane] = float(y), variance_[lane] = patch_.variance;
-      for (int n = 0; n < kSamples; n++) weight_[n][lane] = patch_.weight(n), weighted_[n][lane] = patch_.weighted(n);
-    }
-    places_[waiting_++] = size_t(y) * task_.width + x;
-    if (count_ + task_.source_count > kPacked) flush();
+  void add(unsigned lanes, const Warp<Floats>& warp, const Source& source, Integers pixel, Integers place) {
+    const Floats columns[kPacked] = {warp.x, warp.y, warp.xu, warp.xv, warp.yu, warp.yv, warp.zu, warp.zv,
+                                     (Floats)pixel, (Floats)place};
+    for (int k = 0; k < kPacked; k++) pack(packed_[k] + count_, lanes, columns[k]);
+    store(last_x_ + count_, all<Floats>(last_place(source.width)));
+    store(last_y_ + count_, all<Floats>(last_place(source.height)));
+    store(first_ + count_, (Floats)(Integers{} + source.first));
+    store(stride_ + count_, (Floats)(Integers{} + source.width));
+    count_ += __builtin_popcount(lanes);
+    if (count_ < kLanes) return;
+    match(kLanes);
+    count_ -= kLanes;
+    for (auto& column : packed_) store(column, load<Floats>(column + kLanes));
+    for (float* column : {last_x_, last_y_, first_, stride_}) store(column, load<Floats>(column + kLanes));
   }
 
   void flush() {
-    for (int lane = count_; lane % kLanes; lane++) a_[lane] = b_[lane] = c_[lane] = u_[lane] = v_[lane] = variance_[lane] = 0;
-    alignas(64) float costs[kPacked];
-    for (int from = 0; from < count_; from += kLanes) {
-      const auto weight = [&](int n) { return load<Floats>(weight_[n] + from); };
-      const auto weighted = [&](int n) { return load<Floats>(weighted_[n] + from); };
-      store(costs + from, match_lanes(task_, table_, from, load<Floats>(a_ + from), load<Floats>(b_ + from),
-                                      load<Floats>(c_ + from), load<Floats>(u_ + from), load<Floats>(v_ + from),
-                                      load<Floats>(variance_ + from), weight, weighted));
-    }
-    for (int n = 0; n < waiting_; n++) begin(task_, costs + n * task_.source_count, places_[n]);
-    count_ = waiting_ = 0;
+    if (count_ > 0) match(count_);
+    count_ = 0;
   }
 
  private:
-  static constexpr int kPacked = (kMaxSources + 15) / 16 * 16;  // lanes: at least all sources of one pixel
+  void match(int count) const {
+    const auto of = [&](int k) { return load<Floats>(packed_[k]); };
+    const Warp<Floats> warp = {of(0), of(1), of(2), of(3), of(4), of(5), of(6), of(7), all<Floats>(1.f)};
+    const Floats last_x = load<Floats>(last_x_), last_y = load<Floats>(last_y_);
+    alignas(64) float found[kLanes];
+    const bool inside = stays_inside(warp, last_x, last_y);
+    store(found, inside ? match<true>(warp, last_x, last_y) : match<false>(warp, last_x, last_y));
+    const Integers place = load<Integers>(packed_[9]);
+    for (int l = 0; l < count; l++) costs_[place[l]] = found[l];
+  }
+
+  template <bool bounded>
+  Floats match(const Warp<Floats>& warp, Floats last_x, Floats last_y) const {
+    const Integers first = load<Integers>(first_), stride = load<Integers>(stride_), pixel = load<Integers>(packed_[8]);
+    Sums<Floats> sums = {};
+    for (int n = 0; n < kSamples;) {
+      const int dv = sample_dv(n), end = dv == -5 || dv == 5 ? n + 4 : n + 6;
+      const Line<Floats> line = line_of(warp, all<Floats>(float(dv)));
+      for (float du = n + 6 == end ? -5.f : -3.f; n < end; n++, du += 2) {
+        const Floats weight = reordered(load<Floats>(windows_.weight[n]), pixel);
+        const Floats weighted = reordered(load<Floats>(windows_.weighted[n]), pixel);
+        sums.add<bounded>(task_.quads, first, stride, last_x, last_y, warp, line, all<Floats>(du), weight, weighted);
+      }
+    }
+    return sums.cost(reordered(windows_.variance, pixel), warp.seen);
+  }
+
+  // Whether all windows lie within their sources, with a quarter of a pixel to spare for what is rounded.
+  static bool stays_inside(const Warp<Floats>& warp, Floats last_x, Floats last_y) {
+    const Floats zero = all<Floats>(0.f);
+    const auto sum = [&](Floats a, Floats b) { return 5.f * (larger(a, zero - a) + larger(b, zero - b)); };
+    const Floats e = sum(warp.zu, warp.zv), scale = mad(mad(e, e, e), e, e) + 1.f;
+    const Floats x = mad(sum(warp.xu, warp.xv), scale, all<Floats>(.25f));
+    const Floats y = mad(sum(warp.yu, warp.yv), scale, all<Floats>(.25f));
+    return bits((warp.x >= x) & (warp.y >= y) & (warp.x + x <= last_x) & (warp.y + y <= last_y)) == kAllLanes;
+  }
+
+  static constexpr int kPacked = 10;
   const Task& task_;
-  const Table& table_;
-  Patch patch_;
-  int count_ = 0, waiting_ = 0;
-  size_t places_[kPacked];
-  alignas(64) float a_[kPacked], b_[kPacked], c_[kPacked], u_[kPacked], v_[kPacked], variance_[kPacked];
-  alignas(64) float weight_[kSamples][kPacked] = {}, weighted_[kSamples][kPacked] = {};
+  const Windows& windows_;
+  float* costs_;
+  int count_ = 0;
+  alignas(64) float packed_[kPacked][2 * kLanes] = {};
+  alignas(64) float last_x_[2 * kLanes] = {}, last_y_[2 * kLanes] = {};
+  alignas(64) float first_[2 * kLanes] = {}, stride_[2 * kLanes] = {};  // integers, as they are
 };
 
-void begin_row(const Task& t, const Table& table, int y) {
-  Pack pack(t, table);
-  for (int x = 0; x < t.width; x++) {
-    if (wanted(t, size_t(y) * t.width + x)) pack.add(x, y);
+// Planes of the pixels whose windows are placed, and what they cost: [kLanes, kMaxCandidates, source_count].
+class Batch {
+ public:
+  Batch(const Task& task, const Reference& reference)
+      : task_(task), reference_(reference), costs_(size_t(kLanes) * kMaxCandidates * task.source_count + kLanes),
+        beliefs_(costs_.size()), queue_(task, windows_, costs_.data()) {}
+
+  // Places the windows of `count` pixels of a row.
+  void place(const int* columns, int count, int y) {
+    for (int l = 0; l < kLanes; l++) columns_[l] = columns[std::min(l, count - 1)];
+    windows_.place(reference_, task_.per_gray, columns_, y);
   }
-  pack.flush();
+  Integers columns() const { return columns_; }
+  bool textured(int pixel) const { return windows_.variance[pixel] >= kMinVariance; }
+
+  // Asks what the planes of a pixel from number `known` on cost in the sources whose bit in `views` is 1.
+  void ask(int pixel, const Plane* planes, int known, int count, unsigned views) {
+    for (int k = known; k < count; k++, asked_++) {
+      a_[asked_] = planes[k].a, b_[asked_] = planes[k].b, c_[asked_] = planes[k].c;
+      pixel_[asked_] = pixel, place_[asked_] = int(costs(pixel) - costs_.data()) + k * task_.source_count;
+      views_[asked_] = int(views);
+    }
+  }
+
+  // Matches all that was asked for.
+  void match() {
+    const int asked = asked_;
+    for (; asked_ % kLanes; asked_++) {
+      a_[asked_] = b_[asked_] = c_[asked_] = 0;
+      pixel_[asked_] = place_[asked_] = views_[asked_] = 0;
+    }
+    std::fill(costs_.begin(), costs_.end(), kNoMatch);
+    for (int s = 0; s < task_.source_count; s++) match(task_.sources[s], s, asked);
+    queue_.flush();
+    asked_ = 0;
+  }
+
+  // belief_of all costs.
+  void believe() {
+    for (size_t n = 0; n + kLanes <= costs_.size(); n += kLanes)
+      store(&beliefs_[n], belief_of(load<Floats>(&costs_[n])));
+  }
+
+  float* costs(int pixel) { return &costs_[size_t(pixel) * kMaxCandidates * task_.source_count]; }
+  const float* beliefs(int pixel) const { return &beliefs_[size_t(pixel) * kMaxCandidates * task_.source_count]; }
+
+ private:
+  void match(const Source& source, int number, int asked) {
+    Floats A[9], k[3];
+    for (int e = 0; e < 9; e++) A[e] = all<Floats>(source.A[e]);
+    for (int e = 0; e < 3; e++) k[e] = all<Floats>(source.k[e]);
+    const Floats width = all<Floats>(float(source.width)), height = all<Floats>(float(source.height));
+    for (int from = 0; from < asked; from += kLanes) {
+      const unsigned selected = bits((load<Integers>(views_ + from) >> number & 1) > 0);
+      if (!selected) continue;
+      const Integers pixel = load<Integers>(pixel_ + from);
+      const Floats u = reordered(windows_.u, pixel), v = windows_.v;
+      const Warp<Floats> warp = warp_of(A, k, width, height, load<Floats>(a_ + from), load<Floats>(b_ + from),
+                                        load<Floats>(c_ + from), u, v);
+      const unsigned lanes = selected & bits(warp.seen > 0.f);
+      if (lanes) queue_.add(lanes, warp, source, pixel, load<Integers>(place_ + from) + number);
+    }
+  }
+
+  static constexpr int kMostAsked = kLanes * kMaxCandidates;
+  const Task& task_;
+  const Reference& reference_;
+  Windows windows_;
+  Integers columns_ = {};
+  std::vector<float> costs_, beliefs_;
+  Queue queue_;
+  int asked_ = 0;
+  alignas(64) float a_[kMostAsked], b_[kMostAsked], c_[kMostAsked];
+  alignas(64) int pixel_[kMostAsked], place_[kMostAsked], views_[kMostAsked];
+};
+
+// cheapest_of for the pixels at `columns` of a row and every region, as numbers of pixels; -1 where there is none.
+struct Cheapest {
+  alignas(64) int place[kRegions][kLanes];
+
+  Cheapest(const Task& t, const Reference& reference, Integers columns, int y) {
+    const Integers here = columns + y * t.width, none = Integers{} - 1;
+    for (int region = 0; region < kRegions; region++) {
+      Floats lowest = all<Floats>(1e9f);
+      Integers found = none;
+      for (int n = 0; n < region_size(region); n++) {
+        const int dx = reference.dx[region][n], dy = reference.dy[region][n];
+        if (y + dy < 0 || y + dy >= t.height) continue;
+        const Integers x = columns + dx, inside = (x >= 0) & (x < t.width);
+        const Integers at = inside ? here + (dy * t.width + dx) : here;
+        const Floats cost = look_up(t.costs, at);
+        const Integers better = inside & (cost < lowest);
+        lowest = pick(better, cost, lowest), found = better ? at : found;
+      }
+      std::memcpy(place[region], &found, sizeof found);
+    }
+  }
+};
+
+// Calls work(columns, count) with the wanted pixels of a row, every `step`-th from `first` on, kLanes at a time.
+template <class Work>
+void wanted_pixels(const Task& t, int y, int first, int step, const Work& work) {
+  int columns[kLanes], count = 0;
+  for (int x = first; x < t.width; x += step) {
+    if (wanted(t, (long long)y * t.width + x)) columns[count++] = x;
+    if (count == kLanes) work(columns, count), count = 0;
+  }
+  if (count) work(columns, count);
 }
 
-void update_row(const Task& t, const Table& table, int y, int colour, int round) {
-  Patch patch(t, table);
-  for (int x = (y + colour) & 1; x < t.width; x += 2) {
-    const size_t i = size_t(y) * t.width + x;
-    if (!wanted(t, i)) continue;
-    patch.place(x, y);
-    if (patch.variance < kMinVariance) t.costs[i] = kNoMatch;
-    else update(t, patch, x, y, round);
-  }
+// first_costs [H, W, source_count]: of the planes that the pixels start with.
+void begin_row(const Task& t, const Reference& reference, float* first_costs, int y) {
+  Batch batch(t, reference);
+  wanted_pixels(t, y, 0, 1, [&](const int* columns, int count) {
+    batch.place(columns, count, y);
+    for (int n = 0; n < count; n++) {
+      const Plane plane = drawn_plane(t, columns[n], y);
+      if (batch.textured(n)) batch.ask(n, &plane, 0, 1, ~0u);
+    }
+    batch.match();
+    for (int n = 0; n < count; n++) {
+      const long long i = (long long)y * t.width + columns[n];
+      begin(t, batch.costs(n), i);
+      std::copy_n(batch.costs(n), t.source_count, first_costs + i * t.source_count);
+    }
+  });
+}
+
+void update_row(const Task& t, const Reference& reference, const float* first_costs, int y, int colour, int round) {
+  Batch batch(t, reference);
+  std::vector<Turn> turns;
+  turns.reserve(kLanes);
+  wanted_pixels(t, y, (y + colour) & 1, 2, [&](const int* columns, int count) {
+    batch.place(columns, count, y);
+    turns.clear();
+    int pixel[kLanes];
+    for (int n = 0; n < count; n++) {
+      if (!batch.textured(n)) {
+        t.costs[(long long)y * t.width + columns[n]] = kNoMatch;
+        continue;
+      }
+      pixel[turns.size()] = n;
+      turns.emplace_back(t, columns[n], y, round);
+    }
+    const int turned = int(turns.size());
+    const auto match_selected = [&] {
+      for (int n = 0; n < turned; n++)
+        batch.ask(pixel[n], turns[n].planes, 0, turns[n].count, turns[n].selection.views);
+      batch.match();
+    };
+    const Cheapest cheapest(t, reference, batch.columns(), y);
+    for (int n = 0; n < turned; n++) turns[n].gather([&](int region) { return cheapest.place[region][pixel[n]]; });
+    const int known = round == 0 ? 1 : 0;  // nobody else has changed the plane that a pixel starts with
+    for (int n = 0; n < turned; n++) batch.ask(pixel[n], turns[n].planes, known, turns[n].count, ~0u);
+    batch.match();
+    for (int n = 0; n < turned * known; n++)
+      std::copy_n(first_costs + turns[n].pixel() * t.source_count, t.source_count, batch.costs(pixel[n]));
+    batch.believe();
+    for (int n = 0; n < turned; n++) turns[n].choose(batch.costs(pixel[n]), batch.beliefs(pixel[n]));
+    if (t.explore) {
+      for (Turn& turn : turns) turn.draw_anywhere();
+      match_selected();
+      for (int n = 0; n < turned; n++) turns[n].compare(batch.costs(pixel[n]));
+    }
+    for (Turn& turn : turns) turn.draw_nearby();
+    match_selected();
+    for (int n = 0; n < turned; n++) turns[n].compare(batch.costs(pixel[n])), turns[n].finish();
+  });
 }
 
 // Planes with one array per field, and a margin of planes that agree with nothing, so that a row of pixels is a row of
@@ -325,11 +398,13 @@ extern "C" {
 // written.
 void d2_patchmatch(const Task* task) {
   const Task& t = *task;
-  const std::unique_ptr<const Table> table(new Table(t));
-  parallel_rows(t.height, t.threads, [&](int y) { begin_row(t, *table, y); });
+  const Reference reference(t);
+  std::vector<float> first_costs(size_t(t.width) * t.height * t.source_count);
+  parallel_rows(t.height, t.threads, [&](int y) { begin_row(t, reference, first_costs.data(), y); });
   for (int round = 0; round < t.rounds; round++) {
     for (int colour = 0; colour < 2; colour++) {
-      parallel_rows(t.height, t.threads, [&](int y) { update_row(t, *table, y, colour, round); });
+      const auto update = [&](int y) { update_row(t, reference, first_costs.data(), y, colour, round); };
+      parallel_rows(t.height, t.threads, update);
     }
   }
 }

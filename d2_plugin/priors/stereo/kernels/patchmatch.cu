@@ -39,7 +39,7 @@ D2_DEVICE Pixel pixel_of_thread(const Task& t, int step, int colour) {
   return {x, y, x < t.width && y < t.height};
 }
 
-// The window around one pixel, and its matches (see update).
+// The window around one pixel, and its matches.
 class Patch {
  public:
   D2_DEVICE Patch(const Task& task, Windows& windows) : task_(task), windows_(windows) {}
@@ -73,16 +73,13 @@ class Patch {
     u_ = float(x), v_ = float(y), variance = sum_of_partials(squares);
   }
 
-  D2_DEVICE void match(const Plane* planes, int count, float* costs) const {
-    for (int p = 0; p < count; p++)
-      for (int s = 0; s < task_.source_count; s++) costs[p * task_.source_count + s] = cost(planes[p], task_.sources[s]);
+  // Costs [count, source_count] of planes; those of sources whose bit in `views` is 0 are left as they are.
+  D2_DEVICE void match(const Plane* planes, int count, unsigned views, float* costs) const {
+    for (int s = 0; s < task_.source_count; s++) {
+      if (!(views >> s & 1)) continue;
+      for (int p = 0; p < count; p++) costs[p * task_.source_count + s] = cost(planes[p], task_.sources[s]);
+    }
   }
-
-  D2_DEVICE void believe(const float* costs, int count, float* beliefs) const {
-    for (int n = 0; n < count; n++) beliefs[n] = belief_of(costs[n]);
-  }
-
-  D2_DEVICE long long cheapest(int x, int y, int region) const { return cheapest_of(task_, x, y, region); }
 
  private:
   D2_DEVICE float cost(const Plane& plane, const Source& source) const {
@@ -93,8 +90,8 @@ class Patch {
     Sums<float> sums = {0, 0, 0};
 #pragma unroll 8
     for (int n = 0; n < kSamples; n++)
-      sums.add(task_.quads, source.first, source.width, last_x, last_y, warp, float(sample_du(n)), float(sample_dv(n)),
-               windows_.weight[n][me], windows_.weighted[n][me]);
+      sums.add<false>(task_.quads, source.first, source.width, last_x, last_y, warp, line_of(warp, float(sample_dv(n))),
+                      float(sample_du(n)), windows_.weight[n][me], windows_.weighted[n][me]);
     return sums.cost(variance, warp.seen);
   }
 
@@ -114,8 +111,27 @@ D2_KERNEL d2_patchmatch_begin(const Call call) {
   patch.place(p.x, p.y);
   const Plane plane = drawn_plane(t, p.x, p.y);
   float costs[kMaxSources];
-  patch.match(&plane, 1, costs);
+  patch.match(&plane, 1, ~0u, costs);
   begin(t, costs, i);
+}
+
+// What one pixel does in one round; `patch` lies around it.
+D2_DEVICE void update(const Task& t, const Patch& patch, int x, int y, int round) {
+  float costs[kMaxCandidates * kMaxSources], beliefs[kMaxCandidates * kMaxSources];
+  Turn turn(t, x, y, round);
+  turn.gather([&](int region) { return cheapest_of(t, x, y, region); });
+  patch.match(turn.planes, turn.count, ~0u, costs);
+  for (int n = 0; n < turn.count * t.source_count; n++) beliefs[n] = belief_of(costs[n]);
+  turn.choose(costs, beliefs);
+  if (t.explore) {
+    turn.draw_anywhere();
+    patch.match(turn.planes, turn.count, turn.selection.views, costs);
+    turn.compare(costs);
+  }
+  turn.draw_nearby();
+  patch.match(turn.planes, turn.count, turn.selection.views, costs);
+  turn.compare(costs);
+  turn.finish();
 }
 
 // Half a round: the pixels of one colour.

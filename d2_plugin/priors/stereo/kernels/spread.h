@@ -85,22 +85,6 @@ D2_FN long long cheapest_of(const Task& t, int x, int y, int region) {
   return found;
 }
 
-// The pixel's own plane first, then the cheapest plane of each region, none of them twice; how many there are.
-template <class Device>
-D2_FN int gather(const Task& t, const Device& device, int x, int y, Plane* planes) {
-  int count = 0;
-  planes[count++] = plane_at(t, (long long)y * t.width + x);
-  for (int region = 0; region < kRegions; region++) {
-    const long long cheapest = device.cheapest(x, y, region);
-    if (cheapest < 0) continue;
-    const Plane plane = plane_at(t, cheapest);
-    bool fresh = in_range(t, plane.inverse_depth(float(x), float(y)));
-    for (int k = 0; k < count; k++) fresh = fresh && !(planes[k] == plane);
-    if (fresh) planes[count++] = plane;
-  }
-  return count;
-}
-
 template <class S>
 D2_FN S belief_of(S cost) { return exp2_of(cost * cost * (-kLog2E / .18f)); }
 
@@ -170,87 +154,86 @@ D2_FN float total_cost(const Task& t, const Selection& selection, const float* c
   return total;
 }
 
-// Planes that a pixel tries besides those of its neighbours.
-struct Trials {
+// One pixel in one round, step by step: each leaves `count` planes that the device matches before the next.
+struct Turn {
   const Task& task;
-  const Sight& sight;
-  Plane* planes;
+  int x, y, round;
+  Sight sight;
+  Random random;
+  Selection selection;
+  Plane best;
+  float cost;
   int count;
+  Plane planes[kMaxCandidates];
 
+  D2_FN Turn(const Task& t, int column, int row, int number)
+      : task(t), x(column), y(row), round(number), sight(sight_of(t.intrinsics, float(column), float(row))),
+        random(t.seed, unsigned(pixel()), unsigned(number)), cost(1e9f), count(0) {}
+
+  D2_FN long long pixel() const { return (long long)y * task.width + x; }
+
+  // The pixel's own plane first, then the cheapest plane of each region, none of them twice. cheapest(region) is
+  // cheapest_of.
+  template <class Cheapest>
+  D2_FN void gather(const Cheapest& cheapest) {
+    planes[count++] = best = plane_at(task, pixel());
+    for (int region = 0; region < kRegions; region++) {
+      const long long place = cheapest(region);
+      if (place < 0) continue;
+      const Plane plane = plane_at(task, place);
+      bool fresh = in_range(task, plane.inverse_depth(sight.u, sight.v));
+      for (int k = 0; k < count; k++) fresh = fresh && !(planes[k] == plane);
+      if (fresh) planes[count++] = plane;
+    }
+  }
+
+  // Keeps the best plane so far. costs [count, source_count], of the selected sources.
+  D2_FN void compare(const float* costs) {
+    for (int k = 0; k < count; k++) {
+      const float total = total_cost(task, selection, costs + k * task.source_count, planes[k], x, y);
+      if (total < cost) cost = total, best = planes[k];
+    }
+  }
+
+  // After gather: which sources count, and the best of what was gathered. See select_views.
+  D2_FN void choose(const float* costs, const float* belief) {
+    selection = select_views(task, costs, belief, count, x, y, round);
+    compare(costs);
+  }
+
+  // Random depths, random normals, both.
+  D2_FN void draw_anywhere() {
+    count = 0;
+    const Vector drawn = random_normal(sight, random);
+    const float q = random.uniform(task.inverse_far, task.inverse_near);
+    add(q, normal_of(task.intrinsics, best)), add(best.inverse_depth(sight.u, sight.v), drawn), add(q, drawn);
+  }
+
+  // Changes that shrink with every round. None builds on another, so that all are matched at once.
+  D2_FN void draw_nearby() {
+    count = 0;
+    const Vector normal = normal_of(task.intrinsics, best);
+    const float q = best.inverse_depth(sight.u, sight.v), halved = bits_float((127 - round) << 23);
+    const float step = larger(.04f * halved, .003f), turn = larger(.3f * halved, .02f);
+    add(q, jittered_normal(sight, normal, turn, random));
+    add(q * (1 + random.uniform(-step, step)), normal);
+    const float finer = .25f * random.uniform(-step, step);
+    add(q * (1 + finer), jittered_normal(sight, normal, .25f * turn, random));
+    add(q * (1 + .1f * random.uniform(-step, step)), normal);
+    add(q, jittered_normal(sight, normal, .25f * turn, random));
+  }
+
+  D2_FN void finish() const {
+    put(task, pixel(), best);
+    task.costs[pixel()] = cost;
+    task.views[pixel()] = selection.views;
+  }
+
+ private:
   D2_FN void add(float q, Vector normal) {
     if (in_range(task, q)) planes[count++] = plane_through(task.intrinsics, sight, q, normal);
   }
 };
-
-// Random depths, random normals, both.
-D2_FN int draw_anywhere(const Task& t, const Sight& sight, const Plane& best, Random& random, Plane* planes) {
-  Trials trials{t, sight, planes, 0};
-  const Vector drawn = random_normal(sight, random);
-  const float q = random.uniform(t.inverse_far, t.inverse_near);
-  trials.add(q, normal_of(t.intrinsics, best)), trials.add(best.inverse_depth(sight.u, sight.v), drawn), trials.add(q, drawn);
-  return trials.count;
-}
-
-// Changes that shrink with every round. None builds on another, so that all are matched at once.
-D2_FN int draw_nearby(const Task& t, const Sight& sight, const Plane& best, int round, Random& random, Plane* planes) {
-  Trials trials{t, sight, planes, 0};
-  const Vector normal = normal_of(t.intrinsics, best);
-  const float q = best.inverse_depth(sight.u, sight.v), halved = bits_float((127 - round) << 23);
-  const float step = larger(.04f * halved, .003f), turn = larger(.3f * halved, .02f);
-  trials.add(q, jittered_normal(sight, normal, turn, random));
-  trials.add(q * (1 + random.uniform(-step, step)), normal);
-  const float finer = .25f * random.uniform(-step, step);
-  trials.add(q * (1 + finer), jittered_normal(sight, normal, .25f * turn, random));
-  trials.add(q * (1 + .1f * random.uniform(-step, step)), normal);
-  trials.add(q, jittered_normal(sight, normal, .25f * turn, random));
-  return trials.count;
-}
-
-// The best plane of a pixel so far.
-template <class Device>
-struct Best {
-  const Task& task;
-  Device& device;
-  const Selection& selection;
-  int x, y;
-  Plane plane;
-  float cost;
-
-  D2_FN void compare(const Plane* planes, const float* costs, int count) {
-    for (int k = 0; k < count; k++) {
-      const float total = total_cost(task, selection, costs + k * task.source_count, planes[k], x, y);
-      if (total < cost) cost = total, plane = planes[k];
-    }
-  }
-  D2_FN void attempt(const Plane* planes, float* costs, int count) {
-    device.match(planes, count, costs);
-    compare(planes, costs, count);
-  }
-};
-
-// One pixel in one round. The device holds the window around it:
-//   device.match(planes, count, costs)       writes the cost of each plane against each source, [count, source_count]
-//   device.believe(costs, count, beliefs)    writes belief_of(cost)
-//   device.cheapest(x, y, region)            is cheapest_of
-template <class Device>
-D2_FN void update(const Task& t, Device& device, int x, int y, int round) {
-  const long long i = (long long)y * t.width + x;
-  const Sight sight = sight_of(t.intrinsics, float(x), float(y));
-  Plane planes[kMaxCandidates];
-  float costs[kMaxCandidates * kMaxSources], beliefs[kMaxCandidates * kMaxSources];
-  const int count = gather(t, device, x, y, planes);
-  device.match(planes, count, costs);
-  device.believe(costs, count * t.source_count, beliefs);
-  const Selection selection = select_views(t, costs, beliefs, count, x, y, round);
-  Best<Device> best{t, device, selection, x, y, planes[0], 1e9f};
-  best.compare(planes, costs, count);
-  Random random(t.seed, unsigned(i), unsigned(round));
-  if (t.explore) best.attempt(planes, costs, draw_anywhere(t, sight, best.plane, random, planes));
-  best.attempt(planes, costs, draw_nearby(t, sight, best.plane, round, random, planes));
-  put(t, i, best.plane);
-  t.costs[i] = best.cost;
-  t.views[i] = selection.views;
-}
 
 // The plane that a pixel starts with: its own, or a random one where the task says so.
 D2_FN Plane drawn_plane(const Task& t, int x, int y) {
