@@ -53,7 +53,7 @@ def libraries() -> list[Library]:
     from d2_plugin.compat import absolute
     from d2_plugin.gaussians import native_adam, native_picture, native_slice, native_ssim
     from d2_plugin.hooks import native_depth_loss
-    from d2_plugin.priors.monocular import kernel as monocular
+    from d2_plugin.priors.monocular.native import library as monocular
     from d2_plugin.priors.stereo.filtering import kernel as filtering
     from d2_plugin.priors.stereo.patchmatch_kernel import PatchMatchKernel
     from d2_plugin.priors.stereo.settings import StereoSettings

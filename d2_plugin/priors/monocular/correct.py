@@ -23,7 +23,8 @@ from types import ModuleType
 import numpy as np
 
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.monocular import kernel
+from d2_plugin.priors.monocular.native import library
+from d2_plugin.priors.monocular.native.field import smooth_fields
 from d2_plugin.priors.monocular.settings import AlignSettings
 
 GRID = 80  # cells across the picture: twice as many change the median error by less than .0002 and take 8 times longer
@@ -72,13 +73,11 @@ def _smooth_fields(bend: np.ndarray, known: np.ndarray, scales: Sequence[float],
     for scale in scales:
         sigma = max(scale * width / cell, 0.5)
         blurs.append((_blur_matrix(cv2, rows, sigma), _blur_matrix(cv2, columns, sigma), _reach(sigma)))
-    if kernel.library() is None:
+    if library.library() is None:
         cells = [_cell_field(np.where(which, bend, 0), which, cell, blurs, prior) for which in known]
     else:
         shared = np.broadcast_to(bend, known.shape)
-        cells = list(
-            kernel.smooth_fields(shared, known, cell, blurs, prior=prior, outlier=OUTLIER, rounds=ROUNDS)
-        )
+        cells = list(smooth_fields(shared, known, cell, blurs, prior=prior, outlier=OUTLIER, rounds=ROUNDS))
     fields = np.empty(known.shape, np.float32)
     for field, out in zip(cells, fields):
         enlarged = cv2.resize(field, (columns * cell, rows * cell), interpolation=cv2.INTER_LINEAR)

@@ -1,26 +1,14 @@
-"""The compiled parts of the alignment and of the local correction (`kernels/`): the numbers of the NumPy code.
-
-Compiled at first use; runs on `torch.get_num_threads()` threads, and results are the same bits for any number of them.
-"""
+"""The smooth fields of the local correction, compiled (`kernels/correct.cpp`)."""
 
 from __future__ import annotations
 
 import ctypes
-import functools
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
 
-from d2_plugin.compiler import NoCompiler, load_library
-
-SOURCES = (Path(__file__).parent / "kernels" / "correct.cpp",)
-_STEREO = Path(__file__).parents[1] / "stereo" / "kernels"
-_RASTERIZER = Path(__file__).parents[2] / "rasterizer" / "kernels"  # no import: only headers are shared
-HEADERS = (_RASTERIZER / "parallel.h", *(_STEREO / name for name in ("lanes.h", "numbers.h")))
-FLAGS = ("-ffp-contract=off",)
-"""No contraction: NumPy has none, and where its products have one it is written out."""
+from d2_plugin.priors.monocular.native.library import run
 
 _int, _float, _pointer = ctypes.c_int32, ctypes.c_float, ctypes.c_void_p
 
@@ -34,25 +22,6 @@ class _Field(ctypes.Structure):
         ("bend_stride", ctypes.c_int64),
         *((name, _pointer) for name in ("bend", "known", "down", "across", "reach", "field")),
     )
-
-
-@functools.cache
-def library() -> ctypes.CDLL | None:
-    """The compiled kernels; None without a compiler: NumPy then does the same.
-
-    Raises:
-        CompileError: see `d2_plugin.compiler.load_library`.
-    """
-    try:
-        kernel = load_library("monocular", SOURCES, HEADERS, FLAGS)
-    except NoCompiler:
-        return None
-    for name, call in (("field", _Field),):
-        function, size = getattr(kernel, f"d2_{name}"), getattr(kernel, f"d2_{name}_size")
-        function.argtypes, function.restype = (ctypes.POINTER(call),), None
-        size.restype = ctypes.c_int64
-        assert size() == ctypes.sizeof(call), f"the call of {name} differs between kernel.py and kernels/"
-    return kernel
 
 
 def smooth_fields(
@@ -75,8 +44,6 @@ def smooth_fields(
             how many cells their windows reach.
         prior, outlier, rounds: see `correct`.
     """
-    kernel = library()
-    assert kernel is not None
     assert bend.dtype == np.float32
     assert bend[0].flags.c_contiguous
     maps, height, width = bend.shape
@@ -89,5 +56,5 @@ def smooth_fields(
     arrays = {"bend": bend, "known": known, "down": down, "across": across, "reach": reach, "field": field}
     for name, array in arrays.items():
         setattr(call, name, array.ctypes.data)
-    kernel.d2_field(ctypes.byref(call))
+    run("field", call)
     return field

@@ -11,7 +11,7 @@
 
 namespace d2 {
 
-// Mirrored by `_Field` in kernel.py.
+// Mirrored by `_Field` in field.py.
 struct Field {
   int32_t width, height, cell, maps, scales, rounds, threads;
   float prior, outlier, outlier_squared;
