@@ -12,8 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from d2_plugin.captures.capture import MonoKind
+from d2_plugin.priors.fuse import fuse
 from d2_plugin.priors.monocular.affine import fit_affine
-from d2_plugin.priors.monocular.align import align, unjudged_line
+from d2_plugin.priors.monocular.align import (
+    Alignment,
+    AlignStatus,
+    align,
+    aligned_depth,
+    aligned_inverse,
+    inverse_at_least,
+    unjudged_line,
+)
 from d2_plugin.priors.monocular.correct import corrected_without
 from d2_plugin.priors.monocular.native import library, points
 from d2_plugin.priors.settings import AlignSettings
@@ -178,3 +187,58 @@ def test_the_unjudged_line_is_that_of_the_alignment(anchors: int, kind: MonoKind
     views = mono.reshape(60, 100), geometric.reshape(60, 100)
     found = align(*views, kind=kind, settings=SETTINGS)
     np.testing.assert_equal(unjudged_line(*views, kind=kind, settings=SETTINGS), (found.scale, found.shift))
+
+
+def odd_maps(seed: int) -> list[np.ndarray]:
+    """Four maps float32 [40, 50] with all that may stand in one: 0, tiny, huge, negative, infinite, NaN."""
+    random = np.random.default_rng(seed)
+    odd = np.array([0, -0.0, 1e-40, 1e-30, 1e30, -1, np.inf, -np.inf, np.nan], np.float32)
+    usual = random.uniform(0, 4, (4, 40, 50)).astype(np.float32)
+    return list(np.where(random.random(usual.shape) < 0.2, random.choice(odd, usual.shape), usual))
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("kind", ["relative", "metric"])
+@pytest.mark.parametrize(("scale", "shift"), [(1, 0), (0.3, -0.5), (1e-30, 1e30), (2, -1e-3), (0, 0.25)])
+@pytest.mark.parametrize("z_far", [5.0, 1e-3, np.inf])
+def test_aligned_maps_are_the_bits_of_numpy(kind: MonoKind, scale: float, shift: float, z_far: float) -> None:
+    mono, alignment = odd_maps(0)[0], Alignment(AlignStatus.OK, kind, scale=scale, shift=shift)
+    np.testing.assert_array_equal(*both_ways(lambda: aligned_depth(mono, alignment, z_far)))
+    np.testing.assert_array_equal(*both_ways(lambda: aligned_inverse(mono, alignment)))
+
+
+@pytest.mark.parametrize("kind", ["relative", "metric"])
+@pytest.mark.parametrize("seed", range(20))
+def test_no_aligned_inverse_lies_below_the_bound_that_spares_the_map(kind: MonoKind, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    mono = random.normal(random.normal(), 1, (9, 9)).astype(np.float32) * (random.random((9, 9)) < random.random() * 2)
+    mono[0, :2] = np.nan, np.inf
+    alignment = Alignment(AlignStatus.OK, kind, scale=random.uniform(0.1, 2), shift=random.normal())
+    bound, inverse = inverse_at_least(mono, alignment), aligned_inverse(mono, alignment)
+    assert np.isnan(bound) or not (inverse < bound - 1e-12 * abs(bound)).any()
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 99),
+    tau=st.sampled_from([0.0, 0.1, 1, np.inf, "map"]),
+    most_vetoed=st.sampled_from([0.0, 0.3, 1]),
+    hanging=st.booleans(),
+    sigma=st.sampled_from([0, 0.1, np.inf]),
+)
+def test_fusion_is_the_bits_of_numpy(
+    seed: int, tau: float | str, most_vetoed: float, hanging: bool, sigma: float
+) -> None:
+    mono, geometric, tau_map, sigmas = odd_maps(seed)
+    asked = {
+        "tau_c": tau_map if tau == "map" else tau,
+        "most_vetoed": most_vetoed,
+        "hanging": sigmas > 2 if hanging else None,
+        "sigma_mono": np.full_like(mono, sigma),
+        "sigma_geometric": sigmas,
+    }
+    found, expected = both_ways(lambda: fuse(mono, geometric, **asked))
+    for name in ("depth", "labels", "sigma"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+        assert getattr(found, name).dtype == getattr(expected, name).dtype

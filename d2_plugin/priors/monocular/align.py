@@ -19,6 +19,7 @@ from d2_plugin.captures.capture import MonoKind
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.monocular.affine import AffineFit, fit_affine
 from d2_plugin.priors.monocular.leverage import near_best_line
+from d2_plugin.priors.monocular.native import library, pixels
 from d2_plugin.priors.monocular.settings import AlignSettings
 
 KINDS: tuple[MonoKind, ...] = get_args(MonoKind)
@@ -137,7 +138,11 @@ def aligned_depth(mono: np.ndarray, alignment: Alignment, z_far: float) -> np.nd
     """
     if not alignment.accepted:
         return np.zeros(mono.shape, np.float32)
-    return _depth(mono.astype(np.float64), alignment.scale, alignment.shift, alignment.kind, z_far).astype(np.float32)
+    line = alignment.scale, alignment.shift
+    if library.library() is not None and mono.dtype == np.float32:
+        relative = alignment.kind == "relative"
+        return pixels.aligned_depth(mono, *line, _nearest(z_far) if relative else z_far, relative)
+    return _depth(mono.astype(np.float64), *line, alignment.kind, z_far).astype(np.float32)
 
 
 def aligned_inverse(mono: np.ndarray, alignment: Alignment) -> np.ndarray:
@@ -145,11 +150,20 @@ def aligned_inverse(mono: np.ndarray, alignment: Alignment) -> np.ndarray:
 
     The zero of a saturated ReLU says "farther than I can tell" and is taken at its word.
     """
+    if library.library() is not None and mono.dtype == np.float32:
+        return pixels.aligned_inverse(mono, alignment.scale, alignment.shift, alignment.kind == "relative")
     value = alignment.scale * mono.astype(np.float64) + alignment.shift
     if alignment.kind == "metric":
         with np.errstate(divide="ignore"):
             return np.where(value > 0, 1 / np.where(value > 0, value, 1), np.nan)
     return np.where(mono == 0, np.minimum(value, 0), value)
+
+
+def inverse_at_least(mono: np.ndarray, alignment: Alignment) -> float:
+    """What no number of `aligned_inverse` lies below, from the ends of the map [H, W]; NaN where that tells nothing."""
+    low, high = float(np.fmin.reduce(mono, axis=None)), float(np.fmax.reduce(mono, axis=None))
+    ends = [low, high, 0.0] if low <= 0 <= high else [low, high]
+    return float(np.fmin.reduce(aligned_inverse(np.array(ends), alignment)))
 
 
 def predicted(mono: np.ndarray) -> np.ndarray:
@@ -181,7 +195,7 @@ def _twice_the_ranks(values: np.ndarray) -> np.ndarray:
 def _depth(mono: np.ndarray, scale: float, shift: float, kind: MonoKind, z_far: float) -> np.ndarray:
     value: np.ndarray = scale * np.where(predicted(mono), mono, np.nan) + shift
     if kind == "relative":
-        near_enough = value > max(1 / z_far, float(np.finfo(np.float32).tiny))
+        near_enough = value > _nearest(z_far)
         return np.where(near_enough, 1 / np.where(near_enough, value, 1), 0)
     return np.where((value > 0) & (value <= z_far), value, 0)
 
@@ -229,6 +243,11 @@ def _fit(x: np.ndarray, target: np.ndarray, settings: AlignSettings) -> tuple[Af
     fit = fit_affine(x, target, 1 / target if relative else None, epsilon=epsilon)
     t = fit.scale / max(fit.scale_error, np.finfo(float).tiny) if selection is None else selection.t
     return fit, epsilon, t
+
+
+def _nearest(z_far: float) -> float:
+    """The inverse depth of z_far, or what float32 can hold of it."""
+    return max(1 / z_far, float(np.finfo(np.float32).tiny))
 
 
 def _judge(fit: AffineFit, correlation: float, t: float, inliers: float, settings: AlignSettings) -> AlignStatus:

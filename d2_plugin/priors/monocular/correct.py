@@ -53,14 +53,17 @@ def corrected_without(
         left_out: anchors that do not count, bool [n, H, W].
         settings: as above.
     """
-    both = (aligned > 0) & (geometric > 0)
-    known = both & ~left_out
+    known = (aligned > 0) & (geometric > 0)
     if not settings.local_scales or not known.any():
         return np.repeat(aligned[None].astype(np.float32), len(left_out), axis=0)
-    bend = np.log(np.where(both, geometric, 1) / np.where(both, aligned, 1)).astype(np.float32)
-    known &= np.abs(bend) < settings.local_limit
-    fields = _smooth_fields(bend, known, settings.local_scales, settings.local_prior)
-    return (aligned * np.exp(fields, out=fields)).astype(np.float32, copy=False)
+    with np.errstate(all="ignore"):  # where either is 0 the ratio is no number, which no limit admits
+        bend = np.divide(geometric, aligned)
+        bend = np.log(bend, out=bend).astype(np.float32, copy=False)
+        known &= np.abs(bend) < settings.local_limit
+    some = known[None] if left_out.size == 1 and not left_out.any() else known & ~left_out
+    fields = _smooth_fields(bend, some, settings.local_scales, settings.local_prior)
+    np.exp(fields, out=fields)
+    return np.multiply(aligned, fields, out=fields) if aligned.dtype == np.float32 else (aligned * fields).astype("f4")
 
 
 def _smooth_fields(bend: np.ndarray, known: np.ndarray, scales: Sequence[float], prior: float) -> np.ndarray:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from d2_plugin.compiler import NoCompiler, load_library
 
-SOURCES = tuple(Path(__file__).parent / "kernels" / name for name in ("correct.cpp", "fit.cpp"))
+SOURCES = tuple(Path(__file__).parent / "kernels" / name for name in ("correct.cpp", "fit.cpp", "pixels.cpp"))
 _STEREO = Path(__file__).parents[2] / "stereo" / "kernels"
 _RASTERIZER = Path(__file__).parents[3] / "rasterizer" / "kernels"  # no import: only headers are shared
 HEADERS = (_RASTERIZER / "parallel.h", *(_STEREO / name for name in ("lanes.h", "numbers.h")))
