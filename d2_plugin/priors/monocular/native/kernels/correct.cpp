@@ -26,7 +26,7 @@ struct Field {
 
 namespace {
 
-constexpr int ROWS = 8;    // of a product at a time: as many sums as a multiply-add takes to come back, twice
+constexpr int ROWS = 6;    // of a product at a time: with two vectors of columns, as registers allow
 
 D2_FN int least(int a, int b) { return a < b ? a : b; }
 D2_FN int most(int a, int b) { return a > b ? a : b; }
@@ -48,16 +48,32 @@ float sum_of(const float* from, int n) {
   return total;
 }
 
-// out[r][lanes at column] = sum over k in first..last-1 of left[r][k] right[k][lanes at column], for R rows.
-template <int R>
+// out[r][V vectors at column] = sum over k in first..last-1 of left[r][k] right[k][V vectors at column], for R rows.
+template <int R, int V>
 D2_FN void product(const float* left, int left_stride, const float* right, int stride, int first, int last, float* out) {
-  Floats total[R];
-  for (int r = 0; r < R; r++) total[r] = Floats{};
+  Floats total[R][V];
+  for (int r = 0; r < R; r++)
+    for (int v = 0; v < V; v++) total[r][v] = Floats{};
   for (int k = first; k < last; k++) {
-    const Floats there = load<Floats>(right + int64_t(k) * stride);
-    for (int r = 0; r < R; r++) total[r] = mad(Floats{} + left[r * left_stride + k], there, total[r]);
+    Floats there[V];
+    for (int v = 0; v < V; v++) there[v] = load<Floats>(right + int64_t(k) * stride + v * kLanes);
+    for (int r = 0; r < R; r++) {
+      const Floats here = Floats{} + left[r * left_stride + k];
+      for (int v = 0; v < V; v++) total[r][v] = mad(here, there[v], total[r][v]);
+    }
   }
-  for (int r = 0; r < R; r++) store(out + r * stride, total[r]);
+  for (int r = 0; r < R; r++)
+    for (int v = 0; v < V; v++) store(out + r * stride + v * kLanes, total[r][v]);
+}
+
+// The same for any number of rows.
+template <int V>
+void products(const float* left, int left_stride, int rows, const float* right, int stride, int first, int last, float* out) {
+  int row = 0;
+  for (; row + ROWS <= rows; row += ROWS)
+    product<ROWS, V>(left + int64_t(row) * left_stride, left_stride, right, stride, first, last, out + int64_t(row) * stride);
+  for (; row < rows; row++)
+    product<1, V>(left + int64_t(row) * left_stride, 0, right, stride, first, last, out + int64_t(row) * stride);
 }
 
 // Rows of cells, padded to whole vectors: the padding is zero and stays so.
@@ -80,32 +96,34 @@ void blur_down(const Cells& cells, const Blur& blur, const float* from, float* t
       const int last = least(cells.rows, row + count + blur.reach);
       const float* left = blur.down.data() + int64_t(row) * cells.rows;
       float* out = to + int64_t(row) * cells.stride;
-      for (int column = 0; column < cells.stride; column += kLanes) {
-        if (count == ROWS) {
-          product<ROWS>(left, cells.rows, from + column, cells.stride, first, last, out + column);
-        } else {
-          for (int r = 0; r < count; r++)
-            product<1>(left + r * cells.rows, 0, from + column, cells.stride, first, last, out + r * cells.stride + column);
-        }
-      }
+      int column = 0;
+      for (; column + 2 * kLanes <= cells.stride; column += 2 * kLanes)
+        products<2>(left, cells.rows, count, from + column, cells.stride, first, last, out + column);
+      if (column < cells.stride)
+        products<1>(left, cells.rows, count, from + column, cells.stride, first, last, out + column);
     }
 }
 
 // to = from across^T, both halves at once.
 void blur_across(const Cells& cells, const Blur& blur, const float* from, float* to) {
-  const int rows = 2 * cells.rows;
-  for (int column = 0; column < cells.stride; column += kLanes) {
-    const int first = most(0, column - blur.reach), last = least(cells.columns, column + kLanes + blur.reach);
+  const auto columns = [&](int column, int count) {
+    const int first = most(0, column - blur.reach), last = least(cells.columns, column + count * kLanes + blur.reach);
     const float* right = blur.across.data() + column;
-    int row = 0;
-    for (; row + ROWS <= rows; row += ROWS) {
-      const int64_t at = int64_t(row) * cells.stride;
-      product<ROWS>(from + at, cells.stride, right, cells.stride, first, last, to + at + column);
-    }
-    for (; row < rows; row++) {
-      const int64_t at = int64_t(row) * cells.stride;
-      product<1>(from + at, 0, right, cells.stride, first, last, to + at + column);
-    }
+    const auto all = count == 2 ? products<2> : products<1>;
+    all(from, cells.stride, 2 * cells.rows, right, cells.stride, first, last, to + column);
+  };
+  int column = 0;
+  for (; column + 2 * kLanes <= cells.stride; column += 2 * kLanes) columns(column, 2);
+  if (column < cells.stride) columns(column, 1);
+}
+
+// Add to each cell the sum of its part of a row of pixels; N of a cell where that is known when compiled, or 0.
+template <int N>
+void add_row(const float* row, int columns, int cell, float* out) {
+  for (int j = 0; j < columns; j++) {
+    float total = 0;
+    for (int i = 0; i < N; i++) total += row[j * N + i];
+    out[j] += N ? total : sum_of(row + j * cell, cell);
   }
 }
 
@@ -113,21 +131,21 @@ void blur_across(const Cells& cells, const Blur& blur, const float* from, float*
 void cell_means(const Field& call, int map, const Cells& cells, float* mean, float* share) {
   const float* bend = call.bend + map * call.bend_stride;
   const uint8_t* known = call.known + int64_t(map) * call.height * call.width;
-  std::vector<float> row(int64_t(cells.columns) * call.cell);
-  std::vector<int> counts(cells.columns);
+  std::vector<float> values(int64_t(cells.columns) * call.cell), ones(values.size());
+  const auto add = call.cell == 2 ? add_row<2> : call.cell == 4 ? add_row<4> : add_row<0>;
   for (int i = 0; i < cells.rows; i++, mean += cells.stride, share += cells.stride) {
-    counts.assign(cells.columns, 0);
     for (int y = i * call.cell; y < least((i + 1) * call.cell, call.height); y++) {
       const int64_t at = int64_t(y) * call.width;
-      for (int x = 0; x < call.width; x++) row[x] = known[at + x] ? bend[at + x] : 0.f;
-      for (int j = 0; j < cells.columns; j++) {
-        mean[j] += sum_of(row.data() + j * call.cell, call.cell);
-        for (int x = j * call.cell; x < least((j + 1) * call.cell, call.width); x++) counts[j] += known[at + x] != 0;
+      for (int x = 0; x < call.width; x++) {
+        values[x] = known[at + x] ? bend[at + x] : 0.f;
+        ones[x] = float(known[at + x]);
       }
+      add(values.data(), cells.columns, call.cell, mean);
+      add(ones.data(), cells.columns, call.cell, share);
     }
     for (int j = 0; j < cells.columns; j++) {
-      mean[j] /= float(most(counts[j], 1));
-      share[j] = float(counts[j]) / float(call.cell * call.cell);
+      mean[j] /= share[j] > 1 ? share[j] : 1;
+      share[j] /= float(call.cell * call.cell);
     }
   }
 }
