@@ -33,6 +33,7 @@ from d2_plugin.priors.monocular.align import (
 from d2_plugin.priors.monocular.correct import corrected_depth
 from d2_plugin.priors.monocular.far import CLEARLY, far_pixels
 from d2_plugin.priors.monocular.maps import MonoSource
+from d2_plugin.priors.monocular.native.order import quantile
 from d2_plugin.priors.monocular.together import Seen, aligned_together
 from d2_plugin.priors.monocular.uncertainty import Skill, Uncertainty, monocular_uncertainty
 from d2_plugin.priors.settings import PriorSettings
@@ -213,7 +214,7 @@ class Construction:
         if not alignment.accepted:
             return AlignedMap(nothing, alignment, alignment.status.value)
         anchors = geometric[geometric > 0]
-        farthest = float(np.percentile(anchors, 99.5)) if anchors.size else np.inf
+        farthest = quantile(anchors, 0.995) if anchors.size else np.inf
         aligned = aligned_depth(prediction, alignment, self.settings.z_far_factor * farthest)
         if self.settings.variant == "dual_unaligned":
             return AlignedMap(aligned, alignment)

@@ -10,6 +10,7 @@ import numpy as np
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.monocular.native import library, pixels
+from d2_plugin.priors.monocular.native.order import median
 from d2_plugin.priors.settings import Variant
 from d2_plugin.protocol import Label
 
@@ -47,7 +48,7 @@ def _finite_median(values: np.ndarray) -> float | None:
     """Median of non-negative numbers [n]; None where it is infinite or there are none."""
     if 2 * np.count_nonzero(values < np.inf) <= values.size:
         return None
-    return float(np.median(values))
+    return median(values)
 
 
 def cross_source_discrepancy(mono: np.ndarray, geometric: np.ndarray, epsilon: float = EPSILON) -> np.ndarray:

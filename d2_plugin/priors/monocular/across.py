@@ -28,6 +28,7 @@ import numpy as np
 from d2_plugin.captures.capture import Camera, MonoKind
 from d2_plugin.priors.geometry import view_pair
 from d2_plugin.priors.monocular.align import Alignment, AlignStatus, predicted
+from d2_plugin.priors.monocular.native.order import quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
 
 SPAN = 0.15
@@ -105,7 +106,7 @@ def is_open(view: Shown) -> bool:
     anchors = view.mono[known & (view.geometric > 0)]
     if not anchors.size:
         return False
-    first, last = np.quantile(anchors, MOST)
+    first, last = (quantile(anchors, share) for share in MOST)
     if last - first > SPAN * (np.fmax.reduce(view.mono, axis=None) - np.fmin.reduce(view.mono, axis=None)):
         return False  # nearly always, and spares the quantiles of the whole map
     low, high = np.quantile(view.mono[known], RANGE)

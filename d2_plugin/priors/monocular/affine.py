@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from d2_plugin.priors.monocular.native.order import median
 from d2_plugin.priors.monocular.native.points import Points, Sums, dot
 
 BLENDS = (0.0, 0.01, 0.1, 0.5, 1.0)
@@ -135,8 +136,8 @@ class _Units:
 
     @classmethod
     def of(cls, x: np.ndarray, y: np.ndarray, weights: np.ndarray, epsilon: float) -> _Units:
-        weight = float(np.median(weights))
-        x_centre, y_centre = float(np.median(x)), float(np.median(y))
+        weight = median(weights)
+        x_centre, y_centre = median(x), median(y)
         x_spread, y_spread = float(np.abs(x - x_centre).mean()), float(np.abs(y - y_centre).mean())
         tiny = np.finfo(float).tiny
         y_spread = max(y_spread, epsilon / weight, tiny)
@@ -158,7 +159,7 @@ class _Problem(Points):
     scale_min: float
 
     def median_shift(self) -> float:
-        return float(np.median(self.t / self.q))
+        return median(self.t / self.q)
 
     def solve(self, tolerance: float, max_iterations: int) -> _State:
         """Newton with IRLS blending from a few IRLS steps; the gap uses the best bound over all iterates."""

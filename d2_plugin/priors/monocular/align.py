@@ -20,6 +20,7 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.monocular.affine import AffineFit, fit_affine
 from d2_plugin.priors.monocular.leverage import near_best_line
 from d2_plugin.priors.monocular.native import library, pixels
+from d2_plugin.priors.monocular.native.order import median, quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
 
 KINDS: tuple[MonoKind, ...] = get_args(MonoKind)
@@ -225,7 +226,7 @@ def _fitted(mono: np.ndarray, geometric: np.ndarray, kind: MonoKind, settings: A
     x, depth = (values.ravel()[rows].astype(np.float64) for values in (mono, geometric))
     if _central_range(x) <= 1e-6 * np.abs(x).max():
         return Alignment(AlignStatus.FLAT, kind, anchors=count)
-    if _central_range(depth) <= settings.min_spread * np.median(depth):
+    if _central_range(depth) <= settings.min_spread * median(depth):
         return Alignment(AlignStatus.ONE_DEPTH, kind, anchors=count)
     target = 1 / depth if kind == "relative" else depth
     return _Fitted(count, x, depth, target, *_fit(x, target, settings))
@@ -274,8 +275,7 @@ def _subsample(count: int, limit: int, seed: int) -> np.ndarray | slice:
 
 def _central_range(values: np.ndarray) -> float:
     """Width of the central 90 %: a handful of leverage points must not pass for spread."""
-    low, high = np.percentile(values, (5, 95))
-    return float(high - low)
+    return quantile(values, 0.95) - quantile(values, 0.05)
 
 
 def _check(mono: np.ndarray, geometric: np.ndarray, kind: str) -> None:

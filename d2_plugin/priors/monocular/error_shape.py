@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.monocular.native.order import median
 
 FLOOR, DISTANCE, GAP, EDGE, WIDE_EDGE, BEYOND = 0.051, 1.19, 0.79, 2.76, 0.16, 0.086
 """f0 and fd (of d itself) to fr; fitted once to the true errors of studio, plaza and a rendered room together."""
@@ -52,7 +53,7 @@ class ErrorShape:
         by_label = np.zeros(int(label.max()) + 1, np.float32)
         by_label[label[known]] = log_anchors
         gap = np.abs(asked(log_depth) - by_label[asked(label)])
-        beyond = np.maximum(asked(log_depth) - np.median(log_anchors), 0)
+        beyond = np.maximum(asked(log_depth) - np.float32(median(log_anchors)), 0)
         nowhere_above = np.where(predicted, log_depth, np.float32(-EVER))
         nowhere_below = np.where(predicted, log_depth, np.float32(EVER))
         edge, wide_edge = (

@@ -12,6 +12,7 @@ import numpy as np
 
 from d2_plugin.captures.capture import MonoKind
 from d2_plugin.priors.monocular.align import unjudged_line
+from d2_plugin.priors.monocular.native.order import median, quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
 
 THIRD = 1 / 3
@@ -42,9 +43,9 @@ def extrapolation_error(
     known = (anchors > 0) & (aligned > 0)
     if not known.any():
         return np.zeros(aligned.shape)
-    depth = np.where(aligned > 0, aligned, np.median(aligned[known])).astype(np.float64)
-    held = np.clip(depth, *np.quantile(depth[known], RANGE))
-    near, far = np.quantile(anchors[known], (THIRD, 1 - THIRD))
+    depth = np.where(aligned > 0, aligned, median(aligned[known])).astype(np.float64)
+    held = np.clip(depth, quantile(depth[known], RANGE[0]), quantile(depth[known], RANGE[1]))
+    near, far = (quantile(anchors[known], share) for share in (THIRD, 1 - THIRD))
     error, beyond = np.zeros(aligned.shape), np.flatnonzero(depth != held)
     parted = []
     for rest in (anchors > near, anchors < far):

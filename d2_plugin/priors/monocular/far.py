@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.monocular.native.order import quantile
 
 CLEARLY = 0.4
 """Inverse depth, in units of that of the farthest anchors, below which a pixel is clearly beyond."""
@@ -40,7 +41,7 @@ def far_pixels(inverse: np.ndarray, geometric: np.ndarray, image: np.ndarray) ->
     if anchors.size == 0:
         return np.zeros(geometric.shape, bool)
     cv2: Any = opencv("finding the sky")
-    farthest = np.percentile(anchors, 99.5)
+    farthest = quantile(anchors, 0.995)
     if np.fmin.reduce(inverse, axis=None) * farthest >= CLEARLY:
         return np.zeros(geometric.shape, bool)
     beyond = np.where(np.isfinite(inverse), inverse, np.inf) * farthest

@@ -1,1 +1,1 @@
-"""The compiled parts of alignment and local correction, each with the numbers of the NumPy code."""
+"""The parts of alignment and local correction that are compiled, and orders by what NumPy has compiled."""
