@@ -21,10 +21,19 @@ from d2_plugin.priors.evidence import with_evidence
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.fuse import FusedPrior, empty_prior, fuse, hanging_pixels
 from d2_plugin.priors.monocular.across import Shown, aligned_across
-from d2_plugin.priors.monocular.align import Alignment, AlignStatus, align, aligned_depth, aligned_inverse, not_aligned
+from d2_plugin.priors.monocular.align import (
+    Alignment,
+    AlignStatus,
+    align,
+    aligned_depth,
+    aligned_inverse,
+    inverse_at_least,
+    not_aligned,
+)
 from d2_plugin.priors.monocular.correct import corrected_depth
-from d2_plugin.priors.monocular.far import far_pixels
+from d2_plugin.priors.monocular.far import CLEARLY, far_pixels
 from d2_plugin.priors.monocular.maps import MonoSource
+from d2_plugin.priors.monocular.native.order import quantile
 from d2_plugin.priors.monocular.together import Seen, aligned_together
 from d2_plugin.priors.monocular.uncertainty import Skill, Uncertainty, monocular_uncertainty
 from d2_plugin.priors.settings import PriorSettings
@@ -73,8 +82,8 @@ class AlignedMap:
     refused: str = ""
     uncertainty: Uncertainty | None = None
     """How wrong it may be; None where the settings do not ask."""
-    inverse: np.ndarray | None = None
-    """Aligned inverse depth [H, W], also where it is no depth: 0 and below is infinitely far."""
+    farthest: float = float("inf")
+    """The farthest anchor, but for a half per cent; infinite where there is none."""
 
 
 class Sources(NamedTuple):
@@ -159,8 +168,8 @@ class Construction:
         image, stereo, recorded = frame.images[name], sources.stereo, frame.recorded.get(name)
         mono = self._aligned(name, frame, sources)
         maps = self._fused(mono, stereo)
-        if self.settings.far and self.settings.variant == "dual" and mono.inverse is not None:
-            maps = _with_far(maps, far_pixels(mono.inverse, stereo.depth, image), stereo.depth)
+        if self.settings.far and self.settings.variant == "dual" and sources.prediction is not None:
+            maps = _with_far(maps, mono, sources.prediction, stereo.depth, image)
         if recorded is not None:
             maps = _within(maps, recorded)
         about_stereo = {key: value for key, value in stereo.record.items() if key != "checksum"} or None
@@ -180,7 +189,7 @@ class Construction:
         unknown = np.full_like(stereo.sigma, np.inf)
         alone, at_anchors = (unknown, unknown) if mono.uncertainty is None else mono.uncertainty[:2]
         # A map that was not aligned has no sigma to verify by: that row of the paper's table keeps its fixed threshold.
-        allowed = settings.conflict_sigmas * np.hypot(at_anchors, stereo.sigma)
+        allowed = settings.conflict_sigmas * np.sqrt(at_anchors * at_anchors + stereo.sigma * stereo.sigma)
         return fuse(
             mono.depth,
             stereo.depth,
@@ -205,8 +214,8 @@ class Construction:
         if not alignment.accepted:
             return AlignedMap(nothing, alignment, alignment.status.value)
         anchors = geometric[geometric > 0]
-        z_far = self.settings.z_far_factor * float(np.percentile(anchors, 99.5)) if anchors.size else np.inf
-        aligned = aligned_depth(prediction, alignment, z_far)
+        farthest = quantile(anchors, 0.995) if anchors.size else np.inf
+        aligned = aligned_depth(prediction, alignment, self.settings.z_far_factor * farthest)
         if self.settings.variant == "dual_unaligned":
             return AlignedMap(aligned, alignment)
         depth = corrected_depth(aligned, geometric, self.settings.align)
@@ -217,7 +226,7 @@ class Construction:
         if uncertainty is not None and (alignment.status is AlignStatus.ACROSS or np.isnan(uncertainty.skill.scale)):
             shared = np.where(depth > 0, np.float32(alignment.across), np.float32(np.inf))
             uncertainty = uncertainty._replace(sigma=np.fmin(uncertainty.sigma, shared))
-        return AlignedMap(depth, alignment, "", uncertainty, aligned_inverse(prediction, alignment))
+        return AlignedMap(depth, alignment, "", uncertainty, farthest)
 
     def _prediction(self, name: str, frame: Frame) -> np.ndarray | None:
         """The monocular map [H, W], planar and NaN where it says nothing of itself; None where there is none."""
@@ -270,14 +279,19 @@ def _within(maps: FusedPrior, recorded: np.ndarray) -> FusedPrior:
     )
 
 
-def _with_far(maps: FusedPrior, far: np.ndarray, geometric: np.ndarray) -> FusedPrior:
+def _with_far(
+    maps: FusedPrior, mono: AlignedMap, prediction: np.ndarray, geometric: np.ndarray, image: np.ndarray
+) -> FusedPrior:
     """Far pixels take the farthest geometric depth of the view: what is known of them is that they lie behind it."""
+    alignment = mono.alignment
+    if mono.refused or alignment is None or inverse_at_least(prediction, alignment) * mono.farthest >= CLEARLY:
+        return maps
+    far = far_pixels(aligned_inverse(prediction, alignment), geometric, image)
     if not far.any():
         return maps
-    bound = np.float32(np.percentile(geometric[geometric > 0], 99.5))
     return replace(
         maps,
-        depth=np.where(far, bound, maps.depth),
+        depth=np.where(far, np.float32(mono.farthest), maps.depth),
         labels=np.where(far, np.uint8(Label.FAR), maps.labels),
         sigma=np.where(far, np.float32(np.inf), maps.sigma),
     )

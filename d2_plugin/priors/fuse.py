@@ -9,12 +9,15 @@ import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.monocular.native import library, pixels
+from d2_plugin.priors.monocular.native.order import median
 from d2_plugin.priors.settings import Variant
 from d2_plugin.protocol import Label
 
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
 
-NEVER = 1e3  # beyond any logarithm of a float32 depth: neutral in a minimum or, negated, in a maximum
+EPSILON = 1e-9
+"""The paper's eps, world units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,23 +36,28 @@ class FusedPrior:
 
     def sigmas(self) -> dict[str, float | None]:
         """Median sigma of the pixels that carry each label; None where it is infinite or there are none."""
-        found = {label: self.sigma[self.labels == label] for label in Label}
-        medians = {label: float(np.median(values)) if values.size else np.inf for label, values in found.items()}
-        return {label.name.lower(): value if np.isfinite(value) else None for label, value in medians.items()}
+        return {label.name.lower(): _finite_median(self.sigma[self.labels == label]) for label in Label}
 
     def shares(self) -> dict[str, float]:
         """Share of the pixels that carry each label."""
-        counts = np.bincount(self.labels.ravel(), minlength=len(Label))
-        return {label.name.lower(): float(counts[label] / self.labels.size) for label in Label}
+        counts = {label: np.count_nonzero(self.labels == label) for label in Label}
+        return {label.name.lower(): counts[label] / self.labels.size for label in Label}
 
 
-def cross_source_discrepancy(mono: np.ndarray, geometric: np.ndarray, epsilon: float = 1e-9) -> np.ndarray:
+def _finite_median(values: np.ndarray) -> float | None:
+    """Median of non-negative numbers [n]; None where it is infinite or there are none."""
+    if 2 * np.count_nonzero(values < np.inf) <= values.size:
+        return None
+    return median(values)
+
+
+def cross_source_discrepancy(mono: np.ndarray, geometric: np.ndarray, epsilon: float = EPSILON) -> np.ndarray:
     """e = |D-bar^m - D^g| / (D^g + eps), float32 [H, W]; infinite where there is no geometric depth.
 
     Args:
         mono: aligned monocular depth D-bar^m [H, W], 0 where it has none (which then disagrees with any D^g).
         geometric: D^g [H, W], 0 where there is none.
-        epsilon: the paper's eps, world units.
+        epsilon: see `EPSILON`.
     """
     known = geometric > 0
     relative = np.abs(mono - geometric) / (np.where(known, geometric, 1) + epsilon)
@@ -75,10 +83,9 @@ def hanging_pixels(mono: np.ndarray, limit: float) -> np.ndarray:
     side = 2 * max(1, mono.shape[1] // 200) + 1
     kernel = np.ones((side, side), np.uint8)
     known = mono > 0
-    logs = np.log(np.where(known, mono, 1)).astype(np.float32)
-    farthest = cv2.dilate(np.where(known, logs, np.float32(-NEVER)), kernel)
-    nearest = cv2.erode(np.where(known, logs, np.float32(NEVER)), kernel)
-    return known & (farthest - nearest > limit)
+    farthest = cv2.dilate(mono, kernel)
+    nearest = cv2.erode(np.where(known, mono, np.float32(np.inf)), kernel)
+    return known & (farthest * np.float32(np.exp(-limit)) > nearest)
 
 
 def fuse(
@@ -114,6 +121,11 @@ def fuse(
         raise unknown_name("prior variant", variant, VARIANTS)
     if mono.shape != geometric.shape:
         raise D2Error(f"monocular depth is {mono.shape}, geometric depth {geometric.shape}: bring both to one size")
+    if _compiled(variant, mono, geometric, sigma_mono, sigma_geometric):
+        assert sigma_mono is not None
+        assert sigma_geometric is not None
+        pairs = (mono, geometric), (sigma_mono, sigma_geometric)
+        return FusedPrior(*pixels.fused(*pairs, tau_c, hanging, most_vetoed, EPSILON))
     alone = mono if hanging is None else np.where(hanging, 0, mono)
     if variant == "mono":
         geometric, verified = np.zeros_like(geometric), alone > 0
@@ -131,6 +143,12 @@ def fuse(
         return FusedPrior(depth, labels, np.where(labels == Label.VERIFIED, 0, np.inf).astype(np.float32))
     sigma = np.where(geometric > 0, sigma_geometric, sigma_mono)
     return FusedPrior(depth, labels, np.where(depth > 0, sigma, np.inf).astype(np.float32))
+
+
+def _compiled(variant: Variant, *maps: np.ndarray | None) -> bool:
+    """Whether the compiled code does the same: it verifies, and takes float32 alone."""
+    verifies = variant in ("dual", "dual_unaligned") and library.library() is not None
+    return verifies and all(values is not None and values.dtype == np.float32 for values in maps)
 
 
 def empty_prior(shape: tuple[int, int]) -> FusedPrior:

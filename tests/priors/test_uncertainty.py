@@ -11,7 +11,8 @@ from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.fuse import FusedPrior, fuse
 from d2_plugin.priors.monocular.align import align, aligned_depth
 from d2_plugin.priors.monocular.correct import corrected_depth
-from d2_plugin.priors.monocular.uncertainty import FLOOR, HARDER, USUAL, _scale, error_shape, monocular_uncertainty
+from d2_plugin.priors.monocular.error_shape import FLOOR, ErrorShape
+from d2_plugin.priors.monocular.uncertainty import HARDER, USUAL, _scale, monocular_uncertainty
 from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.protocol import Label
 
@@ -250,7 +251,7 @@ def test_sigma_grows_with_the_distance_to_the_nearest_anchor_and_is_never_below_
     depth = np.full((60, 160), 3.0, np.float32)
     anchors = np.zeros_like(depth)
     anchors[:, :40] = 3.0
-    shape = error_shape(depth, anchors)
+    shape = ErrorShape.of(depth, anchors).usual()
     assert (np.diff(shape[30, 40:]) >= 0).all()
     assert shape[30, 100] > 2 * shape[30, 41]
     np.testing.assert_allclose(shape[:, :39], FLOOR, rtol=0.01)

@@ -28,6 +28,7 @@ import numpy as np
 from d2_plugin.captures.capture import Camera, MonoKind
 from d2_plugin.priors.geometry import view_pair
 from d2_plugin.priors.monocular.align import Alignment, AlignStatus, predicted
+from d2_plugin.priors.monocular.native.order import quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
 
 SPAN = 0.15
@@ -77,6 +78,8 @@ def aligned_across(views: Mapping[str, Shown], kind: MonoKind, settings: AlignSe
         settings: of the alignment.
     """
     wanted = [name for name, view in views.items() if is_open(view)]
+    if not wanted:
+        return {}
     maps = {
         name: _Map.of(view, kind, name in wanted, settings.seed)
         for name, view in views.items()
@@ -97,11 +100,16 @@ def aligned_across(views: Mapping[str, Shown], kind: MonoKind, settings: AlignSe
 
 def is_open(view: Shown) -> bool:
     """Whether a view's anchors fix one depth of its map and leave the slope open."""
-    known, anchors = predicted(view.mono), view.geometric > 0
-    if view.alignment.status not in OPEN or not (known & anchors).any():
+    if view.alignment.status not in OPEN:
         return False
+    known = predicted(view.mono)
+    anchors = view.mono[known & (view.geometric > 0)]
+    if not anchors.size:
+        return False
+    first, last = (quantile(anchors, share) for share in MOST)
+    if last - first > SPAN * (np.fmax.reduce(view.mono, axis=None) - np.fmin.reduce(view.mono, axis=None)):
+        return False  # nearly always, and spares the quantiles of the whole map
     low, high = np.quantile(view.mono[known], RANGE)
-    first, last = np.quantile(view.mono[known & anchors], MOST)
     return bool(last - first < SPAN * (high - low))
 
 

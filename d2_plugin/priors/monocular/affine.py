@@ -17,8 +17,12 @@ and u = rho'(r), projected onto the equalities, makes this bound tight at the op
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+
+from d2_plugin.priors.monocular.native.order import median
+from d2_plugin.priors.monocular.native.points import Points, Sums, dot
 
 BLENDS = (0.0, 0.01, 0.1, 0.5, 1.0)
 """Shares of IRLS curvature tried in turn; at 1 the model majorises F, so a step of it always descends."""
@@ -87,7 +91,8 @@ def fit_affine(
     flat = x.size < 2 or not unit.x_spread > 64 * np.finfo(float).eps * np.abs(x).max()
     if flat:
         problem = _Problem(np.zeros_like(problem.p), problem.q, problem.t, problem.epsilon, 0.0)
-        state = _State(0.0, problem.best_shift(0.0, problem.median_shift()), 0.0, 0)
+        shift = problem.best_shift(0.0, problem.median_shift())
+        state = _State(0.0, shift, problem.sums(0.0, shift), 0.0, 0)
         boundary = False
     else:
         state = problem.solve(tolerance, max_iterations)
@@ -96,13 +101,13 @@ def fit_affine(
     return AffineFit(
         scale=scale,
         shift=state.b * unit.y_spread + unit.y_centre - scale * unit.x_centre,
-        objective=problem.objective(state.a, state.b) * unit.y_spread * unit.weight,
+        objective=state.sums.value * unit.y_spread * unit.weight,
         gap=state.gap,
         iterations=state.iterations,
         count=x.size,
         boundary=boundary,
         flat=flat,
-        scale_error=problem.scale_error(state.a, state.b) * unit.y_spread / unit.x_spread,
+        scale_error=_scale_error(state.sums) * unit.y_spread / unit.x_spread,
     )
 
 
@@ -131,92 +136,69 @@ class _Units:
 
     @classmethod
     def of(cls, x: np.ndarray, y: np.ndarray, weights: np.ndarray, epsilon: float) -> _Units:
-        weight = float(np.median(weights))
-        x_centre, y_centre = float(np.median(x)), float(np.median(y))
+        weight = median(weights)
+        x_centre, y_centre = median(x), median(y)
         x_spread, y_spread = float(np.abs(x - x_centre).mean()), float(np.abs(y - y_centre).mean())
         tiny = np.finfo(float).tiny
         y_spread = max(y_spread, epsilon / weight, tiny)
         return cls(x_centre, max(x_spread, tiny), y_centre, y_spread, weight, weights / weight)
 
 
-@dataclass(frozen=True)
-class _State:
+class _State(NamedTuple):
     a: float
     b: float
+    sums: Sums
     gap: float
     iterations: int
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _Problem(Points):
     """min over a >= scale_min, b of sum rho(a p + b q - t): the same problem in normalised units."""
 
-    p: np.ndarray
-    q: np.ndarray
-    t: np.ndarray
-    epsilon: float
     scale_min: float
 
-    def residual(self, a: float, b: float) -> np.ndarray:
-        return a * self.p + b * self.q - self.t
-
-    def root(self, r: np.ndarray) -> np.ndarray:
-        """sqrt(r^2 + eps^2); in normalised units |r| <= n, so that the squares need no care."""
-        return np.sqrt(r * r + self.epsilon * self.epsilon)
-
-    def objective(self, a: float, b: float) -> float:
-        r = self.residual(a, b)
-        return _dot(r, r / (self.root(r) + self.epsilon))
-
     def median_shift(self) -> float:
-        return float(np.median(self.t / self.q))
-
-    def normal(self, curvature: np.ndarray) -> tuple[float, float, float]:
-        """The 2x2 matrix sum c (p, q)(p, q)^T as its entries aa, ab, bb."""
-        cp = curvature * self.p
-        return _dot(cp, self.p), _dot(cp, self.q), _dot(curvature * self.q, self.q)
+        return median(self.t / self.q)
 
     def solve(self, tolerance: float, max_iterations: int) -> _State:
         """Newton with IRLS blending from a few IRLS steps; the gap uses the best bound over all iterates."""
         a, b = self._start()
+        here = self.sums(a, b)
         bound, gap = -np.inf, np.inf
         floor = OBJECTIVE_FLOOR * self.t.size * self.epsilon
         for iteration in range(max_iterations + 1):
-            r = self.residual(a, b)
-            inverse_root = 1 / self.root(r)
-            u = r * inverse_root
-            value = _dot(r, u / (1 + self.epsilon * inverse_root))
-            bound = max(bound, self.lower_bound(u, a))
-            gap = max(value - bound, 0.0) / max(value, floor)
-            step = None if gap <= tolerance else self._descend(a, b, u, inverse_root, value)
-            if step is None or iteration == max_iterations:
+            bound = max(bound, self.lower_bound(a, b, here))
+            gap = max(here.value - bound, 0.0) / max(here.value, floor)
+            if gap <= tolerance or iteration == max_iterations:
                 break
-            a, b = step
-        return _State(a, b, gap, iteration)
+            step = self._descend(a, b, here)
+            if step is None:
+                break
+            a, b, here = step
+        return _State(a, b, here, gap, iteration)
 
     def _start(self) -> tuple[float, float]:
         """Least squares, then two reweighted steps."""
-        a, b = self.scale_min, self.median_shift()
-        weight = np.ones_like(self.t)
-        for _ in range(3):
-            wp, wq = weight * self.p, weight * self.q
-            step = _solve_2x2(*self.normal(weight), _dot(wp, self.t), _dot(wq, self.t))
+        least = _solve_2x2(*self.plain, dot(self.p, self.t), dot(self.q, self.t))
+        if least is None:
+            return self.scale_min, self.median_shift()
+        a = max(self.scale_min, least[0])
+        b = dot(self.q, self.t - a * self.p) / self.plain[2]
+        for _ in range(2):
+            here = self.sums(a, b)
+            step = _solve_2x2(*here.irls, -here.slope[0], -here.slope[1])
             if step is None:
                 break
-            a = max(self.scale_min, step[0])
-            b = _dot(wq, self.t - a * self.p) / _dot(wq, self.q)
-            weight = 1 / self.root(self.residual(a, b))
+            moved = max(self.scale_min, a + step[0]) - a
+            a, b = a + moved, b - (here.slope[1] + here.irls[1] * moved) / here.irls[2]
         return a, b
 
-    def _descend(
-        self, a: float, b: float, u: np.ndarray, inverse_root: np.ndarray, value: float
-    ) -> tuple[float, float] | None:
+    def _descend(self, a: float, b: float, here: Sums) -> tuple[float, float, Sums] | None:
         """One step that lowers F, on the boundary the exact best shift, or None where neither moves."""
-        gradient_a, gradient_b = _dot(self.p, u), _dot(self.q, u)
-        irls = self.normal(inverse_root)
-        newton = self.normal(inverse_root * (self.epsilon * inverse_root) ** 2)
+        gradient_a, gradient_b = here.slope
         for blend in BLENDS:
-            h_aa, h_ab, h_bb = ((1 - blend) * n + blend * i for n, i in zip(newton, irls))
+            h_aa, h_ab, h_bb = ((1 - blend) * n + blend * i for n, i in zip(here.newton, here.irls))
             step = _solve_2x2(h_aa, h_ab, h_bb, -gradient_a, -gradient_b)
             if step is None:
                 continue
@@ -225,10 +207,11 @@ class _Problem:
                 a_new = self.scale_min
                 b_new = b - (gradient_b + h_ab * (a_new - a)) / h_bb
             predicted = gradient_a * (a_new - a) + gradient_b * (b_new - b)
-            if self.objective(a_new, b_new) < value + ARMIJO * min(predicted, 0.0):
-                return a_new, b_new
+            there = self.sums(a_new, b_new)
+            if there.value < here.value + ARMIJO * min(predicted, 0.0):
+                return a_new, b_new, there
         b_new = self.best_shift(a, b) if a <= self.scale_min else b
-        return None if b_new == b else (a, b_new)
+        return None if b_new == b else (a, b_new, self.sums(a, b_new))
 
     def best_shift(self, a: float, b: float) -> float:
         """argmin over b at fixed a: Newton on a monotone derivative inside a shrinking bracket, to the last digit."""
@@ -238,8 +221,8 @@ class _Problem:
         for _ in range(200):
             r = self.residual(a, b)
             inverse_root = 1 / self.root(r)
-            slope = _dot(self.q, r * inverse_root)
-            curvature = _dot(self.q * self.q, inverse_root * (self.epsilon * inverse_root) ** 2)
+            slope = dot(self.q, r * inverse_root)
+            curvature = dot(self.q * self.q, inverse_root * (self.epsilon * inverse_root) ** 2)
             low, high = (low, b) if slope > 0 else (b, high)
             proposal = b - slope / curvature if curvature > 0 else np.nan
             b_new = proposal if low <= proposal <= high else 0.5 * (low + high)
@@ -248,43 +231,32 @@ class _Problem:
             b = b_new
         return b
 
-    def lower_bound(self, u: np.ndarray, a: float) -> float:
+    def lower_bound(self, a: float, b: float, here: Sums) -> float:
         """The dual value of u = rho'(r) after making it feasible; valid for every feasible a and b."""
-        slope_a, slope_b = _dot(self.p, u), _dot(self.q, u)
+        slope_a, slope_b = here.slope
         keep = max(0.0, slope_a) if a <= self.scale_min else 0.0
-        best = -np.inf
         # Moving only those u that have room to +-1 wastes least; where none has, all of them move and are scaled.
-        for room in (1 - u * u, np.ones_like(u)):
-            step = _solve_2x2(*self.normal(room), slope_a - keep, slope_b)
-            if step is None:
-                if keep != slope_a or slope_b != 0:
-                    continue
-                step = (0.0, 0.0)
-            feasible = u - room * (step[0] * self.p + step[1] * self.q)
-            shrink = max(1.0, float(np.abs(feasible).max()))
-            feasible = feasible / shrink
-            square = np.minimum(feasible * feasible, 1.0)
-            conjugate = self.epsilon * float((square / (1 + np.sqrt(1 - square))).sum())
-            best = max(best, self.scale_min * keep / shrink - _dot(feasible, self.t) - conjugate)
+        found = [_solve_2x2(*normal, slope_a - keep, slope_b) for normal in (here.room, self.plain)]
+        steps = found[0] or (0.0, 0.0), found[1] or (0.0, 0.0)
+        shrink = 1.0, 1.0
+        duals = self.duals(a, b, steps, shrink)
+        if max(dual.largest for dual in duals) > 1:
+            shrink = max(1.0, duals[0].largest), max(1.0, duals[1].largest)
+            duals = self.duals(a, b, steps, shrink)
+        best = -np.inf
+        for step, by, dual in zip(found, shrink, duals):
+            if step is not None or (keep == slope_a and slope_b == 0):
+                best = max(best, self.scale_min * keep / by - dual.product - self.epsilon * dual.conjugate)
         return best
 
-    def scale_error(self, a: float, b: float) -> float:
-        """Sandwich standard error of the scale of an M-estimator: H^-1 (sum psi^2 z z^T) H^-1 with z = (p, q)."""
-        r = self.residual(a, b)
-        inverse_root = 1 / self.root(r)
-        row = _solve_2x2(*self.normal(inverse_root * (self.epsilon * inverse_root) ** 2), 1.0, 0.0)
-        if row is None:
-            return float("inf")
-        m_aa, m_ab, m_bb = self.normal((r * inverse_root) ** 2)
-        return float(np.sqrt(max(row[0] ** 2 * m_aa + 2 * row[0] * row[1] * m_ab + row[1] ** 2 * m_bb, 0.0)))
 
-
-def _dot(a: np.ndarray, b: np.ndarray) -> float:
-    """Inner product on one core: BLAS splits vectors of this length over threads that wait for each other.
-
-    Measured: on a busy machine BLAS takes 20 times as long.
-    """
-    return float(np.einsum("i,i->", a, b))
+def _scale_error(sums: Sums) -> float:
+    """Sandwich standard error of the scale of an M-estimator: H^-1 (sum psi^2 z z^T) H^-1 with z = (p, q)."""
+    row = _solve_2x2(*sums.newton, 1.0, 0.0)
+    if row is None:
+        return float("inf")
+    m_aa, m_ab, m_bb = sums.spread
+    return float(np.sqrt(max(row[0] ** 2 * m_aa + 2 * row[0] * row[1] * m_ab + row[1] ** 2 * m_bb, 0.0)))
 
 
 def _solve_2x2(h_aa: float, h_ab: float, h_bb: float, g_a: float, g_b: float) -> tuple[float, float] | None:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from statistics import NormalDist
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -19,6 +18,9 @@ import numpy as np
 from d2_plugin.captures.capture import MonoKind
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.monocular.affine import AffineFit, fit_affine
+from d2_plugin.priors.monocular.leverage import near_best_line
+from d2_plugin.priors.monocular.native import library, pixels
+from d2_plugin.priors.monocular.native.order import median, quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
 
 KINDS: tuple[MonoKind, ...] = get_args(MonoKind)
@@ -48,7 +50,7 @@ class Alignment:
 
     `domain` of a and b follows `kind`: relative maps give inverse depth a m + b, metric ones depth a m + b.
     `gap` bounds (F - F*) / F; `inliers` is the share of all anchors with discrepancy e below `inlier_error`; `t` is the
-    scale over its standard error (with the leverage guard, see `_Selection`); `rank_correlation` that of the map with
+    scale over its standard error (with the leverage guard, see `leverage`); `rank_correlation` that of the map with
     1 / D^g (relative) or D^g (metric).
     """
 
@@ -91,38 +93,36 @@ def align(mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: 
         D2Error: maps of two sizes, or an unknown kind.
     """
     _check(mono, geometric, kind)
-    anchors = predicted(mono) & np.isfinite(geometric) & (geometric > 0)
-    x_all, depth_all = mono[anchors].astype(np.float64), geometric[anchors].astype(np.float64)
-    count = int(x_all.size)
-    if count == 0:
-        return Alignment(AlignStatus.EMPTY, kind)
-    if count < settings.min_anchors:
-        return Alignment(AlignStatus.TOO_FEW, kind, anchors=count)
-    rows = _subsample(count, settings.max_anchors, settings.seed)
-    x, depth = x_all[rows], depth_all[rows]
-    if _central_range(x) <= 1e-6 * np.abs(x).max():
-        return Alignment(AlignStatus.FLAT, kind, anchors=count)
-    if _central_range(depth) <= settings.min_spread * np.median(depth):
-        return Alignment(AlignStatus.ONE_DEPTH, kind, anchors=count)
-    target = 1 / depth if kind == "relative" else depth
-    fit, epsilon, t = _fit(x, target, settings)
+    found = _fitted(mono, geometric, kind, settings)
+    if isinstance(found, Alignment):
+        return found
+    x, depth, target, fit = found.x, found.depth, found.target, found.fit
     error = np.abs(_depth(x, fit.scale, fit.shift, kind, np.inf) - depth) / depth
     inliers = float((error < settings.inlier_error).mean())
     correlation = rank_correlation(x[:: max(1, x.size // RANKED)], target[:: max(1, x.size // RANKED)])
     return Alignment(
-        status=_judge(fit, correlation, t, inliers, settings),
+        status=_judge(fit, correlation, found.t, inliers, settings),
         kind=kind,
         scale=fit.scale,
         shift=fit.shift,
-        anchors=count,
+        anchors=found.anchors,
         gap=fit.gap,
         iterations=fit.iterations,
         objective=fit.objective,
-        epsilon=epsilon,
+        epsilon=found.epsilon,
         inliers=inliers,
-        t=float(min(t, 1e12)),
+        t=float(min(found.t, 1e12)),
         rank_correlation=correlation,
     )
+
+
+def unjudged_line(
+    mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: AlignSettings
+) -> tuple[float, float]:
+    """Scale and shift that `align` finds, without the tests that tell whether they may be used; NaN without a line."""
+    _check(mono, geometric, kind)
+    found = _fitted(mono, geometric, kind, settings)
+    return (found.scale, found.shift) if isinstance(found, Alignment) else (found.fit.scale, found.fit.shift)
 
 
 def not_aligned(kind: MonoKind) -> Alignment:
@@ -139,7 +139,11 @@ def aligned_depth(mono: np.ndarray, alignment: Alignment, z_far: float) -> np.nd
     """
     if not alignment.accepted:
         return np.zeros(mono.shape, np.float32)
-    return _depth(mono.astype(np.float64), alignment.scale, alignment.shift, alignment.kind, z_far).astype(np.float32)
+    line = alignment.scale, alignment.shift
+    if library.library() is not None and mono.dtype == np.float32:
+        relative = alignment.kind == "relative"
+        return pixels.aligned_depth(mono, *line, _nearest(z_far) if relative else z_far, relative)
+    return _depth(mono.astype(np.float64), *line, alignment.kind, z_far).astype(np.float32)
 
 
 def aligned_inverse(mono: np.ndarray, alignment: Alignment) -> np.ndarray:
@@ -147,11 +151,20 @@ def aligned_inverse(mono: np.ndarray, alignment: Alignment) -> np.ndarray:
 
     The zero of a saturated ReLU says "farther than I can tell" and is taken at its word.
     """
+    if library.library() is not None and mono.dtype == np.float32:
+        return pixels.aligned_inverse(mono, alignment.scale, alignment.shift, alignment.kind == "relative")
     value = alignment.scale * mono.astype(np.float64) + alignment.shift
     if alignment.kind == "metric":
         with np.errstate(divide="ignore"):
             return np.where(value > 0, 1 / np.where(value > 0, value, 1), np.nan)
     return np.where(mono == 0, np.minimum(value, 0), value)
+
+
+def inverse_at_least(mono: np.ndarray, alignment: Alignment) -> float:
+    """What no number of `aligned_inverse` lies below, from the ends of the map [H, W]; NaN where that tells nothing."""
+    low, high = float(np.fmin.reduce(mono, axis=None)), float(np.fmax.reduce(mono, axis=None))
+    ends = [low, high, 0.0] if low <= 0 <= high else [low, high]
+    return float(np.fmin.reduce(aligned_inverse(np.array(ends), alignment)))
 
 
 def predicted(mono: np.ndarray) -> np.ndarray:
@@ -164,18 +177,59 @@ def predicted(mono: np.ndarray) -> np.ndarray:
 
 def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
     """Spearman's rank correlation of two vectors; 0 where one is constant. Ties share their mean rank."""
-    ranks = [np.searchsorted(np.sort(v), v, "left") + np.searchsorted(np.sort(v), v, "right") for v in (x, y)]
-    centred = [rank - rank.mean() for rank in ranks]
+    centred = [rank - rank.mean() for rank in (_twice_the_ranks(x), _twice_the_ranks(y))]
     norm = np.sqrt((centred[0] @ centred[0]) * (centred[1] @ centred[1]))
     return float(centred[0] @ centred[1] / norm) if norm > 0 else 0.0
+
+
+def _twice_the_ranks(values: np.ndarray) -> np.ndarray:
+    """For each value how many are smaller, and how many are not larger: both together."""
+    order = np.argsort(values)
+    ordered = values[order]
+    steps = np.flatnonzero(ordered[1:] != ordered[:-1]) + 1
+    first, last = np.append(0, steps), np.append(steps, values.size)
+    ranks = np.empty(values.size, np.int64)
+    ranks[order] = np.repeat(first + last, last - first)
+    return ranks
 
 
 def _depth(mono: np.ndarray, scale: float, shift: float, kind: MonoKind, z_far: float) -> np.ndarray:
     value: np.ndarray = scale * np.where(predicted(mono), mono, np.nan) + shift
     if kind == "relative":
-        near_enough = value > max(1 / z_far, float(np.finfo(np.float32).tiny))
+        near_enough = value > _nearest(z_far)
         return np.where(near_enough, 1 / np.where(near_enough, value, 1), 0)
     return np.where((value > 0) & (value <= z_far), value, 0)
+
+
+class _Fitted(NamedTuple):
+    """The anchors of a fit [n] and what it gave."""
+
+    anchors: int
+    """How many there were before some were drawn."""
+    x: np.ndarray
+    depth: np.ndarray
+    target: np.ndarray
+    fit: AffineFit
+    epsilon: float
+    t: float
+
+
+def _fitted(mono: np.ndarray, geometric: np.ndarray, kind: MonoKind, settings: AlignSettings) -> _Fitted | Alignment:
+    """The line, or why there is none."""
+    anchors = np.flatnonzero(predicted(mono) & np.isfinite(geometric) & (geometric > 0))
+    count = int(anchors.size)
+    if count == 0:
+        return Alignment(AlignStatus.EMPTY, kind)
+    if count < settings.min_anchors:
+        return Alignment(AlignStatus.TOO_FEW, kind, anchors=count)
+    rows = anchors[_subsample(count, settings.max_anchors, settings.seed)]
+    x, depth = (values.ravel()[rows].astype(np.float64) for values in (mono, geometric))
+    if _central_range(x) <= 1e-6 * np.abs(x).max():
+        return Alignment(AlignStatus.FLAT, kind, anchors=count)
+    if _central_range(depth) <= settings.min_spread * median(depth):
+        return Alignment(AlignStatus.ONE_DEPTH, kind, anchors=count)
+    target = 1 / depth if kind == "relative" else depth
+    return _Fitted(count, x, depth, target, *_fit(x, target, settings))
 
 
 def _fit(x: np.ndarray, target: np.ndarray, settings: AlignSettings) -> tuple[AffineFit, float, float]:
@@ -184,12 +238,17 @@ def _fit(x: np.ndarray, target: np.ndarray, settings: AlignSettings) -> tuple[Af
     selection = None
     if settings.leverage_guard:
         weights = 1 / target if relative else np.ones_like(target)
-        selection = _near_best_line(x, target, weights, settings.min_inliers, settings.seed)
+        selection = near_best_line(x, target, weights, settings.min_inliers, settings.seed)
         x, target = x[selection.keep], target[selection.keep]
     epsilon = settings.epsilon if relative else settings.epsilon * float(np.median(target))
     fit = fit_affine(x, target, 1 / target if relative else None, epsilon=epsilon)
     t = fit.scale / max(fit.scale_error, np.finfo(float).tiny) if selection is None else selection.t
     return fit, epsilon, t
+
+
+def _nearest(z_far: float) -> float:
+    """The inverse depth of z_far, or what float32 can hold of it."""
+    return max(1 / z_far, float(np.finfo(np.float32).tiny))
 
 
 def _judge(fit: AffineFit, correlation: float, t: float, inliers: float, settings: AlignSettings) -> AlignStatus:
@@ -216,50 +275,7 @@ def _subsample(count: int, limit: int, seed: int) -> np.ndarray | slice:
 
 def _central_range(values: np.ndarray) -> float:
     """Width of the central 90 %: a handful of leverage points must not pass for spread."""
-    low, high = np.percentile(values, (5, 95))
-    return float(high - low)
-
-
-class _Selection(NamedTuple):
-    """Anchors near one line, bool [N], and by how many standard deviations they are more than chance.
-
-    Anchors that were chosen to fit a line say nothing about whether there is one. Chance is how many would lie as near
-    if the map were shuffled.
-    """
-
-    keep: np.ndarray
-    t: float
-
-
-def _near_best_line(
-    x: np.ndarray, y: np.ndarray, weights: np.ndarray, share: float, seed: int, trials: int = 200, probes: int = 500
-) -> _Selection:
-    """Anchors near the rising line through two random ones that passes nearest to the best `share` of all anchors.
-
-    Least quantile of squares (Rousseeuw and Leroy 1987): it stands wrong anchors up to 1 - `share`, where the median
-    breaks at a half. Near is within 2.5 standard deviations, as that quantile tells them for normal residuals.
-    """
-    rng = np.random.default_rng(seed)
-    first, second = rng.integers(0, x.size, (2, trials))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scales = (y[first] - y[second]) / (x[first] - x[second])
-    rising = np.isfinite(scales) & (scales > 0)
-    if not rising.any():
-        return _Selection(np.ones(x.size, bool), 0.0)
-    scales, shifts = scales[rising], y[first[rising]] - scales[rising] * x[first[rising]]
-    probe = rng.integers(0, x.size, min(x.size, probes))
-    residuals = np.abs(scales[:, None] * x[probe] + shifts[:, None] - y[probe]) * weights[probe]
-    place = min(int(share * probe.size), probe.size - 1)
-    quantiles = np.partition(residuals, place, axis=1)[:, place]
-    best = quantiles.argmin()
-    reach = 2.5 * quantiles[best] / NormalDist().inv_cdf((1 + share) / 2)
-
-    def near(mono: np.ndarray) -> np.ndarray:
-        return np.abs(scales[best] * mono + shifts[best] - y) * weights <= reach
-
-    keep, chance = near(x), float(near(rng.permutation(x)).mean())
-    spread = np.sqrt(max(chance * (1 - chance), 1 / x.size) / x.size)
-    return _Selection(keep if keep.sum() >= 2 else np.ones(x.size, bool), float(keep.mean() - chance) / spread)
+    return quantile(values, 0.95) - quantile(values, 0.05)
 
 
 def _check(mono: np.ndarray, geometric: np.ndarray, kind: str) -> None:

@@ -23,6 +23,8 @@ from types import ModuleType
 import numpy as np
 
 from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.monocular.native import library
+from d2_plugin.priors.monocular.native.field import smooth_fields
 from d2_plugin.priors.monocular.settings import AlignSettings
 
 GRID = 80  # cells across the picture: twice as many change the median error by less than .0002 and take 8 times longer
@@ -38,33 +40,73 @@ def corrected_depth(aligned: np.ndarray, geometric: np.ndarray, settings: AlignS
         geometric: D^g [H, W], 0 where there is none.
         settings: the `local_*` fields; with no scales the map comes back as it is, which is the paper.
     """
-    both = (aligned > 0) & (geometric > 0)
-    if not settings.local_scales or not both.any():
-        return aligned.astype(np.float32)
-    bend = np.log(np.where(both, geometric, 1) / np.where(both, aligned, 1)).astype(np.float32)
-    both &= np.abs(bend) < settings.local_limit
-    field = _smooth_field(np.where(both, bend, 0), both, settings.local_scales, settings.local_prior)
-    return (aligned * np.exp(field)).astype(np.float32)
+    return corrected_without(aligned, geometric, np.zeros((1, 1, 1), bool), settings)[0]
 
 
-def _smooth_field(bend: np.ndarray, known: np.ndarray, scales: Sequence[float], prior: float) -> np.ndarray:
-    """Correction of log depth [H, W] from its values at the known pixels."""
+def corrected_without(
+    aligned: np.ndarray, geometric: np.ndarray, left_out: np.ndarray, settings: AlignSettings
+) -> np.ndarray:
+    """`corrected_depth` once for each of several choices of anchors, float32 [n, H, W].
+
+    Args:
+        aligned, geometric: as above.
+        left_out: anchors that do not count, bool [n, H, W].
+        settings: as above.
+    """
+    known = (aligned > 0) & (geometric > 0)
+    if not settings.local_scales or not known.any():
+        return np.repeat(aligned[None].astype(np.float32), len(left_out), axis=0)
+    with np.errstate(all="ignore"):  # where either is 0 the ratio is no number, which no limit admits
+        bend = np.divide(geometric, aligned)
+        bend = np.log(bend, out=bend).astype(np.float32, copy=False)
+        known &= np.abs(bend) < settings.local_limit
+    some = known[None] if left_out.size == 1 and not left_out.any() else known & ~left_out
+    fields = _smooth_fields(bend, some, settings.local_scales, settings.local_prior)
+    np.exp(fields, out=fields)
+    return np.multiply(aligned, fields, out=fields) if aligned.dtype == np.float32 else (aligned * fields).astype("f4")
+
+
+def _smooth_fields(bend: np.ndarray, known: np.ndarray, scales: Sequence[float], prior: float) -> np.ndarray:
+    """Corrections of log depth [n, H, W] from its values [H, W] at the known pixels [n, H, W]."""
     cv2 = opencv("the local correction")
-    cell = max(1, round(bend.shape[1] / GRID))
+    height, width = bend.shape
+    cell = max(1, round(width / GRID))
+    rows, columns = -(-height // cell), -(-width // cell)
+    blurs = []
+    for scale in scales:
+        sigma = max(scale * width / cell, 0.5)
+        blurs.append((_blur_matrix(cv2, rows, sigma), _blur_matrix(cv2, columns, sigma), _reach(sigma)))
+    if library.library() is None:
+        cells = [_cell_field(np.where(which, bend, 0), which, cell, blurs, prior) for which in known]
+    else:
+        shared = np.broadcast_to(bend, known.shape)
+        cells = list(smooth_fields(shared, known, cell, blurs, prior=prior, outlier=OUTLIER, rounds=ROUNDS))
+    fields = np.empty(known.shape, np.float32)
+    for field, out in zip(cells, fields):
+        enlarged = cv2.resize(field, (columns * cell, rows * cell), interpolation=cv2.INTER_LINEAR)
+        out[:] = enlarged[:height, :width]
+    return fields
+
+
+_Blur = tuple[np.ndarray, np.ndarray, int]
+"""Blur of a column of cells and of a row of cells, and how many cells their windows reach."""
+
+
+def _cell_field(bend: np.ndarray, known: np.ndarray, cell: int, blurs: Sequence[_Blur], prior: float) -> np.ndarray:
+    """Correction of log depth in each cell [rows, columns] from its values [H, W] at the known pixels, 0 elsewhere."""
     count = _block_sum(known.astype(np.float32), cell)
     mean = _block_sum(bend, cell) / np.maximum(count, 1)
     share = count / cell**2
     field = np.zeros_like(mean)
-    for scale in scales:
-        sigma = max(scale * bend.shape[1] / cell, 0.5)
-        field = field + _robust_average(cv2, mean - field, share, sigma, prior)
-    size = (field.shape[1] * cell, field.shape[0] * cell)
-    return cv2.resize(field, size, interpolation=cv2.INTER_LINEAR)[: bend.shape[0], : bend.shape[1]]
+    for down, across, _ in blurs:
+        field = field + _robust_average(down, across, mean - field, share, prior)
+    return field
 
 
-def _robust_average(cv2: ModuleType, values: np.ndarray, share: np.ndarray, sigma: float, prior: float) -> np.ndarray:
+def _robust_average(
+    down: np.ndarray, across: np.ndarray, values: np.ndarray, share: np.ndarray, prior: float
+) -> np.ndarray:
     """Gaussian average weighted by how much of a cell is known, then by agreement with that average."""
-    down, across = (_blur_matrix(cv2, size, sigma) for size in values.shape)
 
     def average(weight: np.ndarray) -> np.ndarray:
         total, weights = down @ np.stack([weight * values, weight]) @ across.T
@@ -82,11 +124,16 @@ def _blur_matrix(cv2: ModuleType, size: int, sigma: float) -> np.ndarray:
     So few cells are blurred in a fifth of the time by a product of matrices; the numbers are OpenCV's own.
     """
     if (size, sigma) not in _BLURS:
-        kernel = cv2.getGaussianKernel(2 * round(4 * sigma) + 1, sigma, cv2.CV_32F).ravel()
-        places = np.arange(size)[:, None] - np.arange(size) + kernel.size // 2
-        inside = (places >= 0) & (places < kernel.size)
-        _BLURS[size, sigma] = np.where(inside, kernel[np.clip(places, 0, kernel.size - 1)], 0).astype(np.float32)
+        window = cv2.getGaussianKernel(2 * _reach(sigma) + 1, sigma, cv2.CV_32F).ravel()
+        places = np.arange(size)[:, None] - np.arange(size) + _reach(sigma)
+        inside = (places >= 0) & (places < window.size)
+        _BLURS[size, sigma] = np.where(inside, window[np.clip(places, 0, window.size - 1)], 0).astype(np.float32)
     return _BLURS[size, sigma]
+
+
+def _reach(sigma: float) -> int:
+    """Cells beyond which a Gaussian is taken for zero."""
+    return round(4 * sigma)
 
 
 _BLURS: dict[tuple[int, float], np.ndarray] = {}

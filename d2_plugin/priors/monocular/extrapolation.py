@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from d2_plugin.captures.capture import MonoKind
-from d2_plugin.priors.monocular.align import align
+from d2_plugin.priors.monocular.align import unjudged_line
+from d2_plugin.priors.monocular.native.order import median, quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
 
 THIRD = 1 / 3
@@ -42,27 +43,31 @@ def extrapolation_error(
     known = (anchors > 0) & (aligned > 0)
     if not known.any():
         return np.zeros(aligned.shape)
-    depth = np.where(aligned > 0, aligned, np.median(aligned[known])).astype(np.float64)
-    held = np.clip(depth, *np.quantile(depth[known], RANGE))
-    near, far = np.quantile(anchors[known], (THIRD, 1 - THIRD))
-    parted = [
-        _parted(depth, held, np.where(rest, anchors, 0), kind, settings) for rest in (anchors > near, anchors < far)
-    ]
-    return np.where(depth == held, 0, np.sqrt((1 - THIRD) / THIRD) * np.hypot(*parted))
+    depth = np.where(aligned > 0, aligned, median(aligned[known])).astype(np.float64)
+    held = np.clip(depth, quantile(depth[known], RANGE[0]), quantile(depth[known], RANGE[1]))
+    near, far = (quantile(anchors[known], share) for share in (THIRD, 1 - THIRD))
+    error, beyond = np.zeros(aligned.shape), np.flatnonzero(depth != held)
+    parted = []
+    for rest in (anchors > near, anchors < far):
+        line = _line(depth, np.where(rest, anchors, 0), kind, settings)
+        parted.append(_parted(depth.ravel()[beyond], held.ravel()[beyond], *line, kind))
+    error.ravel()[beyond] = np.sqrt((1 - THIRD) / THIRD) * np.hypot(*parted)
+    return error
 
 
-def _parted(
-    depth: np.ndarray, held: np.ndarray, rest: np.ndarray, kind: MonoKind, settings: AlignSettings
-) -> np.ndarray:
-    """|log| [H, W] by which the line of the remaining anchors and that of all part between `held` and `depth`."""
-    values = 1 / depth if kind == "relative" else depth
-    fit = align(values, rest, kind=kind, settings=settings)
-    if not fit.scale > 0:
+def _line(depth: np.ndarray, rest: np.ndarray, kind: MonoKind, settings: AlignSettings) -> tuple[float, float]:
+    """Scale and shift that the remaining anchors [H, W] give."""
+    return unjudged_line(1 / depth if kind == "relative" else depth, rest, kind=kind, settings=settings)
+
+
+def _parted(depth: np.ndarray, held: np.ndarray, scale: float, shift: float, kind: MonoKind) -> np.ndarray:
+    """|log| [n] by which a line and that of all anchors part between `held` and `depth`."""
+    if not scale > 0:
         return np.full(depth.shape, np.inf)
     sign = -1 if kind == "relative" else 1
     ratios = []
     for place in (depth, held):
         value = place**sign
-        moved = (fit.scale * value + fit.shift) / value
+        moved = (scale * value + shift) / value
         ratios.append(np.where(moved > 0, np.log(np.where(moved > 0, moved, 1)), np.nan))
     return np.nan_to_num(np.abs(ratios[0] - ratios[1]), nan=np.inf)

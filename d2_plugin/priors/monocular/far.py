@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.monocular.native.order import quantile
 
 CLEARLY = 0.4
 """Inverse depth, in units of that of the farthest anchors, below which a pixel is clearly beyond."""
@@ -40,10 +41,15 @@ def far_pixels(inverse: np.ndarray, geometric: np.ndarray, image: np.ndarray) ->
     if anchors.size == 0:
         return np.zeros(geometric.shape, bool)
     cv2: Any = opencv("finding the sky")
-    beyond = np.where(np.isfinite(inverse), inverse, np.inf) * np.percentile(anchors, 99.5)
+    farthest = quantile(anchors, 0.995)
+    if np.fmin.reduce(inverse, axis=None) * farthest >= CLEARLY:
+        return np.zeros(geometric.shape, bool)
+    beyond = np.where(np.isfinite(inverse), inverse, np.inf) * farthest
+    if np.count_nonzero(beyond < CLEARLY) < LEAST * beyond.size:
+        return np.zeros(geometric.shape, bool)
     measured = cv2.dilate((geometric > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    red, green, blue = np.moveaxis(image.astype(np.float32), -1, 0)
-    gray = (red + green + blue) / 3 / 255
+    red, green, blue = cv2.split(image)
+    gray = (cv2.add(cv2.add(red, green, dtype=cv2.CV_16U), blue, dtype=cv2.CV_16U) / np.float32(3)) / 255
     mean = cv2.blur(gray, (5, 5))
     smooth = np.sqrt(np.maximum(cv2.blur(gray * gray, (5, 5)) - mean * mean, 0)) < SMOOTH
     clear = _large(cv2, (beyond < CLEARLY) & smooth & ~measured, rim=True)

@@ -186,7 +186,8 @@ def upsample(prediction: np.ndarray, height: int, width: int) -> np.ndarray:
     source = prediction.astype(np.float32)
     upper, lower = source[rows], source[np.minimum(rows + 1, source.shape[0] - 1)]
     lines = upper + (lower - upper) * row_share[:, None]
-    left, right = lines[:, columns], lines[:, np.minimum(columns + 1, source.shape[1] - 1)]
+    # take keeps rows together, where lines[:, columns] would return columns: ten passes over the map follow.
+    left, right = (lines.take(at, axis=1) for at in (columns, np.minimum(columns + 1, source.shape[1] - 1)))
     return left + (right - left) * column_share[None, :]
 
 

@@ -22,7 +22,7 @@ infinite, so that it may propose and no more.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,18 +30,16 @@ import numpy as np
 from d2_plugin.captures.capture import MonoKind
 from d2_plugin.priors.disk.confidence import divided
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.monocular.correct import corrected_depth
+from d2_plugin.priors.monocular.correct import corrected_depth, corrected_without
+from d2_plugin.priors.monocular.error_shape import ErrorShape
 from d2_plugin.priors.monocular.extrapolation import extrapolation_error
+from d2_plugin.priors.monocular.native.order import median, quantile
 from d2_plugin.priors.settings import AlignSettings
 
-FLOOR, DISTANCE, GAP, EDGE, WIDE_EDGE, BEYOND = 0.051, 1.19, 0.79, 2.76, 0.16, 0.086
-"""f0 and fd (of d itself) to fr; fitted once to the true errors of studio, plaza and a rendered room together."""
 HARDER = 1.25
 """K of a pixel without an anchor."""
 AT_ANCHORS = 1.25
 """K of a pixel that is compared with its anchor."""
-NEXT = 0.003
-"""How far the next anchor lies where a pixel's own is left out, picture widths."""
 WIDTH = 160
 """Columns of the picture at which all this is computed: its terms are in picture widths."""
 PATTERNS, REGIONS = 6, 4
@@ -65,8 +63,6 @@ were normal). Measured in these units: 2.3 to 2.9, once 3.4; PyDNet, or the maps
 away from anchors are 2.5 to 6 times what the scale alone declares, and 3 to 6 % of right stereo would be vetoed."""
 HOPELESS = 0.5
 """A larger sigma says nothing about depth: it becomes infinite."""
-EVER = 1e3
-"""Beyond any logarithm of a float32 depth: neutral in a minimum or, negated, in a maximum."""
 
 
 class Skill(NamedTuple):
@@ -126,10 +122,11 @@ def monocular_uncertainty(
     if not np.isfinite(skill.scale):
         return Uncertainty(unknown, unknown, skill)
     corrected = corrected_depth(small, anchors, settings)
-    between = HARDER * skill.tail * skill.scale * divided(error_shape(corrected, anchors), sure)
+    shape = ErrorShape.of(corrected, anchors)
+    between = HARDER * skill.tail * skill.scale * divided(shape.usual(), sure)
     sigma = _enlarged(np.hypot(between, extrapolation_error(small, anchors, kind, settings)), aligned.shape)
-    left_out = divided(error_shape(corrected, anchors, left_out=True), sure)
-    at_anchors = _enlarged(AT_ANCHORS * skill.tail * skill.scale * left_out, aligned.shape)
+    left_out = AT_ANCHORS * skill.tail * skill.scale * divided(shape.left_out(), sure)
+    at_anchors = _enlarged(left_out, aligned.shape)
     told = (aligned > 0) & (sigma < HOPELESS) & (not skill.nil)
     return Uncertainty(np.where(told, sigma, np.float32(np.inf)), at_anchors, skill)
 
@@ -138,96 +135,64 @@ def measured_skill(
     aligned: np.ndarray, anchors: np.ndarray, settings: AlignSettings, confidence: np.ndarray | None = None
 ) -> Skill:
     """Errors at anchors [H, W] that were left out of the correction of `aligned` [H, W]."""
-    ratios: list[np.ndarray] = []
-    errors: list[np.ndarray] = []
-    without: list[np.ndarray] = []
-    for hole in left_out_regions(anchors.shape):
-        rest = np.where(hole, 0, anchors).astype(np.float32)
-        held = hole & (anchors > 0) & (aligned > 0)
-        if held.sum() < 20 or np.count_nonzero(rest) < max(settings.min_anchors, 1):
-            continue
-        corrected = corrected_depth(aligned, rest, settings)
-        error = np.abs(np.log(corrected[held] / anchors[held]))
-        ratios.append(error / divided(error_shape(corrected, rest), confidence)[held])
-        errors.append(error)
-        if len(without) < COMPARED:
-            # The map was aligned to all anchors, those left out among them: so the constant is the median of all.
-            flat = corrected_depth(np.full_like(rest, np.median(anchors[anchors > 0])), rest, settings)
-            without.append(np.abs(np.log(flat[held] / anchors[held])))
-    if sum(map(len, errors)) < LEAST:
+    holes, both = left_out_regions(anchors.shape), (anchors > 0) & (aligned > 0)
+    held, rest = holes & both, ~holes & (anchors > 0)
+    enough = (_count(held) >= 20) & (_count(rest) >= max(settings.min_anchors, 1))
+    if _count(held[enough]).sum() < LEAST:
         return Skill(np.nan, np.nan, np.nan, np.nan)
-    compared, alone = (float(np.median(np.concatenate(found))) for found in (errors[:COMPARED], without))
-    all_ratios, error = np.concatenate(ratios), float(np.median(np.concatenate(errors)))
+    holes, rest = holes[enough], rest[enough]
+    corrected = corrected_without(aligned, anchors, holes, settings)
+    ratios, errors = [], []
+    places = [np.flatnonzero(mask) for mask in held[enough]]
+    for place, depth, others in zip(places, corrected, rest):
+        shape = ErrorShape.of(depth, np.where(others, anchors, 0), place).usual()
+        errors.append(_log_error(depth, anchors, place))
+        ratios.append(errors[-1] / divided(shape, None if confidence is None else confidence.ravel()[place]))
+    # The map was aligned to all anchors, those left out among them: so the constant is the median of all.
+    constant = np.full(anchors.shape, median(anchors[anchors > 0]), np.float32)
+    flat = corrected_without(constant, anchors, holes[:COMPARED], settings)
+    without = [_log_error(depth, anchors, place) for depth, place in zip(flat, places)]
+    compared, alone = (median(np.concatenate(found)) for found in (errors[:COMPARED], without))
+    all_ratios, error = np.concatenate(ratios), median(np.concatenate(errors))
     scale = _scale(all_ratios, int(np.count_nonzero(anchors)))
     return Skill(scale, error, alone / max(compared, np.finfo(float).tiny), _tail(all_ratios, scale))
 
 
+def _count(masks: np.ndarray) -> np.ndarray:
+    """How many pixels each of the masks [n, H, W] has."""
+    return np.array([np.count_nonzero(mask) for mask in masks], np.int64)
+
+
+def _log_error(depth: np.ndarray, anchors: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """|log(depth / anchor)| [n] at pixels that are given by flat index."""
+    return np.abs(np.log(depth.ravel()[place] / anchors.ravel()[place]))
+
+
 def _tail(ratios: np.ndarray, scale: float) -> float:
     """How far errors in units of their shape go beyond the usual ones of that scale, 1 at least."""
-    return float(max(np.quantile(ratios, IN_TAIL) / (USUAL_TAIL * scale), 1))
+    return float(max(quantile(ratios, IN_TAIL) / (USUAL_TAIL * scale), 1))
 
 
 def _scale(ratios: np.ndarray, anchors: int) -> float:
     """The 68 % quantile of errors in units of their shape, from few anchors not below what is usual."""
-    measured = np.quantile(ratios, 0.68)
+    measured = quantile(ratios, 0.68)
     share = anchors / (anchors + EVIDENCE)
     return float(max(measured, measured**share * USUAL ** (1 - share)))
 
 
-def left_out_regions(shape: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Masks [H, W] of squares, the same for every picture of that size."""
+@functools.cache
+def left_out_regions(shape: tuple[int, int]) -> np.ndarray:
+    """Masks [patterns, H, W] of squares, the same for every picture of that size."""
     height, width = shape
     random = np.random.default_rng(0)
-    for _ in range(PATTERNS):
-        hole = np.zeros(shape, bool)
+    holes = np.zeros((PATTERNS, *shape), bool)
+    for hole in holes:
         for side in np.exp(random.uniform(np.log(SMALLEST), np.log(LARGEST), REGIONS)) * width:
             top, left = random.uniform(-side / 2, height - side / 2), random.uniform(-side / 2, width - side / 2)
             rows, columns = (slice(max(round(a), 0), max(round(a + side), 0)) for a in (top, left))
             hole[rows, columns] = True
-        yield hole
-
-
-def error_shape(depth: np.ndarray, anchors: np.ndarray, left_out: bool = False) -> np.ndarray:
-    """The shape that errors follow, up to the scale, [H, W].
-
-    Args:
-        depth: the corrected map [H, W].
-        anchors: D^g [H, W], 0 where there is none.
-        left_out: pretend that each pixel's own anchor had been left out: the next one is `NEXT` away, and nothing is
-            known of how far the depth lies from it.
-    """
-    cv2: Any = opencv("the uncertainty of monocular depth")
-    known = anchors > 0
-    width = depth.shape[1]
-    log_depth = np.log(np.where(depth > 0, depth, 1)).astype(np.float32)
-    distance, label = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    by_label = np.zeros(int(label.max()) + 1, np.float32)
-    by_label[label[known]] = np.log(anchors[known])
-    gap = np.abs(log_depth - by_label[label])
-    if left_out:
-        distance, gap = np.full_like(distance, NEXT * width), np.zeros_like(gap)
-    beyond = np.maximum(log_depth - np.median(by_label[label[known]]), 0)
-    edge, wide_edge = (_span(cv2, log_depth, depth > 0, share * width) for share in (0.005, 0.02))
-    squares = (
-        FLOOR**2,
-        DISTANCE**2 * np.minimum(distance / width, 0.3),
-        (GAP * np.minimum(gap, 0.6)) ** 2,
-        (EDGE * np.minimum(edge, 0.7)) ** 2,
-        (WIDE_EDGE * np.minimum(wide_edge, 1)) ** 2,
-        (BEYOND * beyond) ** 2,
-    )
-    return np.sqrt(sum(squares))
-
-
-def _span(cv2: Any, values: np.ndarray, known: np.ndarray, radius: float) -> np.ndarray:
-    """Largest minus smallest known value within a square of that radius, pixels."""
-    side = 2 * max(1, round(radius)) + 1
-    kernel = np.ones((side, side), np.uint8)
-    largest = cv2.dilate(np.where(known, values, np.float32(-EVER)), kernel)
-    smallest = cv2.erode(np.where(known, values, np.float32(EVER)), kernel)
-    return np.where(largest < smallest, 0, largest - smallest)
+    holes.setflags(write=False)
+    return holes
 
 
 def _relative(confidence: np.ndarray) -> np.ndarray:
