@@ -50,7 +50,7 @@ def confirm(
     for other, source in enumerate(cameras):
         if other != index:
             ask(sums, rays, depth, np.ascontiguousarray(depths[other], np.float32), reference, source, settings)
-    spread = np.sqrt(sums.difference / np.where(sums.information > 0, sums.information, 1))
+    spread = np.sqrt(sums.difference / (sums.information + (sums.information == 0)))
     return Confirmation(sums.confirming, np.sqrt(sums.information), spread)
 
 

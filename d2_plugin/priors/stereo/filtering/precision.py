@@ -62,10 +62,9 @@ def geometric_sigma(
         spread: root mean square relative difference to the depths of the confirming sources [H, W].
         gradient: change of the grey value around the pixel [H, W], 0..1 per pixel (see `grey_gradient`).
     """
-    depth = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
     compiled = kernel.library() is not None
     maps = {
-        "depth": depth,
+        "depth": np.ascontiguousarray(depth, np.float32),
         "coherence": np.ascontiguousarray(coherence, np.float32),
         "gradient": np.ascontiguousarray(gradient, np.float32),
         "parallax": np.ascontiguousarray(parallax, np.float64),
@@ -104,7 +103,8 @@ def reference_sigma(
         spread: as above.
         scatter: about the plane of the window (see `plane_scatter`) [H, W].
     """
-    known = (depth > 0) & (parallax > 0) & ~np.isnan(coherence) & np.isfinite(spread) & ~np.isnan(gradient)
+    known = (depth > 0) & (parallax > 0) & np.isfinite(depth) & ~np.isnan(coherence)
+    known &= np.isfinite(spread) & ~np.isnan(gradient)
     coherence, spread = (np.where(known, map_, 0) for map_ in (coherence, spread))
     pixels = MATCHING + GRAY_NOISE / np.where(known, np.maximum(gradient, FLATTEST), 1)
     pixels = pixels + PER_INCOHERENCE * (1 - np.clip(coherence, 0, 1))
@@ -128,7 +128,7 @@ def plane_scatter(depth: np.ndarray, window: int = WINDOW) -> np.ndarray:
     A plane in space is linear in inverse depth over the picture.
 
     Args:
-        depth: [H, W], read as float32; 0 where there is none.
+        depth: [H, W], read as float32; 0, infinite or NaN where there is none.
         window: side of the window, pixels, odd.
     """
     depth = np.ascontiguousarray(depth, np.float32)
@@ -141,11 +141,11 @@ def reference_scatter(depth: np.ndarray, reach: int, slack: float) -> np.ndarray
     Moments are about the window's own pixel: those about another one would differ by little from their products.
 
     Args:
-        depth: float32 [H, W], 0 where there is none.
+        depth: float32 [H, W], 0, infinite or NaN where there is none.
         reach: half the side of the window, pixels.
         slack: added to the second moments of the columns and rows, pixels^2.
     """
-    known = depth > 0
+    known = (depth > 0) & np.isfinite(depth)
     weight, inverse = known.astype(np.float64), np.where(known, 1 / np.where(known, depth, 1).astype(np.float64), 0)
 
     def down(values: np.ndarray, power: int) -> np.ndarray:
