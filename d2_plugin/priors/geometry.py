@@ -79,9 +79,10 @@ def pixel_grid(camera: Camera, dtype: type = np.float32) -> tuple[np.ndarray, np
 def viewing_rays(camera: Camera, dtype: type = np.float32) -> np.ndarray:
     """Directions [H, W, 3] with z = 1: the 3D point of a pixel is its depth times its ray, in camera coordinates."""
     u, v = pixel_grid(camera, np.float64)
-    K_inverse = np.linalg.inv(index_intrinsics(camera))
-    pixels = np.stack(np.broadcast_arrays(u, v, np.ones(1)), axis=-1)
-    return (pixels @ K_inverse.T).astype(dtype)
+    rays: np.ndarray = np.empty((camera.height, camera.width, 3), dtype)
+    for axis, (across, down, offset) in enumerate(np.linalg.inv(index_intrinsics(camera))):
+        rays[..., axis] = across * u + down * v + offset
+    return rays
 
 
 def back_project(camera: Camera, depth: np.ndarray) -> np.ndarray:

@@ -25,6 +25,15 @@ FLAGS = ("-ffp-contract=off",)
 _int, _float, _double, _pointer = ctypes.c_int32, ctypes.c_float, ctypes.c_double, ctypes.c_void_p
 
 
+class _Slopes(ctypes.Structure):
+    """d2::Slopes of kernels/filter.cpp."""
+
+    _fields_ = (
+        *((name, _int) for name in ("width", "height", "reach", "threads")),
+        *((name, _pointer) for name in ("depth", "inverse", "slope_x", "slope_y")),
+    )
+
+
 class _Coherence(ctypes.Structure):
     """d2::Coherence of kernels/filter.cpp."""
 
@@ -45,10 +54,11 @@ class _Confirm(ctypes.Structure):
         ("back_A", _float * 9),
         ("back_k", _float * 3),
         ("direction", _float * 3),
+        ("rays", _double * 9),
         *((name, _float) for name in ("continuous", "reprojection_max", "relative_depth_max")),
         *((name, _float) for name in ("sine_min", "cosine_min", "sine_max", "cosine_max")),
         *((name, _double) for name in ("nudge", "nudge_squared")),
-        *((name, _pointer) for name in ("rays", "depth", "theirs", "confirming", "information", "difference")),
+        *((name, _pointer) for name in ("depth", "theirs", "confirming", "information", "difference")),
     )
 
 
@@ -73,7 +83,7 @@ class _Sigma(ctypes.Structure):
     )
 
 
-_CALLS = {"coherence": _Coherence, "confirm": _Confirm, "scatter": _Scatter, "sigma": _Sigma}
+_CALLS = {"slopes": _Slopes, "coherence": _Coherence, "confirm": _Confirm, "scatter": _Scatter, "sigma": _Sigma}
 
 
 @functools.cache
@@ -93,6 +103,14 @@ def library() -> ctypes.CDLL | None:
         size.restype = ctypes.c_int64
         assert size() == ctypes.sizeof(call), f"the call of {name} differs between kernel.py and its source"
     return kernel
+
+
+def slopes(depth: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """See `coherence.reference_slopes`; depth is contiguous float32."""
+    inverse, across, down = (np.empty_like(depth) for _ in range(3))
+    maps = {"depth": depth, "inverse": inverse, "slope_x": across, "slope_y": down}
+    _run("slopes", _Slopes(reach=reach), depth.shape, maps)
+    return inverse, across, down
 
 
 def coherence(

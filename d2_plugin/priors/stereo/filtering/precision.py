@@ -63,7 +63,7 @@ def geometric_sigma(
         gradient: change of the grey value around the pixel [H, W], 0..1 per pixel (see `grey_gradient`).
     """
     compiled = kernel.library() is not None
-    maps = {
+    maps: dict[str, np.ndarray] = {
         "depth": np.ascontiguousarray(depth, np.float32),
         "coherence": np.ascontiguousarray(coherence, np.float32),
         "gradient": np.ascontiguousarray(gradient, np.float32),
