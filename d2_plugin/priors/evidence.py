@@ -22,7 +22,7 @@ from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.others import kernel
-from d2_plugin.priors.others.ask import COMPARED, Points, View, ask
+from d2_plugin.priors.others.ask import Points, View, ask
 from d2_plugin.protocol import Label
 
 AGREED = 0.57
@@ -51,27 +51,26 @@ def with_evidence(
     """
     known = {} if tails is None else {name: tail for name, tail in tails.items() if tail >= 1}
     views = {name: _shown(prior) for name, prior in priors.items()}
-    informed = _informed_compiled if kernel.library() else _informed
+    factors = {name: AGREED / known.get(name, 1.0) for name in priors}
+    if kernel.library():
+        numbers = {"tolerance": tolerance, "at_best": AT_BEST, "alone": ALONE}
+        changed = kernel.inform(views, cameras, factors, numbers)
+        return {
+            name: replace(prior, labels=changed[name][0], depth=changed[name][1], sigma=changed[name][2])
+            for name, prior in priors.items()
+        }
     return {
-        name: informed(name, prior, views, cameras, tolerance, AGREED / known.get(name, 1.0))
-        for name, prior in priors.items()
+        name: _informed(name, prior, views, cameras, tolerance, factors[name]) for name, prior in priors.items()
     }
 
 
 def _shown(prior: FusedPrior) -> View:
     """What a view tells the others."""
-    labels, depth = np.ascontiguousarray(prior.labels), np.ascontiguousarray(prior.depth)
-    surface = np.where(labels == Label.VERIFIED, depth, np.float32(0))
+    labels, depth, sigma = (np.ascontiguousarray(map_) for map_ in (prior.labels, prior.depth, prior.sigma))
+    with np.errstate(divide="ignore"):
+        log = np.log(np.fmax(depth, 0))
     colors = None if prior.colors is None else opencv("the evidence of other cameras").blur(prior.colors, (3, 3))
-    known = np.flatnonzero(surface)
-    rows, columns = np.divmod(known[:: max(len(known) // COMPARED, 1)], surface.shape[1])
-    mono = np.where((labels == Label.MONO) | (labels == Label.AGREED), depth, np.float32(0))
-    return View(_log(mono), surface, _log(surface), np.ascontiguousarray(prior.sigma), colors, (rows, columns))
-
-
-def _log(depth: np.ndarray) -> np.ndarray:
-    """Logarithm of a map of depths, infinite where there is none."""
-    return np.where(depth > 0, np.log(np.where(depth > 0, depth, 1)), np.inf)
+    return View(labels, depth, log, sigma, colors)
 
 
 def _informed(
@@ -94,19 +93,4 @@ def _informed(
     labels[rows, columns] = np.where(met, Label.VERIFIED, np.where(agreed, Label.AGREED, Label.MONO))
     depths[rows, columns] = np.where(met, answer.depth, depth)
     sigmas[rows, columns] = np.where(met, answer.sigma, np.hypot(factor * sigma, np.where(agreed, AT_BEST, 0)))
-    return replace(prior, depth=depths, labels=labels, sigma=sigmas)
-
-
-def _informed_compiled(
-    name: str,
-    prior: FusedPrior,
-    views: Mapping[str, View],
-    cameras: Mapping[str, Camera],
-    tolerance: float,
-    agreeing: float,
-) -> FusedPrior:
-    """`_informed` in C++."""
-    labels, depths, sigmas = (np.array(map_, order="C") for map_ in (prior.labels, prior.depth, prior.sigma))
-    numbers = {"tolerance": tolerance, "agreeing": agreeing, "at_best": AT_BEST, "alone": ALONE}
-    kernel.inform(labels, depths, sigmas, name, views, cameras, numbers)
     return replace(prior, depth=depths, labels=labels, sigma=sigmas)

@@ -5,13 +5,16 @@ What `kernel.ask` answers, where there is no compiler; the numbers and the types
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.geometry import ViewPair, interpolated_surface, view_pair
+from d2_plugin.protocol import Label
 
 WITHIN = 1.2
 """A surface confirms a monocular depth within this many of its standard deviations. Farther ones are often another
@@ -76,21 +79,40 @@ class Answer(NamedTuple):
     """Whether another camera has a depth where the point lies in its picture, bool."""
 
 
-class View(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class View:
     """What one view tells the others; contiguous maps [H, W]."""
 
-    mono_log: np.ndarray
-    """Logarithm of the monocular depth, float32; infinite elsewhere."""
-    surface: np.ndarray
-    """Depth that stereo verified, float32; 0 elsewhere."""
-    surface_log: np.ndarray
-    """Its logarithm, float32; infinite elsewhere."""
+    labels: np.ndarray
+    """`Label`, uint8."""
+    depth: np.ndarray
+    """float32."""
+    log: np.ndarray
+    """Logarithm of the depth, float32; infinite where there is none."""
     sigma: np.ndarray
     """float32."""
     colors: np.ndarray | None
     """Mean of 3x3 pixels, uint8 [H, W, 3]; None where there is no picture."""
-    compared: tuple[np.ndarray, np.ndarray]
-    """Rows and columns of some verified pixels, evenly over the picture, int64."""
+
+    @functools.cached_property
+    def surface(self) -> np.ndarray:
+        """Depth that stereo verified, 0 elsewhere."""
+        return np.where((self.labels == Label.VERIFIED) & (self.depth > 0), self.depth, np.float32(0))
+
+    @functools.cached_property
+    def compared(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of some verified pixels, evenly over the picture."""
+        known = np.flatnonzero(self.surface)
+        rows, columns = np.divmod(known[:: max(len(known) // COMPARED, 1)], self.surface.shape[1])
+        return rows, columns
+
+    def apart(
+        self, at: tuple[np.ndarray, np.ndarray], logs: np.ndarray, labels: tuple[Label, ...]
+    ) -> np.ndarray:
+        """|log difference| [K] of points to the depths of pixels with one of the labels; infinite at others."""
+        found = self.labels[at]
+        labelled = functools.reduce(np.logical_or, [found == label for label in labels])
+        return np.where(labelled, np.abs(logs - self.log[at]), np.inf)
 
 
 def ask(
@@ -113,14 +135,14 @@ def ask(
             continue
         pair = view_pair(cameras[name], cameras[other])
         asked = _as_seen_by(points, _gain(views[name], theirs, pair))
-        place, at, logs = _inside(asked, pair, theirs.surface.shape)
-        apart = np.abs(logs - theirs.mono_log[at])
+        place, at, logs = _inside(asked, pair, theirs.depth.shape)
+        apart = theirs.apart(at, logs, (Label.MONO, Label.AGREED))
         seen[place] |= np.isfinite(apart)
         close = np.flatnonzero(apart < tolerance)
         agreed[place[close]] |= _alike(asked.only(place[close]), theirs, *(values[close] for values in at))
         # Most rays start where nothing is verified; those whose first step leaves the allowed way several times over
         # meet nothing either. Only the others are followed.
-        near = place[np.abs(logs - theirs.surface_log[at]) < MISSED]
+        near = place[theirs.apart(at, logs, (Label.VERIFIED,)) < MISSED]
         found, precision = _intersection(asked.only(near), pair, theirs)
         seen[near] |= found > 0
         better = precision < sigma[near]
@@ -191,7 +213,7 @@ def _gain(ours: View, theirs: View, pair: ViewPair) -> np.ndarray:
     depth, mine = ours.surface[rows, columns].astype(np.float64), ours.colors[rows, columns].astype(np.float32)
     place, at, logs = _inside(Points(columns, rows, depth, depth, mine), pair, theirs.surface.shape)
     seen = theirs.colors[at].astype(np.float32)
-    one_place = np.abs(logs - theirs.surface_log[at]) < ONE_PLACE
+    one_place = theirs.apart(at, logs, (Label.VERIFIED,)) < ONE_PLACE
     bright = one_place & _in_all_channels(np.minimum(mine[place], seen) > DARK)
     if np.count_nonzero(bright) < FEWEST:
         return np.ones(3, np.float32)

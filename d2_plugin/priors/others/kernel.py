@@ -28,30 +28,33 @@ FLAGS = ("-ffp-contract=off",)
 _int, _float, _double, _pointer = ctypes.c_int32, ctypes.c_float, ctypes.c_double, ctypes.c_void_p
 
 
-class _Other(ctypes.Structure):
-    """d2::Other of kernels/ask.cpp."""
+class _View(ctypes.Structure):
+    """d2::View of kernels/ask.cpp."""
 
     _fields_ = (
         *((name, _int) for name in ("width", "height")),
-        ("A", _double * 9),
-        ("k", _double * 3),
-        ("gain", _float * 3),
-        *((name, _pointer) for name in ("mono_log", "surface", "surface_log", "sigma", "colors")),
+        ("agreeing", _double),
+        *((name, _pointer) for name in ("labels", "depth", "log", "sigma", "colors")),
+        *((name, _pointer) for name in ("new_labels", "new_depth", "new_sigma")),
     )
+
+
+class _Pair(ctypes.Structure):
+    """d2::Pair of kernels/ask.cpp."""
+
+    _fields_ = (("A", _double * 9), ("k", _double * 3), ("gain", _float * 3))
 
 
 class _Ask(ctypes.Structure):
     """d2::Ask of kernels/ask.cpp."""
 
     _fields_ = (
-        *((name, _int) for name in ("width", "height", "count", "compared", "threads", "steps", "fewest")),
+        *((name, _int) for name in ("count", "threads", "compared", "steps", "fewest")),
         *((name, _float) for name in ("continuous", "like", "dark")),
-        *((name, _double) for name in ("tolerance", "agreeing", "at_best", "alone", "one_place", "within", "near")),
-        *((name, _double) for name in ("beside", "nudge", "log_nudge", "flattest", "longest", "met", "missed")),
-        ("overshot", _double),
+        *((name, _double) for name in ("tolerance", "at_best", "alone", "one_place", "within", "near", "beside")),
+        *((name, _double) for name in ("nudge", "log_nudge", "flattest", "longest", "met", "missed", "overshot")),
         *((name, ctypes.c_uint8) for name in ("label_mono", "label_agreed", "label_verified")),
-        *((name, _pointer) for name in ("others", "rows", "columns", "surface", "colors")),
-        *((name, _pointer) for name in ("labels", "depth", "sigma")),
+        *((name, _pointer) for name in ("views", "pairs")),
     )
 
 
@@ -59,6 +62,7 @@ _NUMBERS = {
     "continuous": CONTINUOUS,
     "like": ask.LIKE * 255,
     "dark": ask.DARK,
+    "compared": ask.COMPARED,
     "steps": ask.STEPS,
     "fewest": ask.FEWEST,
     "one_place": ask.ONE_PLACE,
@@ -90,7 +94,7 @@ def library() -> ctypes.CDLL | None:
     except NoCompiler:
         return None
     kernel.d2_inform.argtypes, kernel.d2_inform.restype = (ctypes.POINTER(_Ask),), None
-    for name, structure in ("ask", _Ask), ("other", _Other):
+    for name, structure in ("ask", _Ask), ("pair", _Pair), ("view", _View):
         size = getattr(kernel, f"d2_{name}_size")
         size.restype = ctypes.c_int64
         assert size() == ctypes.sizeof(structure), f"{structure.__name__} differs between kernel.py and ask.cpp"
@@ -98,49 +102,46 @@ def library() -> ctypes.CDLL | None:
 
 
 def inform(
-    labels: np.ndarray,
-    depth: np.ndarray,
-    sigma: np.ndarray,
-    name: str,
     views: Mapping[str, ask.View],
     cameras: Mapping[str, Camera],
+    agreeing: Mapping[str, float],
     numbers: Mapping[str, float],
-) -> None:
-    """Change the mono-only pixels of view `name` in place, as `evidence.with_evidence` says.
+) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """The maps of all views of an instant after each was asked: (labels, depth, sigma), as `with_evidence` says.
 
     Args:
-        labels: uint8 [H, W].
-        depth: float32 [H, W].
-        sigma: float32 [H, W].
-        name: of the view.
-        views: all of one instant, by camera.
+        views: by camera.
         cameras: their calibrations.
-        numbers: `tolerance` in log depth, the factors of sigma `agreeing` and `alone`, and `at_best`.
+        agreeing: by camera, the factor of sigma where another map agrees.
+        numbers: `tolerance` in log depth, the factor of sigma `alone`, and `at_best`.
     """
-    ours = views[name]
-    asked = [other for other in views if other != name]
-    others = (_Other * len(asked))(*(_other(views[other], cameras[name], cameras[other]) for other in asked))
-    call = _Ask(**_NUMBERS, **numbers, count=len(asked), compared=len(ours.compared[0]))
-    call.threads = torch.get_num_threads()
-    call.height, call.width = labels.shape
-    call.others = ctypes.addressof(others)
-    call.rows, call.columns = (_address(values, np.int64) for values in ours.compared)
-    call.surface, call.colors = _address(ours.surface, np.float32), _address(ours.colors, np.uint8)
-    call.labels = _address(labels, np.uint8)
-    call.depth, call.sigma = _address(depth, np.float32), _address(sigma, np.float32)
+    count = len(views)
+    changed = {name: (view.labels.copy(), view.depth.copy(), view.sigma.copy()) for name, view in views.items()}
+    shown = (_View * count)(*(_view(view, changed[name], agreeing[name]) for name, view in views.items()))
+    pairs = (_Pair * count**2)(*(_pair(cameras[ours], cameras[theirs]) for ours in views for theirs in views))
+    call = _Ask(**_NUMBERS, **numbers, count=count, threads=torch.get_num_threads())
+    call.views, call.pairs = ctypes.addressof(shown), ctypes.addressof(pairs)
     kernel = library()
     assert kernel is not None, "asked without a compiler"
     kernel.d2_inform(ctypes.byref(call))
+    return changed
 
 
-def _other(view: ask.View, ours: Camera, theirs: Camera) -> _Other:
-    pair = view_pair(ours, theirs)
-    other = _Other(gain=(1, 1, 1), colors=_address(view.colors, np.uint8))
-    other.height, other.width = view.surface.shape
-    other.A[:], other.k[:] = pair.A.ravel().tolist(), pair.k.tolist()
-    for field in ("mono_log", "surface", "surface_log", "sigma"):
-        setattr(other, field, _address(getattr(view, field), np.float32))
-    return other
+def _view(view: ask.View, changed: tuple[np.ndarray, np.ndarray, np.ndarray], agreeing: float) -> _View:
+    told = _View(agreeing=agreeing, labels=_address(view.labels, np.uint8), colors=_address(view.colors, np.uint8))
+    told.height, told.width = view.labels.shape
+    told.depth, told.log, told.sigma = (_address(map_, np.float32) for map_ in (view.depth, view.log, view.sigma))
+    types = np.uint8, np.float32, np.float32
+    told.new_labels, told.new_depth, told.new_sigma = map(_address, changed, types)
+    return told
+
+
+def _pair(ours: Camera, theirs: Camera) -> _Pair:
+    told = _Pair(gain=(1, 1, 1))
+    if ours is not theirs:
+        pair = view_pair(ours, theirs)
+        told.A[:], told.k[:] = pair.A.ravel().tolist(), pair.k.tolist()
+    return told
 
 
 def _address(array: np.ndarray | None, dtype: type) -> int | None:

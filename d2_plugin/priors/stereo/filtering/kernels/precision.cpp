@@ -112,16 +112,18 @@ void scatter_of_row(const Scatter& c, const double* inverse, int row) {
 }
 
 void sigma_of_row(const Sigma& c, int row) {
-  for (int64_t i = int64_t(row) * c.width; i < int64_t(row + 1) * c.width; i++) {
+  float* __restrict__ sigma = c.sigma;
+  const int64_t first = int64_t(row) * c.width, end = first + c.width;
+  for (int64_t i = first; i < end; i++) {
     const float depth = c.depth[i], coherence = c.coherence[i], gradient = c.gradient[i];
-    const bool known = depth > 0 && depth < INFINITY && c.parallax[i] > 0 && std::fabs(c.spread[i]) < INFINITY &&
-                       coherence == coherence && gradient == gradient;
+    const bool known = (depth > 0) & (depth < INFINITY) & (c.parallax[i] > 0) & (std::fabs(c.spread[i]) < INFINITY) &
+                       (coherence == coherence) & (gradient == gradient);
     float pixels = c.matching + c.gray_noise / std::max(gradient, c.flattest);
     pixels = pixels + c.per_incoherence * (1 - std::min(std::max(coherence, 0.f), 1.f));
     const double matching = pixels / c.parallax[i], scatter = c.of_scatter * c.scatter[i];
     const double spread = c.of_spread * c.spread[i];
     const double variance = matching * matching + scatter * scatter + spread * spread + c.floor_squared;
-    c.sigma[i] = known ? float(std::sqrt(variance)) : std::numeric_limits<float>::infinity();
+    sigma[i] = known ? float(std::sqrt(variance)) : std::numeric_limits<float>::infinity();
   }
 }
 
