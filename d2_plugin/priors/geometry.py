@@ -11,6 +11,7 @@ so a plane sweep or an inverse-depth plane costs one homography each.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -64,11 +65,35 @@ def relative_pose(reference: Camera, source: Camera) -> np.ndarray:
 
 
 def view_pair(reference: Camera, source: Camera) -> ViewPair:
-    """The homography parts A and k from `reference` to `source`."""
+    """The homography parts A and k from `reference` to `source`; arrays that nobody may write to."""
+    return _view_pair(_Known(reference), _Known(source))
+
+
+class _Known:
+    """A camera that is told from others by its numbers alone, as they are now."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        self.numbers = np.asarray(camera.K).tobytes() + np.asarray(camera.T_camera_world).tobytes()
+
+    def __hash__(self) -> int:
+        return hash(self.numbers)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Known) and self.numbers == other.numbers
+
+
+@functools.lru_cache(maxsize=1024)
+def _view_pair(ours: _Known, theirs: _Known) -> ViewPair:
+    """See `view_pair`; the same pairs are asked for at every frame, by matching, filter and evidence."""
+    reference, source = ours.camera, theirs.camera
     T = relative_pose(reference, source)
     K_s, K_r = index_intrinsics(source), index_intrinsics(reference)
     R, t = T[:3, :3], T[:3, 3]
-    return ViewPair(K_s @ R @ np.linalg.inv(K_r), K_s @ t, -R.T @ t)
+    pair = ViewPair(K_s @ R @ np.linalg.inv(K_r), K_s @ t, -R.T @ t)
+    for array in (pair.A, pair.k, pair.direction):
+        array.flags.writeable = False
+    return pair
 
 
 def pixel_grid(camera: Camera, dtype: type = np.float32) -> tuple[np.ndarray, np.ndarray]:

@@ -155,11 +155,11 @@ def reference_scatter(depth: np.ndarray, reach: int, slack: float) -> np.ndarray
         return _moment(values.T, reach, power).T
 
     rows, rising = down(weight, 0), down(inverse, 0)
-    count = np.maximum(across(rows, 0), 1)
-    u, uu = across(rows, 1) / count, across(rows, 2) / count
-    v, uv = (across(down(weight, 1), power) / count for power in (0, 1))
-    vv, y, uy = across(down(weight, 2), 0) / count, across(rising, 0) / count, across(rising, 1) / count
-    vy, yy = across(down(inverse, 1), 0) / count, across(down(inverse * inverse, 0), 0) / count
+    share = 1 / np.maximum(across(rows, 0), 1)
+    u, uu = across(rows, 1) * share, across(rows, 2) * share
+    v, uv = (across(down(weight, 1), power) * share for power in (0, 1))
+    vv, y, uy = across(down(weight, 2), 0) * share, across(rising, 0) * share, across(rising, 1) * share
+    vy, yy = across(down(inverse, 1), 0) * share, across(down(inverse * inverse, 0), 0) * share
     uu, vv, uv = uu - u * u + slack, vv - v * v + slack, uv - u * v
     uy, vy, yy = uy - u * y, vy - v * y, yy - y * y
     determinant = uu * vv - uv * uv

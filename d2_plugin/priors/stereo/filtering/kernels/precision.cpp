@@ -98,11 +98,11 @@ void scatter_of_row(const Scatter& c, const double* inverse, int row) {
   const double* own = inverse + int64_t(row) * width;
   double* __restrict__ scatter = c.scatter + int64_t(row) * width;
   for (int x = 0; x < width; x++) {
-    const double count = std::max(double(n[x]), 1.0);
-    const double mean_u = u[x] / count, mean_v = v[x] / count, mean_y = y[x] / count;
-    const double of_uu = uu[x] / count - mean_u * mean_u + c.slack, of_vv = vv[x] / count - mean_v * mean_v + c.slack;
-    const double of_uv = uv[x] / count - mean_u * mean_v, of_yy = yy[x] / count - mean_y * mean_y;
-    const double of_uy = uy[x] / count - mean_u * mean_y, of_vy = vy[x] / count - mean_v * mean_y;
+    const double share = 1 / std::max(double(n[x]), 1.0);  // one division for ten
+    const double mean_u = u[x] * share, mean_v = v[x] * share, mean_y = y[x] * share;
+    const double of_uu = uu[x] * share - mean_u * mean_u + c.slack, of_vv = vv[x] * share - mean_v * mean_v + c.slack;
+    const double of_uv = uv[x] * share - mean_u * mean_v, of_yy = yy[x] * share - mean_y * mean_y;
+    const double of_uy = uy[x] * share - mean_u * mean_y, of_vy = vy[x] * share - mean_v * mean_y;
     const double determinant = of_uu * of_vv - of_uv * of_uv;
     const double explained =
         (of_vv * of_uy * of_uy - 2 * of_uv * of_uy * of_vy + of_uu * of_vy * of_vy) / determinant;
