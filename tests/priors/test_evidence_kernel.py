@@ -168,3 +168,21 @@ def test_maps_of_another_order_in_memory_are_read_alike_and_left_as_they_are() -
     assert_same(with_evidence(priors, cameras, TOLERANCE), with_evidence(turned, cameras, TOLERANCE))
     for name, prior in turned.items():
         np.testing.assert_array_equal(prior.labels, before[name])
+
+
+def test_the_gain_is_the_median_halfway_between_the_middle_two_of_an_even_number() -> None:
+    """Both verified the left half, where the other picture is 1 to 1.3 times brighter; the right half tells."""
+    view, shape = camera(np.zeros(3), 0.0, 40, 30, (0.5, 0.5)), (30, 40)
+    left, top = np.arange(40)[None] < 20, np.arange(30)[:, None] < 15
+    labels = np.broadcast_to(np.where(left, Label.VERIFIED, Label.MONO), shape).astype(np.uint8)
+    theirs = np.where(left, np.where(top, 100, 130), 103)
+    depth, sigma = np.full(shape, 4, np.float32), np.full(shape, 0.05, np.float32)
+    greys = {"ours": np.full(shape, 100), "theirs": theirs}
+    priors = {
+        name: FusedPrior(depth, labels, sigma, np.repeat(grey[..., None], 3, -1).astype(np.uint8))
+        for name, grey in greys.items()
+    }
+    rig = priors, {"ours": view, "theirs": view}
+    asked = with_evidence(*rig, TOLERANCE)
+    assert (asked["ours"].labels[:, 22:] == Label.AGREED).all(), "the larger of the two is too bright for it"
+    assert_same(asked, without_compiler(rig))

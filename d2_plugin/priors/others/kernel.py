@@ -137,11 +137,8 @@ def _view(view: ask.View, changed: tuple[np.ndarray, np.ndarray, np.ndarray], ag
 
 
 def _pair(ours: Camera, theirs: Camera) -> _Pair:
-    told = _Pair(gain=(1, 1, 1))
-    if ours is not theirs:
-        pair = view_pair(ours, theirs)
-        told.A[:], told.k[:] = pair.A.ravel().tolist(), pair.k.tolist()
-    return told
+    pair = view_pair(ours, theirs)
+    return _Pair(A=tuple(pair.A.ravel().tolist()), k=tuple(pair.k.tolist()), gain=(1, 1, 1))
 
 
 def _address(array: np.ndarray | None, dtype: type) -> int | None:

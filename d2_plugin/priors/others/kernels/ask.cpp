@@ -96,7 +96,8 @@ struct Ray {
 
 // The pixel of another view nearest to a place; -1 outside of the picture and behind the camera.
 int64_t nearest(const View& view, Place at) {
-  const bool inside = (at.z > 0) & (at.x > -0.5) & (at.x < view.width - 0.5) & (at.y > -0.5) & (at.y < view.height - 0.5);
+  const double right = view.width - 0.5, bottom = view.height - 0.5;
+  const bool inside = (at.z > 0) & (at.x > -0.5) & (at.x < right) & (at.y > -0.5) & (at.y < bottom);
   return inside ? int64_t(std::nearbyint(at.y)) * view.width + int64_t(std::nearbyint(at.x)) : -1;
 }
 

@@ -128,8 +128,8 @@ void project(const T* A, const T* k, T u, T v, T depth, T* x, T* y, T* z) {
   *y = (depth * (A[3] * u + A[4] * v + A[5]) + k[1]) / safe;
 }
 
-// The pixels of a row that have a depth, packed: `count` of `width`. Each step is a plain loop over them, which compilers
-// turn into vectors, but for the one that reads the source's map.
+// The pixels of a row that have a depth, packed: `count` of `width`. Each step is a plain loop over them, which
+// compilers turn into vectors, but for the one that reads the source's map.
 class Row {
  public:
   Row(const Confirm& call, int row)
@@ -204,8 +204,8 @@ class Row {
   }
 
   // Whether the source's depth takes us back to where we came from, by rays that meet at an angle that is allowed, and
-  // what it says then. |a x b| and a.b are that angle's sine and cosine times the same length; in units of the depth, so
-  // that no unit of the world overflows.
+  // what it says then. |a x b| and a.b are that angle's sine and cosine times the same length; in units of the depth,
+  // so that no unit of the world overflows.
   void return_to_us() {
     const float *u_ = u(), *depth_ = depth(), *x_ = x(), *y_ = y(), *seen_ = seen();
     int32_t* agrees_ = agrees();
