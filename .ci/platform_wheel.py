@@ -54,14 +54,15 @@ def libraries() -> list[Library]:
     from d2_plugin.gaussians import native_adam, native_picture, native_slice, native_ssim
     from d2_plugin.hooks import native_depth_loss
     from d2_plugin.priors.monocular.native import library as monocular
+    from d2_plugin.priors.others import kernel as others
     from d2_plugin.priors.stereo.filtering import kernel as filtering
     from d2_plugin.priors.stereo.patchmatch_kernel import PatchMatchKernel
     from d2_plugin.priors.stereo.settings import StereoSettings
     from d2_plugin.rasterizer import native
 
-    modules = native, native_slice, native_ssim, native_picture, native_adam, native_depth_loss, absolute
-    loads = [*(module.library for module in (*modules, monocular, filtering))]
-    loads.append(lambda: PatchMatchKernel([], (1.0, 2.0), StereoSettings()))
+    gaussians = native, native_slice, native_ssim, native_picture, native_adam, native_depth_loss
+    modules = *gaussians, filtering, monocular, others, absolute
+    loads = [*(module.library for module in modules), lambda: PatchMatchKernel([], (1.0, 2.0), StereoSettings())]
     for load in loads:
         with contextlib.suppress(Noted):
             load()

@@ -11,6 +11,7 @@ so a plane sweep or an inverse-depth plane costs one homography each.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -64,11 +65,35 @@ def relative_pose(reference: Camera, source: Camera) -> np.ndarray:
 
 
 def view_pair(reference: Camera, source: Camera) -> ViewPair:
-    """The homography parts A and k from `reference` to `source`."""
+    """The homography parts A and k from `reference` to `source`; arrays that nobody may write to."""
+    return _view_pair(_Known(reference), _Known(source))
+
+
+class _Known:
+    """A camera that is told from others by its numbers alone, as they are now."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        self.numbers = np.asarray(camera.K).tobytes() + np.asarray(camera.T_camera_world).tobytes()
+
+    def __hash__(self) -> int:
+        return hash(self.numbers)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Known) and self.numbers == other.numbers
+
+
+@functools.lru_cache(maxsize=1024)
+def _view_pair(ours: _Known, theirs: _Known) -> ViewPair:
+    """See `view_pair`; the same pairs are asked for at every frame, by matching, filter and evidence."""
+    reference, source = ours.camera, theirs.camera
     T = relative_pose(reference, source)
     K_s, K_r = index_intrinsics(source), index_intrinsics(reference)
     R, t = T[:3, :3], T[:3, 3]
-    return ViewPair(K_s @ R @ np.linalg.inv(K_r), K_s @ t, -R.T @ t)
+    pair = ViewPair(K_s @ R @ np.linalg.inv(K_r), K_s @ t, -R.T @ t)
+    for array in (pair.A, pair.k, pair.direction):
+        array.flags.writeable = False
+    return pair
 
 
 def pixel_grid(camera: Camera, dtype: type = np.float32) -> tuple[np.ndarray, np.ndarray]:
@@ -79,9 +104,10 @@ def pixel_grid(camera: Camera, dtype: type = np.float32) -> tuple[np.ndarray, np
 def viewing_rays(camera: Camera, dtype: type = np.float32) -> np.ndarray:
     """Directions [H, W, 3] with z = 1: the 3D point of a pixel is its depth times its ray, in camera coordinates."""
     u, v = pixel_grid(camera, np.float64)
-    K_inverse = np.linalg.inv(index_intrinsics(camera))
-    pixels = np.stack(np.broadcast_arrays(u, v, np.ones(1)), axis=-1)
-    return (pixels @ K_inverse.T).astype(dtype)
+    rays: np.ndarray = np.empty((camera.height, camera.width, 3), dtype)
+    for axis, (across, down, offset) in enumerate(np.linalg.inv(index_intrinsics(camera))):
+        rays[..., axis] = across * u + down * v + offset
+    return rays
 
 
 def back_project(camera: Camera, depth: np.ndarray) -> np.ndarray:

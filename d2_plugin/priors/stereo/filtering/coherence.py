@@ -23,7 +23,7 @@ def surface_coherence(gray: np.ndarray, depth: np.ndarray, radius: int, relative
     """Share of a pixel's neighbours that lie on its tangent plane, weighted by similarity of grey value.
 
     A plane in space is linear in inverse depth over the picture, so the tangent is the gradient of inverse depth, taken
-    as a median that a few wrong neighbours cannot turn. Neighbours without depth count as disagreeing.
+    as a median of 5x5 that a few wrong neighbours cannot turn. Neighbours without depth count as disagreeing.
 
     Args:
         gray: uint8 [H, W].
@@ -35,11 +35,13 @@ def surface_coherence(gray: np.ndarray, depth: np.ndarray, radius: int, relative
     Returns:
         float32 [H, W] in 0..1; 0 where there is no depth.
     """
-    valid = depth > 0
-    inverse = np.where(valid, 1 / np.where(valid, depth, 1), 0).astype(np.float32)
-    slopes = np.ascontiguousarray(_vertical_slope(np.ascontiguousarray(inverse.T)).T), _vertical_slope(inverse)
+    cv2 = opencv("the filter of geometric depth")
+    compiled = kernel.library() is not None
+    find = kernel.slopes if compiled else reference_slopes
+    inverse, across, down = find(np.ascontiguousarray(depth, np.float32), SLOPE_REACH)
+    slopes = cv2.medianBlur(across, 5), cv2.medianBlur(down, 5)
     weights = np.append(np.exp(-0.5 * (np.arange(256) / 255 / contrast) ** 2), 0).astype(np.float32)
-    share = kernel.coherence if kernel.library() else reference_share
+    share = kernel.coherence if compiled else reference_share
     return share(np.ascontiguousarray(gray), inverse, slopes, weights, radius, STRIDE, relative)
 
 
@@ -83,16 +85,27 @@ def _offsets(radius: int, stride: int) -> list[tuple[int, int]]:
     return [(dy, dx) for dy in steps for dx in steps if (dy, dx) != (0, 0)]
 
 
-def _vertical_slope(inverse: np.ndarray) -> np.ndarray:
-    """Slope of inverse depth down the columns, per pixel: the flatter one-sided difference, then the median of 5x5.
+def reference_slopes(depth: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What `kernel.slopes` returns, bit for bit, where there is no compiler: (inverse depth, its slopes), per pixel.
 
-    At a depth edge one side runs over the edge and is the steeper one. A side without depth has no say.
+    Args:
+        depth: float32 [H, W], 0 where there is none.
+        reach: pixels between the ends of a difference.
+
+    Returns:
+        inverse depth, 0 where there is none, and its slopes across and down: the flatter one-sided difference, since at
+        a depth edge one side runs over the edge and is the steeper one; a side without depth has no say. All float32.
     """
-    cv2 = opencv("the filter of geometric depth")
-    padded = np.pad(inverse, ((SLOPE_REACH, SLOPE_REACH), (0, 0)))
-    above, below = padded[: -2 * SLOPE_REACH], padded[2 * SLOPE_REACH :]
+    valid = depth > 0
+    inverse = np.where(valid, 1 / np.where(valid, depth, 1), 0).astype(np.float32)
+    return inverse, np.ascontiguousarray(_vertical_slope(inverse.T, reach).T), _vertical_slope(inverse, reach)
+
+
+def _vertical_slope(inverse: np.ndarray, reach: int) -> np.ndarray:
+    """Slope of inverse depth down the columns."""
+    padded = np.pad(inverse, ((reach, reach), (0, 0)))
+    above, below = padded[: -2 * reach], padded[2 * reach :]
     rise = np.where(above > 0, inverse - above, np.inf)
     fall = np.where(below > 0, below - inverse, np.inf)
     flatter = np.where(np.abs(rise) < np.abs(fall), rise, fall)
-    known = np.where(np.isfinite(flatter) & (inverse > 0), flatter, 0) / np.float32(SLOPE_REACH)
-    return cv2.medianBlur(np.ascontiguousarray(known, dtype=np.float32), 5)
+    return (np.where(np.isfinite(flatter) & (inverse > 0), flatter, 0) / np.float32(reach)).astype(np.float32)

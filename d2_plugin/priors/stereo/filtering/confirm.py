@@ -12,6 +12,7 @@ from d2_plugin.priors.geometry import (
     CONTINUOUS,
     Projection,
     ViewPair,
+    index_intrinsics,
     interpolated_surface,
     view_pair,
     viewing_rays,
@@ -45,12 +46,11 @@ def confirm(
     """
     reference, depth = cameras[index], np.ascontiguousarray(depths[index], np.float32)
     sums = _Sums(np.zeros(depth.shape, np.uint8), np.zeros(depth.shape), np.zeros(depth.shape))
-    rays = viewing_rays(reference)
     ask = _ask_compiled if kernel.library() else ask_source
     for other, source in enumerate(cameras):
         if other != index:
-            ask(sums, rays, depth, np.ascontiguousarray(depths[other], np.float32), reference, source, settings)
-    spread = np.sqrt(sums.difference / np.where(sums.information > 0, sums.information, 1))
+            ask(sums, depth, np.ascontiguousarray(depths[other], np.float32), reference, source, settings)
+    spread = np.sqrt(sums.difference / (sums.information + (sums.information == 0)))
     return Confirmation(sums.confirming, np.sqrt(sums.information), spread)
 
 
@@ -67,7 +67,6 @@ class _Sums(NamedTuple):
 
 def _ask_compiled(
     sums: _Sums,
-    rays: np.ndarray,
     depth: np.ndarray,
     theirs: np.ndarray,
     reference: Camera,
@@ -75,6 +74,7 @@ def _ask_compiled(
     settings: StereoSettings,
 ) -> None:
     """`ask_source` in C++."""
+    rays = np.linalg.inv(index_intrinsics(reference))
     pair, back = view_pair(reference, source), view_pair(source, reference)
     low, high = np.deg2rad(settings.min_angle), np.deg2rad(settings.max_angle)
     numbers = {
@@ -91,13 +91,12 @@ def _ask_compiled(
         "nudge": np.exp(NUDGE),
         "nudge_squared": NUDGE**2,
     }
-    vectors = {"A": pair.A, "k": pair.k, "back_A": back.A, "back_k": back.k, "direction": pair.direction}
-    kernel.confirm(depth.shape, numbers, vectors, {"rays": rays, "depth": depth, "theirs": theirs, **sums._asdict()})
+    vectors = {"A": pair.A, "k": pair.k, "back_A": back.A, "back_k": back.k, "direction": pair.direction, "rays": rays}
+    kernel.confirm(depth.shape, numbers, vectors, {"depth": depth, "theirs": theirs, **sums._asdict()})
 
 
 def ask_source(
     sums: _Sums,
-    rays: np.ndarray,
     depth: np.ndarray,
     theirs: np.ndarray,
     reference: Camera,
@@ -109,7 +108,8 @@ def ask_source(
     Each test is made of those alone that passed the one before.
     """
     rows, columns = np.nonzero(depth > 0)
-    u, v, depth, rays = columns.astype(np.float32), rows.astype(np.float32), depth[rows, columns], rays[rows, columns]
+    u, v, depth = columns.astype(np.float32), rows.astype(np.float32), depth[rows, columns]
+    rays = viewing_rays(reference)[rows, columns]
     pair, way_back = view_pair(reference, source), view_pair(source, reference)
     forth = pair.project(u, v, depth)
     seen = (sample_surface if settings.between_pixels else sample_nearest)(theirs, forth)

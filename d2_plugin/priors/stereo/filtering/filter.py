@@ -22,6 +22,9 @@ from d2_plugin.priors.stereo.filtering.confirm import confirm
 from d2_plugin.priors.stereo.filtering.precision import geometric_sigma, grey_gradient
 from d2_plugin.priors.stereo.settings import StereoSettings
 
+NEVER = np.float32(1e3)
+"""Beyond any logarithm of a float32 depth: neutral in a minimum."""
+
 
 @dataclass(frozen=True, eq=False)
 class GeometricDepth:
@@ -64,30 +67,38 @@ def filter_depths(
     Returns:
         One `GeometricDepth` per camera. Nothing survives where no source can confirm it.
     """
-    known = [np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32) for depth in depths]
-    matched = [np.where(cost < settings.cost_max, depth, 0) for depth, cost in zip(known, costs)]
-    textured = [np.where(texture_mask(gray, settings), depth, 0) for gray, depth in zip(grays, matched)]
+    # Products with masks where nothing is infinite: NumPy's choice takes ten times as long.
+    known = [_finite(depth) for depth in depths]
+    matched = [depth * (cost < settings.cost_max) for depth, cost in zip(known, costs)]
+    textured = [depth * texture_mask(gray, settings) for gray, depth in zip(grays, matched)]
     # The unfiltered map is asked: a neighbour that matched badly may still tell where the surface runs.
     coherent = [coherence(gray, depth, settings) for gray, depth in zip(grays, known)]
-    candidates = [np.where(share >= settings.coherence_min, z, 0) for share, z in zip(coherent, textured)]
+    candidates = [z * (share >= settings.coherence_min) for share, z in zip(coherent, textured)]
     results = []
     for index, (gray, cost) in enumerate(zip(grays, costs)):
         confirmation = confirm(index, cameras, candidates, settings)
         needed = min(settings.min_sources, len(cameras) - 1)
-        confirmed = np.where(confirmation.sources >= max(needed, 1), candidates[index], 0)
+        confirmed = candidates[index] * (confirmation.sources >= max(needed, 1))
         final = remove_speckles(confirmed, settings.speckle_size, settings.relative_depth_max)
         survivors = {
             "pixels": gray.size,
-            "matched": int(np.count_nonzero(matched[index])),
-            "textured": int(np.count_nonzero(textured[index])),
-            "coherent": int(np.count_nonzero(candidates[index])),
-            "confirmed": int(np.count_nonzero(confirmed)),
-            "kept": int(np.count_nonzero(final)),
+            "matched": int(np.count_nonzero(matched[index] > 0)),
+            "textured": int(np.count_nonzero(textured[index] > 0)),
+            "coherent": int(np.count_nonzero(candidates[index] > 0)),
+            "confirmed": int(np.count_nonzero(confirmed > 0)),
+            "kept": int(np.count_nonzero(final > 0)),
         }
         evidence = (coherent[index], confirmation.parallax, confirmation.spread, grey_gradient(gray))
         sigma = geometric_sigma(final, *evidence)
         results.append(GeometricDepth(final, np.asarray(cost, np.float32), confirmation.sources, survivors, sigma))
     return results
+
+
+def _finite(depth: np.ndarray) -> np.ndarray:
+    """A raw map as float32, 0 where it has no depth."""
+    known = np.fmax(depth, 0, dtype=np.float32)
+    known[known == np.inf] = 0
+    return known
 
 
 def texture_mask(gray: np.ndarray, settings: StereoSettings) -> np.ndarray:
@@ -116,8 +127,8 @@ def remove_speckles(depth: np.ndarray, size: int, relative_step: float) -> np.nd
         return depth.astype(np.float32)
     cv2 = opencv("the filter of geometric depth")
     valid = depth > 0
-    logs = np.log(np.where(valid, depth, 1), dtype=np.float32)
-    scaled = (logs - logs[valid].min()) / relative_step * 4
-    steps = np.where(valid, np.clip(scaled, 0, 32000) + 1, 0).astype(np.int16)
+    logs = np.log(np.fmax(depth, 0) * valid + ~valid, dtype=np.float32)
+    scaled = (logs - (logs + NEVER * ~valid).min()) / relative_step * 4
+    steps = ((np.clip(scaled, 0, 32000) + 1) * valid).astype(np.int16)
     cv2.filterSpeckles(steps, 0, size, 8)
     return np.where(steps > 0, depth, 0).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The compiled tests of the filter (`kernels/filter.cpp`): the bits of the NumPy code in a sixth of its time.
+"""The compiled filter (`kernels/filter.cpp`, `kernels/precision.cpp`): the bits of the NumPy code in less time.
 
 Compiled at first use; runs on `torch.get_num_threads()` threads, and results are the same bits for any number of them.
 """
@@ -15,7 +15,7 @@ import torch
 
 from d2_plugin.compiler import NoCompiler, load_library
 
-SOURCE = Path(__file__).parent / "kernels" / "filter.cpp"
+SOURCES = tuple(Path(__file__).parent / "kernels" / name for name in ("filter.cpp", "precision.cpp"))
 _STEREO = Path(__file__).parents[1] / "kernels"
 _RASTERIZER = Path(__file__).parents[3] / "rasterizer" / "kernels"  # no import: only its header is shared
 HEADERS = (_RASTERIZER / "parallel.h", *(_STEREO / name for name in ("lanes.h", "numbers.h")))
@@ -23,6 +23,15 @@ FLAGS = ("-ffp-contract=off",)
 """No contraction: NumPy has none either."""
 
 _int, _float, _double, _pointer = ctypes.c_int32, ctypes.c_float, ctypes.c_double, ctypes.c_void_p
+
+
+class _Slopes(ctypes.Structure):
+    """d2::Slopes of kernels/filter.cpp."""
+
+    _fields_ = (
+        *((name, _int) for name in ("width", "height", "reach", "threads")),
+        *((name, _pointer) for name in ("depth", "inverse", "slope_x", "slope_y")),
+    )
 
 
 class _Coherence(ctypes.Structure):
@@ -45,11 +54,36 @@ class _Confirm(ctypes.Structure):
         ("back_A", _float * 9),
         ("back_k", _float * 3),
         ("direction", _float * 3),
+        ("rays", _double * 9),
         *((name, _float) for name in ("continuous", "reprojection_max", "relative_depth_max")),
         *((name, _float) for name in ("sine_min", "cosine_min", "sine_max", "cosine_max")),
         *((name, _double) for name in ("nudge", "nudge_squared")),
-        *((name, _pointer) for name in ("rays", "depth", "theirs", "confirming", "information", "difference")),
+        *((name, _pointer) for name in ("depth", "theirs", "confirming", "information", "difference")),
     )
+
+
+class _Scatter(ctypes.Structure):
+    """d2::Scatter of kernels/precision.cpp."""
+
+    _fields_ = (
+        *((name, _int) for name in ("width", "height", "reach", "threads")),
+        ("slack", _double),
+        *((name, _pointer) for name in ("depth", "scatter")),
+    )
+
+
+class _Sigma(ctypes.Structure):
+    """d2::Sigma of kernels/precision.cpp."""
+
+    _fields_ = (
+        *((name, _int) for name in ("width", "height", "threads")),
+        *((name, _float) for name in ("matching", "gray_noise", "flattest", "per_incoherence")),
+        *((name, _double) for name in ("of_scatter", "of_spread", "floor_squared")),
+        *((name, _pointer) for name in ("depth", "coherence", "gradient", "parallax", "spread", "scatter", "sigma")),
+    )
+
+
+_CALLS = {"slopes": _Slopes, "coherence": _Coherence, "confirm": _Confirm, "scatter": _Scatter, "sigma": _Sigma}
 
 
 @functools.cache
@@ -60,15 +94,23 @@ def library() -> ctypes.CDLL | None:
         CompileError: see `d2_plugin.compiler.load_library`.
     """
     try:
-        kernel = load_library("filter", (SOURCE,), HEADERS, FLAGS)
+        kernel = load_library("filter", SOURCES, HEADERS, FLAGS)
     except NoCompiler:
         return None
-    for name, call in ("coherence", _Coherence), ("confirm", _Confirm):
+    for name, call in _CALLS.items():
         function, size = getattr(kernel, f"d2_{name}"), getattr(kernel, f"d2_{name}_size")
         function.argtypes, function.restype = (ctypes.POINTER(call),), None
         size.restype = ctypes.c_int64
-        assert size() == ctypes.sizeof(call), f"the call of {name} differs between kernel.py and filter.cpp"
+        assert size() == ctypes.sizeof(call), f"the call of {name} differs between kernel.py and its source"
     return kernel
+
+
+def slopes(depth: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """See `coherence.reference_slopes`; depth is contiguous float32."""
+    inverse, across, down = (np.empty_like(depth) for _ in range(3))
+    maps = {"depth": depth, "inverse": inverse, "slope_x": across, "slope_y": down}
+    _run("slopes", _Slopes(reach=reach), depth.shape, maps)
+    return inverse, across, down
 
 
 def coherence(
@@ -106,6 +148,25 @@ def confirm(
     for name, values in vectors.items():
         getattr(call, name)[:] = values.ravel().tolist()
     _run("confirm", call, shape, maps)
+
+
+def scatter(depth: np.ndarray, reach: int, slack: float) -> np.ndarray:
+    """See `precision.reference_scatter`; depth is contiguous float32."""
+    found = np.empty(depth.shape)
+    _run("scatter", _Scatter(reach=reach, slack=slack), depth.shape, {"depth": depth, "scatter": found})
+    return found
+
+
+def sigma(numbers: dict[str, float], maps: dict[str, np.ndarray]) -> np.ndarray:
+    """See `precision.reference_sigma`.
+
+    Args:
+        numbers: fields of d2::Sigma.
+        maps: the contiguous arrays that it points to, but for the result.
+    """
+    found = np.empty(maps["depth"].shape, np.float32)
+    _run("sigma", _Sigma(**numbers), found.shape, maps | {"sigma": found})
+    return found
 
 
 def _run(name: str, call: Any, shape: tuple[int, ...], arrays: dict[str, np.ndarray]) -> None:
