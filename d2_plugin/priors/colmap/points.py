@@ -4,9 +4,9 @@ COLMAP would estimate the geometry of every pair of pictures anew to tell good m
 known here, so a match is kept when it lies on its epipolar line: no random sampling, and pairs with a handful of
 matches still count.
 
-OpenCV's SIFT takes a third of the CPU time of COLMAP's, which is here. With four scales in an octave and as many points
-D2 was the same (studio, plaza, sear_steak, 300 and 1000 steps, three seeds: +.04 +- .06 dB), but the backbone alone lost
-.6 +- .4 dB on six pairs of plaza's cameras, which see two dozen points.
+OpenCV's SIFT takes a third of the CPU time of COLMAP's, which is here. With four scales in an octave and as many
+points D2 was the same (studio, plaza, sear_steak, 300 and 1000 steps, three seeds: +.04 +- .06 dB), but the backbone
+alone lost .6 +- .4 dB on six pairs of plaza's cameras, which see two dozen points.
 """
 
 from __future__ import annotations
