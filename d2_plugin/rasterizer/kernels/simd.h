@@ -92,6 +92,10 @@ D2_INLINE Floats reciprocal(Floats a) {
   const Floats estimate = _mm512_rcp14_ps(a.v);
   return estimate * fnma(a, estimate, Floats(2.f));
 }
+D2_INLINE Floats reciprocal_root(Floats a) {
+  const Floats estimate = _mm512_rsqrt14_ps(a.v);
+  return estimate * fnma(Floats(0.5f) * a * estimate, estimate, Floats(1.5f));
+}
 D2_INLINE float sum(Floats a) { return _mm512_reduce_add_ps(a.v); }
 D2_INLINE float largest(Floats a) { return _mm512_reduce_max_ps(a.v); }
 
@@ -124,6 +128,10 @@ D2_INLINE Floats floor(Floats a) { return _mm256_floor_ps(a.v); }
 D2_INLINE Floats reciprocal(Floats a) {
   const Floats estimate = _mm256_rcp_ps(a.v);
   return estimate * fnma(a, estimate, Floats(2.f));
+}
+D2_INLINE Floats reciprocal_root(Floats a) {
+  const Floats estimate = _mm256_rsqrt_ps(a.v);
+  return estimate * fnma(Floats(0.5f) * a * estimate, estimate, Floats(1.5f));
 }
 D2_INLINE Floats add_to_exponent(Floats a, Floats low_bits) {
   const __m256i exponent = _mm256_slli_epi32(_mm256_castps_si256(low_bits.v), 23);
@@ -178,6 +186,7 @@ D2_INLINE Floats floor(Floats a) {
   return near - where(near > a, Floats(1.f));
 }
 D2_INLINE Floats reciprocal(Floats a) { return Floats(1.f) / a; }
+D2_INLINE Floats reciprocal_root(Floats a) { return Floats(1.f) / sqrt(a); }
 D2_INLINE Floats add_to_exponent(Floats a, Floats low_bits) {
   return Native(Integers(a.v) + (Integers(low_bits.v) << 23));
 }
@@ -186,6 +195,17 @@ D2_INLINE float larger(float a, float b) { return a > b ? a : b; }
 D2_INLINE float largest(Floats a) { return larger(larger(a.v[0], a.v[2]), larger(a.v[1], a.v[3])); }
 
 #endif
+
+// LANES bytes as numbers.
+D2_INLINE Floats load_bytes(const uint8_t* from) {
+#if defined(D2_AVX512)
+  return _mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(_mm_loadu_si128(reinterpret_cast<const __m128i*>(from))));
+#elif defined(D2_AVX2)
+  return _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(from))));
+#else
+  return Native{float(from[0]), float(from[1]), float(from[2]), float(from[3])};
+#endif
+}
 
 // 2^x for x in -126..127 by a minimax polynomial on [-1/2, 1/2], relative error 7.5e-8 before rounding; beyond, the
 // result means nothing. Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits, to be shifted into the
