@@ -16,7 +16,6 @@ constexpr int RUN = 16;              // vectors that are added up in float32 bef
 constexpr float SAFE_SQUARE = 1e18f;  // beyond it a square leaves the range of float32
 constexpr float LEAST = 1e-15f;       // of epsilon: far below what residuals are rounded to, and its square is normal
 constexpr float EPSILON = 1e-8f;
-#define D2_FLAT __attribute__((always_inline))
 
 // What one call works on, as native_depth_loss.py fills it in.
 struct DepthLoss {

@@ -17,6 +17,7 @@
 #endif
 
 #define D2_INLINE inline __attribute__((always_inline))
+#define D2_FLAT __attribute__((always_inline))  // of a lambda
 
 namespace d2 {
 
@@ -420,6 +421,32 @@ D2_INLINE void transpose(Floats (&m)[LANES]) {
     m[k] = _mm512_shuffle_f32x4(even_low, even_high, 0x88), m[8 + k] = _mm512_shuffle_f32x4(even_low, even_high, 0xdd);
     m[4 + k] = _mm512_shuffle_f32x4(odd_low, odd_high, 0x88), m[12 + k] = _mm512_shuffle_f32x4(odd_low, odd_high, 0xdd);
   }
+}
+#elif defined(D2_AVX2)
+D2_INLINE void transpose(Floats (&m)[LANES]) {
+  __m256 a[8], b[8];
+  for (int i = 0; i < 8; i += 2) {
+    a[i] = _mm256_unpacklo_ps(m[i].v, m[i + 1].v);
+    a[i + 1] = _mm256_unpackhi_ps(m[i].v, m[i + 1].v);
+  }
+  for (int i = 0; i < 8; i += 4)
+    for (int k = 0; k < 2; k++) {
+      b[i + 2 * k] = _mm256_shuffle_ps(a[i + k], a[i + k + 2], 0x44);
+      b[i + 2 * k + 1] = _mm256_shuffle_ps(a[i + k], a[i + k + 2], 0xee);
+    }
+  // b[4 q + k]: half p holds number 4 p + k of rows 4 q..4 q + 3.
+  for (int k = 0; k < 4; k++) {
+    m[k] = _mm256_permute2f128_ps(b[k], b[4 + k], 0x20);
+    m[4 + k] = _mm256_permute2f128_ps(b[k], b[4 + k], 0x31);
+  }
+}
+#else
+D2_INLINE void transpose(Floats (&m)[LANES]) {
+  for (int i = 0; i < LANES; i++)
+    for (int j = i + 1; j < LANES; j++) {
+      const float kept = m[i].v[j];
+      m[i].v[j] = m[j].v[i], m[j].v[i] = kept;
+    }
 }
 #endif
 
