@@ -2,10 +2,10 @@
 // over the rows: what photometric.py does in torch.
 //
 // Pictures stay as they are, [H, W, C] with channels interleaved: a step of one pixel is a step of C numbers. LANES
-// rows are worked on together, along the row unit by unit, where a unit is LANES pixels. Going down the columns a vector
-// holds neighbours of one row; going along the row it holds the same number of LANES rows, so that either way a blur
-// adds up whole vectors, each of them read once for LANES sums. A row of the gradient needs 11 rows of the derivatives of
-// SSIM, which wait in a ring. Sums over a row are added up in the order of pixels, and those of rows in the order of
+// rows are worked on together, along the row unit by unit, where a unit is LANES pixels. Going down the columns a
+// vector holds neighbours of one row; going along the row it holds the same number of LANES rows, so that either way a
+// blur adds up whole vectors, each of them read once for LANES sums. A row of the gradient needs 11 rows of the
+// derivatives of SSIM, which wait in a ring. Sums over a row are added up in the order of pixels, and those of rows in the order of
 // rows, so results are the same bits for any number of threads.
 #include <algorithm>
 #include <cstdint>
