@@ -167,10 +167,11 @@ class SplatModel(ABC):
         render = rasterize(
             splats, colors, view, self.settings.raster, background=background, screen_offsets=self.screen_offsets
         )
-        for observer in self.observers:
-            observer.rendered(view, render)
         own = self.background if background is None else None
-        render = render if own is None else own.behind(render, view)
+        shown = render if own is None else own.joined(render, view)
+        for observer in self.observers:
+            observer.rendered(view, render._replace(alpha=shown.alpha))
+        render = shown
         return render if self.appearance is None else self.appearance.seen_by(view.camera, render)
 
     def look_at(self, views: Sequence[View], pictures: Callable[[int], Tensor]) -> None:

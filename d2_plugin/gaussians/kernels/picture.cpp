@@ -29,7 +29,7 @@ struct Behind {
   const float *basis, *constant, *harmonics;             // [rows * columns, terms], [1, 3], [terms - 1, 3]
   const float *color, *alpha;                            // [height, width, 3], [height, width]
   float* out;                                            // [height, width, 3]
-  const float* grad_out;                                 // null going forward
+  const float *grad_out, *more_alpha;                    // null going forward; what else came to alpha, or null
   float *grad_alpha, *grad_constant, *grad_harmonics;
 
   int64_t nodes() const { return int64_t(rows) * columns; }
@@ -99,9 +99,10 @@ static void composite(const float* upper, const float* lower, float low, const f
     out[i] = in[i] + (1 - alpha[i / 3]) * (upper[i] + low * (lower[i] - upper[i]));
 }
 
-// The transpose, pixels begin..end-1 of the row: adds what goes to both rows of nodes, and gives the gradient of alpha.
+// The transpose, pixels begin..end-1 of the row: adds what goes to both rows of nodes, and gives the gradient of alpha
+// with what else came to it, `more` or null.
 static void split(const float* upper, const float* lower, float low, const float* alpha, const float* gradient,
-                  int begin, int end, float* to_upper, float* to_lower, float* on_alpha) {
+                  const float* more, int begin, int end, float* to_upper, float* to_lower, float* on_alpha) {
   int x = begin;
   for (; x + LANES <= end; x += LANES) {
     Floats rest[3], products[3], colors[3];
@@ -115,7 +116,8 @@ static void split(const float* upper, const float* lower, float low, const float
       (Floats::load(to_upper + i) + (part - down)).store(to_upper + i);
     }
     unweave<LANES>(products, colors);
-    (-(colors[0] + colors[1] + colors[2])).store(on_alpha + x);
+    const Floats through = colors[0] + colors[1] + colors[2];
+    ((more ? Floats::load(more + x) : Floats(0.f)) - through).store(on_alpha + x);
   }
   for (; x < end; x++) {
     float product = 0;
@@ -125,7 +127,7 @@ static void split(const float* upper, const float* lower, float low, const float
       to_lower[i] += down;
       to_upper[i] += part - down;
     }
-    on_alpha[x] = -product;
+    on_alpha[x] = (more ? more[x] : 0.f) - product;
   }
 }
 
@@ -153,7 +155,8 @@ class Strip {
     for (int begin = 0; begin < b_.width; begin += SEGMENT)
       for (int y = begin_; y < end_; y++) {
         const int64_t at = int64_t(y) * b_.width;
-        split(upper_.data(), lower_.data(), low(y), b_.alpha + at, b_.grad_out + 3 * at, begin,
+        const float* const more = b_.more_alpha ? b_.more_alpha + at : nullptr;
+        split(upper_.data(), lower_.data(), low(y), b_.alpha + at, b_.grad_out + 3 * at, more, begin,
               std::min(b_.width, begin + SEGMENT), to_upper.data(), to_lower.data(), b_.grad_alpha + at);
       }
     gather_row(b_, to_upper.data(), on_upper);

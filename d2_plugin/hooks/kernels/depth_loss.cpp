@@ -12,6 +12,7 @@
 namespace d2 {
 
 constexpr int64_t CHUNK = 4096;      // pixels of one task
+constexpr int64_t WORTH_WAKING = 32;  // chunks; fewer are done before another thread is awake
 constexpr int RUN = 16;              // vectors that are added up in float32 before the sum goes to float64
 constexpr float SAFE_SQUARE = 1e18f;  // beyond it a square leaves the range of float32
 constexpr float LEAST = 1e-15f;       // of epsilon: far below what residuals are rounded to, and its square is normal
@@ -124,7 +125,8 @@ static Sums compare(const DepthLoss& d, float scale, int64_t begin, int64_t end)
 
 template <class Body>
 static void for_each_chunk(const DepthLoss& d, Body body) {
-  parallel_for(d.threads, (d.pixels + CHUNK - 1) / CHUNK, [&](int64_t chunk) {
+  const int64_t chunks = (d.pixels + CHUNK - 1) / CHUNK;
+  parallel_for(chunks < WORTH_WAKING ? 1 : d.threads, chunks, [&](int64_t chunk) {
     body(chunk, chunk * CHUNK, std::min(d.pixels, (chunk + 1) * CHUNK));
   });
 }
