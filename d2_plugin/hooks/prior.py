@@ -99,16 +99,8 @@ class PriorPixels(KnownPixels):
         sigma = None if prior.sigma is None else prior.sigma.flatten()
         self._maps: KnownMaps
         self.__dict__["_maps"] = KnownMaps(kind, prior.depth.flatten(), sigma)  # frozen, as a list of pixels is
-
-    @cached_property
-    def near(self) -> int:
-        """How many are not far."""
-        return int(torch.count_nonzero(self._maps.kind == NEAR))
-
-    @cached_property
-    def count(self) -> int:
-        """How many there are."""
-        return int(torch.count_nonzero(self._maps.kind))
+        near, far = (int(torch.count_nonzero(kind == which)) for which in (NEAR, FAR))
+        self.__dict__.update(near=near, count=near + far)
 
     @cached_property
     def index(self) -> Tensor:
