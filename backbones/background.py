@@ -68,10 +68,15 @@ class Background:
 
     def behind(self, render: Render, view: View) -> Render:
         """The render with the background where the Gaussians leave some of a ray."""
+        return self.joined(render, view)._replace(alpha=render.alpha)
+
+    def joined(self, render: Render, view: View) -> Render:
+        """The same; gradients of the alpha that it returns are added up along with the background's."""
         basis = self._basis(view)
         if can_draw(render.color, basis):
             parts = render.color, render.alpha, basis, self.constant, self.harmonics
-            return render._replace(color=composite_background(*parts, _nodes(view)))
+            color, alpha = composite_background(*parts, _nodes(view))
+            return render._replace(color=color, alpha=alpha)
         return render._replace(color=render.color + (1 - render.alpha)[..., None] * self._interpolated(view, basis))
 
     def _interpolated(self, view: View, basis: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -163,14 +164,15 @@ class SplatModel(ABC):
         self._drawn = splats.rows
         if self.dropout is not None and torch.is_grad_enabled():
             splats = splats._replace(opacities=self.dropout.thinned(splats.opacities))
-        self.screen_offsets = splats.means.new_zeros(len(splats.means), 2, requires_grad=torch.is_grad_enabled())
+        self.screen_offsets = _zeros(splats.means).requires_grad_(torch.is_grad_enabled())
         render = rasterize(
             splats, colors, view, self.settings.raster, background=background, screen_offsets=self.screen_offsets
         )
-        for observer in self.observers:
-            observer.rendered(view, render)
         own = self.background if background is None else None
-        render = render if own is None else own.behind(render, view)
+        shown = render if own is None else own.joined(render, view)
+        for observer in self.observers:
+            observer.rendered(view, render._replace(alpha=shown.alpha))
+        render = shown
         return render if self.appearance is None else self.appearance.seen_by(view.camera, render)
 
     def look_at(self, views: Sequence[View], pictures: Callable[[int], Tensor]) -> None:
@@ -269,6 +271,13 @@ class SplatModel(ABC):
         self.appearance = Appearance(self.gaussians.device) if "appearance" in state else None
         if self.appearance is not None:
             self.appearance.load_state_dict(state["appearance"])
+
+
+def _zeros(means: Tensor) -> Tensor:
+    """Offsets [M, 2] of centres [M, 3]. On the CPU not by torch, whose threads would spin on for long after it."""
+    if means.device.type == "cpu" and means.dtype == torch.float32:
+        return torch.from_numpy(np.zeros((len(means), 2), np.float32))
+    return means.new_zeros(len(means), 2)
 
 
 def shared_rates(settings: SplatSettings, extent: float) -> dict[str, float]:

@@ -153,7 +153,7 @@ class D2Hooks:
             if term is not None:
                 self.trace.append(Trace(step, name, "loss", 0))
                 self.telling.lost(name, term)
-                total = total + term
+                total = total + term if isinstance(total, Tensor) else term
         self._finite.heard(total, shown)
         return total
 

@@ -27,7 +27,7 @@ class _Behind(ctypes.Structure):
     _fields_ = (
         *((name, _int) for name in ("height", "width", "rows", "columns", "stride", "terms", "threads")),
         *((name, _pointer) for name in ("basis", "constant", "harmonics", "color", "alpha", "out")),
-        *((name, _pointer) for name in ("grad_out", "grad_alpha", "grad_constant", "grad_harmonics")),
+        *((name, _pointer) for name in ("grad_out", "more_alpha", "grad_alpha", "grad_constant", "grad_harmonics")),
     )
 
 
@@ -108,8 +108,11 @@ class _Colors(torch.autograd.Function):
 
 def composite_background(
     color: Tensor, alpha: Tensor, basis: Tensor, constant: Tensor, harmonics: Tensor, nodes: tuple[int, int, int]
-) -> Tensor:
-    """color + (1 - alpha) background, [H, W, 3], differentiable once by all but the basis.
+) -> tuple[Tensor, Tensor]:
+    """color + (1 - alpha) background, [H, W, 3], differentiable once by all but the basis; and alpha.
+
+    Whoever has more to do with alpha takes the one from here: its gradient is added up along with the background's,
+    where torch would walk over the picture once more, with threads of its own.
 
     Args:
         color, alpha: of a render, [H, W, 3] and [H, W], float32 on the CPU.
@@ -123,7 +126,7 @@ def composite_background(
 
 class _Background(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> Tensor:
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:
         *tensors, nodes = inputs
         parts = tuple(part.contiguous() for part in tensors)
         out = torch.empty_like(parts[0])
@@ -132,16 +135,19 @@ class _Background(torch.autograd.Function):
         _kernel().d2_behind(call)
         ctx.save_for_backward(*parts[1:])
         ctx.nodes = nodes
-        return out
+        ctx.set_materialize_grads(False)
+        return out, inputs[1]
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, gradient: Tensor | None, more: Tensor | None) -> tuple[Tensor | None, ...]:
+        if gradient is None:
+            return None, more, None, None, None, None
         alpha, _, constant, harmonics = ctx.saved_tensors
-        gradient = gradient.contiguous()
+        gradient, more = gradient.contiguous(), None if more is None else more.contiguous()
         call = _call((None, *ctx.saved_tensors), ctx.nodes)
         found = torch.empty_like(alpha), torch.empty_like(constant), torch.empty_like(harmonics)
-        call.grad_out = gradient.data_ptr()
+        call.grad_out, call.more_alpha = gradient.data_ptr(), None if more is None else more.data_ptr()
         call.grad_alpha, call.grad_constant, call.grad_harmonics = (part.data_ptr() for part in found)
         _kernel().d2_behind_backward(call)
         return gradient, found[0], None, found[1], found[2], None

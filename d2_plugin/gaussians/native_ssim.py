@@ -88,7 +88,7 @@ class _Photometric(torch.autograd.Function):
         call.differences, call.similarities = sums[0].data_ptr(), sums[1].data_ptr()
         loss = _kernel().d2_photometric(call)
         ctx.save_for_backward(gradient)
-        return image.new_tensor(loss)
+        return image.new_full((), loss)
 
     @staticmethod
     @once_differentiable

@@ -116,7 +116,9 @@ class _PixelDepthLoss(torch.autograd.Function):
         return scattered(gradient * by_depth_sum), scattered(gradient * by_alpha), None, None
 
 
-def pixel_depth_loss(depth_sum: Tensor, alpha: Tensor, pixels: KnownPixels, config: DepthLossConfig) -> Tensor:
+def pixel_depth_loss(
+    depth_sum: Tensor, alpha: Tensor, pixels: KnownPixels, config: DepthLossConfig, factor: float = 1.0
+) -> Tensor:
     """L_depth of a render: `depth_loss` of `rendered_depth` plus `opaque` times the mean of 1 - alpha at near pixels,
     computed at the known pixels alone; by a kernel where there is one.
 
@@ -124,11 +126,12 @@ def pixel_depth_loss(depth_sum: Tensor, alpha: Tensor, pixels: KnownPixels, conf
         depth_sum, alpha: sum of w z and of w, [H, W], differentiable once.
         pixels: where something is known of D*, and how much.
         config: tau_v, epsilon, sigma_full and opaque.
+        factor: what the result is multiplied by.
     """
     if can_compare(depth_sum, alpha, pixels):
-        constants = Constants(config.tau_v, config.sigma_full, config.epsilon, config.opaque)
+        constants = Constants(config.tau_v, config.sigma_full, config.epsilon, config.opaque, factor)
         return native_depth_loss(depth_sum, alpha, pixels, constants)
-    return _PixelDepthLoss.apply(depth_sum, alpha, pixels, config)
+    return factor * _PixelDepthLoss.apply(depth_sum, alpha, pixels, config)
 
 
 class DepthLoss(Hook):
@@ -139,13 +142,12 @@ class DepthLoss(Hook):
     def loss(self, context: Context) -> Tensor | None:
         """lambda_d times the mean of L_depth over the step's views that have known pixels."""
         pairs = [(view, context.prior.known(view)) for view in context.views]
-        terms = [self._term(context, view, pixels) for view, pixels in pairs if pixels is not None]
-        if len(terms) == 1:
-            return self.config.weight * terms[0]
-        return self.config.weight * torch.stack(terms).mean() if terms else None
-
-    def _term(self, context: Context, view: View, pixels: KnownPixels) -> Tensor:
-        return pixel_depth_loss(*depth_and_alpha(context, view), pixels, self.config)
+        known = [(view, pixels) for view, pixels in pairs if pixels is not None]
+        factor = self.config.weight / max(len(known), 1)
+        terms = [
+            pixel_depth_loss(*depth_and_alpha(context, view), pixels, self.config, factor) for view, pixels in known
+        ]
+        return torch.stack(terms).sum() if len(terms) > 1 else next(iter(terms), None)
 
 
 def depth_and_alpha(context: Context, view: View) -> tuple[Tensor, Tensor]:

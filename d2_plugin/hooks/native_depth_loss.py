@@ -20,30 +20,29 @@ from d2_plugin.rasterizer.frame import KERNELS as RASTERIZER_KERNELS
 from .prior import KnownPixels
 
 SOURCE = Path(__file__).parent / "kernels" / "depth_loss.cpp"
-HEADERS = (RASTERIZER_KERNELS / "parallel.h",)
+HEADERS = (RASTERIZER_KERNELS / "parallel.h", RASTERIZER_KERNELS / "simd.h")
 FLAGS = ("-ffp-contract=fast",)
 
 
 class Constants(NamedTuple):
-    """See `DepthLossConfig`."""
+    """See `DepthLossConfig`; `factor` is what all of it is multiplied by."""
 
     tau_v: float
     sigma_full: float
     epsilon: float
     opaque: float
+    factor: float
 
 
 class _Call(ctypes.Structure):
-    """d2::DepthLoss of kernels/depth_loss.cpp."""
+    """d2::DepthLoss of kernels/depth_loss.cpp; null gradients are not computed."""
 
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("known", "pixels")),
+        ("pixels", ctypes.c_int64),
         ("threads", ctypes.c_int32),
-        *((name, ctypes.c_float) for name in Constants._fields),
-        *((name, ctypes.c_void_p) for name in ("index", "depth", "sigma", "far", "depth_sum", "alpha")),
-        *((name, ctypes.c_void_p) for name in ("by_depth_sum", "by_alpha")),
-        ("total", ctypes.c_double),
-        ("upstream", ctypes.c_float),
+        *((name, ctypes.c_float) for name in ("tau_v", "sigma_full", "epsilon")),
+        *((name, ctypes.c_double) for name in ("opaque", "factor")),
+        *((name, ctypes.c_void_p) for name in ("kind", "depth", "sigma", "depth_sum", "alpha")),
         *((name, ctypes.c_void_p) for name in ("grad_depth_sum", "grad_alpha")),
     )
 
@@ -61,7 +60,6 @@ def library() -> ctypes.CDLL | None:
         return None
     call = (ctypes.POINTER(_Call),)
     kernel.d2_depth_loss.argtypes, kernel.d2_depth_loss.restype = call, ctypes.c_double
-    kernel.d2_depth_loss_backward.argtypes, kernel.d2_depth_loss_backward.restype = call, None
     kernel.d2_depth_loss_size.restype = ctypes.c_int64
     size = kernel.d2_depth_loss_size()
     assert size == ctypes.sizeof(_Call), "the call differs between native_depth_loss.py and depth_loss.cpp"
@@ -70,13 +68,20 @@ def library() -> ctypes.CDLL | None:
 
 def can_compare(depth_sum: Tensor, alpha: Tensor, pixels: KnownPixels) -> bool:
     """Whether the kernel takes these: float32 on the CPU, some known pixels, and there is a compiler."""
-    parts = depth_sum, alpha, pixels.depth, pixels.sigma
-    fit = all(part.dtype == torch.float32 and part.device.type == "cpu" for part in parts) and len(pixels.index) > 0
-    return fit and depth_sum.shape == alpha.shape and library() is not None
+    if pixels.count == 0 or depth_sum.shape != alpha.shape:
+        return False
+    maps = pixels.maps(depth_sum.numel())
+    parts = (depth_sum, alpha, maps.depth) + ((maps.sigma,) if maps.sigma is not None else ())
+    return all(part.dtype == torch.float32 and part.device.type == "cpu" for part in parts) and library() is not None
 
 
 def native_depth_loss(depth_sum: Tensor, alpha: Tensor, pixels: KnownPixels, constants: Constants) -> Tensor:
-    """See `depth_loss.pixel_depth_loss`; differentiable once by `depth_sum` and `alpha`."""
+    """See `depth_loss.pixel_depth_loss`; differentiable once by `depth_sum` and `alpha`.
+
+    Gradients are made along with the value, `factor` in them: what comes back is then 1, and nothing is left to do.
+    """
+    if not torch.is_grad_enabled():
+        depth_sum, alpha = depth_sum.detach(), alpha.detach()
     return _DepthLoss.apply(depth_sum, alpha, pixels, constants)
 
 
@@ -86,25 +91,21 @@ class _DepthLoss(torch.autograd.Function):
         kernel = library()
         assert kernel is not None, "native_depth_loss is for where can_compare is True"
         depth_sum, alpha = depth_sum.contiguous(), alpha.contiguous()
-        slopes = torch.empty(2, len(pixels.index))
-        near = max(pixels.near, 1)
-        constants = constants._replace(opaque=constants.opaque / near)
-        call = _Call(len(pixels.index), depth_sum.numel(), torch.get_num_threads(), *constants)
-        call.depth, call.sigma = pixels.depth.data_ptr(), pixels.sigma.data_ptr()
-        call.index, call.far = pixels.index.data_ptr(), pixels.far.data_ptr()
-        call.depth_sum, call.alpha = depth_sum.data_ptr(), alpha.data_ptr()
-        call.by_depth_sum, call.by_alpha = slopes.data_ptr(), slopes.data_ptr() + 4 * len(pixels.index)
-        loss = kernel.d2_depth_loss(call)
-        ctx.call, ctx.pixels, ctx.kernel, ctx.shape = call, pixels, kernel, depth_sum.shape
-        ctx.save_for_backward(slopes)  # the rest of the call is not looked at again, or lives in `pixels`
-        return depth_sum.new_tensor(loss)
+        maps = pixels.maps(depth_sum.numel())
+        constants = constants._replace(opaque=constants.opaque / max(pixels.near, 1))
+        call = _Call(depth_sum.numel(), torch.get_num_threads(), *constants)
+        call.kind, call.depth, call.depth_sum = maps.kind.data_ptr(), maps.depth.data_ptr(), depth_sum.data_ptr()
+        call.sigma, call.alpha = None if maps.sigma is None else maps.sigma.data_ptr(), alpha.data_ptr()
+        if any(ctx.needs_input_grad[:2]):
+            found = torch.empty_like(depth_sum), torch.empty_like(alpha)
+            call.grad_depth_sum, call.grad_alpha = (part.data_ptr() for part in found)
+            ctx.save_for_backward(*found)
+        return depth_sum.new_full((), kernel.d2_depth_loss(call))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
-        (slopes,) = ctx.saved_tensors
-        found = slopes.new_empty(ctx.shape), slopes.new_empty(ctx.shape)
-        ctx.call.upstream = upstream.item()
-        ctx.call.grad_depth_sum, ctx.call.grad_alpha = found[0].data_ptr(), found[1].data_ptr()
-        ctx.kernel.d2_depth_loss_backward(ctx.call)
-        return *found, None, None
+        by_depth_sum, by_alpha = ctx.saved_tensors
+        if upstream.item() != 1:
+            by_depth_sum, by_alpha = by_depth_sum * upstream, by_alpha * upstream
+        return by_depth_sum, by_alpha, None, None

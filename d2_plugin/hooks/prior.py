@@ -6,7 +6,7 @@ import logging
 from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -38,6 +38,21 @@ OUTLINE = 2
 else stand in free space."""
 
 
+NEAR, FAR = 1, 2
+"""What `KnownMaps.kind` says where something is known."""
+
+
+class KnownMaps(NamedTuple):
+    """What may supervise one view, pixel by pixel, [H * W]; depth and sigma mean nothing where nothing is known."""
+
+    kind: Tensor
+    """uint8: 0 where nothing is known, `NEAR`, or `FAR`: there only a depth in front of `depth` is wrong."""
+    depth: Tensor
+    """World units; at far pixels a lower bound."""
+    sigma: Tensor | None
+    """Relative standard deviation of the depth; far pixels count as if it were 0, and all do where there is none."""
+
+
 @dataclass(frozen=True, eq=False)
 class KnownPixels:
     """What may supervise one view: where something is known of D*, and how much; all [K]."""
@@ -55,6 +70,66 @@ class KnownPixels:
     def near(self) -> int:
         """How many are not far."""
         return int((~self.far).sum())
+
+    @cached_property
+    def count(self) -> int:
+        """How many there are."""
+        return len(self.index)
+
+    def maps(self, numel: int) -> KnownMaps:
+        """The same as maps of a view of so many pixels."""
+        kind = torch.zeros(numel, dtype=torch.uint8, device=self.index.device)
+        kind[self.index] = torch.where(self.far, FAR, NEAR).byte()
+        depth, sigma = (part.new_zeros(numel).index_copy_(0, self.index, part) for part in (self.depth, self.sigma))
+        return KnownMaps(kind, depth, sigma)
+
+    @property
+    def bytes(self) -> int:
+        """The memory that they take."""
+        return sum(part.numel() * part.element_size() for part in (self.index, self.depth, self.sigma, self.far))
+
+
+class PriorPixels(KnownPixels):
+    """Those of a prior: its own maps, not copies of them; the list is made where somebody asks for it."""
+
+    def __init__(self, prior: DepthPrior) -> None:
+        """Pixels with a finite sigma, and far ones; without sigma, as in the paper, the trusted ones."""
+        known = prior.trusted if prior.sigma is None else prior.support & torch.isfinite(prior.sigma)
+        kind = (known.byte() * NEAR + prior.far.byte() * FAR).flatten()
+        sigma = None if prior.sigma is None else prior.sigma.flatten()
+        self._maps: KnownMaps
+        self.__dict__["_maps"] = KnownMaps(kind, prior.depth.flatten(), sigma)  # frozen, as a list of pixels is
+        near, far = (int(torch.count_nonzero(kind == which)) for which in (NEAR, FAR))
+        self.__dict__.update(near=near, count=near + far)
+
+    @cached_property
+    def index(self) -> Tensor:
+        """See `KnownPixels`, as all that follows."""
+        return torch.nonzero(self._maps.kind).squeeze(1)
+
+    @cached_property
+    def depth(self) -> Tensor:
+        return self._maps.depth[self.index]
+
+    @cached_property
+    def sigma(self) -> Tensor:
+        sigma = self._maps.sigma
+        return torch.zeros_like(self.depth) if sigma is None else sigma[self.index].masked_fill(self.far, 0)
+
+    @cached_property
+    def far(self) -> Tensor:
+        return self._maps.kind[self.index] == FAR
+
+    def maps(self, numel: int) -> KnownMaps:
+        """See `KnownPixels`; the size is the prior's."""
+        assert numel == self._maps.kind.numel(), "the loader refuses priors of another size than the view's"
+        return self._maps
+
+    @property
+    def bytes(self) -> int:
+        """The memory that they take beside the prior."""
+        made = (self._maps.kind, *(self.__dict__.get(name) for name in ("index", "depth", "sigma", "far")))
+        return sum(part.numel() * part.element_size() for part in made if part is not None)
 
 
 class PriorLoader:
@@ -81,7 +156,7 @@ class PriorLoader:
             self._check(view, prior)
             prior = _usable(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior))
         self._kept[key] = prior
-        while len(self._kept) > 1 and sum(map(_bytes, self._kept.values())) > self.keep_bytes:
+        while len(self._kept) > 1 and self._bytes() > self.keep_bytes:
             dropped, _ = self._kept.popitem(last=False)
             self._pixels.pop(dropped, None)
         return prior
@@ -92,9 +167,14 @@ class PriorLoader:
         if prior is None:
             return None
         if key not in self._pixels:
-            self._pixels[key] = _known(prior)
+            self._pixels[key] = PriorPixels(prior)
         pixels = self._pixels[key]
-        return pixels if len(pixels.index) else None
+        return pixels if pixels.count else None
+
+    def _bytes(self) -> int:
+        tensors = [part for prior in self._kept.values() if prior is not None for part in prior if part is not None]
+        held = sum(part.numel() * part.element_size() for part in tensors)
+        return held + sum(pixels.bytes for pixels in self._pixels.values())
 
     def _check(self, view: View, prior: DepthPrior) -> None:
         height, width = prior.depth.shape
@@ -126,19 +206,3 @@ def _inside(far: Tensor) -> Tensor:
     """The far pixels [H, W] at least `OUTLINE` pixels inside of what is far; the rim of the picture is no outline."""
     others = (~far).float()[None, None]
     return F.max_pool2d(others, 2 * OUTLINE + 1, stride=1, padding=OUTLINE)[0, 0] == 0
-
-
-def _known(prior: DepthPrior) -> KnownPixels:
-    """Pixels with a finite sigma, and far ones; without sigma, as in the paper, the trusted ones."""
-    known = prior.trusted if prior.sigma is None else prior.support & torch.isfinite(prior.sigma)
-    index = torch.nonzero((known | prior.far).flatten()).squeeze(1)
-    depth, far = prior.depth.flatten()[index], prior.far.flatten()[index]
-    sigma = torch.zeros_like(depth) if prior.sigma is None else prior.sigma.flatten()[index].masked_fill(far, 0)
-    return KnownPixels(index, depth, sigma, far)
-
-
-def _bytes(prior: DepthPrior | None) -> int:
-    """Of a prior on the device, and of as many known pixels as it may have."""
-    if prior is None:
-        return 0
-    return sum(t.numel() * t.element_size() for t in prior if t is not None) + 17 * prior.depth.numel()

@@ -347,3 +347,34 @@ def test_the_number_of_threads_changes_no_bit(width: int, height: int) -> None:
             torch.set_num_threads(before)
 
     assert all(torch.equal(one, two) for one, two in zip(drawn(1), drawn(2), strict=True))
+
+
+@pytest.mark.parametrize("width", [5, 32, 67])
+@pytest.mark.parametrize("parts", [(True, False), (False, True), (True, True)])
+def test_gradients_of_a_joined_alpha_are_added_to_the_backgrounds(width: int, parts: tuple[bool, bool]) -> None:
+    """Against the sum that torch makes of both, to the bit, for losses on the colour, on alpha and on both."""
+    view = replace(make_views()[0], width=width, height=24)
+    g = torch.Generator().manual_seed(width)
+    color, values = torch.rand(24, width, 3, generator=g), torch.rand(24, width, generator=g)
+    on_color, on_alpha = torch.randn(24, width, 3, generator=g), torch.randn(24, width, generator=g)
+    found = []
+    for join in (True, False):
+        sky, alpha = some_sky(), values.clone().requires_grad_()
+        render = (sky.joined if join else sky.behind)(Render(color, values, alpha), view)
+        assert torch.equal(render.alpha, values)
+        loss = (on_color * render.color).sum() * parts[0] + (on_alpha * render.alpha).sum() * parts[1]
+        loss.backward(retain_graph=True)
+        loss.backward()
+        sums = sky.constant.grad, sky.harmonics.grad
+        found.append((alpha.grad, *sums))
+    for one, other in zip(*found, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_a_loss_on_a_joined_alpha_alone_leaves_the_sky_without_a_gradient() -> None:
+    sky, view = some_sky(), make_views()[0]
+    alpha = torch.rand(24, 32).requires_grad_()
+    render = sky.joined(Render(torch.rand(24, 32, 3), torch.rand(24, 32), alpha), view)
+    (2 * render.alpha.sum()).backward()
+    assert torch.equal(alpha.grad, torch.full((24, 32), 2.0))
+    assert sky.constant.grad is None

@@ -7,10 +7,12 @@
 #include <vector>
 
 #include "parallel.h"
+#include "simd.h"
 
 namespace d2 {
 
 constexpr int64_t ROWS_CHUNK = 4096;  // Gaussians of one task
+constexpr int SEGMENT = 64;           // pixels of a row whose sums stay near while the rows of a strip go by
 constexpr float SH_C0 = 0.28209479177387814f;
 
 template <class Body>
@@ -27,7 +29,7 @@ struct Behind {
   const float *basis, *constant, *harmonics;             // [rows * columns, terms], [1, 3], [terms - 1, 3]
   const float *color, *alpha;                            // [height, width, 3], [height, width]
   float* out;                                            // [height, width, 3]
-  const float* grad_out;                                 // null going forward
+  const float *grad_out, *more_alpha;                    // null going forward; what else came to alpha, or null
   float *grad_alpha, *grad_constant, *grad_harmonics;
 
   int64_t nodes() const { return int64_t(rows) * columns; }
@@ -77,33 +79,56 @@ static void gather_row(const Behind& b, const float* line, float* nodes) {
   }
 }
 
-// Lines of numbers, three a pixel, on which the loops below are flat: the compiler makes vectors of them.
-static void repeat(const float* __restrict alpha, int width, float* __restrict rest) {
-  for (int x = 0; x < width; x++) {
-    const float value = 1 - alpha[x];
-    rest[3 * x] = value, rest[3 * x + 1] = value, rest[3 * x + 2] = value;
+// A number for each pixel, as it stands beside its three colours.
+D2_INLINE void repeat(Floats values, Floats (&out)[3]) { weave<LANES>({values, values, values}, out); }
+
+// One row of a strip: what the Gaussians leave of each ray shows what lies `low` of the way from `upper` to `lower`.
+static void composite(const float* upper, const float* lower, float low, const float* alpha, const float* in, int width,
+                      float* out) {
+  int x = 0;
+  for (; x + LANES <= width; x += LANES) {
+    Floats rest[3];
+    repeat(Floats(1.f) - Floats::load(alpha + x), rest);
+    for (int n = 0; n < 3; n++) {
+      const int64_t i = int64_t(3) * x + n * LANES;
+      const Floats above = Floats::load(upper + i), behind = fma(low, Floats::load(lower + i) - above, above);
+      fma(rest[n], behind, Floats::load(in + i)).store(out + i);
+    }
   }
+  for (int64_t i = int64_t(3) * x; i < int64_t(3) * width; i++)
+    out[i] = in[i] + (1 - alpha[i / 3]) * (upper[i] + low * (lower[i] - upper[i]));
 }
 
-static void composite(const float* __restrict upper, const float* __restrict lower, float low,
-                      const float* __restrict rest, const float* __restrict in, int64_t length, float* __restrict out) {
-  for (int64_t i = 0; i < length; i++) out[i] = in[i] + rest[i] * (upper[i] + low * (lower[i] - upper[i]));
-}
-
-// What goes to the two rows of nodes, and the gradient times the background in `products`.
-static void split(const float* __restrict upper, const float* __restrict lower, float low, const float* __restrict rest,
-                  const float* __restrict gradient, int64_t length, float* __restrict to_upper,
-                  float* __restrict to_lower, float* __restrict products) {
-  for (int64_t i = 0; i < length; i++) {
-    products[i] = gradient[i] * (upper[i] + low * (lower[i] - upper[i]));
-    const float part = rest[i] * gradient[i], down = low * part;
-    to_lower[i] += down;
-    to_upper[i] += part - down;
+// The transpose, pixels begin..end-1 of the row: adds what goes to both rows of nodes, and gives the gradient of alpha
+// with what else came to it, `more` or null.
+static void split(const float* upper, const float* lower, float low, const float* alpha, const float* gradient,
+                  const float* more, int begin, int end, float* to_upper, float* to_lower, float* on_alpha) {
+  int x = begin;
+  for (; x + LANES <= end; x += LANES) {
+    Floats rest[3], products[3], colors[3];
+    repeat(Floats(1.f) - Floats::load(alpha + x), rest);
+    for (int n = 0; n < 3; n++) {
+      const int64_t i = int64_t(3) * x + n * LANES;
+      const Floats above = Floats::load(upper + i), given = Floats::load(gradient + i), part = rest[n] * given;
+      products[n] = given * fma(low, Floats::load(lower + i) - above, above);
+      const Floats down = Floats(low) * part;
+      (Floats::load(to_lower + i) + down).store(to_lower + i);
+      (Floats::load(to_upper + i) + (part - down)).store(to_upper + i);
+    }
+    unweave<LANES>(products, colors);
+    const Floats through = colors[0] + colors[1] + colors[2];
+    ((more ? Floats::load(more + x) : Floats(0.f)) - through).store(on_alpha + x);
   }
-}
-
-static void add_triples(const float* __restrict products, int width, float* __restrict on_alpha) {
-  for (int x = 0; x < width; x++) on_alpha[x] = -(products[3 * x] + products[3 * x + 1] + products[3 * x + 2]);
+  for (; x < end; x++) {
+    float product = 0;
+    for (int64_t i = int64_t(3) * x; i < int64_t(3) * (x + 1); i++) {
+      product += gradient[i] * (upper[i] + low * (lower[i] - upper[i]));
+      const float part = (1 - alpha[x]) * gradient[i], down = low * part;
+      to_lower[i] += down;
+      to_upper[i] += part - down;
+    }
+    on_alpha[x] = (more ? more[x] : 0.f) - product;
+  }
 }
 
 // The pixels between two rows of nodes, whose colours are spread along them.
@@ -111,7 +136,7 @@ class Strip {
  public:
   Strip(const Behind& b, const std::vector<float>& raw, int row)
       : b_(b), begin_(row * b.stride), end_(std::min(b.height, (row + 1) * b.stride)), upper_(b.length()),
-        lower_(b.length()), rest_(b.length()) {
+        lower_(b.length()) {
     spread_row(b, raw.data() + int64_t(3) * b.columns * row, upper_.data());
     spread_row(b, raw.data() + int64_t(3) * b.columns * (row + 1), lower_.data());
   }
@@ -119,20 +144,21 @@ class Strip {
   void forward() {
     for (int y = begin_; y < end_; y++) {
       const int64_t at = y * b_.length();
-      repeat(b_.alpha + int64_t(y) * b_.width, b_.width, rest_.data());
-      composite(upper_.data(), lower_.data(), low(y), rest_.data(), b_.color + at, b_.length(), b_.out + at);
+      composite(upper_.data(), lower_.data(), low(y), b_.alpha + int64_t(y) * b_.width, b_.color + at, b_.width,
+                b_.out + at);
     }
   }
 
   // Writes the gradient of alpha; adds to both rows of nodes, [columns, 3] each.
   void backward(float* on_upper, float* on_lower) {
-    std::vector<float> to_upper(b_.length(), 0.f), to_lower(b_.length(), 0.f), products(b_.length());
-    for (int y = begin_; y < end_; y++) {
-      repeat(b_.alpha + int64_t(y) * b_.width, b_.width, rest_.data());
-      split(upper_.data(), lower_.data(), low(y), rest_.data(), b_.grad_out + y * b_.length(), b_.length(),
-            to_upper.data(), to_lower.data(), products.data());
-      add_triples(products.data(), b_.width, b_.grad_alpha + int64_t(y) * b_.width);
-    }
+    std::vector<float> to_upper(b_.length(), 0.f), to_lower(b_.length(), 0.f);
+    for (int begin = 0; begin < b_.width; begin += SEGMENT)
+      for (int y = begin_; y < end_; y++) {
+        const int64_t at = int64_t(y) * b_.width;
+        const float* const more = b_.more_alpha ? b_.more_alpha + at : nullptr;
+        split(upper_.data(), lower_.data(), low(y), b_.alpha + at, b_.grad_out + 3 * at, more, begin,
+              std::min(b_.width, begin + SEGMENT), to_upper.data(), to_lower.data(), b_.grad_alpha + at);
+      }
     gather_row(b_, to_upper.data(), on_upper);
     gather_row(b_, to_lower.data(), on_lower);
   }
@@ -143,7 +169,7 @@ class Strip {
 
   const Behind& b_;
   const int begin_, end_;
-  std::vector<float> upper_, lower_, rest_;
+  std::vector<float> upper_, lower_;
 };
 
 // Gradients of the coefficients from those of the nodes, given for the upper and the lower row of each strip.

@@ -1,10 +1,12 @@
 // The photometric loss (1 - w) mean |a - b| + w (1 - mean SSIM(a, b)) and its gradient with respect to a, in one walk
 // over the rows: what photometric.py does in torch.
 //
-// Pictures stay as they are, [H, W, C] with channels interleaved: a step of one pixel is a step of C numbers. A row of
-// SSIM needs 11 rows of the pictures, blurred down the columns and then along the row; a row of the gradient needs 11
-// rows of the derivatives of SSIM, which wait in a ring. Sums over a row are added up in the order of rows, so results
-// are the same bits for any number of threads.
+// Pictures stay as they are, [H, W, C] with channels interleaved: a step of one pixel is a step of C numbers. LANES
+// rows are worked on together, along the row unit by unit, where a unit is LANES pixels. Going down the columns a
+// vector holds neighbours of one row; going along the row it holds the same number of LANES rows, so that either way a
+// blur adds up whole vectors, each of them read once for LANES sums. A row of the gradient needs 11 rows of the
+// derivatives of SSIM, which wait in a ring. Sums over a row are added up in the order of pixels, and those of rows in the order of
+// rows, so results are the same bits for any number of threads.
 #include <algorithm>
 #include <cstdint>
 #include <cstring>
@@ -16,8 +18,11 @@
 namespace d2 {
 
 constexpr int RADIUS = 5, TAPS = 2 * RADIUS + 1;
-constexpr int ROWS = LANES == 16 ? 4 : 2;  // blurred together: a row is then loaded once for all of them
-constexpr int SPAN = TAPS - 1 + ROWS, RING = TAPS - 1 + 2 * ROWS;
+constexpr int SPAN = TAPS - 1 + LANES;             // what LANES blurred values are made of
+constexpr int LAG = (RADIUS + LANES - 1) / LANES;  // units that must lie beyond one that is blurred along the row
+constexpr int HELD = 2 * LAG + 1;                  // units of blurred maps and of derivatives that are in use at a time
+constexpr int RUN = 16;                            // vectors that are added up in float32, before float64
+constexpr int AHEAD = 4 * LANES;                   // numbers of a picture's row that are asked for before their turn
 constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
 
 // Variances are differences of nearly equal numbers where a picture is flat. They do not change if both pictures, and
@@ -41,198 +46,251 @@ struct Photometric {
 D2_INLINE Floats load_row(const float* row, int64_t x, int64_t length) {
   if (x + LANES <= length) return Floats::load(row + x);
   alignas(64) float lane[LANES] = {};
-  std::memcpy(lane, row + x, sizeof(float) * (length - x));
+  if (x < length) std::memcpy(lane, row + x, sizeof(float) * size_t(length - x));
   return Floats::load(lane);
 }
 
-// Sum over 11 values weighted by the window, which is symmetric: small weights first, for less rounding.
-template <class Value>
-D2_INLINE Floats blur(const float* window, Value value) {
-  Floats total = Floats(window[0]) * (value(0) + value(TAPS - 1));
-  for (int t = 1; t < RADIUS; t++) total = fma(Floats(window[t]), value(t) + value(TAPS - 1 - t), total);
-  return fma(Floats(window[RADIUS]), value(RADIUS), total);
+// The same of bytes, over 255: the quotient is corrected by its remainder, which rounds it as a division does.
+D2_INLINE Floats load_row(const uint8_t* row, int64_t x, int64_t length) {
+  uint8_t lane[LANES] = {};
+  const bool inside = x + LANES <= length;
+  if (!inside && x < length) std::memcpy(lane, row + x, size_t(length - x));
+  const Floats value = load_bytes(inside ? row + x : lane), part = value * Floats(1.f / 255.f);
+#if defined(D2_AVX512) || defined(D2_AVX2)
+  return fma(fnma(part, Floats(255.f), value), Floats(1.f / 255.f), part);
+#else
+  return value / Floats(255.f);  // without a fused multiply-add there is no exact remainder
+#endif
 }
 
-// The sum of numbers in double, lane by lane.
-class Total {
- public:
-  D2_INLINE void add(Floats values, int64_t count) {
-    if (count < LANES) {
-      alignas(64) float lane[LANES];
-      values.store(lane);
-      std::fill(lane + count, lane + LANES, 0.f);
-      values = Floats::load(lane);
+// LANES neighbouring sums over 11 values weighted by the window, which is symmetric; value(t) is the t-th of SPAN.
+// Where a multiplication and an addition round apart, both sides share a multiplication, and small weights come first.
+template <class Value>
+D2_INLINE void blur(const float* window, Value value, Floats (&out)[LANES]) {
+  Floats weight[RADIUS + 1];
+  for (int t = 0; t <= RADIUS; t++) weight[t] = window[t];
+  if constexpr (LANES == 4) {
+    for (int r = 0; r < LANES; r++) {
+      out[r] = weight[0] * (value(r) + value(r + TAPS - 1));
+      for (int t = 1; t < RADIUS; t++) out[r] = fma(weight[t], value(r + t) + value(r + TAPS - 1 - t), out[r]);
+      out[r] = fma(weight[RADIUS], value(r + RADIUS), out[r]);
     }
-    lanes_ += __builtin_convertvector(values.v, Doubles);
+    return;
   }
-  double sum() const {
-    double total = 0;
-    for (int i = 0; i < LANES; i++) total += lanes_[i];
-    return total;
+#pragma GCC unroll 32
+  for (int t = SPAN - 1; t >= 0; t--) {
+    const Floats next = value(t);
+#pragma GCC unroll 16
+    for (int r = 0; r < LANES; r++) {
+      const int tap = t - r;
+      if (tap == TAPS - 1) out[r] = weight[0] * next;
+      if (tap >= 0 && tap < TAPS - 1) out[r] = fma(weight[tap <= RADIUS ? tap : TAPS - 1 - tap], next, out[r]);
+    }
   }
-
- private:
-  typedef double Doubles __attribute__((vector_size(8 * LANES)));
-  Doubles lanes_ = {};
-};
+}
 
 // Rows begin..end-1 of the gradient, with the buffers for them.
 class Band {
  public:
   Band(const Photometric& p, int begin, int end)
-      : p_(p), begin_(begin), end_(end), first_(std::max(0, begin - 2 * RADIUS)), length_(p.row_length()),
-        margin_(int64_t(RADIUS) * p.channels), whole_((length_ + LANES - 1) / LANES * LANES),
-        padded_(whole_ + 2 * margin_) {
-    static thread_local std::vector<float> memory, target;
-    memory.assign(size_t((4 * ROWS + 3) * padded_ + (3 * RING + 1) * whole_), 0.f);
-    blurred_ = memory.data();
-    derivatives_ = blurred_ + 4 * ROWS * padded_;
-    ring_ = derivatives_ + 3 * padded_;
-    zeros_ = ring_ + 3 * RING * whole_;
-    const float outside[] = {-SHIFT, -SHIFT, 2 * SHIFT * SHIFT, SHIFT * SHIFT};
-    for (int m = 0; m < 4 * ROWS; m++) std::fill_n(blurred_ + m * padded_, padded_, outside[m % 4]);
-    target_ = p.target;
-    if (p.bytes) target_ = numbers(target) - first_ * length_;
+      : p_(p), begin_(begin), end_(end), channels_(p.channels), length_(p.row_length()),
+        units_((p.width + LANES - 1) / LANES), unit_(int64_t(LANES) * p.channels),
+        per_similarity_(-p.ssim_weight / (float(p.height) * float(length_))),
+        per_difference_((1.f - p.ssim_weight) / (float(p.height) * float(length_))) {
+    static thread_local std::vector<float> memory;
+    const int64_t map = LANES * unit_;
+    memory.resize(size_t((7 * HELD + 1) * map + 3 * SPAN * units_ * unit_ + 16));
+    blurred_ = memory.data() + (64 - reinterpret_cast<uintptr_t>(memory.data()) % 64) % 64 / sizeof(float);
+    derivatives_ = blurred_ + 4 * HELD * map;
+    woven_ = derivatives_ + 3 * HELD * map;
+    ring_ = woven_ + map;
   }
 
   void run() {
     const int reach = p_.gradient ? RADIUS : 0, last = std::min(p_.height, end_ + reach);
     int next = begin_;
-    for (int y = std::max(0, begin_ - reach); y < last; y += ROWS) {
-      const int ready = std::min(y + ROWS, last);
-      blur_columns(y);
-      for (int row = y; row < ready; row++) {
-        const double similarity = compare(row, blurred_ + 4 * (row - y) * padded_);
-        if (row >= begin_ && row < end_) p_.similarities[row] = similarity;
-      }
-      for (int count; next < end_; next += count) {
-        count = std::min(ROWS, end_ - next);
-        if (std::min(next + count - 1 + reach, p_.height - 1) >= ready) break;
-        finish(next, count);
-      }
+    for (int y = std::max(0, begin_ - reach); y < last; y += LANES) {
+      const int ready = std::min(y + LANES, last), finished = ready == last ? end_ : std::min(end_, ready - reach);
+      walk(y, ready - y);
+      for (int count; next < finished; next += count) finish(next, count = std::min(LANES, finished - next));
     }
   }
 
  private:
-  // The target's rows that this band looks at, as numbers. Rows are blurred ROWS together, so it looks at up to
-  // ROWS - 1 more than it needs.
-  const float* numbers(std::vector<float>& memory) const {
-    const int64_t last = std::min(p_.height, end_ + 2 * RADIUS + ROWS - 1), count = (last - first_) * length_;
-    memory.resize(size_t(count));
-    const uint8_t* from = p_.bytes + first_ * length_;
-    float* to = memory.data();
-    for (int64_t i = 0; i < count; i++) to[i] = float(from[i]) / 255.f;
-    return to;
+  bool is_row(int y) const { return y >= 0 && y < p_.height; }
+  D2_INLINE Floats target(int y, int64_t x) const {
+    return p_.bytes ? load_row(p_.bytes + y * length_, x, length_) : load_row(p_.target + y * length_, x, length_);
+  }
+  // LANES numbers of row y, from the x-th on, of a map in the ring.
+  float* waiting(int map, int y, int64_t x) const {
+    return ring_ + (x * 3 + int64_t(map) * LANES) * SPAN + y % SPAN * LANES;
+  }
+  // Number `channel` of a pixel in LANES rows, of a map of which HELD units are kept; pixels count from the margin on.
+  float* held(float* maps, int map, int64_t pixel, int channel) const {
+    return maps + LANES * ((map * HELD + pixel / LANES % HELD) * unit_ + pixel % LANES * channels_ + channel);
+  }
+  // Blurs a map along the row: LANES pixels of a unit.
+  D2_INLINE void blur_along(float* maps, int map, int64_t unit, int channel, Floats (&out)[LANES]) const {
+    const float* from[HELD];
+    for (int i = 0; i < HELD; i++) from[i] = held(maps, map, (unit + i) * LANES, channel);
+    const int64_t step = int64_t(LANES) * channels_;
+    blur(p_.window, [&](int t) D2_FLAT { return Floats::load(from[t / LANES] + t % LANES * step); }, out);
+  }
+  // What lies outside of the picture, from pixel first to last - 1 of maps that are blurred down the columns.
+  void fill(float* maps, int count, const float* outside, int64_t first, int64_t last) const {
+    for (int m = 0; m < count; m++)
+      for (int64_t pixel = first; pixel < last; pixel++) std::fill_n(held(maps, m, pixel, 0), unit_, outside[m]);
   }
 
-  const float* row_of(const float* picture, int y) const {
-    return y >= 0 && y < p_.height ? picture + y * length_ : zeros_;
+  // SSIM of rows y..y+count-1, and its derivatives blurred along the row, which go to the ring. What is beyond on the
+  // right is needed first.
+  void walk(int y, int count) {
+    static constexpr float around[] = {-SHIFT, -SHIFT, 2 * SHIFT * SHIFT, SHIFT * SHIFT}, nothing[3] = {};
+    fill(blurred_, 4, around, 0, RADIUS);
+    fill(derivatives_, 3, nothing, 0, RADIUS);
+    double totals[LANES] = {};
+    for (int64_t unit = 0; unit < units_ + 2 * LAG; unit++) {
+      const int64_t first = RADIUS + unit * LANES;
+      if (unit < units_) blur_columns(y, unit);
+      fill(blurred_, 4, around, std::max(first, RADIUS + int64_t(p_.width)), first + LANES);
+      if (unit >= LAG && unit - LAG < units_)
+        for (int channel = 0; channel < channels_; channel++) {
+          float similarities[LANES];
+          compare(unit - LAG, channel).store(similarities);
+          for (int r = 0; r < LANES; r++) totals[r] += double(similarities[r]);
+        }
+      else if (unit >= LAG)
+        fill(derivatives_, 3, nothing, first - LAG * LANES, first - LAG * LANES + LANES);
+      if (p_.gradient && unit >= 2 * LAG) blur_derivatives(y, count, unit - 2 * LAG);
+    }
+    for (int r = 0; r < count; r++)
+      if (y + r >= begin_ && y + r < end_) p_.similarities[y + r] = totals[r];
   }
-  float* ring_row(int map, int y) const { return ring_ + (map * RING + y % RING) * whole_; }
 
-  // Along a padded row, from the pixel five to the left.
-  Floats blur_along(const float* from) const {
-    return blur(p_.window, [&](int t) { return Floats::load(from + int64_t(t) * p_.channels); });
-  }
-
-  // Blurs a, b, a a + b b and a b down the columns around the rows y..y+ROWS-1.
-  void blur_columns(int y) {
-    const float *a[SPAN], *b[SPAN];
-    for (int t = 0; t < SPAN; t++) a[t] = row_of(p_.image, y + t - RADIUS), b[t] = row_of(target_, y + t - RADIUS);
-    for (int64_t x = 0; x < length_; x += LANES) {
-      Floats sums[ROWS][4];
-      for (int r = 0; r < ROWS; r++)
-        for (int m = 0; m < 4; m++) sums[r][m] = 0.f;
-#pragma GCC unroll 16
+  // Blurs a, b, a a + b b and a b down the columns around the rows y..y+LANES-1.
+  void blur_columns(int y, int64_t unit) {
+    for (int part = 0; part < channels_; part++) {
+      const int64_t x = unit * unit_ + LANES * part;
+      Floats values[4][SPAN];
       for (int t = 0; t < SPAN; t++) {
-        const Floats one = load_row(a[t], x, length_) - Floats(SHIFT), other = load_row(b[t], x, length_) - Floats(SHIFT);
-        const Floats values[] = {one, other, fma(one, one, other * other), one * other};
-#pragma GCC unroll 4
-        for (int r = 0; r < ROWS; r++)
-          if (t - r >= 0 && t - r < TAPS)
-#pragma GCC unroll 4
-            for (int m = 0; m < 4; m++) sums[r][m] = fma(Floats(p_.window[t - r]), values[m], sums[r][m]);
+        const int row = y + t - RADIUS;
+        Floats one = -SHIFT, other = -SHIFT;
+        if (is_row(row)) {
+          one = one + load_row(p_.image + row * length_, x, length_), other = other + target(row, x);
+          __builtin_prefetch(p_.image + row * length_ + x + AHEAD);
+          __builtin_prefetch(p_.bytes ? static_cast<const void*>(p_.bytes + row * length_ + x + AHEAD)
+                                      : static_cast<const void*>(p_.target + row * length_ + x + AHEAD));
+        }
+        values[0][t] = one, values[1][t] = other;
+        values[2][t] = fma(one, one, other * other), values[3][t] = one * other;
       }
-      for (int r = 0; r < ROWS; r++)
-        for (int m = 0; m < 4; m++) sums[r][m].store(blurred_ + (4 * r + m) * padded_ + margin_ + x);
+      for (int m = 0; m < 4; m++) {
+        Floats block[LANES];
+        blur(p_.window, [&](int t) D2_FLAT { return values[m][t]; }, block);
+        transpose(block);
+        put_along(blurred_, m, unit, part, block);
+      }
     }
   }
 
-  // Sum of SSIM over row y, blurred down the columns; its derivatives by mean_a, a a and a b, blurred along the row, go
-  // to the ring. Only the sum of both variances counts, so a a and b b are blurred as one.
-  double compare(int y, const float* blurred) {
-    Total total;
-    for (int64_t x = 0; x < length_; x += LANES) {
-      Floats maps[4];
-      for (int m = 0; m < 4; m++) maps[m] = blur_along(blurred + m * padded_ + x);
-      const Floats shifted_a = maps[0], shifted_b = maps[1], two = 2.f, c1 = C1, c2 = C2;
+  // LANES vectors of numbers that follow each other along the row, part `part` of a unit's.
+  D2_INLINE void put_along(float* maps, int map, int64_t unit, int part, const Floats (&block)[LANES]) const {
+    const int64_t first = LANES * part + RADIUS * channels_;
+    int64_t whole = unit + first / unit_, number = first % unit_;
+#pragma GCC unroll 16
+    for (int i = 0; i < LANES; i++) {
+      block[i].store(maps + LANES * ((map * HELD + whole % HELD) * unit_ + number));
+      if (++number == unit_) number = 0, whole++;
+    }
+  }
+
+  // The sum of SSIM over a unit, row by row, and its derivatives by mean_a, a a and a b. Only the sum of both variances
+  // counts, so a a and b b are blurred as one.
+  Floats compare(int64_t unit, int channel) {
+    const Floats two = 2.f, c1 = C1, c2 = C2;
+    Floats maps[4][LANES], total = 0.f;
+    for (int m = 0; m < 4; m++)
+      blur_along(blurred_, m, unit, channel, maps[m]);
+    float* places[3][LAG + 1];
+    for (int m = 0; m < 3; m++)
+      for (int k = 0; k <= LAG; k++) places[m][k] = held(derivatives_, m, (unit + k) * LANES, channel);
+    const int64_t step = int64_t(LANES) * channels_;
+    for (int i = 0; i < LANES; i++) {
+      float* out[3];
+      for (int m = 0; m < 3; m++) out[m] = places[m][(RADIUS + i) / LANES] + (RADIUS + i) % LANES * step;
+      if (unit * LANES + i >= p_.width) {
+        for (float* to : out) Floats(0.f).store(to);
+        continue;
+      }
+      const Floats shifted_a = maps[0][i], shifted_b = maps[1][i];
       const Floats mean_a = shifted_a + Floats(SHIFT), mean_b = shifted_b + Floats(SHIFT);
-      const Floats variances = maps[2] - (shifted_a * shifted_a + shifted_b * shifted_b);
+      const Floats variances = maps[2][i] - (shifted_a * shifted_a + shifted_b * shifted_b);
       const Floats means_match = two * mean_a * mean_b + c1, means_size = mean_a * mean_a + mean_b * mean_b + c1;
-      const Floats match = two * (maps[3] - shifted_a * shifted_b) + c2, size = variances + c2;
+      const Floats match = two * (maps[3][i] - shifted_a * shifted_b) + c2, size = variances + c2;
       const Floats inverse = Floats(1.f) / (means_size * size);
       const Floats similarity = means_match * match * inverse;
-      total.add(similarity, length_ - x);
-      if (!p_.gradient) continue;
+      total = total + similarity;
       const Floats by_aa = -similarity * (means_size * inverse), by_ab = two * means_match * inverse;
       const Floats by_mean = two * (mean_b * match * inverse - mean_a * similarity * (size * inverse)) -
                              two * shifted_a * by_aa - shifted_b * by_ab;
-      float* out = derivatives_ + margin_ + x;
-      by_mean.store(out);
-      by_aa.store(out + padded_);
-      by_ab.store(out + 2 * padded_);
+      by_mean.store(out[0]);
+      by_aa.store(out[1]);
+      by_ab.store(out[2]);
     }
-    if (p_.gradient) blur_derivatives(y);
-    return total.sum();
+    return total;
   }
 
-  void blur_derivatives(int y) {
+  void blur_derivatives(int y, int count, int64_t unit) {
     for (int m = 0; m < 3; m++) {
-      float* row = derivatives_ + m * padded_;
-      std::fill(row + margin_ + length_, row + padded_, 0.f);
-      for (int64_t x = 0; x < length_; x += LANES) blur_along(row + x).store(ring_row(m, y) + x);
+      Floats block[LANES];
+      for (int channel = 0; channel < channels_; channel++) {
+        blur_along(derivatives_, m, unit, channel, block);
+#pragma GCC unroll 16
+        for (int i = 0; i < LANES; i++) block[i].store(woven_ + LANES * (i * channels_ + channel));
+      }
+      for (int part = 0; part < channels_; part++) {
+#pragma GCC unroll 16
+        for (int i = 0; i < LANES; i++) block[i] = Floats::load(woven_ + LANES * (LANES * part + i));
+        transpose(block);
+        const int64_t x = unit * unit_ + LANES * part;
+#pragma GCC unroll 16
+        for (int r = 0; r < LANES; r++)
+          if (r < count) block[r].store(waiting(m, y + r, x));
+      }
     }
   }
 
   // Rows y..y+count-1 of the gradient and of sum |a - b|, once SSIM is known in the rows around them.
   void finish(int y, int count) {
-    const float* rows[SPAN][3];
-    for (int t = 0; t < SPAN; t++)
-      for (int m = 0; m < 3; m++) {
-        const int from = y + t - RADIUS;
-        rows[t][m] = from >= 0 && from < p_.height ? ring_row(m, from) : zeros_;
+    alignas(64) static constexpr float nothing[LANES] = {};
+    int64_t places[SPAN];
+    for (int t = 0; t < SPAN; t++) places[t] = is_row(y + t - RADIUS) ? (y + t - RADIUS) % SPAN * LANES : -1;
+    double totals[LANES] = {};
+    Floats runs[LANES];
+    for (int64_t x = 0, run = 0; x < length_; x += LANES) {
+      Floats by[3][LANES];
+      for (int m = 0; m < (p_.gradient ? 3 : 0); m++) {
+        const float* const from = waiting(m, 0, x);
+        blur(p_.window, [&](int t) D2_FLAT { return Floats::load(places[t] < 0 ? nothing : from + places[t]); }, by[m]);
       }
-    Total totals[ROWS];
-    for (int64_t x = 0; x < length_; x += LANES) {
-      Floats by[ROWS][3];
-      if (p_.gradient) blur_finally(rows, x, by);
-      for (int r = 0; r < count; r++) totals[r].add(finish_numbers(y + r, x, by[r]), length_ - x);
+      for (int r = 0; r < count; r++) {
+        const Floats difference = finish_numbers(y + r, x, by[0][r], by[1][r], by[2][r]);
+        runs[r] = run ? runs[r] + difference : difference;
+      }
+      if (++run < RUN && x + LANES < length_) continue;
+      for (int r = 0; r < count; r++) totals[r] += double(sum(runs[r]));
+      run = 0;
     }
-    for (int r = 0; r < count; r++) p_.differences[y + r] = totals[r].sum();
-  }
-
-  void blur_finally(const float* const (&rows)[SPAN][3], int64_t x, Floats (&by)[ROWS][3]) const {
-    for (int r = 0; r < ROWS; r++)
-      for (int m = 0; m < 3; m++) by[r][m] = 0.f;
-#pragma GCC unroll 16
-    for (int t = 0; t < SPAN; t++)
-#pragma GCC unroll 4
-      for (int m = 0; m < 3; m++) {
-        const Floats value = Floats::load(rows[t][m] + x);
-#pragma GCC unroll 4
-        for (int r = 0; r < ROWS; r++)
-          if (t - r >= 0 && t - r < TAPS) by[r][m] = fma(Floats(p_.window[t - r]), value, by[r][m]);
-      }
+    std::copy_n(totals, count, p_.differences + y);
   }
 
   // The gradient at LANES numbers of row y, from the blurred derivatives; returns |a - b|.
-  D2_INLINE Floats finish_numbers(int y, int64_t x, const Floats (&by)[3]) const {
-    const float number = float(p_.height) * float(length_);
-    const Floats per_similarity = -p_.ssim_weight / number, per_difference = (1.f - p_.ssim_weight) / number, zero = 0.f;
-    const Floats a = load_row(p_.image + y * length_, x, length_), b = load_row(target_ + y * length_, x, length_);
+  D2_INLINE Floats finish_numbers(int y, int64_t x, Floats by_mean, Floats by_aa, Floats by_ab) const {
+    const Floats per_similarity = per_similarity_, per_difference = per_difference_, zero = 0.f;
+    const Floats a = load_row(p_.image + y * length_, x, length_), b = target(y, x);
     const Floats difference = a - b;
     if (!p_.gradient) return abs(difference);
-    const Floats on_similarity = by[0] + Floats(2.f) * (a - Floats(SHIFT)) * by[1] + (b - Floats(SHIFT)) * by[2];
+    const Floats on_similarity = by_mean + Floats(2.f) * (a - Floats(SHIFT)) * by_aa + (b - Floats(SHIFT)) * by_ab;
     const Floats result = where(difference > zero, per_difference) - where(difference < zero, per_difference) +
                           per_similarity * on_similarity;
     float* out = p_.gradient + y * length_ + x;
@@ -247,10 +305,10 @@ class Band {
   }
 
   const Photometric& p_;
-  const int begin_, end_;
-  const int64_t first_, length_, margin_, whole_, padded_;
-  const float* target_;
-  float *blurred_, *derivatives_, *ring_, *zeros_;
+  const int begin_, end_, channels_;
+  const int64_t length_, units_, unit_;
+  const float per_similarity_, per_difference_;
+  float *blurred_, *derivatives_, *woven_, *ring_;
 };
 
 }  // namespace d2

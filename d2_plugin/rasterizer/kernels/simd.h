@@ -17,6 +17,7 @@
 #endif
 
 #define D2_INLINE inline __attribute__((always_inline))
+#define D2_FLAT __attribute__((always_inline))  // of a lambda
 
 namespace d2 {
 
@@ -92,6 +93,10 @@ D2_INLINE Floats reciprocal(Floats a) {
   const Floats estimate = _mm512_rcp14_ps(a.v);
   return estimate * fnma(a, estimate, Floats(2.f));
 }
+D2_INLINE Floats reciprocal_root(Floats a) {
+  const Floats estimate = _mm512_rsqrt14_ps(a.v);
+  return estimate * fnma(Floats(0.5f) * a * estimate, estimate, Floats(1.5f));
+}
 D2_INLINE float sum(Floats a) { return _mm512_reduce_add_ps(a.v); }
 D2_INLINE float largest(Floats a) { return _mm512_reduce_max_ps(a.v); }
 
@@ -124,6 +129,10 @@ D2_INLINE Floats floor(Floats a) { return _mm256_floor_ps(a.v); }
 D2_INLINE Floats reciprocal(Floats a) {
   const Floats estimate = _mm256_rcp_ps(a.v);
   return estimate * fnma(a, estimate, Floats(2.f));
+}
+D2_INLINE Floats reciprocal_root(Floats a) {
+  const Floats estimate = _mm256_rsqrt_ps(a.v);
+  return estimate * fnma(Floats(0.5f) * a * estimate, estimate, Floats(1.5f));
 }
 D2_INLINE Floats add_to_exponent(Floats a, Floats low_bits) {
   const __m256i exponent = _mm256_slli_epi32(_mm256_castps_si256(low_bits.v), 23);
@@ -178,6 +187,7 @@ D2_INLINE Floats floor(Floats a) {
   return near - where(near > a, Floats(1.f));
 }
 D2_INLINE Floats reciprocal(Floats a) { return Floats(1.f) / a; }
+D2_INLINE Floats reciprocal_root(Floats a) { return Floats(1.f) / sqrt(a); }
 D2_INLINE Floats add_to_exponent(Floats a, Floats low_bits) {
   return Native(Integers(a.v) + (Integers(low_bits.v) << 23));
 }
@@ -186,6 +196,17 @@ D2_INLINE float larger(float a, float b) { return a > b ? a : b; }
 D2_INLINE float largest(Floats a) { return larger(larger(a.v[0], a.v[2]), larger(a.v[1], a.v[3])); }
 
 #endif
+
+// LANES bytes as numbers.
+D2_INLINE Floats load_bytes(const uint8_t* from) {
+#if defined(D2_AVX512)
+  return _mm512_cvtepi32_ps(_mm512_cvtepu8_epi32(_mm_loadu_si128(reinterpret_cast<const __m128i*>(from))));
+#elif defined(D2_AVX2)
+  return _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(from))));
+#else
+  return Native{float(from[0]), float(from[1]), float(from[2]), float(from[3])};
+#endif
+}
 
 // 2^x for x in -126..127 by a minimax polynomial on [-1/2, 1/2], relative error 7.5e-8 before rounding; beyond, the
 // result means nothing. Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits, to be shifted into the
@@ -400,6 +421,32 @@ D2_INLINE void transpose(Floats (&m)[LANES]) {
     m[k] = _mm512_shuffle_f32x4(even_low, even_high, 0x88), m[8 + k] = _mm512_shuffle_f32x4(even_low, even_high, 0xdd);
     m[4 + k] = _mm512_shuffle_f32x4(odd_low, odd_high, 0x88), m[12 + k] = _mm512_shuffle_f32x4(odd_low, odd_high, 0xdd);
   }
+}
+#elif defined(D2_AVX2)
+D2_INLINE void transpose(Floats (&m)[LANES]) {
+  __m256 a[8], b[8];
+  for (int i = 0; i < 8; i += 2) {
+    a[i] = _mm256_unpacklo_ps(m[i].v, m[i + 1].v);
+    a[i + 1] = _mm256_unpackhi_ps(m[i].v, m[i + 1].v);
+  }
+  for (int i = 0; i < 8; i += 4)
+    for (int k = 0; k < 2; k++) {
+      b[i + 2 * k] = _mm256_shuffle_ps(a[i + k], a[i + k + 2], 0x44);
+      b[i + 2 * k + 1] = _mm256_shuffle_ps(a[i + k], a[i + k + 2], 0xee);
+    }
+  // b[4 q + k]: half p holds number 4 p + k of rows 4 q..4 q + 3.
+  for (int k = 0; k < 4; k++) {
+    m[k] = _mm256_permute2f128_ps(b[k], b[4 + k], 0x20);
+    m[4 + k] = _mm256_permute2f128_ps(b[k], b[4 + k], 0x31);
+  }
+}
+#else
+D2_INLINE void transpose(Floats (&m)[LANES]) {
+  for (int i = 0; i < LANES; i++)
+    for (int j = i + 1; j < LANES; j++) {
+      const float kept = m[i].v[j];
+      m[i].v[j] = m[j].v[i], m[j].v[i] = kept;
+    }
 }
 #endif
 
