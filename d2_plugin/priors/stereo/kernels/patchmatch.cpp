@@ -35,20 +35,35 @@ void parallel_rows(int rows, int threads, const Work& work) {
   for (std::thread& other : others) other.join();
 }
 
-// Grey values of the reference with a margin, so that all windows are read alike, and where other pixels lie.
+// Grey values of the reference with a margin, so that all windows are read alike, what samples weigh, and where other
+// pixels lie.
 struct Reference {
   static constexpr int kMargin = 5;
+  static constexpr int kGrays = 256, kDistances = 5;  // of samples from the middle of a window
   int stride;
   std::vector<unsigned> levels;                // -1 outside of the picture
   int offset[kSamples];                        // of the samples, in `levels`
+  alignas(64) float weight[kDistances][2 * kGrays];  // by distance and difference of grey values, from -256 on
   int dx[kRegions][kMostPlaces], dy[kRegions][kMostPlaces];
 
   explicit Reference(const Task& t)
       : stride(t.width + 2 * kMargin), levels(size_t(stride) * (t.height + 2 * kMargin), ~0u) {
     for (int y = 0; y < t.height; y++) std::copy_n(t.gray + size_t(y) * t.width, t.width, &levels[at(0, y)]);
-    for (int n = 0; n < kSamples; n++) offset[n] = sample_dv(n) * stride + sample_du(n);
+    for (int n = 0; n < kSamples; n++) {
+      const int du = sample_du(n), dv = sample_dv(n);
+      offset[n] = dv * stride + du;
+      if (du < dv || dv < 0) continue;  // each distance once
+      for (int k = 0; k < 2 * kGrays; k++) {
+        const float off = float(k - kGrays);
+        weight[distance(n)][k] = exp2_of(mad(off * off, t.per_gray, log2_spatial(du, dv)));
+      }
+    }
     for (int region = 0; region < kRegions; region++)
       for (int n = 0; n < region_size(region); n++) region_place(region, n, dx[region][n], dy[region][n]);
+  }
+  // Squared distances are 2, 10, 18, 26 and 34.
+  static int distance(int sample) {
+    return (sample_du(sample) * sample_du(sample) + sample_dv(sample) * sample_dv(sample)) / 8;
   }
   size_t at(int x, int y) const { return size_t(y + kMargin) * stride + kMargin + x; }
 };
@@ -59,18 +74,16 @@ struct Windows {
   Floats u, v, variance;
 
   // columns: of the pixels.
-  void place(const Reference& reference, float per_gray, Integers columns, int y) {
+  void place(const Reference& reference, Integers columns, int y) {
     const unsigned* row = &reference.levels[reference.at(0, y)];
-    const Floats centre = real(look_up(row, columns));
+    const Integers centre = look_up(row, columns);
     Floats level[kSamples], total[kPartials], mean[kPartials], squares[kPartials];
     for (int k = 0; k < kPartials; k++) total[k] = mean[k] = squares[k] = all<Floats>(0.f);
     for (int n = 0; n < kSamples; n++) {
-      const Integers read = look_up(row, columns + reference.offset[n]);
-      level[n] = pick(read >= 0, real(read), centre);
-      const Floats off = level[n] - centre;
-      const Floats spatial = all<Floats>(log2_spatial(sample_du(n), sample_dv(n)));
-      const Floats log2_weight = mad(off * off, all<Floats>(per_gray), spatial);
-      const Floats w = pick(read >= 0, exp2_of(log2_weight), all<Floats>(0.f));
+      const Integers read = look_up(row, columns + reference.offset[n]), gray = pick(read >= 0, read, centre);
+      const float* weights = reference.weight[Reference::distance(n)] + Reference::kGrays;
+      const Floats w = pick(read >= 0, look_up(weights, gray - centre), all<Floats>(0.f));
+      level[n] = real(gray);
       store(weight[n], w);
       total[n % kPartials] += w, mean[n % kPartials] = mad(w, level[n], mean[n % kPartials]);
     }
@@ -169,7 +182,7 @@ class Batch {
   // Places the windows of `count` pixels of a row; the lanes beyond repeat the last one.
   void place(const int* columns, int count, int y) {
     for (int l = 0; l < kLanes; l++) columns_[l] = columns[std::min(l, count - 1)];
-    windows_.place(reference_, task_.per_gray, columns_, y);
+    windows_.place(reference_, columns_, y);
     lanes_ = bits(windows_.variance >= kMinVariance) & ((2u << (count - 1)) - 1);
   }
   Integers columns() const { return columns_; }
