@@ -46,6 +46,7 @@ D2_FN Floats pick(Integers yes, Floats a, Floats b) { return yes ? a : b; }
 D2_FN Integers pick(Integers yes, Integers a, Integers b) { return yes ? a : b; }
 D2_FN Unsigneds pick(Integers yes, Unsigneds a, Unsigneds b) { return (Unsigneds)(yes ? (Integers)a : (Integers)b); }
 D2_FN Integers opposite(Integers yes) { return ~yes; }
+D2_FN int first_lane(Integers a) { return a[0]; }
 
 #if defined(__AVX512F__)
 D2_FN Floats mad(Floats a, Floats b, Floats c) { return (Floats)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c); }

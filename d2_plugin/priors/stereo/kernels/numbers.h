@@ -33,6 +33,7 @@ D2_FN int pick(bool yes, int a, int b) { return yes ? a : b; }
 D2_FN unsigned pick(bool yes, unsigned a, unsigned b) { return yes ? a : b; }
 D2_FN bool none(bool yes) { return !yes; }  // whether it is true in no lane
 D2_FN bool opposite(bool yes) { return !yes; }
+D2_FN int first_lane(int a) { return a; }
 // NaN in the first argument gives the second: what is not a number is sent to a border.
 D2_FN float smaller(float a, float b) { return a < b ? a : b; }
 D2_FN float larger(float a, float b) { return a > b ? a : b; }

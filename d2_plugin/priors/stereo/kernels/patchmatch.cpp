@@ -1,5 +1,5 @@
-// PatchMatch multi-view stereo on the CPU: the pixels of spread.h in threads, as many of a row at once as a vector has
-// lanes. What they ask for (planes times sources) is packed and matched in the lanes: no sum runs across a vector.
+// PatchMatch multi-view stereo on the CPU: the pixels of spread.h in threads, as many at once as a vector has lanes.
+// What they ask for (planes times sources) is packed and matched in the lanes: no sum runs across a vector.
 #include <algorithm>
 #include <atomic>
 #include <cstddef>
@@ -17,13 +17,13 @@ namespace {
 constexpr int kRowsAtOnce = 4;     // that a thread takes from the queue
 constexpr int kRowsPerThread = 16;  // fewer are not worth starting one
 
+// Calls work(top, bottom) in threads until all rows are done, those from top to bottom - 1 at a time.
 template <class Work>
 void parallel_rows(int rows, int threads, const Work& work) {
   std::atomic<int> next{0};
   const auto run = [&] {
-    for (int first; (first = next.fetch_add(kRowsAtOnce)) < rows;) {
-      for (int row = first; row < std::min(rows, first + kRowsAtOnce); row++) work(row);
-    }
+    for (int first; (first = next.fetch_add(kRowsAtOnce)) < rows;)
+      work(first, std::min(rows, first + kRowsAtOnce));
   };
   std::vector<std::thread> others;
   try {
@@ -68,19 +68,19 @@ struct Reference {
   size_t at(int x, int y) const { return size_t(y + kMargin) * stride + kMargin + x; }
 };
 
-// The windows around as many pixels of a row as there are lanes.
+// The windows around as many pixels as there are lanes.
 struct Windows {
   alignas(64) float weight[kSamples][kLanes], weighted[kSamples][kLanes];
   Floats u, v, variance;
 
-  // columns: of the pixels.
-  void place(const Reference& reference, Integers columns, int y) {
-    const unsigned* row = &reference.levels[reference.at(0, y)];
-    const Integers centre = look_up(row, columns);
+  // columns, rows: of the pixels.
+  void place(const Reference& reference, Integers columns, Integers rows) {
+    const unsigned* first = &reference.levels[reference.at(0, 0)];
+    const Integers at = rows * reference.stride + columns, centre = look_up(first, at);
     Floats level[kSamples], total[kPartials], mean[kPartials], squares[kPartials];
     for (int k = 0; k < kPartials; k++) total[k] = mean[k] = squares[k] = all<Floats>(0.f);
     for (int n = 0; n < kSamples; n++) {
-      const Integers read = look_up(row, columns + reference.offset[n]), gray = pick(read >= 0, read, centre);
+      const Integers read = look_up(first, at + reference.offset[n]), gray = pick(read >= 0, read, centre);
       const float* weights = reference.weight[Reference::distance(n)] + Reference::kGrays;
       const Floats w = pick(read >= 0, look_up(weights, gray - centre), all<Floats>(0.f));
       level[n] = real(gray);
@@ -93,7 +93,7 @@ struct Windows {
       store(weight[n], w), store(weighted[n], product);
       squares[n % kPartials] = mad(product, off, squares[n % kPartials]);
     }
-    u = real(columns), v = all<Floats>(float(y)), variance = sum_of_partials(squares);
+    u = real(columns), v = real(rows), variance = sum_of_partials(squares);
   }
 };
 
@@ -179,13 +179,17 @@ class Batch {
       : task_(task), reference_(reference), costs_(size_t(kLanes) * kMaxCandidates * task.source_count),
         queue_(task, windows_, costs_.data()) {}
 
-  // Places the windows of `count` pixels of a row; the lanes beyond repeat the last one.
-  void place(const int* columns, int count, int y) {
-    for (int l = 0; l < kLanes; l++) columns_[l] = columns[std::min(l, count - 1)];
-    windows_.place(reference_, columns_, y);
+  // Places the windows of `count` pixels; the lanes beyond repeat the last one.
+  void place(const int* columns, const int* rows, int count) {
+    for (int l = 0; l < kLanes; l++) {
+      const int n = std::min(l, count - 1);
+      columns_[l] = columns[n], rows_[l] = rows[n];
+    }
+    windows_.place(reference_, columns_, rows_);
     lanes_ = bits(windows_.variance >= kMinVariance) & ((2u << (count - 1)) - 1);
   }
   Integers columns() const { return columns_; }
+  Integers rows() const { return rows_; }
   unsigned lanes() const { return lanes_; }  // bit l says that lane l holds a pixel with texture
 
   // Matches the planes from number `known` on, where they are used, in the sources whose bit in `views` is 1.
@@ -226,79 +230,82 @@ class Batch {
   const Reference& reference_;
   Windows windows_;
   const Integers lane_ = numbered();
-  Integers columns_ = {};
+  Integers columns_ = {}, rows_ = {};
   unsigned lanes_ = 0;
   std::vector<float> costs_;
   Queue queue_;
 };
 
-// cheapest_of for the pixels at `columns` of a row.
-Integers cheapest_of(const Task& t, const Reference& reference, Integers columns, int y, int region) {
-  const float* row = t.costs + (long long)y * t.width;
+// cheapest_of for the pixels at `columns` and `rows`.
+Integers cheapest_of(const Task& t, const Reference& reference, Integers columns, Integers rows, int region) {
+  const Integers here = rows * t.width + columns;
   Floats lowest = all<Floats>(1e9f);
-  Integers found = Integers{} + kNowhere;
+  Integers found = Integers{} - 1;
   for (int n = 0; n < region_size(region); n++) {
     const int dx = reference.dx[region][n], dy = reference.dy[region][n];
-    if (y + dy < 0 || y + dy >= t.height) continue;
-    const Integers x = columns + dx, inside = (x >= 0) & (x < t.width);
-    const Integers at = pick(inside, x + dy * t.width, columns);
-    const Floats cost = look_up(row, at);
+    // As if they had no sign, numbers below 0 are large.
+    const Unsigneds x = (Unsigneds)(columns + dx), y = (Unsigneds)(rows + dy);
+    const Integers inside = (Integers)(x < unsigned(t.width)) & (Integers)(y < unsigned(t.height));
+    const Integers at = pick(inside, here + (dy * t.width + dx), here);
+    const Floats cost = look_up(t.costs, at);
     const Integers better = inside & (cost < lowest);
     lowest = pick(better, cost, lowest), found = pick(better, at, found);
   }
   return found;
 }
 
-// Calls work(columns, count) with the wanted pixels of a row, every `step`-th from `first` on, kLanes at a time.
+// Calls work(columns, rows, count) with the wanted pixels of rows top to bottom - 1, kLanes at a time: all of them, or
+// those of one colour.
 template <class Work>
-void wanted_pixels(const Task& t, int y, int first, int step, const Work& work) {
-  int columns[kLanes], count = 0;
-  for (int x = first; x < t.width; x += step) {
-    if (wanted(t, (long long)y * t.width + x)) columns[count++] = x;
-    if (count == kLanes) work(columns, count), count = 0;
+void wanted_pixels(const Task& t, int top, int bottom, int step, int colour, const Work& work) {
+  int columns[kLanes], rows[kLanes], count = 0;
+  for (int y = top; y < bottom; y++) {
+    for (int x = step == 2 ? (y + colour) & 1 : 0; x < t.width; x += step) {
+      if (wanted(t, (long long)y * t.width + x)) columns[count] = x, rows[count++] = y;
+      if (count == kLanes) work(columns, rows, count), count = 0;
+    }
   }
-  if (count) work(columns, count);
+  if (count) work(columns, rows, count);
 }
 
-// first_costs [H, source_count, W]: of the planes that the pixels start with.
-void begin_row(const Task& t, const Reference& reference, float* first_costs, int y) {
+// first_costs [source_count, H, W]: of the planes that the pixels start with.
+void begin_rows(const Task& t, const Reference& reference, float* first_costs, int top, int bottom) {
   Batch batch(t, reference);
-  wanted_pixels(t, y, 0, 1, [&](const int* columns, int count) {
-    batch.place(columns, count, y);
+  const size_t size = size_t(t.width) * t.height;
+  wanted_pixels(t, top, bottom, 1, 0, [&](const int* columns, const int* rows, int count) {
+    batch.place(columns, rows, count);
     Plane<Floats> planes = {};
     for (int n = 0; n < count; n++) {
-      const Plane<float> plane = drawn_plane(t, columns[n], y);
+      const Plane<float> plane = drawn_plane(t, columns[n], rows[n]);
       planes.a[n] = plane.a, planes.b[n] = plane.b, planes.c[n] = plane.c;
     }
     for (int s = 0; s < t.source_count; s++) batch.know(0, s, all<Floats>(kNoMatch));
     const Integers used = Integers{} - 1;
     batch.match(&planes, &used, 0, 1, Unsigneds{} - 1u);
     for (int n = 0; n < count; n++) {
+      const size_t i = size_t(rows[n]) * t.width + columns[n];
       float costs[kMaxSources];
-      for (int s = 0; s < t.source_count; s++) {
-        costs[s] = batch.cost(0, s)[n];
-        first_costs[(size_t(y) * t.source_count + s) * t.width + columns[n]] = costs[s];
-      }
-      begin(t, costs, (long long)y * t.width + columns[n]);
+      for (int s = 0; s < t.source_count; s++) costs[s] = first_costs[s * size + i] = batch.cost(0, s)[n];
+      begin(t, costs, (long long)i);
     }
   });
 }
 
-void update_row(const Task& t, const Reference& reference, const float* first_costs, int y, int colour, int round) {
+void update_rows(const Task& t, const Reference& reference, const float* first_costs, int top, int bottom, int colour,
+                 int round) {
   Batch batch(t, reference);
   const auto cost = [&](int k, int s) { return batch.cost(k, s); };
-  wanted_pixels(t, y, (y + colour) & 1, 2, [&](const int* columns, int count) {
-    batch.place(columns, count, y);
-    const long long row = (long long)y * t.width;
+  wanted_pixels(t, top, bottom, 2, colour, [&](const int* columns, const int* rows, int count) {
+    batch.place(columns, rows, count);
+    Turn<Floats> turn(t, batch.columns(), batch.rows(), round);
     const auto textured = [&](int n) { return batch.lanes() >> n & 1; };
     for (int n = 0; n < count; n++)
-      if (!textured(n)) t.costs[row + columns[n]] = kNoMatch;
+      if (!textured(n)) t.costs[turn.pixel[n]] = kNoMatch;
     if (!batch.lanes()) return;
-    Turn<Floats> turn(t, batch.columns(), y, round);
-    turn.gather([&](int region) { return cheapest_of(t, reference, batch.columns(), y, region); });
+    turn.gather([&](int region) { return cheapest_of(t, reference, batch.columns(), batch.rows(), region); });
     const int known = round == 0 ? 1 : 0;  // nobody else has changed the plane that a pixel starts with
     for (int s = 0; s < t.source_count * known; s++)
-      batch.know(0, s, look_up(first_costs + (size_t(y) * t.source_count + s) * t.width, batch.columns()));
+      batch.know(0, s, look_up(first_costs + size_t(s) * t.width * t.height, turn.pixel));
     batch.match(turn.planes, turn.used, known, turn.count, Unsigneds{} - 1u);
     turn.choose(cost, [&](int k, int s) { return belief_of(batch.cost(k, s)); });
     const auto match_drawn = [&] {
@@ -309,8 +316,9 @@ void update_row(const Task& t, const Reference& reference, const float* first_co
     turn.draw_nearby(), match_drawn();
     for (int n = 0; n < count; n++) {
       if (!textured(n)) continue;
-      put(t, row + columns[n], {turn.best.a[n], turn.best.b[n], turn.best.c[n]});
-      t.costs[row + columns[n]] = turn.cost[n], t.views[row + columns[n]] = turn.selection.views[n];
+      const int i = turn.pixel[n];
+      put(t, i, {turn.best.a[n], turn.best.b[n], turn.best.c[n]});
+      t.costs[i] = turn.cost[n], t.views[i] = turn.selection.views[n];
     }
   });
 }
@@ -386,10 +394,14 @@ void d2_patchmatch(const Task* task) {
   const Task& t = *task;
   const Reference reference(t);
   std::vector<float> first_costs(size_t(t.width) * t.height * t.source_count);
-  parallel_rows(t.height, t.threads, [&](int y) { begin_row(t, reference, first_costs.data(), y); });
+  parallel_rows(t.height, t.threads, [&](int top, int bottom) {
+    begin_rows(t, reference, first_costs.data(), top, bottom);
+  });
   for (int round = 0; round < t.rounds; round++) {
     for (int colour = 0; colour < 2; colour++) {
-      const auto update = [&](int y) { update_row(t, reference, first_costs.data(), y, colour, round); };
+      const auto update = [&](int top, int bottom) {
+        update_rows(t, reference, first_costs.data(), top, bottom, colour, round);
+      };
       parallel_rows(t.height, t.threads, update);
     }
   }
@@ -399,7 +411,9 @@ void d2_patchmatch(const Task* task) {
 // the plane stays as it is.
 void d2_consensus(const Task* task, int32_t radius, float tolerance, float* averaged) {
   const Fields fields(*task, radius, task->planes);
-  parallel_rows(task->height, task->threads, [&](int y) { average_row(*task, fields, tolerance, y, averaged); });
+  parallel_rows(task->height, task->threads, [&](int top, int bottom) {
+    for (int y = top; y < bottom; y++) average_row(*task, fields, tolerance, y, averaged);
+  });
 }
 
 }  // extern "C"

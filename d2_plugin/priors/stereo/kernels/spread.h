@@ -74,19 +74,16 @@ D2_FN void region_place(int region, int k, int& dx, int& dy) {
   dy = y ? y * forward : middle ? 0 : across;
 }
 
-constexpr int kNowhere = -2147483647;
-
-// The cheapest pixel of a region, counted from the first of row y; kNowhere if all of it lies outside of the picture.
+// The cheapest pixel of a region, negative where all of it lies outside of the picture.
 D2_FN int cheapest_of(const Task& t, int x, int y, int region) {
-  const float* row = t.costs + (long long)y * t.width;
   float lowest = 1e9f;
-  int found = kNowhere;
+  int found = -1;
   for (int k = 0; k < region_size(region); k++) {
     int dx, dy;
     region_place(region, k, dx, dy);
     if (x + dx < 0 || y + dy < 0 || x + dx >= t.width || y + dy >= t.height) continue;
-    const int j = x + dx + dy * t.width;
-    if (row[j] < lowest) lowest = row[j], found = j;
+    const int j = (y + dy) * t.width + x + dx;
+    if (t.costs[j] < lowest) lowest = t.costs[j], found = j;
   }
   return found;
 }
@@ -100,13 +97,10 @@ struct Neighbours {
   Word<S> views[4];
   Mask<S> there[4];
 
-  D2_FN Neighbours(const Task& t, Whole<S> x, int y) {
-    const unsigned* row = t.views + (long long)y * t.width;
-    const Mask<S> yes = x == x, no = opposite(yes);
-    there[0] = x > 0, there[1] = x + 1 < t.width;
-    there[2] = y > 0 ? yes : no, there[3] = y + 1 < t.height ? yes : no;
+  D2_FN Neighbours(const Task& t, Whole<S> x, Whole<S> y, Whole<S> pixel) {
+    there[0] = x > 0, there[1] = x + 1 < t.width, there[2] = y > 0, there[3] = y + 1 < t.height;
     const int step[4] = {-1, 1, -t.width, t.width};
-    for (int n = 0; n < 4; n++) views[n] = (Word<S>)look_up(row, pick(there[n], x + step[n], x));
+    for (int n = 0; n < 4; n++) views[n] = (Word<S>)look_up(t.views, pick(there[n], pixel + step[n], pixel));
   }
 
   // How far they believe in a source.
@@ -142,8 +136,8 @@ D2_FN void normalise(const Task& t, Selection<S>& selection, S total) {
 template <class S>
 struct Turn {
   const Task& task;
-  Whole<S> x;
-  int y, round;
+  Whole<S> x, y, pixel;
+  int round;
   Sight<S> sight;
   Random<S> random;
   Selection<S> selection;
@@ -153,21 +147,21 @@ struct Turn {
   Mask<S> used[kMaxCandidates];
   Plane<S> planes[kMaxCandidates];
 
-  D2_FN Turn(const Task& t, Whole<S> column, int row, int number)
-      : task(t), x(column), y(row), round(number), sight(sight_of(t.intrinsics, real(column), all<S>(float(row)))),
-        random(t.seed, (Word<S>)column + unsigned(row) * unsigned(t.width), unsigned(number)), cost(all<S>(1e9f)),
-        count(0) {}
+  D2_FN Turn(const Task& t, Whole<S> column, Whole<S> row, int number)
+      : task(t), x(column), y(row), pixel(row * t.width + column), round(number),
+        sight(sight_of(t.intrinsics, real(column), real(row))), random(t.seed, (Word<S>)pixel, unsigned(number)),
+        cost(all<S>(1e9f)), count(0) {}
 
   // The pixel's own plane first, then the cheapest plane of each region, none of them twice. cheapest(region) is
   // cheapest_of.
   template <class Cheapest>
   D2_FN void gather(const Cheapest& cheapest) {
-    best = plane_from(x);
+    best = plane_from(pixel);
     keep(best, x == x);
     for (int region = 0; region < kRegions; region++) {
       const Whole<S> place = cheapest(region);
-      const Mask<S> found = place != kNowhere;
-      const Plane<S> plane = plane_from(pick(found, place, x));
+      const Mask<S> found = place >= 0;
+      const Plane<S> plane = plane_from(pick(found, place, pixel));
       Mask<S> fresh = found & in_range(task, plane.inverse_depth(sight.u, sight.v));
       for (int k = 0; k < count; k++) fresh = fresh & opposite(used[k] & (planes[k] == plane));
       keep(plane, fresh);
@@ -184,7 +178,7 @@ struct Turn {
     S share = zero, total = zero;
     for (int k = 0; k < count; k++) share += pick(used[k], one, zero);
     share = share / 8.f;  // the published counts are for eight candidates
-    const Neighbours<S> neighbours(task, x, y);
+    const Neighbours<S> neighbours(task, x, y, pixel);
     for (int s = 0; s < task.source_count; s++) {
       S likelihood = zero, good = zero, bad = zero;
       for (int k = 0; k < count; k++) {
@@ -248,8 +242,10 @@ struct Turn {
 
  private:
   D2_FN Plane<S> plane_from(Whole<S> place) const {
-    const float* row = task.planes + 3 * (long long)y * task.width;
-    return {look_up(row, place * 3), look_up(row + 1, place * 3), look_up(row + 2, place * 3)};
+    const int base = first_lane(pixel);  // three times a place may be more than an integer holds
+    const float* from = task.planes + 3ll * base;
+    const Whole<S> at = (place - base) * 3;
+    return {look_up(from, at), look_up(from + 1, at), look_up(from + 2, at)};
   }
   D2_FN void keep(const Plane<S>& plane, Mask<S> yes) { planes[count] = plane, used[count++] = yes; }
   D2_FN void add(S q, const Vector<S>& normal) {
