@@ -22,6 +22,13 @@ constexpr int kLanes = 4;
 #endif
 typedef float Floats __attribute__((vector_size(4 * kLanes)));
 typedef int32_t Integers __attribute__((vector_size(4 * kLanes)));
+typedef uint32_t Unsigneds __attribute__((vector_size(4 * kLanes)));
+template <>
+struct Kind<Floats> {
+  typedef Integers Mask;
+  typedef Integers Whole;
+  typedef Unsigneds Word;
+};
 constexpr unsigned kAllLanes = (1u << kLanes) - 1;
 
 template <class V, class E>
@@ -36,6 +43,10 @@ D2_FN Integers whole(Floats a) { return __builtin_convertvector(a, Integers); }
 D2_FN Floats real(Integers a) { return __builtin_convertvector(a, Floats); }
 D2_FN Floats bits_float(Integers a) { return (Floats)a; }
 D2_FN Floats pick(Integers yes, Floats a, Floats b) { return yes ? a : b; }
+D2_FN Integers pick(Integers yes, Integers a, Integers b) { return yes ? a : b; }
+D2_FN Unsigneds pick(Integers yes, Unsigneds a, Unsigneds b) { return (Unsigneds)(yes ? (Integers)a : (Integers)b); }
+D2_FN Integers opposite(Integers yes) { return ~yes; }
+D2_FN int first_lane(Integers a) { return a[0]; }
 
 #if defined(__AVX512F__)
 D2_FN Floats mad(Floats a, Floats b, Floats c) { return (Floats)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c); }
@@ -98,6 +109,8 @@ D2_FN unsigned bits(Integers yes) {
   return found;
 }
 #endif
+D2_FN bool none(Integers yes) { return bits(yes) == 0; }
+
 #if defined(__AVX512BW__)
 // A byte k in the lowest bits of 2^23 is 2^23 + k, and differences of such numbers are exact.
 D2_FN Corners<Floats> corners_of(Integers quad) {

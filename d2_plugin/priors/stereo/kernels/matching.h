@@ -116,22 +116,26 @@ struct Sums {
 D2_FN float last_place(int size) { return larger(float(size) - 1.001f, 0.f); }
 
 // Forward-backward error in pixels: to the source by the plane, back by the source's own depth.
-D2_FN float reprojection_error(const Source& source, const float* depths, const Plane& plane, float u, float v) {
-  const float q = plane.inverse_depth(u, v);
-  const float* A = source.A;
-  const float z = mad(source.k[2], q, mad(A[6], u, mad(A[7], v, A[8])));
-  if (!(q > 0 && z > 1e-6f)) return kMaxReprojection;
-  const float x = mad(source.k[0], q, mad(A[0], u, mad(A[1], v, A[2]))) / z;
-  const float y = mad(source.k[1], q, mad(A[3], u, mad(A[4], v, A[5]))) / z;
+template <class S>
+D2_FN S reprojection_error(const Source& source, const float* depths, const Plane<S>& plane, S u, S v) {
+  const auto row = [](const float* m, S x, S y) {
+    return mad(all<S>(m[0]), x, mad(all<S>(m[1]), y, all<S>(m[2])));
+  };
+  const float *A = source.A, *B = source.back_A, *k = source.k, *back_k = source.back_k;
+  const S q = plane.inverse_depth(u, v), z = mad(all<S>(k[2]), q, row(A + 6, u, v));
+  const S x = mad(all<S>(k[0]), q, row(A, u, v)) / z, y = mad(all<S>(k[1]), q, row(A + 3, u, v)) / z;
   const float right = source.width - .5f, bottom = source.height - .5f;
-  if (!(x > -.5f && y > -.5f && x < right && y < bottom)) return kMaxReprojection;
-  const float depth = depths[source.first + int(y + .5f) * source.width + int(x + .5f)];
-  const float* B = source.back_A;
-  const float back_z = mad(mad(B[6], x, mad(B[7], y, B[8])), depth, source.back_k[2]);
-  if (!(depth > 0 && back_z > 1e-6f)) return kMaxReprojection;
-  const float du = mad(mad(B[0], x, mad(B[1], y, B[2])), depth, source.back_k[0]) / back_z - u;
-  const float dv = mad(mad(B[3], x, mad(B[4], y, B[5])), depth, source.back_k[1]) / back_z - v;
-  return smaller(root(mad(du, du, dv * dv)), kMaxReprojection);
+  const Mask<S> ahead = (q > 0.f) & (z > 1e-6f);
+  const Mask<S> inside = ahead & (x > -.5f) & (y > -.5f) & (x < right) & (y < bottom);
+  const S zero = all<S>(0.f);
+  const Whole<S> column = whole(pick(inside, x + .5f, zero)), line = whole(pick(inside, y + .5f, zero));
+  const S depth = look_up(depths, line * source.width + column + source.first);
+  const S back_z = mad(row(B + 6, x, y), depth, all<S>(back_k[2]));
+  const S du = mad(row(B, x, y), depth, all<S>(back_k[0])) / back_z - u;
+  const S dv = mad(row(B + 3, x, y), depth, all<S>(back_k[1])) / back_z - v;
+  const S most = all<S>(kMaxReprojection);
+  const Mask<S> back = inside & (depth > 0.f) & (back_z > 1e-6f);
+  return pick(back, smaller(root(mad(du, du, dv * dv)), most), most);
 }
 
 }  // namespace d2

@@ -29,11 +29,33 @@ D2_FN float bits_float(int a) { float b; __builtin_memcpy(&b, &a, sizeof b); ret
 D2_FN int whole(float a) { return int(a); }  // towards zero
 D2_FN float real(int a) { return float(a); }
 D2_FN float pick(bool yes, float a, float b) { return yes ? a : b; }
+D2_FN int pick(bool yes, int a, int b) { return yes ? a : b; }
+D2_FN unsigned pick(bool yes, unsigned a, unsigned b) { return yes ? a : b; }
+D2_FN bool none(bool yes) { return !yes; }  // whether it is true in no lane
+D2_FN bool opposite(bool yes) { return !yes; }
+D2_FN int first_lane(int a) { return a; }
 // NaN in the first argument gives the second: what is not a number is sent to a border.
 D2_FN float smaller(float a, float b) { return a < b ? a : b; }
 D2_FN float larger(float a, float b) { return a > b ? a : b; }
 D2_FN float magnitude(float a) { return a < 0 ? -a : a; }
 D2_FN int look_up(const unsigned* from, int place) { return int(from[place]); }
+D2_FN float look_up(const float* from, int place) { return from[place]; }
+
+// What goes with a number, or with a vector of them (lanes.h): the result of a comparison, and integers.
+template <class S>
+struct Kind;
+template <>
+struct Kind<float> {
+  typedef bool Mask;
+  typedef int Whole;
+  typedef unsigned Word;
+};
+template <class S>
+using Mask = typename Kind<S>::Mask;
+template <class S>
+using Whole = typename Kind<S>::Whole;
+template <class S>
+using Word = typename Kind<S>::Word;
 
 // The bytes of a quad, from the lowest on: a grey value, what its right neighbour is more, and the same a row below.
 template <class S>

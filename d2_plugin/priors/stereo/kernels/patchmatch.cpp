@@ -1,5 +1,5 @@
-// PatchMatch multi-view stereo on the CPU: the pixels of spread.h in threads, as many of a row at once as a vector has
-// lanes. What they ask for (planes times sources) is matched in the lanes, so that no sum runs across a vector.
+// PatchMatch multi-view stereo on the CPU: the pixels of spread.h in threads, as many at once as a vector has lanes.
+// What they ask for (planes times sources) is packed and matched in the lanes: no sum runs across a vector.
 #include <algorithm>
 #include <atomic>
 #include <cstddef>
@@ -17,13 +17,13 @@ namespace {
 constexpr int kRowsAtOnce = 4;     // that a thread takes from the queue
 constexpr int kRowsPerThread = 16;  // fewer are not worth starting one
 
+// Calls work(top, bottom) in threads until all rows are done, those from top to bottom - 1 at a time.
 template <class Work>
 void parallel_rows(int rows, int threads, const Work& work) {
   std::atomic<int> next{0};
   const auto run = [&] {
-    for (int first; (first = next.fetch_add(kRowsAtOnce)) < rows;) {
-      for (int row = first; row < std::min(rows, first + kRowsAtOnce); row++) work(row);
-    }
+    for (int first; (first = next.fetch_add(kRowsAtOnce)) < rows;)
+      work(first, std::min(rows, first + kRowsAtOnce));
   };
   std::vector<std::thread> others;
   try {
@@ -35,42 +35,55 @@ void parallel_rows(int rows, int threads, const Work& work) {
   for (std::thread& other : others) other.join();
 }
 
-// Grey values of the reference with a margin, so that all windows are read alike, and where other pixels lie.
+// Grey values of the reference with a margin, so that all windows are read alike, what samples weigh, and where other
+// pixels lie.
 struct Reference {
   static constexpr int kMargin = 5;
+  static constexpr int kGrays = 256, kDistances = 5;  // of samples from the middle of a window
   int stride;
   std::vector<unsigned> levels;                // -1 outside of the picture
   int offset[kSamples];                        // of the samples, in `levels`
+  alignas(64) float weight[kDistances][2 * kGrays];  // by distance and difference of grey values, from -256 on
   int dx[kRegions][kMostPlaces], dy[kRegions][kMostPlaces];
 
   explicit Reference(const Task& t)
       : stride(t.width + 2 * kMargin), levels(size_t(stride) * (t.height + 2 * kMargin), ~0u) {
     for (int y = 0; y < t.height; y++) std::copy_n(t.gray + size_t(y) * t.width, t.width, &levels[at(0, y)]);
-    for (int n = 0; n < kSamples; n++) offset[n] = sample_dv(n) * stride + sample_du(n);
+    for (int n = 0; n < kSamples; n++) {
+      const int du = sample_du(n), dv = sample_dv(n);
+      offset[n] = dv * stride + du;
+      if (du < dv || dv < 0) continue;  // each distance once
+      for (int k = 0; k < 2 * kGrays; k++) {
+        const float off = float(k - kGrays);
+        weight[distance(n)][k] = exp2_of(mad(off * off, t.per_gray, log2_spatial(du, dv)));
+      }
+    }
     for (int region = 0; region < kRegions; region++)
       for (int n = 0; n < region_size(region); n++) region_place(region, n, dx[region][n], dy[region][n]);
+  }
+  // Squared distances are 2, 10, 18, 26 and 34.
+  static int distance(int sample) {
+    return (sample_du(sample) * sample_du(sample) + sample_dv(sample) * sample_dv(sample)) / 8;
   }
   size_t at(int x, int y) const { return size_t(y + kMargin) * stride + kMargin + x; }
 };
 
-// The windows around as many pixels of a row as there are lanes.
+// The windows around as many pixels as there are lanes.
 struct Windows {
   alignas(64) float weight[kSamples][kLanes], weighted[kSamples][kLanes];
   Floats u, v, variance;
 
-  // columns: of the pixels.
-  void place(const Reference& reference, float per_gray, Integers columns, int y) {
-    const unsigned* row = &reference.levels[reference.at(0, y)];
-    const Floats centre = real(look_up(row, columns));
+  // columns, rows: of the pixels.
+  void place(const Reference& reference, Integers columns, Integers rows) {
+    const unsigned* first = &reference.levels[reference.at(0, 0)];
+    const Integers at = rows * reference.stride + columns, centre = look_up(first, at);
     Floats level[kSamples], total[kPartials], mean[kPartials], squares[kPartials];
     for (int k = 0; k < kPartials; k++) total[k] = mean[k] = squares[k] = all<Floats>(0.f);
     for (int n = 0; n < kSamples; n++) {
-      const Integers read = look_up(row, columns + reference.offset[n]);
-      level[n] = pick(read >= 0, real(read), centre);
-      const Floats off = level[n] - centre;
-      const Floats spatial = all<Floats>(log2_spatial(sample_du(n), sample_dv(n)));
-      const Floats log2_weight = mad(off * off, all<Floats>(per_gray), spatial);
-      const Floats w = pick(read >= 0, exp2_of(log2_weight), all<Floats>(0.f));
+      const Integers read = look_up(first, at + reference.offset[n]), gray = pick(read >= 0, read, centre);
+      const float* weights = reference.weight[Reference::distance(n)] + Reference::kGrays;
+      const Floats w = pick(read >= 0, look_up(weights, gray - centre), all<Floats>(0.f));
+      level[n] = real(gray);
       store(weight[n], w);
       total[n % kPartials] += w, mean[n % kPartials] = mad(w, level[n], mean[n % kPartials]);
     }
@@ -80,7 +93,7 @@ struct Windows {
       store(weight[n], w), store(weighted[n], product);
       squares[n % kPartials] = mad(product, off, squares[n % kPartials]);
     }
-    u = real(columns), v = all<Floats>(float(y)), variance = sum_of_partials(squares);
+    u = real(columns), v = real(rows), variance = sum_of_partials(squares);
   }
 };
 
@@ -159,173 +172,154 @@ class Queue {
   alignas(64) float first_[2 * kLanes] = {}, stride_[2 * kLanes] = {};  // integers, as they are
 };
 
-// Planes of the pixels whose windows are placed, and what they cost: [kLanes, kMaxCandidates, source_count].
+// The planes of the pixels whose windows are placed, and what they cost: [kMaxCandidates, source_count, kLanes].
 class Batch {
  public:
   Batch(const Task& task, const Reference& reference)
-      : task_(task), reference_(reference), costs_(size_t(kLanes) * kMaxCandidates * task.source_count + kLanes),
-        beliefs_(costs_.size()), queue_(task, windows_, costs_.data()) {}
+      : task_(task), reference_(reference), costs_(size_t(kLanes) * kMaxCandidates * task.source_count),
+        queue_(task, windows_, costs_.data()) {}
 
-  // Places the windows of `count` pixels of a row.
-  void place(const int* columns, int count, int y) {
-    for (int l = 0; l < kLanes; l++) columns_[l] = columns[std::min(l, count - 1)];
-    windows_.place(reference_, task_.per_gray, columns_, y);
+  // Places the windows of `count` pixels; the lanes beyond repeat the last one.
+  void place(const int* columns, const int* rows, int count) {
+    for (int l = 0; l < kLanes; l++) {
+      const int n = std::min(l, count - 1);
+      columns_[l] = columns[n], rows_[l] = rows[n];
+    }
+    windows_.place(reference_, columns_, rows_);
+    lanes_ = bits(windows_.variance >= kMinVariance) & ((2u << (count - 1)) - 1);
   }
   Integers columns() const { return columns_; }
-  bool textured(int pixel) const { return windows_.variance[pixel] >= kMinVariance; }
+  Integers rows() const { return rows_; }
+  unsigned lanes() const { return lanes_; }  // bit l says that lane l holds a pixel with texture
 
-  // Asks what the planes of a pixel from number `known` on cost in the sources whose bit in `views` is 1.
-  void ask(int pixel, const Plane* planes, int known, int count, unsigned views) {
-    for (int k = known; k < count; k++, asked_++) {
-      a_[asked_] = planes[k].a, b_[asked_] = planes[k].b, c_[asked_] = planes[k].c;
-      pixel_[asked_] = pixel, place_[asked_] = int(costs(pixel) - costs_.data()) + k * task_.source_count;
-      views_[asked_] = int(views);
+  // Matches the planes from number `known` on, where they are used, in the sources whose bit in `views` is 1.
+  void match(const Plane<Floats>* planes, const Integers* used, int known, int count, Unsigneds views) {
+    unsigned asked[kMaxCandidates];
+    for (int k = known; k < count; k++) asked[k] = bits(used[k]) & lanes_;
+    for (int s = 0; s < task_.source_count; s++) {
+      const unsigned selected = bits((Integers)(views >> s & 1u) > 0);
+      const Source& source = task_.sources[s];
+      Floats A[9], shift[3];
+      for (int e = 0; e < 9; e++) A[e] = all<Floats>(source.A[e]);
+      for (int e = 0; e < 3; e++) shift[e] = all<Floats>(source.k[e]);
+      const Floats width = all<Floats>(float(source.width)), height = all<Floats>(float(source.height));
+      for (int k = known; k < count; k++) {
+        if (!(asked[k] & selected)) continue;
+        const Plane<Floats>& p = planes[k];
+        const Warp<Floats> warp = warp_of(A, shift, width, height, p.a, p.b, p.c, windows_.u, windows_.v);
+        const unsigned lanes = asked[k] & selected & bits(warp.seen > 0.f);
+        const int first = (k * task_.source_count + s) * kLanes;
+        store(&costs_[first], all<Floats>(kNoMatch));
+        if (lanes) queue_.add(lanes, warp, source, lane_, lane_ + first);
+      }
     }
-  }
-
-  // Matches all that was asked for.
-  void match() {
-    const int asked = asked_;
-    for (; asked_ % kLanes; asked_++) {
-      a_[asked_] = b_[asked_] = c_[asked_] = 0;
-      pixel_[asked_] = place_[asked_] = views_[asked_] = 0;
-    }
-    std::fill(costs_.begin(), costs_.end(), kNoMatch);
-    for (int s = 0; s < task_.source_count; s++) match(task_.sources[s], s, asked);
     queue_.flush();
-    asked_ = 0;
   }
 
-  // belief_of all costs.
-  void believe() {
-    for (size_t n = 0; n + kLanes <= costs_.size(); n += kLanes)
-      store(&beliefs_[n], belief_of(load<Floats>(&costs_[n])));
-  }
-
-  float* costs(int pixel) { return &costs_[size_t(pixel) * kMaxCandidates * task_.source_count]; }
-  const float* beliefs(int pixel) const { return &beliefs_[size_t(pixel) * kMaxCandidates * task_.source_count]; }
+  Floats cost(int k, int s) const { return load<Floats>(&costs_[(size_t(k) * task_.source_count + s) * kLanes]); }
+  void know(int k, int s, Floats cost) { store(&costs_[(size_t(k) * task_.source_count + s) * kLanes], cost); }
 
  private:
-  void match(const Source& source, int number, int asked) {
-    Floats A[9], k[3];
-    for (int e = 0; e < 9; e++) A[e] = all<Floats>(source.A[e]);
-    for (int e = 0; e < 3; e++) k[e] = all<Floats>(source.k[e]);
-    const Floats width = all<Floats>(float(source.width)), height = all<Floats>(float(source.height));
-    for (int from = 0; from < asked; from += kLanes) {
-      const unsigned selected = bits((load<Integers>(views_ + from) >> number & 1) > 0);
-      if (!selected) continue;
-      const Integers pixel = load<Integers>(pixel_ + from);
-      const Floats u = reordered(windows_.u, pixel), v = windows_.v;
-      const Warp<Floats> warp = warp_of(A, k, width, height, load<Floats>(a_ + from), load<Floats>(b_ + from),
-                                        load<Floats>(c_ + from), u, v);
-      const unsigned lanes = selected & bits(warp.seen > 0.f);
-      if (lanes) queue_.add(lanes, warp, source, pixel, load<Integers>(place_ + from) + number);
-    }
+  static Integers numbered() {
+    Integers lane;
+    for (int l = 0; l < kLanes; l++) lane[l] = l;
+    return lane;
   }
 
-  static constexpr int kMostAsked = kLanes * kMaxCandidates;
   const Task& task_;
   const Reference& reference_;
   Windows windows_;
-  Integers columns_ = {};
-  std::vector<float> costs_, beliefs_;
+  const Integers lane_ = numbered();
+  Integers columns_ = {}, rows_ = {};
+  unsigned lanes_ = 0;
+  std::vector<float> costs_;
   Queue queue_;
-  int asked_ = 0;
-  alignas(64) float a_[kMostAsked], b_[kMostAsked], c_[kMostAsked];
-  alignas(64) int pixel_[kMostAsked], place_[kMostAsked], views_[kMostAsked];
 };
 
-// cheapest_of for the pixels at `columns` of a row and every region, as numbers of pixels; -1 where there is none.
-struct Cheapest {
-  alignas(64) int place[kRegions][kLanes];
-
-  Cheapest(const Task& t, const Reference& reference, Integers columns, int y) {
-    const Integers here = columns + y * t.width, none = Integers{} - 1;
-    for (int region = 0; region < kRegions; region++) {
-      Floats lowest = all<Floats>(1e9f);
-      Integers found = none;
-      for (int n = 0; n < region_size(region); n++) {
-        const int dx = reference.dx[region][n], dy = reference.dy[region][n];
-        if (y + dy < 0 || y + dy >= t.height) continue;
-        const Integers x = columns + dx, inside = (x >= 0) & (x < t.width);
-        const Integers at = inside ? here + (dy * t.width + dx) : here;
-        const Floats cost = look_up(t.costs, at);
-        const Integers better = inside & (cost < lowest);
-        lowest = pick(better, cost, lowest), found = better ? at : found;
-      }
-      std::memcpy(place[region], &found, sizeof found);
-    }
+// cheapest_of for the pixels at `columns` and `rows`.
+Integers cheapest_of(const Task& t, const Reference& reference, Integers columns, Integers rows, int region) {
+  const Integers here = rows * t.width + columns;
+  Floats lowest = all<Floats>(1e9f);
+  Integers found = Integers{} - 1;
+  for (int n = 0; n < region_size(region); n++) {
+    const int dx = reference.dx[region][n], dy = reference.dy[region][n];
+    // As if they had no sign, numbers below 0 are large.
+    const Unsigneds x = (Unsigneds)(columns + dx), y = (Unsigneds)(rows + dy);
+    const Integers inside = (Integers)(x < unsigned(t.width)) & (Integers)(y < unsigned(t.height));
+    const Integers at = pick(inside, here + (dy * t.width + dx), here);
+    const Floats cost = look_up(t.costs, at);
+    const Integers better = inside & (cost < lowest);
+    lowest = pick(better, cost, lowest), found = pick(better, at, found);
   }
-};
-
-// Calls work(columns, count) with the wanted pixels of a row, every `step`-th from `first` on, kLanes at a time.
-template <class Work>
-void wanted_pixels(const Task& t, int y, int first, int step, const Work& work) {
-  int columns[kLanes], count = 0;
-  for (int x = first; x < t.width; x += step) {
-    if (wanted(t, (long long)y * t.width + x)) columns[count++] = x;
-    if (count == kLanes) work(columns, count), count = 0;
-  }
-  if (count) work(columns, count);
+  return found;
 }
 
-// first_costs [H, W, source_count]: of the planes that the pixels start with.
-void begin_row(const Task& t, const Reference& reference, float* first_costs, int y) {
-  Batch batch(t, reference);
-  wanted_pixels(t, y, 0, 1, [&](const int* columns, int count) {
-    batch.place(columns, count, y);
-    for (int n = 0; n < count; n++) {
-      const Plane plane = drawn_plane(t, columns[n], y);
-      if (batch.textured(n)) batch.ask(n, &plane, 0, 1, ~0u);
+// Calls work(columns, rows, count) with the wanted pixels of rows top to bottom - 1, kLanes at a time: all of them, or
+// those of one colour.
+template <class Work>
+void wanted_pixels(const Task& t, int top, int bottom, int step, int colour, const Work& work) {
+  int columns[kLanes], rows[kLanes], count = 0;
+  for (int y = top; y < bottom; y++) {
+    for (int x = step == 2 ? (y + colour) & 1 : 0; x < t.width; x += step) {
+      if (wanted(t, (long long)y * t.width + x)) columns[count] = x, rows[count++] = y;
+      if (count == kLanes) work(columns, rows, count), count = 0;
     }
-    batch.match();
+  }
+  if (count) work(columns, rows, count);
+}
+
+// first_costs [source_count, H, W]: of the planes that the pixels start with.
+void begin_rows(const Task& t, const Reference& reference, float* first_costs, int top, int bottom) {
+  Batch batch(t, reference);
+  const size_t size = size_t(t.width) * t.height;
+  wanted_pixels(t, top, bottom, 1, 0, [&](const int* columns, const int* rows, int count) {
+    batch.place(columns, rows, count);
+    Plane<Floats> planes = {};
     for (int n = 0; n < count; n++) {
-      const long long i = (long long)y * t.width + columns[n];
-      begin(t, batch.costs(n), i);
-      std::copy_n(batch.costs(n), t.source_count, first_costs + i * t.source_count);
+      const Plane<float> plane = drawn_plane(t, columns[n], rows[n]);
+      planes.a[n] = plane.a, planes.b[n] = plane.b, planes.c[n] = plane.c;
+    }
+    for (int s = 0; s < t.source_count; s++) batch.know(0, s, all<Floats>(kNoMatch));
+    const Integers used = Integers{} - 1;
+    batch.match(&planes, &used, 0, 1, Unsigneds{} - 1u);
+    for (int n = 0; n < count; n++) {
+      const size_t i = size_t(rows[n]) * t.width + columns[n];
+      float costs[kMaxSources];
+      for (int s = 0; s < t.source_count; s++) costs[s] = first_costs[s * size + i] = batch.cost(0, s)[n];
+      begin(t, costs, (long long)i);
     }
   });
 }
 
-void update_row(const Task& t, const Reference& reference, const float* first_costs, int y, int colour, int round) {
+void update_rows(const Task& t, const Reference& reference, const float* first_costs, int top, int bottom, int colour,
+                 int round) {
   Batch batch(t, reference);
-  std::vector<Turn> turns;
-  turns.reserve(kLanes);
-  wanted_pixels(t, y, (y + colour) & 1, 2, [&](const int* columns, int count) {
-    batch.place(columns, count, y);
-    turns.clear();
-    int pixel[kLanes];
-    for (int n = 0; n < count; n++) {
-      if (!batch.textured(n)) {
-        t.costs[(long long)y * t.width + columns[n]] = kNoMatch;
-        continue;
-      }
-      pixel[turns.size()] = n;
-      turns.emplace_back(t, columns[n], y, round);
-    }
-    const int turned = int(turns.size());
-    const auto match_selected = [&] {
-      for (int n = 0; n < turned; n++)
-        batch.ask(pixel[n], turns[n].planes, 0, turns[n].count, turns[n].selection.views);
-      batch.match();
-    };
-    const Cheapest cheapest(t, reference, batch.columns(), y);
-    for (int n = 0; n < turned; n++) turns[n].gather([&](int region) { return cheapest.place[region][pixel[n]]; });
+  const auto cost = [&](int k, int s) { return batch.cost(k, s); };
+  wanted_pixels(t, top, bottom, 2, colour, [&](const int* columns, const int* rows, int count) {
+    batch.place(columns, rows, count);
+    Turn<Floats> turn(t, batch.columns(), batch.rows(), round);
+    const auto textured = [&](int n) { return batch.lanes() >> n & 1; };
+    for (int n = 0; n < count; n++)
+      if (!textured(n)) t.costs[turn.pixel[n]] = kNoMatch;
+    if (!batch.lanes()) return;
+    turn.gather([&](int region) { return cheapest_of(t, reference, batch.columns(), batch.rows(), region); });
     const int known = round == 0 ? 1 : 0;  // nobody else has changed the plane that a pixel starts with
-    for (int n = 0; n < turned; n++) batch.ask(pixel[n], turns[n].planes, known, turns[n].count, ~0u);
-    batch.match();
-    for (int n = 0; n < turned * known; n++)
-      std::copy_n(first_costs + turns[n].pixel() * t.source_count, t.source_count, batch.costs(pixel[n]));
-    batch.believe();
-    for (int n = 0; n < turned; n++) turns[n].choose(batch.costs(pixel[n]), batch.beliefs(pixel[n]));
-    if (t.explore) {
-      for (Turn& turn : turns) turn.draw_anywhere();
-      match_selected();
-      for (int n = 0; n < turned; n++) turns[n].compare(batch.costs(pixel[n]));
+    for (int s = 0; s < t.source_count * known; s++)
+      batch.know(0, s, look_up(first_costs + size_t(s) * t.width * t.height, turn.pixel));
+    batch.match(turn.planes, turn.used, known, turn.count, Unsigneds{} - 1u);
+    turn.choose(cost, [&](int k, int s) { return belief_of(batch.cost(k, s)); });
+    const auto match_drawn = [&] {
+      batch.match(turn.planes, turn.used, 0, turn.count, turn.selection.views);
+      turn.compare(cost);
+    };
+    if (t.explore) turn.draw_anywhere(), match_drawn();
+    turn.draw_nearby(), match_drawn();
+    for (int n = 0; n < count; n++) {
+      if (!textured(n)) continue;
+      const int i = turn.pixel[n];
+      put(t, i, {turn.best.a[n], turn.best.b[n], turn.best.c[n]});
+      t.costs[i] = turn.cost[n], t.views[i] = turn.selection.views[n];
     }
-    for (Turn& turn : turns) turn.draw_nearby();
-    match_selected();
-    for (int n = 0; n < turned; n++) turns[n].compare(batch.costs(pixel[n])), turns[n].finish();
   });
 }
 
@@ -383,8 +377,8 @@ void average_row(const Task& t, const Fields& f, float tolerance, int y, float* 
       const size_t i = start + n;
       // None where the pixel's own inverse depth is not positive.
       const bool told = total[n] > 0 && wanted(t, i);
-      const Plane mean = mean_plane({told ? total[n] : 1.f, a[n], b[n], q[n]}, float(left + n), float(y));
-      const Plane plane = told ? mean : plane_at(t, i);
+      const Plane<float> mean = mean_plane({told ? total[n] : 1.f, a[n], b[n], q[n]}, float(left + n), float(y));
+      const Plane<float> plane = told ? mean : plane_at(t, i);
       averaged[3 * i] = plane.a, averaged[3 * i + 1] = plane.b, averaged[3 * i + 2] = plane.c;
     }
   }
@@ -400,10 +394,14 @@ void d2_patchmatch(const Task* task) {
   const Task& t = *task;
   const Reference reference(t);
   std::vector<float> first_costs(size_t(t.width) * t.height * t.source_count);
-  parallel_rows(t.height, t.threads, [&](int y) { begin_row(t, reference, first_costs.data(), y); });
+  parallel_rows(t.height, t.threads, [&](int top, int bottom) {
+    begin_rows(t, reference, first_costs.data(), top, bottom);
+  });
   for (int round = 0; round < t.rounds; round++) {
     for (int colour = 0; colour < 2; colour++) {
-      const auto update = [&](int y) { update_row(t, reference, first_costs.data(), y, colour, round); };
+      const auto update = [&](int top, int bottom) {
+        update_rows(t, reference, first_costs.data(), top, bottom, colour, round);
+      };
       parallel_rows(t.height, t.threads, update);
     }
   }
@@ -413,7 +411,9 @@ void d2_patchmatch(const Task* task) {
 // the plane stays as it is.
 void d2_consensus(const Task* task, int32_t radius, float tolerance, float* averaged) {
   const Fields fields(*task, radius, task->planes);
-  parallel_rows(task->height, task->threads, [&](int y) { average_row(*task, fields, tolerance, y, averaged); });
+  parallel_rows(task->height, task->threads, [&](int top, int bottom) {
+    for (int y = top; y < bottom; y++) average_row(*task, fields, tolerance, y, averaged);
+  });
 }
 
 }  // extern "C"

@@ -73,16 +73,18 @@ class Patch {
     u_ = float(x), v_ = float(y), variance = sum_of_partials(squares);
   }
 
-  // Costs [count, source_count] of planes; those of sources whose bit in `views` is 0 are left as they are.
-  D2_DEVICE void match(const Plane* planes, int count, unsigned views, float* costs) const {
+  // Costs [count, source_count] of the planes that are used; those of sources whose bit in `views` is 0 stay as they
+  // are.
+  D2_DEVICE void match(const Plane<float>* planes, const bool* used, int count, unsigned views, float* costs) const {
     for (int s = 0; s < task_.source_count; s++) {
       if (!(views >> s & 1)) continue;
-      for (int p = 0; p < count; p++) costs[p * task_.source_count + s] = cost(planes[p], task_.sources[s]);
+      for (int p = 0; p < count; p++)
+        if (used[p]) costs[p * task_.source_count + s] = cost(planes[p], task_.sources[s]);
     }
   }
 
  private:
-  D2_DEVICE float cost(const Plane& plane, const Source& source) const {
+  D2_DEVICE float cost(const Plane<float>& plane, const Source& source) const {
     const float width = float(source.width), height = float(source.height);
     const Warp<float> warp = warp_of(source.A, source.k, width, height, plane.a, plane.b, plane.c, u_, v_);
     const float last_x = last_place(source.width), last_y = last_place(source.height);
@@ -109,29 +111,32 @@ D2_KERNEL d2_patchmatch_begin(const Call call) {
   if (!p.inside || !wanted(t, i)) return;
   Patch patch(t, windows);
   patch.place(p.x, p.y);
-  const Plane plane = drawn_plane(t, p.x, p.y);
+  const Plane<float> plane = drawn_plane(t, p.x, p.y);
+  const bool used = true;
   float costs[kMaxSources];
-  patch.match(&plane, 1, ~0u, costs);
+  patch.match(&plane, &used, 1, ~0u, costs);
   begin(t, costs, i);
 }
 
 // What one pixel does in one round; `patch` lies around it.
 D2_DEVICE void update(const Task& t, const Patch& patch, int x, int y, int round) {
-  float costs[kMaxCandidates * kMaxSources], beliefs[kMaxCandidates * kMaxSources];
-  Turn turn(t, x, y, round);
+  float costs[kMaxCandidates * kMaxSources];
+  const auto cost = [&](int k, int s) { return costs[k * t.source_count + s]; };
+  Turn<float> turn(t, x, y, round);
   turn.gather([&](int region) { return cheapest_of(t, x, y, region); });
-  patch.match(turn.planes, turn.count, ~0u, costs);
-  for (int n = 0; n < turn.count * t.source_count; n++) beliefs[n] = belief_of(costs[n]);
-  turn.choose(costs, beliefs);
+  patch.match(turn.planes, turn.used, turn.count, ~0u, costs);
+  turn.choose(cost, [&](int k, int s) { return belief_of(cost(k, s)); });
   if (t.explore) {
     turn.draw_anywhere();
-    patch.match(turn.planes, turn.count, turn.selection.views, costs);
-    turn.compare(costs);
+    patch.match(turn.planes, turn.used, turn.count, turn.selection.views, costs);
+    turn.compare(cost);
   }
   turn.draw_nearby();
-  patch.match(turn.planes, turn.count, turn.selection.views, costs);
-  turn.compare(costs);
-  turn.finish();
+  patch.match(turn.planes, turn.used, turn.count, turn.selection.views, costs);
+  turn.compare(cost);
+  const long long i = (long long)y * t.width + x;
+  put(t, i, turn.best);
+  t.costs[i] = turn.cost, t.views[i] = turn.selection.views;
 }
 
 // Half a round: the pixels of one colour.
@@ -153,7 +158,7 @@ D2_KERNEL d2_patchmatch_average(const Call call) {
   const Pixel p = pixel_of_thread(t, 1, 0);
   if (!p.inside) return;
   const long long i = (long long)p.y * t.width + p.x;
-  const Plane plane = plane_at(t, i);
+  const Plane<float> plane = plane_at(t, i);
   const float u = float(p.x), v = float(p.y), own = plane.inverse_depth(u, v), level = t.gray[i];
   Consensus<float> sums = {0, 0, 0, 0};
   if (wanted(t, i)) {
@@ -161,12 +166,12 @@ D2_KERNEL d2_patchmatch_average(const Call call) {
       for (int x = p.x - call.radius; x <= p.x + call.radius; x++) {
         if (x < 0 || y < 0 || x >= t.width || y >= t.height) continue;
         const long long j = (long long)y * t.width + x;
-        const Plane other = plane_at(t, j);
+        const Plane<float> other = plane_at(t, j);
         sums.add(own, call.tolerance, float(t.gray[j]) - level, t.per_gray, other.a, other.b, other.inverse_depth(u, v));
       }
     }
   }
-  const Plane mean = sums.total > 0 ? mean_plane(sums, u, v) : plane;
+  const Plane<float> mean = sums.total > 0 ? mean_plane(sums, u, v) : plane;
   call.averaged[3 * i] = mean.a, call.averaged[3 * i + 1] = mean.b, call.averaged[3 * i + 2] = mean.c;
 }
 

@@ -26,15 +26,25 @@ D2_FN S exp2_of(S x) {
 constexpr float kLog2E = 1.44269504f;
 D2_FN float exp_of(float x) { return exp2_of(kLog2E * x); }
 
+template <class S>
 struct Vector {
-  float x, y, z;
+  S x, y, z;
+
+  D2_FN Vector operator-() const { return {-x, -y, -z}; }
 };
 
-D2_FN float dot(Vector p, Vector q) { return mad(p.x, q.x, mad(p.y, q.y, p.z * q.z)); }
+template <class S>
+D2_FN Vector<S> pick(Mask<S> yes, const Vector<S>& p, const Vector<S>& q) {
+  return {pick(yes, p.x, q.x), pick(yes, p.y, q.y), pick(yes, p.z, q.z)};
+}
 
-D2_FN Vector normalised(Vector p) {
-  const float length = root(dot(p, p));
-  const float scale = length > 0 ? 1.f / length : 0.f;
+template <class S>
+D2_FN S dot(const Vector<S>& p, const Vector<S>& q) { return mad(p.x, q.x, mad(p.y, q.y, p.z * q.z)); }
+
+template <class S>
+D2_FN Vector<S> normalised(const Vector<S>& p) {
+  const S length = root(dot(p, p));
+  const S scale = pick(length > 0.f, 1.f / length, all<S>(0.f));
   return {p.x * scale, p.y * scale, p.z * scale};
 }
 
@@ -43,55 +53,71 @@ struct Intrinsics {
 };
 
 // How the camera sees a pixel.
+template <class S>
 struct Sight {
-  float u, v;
-  Vector ray, direction;  // through the pixel: with z = 1, and of length 1
+  S u, v;
+  Vector<S> ray, direction;  // through the pixel: with z = 1, and of length 1
 };
 
-D2_FN Sight sight_of(const Intrinsics& k, float u, float v) {
-  const Vector ray = {(u - k.cx) / k.fx, (v - k.cy) / k.fy, 1.f};
+template <class S>
+D2_FN Sight<S> sight_of(const Intrinsics& k, S u, S v) {
+  const Vector<S> ray = {(u - k.cx) / k.fx, (v - k.cy) / k.fy, all<S>(1.f)};
   return {u, v, ray, normalised(ray)};
 }
 
+template <class S>
 struct Plane {
-  float a, b, c;
+  S a, b, c;
 
-  D2_FN float inverse_depth(float u, float v) const { return mad(a, u, mad(b, v, c)); }
-  D2_FN bool operator==(const Plane& other) const { return a == other.a && b == other.b && c == other.c; }
+  D2_FN S inverse_depth(S u, S v) const { return mad(a, u, mad(b, v, c)); }
+  D2_FN Mask<S> operator==(const Plane& other) const { return (a == other.a) & (b == other.b) & (c == other.c); }
 };
 
+template <class S>
+D2_FN Plane<S> pick(Mask<S> yes, const Plane<S>& p, const Plane<S>& q) {
+  return {pick(yes, p.a, q.a), pick(yes, p.b, q.b), pick(yes, p.c, q.c)};
+}
+
 // The plane with normal n through a pixel at inverse depth q: n.X = d, hence 1/z = n.ray / d.
-D2_FN Plane plane_through(const Intrinsics& k, const Sight& sight, float q, Vector n) {
-  const float scale = q / dot(n, sight.ray);
-  const float a = n.x * scale / k.fx, b = n.y * scale / k.fy;
-  return {a, b, mad(-b, k.cy, mad(-a, k.cx, n.z * scale))};
+template <class S>
+D2_FN Plane<S> plane_through(const Intrinsics& k, const Sight<S>& sight, S q, const Vector<S>& n) {
+  const S scale = q / dot(n, sight.ray);
+  const S a = n.x * scale / k.fx, b = n.y * scale / k.fy;
+  return {a, b, mad(-b, all<S>(k.cy), mad(-a, all<S>(k.cx), n.z * scale))};
 }
 
 // The unit normal that faces the camera (its product with the ray of any visible pixel is negative).
-D2_FN Vector normal_of(const Intrinsics& k, const Plane& p) {
-  const Vector inward = normalised({p.a * k.fx, p.b * k.fy, mad(p.a, k.cx, mad(p.b, k.cy, p.c))});
-  return {-inward.x, -inward.y, -inward.z};
+template <class S>
+D2_FN Vector<S> normal_of(const Intrinsics& k, const Plane<S>& p) {
+  const Vector<S> inward = {p.a * k.fx, p.b * k.fy, mad(p.a, all<S>(k.cx), mad(p.b, all<S>(k.cy), p.c))};
+  return -normalised(inward);
 }
 
 // Cosine of the angle between the normal and the direction back to the camera.
-D2_FN float facing(Vector n, const Sight& sight) { return -dot(n, sight.direction); }
+template <class S>
+D2_FN S facing(const Vector<S>& n, const Sight<S>& sight) { return -dot(n, sight.direction); }
 
 // Random numbers of one pixel in one round: they depend on nothing else, so any number of threads draws the same.
+template <class S>
 class Random {
  public:
-  D2_FN Random(unsigned seed, unsigned pixel, unsigned round) : state_(mix(mix(mix(seed) + pixel) + round) | 1u) {}
+  D2_FN Random(unsigned seed, Word<S> pixel, unsigned round) : state_(mix(mix(mix(seed) + pixel) + round) | 1u) {}
 
   // Uniform in [low, high); xorshift32.
-  D2_FN float uniform(float low, float high) {
+  D2_FN S uniform(float low, float high) {
     state_ ^= state_ << 13;
     state_ ^= state_ >> 17;
     state_ ^= state_ << 5;
-    return mad(high - low, float(state_ >> 8) * (1.f / 16777216.f), low);
+    return mad(all<S>(high - low), real((Whole<S>)(state_ >> 8)) * (1.f / 16777216.f), all<S>(low));
   }
+
+  // Goes on as `other` where `yes`.
+  D2_FN void follow(Mask<S> yes, const Random& other) { state_ = pick(yes, other.state_, state_); }
 
  private:
   // A bijection of 32 bits in which every bit of the argument changes half of the result ("lowbias32", C. Wellons).
-  static D2_FN unsigned mix(unsigned h) {
+  template <class W>
+  static D2_FN W mix(W h) {
     h ^= h >> 16;
     h *= 0x7feb352du;
     h ^= h >> 15;
@@ -99,30 +125,43 @@ class Random {
     return h ^ (h >> 16);
   }
 
-  unsigned state_;
+  Word<S> state_;
 };
 
 // A random direction towards the camera, at most 75 degrees from the viewing ray (Marsaglia's disk method).
-D2_FN Vector random_normal(const Sight& sight, Random& random) {
-  for (;;) {
-    const float s = random.uniform(-1, 1), t = random.uniform(-1, 1), square = mad(s, s, t * t);
-    if (square >= 1) continue;
-    const float scale = 2 * root(1 - square);
-    Vector n{s * scale, t * scale, 1 - 2 * square};
-    float cosine = facing(n, sight);
-    if (cosine < 0) n = {-n.x, -n.y, -n.z}, cosine = -cosine;
-    if (cosine > .25f) return n;
+template <class S>
+D2_FN Vector<S> random_normal(const Sight<S>& sight, Random<S>& random) {
+  Vector<S> found = {};
+  for (Mask<S> left = sight.u == sight.u; !none(left);) {
+    Random<S> next = random;
+    const S s = next.uniform(-1, 1), t = next.uniform(-1, 1), square = mad(s, s, t * t);
+    random.follow(left, next);
+    const S scale = 2.f * root(larger(1.f - square, all<S>(0.f)));
+    const Vector<S> n = {s * scale, t * scale, 1.f - 2.f * square};
+    const S cosine = facing(n, sight);
+    const Mask<S> good = left & (square < 1.f) & ((cosine > .25f) | (cosine < -.25f));
+    found = pick(good, pick(cosine < 0.f, -n, n), found);
+    left = left & opposite(good);
   }
+  return found;
 }
 
 // `n` turned by a random amount; the old one where four draws all turn it away from the camera.
-D2_FN Vector jittered_normal(const Sight& sight, Vector n, float amount, Random& random) {
-  for (int attempt = 0; attempt < 4; attempt++, amount *= .5f) {
-    const float x = random.uniform(-1, 1), y = random.uniform(-1, 1), z = random.uniform(-1, 1);
-    const Vector turned = normalised({mad(amount, x, n.x), mad(amount, y, n.y), mad(amount, z, n.z)});
-    if (facing(turned, sight) > .15f) return turned;
+template <class S>
+D2_FN Vector<S> jittered_normal(const Sight<S>& sight, const Vector<S>& n, float amount, Random<S>& random) {
+  Vector<S> found = n;
+  Mask<S> left = sight.u == sight.u;
+  for (int attempt = 0; attempt < 4 && !none(left); attempt++, amount *= .5f) {
+    Random<S> next = random;
+    const S x = next.uniform(-1, 1), y = next.uniform(-1, 1), z = next.uniform(-1, 1);
+    random.follow(left, next);
+    const S change = all<S>(amount);
+    const Vector<S> turned = normalised(Vector<S>{mad(change, x, n.x), mad(change, y, n.y), mad(change, z, n.z)});
+    const Mask<S> good = left & (facing(turned, sight) > .15f);
+    found = pick(good, turned, found);
+    left = left & opposite(good);
   }
-  return n;
+  return found;
 }
 
 }  // namespace d2

@@ -45,15 +45,19 @@ struct Task {
 
 }  // extern "C"
 
+template <class S>
 struct Selection {
-  float weight[kMaxSources];
-  unsigned views;
+  S weight[kMaxSources];
+  Word<S> views;
 };
 
 D2_FN bool wanted(const Task& t, long long i) { return !t.wanted || t.wanted[i]; }
-D2_FN bool in_range(const Task& t, float q) { return q >= t.inverse_far && q <= t.inverse_near; }
-D2_FN Plane plane_at(const Task& t, long long i) { return {t.planes[3 * i], t.planes[3 * i + 1], t.planes[3 * i + 2]}; }
-D2_FN void put(const Task& t, long long i, const Plane& p) {
+template <class S>
+D2_FN Mask<S> in_range(const Task& t, S q) { return (q >= t.inverse_far) & (q <= t.inverse_near); }
+D2_FN Plane<float> plane_at(const Task& t, long long i) {
+  return {t.planes[3 * i], t.planes[3 * i + 1], t.planes[3 * i + 2]};
+}
+D2_FN void put(const Task& t, long long i, const Plane<float>& p) {
   t.planes[3 * i] = p.a, t.planes[3 * i + 1] = p.b, t.planes[3 * i + 2] = p.c;
 }
 
@@ -71,15 +75,14 @@ D2_FN void region_place(int region, int k, int& dx, int& dy) {
 }
 
 // The cheapest pixel of a region, negative where all of it lies outside of the picture.
-D2_FN long long cheapest_of(const Task& t, int x, int y, int region) {
-  const long long i = (long long)y * t.width + x;
+D2_FN int cheapest_of(const Task& t, int x, int y, int region) {
   float lowest = 1e9f;
-  long long found = -1;
+  int found = -1;
   for (int k = 0; k < region_size(region); k++) {
     int dx, dy;
     region_place(region, k, dx, dy);
     if (x + dx < 0 || y + dy < 0 || x + dx >= t.width || y + dy >= t.height) continue;
-    const long long j = i + (long long)dy * t.width + dx;
+    const int j = (y + dy) * t.width + x + dx;
     if (t.costs[j] < lowest) lowest = t.costs[j], found = j;
   }
   return found;
@@ -88,160 +91,175 @@ D2_FN long long cheapest_of(const Task& t, int x, int y, int region) {
 template <class S>
 D2_FN S belief_of(S cost) { return exp2_of(cost * cost * (-kLog2E / .18f)); }
 
-// How far the four neighbours believe in a source.
-D2_FN float neighbours_use(const Task& t, int source, int x, int y) {
-  const long long i = (long long)y * t.width + x;
-  float belief = 0;
-  if (x > 0) belief += t.views[i - 1] >> source & 1 ? .9f : .1f;
-  if (x + 1 < t.width) belief += t.views[i + 1] >> source & 1 ? .9f : .1f;
-  if (y > 0) belief += t.views[i - t.width] >> source & 1 ? .9f : .1f;
-  if (y + 1 < t.height) belief += t.views[i + t.width] >> source & 1 ? .9f : .1f;
-  return belief;
-}
+// The sources that the four neighbours use, and which neighbours there are.
+template <class S>
+struct Neighbours {
+  Word<S> views[4];
+  Mask<S> there[4];
+
+  D2_FN Neighbours(const Task& t, Whole<S> x, Whole<S> y, Whole<S> pixel) {
+    there[0] = x > 0, there[1] = x + 1 < t.width, there[2] = y > 0, there[3] = y + 1 < t.height;
+    const int step[4] = {-1, 1, -t.width, t.width};
+    for (int n = 0; n < 4; n++) views[n] = (Word<S>)look_up(t.views, pick(there[n], pixel + step[n], pixel));
+  }
+
+  // How far they believe in a source.
+  D2_FN S use(int source) const {
+    S belief = all<S>(0.f);
+    for (int n = 0; n < 4; n++) {
+      const S more = pick((Whole<S>)(views[n] >> source & 1u) > 0, all<S>(.9f), all<S>(.1f));
+      belief = pick(there[n], belief + more, belief);
+    }
+    return belief;
+  }
+};
 
 // Weights that sum to 1; sources with next to none are dropped.
-D2_FN void normalise(const Task& t, Selection& selection, float total) {
-  float kept = 0;
+template <class S>
+D2_FN void normalise(const Task& t, Selection<S>& selection, S total) {
+  const S zero = all<S>(0.f), even = all<S>(1.f / float(t.source_count));
+  S kept = zero;
   for (int s = 0; s < t.source_count; s++) {
-    const float share = total > 0 ? selection.weight[s] / total : 1.f / float(t.source_count);
-    selection.weight[s] = share < 1.f / 30 ? 0.f : share;
+    const S share = pick(total > 0.f, selection.weight[s] / total, even);
+    selection.weight[s] = pick(share < 1.f / 30, zero, share);
     kept += selection.weight[s];
   }
-  selection.views = 0;
+  selection.views = Word<S>{};
   for (int s = 0; s < t.source_count; s++) {
-    selection.weight[s] /= kept;
-    if (selection.weight[s] > 0) selection.views |= 1u << s;
+    selection.weight[s] = selection.weight[s] / kept;
+    selection.views |= pick(selection.weight[s] > 0.f, Word<S>{} + (1u << s), Word<S>{});
   }
 }
 
-// Joint view selection (ACMH, section 3.2): a source is weighted by how many candidates match it well, and by whether
-// the neighbours use it; one that most candidates contradict is left out. costs [count, source_count], and belief
-// exp(-cost^2 / .18) of each.
-D2_FN Selection select_views(const Task& t, const float* costs, const float* belief, int count, int x, int y, int round) {
-  const float threshold = .8f * exp_of(-float(round * round) / 90.f);
-  const float faint = exp_of(-threshold * threshold * (1 / .32f));
-  const float share = count / 8.f;  // the published counts are for eight candidates
-  Selection selection;
-  float total = 0;
-  for (int s = 0; s < t.source_count; s++) {
-    float likelihood = 0;
-    int good = 0, bad = 0;
-    for (int k = 0; k < count; k++) {
-      const float cost = costs[k * t.source_count + s];
-      if (cost < threshold) likelihood += belief[k * t.source_count + s], good++;
-      if (cost > 1.2f) bad++;
-    }
-    if (bad >= 3 * share) likelihood = 0;
-    else if (good > 2 * share) likelihood /= good;
-    else likelihood = faint;
-    selection.weight[s] = likelihood * neighbours_use(t, s, x, y);
-    total += selection.weight[s];
-  }
-  normalise(t, selection, total);
-  return selection;
-}
-
-// What a plane costs, all selected sources together.
-D2_FN float total_cost(const Task& t, const Selection& selection, const float* costs, const Plane& plane, int x, int y) {
-  float total = 0;
-  for (int s = 0; s < t.source_count; s++) {
-    if (!(selection.weight[s] > 0)) continue;
-    float cost = costs[s];
-    if (t.geometric_weight > 0)
-      cost = mad(t.geometric_weight, reprojection_error(t.sources[s], t.depths, plane, float(x), float(y)), cost);
-    total = mad(selection.weight[s], cost, total);
-  }
-  return total;
-}
-
-// One pixel in one round, step by step: each leaves `count` planes that the device matches before the next.
+// One pixel in one round, or as many as there are lanes, step by step: each leaves `count` planes, of which those in
+// `used` are matched before the next. A step is passed costs(k, s), what plane k costs in source s.
+template <class S>
 struct Turn {
   const Task& task;
-  int x, y, round;
-  Sight sight;
-  Random random;
-  Selection selection;
-  Plane best;
-  float cost;
+  Whole<S> x, y, pixel;
+  int round;
+  Sight<S> sight;
+  Random<S> random;
+  Selection<S> selection;
+  Plane<S> best;
+  S cost;
   int count;
-  Plane planes[kMaxCandidates];
+  Mask<S> used[kMaxCandidates];
+  Plane<S> planes[kMaxCandidates];
 
-  D2_FN Turn(const Task& t, int column, int row, int number)
-      : task(t), x(column), y(row), round(number), sight(sight_of(t.intrinsics, float(column), float(row))),
-        random(t.seed, unsigned(pixel()), unsigned(number)), cost(1e9f), count(0) {}
-
-  D2_FN long long pixel() const { return (long long)y * task.width + x; }
+  D2_FN Turn(const Task& t, Whole<S> column, Whole<S> row, int number)
+      : task(t), x(column), y(row), pixel(row * t.width + column), round(number),
+        sight(sight_of(t.intrinsics, real(column), real(row))), random(t.seed, (Word<S>)pixel, unsigned(number)),
+        cost(all<S>(1e9f)), count(0) {}
 
   // The pixel's own plane first, then the cheapest plane of each region, none of them twice. cheapest(region) is
   // cheapest_of.
   template <class Cheapest>
   D2_FN void gather(const Cheapest& cheapest) {
-    planes[count++] = best = plane_at(task, pixel());
+    best = plane_from(pixel);
+    keep(best, x == x);
     for (int region = 0; region < kRegions; region++) {
-      const long long place = cheapest(region);
-      if (place < 0) continue;
-      const Plane plane = plane_at(task, place);
-      bool fresh = in_range(task, plane.inverse_depth(sight.u, sight.v));
-      for (int k = 0; k < count; k++) fresh = fresh && !(planes[k] == plane);
-      if (fresh) planes[count++] = plane;
+      const Whole<S> place = cheapest(region);
+      const Mask<S> found = place >= 0;
+      const Plane<S> plane = plane_from(pick(found, place, pixel));
+      Mask<S> fresh = found & in_range(task, plane.inverse_depth(sight.u, sight.v));
+      for (int k = 0; k < count; k++) fresh = fresh & opposite(used[k] & (planes[k] == plane));
+      keep(plane, fresh);
     }
   }
 
-  // Keeps the best plane so far. costs [count, source_count], of the selected sources.
-  D2_FN void compare(const float* costs) {
-    for (int k = 0; k < count; k++) {
-      const float total = total_cost(task, selection, costs + k * task.source_count, planes[k], x, y);
-      if (total < cost) cost = total, best = planes[k];
+  // Joint view selection (ACMH, section 3.2) after gather: a source is weighted by how many candidates match it well,
+  // and by whether the neighbours use it; one that most candidates contradict is left out.
+  template <class Costs, class Beliefs>
+  D2_FN void choose(const Costs& costs, const Beliefs& beliefs) {
+    const float threshold = .8f * exp_of(-float(round * round) / 90.f);
+    const float faint = exp_of(-threshold * threshold * (1 / .32f));
+    const S zero = all<S>(0.f), one = all<S>(1.f);
+    S share = zero, total = zero;
+    for (int k = 0; k < count; k++) share += pick(used[k], one, zero);
+    share = share / 8.f;  // the published counts are for eight candidates
+    const Neighbours<S> neighbours(task, x, y, pixel);
+    for (int s = 0; s < task.source_count; s++) {
+      S likelihood = zero, good = zero, bad = zero;
+      for (int k = 0; k < count; k++) {
+        const S found = costs(k, s);
+        const Mask<S> fits = used[k] & (found < threshold);
+        likelihood = pick(fits, likelihood + beliefs(k, s), likelihood);
+        good += pick(fits, one, zero);
+        bad += pick(used[k] & (found > 1.2f), one, zero);
+      }
+      likelihood = pick(good > 2.f * share, likelihood / good, all<S>(faint));
+      likelihood = pick(bad >= 3.f * share, zero, likelihood);
+      selection.weight[s] = likelihood * neighbours.use(s);
+      total += selection.weight[s];
     }
-  }
-
-  // After gather: which sources count, and the best of what was gathered. See select_views.
-  D2_FN void choose(const float* costs, const float* belief) {
-    selection = select_views(task, costs, belief, count, x, y, round);
+    normalise(task, selection, total);
     compare(costs);
+  }
+
+  // Keeps the best plane so far, all selected sources together.
+  template <class Costs>
+  D2_FN void compare(const Costs& costs) {
+    for (int k = 0; k < count; k++) {
+      S total = all<S>(0.f);
+      for (int s = 0; s < task.source_count; s++) {
+        const Mask<S> selected = selection.weight[s] > 0.f;
+        if (none(selected)) continue;
+        S found = costs(k, s);
+        if (task.geometric_weight > 0) {
+          const S error = reprojection_error(task.sources[s], task.depths, planes[k], sight.u, sight.v);
+          found = mad(all<S>(task.geometric_weight), error, found);
+        }
+        total = pick(selected, mad(selection.weight[s], found, total), total);
+      }
+      const Mask<S> better = used[k] & (total < cost);
+      cost = pick(better, total, cost), best = pick(better, planes[k], best);
+    }
   }
 
   // Random depths, random normals, both.
   D2_FN void draw_anywhere() {
     count = 0;
-    const Vector drawn = random_normal(sight, random);
-    const float q = random.uniform(task.inverse_far, task.inverse_near);
+    const Vector<S> drawn = random_normal(sight, random);
+    const S q = random.uniform(task.inverse_far, task.inverse_near);
     add(q, normal_of(task.intrinsics, best)), add(best.inverse_depth(sight.u, sight.v), drawn), add(q, drawn);
   }
 
   // Changes that shrink with every round. None builds on another, so that all are matched at once.
   D2_FN void draw_nearby() {
     count = 0;
-    const Vector normal = normal_of(task.intrinsics, best);
-    const float q = best.inverse_depth(sight.u, sight.v), halved = bits_float((127 - round) << 23);
+    const Vector<S> normal = normal_of(task.intrinsics, best);
+    const S q = best.inverse_depth(sight.u, sight.v);
+    const float halved = bits_float((127 - round) << 23);
     const float step = larger(.04f * halved, .003f), turn = larger(.3f * halved, .02f);
     add(q, jittered_normal(sight, normal, turn, random));
-    add(q * (1 + random.uniform(-step, step)), normal);
-    const float finer = .25f * random.uniform(-step, step);
-    add(q * (1 + finer), jittered_normal(sight, normal, .25f * turn, random));
-    add(q * (1 + .1f * random.uniform(-step, step)), normal);
+    add(q * (1.f + random.uniform(-step, step)), normal);
+    const S finer = .25f * random.uniform(-step, step);
+    add(q * (1.f + finer), jittered_normal(sight, normal, .25f * turn, random));
+    add(q * (1.f + .1f * random.uniform(-step, step)), normal);
     add(q, jittered_normal(sight, normal, .25f * turn, random));
   }
 
-  D2_FN void finish() const {
-    put(task, pixel(), best);
-    task.costs[pixel()] = cost;
-    task.views[pixel()] = selection.views;
-  }
-
  private:
-  D2_FN void add(float q, Vector normal) {
-    if (in_range(task, q)) planes[count++] = plane_through(task.intrinsics, sight, q, normal);
+  D2_FN Plane<S> plane_from(Whole<S> place) const {
+    const int base = first_lane(pixel);  // three times a place may be more than an integer holds
+    const float* from = task.planes + 3ll * base;
+    const Whole<S> at = (place - base) * 3;
+    return {look_up(from, at), look_up(from + 1, at), look_up(from + 2, at)};
+  }
+  D2_FN void keep(const Plane<S>& plane, Mask<S> yes) { planes[count] = plane, used[count++] = yes; }
+  D2_FN void add(S q, const Vector<S>& normal) {
+    keep(plane_through(task.intrinsics, sight, q, normal), in_range(task, q));
   }
 };
 
 // The plane that a pixel starts with: its own, or a random one where the task says so.
-D2_FN Plane drawn_plane(const Task& t, int x, int y) {
+D2_FN Plane<float> drawn_plane(const Task& t, int x, int y) {
   const long long i = (long long)y * t.width + x;
   if (t.draw_planes) {
-    Random random(t.seed, unsigned(i), ~0u);
-    const Sight sight = sight_of(t.intrinsics, float(x), float(y));
-    const Vector normal = random_normal(sight, random);
+    Random<float> random(t.seed, unsigned(i), ~0u);
+    const Sight<float> sight = sight_of(t.intrinsics, float(x), float(y));
+    const Vector<float> normal = random_normal(sight, random);
     put(t, i, plane_through(t.intrinsics, sight, random.uniform(t.inverse_far, t.inverse_near), normal));
   }
   return plane_at(t, i);
@@ -279,7 +297,7 @@ struct Consensus {
 };
 
 // Where the total is positive.
-D2_FN Plane mean_plane(const Consensus<float>& sums, float u, float v) {
+D2_FN Plane<float> mean_plane(const Consensus<float>& sums, float u, float v) {
   const float a = sums.a / sums.total, b = sums.b / sums.total;
   return {a, b, mad(-b, v, mad(-a, u, sums.q / sums.total))};
 }
