@@ -172,8 +172,8 @@ def step(rows: Sequence[Row]) -> Section:
         "step",
         "A training step",
         "The rasterizer alone, a bare step and a step with the depth loss run in turn in one process on a synthetic "
-        "scene. What counts is the ratio: the machine is shared. The views were all seen before, so the search for the "
-        "known pixels of a view, once for each, is not in it.",
+        "scene whose Gaussians stay as they are. What counts is the ratio: the machine is shared. The views "
+        "were all seen before, so the search for the known pixels of a view, once for each, is not in it.",
         tables=(("Steps", Table(header, cells)),),
         sources=sources_of(rows),
     )
