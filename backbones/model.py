@@ -274,7 +274,7 @@ class SplatModel(ABC):
 
 
 def _zeros(means: Tensor) -> Tensor:
-    """Offsets [M, 2] of centres [M, 3]. On the CPU not by torch, whose threads would spin on for long after it."""
+    """Offsets [M, 2] of centres [M, 3]. On the CPU not by torch, which wakes threads of its own for many."""
     if means.device.type == "cpu" and means.dtype == torch.float32:
         return torch.from_numpy(np.zeros((len(means), 2), np.float32))
     return means.new_zeros(len(means), 2)

@@ -19,10 +19,10 @@ from dataclasses import replace
 import numpy as np
 
 from d2_plugin.captures.capture import Camera
+from d2_plugin.priors.cross_view import kernel
+from d2_plugin.priors.cross_view.ask import Points, View, ask
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.others import kernel
-from d2_plugin.priors.others.ask import Points, View, ask
 from d2_plugin.protocol import Label
 
 AGREED = 0.57

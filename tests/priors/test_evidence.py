@@ -12,9 +12,9 @@ import torch
 from d2_plugin.captures.capture import Camera
 from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.build import build_priors
+from d2_plugin.priors.cross_view.ask import BESIDE, LIKE, NEAR, WITHIN
 from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, with_evidence
 from d2_plugin.priors.fuse import FusedPrior, empty_prior
-from d2_plugin.priors.others.ask import BESIDE, LIKE, NEAR, WITHIN
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import DepthPrior, Label

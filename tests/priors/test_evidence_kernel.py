@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from d2_plugin.captures.capture import Camera
+from d2_plugin.priors.cross_view import kernel
 from d2_plugin.priors.evidence import with_evidence
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.others import kernel
 from d2_plugin.protocol import Label
 
 pytest.importorskip("cv2")

@@ -5,7 +5,7 @@ known here, so a match is kept when it lies on its epipolar line: no random samp
 matches still count.
 
 OpenCV's SIFT takes a third of the CPU time of COLMAP's, which is here. With four scales in an octave and as many
-points D2 was the same (studio, plaza, sear_steak, 300 and 1000 steps, three seeds: +.04 +- .06 dB), but the backbone
+points D2 was the same (studio, plaza, sear_steak, 300 and 1000 steps, three seeds: +.06 +- .05 dB), but the backbone
 alone lost .6 +- .4 dB on six pairs of plaza's cameras, which see two dozen points.
 """
 

@@ -1,4 +1,4 @@
-"""Medians and quantiles of vectors without NaN, each by a partition around one place.
+"""Medians and quantiles of vectors, each by a partition around one place.
 
 NumPy has that one compiled for vectors of numbers; its own median and quantile ask for several places at once, which is
 not. Measured: the median of 20,000 numbers takes 31 us instead of 200.

@@ -16,8 +16,8 @@ import torch
 
 from d2_plugin.captures.capture import Camera
 from d2_plugin.compiler import NoCompiler, load_library
+from d2_plugin.priors.cross_view import ask
 from d2_plugin.priors.geometry import CONTINUOUS, view_pair
-from d2_plugin.priors.others import ask
 from d2_plugin.protocol import Label
 
 SOURCE = Path(__file__).parent / "kernels" / "ask.cpp"
