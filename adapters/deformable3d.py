@@ -39,8 +39,8 @@ class Deformable3DAdapter(InriaAdapter):
             then, which widens every Gaussian by about .04 units and hides what hooks gain (docs/results/attach.md).
         is_6dof: whether the field returns rigid motions [N, 4, 4] (dataset.is_6dof); read from the network by default.
         settings: constants of its rasterizer, where they were changed.
-        key: finds the prior of a camera; needed where the picture's name does not say camera and frame
-        (poses_bounds.npy with pictures 0000.png).
+        key: finds the prior of a camera; needed where the image's name does not say camera and frame
+        (poses_bounds.npy with images 0000.png).
     """
 
     def __init__(

@@ -22,13 +22,13 @@ from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_ma
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from .inria import InriaAdapter
-from .keys import KeyOf, PriorKey, key_from_picture, key_of_technicolor
+from .keys import KeyOf, PriorKey, key_from_image_name, key_of_technicolor
 
 SMALL = 1e-6
 """Guards of the rasterizer's opacity compensation (cuda_rasterizer/forward.cu, computeCov2D)."""
 
 FRUSTUM = 1.3
-"""Gaussians whose centre projects beyond this multiple of the half picture are not drawn (auxiliary.h, in_frustum)."""
+"""Gaussians whose centre projects beyond this multiple of the half image are not drawn (auxiliary.h, in_frustum)."""
 
 
 class Ex4DGSAdapter(InriaAdapter):
@@ -41,9 +41,9 @@ class Ex4DGSAdapter(InriaAdapter):
     Args:
         gaussians: the model, after `training_setup` and, when resuming, after `restore`.
         near, far: dataset.near and dataset.far.
-        first_frame: number of the frame whose picture is 0.png, where the prior counts from elsewhere.
+        first_frame: number of the frame whose image is 0.png, where the prior counts from elsewhere.
         settings: constants of its rasterizer, where they were changed.
-        key: finds the prior of a camera; needed where the picture's path does not say camera and frame.
+        key: finds the prior of a camera; needed where the image's path does not say camera and frame.
     """
 
     appending = ("densification_postfix", "densification_postfix_onlystatic")
@@ -119,13 +119,13 @@ class Ex4DGSAdapter(InriaAdapter):
         self.gaussians.densification_postfix_onlystatic(*rows, torch.zeros_like(rows.xyz))
 
     def _default_key(self, camera: Any) -> PriorKey:
-        """From the path of the picture: `image_name` is the file's name, which for N3V says the frame alone.
+        """From the path of the image: `image_name` is the file's name, which for N3V says the frame alone.
 
-        Pictures are CAMERA/FRAME.png (N3V) or SCENE_undist_FRAME_CAMERA.png (Technicolor, dataset_readers.py:143).
+        Images are CAMERA/FRAME.png (N3V) or SCENE_undist_FRAME_CAMERA.png (Technicolor, dataset_readers.py:143).
         """
-        picture = str(getattr(camera, "image_path", None) or camera.image_name)
-        in_folders = PurePosixPath(picture).stem.isdigit()
-        key = key_from_picture(picture) if in_folders else key_of_technicolor(picture)
+        image = str(getattr(camera, "image_path", None) or camera.image_name)
+        in_folders = PurePosixPath(image).stem.isdigit()
+        key = key_from_image_name(image) if in_folders else key_of_technicolor(image)
         return key._replace(frame=self.first_frame + key.frame)
 
     def _sizes(self) -> tuple[int, int]:

@@ -46,7 +46,7 @@ class FudanAdapter(InriaAdapter):
             get corrected (see `correct_fields_of_view`), but only if a hook is on: without hooks nothing changes.
         correct_fov: False leaves the fields of view alone, to continue a model that was trained with them.
         settings: constants of its rasterizer, where they were changed.
-        key: finds the prior of a camera; needed where the picture's name does not say camera and frame.
+        key: finds the prior of a camera; needed where the image's name does not say camera and frame.
     """
 
     evidence = InriaAdapter.evidence | {"t_gradient_accum": 0.0}

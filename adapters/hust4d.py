@@ -25,7 +25,7 @@ from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from .inria import InriaAdapter, RenderedCamera
 from .inverse_deformation import Inversion, invert_at_times
-from .keys import KeyOf, PriorKey, key_from_picture
+from .keys import KeyOf, PriorKey, key_from_image_name
 
 STAGES = ("coarse", "fine")
 
@@ -39,13 +39,13 @@ class Hust4DAdapter(InriaAdapter):
     Args:
         gaussians: the model, after `training_setup`.
         scene: its `Scene`; `image_name` and `uid` of a camera are only its place in the data set
-            (scene/dataset.py:39), so the picture's path, which says camera and frame, comes from
+            (scene/dataset.py:39), so the image's path, which says camera and frame, comes from
             `scene.train_camera.dataset`.
         stage: "coarse" or "fine", the variable of that name in `scene_reconstruction`.
         active_stages: the stages in which hooks run. The coarse one fits one still scene to all instants, which the
             prior of a moving surface contradicts, so it is left alone by default.
         settings: constants of its rasterizer, where they were changed.
-        key: finds the prior of a camera; needed where the picture's path does not say camera and frame.
+        key: finds the prior of a camera; needed where the image's path does not say camera and frame.
     """
 
     evidence = InriaAdapter.evidence | {"_deformation_accum": 0.0}
@@ -119,11 +119,11 @@ class Hust4DAdapter(InriaAdapter):
 
     def _default_key(self, camera: Any) -> PriorKey:
         if self._dataset is None:
-            return key_from_picture(str(camera.image_name))
-        return key_from_picture(str(self.picture(camera)))
+            return key_from_image_name(str(camera.image_name))
+        return key_from_image_name(str(self.image_name(camera)))
 
-    def picture(self, camera: Any) -> str | None:
-        """Path of the picture, from the data set: the camera's object has its place there and nothing more."""
+    def image_name(self, camera: Any) -> str | None:
+        """Path of the image, from the data set: the camera's object has its place there and nothing more."""
         if isinstance(camera, RenderedCamera):
             camera = camera.camera
         if self._dataset is None or not hasattr(camera, "uid"):

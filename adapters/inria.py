@@ -25,7 +25,7 @@ from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, V
 from d2_plugin.rasterizer import rasterize
 
 from .cameras import inria_view
-from .keys import KeyOf, PriorKey, key_from_picture
+from .keys import KeyOf, PriorKey, key_from_image_name
 from .probe import Probe, probe_package
 from .renders import Renders
 
@@ -57,7 +57,7 @@ class RenderedCamera:
 class InriaAdapter(ABC):
     """Base of the adapters: everything of the contract but `slice_at` and `_append`.
 
-    `key` finds the prior of a camera object; by default it is read from the picture's name.
+    `key` finds the prior of a camera object; by default it is read from the image's name.
     """
 
     appending: ClassVar[tuple[str, ...]] = ("densification_postfix",)
@@ -98,8 +98,8 @@ class InriaAdapter(ABC):
             self._renders.put(view, package)
         return view
 
-    def picture(self, camera: Any) -> str | None:
-        """Path of the picture that a camera shows, where its object says it: an export's names are found by it."""
+    def image_name(self, camera: Any) -> str | None:
+        """Path of the image that a camera shows, where its object says it: an export's names are found by it."""
         if isinstance(camera, RenderedCamera):
             camera = camera.camera
         path = getattr(camera, "image_path", None)
@@ -210,7 +210,7 @@ class InriaAdapter(ABC):
         return self._key(camera) if self._key is not None else self._default_key(camera)
 
     def _default_key(self, camera: Any) -> PriorKey:
-        return key_from_picture(str(getattr(camera, "image_path", None) or camera.image_name))
+        return key_from_image_name(str(getattr(camera, "image_path", None) or camera.image_name))
 
     def _attach(self) -> None:
         """Override the structural methods; stages attach again to the same instance, so the last adapter wins."""

@@ -1,6 +1,6 @@
 """Which camera and frame of the prior store a trainer's camera object stands for.
 
-What stays the same between runs differs by repository: the picture's name or path where the camera object carries one,
+What stays the same between runs differs by repository: the image's name or path where the camera object carries one,
 never `uid` or `colmap_id`, which are positions in a list that some of them shuffle (scene/__init__.py:69 of
 fudan-zvg/4d-gaussian-splatting).
 """
@@ -36,8 +36,8 @@ _NO_CAMERA = {"frame", "image", "img"}
 _NO_FOLDER = {"", ".", "..", "/", "images"}
 
 
-def key_from_picture(name: str) -> PriorKey:
-    """The key in the name or path of a picture: cam01_0003(.png), cam01/0003.png or cam01/images/frame_00003.png.
+def key_from_image_name(name: str) -> PriorKey:
+    """The key in the name or path of an image: cam01_0003(.png), cam01/0003.png or cam01/images/frame_00003.png.
 
     Raises:
         D2Error: the name has no camera or no frame in it.
@@ -51,7 +51,7 @@ def key_from_picture(name: str) -> PriorKey:
     if folders and number:
         return PriorKey(folders[-1], int(number[1]))
     raise D2Error(
-        f"picture '{name}' does not say its camera and frame: name it CAMERA_FRAME or CAMERA/FRAME, or give the "
+        f"image '{name}' does not say its camera and frame: name it CAMERA_FRAME or CAMERA/FRAME, or give the "
         "adapter a function `key` that returns PriorKey(camera, frame) for a camera object"
     )
 
@@ -66,17 +66,17 @@ def key_of_technicolor(name: str) -> PriorKey:
     """
     match = _TECHNICOLOR.search(_stem(name))
     if match is None:
-        raise D2Error(f"picture '{name}' does not end in FRAME_CAMERA as those of Technicolor do: give another `key`")
+        raise D2Error(f"image '{name}' does not end in FRAME_CAMERA as those of Technicolor do: give another `key`")
     return PriorKey(f"{int(match['camera']):02d}", int(match["frame"]))
 
 
-def one_picture_each(camera: Any) -> PriorKey:
-    """The key of a recording by one moving camera, where every picture is a camera of its own at frame 0."""
+def one_image_each(camera: Any) -> PriorKey:
+    """The key of a recording by one moving camera, where every image is a camera of its own at frame 0."""
     return PriorKey(PurePosixPath(str(camera.image_name)).stem, 0)
 
 
 def _stem(name: str) -> str:
-    """The file's name without folders and without the suffix of a picture."""
+    """The file's name without folders and without the suffix of an image."""
     path = PurePosixPath(name.replace("\\", "/"))
     return path.stem if path.suffix and not path.suffix[1:].isdigit() else path.name
 
@@ -122,15 +122,17 @@ class KeysByPose:
 
 
 class ViewsByPose:
-    """Views of gsplat's data sets, whose items have no names: camera and frame are those of the picture at that pose.
+    """Views of gsplat's data sets, whose items have no names: camera and frame are those of the image at that pose.
 
     Args:
         parser: `datasets.colmap.Parser` of gsplat's examples: `camtoworlds` [P, 4, 4] and `image_names`.
-        key: from the name of a picture to its key.
+        key: from the name of an image to its key.
         tolerance: how far two poses may lie apart to be the same, in the world's unit per unit of distance.
     """
 
-    def __init__(self, parser: Any, key: Callable[[str], PriorKey] = key_from_picture, tolerance: float = 1e-4) -> None:
+    def __init__(
+        self, parser: Any, key: Callable[[str], PriorKey] = key_from_image_name, tolerance: float = 1e-4
+    ) -> None:
         self.poses = torch.as_tensor(parser.camtoworlds).double().cpu()
         self.keys, self.tolerance = [key(name) for name in parser.image_names], tolerance
 
@@ -138,7 +140,7 @@ class ViewsByPose:
         """The view of an item or a batch of one: camtoworld [4, 4], K [3, 3], and image [H, W, 3] or width and height.
 
         Raises:
-            D2Error: no picture has that pose, or several have.
+            D2Error: no image has that pose, or several have.
         """
         pose, K = item["camtoworld"].detach().reshape(4, 4), item["K"].detach().reshape(3, 3)
         height, width = item["image"].shape[-3:-1] if "image" in item else (item["height"], item["width"])
@@ -146,8 +148,8 @@ class ViewsByPose:
         near = torch.nonzero(distances < self.tolerance * max(1.0, float(pose.abs().max()))).squeeze(-1)
         if len(near) != 1:
             raise D2Error(
-                f"{len(near)} pictures have the pose of this view: gsplat's pictures are told by their poses, so give "
-                "it one instant of the recording (`d2 export-capture --format gsplat`), and no pose_opt or pose_noise"
+                f"{len(near)} images have the pose of this view: gsplat's images are told by their poses, so give "
+                "it one instant of the recording (`d2 export-recording --format gsplat`), and no pose_opt or pose_noise"
             )
         key = self.keys[int(near)]
         return View(key.camera, key.frame, 0.0, torch.linalg.inv(pose), K, int(width), int(height))

@@ -56,7 +56,7 @@ class Appearance:
         return render._replace(color=render.color + render.color @ change[:, :3].T + change[:, 3])
 
     def change(self, camera: str) -> Tensor:
-        """M_c - mean M [3, 4]; the gradient is that of M_c alone, since the other cameras do not see this picture."""
+        """M_c - mean M [3, 4]; the gradient is that of M_c alone, since the other cameras do not see this image."""
         mean = torch.stack([value.detach() for value in self.changes.values()]).mean(0)
         return self.changes[camera] - mean
 

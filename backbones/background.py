@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from d2_plugin.gaussians.native_adam import Adam
-from d2_plugin.gaussians.native_picture import can_draw, composite_background
+from d2_plugin.gaussians.native_image import can_draw, composite_background
 from d2_plugin.gaussians.spherical_harmonics import basis
 from d2_plugin.rasterizer import Render, View
 
@@ -24,9 +24,9 @@ DEGREE = 3
 RATE = 1e-2
 """Learning rate of the constant term; the others learn at a fifth of it."""
 NODES = 40
-"""Directions across the picture at which the colour is computed; smaller pictures have one at each pixel."""
-STARTING_PICTURES = 32
-"""Pictures that its first colours are fitted to."""
+"""Directions across the image at which the colour is computed; smaller images have one at each pixel."""
+STARTING_IMAGES = 32
+"""Images that its first colours are fitted to."""
 RIDGE = 1e-3
 """Weight of the squared coefficients, times the square of their degree, beside the mean squared error."""
 KEPT_CAMERAS = 256
@@ -44,20 +44,20 @@ class Background:
         self._bases: dict[tuple[Any, ...], Tensor] = {}
 
     @torch.no_grad()
-    def start_from(self, views: Sequence[View], pictures: Callable[[int], Tensor]) -> None:
-        """Begin with what the pictures show in each direction, as if all of it were at infinity.
+    def start_from(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None:
+        """Begin with what the images show in each direction, as if all of it were at infinity.
 
-        Least squares over the nodes of at most `STARTING_PICTURES` views, spread evenly. A ridge that grows with the
+        Least squares over the nodes of at most `STARTING_IMAGES` views, spread evenly. A ridge that grows with the
         degree keeps directions that no camera sees near the mean colour.
 
         Args:
             views: the training views.
-            pictures: the picture [H, W, 3] in 0..1 of each, by its index in `views`.
+            images: the image [H, W, 3] in 0..1 of each, by its index in `views`.
         """
         if not views:
             return
-        chosen = sorted({round(index) for index in torch.linspace(0, len(views) - 1, STARTING_PICTURES).tolist()})
-        seen = [self._seen(views[index], pictures(index)) for index in chosen]
+        chosen = sorted({round(index) for index in torch.linspace(0, len(views) - 1, STARTING_IMAGES).tolist()})
+        seen = [self._seen(views[index], images(index)) for index in chosen]
         values = torch.cat([harmonics for harmonics, _ in seen]).double()
         colors = torch.cat([color for _, color in seen]).double() - 0.5
         degrees = torch.tensor([degree for degree in range(DEGREE + 1) for _ in range(2 * degree + 1)])
@@ -94,14 +94,14 @@ class Background:
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
 
-    def _seen(self, view: View, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Harmonics [nodes, (DEGREE + 1)^2] and colours [nodes, 3] at those nodes of a view inside of its picture."""
+    def _seen(self, view: View, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Harmonics [nodes, (DEGREE + 1)^2] and colours [nodes, 3] at those nodes of a view inside of its image."""
         rows, columns, stride = _nodes(view)
-        row = stride * torch.arange(rows, device=picture.device)
-        column = stride * torch.arange(columns, device=picture.device)
+        row = stride * torch.arange(rows, device=image.device)
+        column = stride * torch.arange(columns, device=image.device)
         row, column = row[row < view.height], column[column < view.width]
         harmonics = self._basis(view).view(rows, columns, -1)[: len(row), : len(column)]
-        return harmonics.flatten(0, 1), picture[row][:, column].flatten(0, 1).to(self.constant)
+        return harmonics.flatten(0, 1), image[row][:, column].flatten(0, 1).to(self.constant)
 
     def _basis(self, view: View) -> Tensor:
         """Harmonics of the nodes' directions [nodes, (DEGREE + 1)^2]; kept, since cameras mostly stand still."""
@@ -131,7 +131,7 @@ class Background:
 
 
 def _nodes(view: View) -> tuple[int, int, int]:
-    """Rows and columns of nodes and the pixels between them; the last ones lie beyond the picture."""
+    """Rows and columns of nodes and the pixels between them; the last ones lie beyond the image."""
     stride = max(1, view.width // NODES)
     return (view.height - 1) // stride + 2, (view.width - 1) // stride + 2, stride
 

@@ -1,7 +1,7 @@
 """Cameras whose clocks are a little off: a shift in time for each training camera, learnt with the Gaussians.
 
 What import leaves open (a fraction of a frame, where motion alone said when the cameras started) shows as a ghost of
-whatever moves. The shift of a camera is the time that passed, in its pictures, since the instant that they are named
+whatever moves. The shift of a camera is the time that passed, in its images, since the instant that they are named
 after. The median of all shifts is zero, so that they cannot wander off together, and a camera that does not train is
 shown at the instant that was asked for.
 """
@@ -27,7 +27,7 @@ class ClockSettings(Settings):
     learn: bool = False
     """Whether it is learnt. Off is right where cameras are triggered together, and where their offsets are known."""
     rate: Positive = 0.05
-    """Learning rate in frames. One of four cameras a frame late, half-size pictures, one seed: studio finds .7 of it
+    """Learning rate in frames. One of four cameras a frame late, half-size images, one seed: studio finds .7 of it
     in 900 steps at 0.05, .10 in 300 steps at 0.02; plaza, wider and with smaller movers, finds none of it."""
     last_rate: NotNegative = 0.1
     """Learning rate at the last step, as a share of `rate`; exponential in between."""

@@ -1,4 +1,4 @@
-"""Stopping early: patches of the training pictures that no loss sees say when more steps only fit the rest."""
+"""Stopping early: patches of the training images that no loss sees say when more steps only fit the rest."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from d2_plugin.gaussians.photometric import as_numbers
 from d2_plugin.settings import AtLeastOne, Range, Settings
 
 PATCHES = 16
-"""Patches along the longer side of a picture."""
+"""Patches along the longer side of an image."""
 
 
 @dataclass(frozen=True)
@@ -21,10 +21,10 @@ class EarlyStopSettings(Settings):
     """When a run ends before its last step."""
 
     share: Annotated[float, Range(0, 1, open_high=True)] = 0.0
-    """Share of each training picture that is held out of the photometric loss, in patches of a sixteenth of its longer
+    """Share of each training image that is held out of the photometric loss, in patches of a sixteenth of its longer
     side; 0 holds nothing out and never stops early."""
     patience: AtLeastOne = 5
-    """Rounds through all training pictures without a smaller error in those patches after which training ends."""
+    """Rounds through all training images without a smaller error in those patches after which training ends."""
 
 
 class EarlyStop:
@@ -33,7 +33,7 @@ class EarlyStop:
     def __init__(self, settings: EarlyStopSettings, seed: int) -> None:
         self.settings, self.seed = settings, seed
         self.rounds: list[float] = []
-        """Mean squared error of the patches over each round through all pictures."""
+        """Mean squared error of the patches over each round through all images."""
         self._errors: list[float] = []
 
     @property
@@ -45,7 +45,7 @@ class EarlyStop:
         return len(self.rounds) - 1 - best >= self.settings.patience
 
     def target(self, index: int, image: Tensor, rendered: Tensor) -> Tensor:
-        """The picture [H, W, 3] that the loss compares with: in its patches what was rendered, so nothing is learnt.
+        """The image [H, W, 3] that the loss compares with: in its patches what was rendered, so nothing is learnt.
 
         `image` is in 0..1, or as bytes.
         """
@@ -58,14 +58,14 @@ class EarlyStop:
         return torch.where(mask[..., None], rendered, image)
 
     def mask(self, index: int, height: int, width: int) -> Tensor:
-        """The held-out pixels [H, W] of a picture, the same each time."""
+        """The held-out pixels [H, W] of an image, the same each time."""
         side = -(-max(height, width) // PATCHES)
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + index)
         chosen = torch.rand(-(-height // side), -(-width // side), generator=generator) < self.settings.share
         return chosen.repeat_interleave(side, 0).repeat_interleave(side, 1)[:height, :width]
 
     def end_round(self) -> None:
-        """All pictures were seen once more."""
+        """All images were seen once more."""
         if self._errors:
             self.rounds.append(sum(self._errors) / len(self._errors))
             self._errors = []

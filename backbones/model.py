@@ -15,7 +15,7 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
-from d2_plugin.gaussians.native_picture import add_screen_gradients, can_draw, constant_colors
+from d2_plugin.gaussians.native_image import add_screen_gradients, can_draw, constant_colors
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 from d2_plugin.settings import NotNegative, Positive, Range, Settings
 
@@ -55,7 +55,7 @@ class SplatSettings(Settings):
     initial_opacity: Annotated[float, Range(0, 1, open_low=True)] = 0.1
     """Opacity of the Gaussians at the start."""
     opacity_weight: NotNegative = 0.0
-    """Weight of the mean opacity in the loss; what no picture needs fades and is pruned. 3DGS-MCMC: 0.01.
+    """Weight of the mean opacity in the loss; what no image needs fades and is pruned. 3DGS-MCMC: 0.01.
     At 0.01, 500 steps, one seed: studio -.04 dB with D2 and -.01 without, plaza -.75 and +.43; SSIM1 never rises."""
     scale_weight: NotNegative = 0.0
     """Weight of the mean standard deviation, in extents of the scene, in the loss. 3DGS-MCMC: 0.01 in its own unit.
@@ -175,15 +175,15 @@ class SplatModel(ABC):
         render = shown
         return render if self.appearance is None else self.appearance.seen_by(view.camera, render)
 
-    def look_at(self, views: Sequence[View], pictures: Callable[[int], Tensor]) -> None:
-        """What the model takes from the training pictures before the first step: background colours, frame rates."""
+    def look_at(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None:
+        """What the model takes from the training images before the first step: background colours, frame rates."""
         if self.background is not None:
-            self.background.start_from(views, pictures)
+            self.background.start_from(views, images)
         if self.clocks is not None:
             self.clocks.look_at(views)
 
     def regularization(self) -> Tensor | float:
-        """A term of the training loss that concerns no picture; 0.0 where there is none."""
+        """A term of the training loss that concerns no image; 0.0 where there is none."""
         s = self.settings
         total: Tensor | float = 0.0
         if s.opacity_weight:

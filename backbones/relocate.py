@@ -1,7 +1,7 @@
 """Relocation instead of clone and split: Gaussians that are nearly gone start again where opaque ones are.
 
 After "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al. 2024): a copy joins its source in such a
-way that the picture stays nearly what it was, so that no edit costs quality, and faint Gaussians wander.
+way that the image stays nearly what it was, so that no edit costs quality, and faint Gaussians wander.
 """
 
 from __future__ import annotations

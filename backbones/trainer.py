@@ -31,7 +31,7 @@ class Model(Protocol):
 
     @property
     def settings(self) -> Chosen: ...
-    def look_at(self, views: Sequence[View], pictures: Callable[[int], Tensor]) -> None: ...
+    def look_at(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None: ...
     def render(self, view: View, background: Tensor | None = None) -> Render: ...
     def regularization(self) -> Tensor | float: ...
     def accumulate(self, view: View) -> None: ...
@@ -51,9 +51,9 @@ class Hooks(Protocol):
 
 
 class Frames(Protocol):
-    """The training pictures: views, and the picture [H, W, 3] in 0..1 of each.
+    """The training images: views, and the image [H, W, 3] in 0..1 of each.
 
-    Where there is also `picture(index)`, the same as it is kept (uint8, 0..255), the loss is computed from that.
+    Where there is also `image_bytes(index)`, the same as it is kept (uint8, 0..255), the loss is computed from that.
     It may have `weights(index) -> [H, W] | None` as well: how much each pixel counts, 0..1. It may have `opened(step)`:
     how many of the views, from the first on, are trained on at a step, where that is not all of them.
     """
@@ -97,7 +97,7 @@ class Trainer:
 
     @property
     def stopped(self) -> bool:
-        """Whether held-out patches of the training pictures have ended the run before its last step."""
+        """Whether held-out patches of the training images have ended the run before its last step."""
         return self.early_stop.stopped
 
     def run(self, until: int | None = None, on_step: Callable[[int, float], None] | None = None) -> None:
@@ -108,7 +108,7 @@ class Trainer:
             index = self._next_view()
             view = self.frames.views[index]
             render = model.render(view)
-            target = self.early_stop.target(index, self._picture(index), render.color)
+            target = self.early_stop.target(index, self._image(index), render.color)
             loss = photometric_loss(render.color, target, self.settings.ssim_weight, self._weights(index))
             logged = loss.item()
             regularization = model.regularization()
@@ -147,9 +147,9 @@ class Trainer:
         if self.d2 is not None:
             self.d2.load_state_dict(state["d2"])
 
-    def _picture(self, index: int) -> Tensor:
-        picture: Callable[[int], Tensor] = getattr(self.frames, "picture", self.frames.image)
-        return picture(index)
+    def _image(self, index: int) -> Tensor:
+        read: Callable[[int], Tensor] = getattr(self.frames, "image_bytes", self.frames.image)
+        return read(index)
 
     def _weights(self, index: int) -> Tensor | None:
         weights: Callable[[int], Tensor | None] | None = getattr(self.frames, "weights", None)

@@ -16,7 +16,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from .errors import D2Error
+from d2_plugin.errors import D2Error
 
 
 class Untrusted(D2Error):

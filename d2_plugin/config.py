@@ -1,7 +1,7 @@
 """The configuration of D2: its prior, and one table per hook. A hook is switched on by its presence. TOML in and out.
 
 The paper's supplement, which fixes thresholds, weights and schedules, is not public: the defaults are this project's
-own choices, set by measurement. "Studio" in a docstring means the rendered studio capture (320x180, four training views
+own choices, set by measurement. "Studio" in a docstring means the rendered recording (320x180, four training views
 00 02 05 07, frames 0 to 8, emulated monocular depth, one seed), the numbers are held-out PSNR.
 """
 
@@ -43,8 +43,8 @@ class D2Config(_HookTables):
     prior: str | None = None
     """Folder of the depth prior, as `d2 priors` writes it."""
     exported: str | None = None
-    """Folder that `d2 export-capture` wrote and the trainer reads, where the prior is that of the source: its cameras
-    and frames have other names there. Found without this where the trainer's cameras know the paths of their pictures.
+    """Folder that `d2 export-recording` wrote and the trainer reads, where the prior is that of the source: its cameras
+    and frames have other names there. Found without this where the trainer's cameras know the paths of their images.
     """
     iterations: AtLeastOne | None = None
     """Length of the trainer's run: what the hooks' tables leave out of start, stop, every and budget follows from it.

@@ -142,8 +142,8 @@ class D2Hooks:
             return 0.0
         self._begin(step)
         batch = views if isinstance(views, (list, tuple)) else [views]
-        if not self._named and batch and hasattr(self.backbone, "picture"):
-            self._prior.store, self._named = _renamed(self._prior.store, self.backbone.picture(batch[0])), True
+        if not self._named and batch and hasattr(self.backbone, "image_name"):
+            self._prior.store, self._named = _renamed(self._prior.store, self.backbone.image_name(batch[0])), True
         shown = [converted(self.backbone, camera) for camera in batch]
         self._sampler.add(shown)
         context = self._context(step, shown)
@@ -286,12 +286,12 @@ def _of_other_names(hooks: Mapping[str, Hook]) -> dict[str, Hook]:
 def _open_store(config: D2Config) -> Store:
     if config.prior is None:
         raise D2Error(f"{', '.join(HOOKS)} need a depth prior: set `prior` to the folder that `d2 priors` wrote")
-    from d2_plugin.priors.disk.exported import opened
+    from d2_plugin.store.exported import opened
 
     return opened(config.prior, config.exported)
 
 
-def _renamed(store: Store, picture: str | None) -> Store:
-    from d2_plugin.priors.disk.exported import renamed_by
+def _renamed(store: Store, image: str | None) -> Store:
+    from d2_plugin.store.exported import renamed_by
 
-    return renamed_by(store, picture)
+    return renamed_by(store, image)

@@ -99,8 +99,8 @@ class Edit(NamedTuple):
 class DepthPrior(NamedTuple):
     """D* of one view: `depth` [H, W] float32 (0 where there is none) and `labels` [H, W] uint8 (see `Label`).
 
-    `colors` [H, W, 3] uint8 are the pixels of the picture the prior was made for: inserted Gaussians start with them,
-    and a trainer's camera need not keep its picture in memory.
+    `colors` [H, W, 3] uint8 are the pixels of the image the prior was made for: inserted Gaussians start with them,
+    and a trainer's camera need not keep its image in memory.
 
     `sigma` [H, W] float32 is the relative standard deviation of D*, infinite where nothing is known. `reliability`
     [H, W] float32 in 0..1, r(p), is how much a pixel counts where depth is judged. None stands for the paper: sigma is
@@ -219,8 +219,8 @@ class Backbone(Protocol):
         second render. The views of a batch are told apart by camera and frame.
     ``begin_step(step) -> None``
         called with the number of the training step before anything else is asked in it.
-    ``picture(camera) -> str | None``
-        path of the picture that a camera of the trainer shows; priors of an exported capture are found by it.
+    ``image(camera) -> str | None``
+        path of the image that a camera of the trainer shows; priors of an exported recording are found by it.
     ``active(step) -> bool``
         False while the hooks must wait (stages, warm-up); a question, which changes nothing.
     ``colors(view, splats) -> Tensor``

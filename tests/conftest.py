@@ -26,12 +26,14 @@ SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session")
 def shared_data() -> Callable[[str], Path]:
-    """Path of a real capture beside the checkout; skips the test, by name, where it is absent."""
+    """Path of a real recording beside the checkout; skips the test, by name, where it is absent."""
 
     def locate(name: str) -> Path:
         path = SHARED_DATA / name
         if not path.exists():
-            pytest.skip(f"capture '{name}' is not in {SHARED_DATA.parent.name}/{SHARED_DATA.name} beside the checkout")
+            pytest.skip(
+                f"recording '{name}' is not in {SHARED_DATA.parent.name}/{SHARED_DATA.name} beside the checkout"
+            )
         return path
 
     return locate

@@ -1,4 +1,4 @@
-"""Recordings filmed again by cameras that start when they like: videos of a capture with known offsets and gains."""
+"""Recordings filmed again by cameras that start when they like: videos of a recording with known offsets and gains."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from films import write_film
+from videos import write_video
 
-from d2_plugin.captures import Capture
-from d2_plugin.captures.export.folder import described
+from d2_plugin.recordings import Recording
+from d2_plugin.recordings.export.folder import described
 
 SOUND_RATE = 48_000
 
@@ -21,7 +21,7 @@ class Shooting:
     """How one camera filmed."""
 
     offset: float = 0.0
-    """Seconds after the first instant of the capture at which its clock began."""
+    """Seconds after the first instant of the recording at which its clock began."""
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     turn: int = 0
     dropped: tuple[int, ...] = ()
@@ -54,8 +54,8 @@ class Filmed:
         return self.folder / "videos"
 
 
-def film(
-    capture: Capture,
+def video(
+    recording: Recording,
     folder: Path,
     shootings: Mapping[str, Shooting],
     sound: bool = False,
@@ -64,35 +64,35 @@ def film(
     """Write one video per shooting, with what the room sounds like; `sounds` are seeds of other rooms by camera.
 
     A camera that begins after the first instant lacks the first frames; one that begins earlier waits for them, and
-    its first video frame is the first of the capture at a later time of its own.
+    its first video frame is the first of the recording at a later time of its own.
     """
     (folder / "videos").mkdir(parents=True)
-    length = (len(capture.frames) + 1) / capture.fps
+    length = (len(recording.frames) + 1) / recording.fps
     early = -min(min(one.offset for one in shootings.values()), 0.0)
     for name, shot in shootings.items():
-        instants = np.array([capture.seconds(frame) for frame in capture.frames]) - shot.offset
+        instants = np.array([recording.seconds(frame) for frame in recording.frames]) - shot.offset
         begun = np.flatnonzero(instants >= -1e-9)
         kept = [i for place, i in enumerate(begun) if place not in shot.dropped]
-        pictures = [graded(capture.image(name, capture.frames[i]), shot.gain) for i in kept]
+        images = [graded(recording.image(name, recording.frames[i]), shot.gain) for i in kept]
         heard = None
         if sound:
             rng = np.random.default_rng(sum(name.encode()))
             room = room_sound(length + early, (sounds or {}).get(name, 7))
             own = room[round((early + shot.offset) * SOUND_RATE) :]
             heard = (own * rng.uniform(0.3, 1.0) + rng.normal(0, 0.002, len(own))).clip(-1, 1)
-        write_film(
+        write_video(
             folder / "videos" / f"{name}.mp4",
-            pictures,
+            images,
             [max(float(instants[i]), 0.0) for i in kept],
             turn=shot.turn,
             sound=heard,
             timecode=shot.timecode,
         )
     calibration = folder / "cameras.json"
-    calibration.write_text(json.dumps(described(capture)))
+    calibration.write_text(json.dumps(described(recording)))
     return Filmed(folder, calibration, dict(shootings))
 
 
-def graded(picture: np.ndarray, gain: tuple[float, float, float]) -> np.ndarray:
-    """The picture as a camera of another exposure has it."""
-    return np.rint(picture.astype(float) * gain).clip(0, 255).astype(np.uint8)
+def graded(image: np.ndarray, gain: tuple[float, float, float]) -> np.ndarray:
+    """The image as a camera of another exposure has it."""
+    return np.rint(image.astype(float) * gain).clip(0, 255).astype(np.uint8)

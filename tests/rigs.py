@@ -1,4 +1,4 @@
-"""Made-up rigs for tests of calibration: what their cameras see of random things, and boards that they film."""
+"""Made-up rigs for tests of calibration: what their cameras see of random things, and boards that they video."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from d2_plugin.captures.calibrate import Board
-from d2_plugin.captures.calibrate.align import differences, rig_width
-from d2_plugin.captures.calibrate.bundle import project
-from d2_plugin.captures.calibrate.features import Features
-from d2_plugin.captures.calibration import pinhole, rigid
-from d2_plugin.captures.capture import Camera
+from d2_plugin.recordings.cameras.calibrating import Board
+from d2_plugin.recordings.cameras.calibrating.align import differences, rig_width
+from d2_plugin.recordings.cameras.calibrating.bundle import project
+from d2_plugin.recordings.cameras.calibrating.features import Features
+from d2_plugin.recordings.cameras.calibration import pinhole, rigid
+from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
 cv2 = pytest.importorskip("cv2", reason="opencv is in the `calibration` extra")
@@ -71,12 +71,12 @@ def worst(cameras: dict[str, Camera], truth: dict[str, Camera]) -> tuple[float, 
 
 
 def filmed(rig: dict[str, Camera], square: float) -> tuple[dict[str, list[np.ndarray]], Board]:
-    """Pictures of a ChArUco board of 7 x 5 squares that stands in front of the rig, and the board."""
+    """Images of a ChArUco board of 7 x 5 squares that stands in front of the rig, and the board."""
     board = Board(7, 5, square, 0.75 * square)
     side = 60
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     drawn = cv2.aruco.CharucoBoard((7, 5), square, 0.75 * square, dictionary).generateImage((7 * side, 5 * side))
-    pictures = {}
+    images = {}
     for name, camera in rig.items():
         T = camera.T_camera_world
         onto_plane = camera.K @ np.column_stack([T[:3, 0] * square / side, T[:3, 1] * square / side, T[:3, 3]])
@@ -84,5 +84,5 @@ def filmed(rig: dict[str, Camera], square: float) -> tuple[dict[str, list[np.nda
         half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])  # cv2 puts centres at whole numbers
         warp = half @ onto_plane @ middle @ np.linalg.inv(half)
         grey = cv2.warpPerspective(drawn, warp, (camera.width, camera.height), flags=cv2.INTER_AREA, borderValue=128)
-        pictures[name] = [np.repeat(grey[..., None], 3, axis=2)]
-    return pictures, board
+        images[name] = [np.repeat(grey[..., None], 3, axis=2)]
+    return images, board

@@ -7,22 +7,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stand_in_captures import smooth_capture, write_rows, write_videos
+from stand_in_recordings import smooth_recording, write_rows, write_videos
 
-from d2_plugin.captures import Capture
-from d2_plugin.captures.export.export import export_capture
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.export.ply import PointCloud
-from d2_plugin.captures.pictures import write_png
-from d2_plugin.captures.rotations import quaternion_of_rotation
-from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.recordings import Recording
+from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
+from d2_plugin.recordings.export.export import export_recording
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.export.ply import PointCloud
+from d2_plugin.recordings.images import write_png
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 W, H = 48, 32
 
 
-def small_capture() -> Capture:
+def small_recording() -> Recording:
     """Two cameras, two frames, true depth and monocular maps; it declares near and far."""
-    room = synthetic_capture(cameras=2, held_out=0, frames=2, width=W, height=H)
+    room = synthetic_recording(cameras=2, held_out=0, frames=2, width=W, height=H)
     cameras = {
         f"cam{i:02d}": replace(camera, name=f"cam{i:02d}", near_far=(1.0, 9.0))
         for i, camera in enumerate(room.cameras.values())
@@ -32,69 +32,69 @@ def small_capture() -> Capture:
 
 
 class _Renamed:
-    def __init__(self, capture: Capture, names: dict[str, str]) -> None:
-        self.capture, self.names = capture, names
+    def __init__(self, recording: Recording, names: dict[str, str]) -> None:
+        self.recording, self.names = recording, names
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        return self.capture.image(self.names[camera], frame)
+        return self.recording.image(self.names[camera], frame)
 
     def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        return self.capture.depth(self.names[camera], frame)
+        return self.recording.depth(self.names[camera], frame)
 
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        return self.capture.mono(self.names[camera], frame)
+        return self.recording.mono(self.names[camera], frame)
 
 
 def write_layout(name: str, path: Path) -> Path:
     """The recording in one layout: `folder`, `n3dv`, `videos`, `technicolor`, `enerf`, `transforms` or `colmap*`."""
-    capture = small_capture()
+    recording = small_recording()
     if name == "folder":
-        return save_capture(capture, path)
+        return save_recording(recording, path)
     if name == "videos":
-        return write_videos(smooth_capture(("00", "01"), frames=3), path)
+        return write_videos(smooth_recording(("00", "01"), frames=3), path)
     if name == "n3dv":
-        for camera in capture.cameras:
-            _pictures(capture, camera, path / camera)
-        return write_rows(capture, path)
+        for camera in recording.cameras:
+            _images(recording, camera, path / camera)
+        return write_rows(recording, path)
     if name == "technicolor":
-        return _technicolor(capture, path)
+        return _technicolor(recording, path)
     if name == "enerf":
-        return _enerf(capture, path)
+        return _enerf(recording, path)
     cloud = PointCloud(np.eye(3) + 2, np.full((3, 3), 0.5), np.zeros(3))
-    export_capture(capture, name.removesuffix("_text"), path, cloud=cloud)
+    export_recording(recording, name.removesuffix("_text"), path, cloud=cloud)
     if name == "colmap_text":
         _as_text(path / "sparse" / "0")
     return path
 
 
-def _pictures(capture: Capture, camera: str, folder: Path, pattern: str = "{:05d}.png") -> None:
+def _images(recording: Recording, camera: str, folder: Path, pattern: str = "{:05d}.png") -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    for frame in capture.frames:
-        write_png(folder / pattern.format(frame), capture.image(camera, frame))
+    for frame in recording.frames:
+        write_png(folder / pattern.format(frame), recording.image(camera, frame))
 
 
-def _technicolor(capture: Capture, path: Path) -> Path:
+def _technicolor(recording: Recording, path: Path) -> Path:
     lines = ["f cu cv ar sk d1 d2 qw qx qy qz tx ty tz"]
-    for number, (name, camera) in enumerate(capture.cameras.items()):
+    for number, (name, camera) in enumerate(recording.cameras.items()):
         K, T = camera.K, camera.T_camera_world
         numbers = [K[0, 0], K[0, 2], K[1, 2], K[1, 1] / K[0, 0], 0.0, 0.01, 0.0]
         numbers += [*quaternion_of_rotation(T[:3, :3]), *T[:3, 3]]
         lines.append(" ".join(f"{value:.17g}" for value in numbers))
-        _pictures(capture, name, path, "scene_{:05d}" + f"_{number:02d}.png")
+        _images(recording, name, path, "scene_{:05d}" + f"_{number:02d}.png")
     (path / "cameras_parameters.txt").write_text("\n".join(lines))
     return path
 
 
-def _enerf(capture: Capture, path: Path) -> Path:
+def _enerf(recording: Recording, path: Path) -> Path:
     cv2 = pytest.importorskip("cv2")
     path.mkdir(parents=True, exist_ok=True)
     files = {name: cv2.FileStorage(str(path / f"{name}.yml"), cv2.FILE_STORAGE_WRITE) for name in ("intri", "extri")}
-    for name, camera in capture.cameras.items():
+    for name, camera in recording.cameras.items():
         files["intri"].write(f"K_{name}", camera.K)
         files["intri"].write(f"dist_{name}", np.array([[0.01, 0, 0, 0, 0]]))
         files["extri"].write(f"R_{name}", cv2.Rodrigues(camera.T_camera_world[:3, :3])[0])
         files["extri"].write(f"T_{name}", camera.T_camera_world[:3, 3:])
-        _pictures(capture, name, path / "images" / name)
+        _images(recording, name, path / "images" / name)
     for file in files.values():
         file.release()
     return path
@@ -102,7 +102,7 @@ def _enerf(capture: Capture, path: Path) -> Path:
 
 def _as_text(folder: Path) -> None:
     """The binary model of a folder as COLMAP writes it in text."""
-    from d2_plugin.captures.readers.colmap_model import read_model
+    from d2_plugin.recordings.readers.colmap_model import read_model
 
     model = read_model(folder)
     cameras = [

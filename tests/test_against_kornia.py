@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from d2_plugin.captures.lens import Lens
 from d2_plugin.gaussians.photometric import ssim
+from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.runs.drawing import color_scale
 
 kornia = pytest.importorskip("kornia", reason="kornia is in the `test` extra")
@@ -24,7 +24,7 @@ def test_a_lens_bends_as_kornias(coefficients: tuple[float, ...]) -> None:
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
 
 
-def test_beyond_the_fold_kornia_puts_a_picture_where_there_is_none() -> None:
+def test_beyond_the_fold_kornia_puts_a_image_where_there_is_none() -> None:
     lens = Lens(K, (-0.5,))
     corner = np.array([[320 + 500 * 1.2, 240.0]])  # r = 1.2: the polynomial grows up to r = .82
     theirs = kornia.geometry.calibration.distort_points(
@@ -36,10 +36,10 @@ def test_beyond_the_fold_kornia_puts_a_picture_where_there_is_none() -> None:
 
 def test_similarity_equals_kornias_inside_a_black_frame() -> None:
     generator = torch.Generator().manual_seed(0)
-    pictures = [torch.rand(3, 30, 40, generator=generator, dtype=torch.float64) for _ in range(2)]
+    images = [torch.rand(3, 30, 40, generator=generator, dtype=torch.float64) for _ in range(2)]
     # At the border ours pads with zeros, as 3DGS does, and kornia reflects: in a black frame both are the same.
     # kornia adds 1e-12 to a denominator that is 9e-8 where all is black, hence the tolerance.
-    a, b = (torch.nn.functional.pad(picture, (10,) * 4) for picture in pictures)
+    a, b = (torch.nn.functional.pad(image, (10,) * 4) for image in images)
     theirs = kornia.metrics.ssim(a[None], b[None], window_size=11).mean()
     torch.testing.assert_close(ssim(a.permute(1, 2, 0), b.permute(1, 2, 0)), theirs, rtol=0, atol=2e-5)
 

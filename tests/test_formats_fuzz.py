@@ -11,29 +11,29 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from fuzzing import bounded_memory, expect_result_or_sentence, mutate_file
-from small_layouts import small_capture
+from small_layouts import small_recording
 from tiny_onnx import mean_network
 
 from d2_plugin.arrays import map_array, read_array
-from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.export.export import EXPORT_FILE, export_capture
-from d2_plugin.captures.pictures import picture_size, read_picture, write_png
-from d2_plugin.captures.videos.plain import VideoSource, video_header
 from d2_plugin.config import D2Config, for_iterations
 from d2_plugin.priors.colmap.dense_arrays import read_dense_array, write_dense_array
 from d2_plugin.priors.depth_on_disk import SensorDepth
-from d2_plugin.priors.disk.exported import RenamedStore
 from d2_plugin.priors.monocular.network import MonocularModel
 from d2_plugin.reading import read_json
-from d2_plugin.study.report.report import collect, make_report
+from d2_plugin.recordings.export.export import EXPORT_FILE, export_recording
+from d2_plugin.recordings.images import image_size, read_image, write_png
+from d2_plugin.recordings.importing.plain import VideoSource, video_header
+from d2_plugin.recordings.recording import Camera
+from d2_plugin.runs.report.report import collect, make_report
+from d2_plugin.store.exported import RenamedStore
 from d2_plugin.viewing.checkpoints import read_ply
-from d2_plugin.viewing.films.path_file import read_camera_path
+from d2_plugin.viewing.videos.path_file import read_camera_path
 
 cv2 = pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
 FEW, MANY = 50, 2000
 MAP = np.linspace(0.5, 3, 48 * 32, dtype=np.float32).reshape(32, 48)
-PICTURE = (np.stack([MAP, MAP[::-1], MAP * 0.3], axis=-1) * 80).astype(np.uint8)
+IMAGE = (np.stack([MAP, MAP[::-1], MAP * 0.3], axis=-1) * 80).astype(np.uint8)
 
 
 class Case(NamedTuple):
@@ -60,8 +60,8 @@ def write_sensor(path: Path) -> None:
 
 
 def report(path: Path) -> object:
-    rows, pictures = collect([path])
-    return make_report(rows, path.parent / "report", pictures)
+    rows, images = collect([path])
+    return make_report(rows, path.parent / "report", images)
 
 
 def some_rows() -> list[str]:
@@ -73,7 +73,7 @@ def some_rows() -> list[str]:
 
 
 def network(path: Path) -> np.ndarray:
-    return MonocularModel(path, "relative")(PICTURE)
+    return MonocularModel(path, "relative")(IMAGE)
 
 
 def video(path: Path) -> np.ndarray:
@@ -84,7 +84,7 @@ def video(path: Path) -> np.ndarray:
 def write_video(path: Path) -> None:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 24, (48, 32))
     for _ in range(3):
-        writer.write(PICTURE)
+        writer.write(IMAGE)
     writer.release()
 
 
@@ -112,8 +112,8 @@ CASES = {
     "npy": Case("a.npy", lambda p: np.save(p, MAP), read_array),
     "npy mapped": Case("a.npy", lambda p: np.save(p, MAP), map_array),
     "npz": Case("a.npz", lambda p: np.savez_compressed(p, depth=MAP), lambda p: read_array(p, key="depth", ndim=2)),
-    "png": Case("a.png", lambda p: write_png(p, PICTURE), lambda p: (picture_size(p), read_picture(p))),
-    "jpeg": Case("a.jpg", lambda p: cv2.imwrite(str(p), PICTURE), lambda p: (picture_size(p), read_picture(p))),
+    "png": Case("a.png", lambda p: write_png(p, IMAGE), lambda p: (image_size(p), read_image(p))),
+    "jpeg": Case("a.jpg", lambda p: cv2.imwrite(str(p), IMAGE), lambda p: (image_size(p), read_image(p))),
     "video": Case("a.mp4", write_video, video),
     "dense": Case("a.bin", lambda p: write_dense_array(p, MAP), read_dense_array),
     "sensor json": Case("depth.json", write_sensor, sensor),
@@ -126,7 +126,7 @@ CASES = {
     ),
     "export": Case(
         f"export/{EXPORT_FILE}",
-        lambda p: export_capture(small_capture(), "transforms", p.parent),
+        lambda p: export_recording(small_recording(), "transforms", p.parent),
         lambda p: RenamedStore.of_export(None, p.parent),
     ),
     "onnx": Case("net.onnx", lambda p: mean_network(p, 32, 48), network),

@@ -58,7 +58,7 @@ def test_an_object_that_is_no_camera() -> None:
         ({"width": 0}, "0x24 pixels, expected at least one"),
     ],
 )
-def test_a_view_that_no_picture_has(changes: dict[str, Any], says: str) -> None:
+def test_a_view_that_no_image_has(changes: dict[str, Any], says: str) -> None:
     with pytest.raises(D2Error, match=says):
         attached().loss(1, replace(make_views()[0], **changes))
 

@@ -89,7 +89,7 @@ def test_every_extra_in_an_error_exists(setup: configparser.ConfigParser) -> Non
     named = {place: extra.value for place, extra in second.items() if isinstance(extra, ast.Constant)}
     assert len(named) > 3
     assert not {place: extra for place, extra in named.items() if extra not in known}
-    assert extras_in(str(missing_extra("OpenCV", "image", "reading pictures"))) == {"image"}
+    assert extras_in(str(missing_extra("OpenCV", "image", "reading images"))) == {"image"}
 
 
 def test_every_extra_in_text_exists(setup: configparser.ConfigParser) -> None:

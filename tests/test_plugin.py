@@ -256,7 +256,7 @@ def test_training_with_a_finished_prior_needs_torch_and_numpy_alone() -> None:
 import sys
 for name in ("cv2", "pycolmap", "onnxruntime", "kornia", "rich", "matplotlib"):
     sys.modules[name] = None  # an import of it now fails
-import d2_plugin.priors.store
+import d2_plugin.store.store
 from tiny import ALL_HOOKS, make_trainer
 make_trainer(ALL_HOOKS, iterations=6).run()
 """

@@ -222,8 +222,8 @@ def test_a_setting_without_a_default_is_asked_for() -> None:
         name: str
         count: Count = 0
 
-    with pytest.raises(D2Error, match="capture must have name: add what is missing"):
-        Needy.from_dict({"count": 1}, "capture")
+    with pytest.raises(D2Error, match="recording must have name: add what is missing"):
+        Needy.from_dict({"count": 1}, "recording")
     assert declared(Needy)[0].default is MISSING
 
 

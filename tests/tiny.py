@@ -37,7 +37,7 @@ def make_views() -> list[View]:
 
 
 class TinyFrames:
-    """Pictures of the plane."""
+    """Images of the plane."""
 
     def __init__(self) -> None:
         self.views = make_views()

@@ -20,13 +20,13 @@ def mean_network(
     batch: int = 1,
 ) -> Path:
     """A network whose output [N, outputs, H, W] is the mean of its input channels; a size given as text is dynamic."""
-    steps = [_node("ReduceMean", ["picture"], ["mean"], axes=[1], keepdims=1)]
+    steps = [_node("ReduceMean", ["image"], ["mean"], axes=[1], keepdims=1)]
     if outputs == 1:
         steps.append(_node("Identity", ["mean"], ["disparity"]))
     else:
         steps.append(_node("Concat", ["mean"] * outputs, ["disparity"], axis=1))
     graph = b"".join(_message(1, step) for step in steps) + _text(2, "mean")
-    graph += _message(11, _value("picture", dtype, [batch, channels, height, width]))
+    graph += _message(11, _value("image", dtype, [batch, channels, height, width]))
     graph += _message(12, _value("disparity", dtype, [batch, outputs, height, width]))
     opset = _text(1, "") + _varint(2, 13)
     path.write_bytes(_varint(1, 8) + _message(7, graph) + _message(8, opset))
@@ -34,15 +34,15 @@ def mean_network(
 
 
 def scaled_network(path: Path, weights: str) -> Path:
-    """A network whose output [1, 3, 6, 8] is the picture times a number that lies in the file `weights` beside it."""
+    """A network whose output [1, 3, 6, 8] is the image times a number that lies in the file `weights` beside it."""
     entry = b"".join(
         _message(13, _text(1, key) + _text(2, value)) for key, value in (("location", weights), ("length", "4"))
     )
     tensor = _varint(1, 1) + _varint(2, FLOAT) + _text(8, "factor") + entry + _varint(14, EXTERNAL)
-    product = _node("Mul", ["picture", "factor"], ["scaled"])
+    product = _node("Mul", ["image", "factor"], ["scaled"])
     mean = _node("ReduceMean", ["scaled"], ["disparity"], axes=[1], keepdims=1)
     graph = _message(1, product) + _message(1, mean) + _text(2, "scaled") + _message(5, tensor)
-    graph += _message(11, _value("picture", FLOAT, [1, 3, 6, 8]))
+    graph += _message(11, _value("image", FLOAT, [1, 3, 6, 8]))
     graph += _message(12, _value("disparity", FLOAT, [1, 1, 6, 8]))
     opset = _text(1, "") + _varint(2, 13)
     path.write_bytes(_varint(1, 8) + _message(7, graph) + _message(8, opset))

@@ -4,7 +4,7 @@
     loss = loss + self.d2.loss(iteration + 1, view) / self.BATCH_SIZE           # before loss.backward() (:168)
     self.d2.step(iteration + 1)                                                 # after optimizer.zero_grad() (:180)
 
-Its rasterizer returns a picture and nothing else, so depth comes from ours. It counts iterations from 0.
+Its rasterizer returns an image and nothing else, so depth comes from ours. It counts iterations from 0.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
 
-from ..keys import KeyOf, PriorKey, key_from_picture
+from ..keys import KeyOf, PriorKey, key_from_image_name
 
 CONSTANTS = RasterSettings(alpha_max=1 - 1e-6)
 """Of its rasterizer (rasterization_config.h): alpha is not clamped; near comes from the camera."""
@@ -55,7 +55,7 @@ class FasterGS4DAdapter:
         gaussians: `model.gaussians`, after `training_setup`.
         duration: of the clip in the unit of `view.timestamp`, which its data sets bring to 0..1.
         settings: constants of its rasterizer, where they were changed.
-        key: finds the prior of a view; needed where the picture's path does not say camera and frame.
+        key: finds the prior of a view; needed where the image's path does not say camera and frame.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class FasterGS4DAdapter:
         if lens is None or not hasattr(lens, "focal_x"):
             kind = type(camera).__name__
             raise D2Error(f"a camera of type {kind} has no perspective `camera`: pass the trainer's view")
-        key = self._key(camera) if self._key is not None else _key_of_picture(camera)
+        key = self._key(camera) if self._key is not None else _key_of_image(camera)
         like = self.gaussians._spatial_means
         K = torch.tensor([[lens.focal_x, 0, lens.center_x], [0, lens.focal_y, lens.center_y], [0, 0, 1]])
         pose = camera.w2c.detach().to(like).contiguous()
@@ -196,9 +196,9 @@ class FasterGS4DAdapter:
             listener(index)
 
 
-def _key_of_picture(view: Any) -> PriorKey:
-    """Its data sets number frames through all cameras; only the path of the picture says which is which."""
-    picture = getattr(view, "_rgb", None)
-    if picture is None:
-        raise D2Error("a view without a picture does not say its camera: give the adapter a function `key`")
-    return key_from_picture(str(picture.path))
+def _key_of_image(view: Any) -> PriorKey:
+    """Its data sets number frames through all cameras; only the path of the image says which is which."""
+    image = getattr(view, "_rgb", None)
+    if image is None:
+        raise D2Error("a view without an image does not say its camera: give the adapter a function `key`")
+    return key_from_image_name(str(image.path))

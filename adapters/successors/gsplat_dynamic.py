@@ -140,7 +140,7 @@ class GsplatDynamicAdapter(GsplatAdapter):
         return found
 
     def _view_of_item(self, item: object) -> View:
-        """An item of its data set: camtoworld, K, time and the picture of one frame."""
+        """An item of its data set: camtoworld, K, time and the image of one frame."""
         if not isinstance(item, Mapping) or self.frames is None:
             given = f"a camera of type {type(item).__name__}" if self.frames is not None else "no number of frames"
             raise D2Error(f"got {given}: pass views, or the data set's items and `frames=`, or give the adapter `view`")

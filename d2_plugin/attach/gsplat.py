@@ -18,11 +18,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from d2_plugin.attach.recipes import Objects, Recipe, adapter_of
+from d2_plugin.attach.session import AddGradient, Session, keep_instances, remember
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
-
-from .recipes import Objects, Recipe, adapter_of
-from .session import AddGradient, Session, keep_instances, remember
 
 log = logging.getLogger(__name__)
 

@@ -13,16 +13,15 @@ from typing import NoReturn
 
 import torch
 
+from d2_plugin.attach.cpu import run_on_cpu
+from d2_plugin.attach.gsplat import GsplatSession, put_in_place
+from d2_plugin.attach.originals import provide
+from d2_plugin.attach.packages import stand_in_for
+from d2_plugin.attach.recipes import RECIPES, Recipe, recipe
+from d2_plugin.attach.repairs import repair
+from d2_plugin.attach.session import Session, found_in
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
-
-from .cpu import run_on_cpu
-from .gsplat import GsplatSession, put_in_place
-from .originals import provide
-from .packages import stand_in_for
-from .recipes import RECIPES, Recipe, recipe
-from .repairs import repair
-from .session import Session, found_in
 
 SESSIONS: dict[str, type[Session]] = {"trainer": Session, "gsplat": GsplatSession}
 """By the kind of a recipe, what follows its run."""
@@ -61,7 +60,7 @@ def prepare(options: argparse.Namespace, command: Sequence[str]) -> Recipe:
         raise D2Error(f"no script at {script}: give the repository's train.py and its arguments after --")
     _check_device(options.cpu)
     if options.d2 is not None:
-        D2Config.from_toml(options.d2)  # a mistake is told now, not when the trainer has read its pictures
+        D2Config.from_toml(options.d2)  # a mistake is told now, not when the trainer has read its images
     sys.argv = list(command)
     found = recipe(options.repository)
     folder = script.resolve().parent
@@ -114,7 +113,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("repository", choices=sorted(RECIPES), help="which codebase the script belongs to")
     parser.add_argument("--d2", type=Path, default=None, help="configuration of D2; without it the bare trainer runs")
-    exported = "folder that d2 export-capture wrote, if the prior was built from its source"
+    exported = "folder that d2 export-recording wrote, if the prior was built from its source"
     parser.add_argument("--exported", type=Path, default=None, help=exported)
     parser.add_argument("--cpu", action="store_true", help="no GPU: cuda means cpu, D2's modules replace CUDA builds")
     return parser

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import torch
 
+from d2_plugin.attach.packages import STAND_INS, missing, needed, pip_command
+from d2_plugin.attach.recipes import Original, recipe
 from d2_plugin.errors import D2Error
-
-from .packages import STAND_INS, missing, needed, pip_command
-from .recipes import Original, recipe
 
 WIDTH = 48
 """Of the column of names."""

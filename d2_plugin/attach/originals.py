@@ -9,7 +9,7 @@ import sys
 import types
 from pathlib import Path
 
-from .recipes import Original
+from d2_plugin.attach.recipes import Original
 
 log = logging.getLogger(__name__)
 

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin import registry
+from d2_plugin.attach.repairs import saves_parents
 from d2_plugin.errors import unknown_name
 from d2_plugin.protocol import Backbone
-
-from .repairs import saves_parents
 
 Adapter = Callable[..., Backbone]
 

@@ -49,7 +49,7 @@ def _pillow() -> str | None:
 
 
 def _joblib() -> str | None:
-    """cem-4dgs reads pictures in processes that import its modules again, where no stand-in is (scene/__init__.py)."""
+    """cem-4dgs reads images in processes that import its modules again, where no stand-in is (scene/__init__.py)."""
     try:
         from joblib import parallel, register_parallel_backend
     except ImportError:

@@ -13,12 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from d2_plugin.attach.recipes import Objects, Recipe, adapter_of
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.prior import Store
 from d2_plugin.plugin import D2Hooks
-
-from .recipes import Objects, Recipe, adapter_of
 
 log = logging.getLogger(__name__)
 
@@ -56,20 +55,20 @@ def _keeping(training_setup: Callable[..., Any], objects: Objects) -> Callable[.
 
 
 class AddGradient(torch.autograd.Function):
-    """The picture unchanged; its backward pass also sends `weight` into `term`, as if weight * term were in the loss.
+    """The image unchanged; its backward pass also sends `weight` into `term`, as if weight * term were in the loss.
 
-    So a trainer that computes its own loss from this picture minimises the sum, and none of its code is edited.
+    So a trainer that computes its own loss from this image minimises the sum, and none of its code is edited.
     """
 
     @staticmethod
-    def forward(ctx: Any, picture: Tensor, term: Tensor, weight: float) -> Tensor:
-        """`picture` as it is."""
+    def forward(ctx: Any, image: Tensor, term: Tensor, weight: float) -> Tensor:
+        """`image` as it is."""
         ctx.weight, ctx.like = weight, term.new_empty(())
-        return picture.view_as(picture)
+        return image.view_as(image)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
-        """The picture's own gradient, and the term's."""
+        """The image's own gradient, and the term's."""
         return gradient, torch.full_like(ctx.like, ctx.weight), None
 
 
@@ -79,7 +78,7 @@ class Session:
     The number of the iteration is what the trainer gives to `update_learning_rate(iteration)`, before or after
     rendering. Where it has no such method, iterations are counted from 1.
     A trainer that draws a batch takes the mean of its loss, and D2's term is divided by the batch size in the same way.
-    That size is the number of pictures in the step before, so the first step has no term.
+    That size is the number of images in the step before, so the first step has no term.
     """
 
     def __init__(
@@ -140,11 +139,11 @@ class Session:
         return config if exported is None else replace(config, exported=str(exported))
 
     def _export_read(self, config: D2Config) -> Path | None:
-        """The export of the prior's capture that the trainer reads, by the folder that its Scene was given."""
+        """The export of the prior's recording that the trainer reads, by the folder that its Scene was given."""
         source = self._source()
         if source is None or config.prior is None or config.exported is not None or self.store is not None:
             return None
-        from d2_plugin.priors.disk.exported import export_read
+        from d2_plugin.store.exported import export_read
 
         return export_read(Path(config.prior), Path(source))
 

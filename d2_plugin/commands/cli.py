@@ -29,7 +29,7 @@ COMMANDS = {
     "stability": "study.stability",
     "report": "study.report",
     "export": "export",
-    "export-capture": "export_capture",
+    "export-recording": "export_recording",
     "doctor": "doctor",
 }
 """Name -> module beside this file: its docstring is the help, its `form(words)` what it takes."""

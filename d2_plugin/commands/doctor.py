@@ -22,7 +22,7 @@ from d2_plugin.settings import Positional, Settings
 OPTIONAL = {
     "onnxruntime": ("mono", "monocular depth from an ONNX network"),
     "pycolmap": ("stereo", "sparse points from known cameras"),
-    "cv2": ("image", "pictures, videos, the OpenCV stereo sweep"),
+    "cv2": ("image", "images, videos, the OpenCV stereo sweep"),
     "kornia": ("test", "image operations that tests compare with"),
     "av": ("video", "the import of videos, and videos of a run"),
     "viser": ("view", "the page that shows a run, and one that trains"),
@@ -56,10 +56,10 @@ def run(settings: Doctor) -> str:
         return needs(settings.attach, settings.path)
     if settings.path is None:
         return report()
-    from d2_plugin.captures import open_capture
-    from d2_plugin.captures.checks.lacking import lacking_text
+    from d2_plugin.recordings import open_recording
+    from d2_plugin.recordings.checks.lacking import lacking_text
 
-    return lacking_text(open_capture(settings.path))
+    return lacking_text(open_recording(settings.path))
 
 
 def report() -> str:

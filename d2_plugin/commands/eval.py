@@ -16,7 +16,7 @@ class Evaluation(Settings):
 
     run_folder: Annotated[Path, Positional()]
     """The --output of `d2 train`."""
-    no_pictures: bool = False
+    no_images: bool = False
     """Scores only."""
 
 
@@ -30,5 +30,5 @@ def run(settings: Evaluation) -> str:
     from d2_plugin.runs.run import Run
     from d2_plugin.runs.tables import metrics_table
 
-    metrics = Run.load(settings.run_folder).evaluate(pictures=not settings.no_pictures)
+    metrics = Run.load(settings.run_folder).evaluate(images=not settings.no_images)
     return metrics_table({settings.run_folder.name: metrics})

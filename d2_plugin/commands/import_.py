@@ -1,4 +1,4 @@
-"""Turn videos into a recording: where the cameras stand, one clock for all of them, pictures, exposures."""
+"""Turn videos into a recording: where the cameras stand, one clock for all of them, images, exposures."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from d2_plugin.commands.arguments.recording import say, say_notes
 
 def form(words: list[str]) -> Form:
     """What `d2 import` takes."""
-    from d2_plugin.captures.videos.importing import import_videos
-    from d2_plugin.captures.videos.settings import ImportSettings
+    from d2_plugin.recordings.importing.importing import import_videos
+    from d2_plugin.recordings.importing.settings import ImportSettings
 
     def run(settings: ImportSettings) -> str:
         found = import_videos(settings, told=say)
-        capture = found.capture
-        say_notes(capture.notes)
-        sizes = sorted({(camera.width, camera.height) for camera in capture.cameras.values()})
+        recording = found.recording
+        say_notes(recording.notes)
+        sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
         shown = ", ".join(f"{width}x{height}" for width, height in sizes)
-        about = f"{len(capture.cameras)} cameras, {len(capture.frames)} frames at {capture.fps:g} per second"
+        about = f"{len(recording.cameras)} cameras, {len(recording.frames)} frames at {recording.fps:g} per second"
         return f"{about}, {shown} pixels in {found.folder}\n`d2 doctor {found.folder}` says what it lacks"
 
     return Form.of("d2 import", __doc__, ImportSettings, run)

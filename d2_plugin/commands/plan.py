@@ -12,7 +12,7 @@ from d2_plugin.commands.arguments.study_form import study_form
 from d2_plugin.errors import D2Error
 
 if TYPE_CHECKING:
-    from d2_plugin.captures import Capture
+    from d2_plugin.recordings import Recording
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ def form(words: list[str]) -> Form:
     """What `d2 plan` takes; with --verify, what the measurement takes."""
     if "--verify" in words:
         words.remove("--verify")
-        return study_form("d2 plan --verify", "d2_plugin.study.plan_verify", "PlanVerification")
+        return study_form("d2 plan --verify", "d2_plugin.runs.plan_verify", "PlanVerification")
     return recording_form("d2 plan", __doc__, run, (), PlanOptions, ("priors", "plan"))
 
 
@@ -39,18 +39,18 @@ def run(given: Given) -> None:
     if given.values["verify"]:
         raise D2Error("--verify is a switch: write it in full and without a value")
     scene = Scene.open(check(run_settings(given)))
-    say(f"recording  {described(scene.capture)}")
-    say_notes(scene.capture.notes)
+    say(f"recording  {described(scene.recording)}")
+    say_notes(scene.recording.notes)
     say_plan(scene.plan)
 
 
-def described(capture: Capture) -> str:
-    """Name, layout, cameras, frames and size of the pictures, in one line."""
-    cameras, frames = list(capture.cameras), capture.frames
-    sizes = _each(f"{camera.width}x{camera.height}" for camera in capture.cameras.values())
+def described(recording: Recording) -> str:
+    """Name, layout, cameras, frames and size of the images, in one line."""
+    cameras, frames = list(recording.cameras), recording.frames
+    sizes = _each(f"{camera.width}x{camera.height}" for camera in recording.cameras.values())
     when = f"frames {frames[0]} to {frames[-1]} ({len(frames)})" if len(frames) > 1 else f"frame {frames[0]}"
     who = f"{len(cameras)} camera{'' if len(cameras) == 1 else 's'} ({', '.join(cameras)})"
-    return f"{capture.name}: layout {capture.layout}, {who}, {when} at {capture.fps:g} per second, {sizes} pixels"
+    return f"{recording.name}: layout {recording.layout}, {who}, {when} at {recording.fps:g} per second, {sizes} pixels"
 
 
 def _each(values: Iterable[str]) -> str:

@@ -40,19 +40,19 @@ def run(given: Given) -> str:
     from d2_plugin.locks import in_turn
     from d2_plugin.priors.calibration import frames_with_truth, held_against_truth
     from d2_plugin.priors.sheet import contact_sheet
-    from d2_plugin.priors.store import PriorStore
     from d2_plugin.runs.prior.build import build_priors_for
     from d2_plugin.runs.scene import Scene
     from d2_plugin.runs.settings import check
     from d2_plugin.runs.start import triangulated_points
+    from d2_plugin.store.store import PriorStore
 
     options = given.make(PriorOptions)
     shard, cluster = part_of(options.shard), cluster_of(options)
     settings = check(run_settings(given))
     scene = Scene.open(settings)
-    say_notes(scene.capture.notes)
+    say_notes(scene.recording.notes)
     say_plan(scene.plan)
-    points = triangulated_points(scene.capture, scene.train_cameras).positions
+    points = triangulated_points(scene.recording, scene.train_cameras).positions
     summary = build_priors_for(settings, scene, points, options.output, shard=shard, cluster=cluster)
     say(str(summary), summary.headline())
     folder = summary.folder or options.output
@@ -61,13 +61,13 @@ def run(given: Given) -> str:
     if shard is not None:
         return f"part {options.shard} of the prior is in {folder}"
     store, sheet = PriorStore.open(folder), folder / "contact_sheet.png"
-    frames = frames_with_truth(scene.capture, scene.train_cameras, HELD_FRAMES)
-    calibration = held_against_truth(store, scene.capture, frames)
+    frames = frames_with_truth(scene.recording, scene.train_cameras, HELD_FRAMES)
+    calibration = held_against_truth(store, scene.recording, frames)
     if calibration is not None:
         say(str(calibration))
     try:
         with in_turn(options.output):
-            contact_sheet(store, scene.capture, sheet)
+            contact_sheet(store, scene.recording, sheet)
     except CannotWrite as error:
         if summary.built:
             raise

@@ -36,7 +36,7 @@ class TrainOptions(ConfigFile):
     output: Path
     """Folder of the run; an unfinished run in it is continued."""
     calibration: Path | None = None
-    """Calibration of the cameras where CAPTURE is a folder of videos: they are imported first, into OUTPUT-capture."""
+    """Of the cameras where RECORDING is a folder of videos: they are imported first, into OUTPUT-recording."""
     view: bool = False
     """Watch it train on a page in the browser."""
     export_ply: bool = False
@@ -56,7 +56,7 @@ def run(given: Given) -> str:
     options = given.make(TrainOptions)
     given = _imported(given, options)
     run = Run(run_settings(given), options.output)
-    say_notes(run.scene.capture.notes)
+    say_notes(run.scene.recording.notes)
     say_plan(run.scene.plan)
     live = _live(run) if options.view else None
     run.train(told=lambda summary: say(str(summary)), watch=None if live is None else live.watch)
@@ -69,30 +69,30 @@ def run(given: Given) -> str:
     if live is not None:
         live.stay()
     table = metrics_table({options.output.name: metrics})
-    where = f"metrics in {options.output / 'metrics.json'}, pictures in {options.output / 'pictures'}"
+    where = f"metrics in {options.output / 'metrics.json'}, images in {options.output / 'images'}"
     return "\n".join([table, where, *([] if run.prior is None else [run.prior["headline"]])])
 
 
 def _imported(given: Given, options: TrainOptions) -> Given:
     """What was given, with videos replaced by the recording that they become; an unfinished import goes on."""
-    from d2_plugin.captures.videos.importing import import_videos
-    from d2_plugin.captures.videos.settings import ImportChoices, ImportSettings
+    from d2_plugin.recordings.importing.importing import import_videos
+    from d2_plugin.recordings.importing.settings import ImportChoices, ImportSettings
 
-    videos = Path(given.values["capture"])
+    videos = Path(given.values["recording"])
     if options.calibration is None:
         _refuse_videos(videos)
         return given
     chosen = ImportChoices.from_dict(table_of_config(given, "import"), "import")
-    folder = options.output.with_name(f"{options.output.name}-capture")
+    folder = options.output.with_name(f"{options.output.name}-recording")
     settings = ImportSettings(videos=(videos,), calibration=options.calibration, output=folder, **vars(chosen))
     import_videos(settings, told=say)
-    return replace(given, values={**given.values, "capture": str(folder)})
+    return replace(given, values={**given.values, "recording": str(folder)})
 
 
 def _refuse_videos(path: Path) -> None:
     """Say what a folder of nothing but videos needs."""
-    from d2_plugin.captures.layouts import LAYOUTS
-    from d2_plugin.captures.videos.files import videos_below
+    from d2_plugin.recordings.importing.files import videos_below
+    from d2_plugin.recordings.layouts import LAYOUTS
 
     if path.is_dir() and not any(layout.recognised(path) for layout in LAYOUTS.values()) and videos_below(path):
         raise D2Error(

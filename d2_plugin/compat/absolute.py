@@ -29,12 +29,12 @@ class _Walk(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int32) for name in ("width", "height", "channels", "count")),
         *((name, ctypes.c_float) for name in ("alpha_min", "alpha_max", "transmittance_min")),
-        *((name, ctypes.c_void_p) for name in (*_GAUSSIANS, "picture", "gradient", "sums")),
+        *((name, ctypes.c_void_p) for name in (*_GAUSSIANS, "image", "gradient", "sums")),
     )
 
 
 class Drawing(NamedTuple):
-    """A picture and what it was drawn from."""
+    """An image and what it was drawn from."""
 
     splats: Splats
     values: Tensor  # [M, C] colours, and whatever else was composited
@@ -57,30 +57,30 @@ def library() -> ctypes.CDLL:
 
 
 class WithAbsoluteGradient(torch.autograd.Function):
-    """The picture unchanged; `points` [N, 3] receive absolute_gradient in normalised device coordinates."""
+    """The image unchanged; `points` [N, 3] receive absolute_gradient in normalised device coordinates."""
 
     @staticmethod
-    def forward(ctx: Any, picture: Tensor, points: Tensor, drawing: Drawing) -> Tensor:
-        """`picture` [H, W, C] as it is."""
+    def forward(ctx: Any, image: Tensor, points: Tensor, drawing: Drawing) -> Tensor:
+        """`image` [H, W, C] as it is."""
         ctx.drawing, ctx.shape = drawing, points.shape
-        ctx.save_for_backward(picture)
-        return picture.view_as(picture)
+        ctx.save_for_backward(image)
+        return image.view_as(image)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
-        """The picture's own gradient, and the absolute one."""
-        (picture,) = ctx.saved_tensors
+        """The image's own gradient, and the absolute one."""
+        (image,) = ctx.saved_tensors
         view, rows = ctx.drawing.view, ctx.drawing.splats.rows
-        sums = absolute_gradient(ctx.drawing, picture, gradient)
+        sums = absolute_gradient(ctx.drawing, image, gradient)
         points = sums.new_zeros(ctx.shape)
         points[rows, :2] = sums * sums.new_tensor([0.5 * view.width, 0.5 * view.height])
         return gradient, points, None
 
 
 @torch.no_grad()
-def absolute_gradient(drawing: Drawing, picture: Tensor, gradient: Tensor) -> Tensor:
-    """Sum over pixels p of |dL_p/d(screen centre)|, [M, 2] in pixels, for `gradient` [H, W, C] = dL/d(picture).
+def absolute_gradient(drawing: Drawing, image: Tensor, gradient: Tensor) -> Tensor:
+    """Sum over pixels p of |dL_p/d(screen centre)|, [M, 2] in pixels, for `gradient` [H, W, C] = dL/d(image).
 
     Raises:
         NoCompiler: there is no compiler, and these sums have no other way.
@@ -102,8 +102,8 @@ def absolute_gradient(drawing: Drawing, picture: Tensor, gradient: Tensor) -> Te
         values[kept],
     )
     arrays = {name: _plain(column[order]) for name, column in zip(_GAUSSIANS, columns)}
-    arrays |= {"picture": _plain(picture), "gradient": _plain(gradient), "sums": torch.zeros(len(order), 2)}
-    walk = _Walk(view.width, view.height, picture.shape[-1], len(order))
+    arrays |= {"image": _plain(image), "gradient": _plain(gradient), "sums": torch.zeros(len(order), 2)}
+    walk = _Walk(view.width, view.height, image.shape[-1], len(order))
     walk.alpha_min, walk.alpha_max = settings.alpha_min, settings.alpha_max
     walk.transmittance_min = settings.transmittance_min
     for name, array in arrays.items():

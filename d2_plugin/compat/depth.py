@@ -12,10 +12,9 @@ import logging
 
 from torch import Tensor
 
+from d2_plugin.compat import absolute, threedgs
+from d2_plugin.compat.threedgs import GaussianRasterizationSettings
 from d2_plugin.compiler import NoCompiler
-
-from . import absolute, threedgs
-from .threedgs import GaussianRasterizationSettings
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 

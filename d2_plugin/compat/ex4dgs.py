@@ -1,8 +1,8 @@
 """`diff_gaussian_rasterization_df` of juno181/Ex4DGS: another blur, depth over alpha, and a flow that carries errors.
 
 Footprints are blurred by `kernel_size`, and opacities are lowered by what the blur spreads (Mip-Splatting); Gaussians
-are drawn between `min_depth` and `max_depth` and within 1.3 half pictures of the centre. The trainer registers a hook
-on the flow that replaces its gradient by pictures of errors, whose sums per Gaussian then arrive at `dir3D`: no
+are drawn between `min_depth` and `max_depth` and within 1.3 half images of the centre. The trainer registers a hook
+on the flow that replaces its gradient by images of errors, whose sums per Gaussian then arrive at `dir3D`: no
 gradient of the flow may therefore reach anything else, as in the original.
 
 What differs: the gradients of depth and acc are the true ones (backward.cu:596 has a sign reversed, and the trainer
@@ -17,13 +17,22 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from d2_plugin.compat.inria import (
+    SETTINGS,
+    StandIn,
+    colors_of,
+    covariances_of,
+    draw,
+    exactly_one,
+    given,
+    shape_given,
+    view_of,
+)
 from d2_plugin.protocol import Splats
 from d2_plugin.rasterizer import rasterize
 
-from .inria import SETTINGS, StandIn, colors_of, covariances_of, draw, exactly_one, given, shape_given, view_of
-
 FRUSTUM = 1.3
-"""Gaussians whose centre projects beyond this multiple of the half picture are not drawn (auxiliary.h, in_frustum)."""
+"""Gaussians whose centre projects beyond this multiple of the half image are not drawn (auxiliary.h, in_frustum)."""
 
 
 class GaussianRasterizationSettings(NamedTuple):

@@ -8,11 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from d2_plugin.compat.inria import StandIn, colors_of, covariances_of, draw, exactly_one, given, harmonics, shape_given
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_4d, time_row
 from d2_plugin.protocol import Splats
-
-from .inria import StandIn, colors_of, covariances_of, draw, exactly_one, given, harmonics, shape_given
 
 MARGINAL_MIN = 0.05
 """Gaussians whose temporal factor is not above this are skipped (forward.cu, computeCov3D_conditional)."""

@@ -18,11 +18,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from d2_plugin.compat.inria import colors_of, covariances_of, screen_radii
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import RasterSettings, Render, Splats, View
 from d2_plugin.rasterizer import rasterize
-
-from .inria import colors_of, covariances_of, screen_radii
 
 ALPHA_MAX = 0.999
 """gsplat's clamp of alpha, where Inria's is .99."""
@@ -82,16 +81,16 @@ def rasterization(
     views = [View("", 0, 0.0, pose.detach(), K.detach(), width, height) for pose, K in zip(viewmats, Ks)]
     parts = [_in_front(means, covariances, opacities, view, near_plane, far_plane) for view in views]
     screen = _on_screen(parts, views, settings, len(means), radius_clip, packed)
-    pictures, alphas = [], []
+    images, alphas = [], []
     for number, (splats, view) in enumerate(zip(parts, views)):
         shown = _colors(colors, sh_degree, means, view, number)[splats.rows]
         background = None if backgrounds is None else backgrounds[number]
         offsets = screen["offsets"][number, splats.rows]
         image = rasterize(splats, shown, view, settings, background=background, screen_offsets=offsets)
-        pictures.append(_picture(image, render_mode))
+        images.append(_image(image, render_mode))
         alphas.append(image.alpha[..., None])
     meta = {"width": width, "height": height, "n_cameras": len(views), "n_batches": 1, **screen}
-    return torch.stack(pictures), torch.stack(alphas), meta
+    return torch.stack(images), torch.stack(alphas), meta
 
 
 def _refuse(render_mode: str, camera_model: str, others: dict[str, Any]) -> None:
@@ -146,7 +145,7 @@ def _on_screen(
     return named | {"offsets": offsets}
 
 
-def _picture(image: Render, render_mode: str) -> Tensor:
+def _image(image: Render, render_mode: str) -> Tensor:
     """[H, W, D]: colours, and the depth that the mode asks for behind them."""
     has_color, depth = DEPTH_MODES[render_mode]
     parts = [image.color] if has_color else []

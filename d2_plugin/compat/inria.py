@@ -8,14 +8,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from d2_plugin.compat.absolute import Drawing, WithAbsoluteGradient
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
 from d2_plugin.gaussians.spherical_harmonics import basis
 from d2_plugin.protocol import RasterSettings, Splats, View
 from d2_plugin.rasterizer import rasterize
 from d2_plugin.rasterizer.reference import project
-
-from .absolute import Drawing, WithAbsoluteGradient
 
 log = logging.getLogger(__name__)
 
@@ -83,7 +82,7 @@ def draw(
         color = WithAbsoluteGradient.apply(color, absolute, drawing)
     radii = torch.zeros(count, dtype=torch.int32, device=splats.means.device)
     radii[splats.rows] = screen_radii(splats, view, constants)
-    # Contiguous, as the originals': trainers call .view on the picture.
+    # Contiguous, as the originals': trainers call .view on the image.
     return Drawn(color.permute(2, 0, 1).contiguous(), image.depth_sum[None], image.alpha[None], radii)
 
 

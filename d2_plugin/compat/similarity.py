@@ -10,9 +10,9 @@ from d2_plugin.gaussians.photometric import ssim
 
 
 def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
-    """Mean structural similarity of pictures [B, C, H, W] in 0..1, a scalar with gradients to both.
+    """Mean structural similarity of images [B, C, H, W] in 0..1, a scalar with gradients to both.
 
-    Only `padding="same"`, zeros around the picture, which is 3D Gaussian Splatting's. `train` changes nothing here.
+    Only `padding="same"`, zeros around the image, which is 3D Gaussian Splatting's. `train` changes nothing here.
     """
     if padding != "same":
         raise D2Error(f"fused_ssim with padding '{padding}' needs the original, this stand-in has 'same' only")

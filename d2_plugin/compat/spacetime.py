@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from . import threedgs
+from d2_plugin.compat import threedgs
 
 NO_DEPTH = 15.0
 """Of pixels that let more than half of the light through (forward.cu:308)."""

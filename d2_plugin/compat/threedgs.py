@@ -7,10 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from d2_plugin.compat.inria import Drawn, StandIn, colors_of, covariances_of, draw, exactly_one, given, shape_given
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Splats
-
-from .inria import Drawn, StandIn, colors_of, covariances_of, draw, exactly_one, given, shape_given
 
 
 class GaussianRasterizationSettings(NamedTuple):

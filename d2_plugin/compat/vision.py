@@ -1,4 +1,4 @@
-"""What trainers call of torchvision on their way through a training: grids, saving pictures, PIL pictures to tensors.
+"""What trainers call of torchvision on their way through a training: grids, saving images, PIL images to tensors.
 
 torchvision has to match torch to the last digit of its build, which is why it is so often missing.
 """
@@ -17,39 +17,39 @@ from torch.nn.functional import interpolate
 
 
 def make_grid(tensor: Tensor | Sequence[Tensor], nrow: int = 8, padding: int = 2, **_: Any) -> Tensor:
-    """Pictures [B, C, H, W], or a list of [C, H, W], side by side on black, `nrow` to a row; [C, H', W']."""
-    pictures = tensor if isinstance(tensor, Tensor) else torch.stack(list(tensor))
-    if pictures.ndim < 4:
-        pictures = pictures.reshape(1, -1, *pictures.shape[-2:])
-    count, channels, height, width = pictures.shape
+    """Images [B, C, H, W], or a list of [C, H, W], side by side on black, `nrow` to a row; [C, H', W']."""
+    images = tensor if isinstance(tensor, Tensor) else torch.stack(list(tensor))
+    if images.ndim < 4:
+        images = images.reshape(1, -1, *images.shape[-2:])
+    count, channels, height, width = images.shape
     columns = min(nrow, count)
     rows = math.ceil(count / columns)
-    grid = pictures.new_zeros(channels, rows * (height + padding) + padding, columns * (width + padding) + padding)
-    for index, picture in enumerate(pictures):
+    grid = images.new_zeros(channels, rows * (height + padding) + padding, columns * (width + padding) + padding)
+    for index, image in enumerate(images):
         top, left = (padding + place * (size + padding) for place, size in zip(divmod(index, columns), (height, width)))
-        grid[:, top : top + height, left : left + width] = picture
+        grid[:, top : top + height, left : left + width] = image
     return grid
 
 
 def save_image(tensor: Tensor, fp: str | Path, **options: Any) -> None:
-    """One picture in 0..1, or a grid of several, as a file."""
+    """One image in 0..1, or a grid of several, as a file."""
     from PIL import Image
 
-    picture = make_grid(tensor, **options) if tensor.ndim == 4 and len(tensor) > 1 else tensor.reshape(
+    image = make_grid(tensor, **options) if tensor.ndim == 4 and len(tensor) > 1 else tensor.reshape(
         -1, *tensor.shape[-2:]
     )  # fmt: skip
-    values = (picture.detach().cpu().clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
+    values = (image.detach().cpu().clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
     Image.fromarray(values[..., 0] if values.shape[-1] == 1 else np.ascontiguousarray(values)).save(fp)
 
 
 def resize(img: Tensor, size: Sequence[int], interpolation: Any = None, antialias: bool = True, **_: Any) -> Tensor:
-    """Pictures [..., C, H, W] at `size` (height, width), bilinear."""
+    """Images [..., C, H, W] at `size` (height, width), bilinear."""
     batch = img.reshape(-1, *img.shape[-3:])
     return interpolate(batch, tuple(size), mode="bilinear", antialias=antialias).reshape(*img.shape[:-2], *size)
 
 
 class ToTensor:
-    """A PIL picture or an array [H, W, C] uint8 as float [C, H, W] in 0..1."""
+    """A PIL image or an array [H, W, C] uint8 as float [C, H, W] in 0..1."""
 
     def __call__(self, pic: Any) -> Tensor:
         """The tensor."""
@@ -60,10 +60,10 @@ class ToTensor:
 
 
 class ToPILImage:
-    """A tensor [C, H, W] in 0..1 as a PIL picture."""
+    """A tensor [C, H, W] in 0..1 as a PIL image."""
 
     def __call__(self, pic: Tensor) -> Any:
-        """The picture."""
+        """The image."""
         from PIL import Image
 
         return Image.fromarray((pic.detach().cpu() * 255).byte().permute(1, 2, 0).contiguous().numpy())

@@ -28,10 +28,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..cache import cache_folder, cache_lock, check_private, is_trusted, private_cache
-from ..durable import write_text
-from ..errors import D2Error
-from .prebuilt import find as find_prebuilt
+from d2_plugin.cache import cache_folder, cache_lock, check_private, is_trusted, private_cache
+from d2_plugin.compiler.prebuilt import find as find_prebuilt
+from d2_plugin.durable import write_text
+from d2_plugin.errors import D2Error
 
 __all__ = ["CompileError", "NoCompiler", "cache_folder", "find_compiler", "load_library"]
 

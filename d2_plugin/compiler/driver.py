@@ -9,9 +9,8 @@ from collections.abc import Iterator
 
 import torch
 
+from d2_plugin.compiler.nvrtc import Binary, NoCuda, library
 from d2_plugin.errors import D2Error
-
-from .nvrtc import Binary, NoCuda, library
 
 LARGEST_GRID = (2**31 - 1, 65535)
 """Blocks that a grid may have each way."""
@@ -70,7 +69,7 @@ class Driver:
         if grid[0] > LARGEST_GRID[0] or grid[1] > LARGEST_GRID[1]:
             raise D2Error(
                 f"a grid of {grid[0]} x {grid[1]} blocks, at most {LARGEST_GRID[0]} x {LARGEST_GRID[1]} can be "
-                "launched: use fewer Gaussians or a smaller picture"
+                "launched: use fewer Gaussians or a smaller image"
             )
         stream = ctypes.c_void_p(torch.cuda.current_stream(self.device).cuda_stream)
         parameters = (ctypes.c_void_p * 1)(ctypes.addressof(argument))

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import torch
 
-from . import driver, nvrtc
+from d2_plugin.compiler import driver, nvrtc
 
 TORCH_FOR_CUDA = "https://pytorch.org/get-started"
 

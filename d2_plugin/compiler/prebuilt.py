@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from ..errors import unknown_name
+from d2_plugin.errors import unknown_name
 
 logger = logging.getLogger(__name__)
 

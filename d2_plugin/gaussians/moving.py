@@ -16,16 +16,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from d2_plugin.protocol import Splats
-
-from .rotation4d import (
+from d2_plugin.gaussians.rotation4d import (
     condition_on_time,
     covariances_from_factors,
     rotation_matrices_3d,
     rotation_matrices_4d,
     temporal_marginal,
 )
-from .slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, unit_quaternions
+from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, unit_quaternions
+from d2_plugin.protocol import Splats
 
 
 class LinearMotion(NamedTuple):

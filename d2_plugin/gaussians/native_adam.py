@@ -17,8 +17,7 @@ from torch import Tensor
 from torch.autograd.graph import increment_version
 
 from d2_plugin.compiler import NoCompiler, load_library
-
-from .native_slice import FLAGS, KERNELS, SHARED_HEADERS
+from d2_plugin.gaussians.native_slice import FLAGS, KERNELS, SHARED_HEADERS
 
 
 class _Tensor(ctypes.Structure):

@@ -19,8 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from d2_plugin.compiler import NoCompiler, load_library
 from d2_plugin.errors import D2Error
-
-from .rotation4d import SMALL_NORM
+from d2_plugin.gaussians.rotation4d import SMALL_NORM
 
 KERNELS = Path(__file__).parent / "kernels"
 _RASTERIZER = Path(__file__).parents[1] / "rasterizer" / "kernels"  # no import: only its headers are shared

@@ -14,8 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from d2_plugin.compiler import NoCompiler, load_library
-
-from .native_slice import FLAGS, KERNELS, SHARED_HEADERS
+from d2_plugin.gaussians.native_slice import FLAGS, KERNELS, SHARED_HEADERS
 
 
 class _Call(ctypes.Structure):
@@ -56,7 +55,7 @@ def _kernel() -> ctypes.CDLL:
 
 
 def can_compare(image: Tensor, target: Tensor) -> bool:
-    """Whether the kernel takes these pictures: float32 on the CPU, a fixed target, which may be bytes, and there is a
+    """Whether the kernel takes these images: float32 on the CPU, a fixed target, which may be bytes, and there is a
     compiler."""
     fit = image.dtype == torch.float32 and target.dtype in (torch.float32, torch.uint8)
     fit = fit and all(part.device.type == "cpu" for part in (image, target))
@@ -65,7 +64,7 @@ def can_compare(image: Tensor, target: Tensor) -> bool:
 
 
 def native_photometric_loss(image: Tensor, target: Tensor, window: Tensor, ssim_weight: float) -> Tensor:
-    """`photometric.photometric_loss` of float32 pictures [H, W, C] on the CPU, differentiable once by `image`.
+    """`photometric.photometric_loss` of float32 images [H, W, C] on the CPU, differentiable once by `image`.
 
     `window` [11] holds the weights of the blur, symmetric. A target of bytes stands for its numbers over 255.
     """

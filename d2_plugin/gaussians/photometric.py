@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .native_ssim import can_compare, native_photometric_loss
+from d2_plugin.gaussians.native_ssim import can_compare, native_photometric_loss
 
 
 @lru_cache(maxsize=8)
@@ -46,7 +46,7 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
 def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2, weights: Tensor | None = None) -> Tensor:
     """(1 - w) mean |image - target| + w (1 - SSIM) for images [H, W, 3] in 0..1.
 
-    The target may be uint8, 0..255: a picture as it is kept.
+    The target may be uint8, 0..255: an image as it is kept.
 
     `weights` [H, W] in 0..1 multiply both terms pixel by pixel before the mean over all pixels; where they are 0 the
     target counts for nothing, nor does it in a window of SSIM that reaches over. What a pixel of weight 1 pulls does
@@ -61,9 +61,9 @@ def photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2, we
     return reference_photometric_loss(image, as_numbers(target).to(image.dtype), ssim_weight)
 
 
-def as_numbers(picture: Tensor) -> Tensor:
-    """A picture in 0..1: bytes divided by 255, in float32; what is numbers already stays as it is."""
-    return picture.float() / 255 if picture.dtype == torch.uint8 else picture
+def as_numbers(image: Tensor) -> Tensor:
+    """An image in 0..1: bytes divided by 255, in float32; what is numbers already stays as it is."""
+    return image.float() / 255 if image.dtype == torch.uint8 else image
 
 
 def reference_photometric_loss(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:

@@ -7,10 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from d2_plugin.protocol import Splats
-
-from .native_slice import can_slice, native_slice
-from .rotation4d import (
+from d2_plugin.gaussians.native_slice import can_slice, native_slice
+from d2_plugin.gaussians.rotation4d import (
     condition_on_time,
     covariances_from_factors,
     normalized_quaternions,
@@ -19,6 +17,7 @@ from .rotation4d import (
     temporal_marginal,
     time_row,
 )
+from d2_plugin.protocol import Splats
 
 MARGINAL_CUT = 0.05
 """A Gaussian whose temporal marginal F(t) is not above this is not drawn (forward.cu:334)."""

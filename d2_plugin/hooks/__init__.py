@@ -5,11 +5,11 @@
 
 from __future__ import annotations
 
-from .densify import Densify, DensifyConfig
-from .depth_loss import DepthLoss, DepthLossConfig
-from .hook import Context, Hook, HookConfig, Surveyed, Window
-from .prior import PriorLoader
-from .prune import Prune, PruneConfig
+from d2_plugin.hooks.densify import Densify, DensifyConfig
+from d2_plugin.hooks.depth_loss import DepthLoss, DepthLossConfig
+from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, Window
+from d2_plugin.hooks.prior import PriorLoader
+from d2_plugin.hooks.prune import Prune, PruneConfig
 
 __all__ = [
     "Context",

@@ -21,7 +21,7 @@ FOCAL_TOLERANCE = 0.01
 """Largest relative difference of focal lengths."""
 
 CENTRE_TOLERANCE = 0.01
-"""Largest difference of principal points, relative to the picture's width and height."""
+"""Largest difference of principal points, relative to the image's width and height."""
 
 ANGLE_TOLERANCE = 0.2
 """Largest difference of directions, in degrees."""

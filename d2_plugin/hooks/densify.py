@@ -9,13 +9,12 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from d2_plugin.hooks.expected import check_splats
+from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
+from d2_plugin.hooks.motion import Motion
+from d2_plugin.hooks.rendered_depth import relative_discrepancy, rendered_depth
 from d2_plugin.protocol import DepthPrior, Edit, Label, Points, Splats, View
 from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
-
-from .expected import check_splats
-from .hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
-from .motion import Motion
-from .rendered_depth import relative_discrepancy, rendered_depth
 
 AT_LEAST = 5
 """Steps from one evaluation to the next in a short run: an evaluation costs as much as several steps. sear_steak, 10
@@ -59,11 +58,11 @@ class DensifyConfig(HookConfig):
     """Opacity of a new Gaussian. A faint one cannot spoil what stands; training makes it opaque where it is right. As
     above: .05 gives 30.7 and 21.9 dB with a third more Gaussians, .1 30.7 and 21.8, .3 30.1 and 21.6."""
     lifetime: Positive | None = 1.0
-    """Standard deviation in time of a new Gaussian where the picture moves, in intervals from instant to instant, in a
+    """Standard deviation in time of a new Gaussian where the image moves, in intervals from instant to instant, in a
     backbone that has one; none: as it begins there. 1000 steps, seed 0, PSNR of what moves: studio 26.0 dB (none 20.4),
     plaza 20.9 (19.6); a rendered room at 10 and 60 frames a second 21.2 and 20.6, at 6 intervals 20.2 and 20.6, none
     20.2 and 20.1. New ones stand still: with the velocity that optical flow between two instants gives, what moves
-    gains .1 to .2 dB and the whole picture loses as much (studio and plaza, two seeds); twice the lifetime adds
+    gains .1 to .2 dB and the whole image loses as much (studio and plaza, two seeds); twice the lifetime adds
     nothing."""
     cell: Positive = 1.0
     """Side of the frustum cells that keep duplicates out, in units of the distance between samples."""
@@ -104,7 +103,7 @@ def shuffled_pixels(mask: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def frustum_cells(view: View, points: Tensor, stride: float, depth_step: float) -> Tensor:
-    """Which cell of the view's frustum each world point lies in: int64 [K]; -1 outside the picture.
+    """Which cell of the view's frustum each world point lies in: int64 [K]; -1 outside the image.
 
     Cells are `stride` pixels wide and `depth_step` (relative) deep, so they grow with distance as the prior's own
     uncertainty does. Two points in one cell describe the same piece of surface.

@@ -15,14 +15,13 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from d2_plugin.hooks.hook import Context, Hook, HookConfig
+from d2_plugin.hooks.native_depth_loss import Constants, can_compare, native_depth_loss
+from d2_plugin.hooks.prior import KnownPixels
+from d2_plugin.hooks.rendered_depth import EPSILON
 from d2_plugin.protocol import View
 from d2_plugin.rasterizer import rasterize
 from d2_plugin.settings import Every, Positive, Range, Share, Steps
-
-from .hook import Context, Hook, HookConfig
-from .native_depth_loss import Constants, can_compare, native_depth_loss
-from .prior import KnownPixels
-from .rendered_depth import EPSILON
 
 
 @dataclass(frozen=True)

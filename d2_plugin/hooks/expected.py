@@ -54,7 +54,7 @@ def converted(backbone: Backbone, camera: object) -> View:
 
 
 def check_view(view: View) -> None:
-    """Refuse a view that no picture can have; waits for its device, so once per view is enough."""
+    """Refuse a view that no image can have; waits for its device, so once per view is enough."""
     name = f"the view of camera {shown(view.camera)} at frame {shown(view.frame)}"
     K, T = view.K, view.T_camera_world
     for matrix, shape, what in ((K, (3, 3), "K"), (T, (4, 4), "T_camera_world")):

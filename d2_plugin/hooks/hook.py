@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 
 from d2_plugin.hooks.expected import check_splats
+from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.protocol import Backbone, DepthPrior, Edit, Splats, Survey, View
 from d2_plugin.rasterizer import survey
 from d2_plugin.settings import Every, Settings, Steps
-
-from .prior import PriorLoader
 
 FREE_SIGMAS = 3.0
 """Space is known to be free up to D* less this many standard deviations."""

@@ -1,4 +1,4 @@
-"""Where pictures move: a Gaussian that is inserted there must not outlive its instant."""
+"""Where images move: a Gaussian that is inserted there must not outlive its instant."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from d2_plugin.hooks.hook import Context
 from d2_plugin.protocol import View
-
-from .hook import Context
 
 CHANGED = 24
 """A channel, of 0 to 255, that differs by more than this from the camera's median over time shows something else."""
@@ -18,11 +17,11 @@ INSTANTS = 9
 FEWEST = 3
 """With fewer there is no median to differ from."""
 MOST_MOVING = 0.5
-"""Where more of a picture differs, it is the light or the camera that changes, and nothing is known."""
+"""Where more of an image differs, it is the light or the camera that changes, and nothing is known."""
 
 
 class Motion:
-    """Compares the pictures of a camera that stands still with their median over time, from the prior's colours."""
+    """Compares the images of a camera that stands still with their median over time, from the prior's colours."""
 
     def __init__(self) -> None:
         self._still: dict[str, tuple[tuple[int, ...], Tensor]] = {}
@@ -43,14 +42,14 @@ class Motion:
         return torch.where(moving, _interval(seen), torch.inf)
 
     def _median(self, camera: str, views: Sequence[View], context: Context) -> Tensor | None:
-        """The median picture uint8 [H, W, 3] of some views of a camera."""
+        """The median image uint8 [H, W, 3] of some views of a camera."""
         frames = tuple(view.frame for view in views)
         if camera not in self._still or self._still[camera][0] != frames:
             priors = [prior for view in views if (prior := context.prior(view)) is not None]
-            pictures = [prior.colors for prior in priors if prior.colors is not None]
-            if len(pictures) < FEWEST:
+            images = [prior.colors for prior in priors if prior.colors is not None]
+            if len(images) < FEWEST:
                 return None
-            self._still[camera] = frames, torch.stack(pictures).median(0).values
+            self._still[camera] = frames, torch.stack(images).median(0).values
         return self._still[camera][1]
 
 

@@ -15,9 +15,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from d2_plugin.compiler import NoCompiler, load_library
+from d2_plugin.hooks.prior import KnownPixels
 from d2_plugin.rasterizer.frame import KERNELS as RASTERIZER_KERNELS
-
-from .prior import KnownPixels
 
 SOURCE = Path(__file__).parent / "kernels" / "depth_loss.cpp"
 HEADERS = (RASTERIZER_KERNELS / "parallel.h", RASTERIZER_KERNELS / "simd.h")

@@ -13,15 +13,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.hooks.camera_check import CameraCheck
 from d2_plugin.protocol import DepthPrior, Label, View
-
-from .camera_check import CameraCheck
 
 log = logging.getLogger(__name__)
 
 
 class Store(Protocol):
-    """What the loader needs of a prior store (d2_plugin.priors.store.PriorStore).
+    """What the loader needs of a prior store (d2_plugin.store.store.PriorStore).
 
     Where it also has `camera(camera, frame) -> CameraRecord | None`, views are checked against it.
     """
@@ -203,6 +202,6 @@ def _usable(prior: DepthPrior) -> DepthPrior:
 
 
 def _inside(far: Tensor) -> Tensor:
-    """The far pixels [H, W] at least `OUTLINE` pixels inside of what is far; the rim of the picture is no outline."""
+    """The far pixels [H, W] at least `OUTLINE` pixels inside of what is far; the rim of the image is no outline."""
     others = (~far).float()[None, None]
     return F.max_pool2d(others, 2 * OUTLINE + 1, stride=1, padding=OUTLINE)[0, 0] == 0

@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
+from d2_plugin.hooks.rendered_depth import EPSILON
 from d2_plugin.protocol import Edit
 from d2_plugin.settings import AtLeastOne, Every, Positive, Share, Steps
-
-from .hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
-from .rendered_depth import EPSILON
 
 AT_LEAST = 10
 """Steps from one evaluation to the next in a short run. Training closes a hole in some ten steps however long the run

@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
+from d2_plugin.hooks.hook import Hook
 from d2_plugin.protocol import Backbone
-
-from .hook import Hook
 
 log = logging.getLogger(__name__)
 

@@ -21,10 +21,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from .densify import Densify, DensifyConfig
-from .depth_loss import DepthLoss, DepthLossConfig
-from .hook import Hook, HookConfig
-from .prune import Prune, PruneConfig
+from d2_plugin.hooks.densify import Densify, DensifyConfig
+from d2_plugin.hooks.depth_loss import DepthLoss, DepthLossConfig
+from d2_plugin.hooks.hook import Hook, HookConfig
+from d2_plugin.hooks.prune import Prune, PruneConfig
 
 
 class HookRow(NamedTuple):

@@ -1,4 +1,4 @@
-"""Building the priors of a capture: choose the sources, construct D* frame by frame, keep what is there already."""
+"""Building the priors of a recording: choose the sources, construct D* frame by frame, keep what is there already."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.captures.capture import Capture
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.construct import CONSTRUCTION_VERSION, Construction
 from d2_plugin.priors.depth_on_disk import FilteredDepthOnDisk, find_depth_on_disk
 from d2_plugin.priors.disk.confidence import OF_DEPTH, OF_MONO, ConfidenceMaps
-from d2_plugin.priors.frame import Frame, describe_camera, describe_capture, digest, hash_of, not_of, view_digest
+from d2_plugin.priors.frame import Frame, describe_camera, describe_recording, digest, hash_of, not_of, view_digest
 from d2_plugin.priors.monocular.maps import mono_source
 from d2_plugin.priors.settings import PriorSettings, Variant
 from d2_plugin.priors.stereo.cache import DepthCache, GeometricSource
 from d2_plugin.priors.stereo.depth_range import DepthBounds, depth_bounds
 from d2_plugin.priors.stereo.match import MatchedDepth, frame_blocks
 from d2_plugin.priors.stereo.settings import NO_MATCHER
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.priors.summary import PriorSummary
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.store.store import PriorStore
 
 __all__ = ["PriorSettings", "PriorSummary", "build_priors"]
 
 COMPARED = 12
-"""At most about so many pictures are read to tell whether a store belongs to a capture; the first equal one decides."""
+"""At most about so many images are read to tell whether a store belongs to a recording; the first equal one decides."""
 
 Progress = Callable[[int, int, str], None]
-"""(pictures done, pictures in all, what was just done)."""
+"""(images done, images in all, what was just done)."""
 
 
 def build_priors(
-    capture: Capture,
+    recording: Recording,
     cameras: Sequence[str],
     output: Path | str,
     settings: PriorSettings,
@@ -50,21 +50,21 @@ def build_priors(
     gets an empty prior and a reason, and the others are built. A build that was killed goes on where it stopped.
 
     Args:
-        capture: the recording.
+        recording: the recording.
         cameras: the training cameras; held-out ones must not be among them.
         output: folder of the store.
         settings: everything that decides what D* is.
         sparse_points: world points [N, 3] triangulated with the known poses, for the depth range.
-        progress: called after every picture.
+        progress: called after every image.
         shard: (index, count) with 0 <= index < count builds one part of the frames; all parts, built anywhere and in
             any order into one folder, make the store that a single build makes.
 
     Raises:
         D2Error: unknown cameras, no depth source at all, a folder that holds something else or the priors of another
-            capture, or a disk that is full, broken or not ours.
+            recording, or a disk that is full, broken or not ours.
     """
-    frames = _shard(capture.frames, settings, shard)
-    builder = _Builder(capture, list(cameras), Path(output), settings, sparse_points)
+    frames = _shard(recording.frames, settings, shard)
+    builder = _Builder(recording, list(cameras), Path(output), settings, sparse_points)
     summary = PriorSummary(notes=builder.notes, folder=builder.store.path)
     total, done = len(frames) * len(builder.names), 0
     with builder.store.building(Path(output)):
@@ -82,38 +82,38 @@ class _Builder:
     """The sources, the construction and the store of one build."""
 
     def __init__(
-        self, capture: Capture, names: list[str], output: Path, settings: PriorSettings, points: np.ndarray | None
+        self, recording: Recording, names: list[str], output: Path, settings: PriorSettings, points: np.ndarray | None
     ) -> None:
-        _check(capture, names)
-        _refuse_other_pictures(capture, names, output)
-        self.capture, self.names, self.settings = capture, _ordered(names, output), settings
+        _check(recording, names)
+        _refuse_other_images(recording, names, output)
+        self.recording, self.names, self.settings = recording, _ordered(names, output), settings
         self.notes: list[str] = []
         self._block_keys: dict[int, str] = {}
-        self.cameras = {name: capture.cameras[name] for name in self.names}
+        self.cameras = {name: recording.cameras[name] for name in self.names}
         self.bounds: DepthBounds | None = None
-        maps = output / "cache" / "mono"  # one for all sets of cameras: a map depends on its own picture alone
-        self.mono = None if settings.variant == "mvs" else mono_source(capture, settings, maps)
+        maps = output / "cache" / "mono"  # one for all sets of cameras: a map depends on its own image alone
+        self.mono = None if settings.variant == "mvs" else mono_source(recording, settings, maps)
         cache = PriorStore.place(output, self.names) / "cache"
         self.source = self._geometric_source(points, cache / "matches")
         possible = replace(settings, variant=self._variant())
-        self.confidence = ConfidenceMaps.beside(capture.path if settings.uncertainty else None, OF_MONO, self.names)
-        self.store = PriorStore.create(output, self.names, capture.frames, describe_capture(capture))
+        self.confidence = ConfidenceMaps.beside(recording.path if settings.uncertainty else None, OF_MONO, self.names)
+        self.store = PriorStore.create(output, self.names, recording.frames, describe_recording(recording))
         geometric = None if self.source is None else DepthCache(self.source, cache / "stereo")
         self.construction = Construction(self.cameras, self.mono, geometric, possible, self.confidence, self.block)
 
     def _geometric_source(self, points: np.ndarray | None, matches: Path) -> GeometricSource | None:
         """Depth on disk where there is any, else matching, or None where nothing is matched; sets the depth range."""
         stereo, cameras = self.settings.stereo, list(self.cameras.values())
-        found = find_depth_on_disk(self.capture, self.names, stereo)
+        found = find_depth_on_disk(self.recording, self.names, stereo)
         if found is not None:
             self.notes.append(f"geometric depth: {found.about}")
             self.bounds = _chosen_bounds(self.settings)
-            confidence = ConfidenceMaps.beside(self.capture.path, OF_DEPTH, self.names)
+            confidence = ConfidenceMaps.beside(self.recording.path, OF_DEPTH, self.names)
             return FilteredDepthOnDisk(found, cameras, self.bounds, stereo, confidence)
         if len(cameras) == 1 or stereo.matcher == NO_MATCHER:
             return None
         self.bounds = _chosen_bounds(self.settings) or _rounded(depth_bounds(cameras, points, stereo.max_angle))
-        return MatchedDepth(cameras, self.bounds, stereo, matches, self.capture.frames, self.read)
+        return MatchedDepth(cameras, self.bounds, stereo, matches, self.recording.frames, self.read)
 
     def _variant(self) -> Variant:
         """The variant that the sources at hand allow; what is left out is noted."""
@@ -126,7 +126,7 @@ class _Builder:
             return "mvs"
         if self.mono is None:
             raise D2Error(
-                f"{self.capture.name} has no depth source ({self._lacking}): give a metric monocular network, or "
+                f"{self.recording.name} has no depth source ({self._lacking}): give a metric monocular network, or "
                 "cameras that see the same"
             )
         self.notes.append(
@@ -140,12 +140,12 @@ class _Builder:
         return "one camera" if len(self.names) == 1 else "nothing matched"
 
     def read(self, number: int) -> Frame:
-        """The pictures of one frame."""
-        return Frame.read(self.capture, self.names, number)
+        """The images of one frame."""
+        return Frame.read(self.recording, self.names, number)
 
     def block(self, number: int) -> list[Frame]:
-        """The pictures of all frames that are built in order with this one."""
-        blocks = frame_blocks(self.capture.frames, self.settings.stereo)
+        """The images of all frames that are built in order with this one."""
+        blocks = frame_blocks(self.recording.frames, self.settings.stereo)
         return [self.read(frame) for frame in next(block for block in blocks if number in block)]
 
     def build(self, number: int) -> Iterator[tuple[str, dict[str, Any], bool]]:
@@ -210,20 +210,20 @@ def _ordered(names: list[str], output: Path) -> list[str]:
     return list(PriorStore.described(place).cameras) if (place / "store.json").is_file() else names
 
 
-def _refuse_other_pictures(capture: Capture, names: list[str], output: Path) -> None:
-    """Refuse a store none of whose pictures are those of this capture; where some are, the others were changed since.
+def _refuse_other_images(recording: Recording, names: list[str], output: Path) -> None:
+    """Refuse a store none of whose images are those of this recording; where some are, the others were changed since.
 
-    Reads one picture where all is well: the first that is recorded and the same.
+    Reads one image where all is well: the first that is recorded and the same.
     """
     if not (output / "store.json").is_file():
         return
     store = PriorStore.described(output)
-    shared = [number for number in capture.frames if number in set(store.frames)]
+    shared = [number for number in recording.frames if number in set(store.frames)]
     views = [(name, number) for number in shared for name in names if name in store.cameras]
     recorded = [(view, record) for view in views if (record := _recorded(store, *view)) is not None]
     compared = recorded[:: max(len(recorded) // COMPARED, 1)]
-    if compared and not any(view_digest(capture, *view) == record.get("image") for view, record in compared):
-        raise not_of(output, store.about, describe_capture(capture), "their pictures differ")
+    if compared and not any(view_digest(recording, *view) == record.get("image") for view, record in compared):
+        raise not_of(output, store.about, describe_recording(recording), "their images differ")
 
 
 def _recorded(store: PriorStore, name: str, number: int) -> dict[str, Any] | None:
@@ -257,11 +257,11 @@ def _shard(frames: Sequence[int], settings: PriorSettings, shard: tuple[int, int
     return [number for block in frame_blocks(frames, settings.stereo)[index::count] for number in block]
 
 
-def _check(capture: Capture, names: list[str]) -> None:
+def _check(recording: Recording, names: list[str]) -> None:
     if not names:
         raise D2Error("no camera was chosen for the priors: name at least one")
     for name in names:
-        if name not in capture.cameras:
-            raise unknown_name("camera", name, capture.cameras)
+        if name not in recording.cameras:
+            raise unknown_name("camera", name, recording.cameras)
     if len(set(names)) < len(names):
         raise D2Error(f"a camera is named twice in {', '.join(names)}: name each once")

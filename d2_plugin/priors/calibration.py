@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.capture import Capture
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.store.store import PriorStore
 
 DECLARED = (Label.VERIFIED, Label.AGREED, Label.MONO)
 """Labels whose sigma is held against the truth; far pixels claim only a lower bound of depth."""
@@ -63,10 +63,10 @@ class LabelCalibration:
 
 @dataclass(frozen=True)
 class Calibration:
-    """D* of one capture held against its true depth."""
+    """D* of one recording held against its true depth."""
 
     views: int
-    """Pictures that have both a prior and a true depth map."""
+    """Images that have both a prior and a true depth map."""
     labels: dict[Label, LabelCalibration]
     """The labels that some pixel carries."""
     sky_found: float
@@ -87,30 +87,32 @@ class Calibration:
         return "\n".join(lines)
 
 
-def frames_with_truth(capture: Capture, cameras: Sequence[str], most: int | None = None) -> list[int]:
+def frames_with_truth(recording: Recording, cameras: Sequence[str], most: int | None = None) -> list[int]:
     """The frames at which one of these cameras at least has a true depth map; `most` of them, spread, where given."""
-    frames = [f for f in capture.frames if any(capture.depth(camera, f) is not None for camera in cameras)]
+    frames = [f for f in recording.frames if any(recording.depth(camera, f) is not None for camera in cameras)]
     if most is None or len(frames) <= most:
         return frames
     return [frames[place] for place in np.linspace(0, len(frames) - 1, most).round().astype(int)]
 
 
-def held_against_truth(store: PriorStore, capture: Capture, frames: Sequence[int] | None = None) -> Calibration | None:
-    """Compare D* with the true depth of the capture, None where it has none.
+def held_against_truth(
+    store: PriorStore, recording: Recording, frames: Sequence[int] | None = None
+) -> Calibration | None:
+    """Compare D* with the true depth of the recording, None where it has none.
 
     Pixels at which nothing tells sigma, so that it is infinite, promise nothing and are left out. Where the truth
     itself is rounded, what rounding may do to it is added to sigma (see `truth_rounding`).
 
     Args:
         store: the priors.
-        capture: the recording they were built for; 0 in a true depth map is a place without depth, such as sky.
+        recording: the recording they were built for; 0 in a true depth map is a place without depth, such as sky.
         frames: all of the store where None.
     """
     collected: dict[Label, list[np.ndarray]] = {label: [] for label in DECLARED}
     views = pixels = sky = sky_far = surface_far = 0
     for frame in store.frames if frames is None else frames:
         for camera in store.cameras:
-            truth = capture.depth(camera, frame)
+            truth = recording.depth(camera, frame)
             prior = None if truth is None else store.prior(camera, frame)
             if truth is None or prior is None or prior.sigma is None:
                 continue

@@ -1,7 +1,7 @@
 """D* of the views of one instant from its two sources: align, correct, verify, fuse, let cameras agree.
 
 A further map per pixel is a field of `FusedPrior` that `Construction._view` fills, and a column of the store's
-`PRIOR_DTYPE` that `PriorStore.write` writes; the colours of the picture go that way.
+`PRIOR_DTYPE` that `PriorStore.write` writes; the colours of the image go that way.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera, MonoKind
 from d2_plugin.priors.disk.confidence import ConfidenceMaps
 from d2_plugin.priors.disk.stored import planar
 from d2_plugin.priors.evidence import with_evidence
@@ -40,6 +39,7 @@ from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.cache import DepthCache, StoredDepth
 from d2_plugin.priors.stereo.reuse import changed
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.recording import Camera, MonoKind
 
 CONSTRUCTION_VERSION = 12  # raise it when alignment or fusion change what they return
 
@@ -238,9 +238,7 @@ class Construction:
         sure = self.confidence.of(self.cameras[name], frame.number)
         return prediction if sure is None else np.where(sure > 0, prediction, np.float32(np.nan))
 
-    def _fit(
-        self, name: str, frame: Frame, prediction: np.ndarray, geometric: np.ndarray, kind: MonoKind
-    ) -> Alignment:
+    def _fit(self, name: str, frame: Frame, prediction: np.ndarray, geometric: np.ndarray, kind: MonoKind) -> Alignment:
         """The alignment; a metric map is taken as it is where there is no geometric depth to fit it to."""
         if self.geometric is None or self.settings.variant == "dual_unaligned":
             return not_aligned(kind)

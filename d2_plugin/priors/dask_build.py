@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.captures.capture import Capture
 from d2_plugin.errors import D2Error, missing_extra
 from d2_plugin.priors.build import Progress, build_priors
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.match import frame_blocks
 from d2_plugin.priors.summary import PriorSummary
+from d2_plugin.recordings.recording import Recording
 
 PARTS_PER_WORKER = 4
 """Parts are handed out as workers become free. More parts even out frames that take longer; each part loads the
@@ -31,7 +31,7 @@ logger = logging.getLogger(__name__)
 
 
 def build_priors_on_cluster(
-    capture: Capture,
+    recording: Recording,
     cameras: Sequence[str],
     output: Path | str,
     settings: PriorSettings,
@@ -47,11 +47,11 @@ def build_priors_on_cluster(
     `if __name__ == "__main__":`.
 
     Args:
-        capture: the recording, whose files every worker can read under the same paths.
+        recording: the recording, whose files every worker can read under the same paths.
         cameras, output, settings, sparse_points: as for `build_priors`; `output` must be the same folder for everyone.
         scheduler: address of a dask scheduler, as `tcp://host:8786`; workers on this machine where None.
         workers: number of processes on this machine, where there is no scheduler.
-        progress: called after every part, with pictures done and in all.
+        progress: called after every part, with images done and in all.
 
     Raises:
         D2Error: what `build_priors` refuses, no scheduler or no worker at the address, or a part whose workers died
@@ -59,20 +59,20 @@ def build_priors_on_cluster(
         MissingExtra: dask.distributed is not installed.
     """
     folder = Path(output).absolute()
-    if capture.path is not None:
-        capture = replace(capture, path=capture.path.absolute())
+    if recording.path is not None:
+        recording = replace(recording, path=recording.path.absolute())
     with cluster_client(scheduler, workers) as client, client.as_current():
-        count = _part_count(capture, settings, len(client.nthreads()))
+        count = _part_count(recording, settings, len(client.nthreads()))
         points = None if sparse_points is None else np.asarray(sparse_points)
         parts = [
-            client.submit(_build_part, capture, list(cameras), folder, settings, points, (index, count), pure=False)
+            client.submit(_build_part, recording, list(cameras), folder, settings, points, (index, count), pure=False)
             for index in range(count)
         ]
-        return _joined(parts, len(capture.frames) * len(cameras), progress)
+        return _joined(parts, len(recording.frames) * len(cameras), progress)
 
 
 def _build_part(
-    capture: Capture,
+    recording: Recording,
     cameras: list[str],
     output: Path,
     settings: PriorSettings,
@@ -80,12 +80,12 @@ def _build_part(
     shard: tuple[int, int],
 ) -> PriorSummary:
     """What a worker does."""
-    return build_priors(capture, cameras, output, settings, sparse_points=points, shard=shard)
+    return build_priors(recording, cameras, output, settings, sparse_points=points, shard=shard)
 
 
-def _part_count(capture: Capture, settings: PriorSettings, workers: int) -> int:
+def _part_count(recording: Recording, settings: PriorSettings, workers: int) -> int:
     """Parts are whole blocks, since frames within a block are built in order."""
-    return min(len(frame_blocks(capture.frames, settings.stereo)), PARTS_PER_WORKER * max(workers, 1))
+    return min(len(frame_blocks(recording.frames, settings.stereo)), PARTS_PER_WORKER * max(workers, 1))
 
 
 def _joined(parts: list[Any], total: int, progress: Progress | None) -> PriorSummary:
@@ -104,7 +104,7 @@ def _joined(parts: list[Any], total: int, progress: Progress | None) -> PriorSum
         summary.add_part(part)
         done += part.built + part.kept
         if progress is not None:
-            progress(done, total, f"a part of {part.built + part.kept} pictures")
+            progress(done, total, f"a part of {part.built + part.kept} images")
     return summary
 
 

@@ -1,6 +1,6 @@
 """Geometric depth that lies on disk: what a sensor measured, or what COLMAP computed in a workspace of the user's.
 
-Sensor maps lie beside the pictures as depth/CAMERA/FRAME.npy or .png, with depth/depth.json: {"scale": world units per
+Sensor maps lie beside the images as depth/CAMERA/FRAME.npy or .png, with depth/depth.json: {"scale": world units per
 stored number}, or {"unit": "m" | "cm" | "mm"} where the calibration is in metres. They hold planar depth, or with
 {"along": "ray"} distances from the camera's centre. 0, NaN and infinity are no depth. Confidence maps may lie beside
 them (`d2_plugin.priors.disk.confidence`). True depth for evaluation (depth/CAMERA/FRAME.npz) is never read here.
@@ -17,18 +17,18 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera, Capture
-from d2_plugin.captures.files import FrameFiles, numbered_files
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.colmap.workspace import WorkspaceDepth
 from d2_plugin.priors.disk.confidence import ConfidenceMaps, divided
-from d2_plugin.priors.disk.stored import SUFFIXES, at_picture_size, planar, stored_numbers
+from d2_plugin.priors.disk.stored import SUFFIXES, at_image_size, planar, stored_numbers
 from d2_plugin.priors.frame import Frame, describe_camera, digest, hash_of
 from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths, remove_speckles
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.reading import read_json
+from d2_plugin.recordings.files import FrameFiles, numbered_files
+from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.values import shown
 
 FILTER_VERSION = 3  # raise it when the filter changes what it returns, so that caches are not trusted
@@ -82,12 +82,12 @@ class SensorDepth:
         with np.errstate(over="ignore", invalid="ignore"):  # numbers beyond float32 are no depth
             stored = stored_numbers(path).astype(np.float32) * np.float32(self.scale)
         known = np.isfinite(stored) & (stored > 0)
-        depth = at_picture_size(np.where(known, stored, np.float32(0)), camera, path)
+        depth = at_image_size(np.where(known, stored, np.float32(0)), camera, path)
         return planar(depth, camera) if self.along_ray else depth
 
 
-def find_depth_on_disk(capture: Capture, cameras: Sequence[str], settings: StereoSettings) -> DepthOnDisk | None:
-    """The depth on disk that settings and capture name, or None where geometric depth is to be matched.
+def find_depth_on_disk(recording: Recording, cameras: Sequence[str], settings: StereoSettings) -> DepthOnDisk | None:
+    """The depth on disk that settings and recording name, or None where geometric depth is to be matched.
 
     Of its own accord (`auto`) no camera is left without depth: sensors are taken where every camera has one.
 
@@ -96,9 +96,9 @@ def find_depth_on_disk(capture: Capture, cameras: Sequence[str], settings: Stere
     """
     if settings.matcher not in ("auto", SensorDepth.name, WorkspaceDepth.name):
         return None
-    if settings.matcher == "auto" and capture.path is None:
+    if settings.matcher == "auto" and recording.path is None:
         return None
-    root = (capture.path or Path()).absolute()
+    root = (recording.path or Path()).absolute()
     if settings.matcher in ("auto", SensorDepth.name):
         folder = root / (settings.folder or "depth")
         sensor = SensorDepth(folder, cameras) if (folder / "depth.json").is_file() else None
@@ -106,8 +106,8 @@ def find_depth_on_disk(capture: Capture, cameras: Sequence[str], settings: Stere
             return sensor
         if settings.matcher == SensorDepth.name:
             raise D2Error(f"matcher = sensor but {folder} has no depth.json: write it beside CAMERA/FRAME.png or .npy")
-    calibrations = [capture.cameras[name] for name in cameras]
-    found = WorkspaceDepth.find(root, settings, calibrations, capture.frames)
+    calibrations = [recording.cameras[name] for name in cameras]
+    found = WorkspaceDepth.find(root, settings, calibrations, recording.frames)
     if found is None and settings.matcher == WorkspaceDepth.name:
         where = settings.folder or "colmap/FRAME, colmap or dense"
         raise D2Error(
@@ -149,7 +149,7 @@ class FilteredDepthOnDisk:
         self._last: tuple[int | None, list[np.ndarray]] = None, []
 
     def key(self, frame: Frame) -> str:
-        """Hash of maps, pictures, cameras, range and settings."""
+        """Hash of maps, images, cameras, range and settings."""
         if frame.number not in self._keys:
             self._keys[frame.number] = hash_of(
                 FILTER_VERSION,

@@ -18,17 +18,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.cross_view import kernel
 from d2_plugin.priors.cross_view.ask import Points, View, ask
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.recording import Camera
 
 AGREED = 0.57
 """Factor of sigma where another camera's monocular depth agrees and the colours are alike. What a heavy tail added to
 sigma falls away there: agreement is evidence that this is not one of the things that the map misses. Measured without
-the tail, maps of PyDNet err there as those that belong to the pictures do (1.2 sigma of these; elsewhere 2.5 to 6)."""
+the tail, maps of PyDNet err there as those that belong to the images do (1.2 sigma of these; elsewhere 2.5 to 6)."""
 AT_BEST = 0.01
 """What agreement cannot go below, in quadrature: errors that the maps share do not show in their difference."""
 ALONE = 1.05
@@ -59,9 +59,7 @@ def with_evidence(
             name: replace(prior, labels=changed[name][0], depth=changed[name][1], sigma=changed[name][2])
             for name, prior in priors.items()
         }
-    return {
-        name: _informed(name, prior, views, cameras, tolerance, factors[name]) for name, prior in priors.items()
-    }
+    return {name: _informed(name, prior, views, cameras, tolerance, factors[name]) for name, prior in priors.items()}
 
 
 def _shown(prior: FusedPrior) -> View:

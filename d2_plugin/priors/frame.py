@@ -1,4 +1,4 @@
-"""The pictures of one timestamp, hashes of everything that a depth depends on, and how a capture is known again."""
+"""The images of one timestamp, hashes of everything that a depth depends on, and how a recording is known again."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.recording import Camera, Recording
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The synchronized pictures of one timestamp and their hashes, by camera."""
+    """The synchronized images of one timestamp and their hashes, by camera."""
 
     number: int
     images: dict[str, np.ndarray]
     hashes: dict[str, str]
     recorded: dict[str, np.ndarray | None] = field(default_factory=dict)
-    """Which pixels of each picture were recorded; all where there is nothing."""
+    """Which pixels of each image were recorded; all where there is nothing."""
 
     @classmethod
-    def read(cls, capture: Capture, cameras: Sequence[str], number: int) -> Frame:
-        """Read the pictures of `cameras` at one frame."""
-        images = {camera: capture.image(camera, number) for camera in cameras}
-        recorded = {camera: capture.recorded(camera) for camera in cameras}
+    def read(cls, recording: Recording, cameras: Sequence[str], number: int) -> Frame:
+        """Read the images of `cameras` at one frame."""
+        images = {camera: recording.image(camera, number) for camera in cameras}
+        recorded = {camera: recording.recorded(camera) for camera in cameras}
         hashes = {camera: _digest(image, recorded[camera]) for camera, image in images.items()}
         return cls(number, images, hashes, recorded)
 
@@ -44,14 +44,14 @@ def describe_camera(camera: Camera) -> dict[str, Any]:
     }
 
 
-def describe_capture(capture: Capture) -> dict[str, Any]:
-    """What a store says of the capture that it belongs to: the name for people, the calibrations of all its cameras."""
-    cameras = {name: describe_camera(camera) for name, camera in capture.cameras.items()}
-    return {"capture": capture.name, "calibrations": cameras}
+def describe_recording(recording: Recording) -> dict[str, Any]:
+    """What a store says of its recording: the name for people, the calibrations of all its cameras."""
+    cameras = {name: describe_camera(camera) for name, camera in recording.cameras.items()}
+    return {"recording": recording.name, "calibrations": cameras}
 
 
-def other_capture(found: dict[str, Any], given: dict[str, Any]) -> str | None:
-    """Why two descriptions (`describe_capture`) are of different captures; None if of one.
+def other_recording(found: dict[str, Any], given: dict[str, Any]) -> str | None:
+    """Why two descriptions (`describe_recording`) are of different recordings; None if of one.
 
     The name decides only where one of them holds no calibration.
     """
@@ -66,10 +66,10 @@ def other_capture(found: dict[str, Any], given: dict[str, Any]) -> str | None:
 
 
 def not_of(path: Path, found: dict[str, Any], given: dict[str, Any], reason: str) -> D2Error:
-    """The error for a store that belongs to another capture."""
+    """The error for a store that belongs to another recording."""
     why = f" ({reason})" if reason else ""
     return D2Error(
-        f"{path} holds the priors of {found.get('capture')}, not of {given.get('capture')}{why}: "
+        f"{path} holds the priors of {found.get('recording')}, not of {given.get('recording')}{why}: "
         "choose another output folder"
     )
 
@@ -87,9 +87,9 @@ def digest(array: np.ndarray) -> str:
     return hashlib.blake2b(head + np.ascontiguousarray(array).tobytes(), digest_size=16).hexdigest()
 
 
-def view_digest(capture: Capture, camera: str, number: int) -> str:
-    """Hash of the picture of one camera at one frame, as `Frame.hashes` has it."""
-    return _digest(capture.image(camera, number), capture.recorded(camera))
+def view_digest(recording: Recording, camera: str, number: int) -> str:
+    """Hash of the image of one camera at one frame, as `Frame.hashes` has it."""
+    return _digest(recording.image(camera, number), recording.recorded(camera))
 
 
 def _digest(image: np.ndarray, recorded: np.ndarray | None) -> str:

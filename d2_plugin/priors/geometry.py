@@ -1,6 +1,6 @@
 """Two-view geometry of calibrated pinhole cameras, in array indices.
 
-A capture's intrinsics place the centre of pixel i at i + 0.5. Resampling kernels (OpenCV, our own) address arrays,
+A recording's intrinsics place the centre of pixel i at i + 0.5. Resampling kernels (OpenCV, our own) address arrays,
 where that pixel is simply i. Everything in this file is in array indices; `index_intrinsics` is the one place where
 the half pixel is taken off. For a reference pixel p = (u, v, 1) at inverse depth q the source pixel is
 
@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.recording import Camera
 
 CONTINUOUS = 1.1
 """Four neighbours of a map whose depths differ by a larger factor are no surface."""
@@ -53,7 +53,7 @@ class ViewPair:
 
 
 def index_intrinsics(camera: Camera) -> np.ndarray:
-    """K [3, 3] for array indices: the pixel whose centre the capture puts at (0.5, 0.5) is at (0, 0) here."""
+    """K [3, 3] for array indices: the pixel whose centre the recording puts at (0.5, 0.5) is at (0, 0) here."""
     K = np.array(camera.K, dtype=np.float64)
     K[:2, 2] -= 0.5
     return K
@@ -159,7 +159,7 @@ def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
 
 
 def cropped_camera(camera: Camera, rows: slice, columns: slice) -> Camera:
-    """The camera whose picture is that part of this one's."""
+    """The camera whose image is that part of this one's."""
     K = np.array(camera.K, dtype=np.float64)
     K[:2, 2] -= columns.start, rows.start
     return replace(camera, width=columns.stop - columns.start, height=rows.stop - rows.start, K=K)
@@ -203,18 +203,18 @@ def check_depth_range(depth_range: tuple[float, float]) -> tuple[float, float]:
 
 
 def check_views(images: Sequence[np.ndarray], cameras: Sequence[Camera]) -> None:
-    """Refuse a list of pictures that does not belong to the list of cameras.
+    """Refuse a list of images that does not belong to the list of cameras.
 
     Raises:
-        D2Error: on unequal lengths, fewer than two views, or a picture of another size than its camera.
+        D2Error: on unequal lengths, fewer than two views, or an image of another size than its camera.
     """
     if len(images) != len(cameras):
-        raise D2Error(f"stereo got {len(images)} pictures for {len(cameras)} cameras: pass one picture per camera")
+        raise D2Error(f"stereo got {len(images)} images for {len(cameras)} cameras: pass one image per camera")
     if len(images) < 2:
         raise D2Error(f"stereo needs at least 2 cameras, got {len(images)}: use monocular depth alone for one camera")
     for image, camera in zip(images, cameras):
         if image.shape[:2] != (camera.height, camera.width):
             raise D2Error(
-                f"picture of camera {camera.name} is {image.shape[1]}x{image.shape[0]} pixels but its calibration says "
-                f"{camera.width}x{camera.height}: resize the picture or correct the camera"
+                f"image of camera {camera.name} is {image.shape[1]}x{image.shape[0]} pixels but its calibration says "
+                f"{camera.width}x{camera.height}: resize the image or correct the camera"
             )

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
-from d2_plugin.captures.capture import MonoKind
 from d2_plugin.priors.geometry import check_depth_range
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.recording import MonoKind
 from d2_plugin.settings import NotNegative, Positive, Range, Settings, Share
 
 __all__ = ["AlignSettings", "Preprocessing", "PriorSettings", "StereoSettings", "Variant"]
@@ -26,7 +26,7 @@ verified, since the paper runs "identical densification, pruning, and RGB-D opti
 """
 
 Preprocessing = Literal["auto", "depth_anything_v2", "unit"]
-"""How a picture becomes a network's input."""
+"""How an image becomes a network's input."""
 
 
 Along = Literal["z", "ray"]
@@ -35,7 +35,7 @@ Along = Literal["z", "ray"]
 
 @dataclass(frozen=True)
 class PriorSettings(Settings):
-    """Everything that decides what D* of a capture is."""
+    """Everything that decides what D* of a recording is."""
 
     variant: Variant = "dual"
     """What D* is made of: `dual`, or one of the paper's ablation rows (see `Variant`)."""
@@ -48,7 +48,7 @@ class PriorSettings(Settings):
     most_vetoed: Share = 0.01
     """Where a map contradicts more than this share of a view's geometric depths, the map is wrong, and all of them stay
     (`dual` with `uncertainty`): .1 to 1 % of filtered stereo are off by over 5 %. 1 lets every map veto. Measured: maps
-    that belong to their pictures contradict 0 to .6 % (studio, plaza, a room; two to four views), PyDNet 1.7 to 2.8 %,
+    that belong to their images contradict 0 to .6 % (studio, plaza, a room; two to four views), PyDNet 1.7 to 2.8 %,
     and of those 85 to 99 % are right, people who walk above all. Studio with PyDNet, 5 frames, 500 steps, three seeds:
     26.7 dB (of what moves 20.5) where it may veto, 28.0 (23.6) where not; plaza, one seed, 19.0 and 19.1."""
     tau_c: NotNegative = 0.1
@@ -58,7 +58,7 @@ class PriorSettings(Settings):
     z_far_factor: Positive = 3.0
     """Aligned monocular depth beyond this multiple of the 99.5 percentile of the anchors is left empty."""
     hanging_limit: NotNegative = 0.08
-    """Mono-only pixels are left empty where monocular depth spans more than this share within 1 % of the picture's
+    """Mono-only pixels are left empty where monocular depth spans more than this share within 1 % of the image's
     width: they hang between two surfaces. 0 keeps them, as the paper does."""
     agreement: NotNegative = 0.02
     """Two cameras' monocular depths agree within this share (`dual` alone). 0 leaves the other cameras out, as in the
@@ -69,7 +69,7 @@ class PriorSettings(Settings):
     depth_range: tuple[Positive, Positive] | None = None
     """Near and far of the stereo search, world units; by default from sparse points, the data set, or the baselines."""
     mono_onnx: str | None = None
-    """Path of a monocular ONNX network; the capture's own maps on disk where None."""
+    """Path of a monocular ONNX network; the recording's own maps on disk where None."""
     mono_kind: MonoKind | None = None
     """What the network predicts: `relative` (inverse depth) or `metric`; required with `mono_onnx`."""
     mono_along: Along = "z"

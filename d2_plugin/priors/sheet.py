@@ -1,4 +1,4 @@
-"""A contact sheet of a prior store: picture, D*, labels and sigma side by side, to be looked at before training."""
+"""A contact sheet of a prior store: image, D*, labels and sigma side by side, to be looked at before training."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from types import ModuleType
 
 import numpy as np
 
-from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.pictures import write_png
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import DepthPrior, Label
+from d2_plugin.recordings.images import write_png
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.store.store import PriorStore
 
 LABEL_COLORS = {
     Label.EMPTY: (40, 40, 40),
@@ -30,7 +30,7 @@ SURE, UNSURE = 0.001, 0.5
 UNKNOWN = (120, 120, 120)
 """RGB of a pixel with a depth of which nothing tells how wrong it may be."""
 TITLES = (
-    "picture",
+    "image",
     "D*: near red, far blue, none black",
     "green verified, cyan agreed, blue mono, pale far, red conflict",
     f"sigma: dark {SURE:.1%}, bright {UNSURE:.0%}, grey unknown",
@@ -42,28 +42,28 @@ CAPTION = 18  # height of a line of text, pixels
 
 def contact_sheet(
     store: PriorStore,
-    capture: Capture,
+    recording: Recording,
     path: Path | str,
     frames: Sequence[int] | None = None,
     width: int = 320,
 ) -> Path:
-    """Write a PNG with one row per camera and frame: picture | D* (near is red) | labels | sigma.
+    """Write a PNG with one row per camera and frame: image | D* (near is red) | labels | sigma.
 
     Args:
         store: the priors.
-        capture: where the pictures come from.
+        recording: where the images come from.
         path: the file to write.
         frames: up to three frames spread over the store where None.
-        width: of one picture in the sheet, pixels.
+        width: of one image in the sheet, pixels.
 
     Raises:
         D2Error: the store has no prior at any of the frames.
     """
     cv2 = opencv("the contact sheet")
-    shared = [frame for frame in store.frames if frame in capture.frames]
+    shared = [frame for frame in store.frames if frame in recording.frames]
     chosen = _spread(shared, 3) if frames is None else list(frames)
     rows = [
-        _row(cv2, capture.image(camera, frame), prior, _caption(store, camera, frame), width)
+        _row(cv2, recording.image(camera, frame), prior, _caption(store, camera, frame), width)
         for frame in chosen
         for camera in store.cameras
         if (prior := store.prior(camera, frame)) is not None

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
-
-from . import cuda, native, ops, reference
-from .evidence import check_maps
+from d2_plugin.rasterizer import cuda, native, ops, reference
+from d2_plugin.rasterizer.evidence import check_maps
 
 __all__ = ["DepthPrior", "RasterSettings", "Render", "Splats", "Survey", "View", "rasterize", "survey"]
 

@@ -20,10 +20,9 @@ from torch import Tensor
 from d2_plugin.compiler.nvrtc import NoCuda
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Survey
-
-from .cuda_frame import GATHERERS, MOMENTS, STATISTICS, THREADS, TILE, WARP, Frame, Launcher
-from .cuda_runtime import CudaLauncher
-from .frame import RECORD
+from d2_plugin.rasterizer.cuda_frame import GATHERERS, MOMENTS, STATISTICS, THREADS, TILE, WARP, Frame, Launcher
+from d2_plugin.rasterizer.cuda_runtime import CudaLauncher
+from d2_plugin.rasterizer.frame import RECORD
 
 MOST_PAIRS = 2**31 - 1
 """Slots are 32-bit integers."""
@@ -218,7 +217,7 @@ def _count_pairs(ends: Tensor, K: Tensor) -> int:
     pairs, skewed = torch.stack([last, (K[0, 1] != 0).to(last)]).tolist()
     if skewed:
         skew = K[0, 1].item()
-        raise D2Error(f"K has skew {skew}, expected 0: undistort the pictures to a pinhole camera without skew")
+        raise D2Error(f"K has skew {skew}, expected 0: undistort the images to a pinhole camera without skew")
     if pairs > MOST_PAIRS:
         raise D2Error(f"{pairs} pairs of Gaussian and tile, at most 2^31 - 1 are possible: use a smaller image")
     return pairs

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from typing import Protocol
 
-from .frame import KERNELS, PointingFrame
+from d2_plugin.rasterizer.frame import KERNELS, PointingFrame
 
 SOURCE, HEADERS = KERNELS / "gpu.cu", (KERNELS / "splat.h",)
 

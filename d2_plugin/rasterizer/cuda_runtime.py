@@ -9,8 +9,7 @@ import torch
 
 from d2_plugin.compiler.driver import Driver
 from d2_plugin.compiler.nvrtc import Binary, Program, build
-
-from .cuda_frame import HEADERS, SOURCE, THREADS, Frame
+from d2_plugin.rasterizer.cuda_frame import HEADERS, SOURCE, THREADS, Frame
 
 CACHED_CHANNELS = 3
 """Number of colors of the kernels that also run the survey, which needs no colors."""

@@ -18,9 +18,8 @@ from torch import Tensor
 from d2_plugin.compiler import NoCompiler, load_library
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Survey
-
-from .frame import KERNELS, RECORD, PointingFrame
-from .reference import refuse_skew
+from d2_plugin.rasterizer.frame import KERNELS, RECORD, PointingFrame
+from d2_plugin.rasterizer.reference import refuse_skew
 
 SOURCES = (KERNELS / "cpu.cpp",)
 HEADERS = tuple(KERNELS / name for name in ("splat.h", "simd.h", "parallel.h", "frame.h", "binning.h"))

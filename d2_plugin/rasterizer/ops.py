@@ -15,11 +15,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
-
-from . import cuda, native
-from .evidence import reliability
-from .frame import RECORD
-from .operator import custom_op
+from d2_plugin.rasterizer import cuda, native
+from d2_plugin.rasterizer.evidence import reliability
+from d2_plugin.rasterizer.frame import RECORD
+from d2_plugin.rasterizer.operator import custom_op
 
 INPUTS = 9
 """Tensors that `rasterize` takes: 6 of the Gaussians and what they are drawn on, 2 of the camera, the near edge."""
@@ -190,7 +189,7 @@ _rasterize.register_autograd(_backward, setup_context=_save)
 
 
 class _Rasterize(torch.autograd.Function):
-    """The operator without the dispatcher, whose way from Python to Python costs more than small pictures do."""
+    """The operator without the dispatcher, whose way from Python to Python costs more than small images do."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:

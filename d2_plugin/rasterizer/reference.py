@@ -21,8 +21,7 @@ from torch.utils.checkpoint import checkpoint
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
-
-from .evidence import reliability
+from d2_plugin.rasterizer.evidence import reliability
 
 TILE = 16
 """Side of the squares of pixels that are composited at once; limits memory, changes nothing else."""
@@ -223,7 +222,7 @@ def _compensation(own_x: Tensor, own_y: Tensor, covariance: Tensor, floor: float
 def refuse_skew(skew: float) -> None:
     """Raise D2Error where K[0, 1] is not 0: the projection's Jacobian knows no skew, nor does any backbone's."""
     if skew != 0:
-        raise D2Error(f"K has skew {skew}, expected 0: undistort the pictures to a pinhole camera without skew")
+        raise D2Error(f"K has skew {skew}, expected 0: undistort the images to a pinhole camera without skew")
 
 
 def _take(splats: Splats, index: Tensor) -> Splats:

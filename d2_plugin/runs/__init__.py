@@ -1,1 +1,1 @@
-"""One run, from a capture to a held-out score."""
+"""One run, from a recording to a held-out score."""

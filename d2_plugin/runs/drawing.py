@@ -1,7 +1,7 @@
-"""Pictures beside each other with captions and colour scales, drawn with numpy alone.
+"""Images beside each other with captions and colour scales, drawn with numpy alone.
 
-A training machine has torch and numpy and perhaps nothing else: held-out pictures must not need a plotting library.
-Pictures here are RGB uint8 [H, W, 3].
+A training machine has torch and numpy and perhaps nothing else: held-out images must not need a plotting library.
+Images here are RGB uint8 [H, W, 3].
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ GAP = 4
 
 
 class Panel(NamedTuple):
-    """A picture with the text above it."""
+    """An image with the text above it."""
 
     caption: str
-    picture: np.ndarray
+    image: np.ndarray
     bar: np.ndarray | None = None  # colours [N, 3] of the scale shown under the caption
 
 
@@ -69,18 +69,18 @@ def text(line: str, size: int = 1) -> np.ndarray:
 
 def side_by_side(panels: Sequence[Panel]) -> np.ndarray:
     """All panels in one row, each with its caption and colour scale above; a caption too long for its panel is cut."""
-    size = int(np.clip(max(panel.picture.shape[1] for panel in panels) // 300, 1, 4))  # of the letters, in pixels
+    size = int(np.clip(max(panel.image.shape[1] for panel in panels) // 300, 1, 4))  # of the letters, in pixels
     header = 20 * size
-    height = header + max(panel.picture.shape[0] for panel in panels)
+    height = header + max(panel.image.shape[0] for panel in panels)
     row: list[np.ndarray] = []
     for panel in panels:
-        width = panel.picture.shape[1]
+        width = panel.image.shape[1]
         canvas = np.full((height, width, 3), BACKGROUND, np.uint8)
         letters = text(panel.caption, size)[:, : width - 2 * size]
         canvas[2 * size : 2 * size + letters.shape[0], 2 * size : 2 * size + letters.shape[1]] = letters
         if panel.bar is not None:
             place = np.linspace(0, len(panel.bar) - 1, width).astype(int)
             canvas[13 * size : 18 * size] = panel.bar[place]
-        canvas[header : header + panel.picture.shape[0]] = panel.picture
+        canvas[header : header + panel.image.shape[0]] = panel.image
         row += [canvas, np.full((height, GAP, 3), BACKGROUND, np.uint8)]
     return np.concatenate(row[:-1], axis=1)

@@ -1,4 +1,4 @@
-"""Scores of a trained model at cameras it has not seen, and pictures that show them."""
+"""Scores of a trained model at cameras it has not seen, and images that show them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.pictures import write_png
 from d2_plugin.durable import make_folder
 from d2_plugin.errors import D2Error
 from d2_plugin.progress import progress_bar
+from d2_plugin.recordings.images import write_png
+from d2_plugin.recordings.recording import Recording
 from d2_plugin.runs import metrics
 from d2_plugin.runs.drawing import Panel, color_scale, colorize, side_by_side
 from d2_plugin.runs.lpips import Lpips, find_lpips
@@ -33,19 +33,19 @@ Progress = Callable[[int, int], None]
 """(views done, views in total)."""
 
 ERROR_SHOWN = 0.25
-"""Absolute colour error, mean over channels, at the bright end of the error picture's scale."""
+"""Absolute colour error, mean over channels, at the bright end of the error image's scale."""
 
 
 RENDERED_ALPHA = 0.5
 """A rendered depth is reported where the accumulated alpha exceeds this."""
 
 
-def renderer(model: Any, capture: Capture, device: torch.device | str) -> RenderView:
+def renderer(model: Any, recording: Recording, device: torch.device | str) -> RenderView:
     """Colour [H, W, 3] and depth [H, W] of a model, 0 where too little is opaque, on the CPU."""
 
     @torch.no_grad()
     def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
-        view = make_view(capture, camera, frame, device)
+        view = make_view(recording, camera, frame, device)
         color, depth_sum, alpha = (part.cpu() for part in model.render(view)[:3])
         solid = alpha > RENDERED_ALPHA
         depth = torch.where(solid, depth_sum / alpha.clamp(min=RENDERED_ALPHA), torch.zeros_like(alpha))
@@ -54,16 +54,14 @@ def renderer(model: Any, capture: Capture, device: torch.device | str) -> Render
     return render
 
 
-def evaluate_scene(
-    model: Any, scene: Scene, device: torch.device | str, pictures: Path | None = None
-) -> dict[str, Any]:
+def evaluate_scene(model: Any, scene: Scene, device: torch.device | str, images: Path | None = None) -> dict[str, Any]:
     """`evaluate` at the test cameras of a scene; at its training cameras, under `train` instead of `test`, where it has
     none."""
-    cameras, frames = scene.test_cameras or scene.train_cameras, scene.capture.frames
+    cameras, frames = scene.test_cameras or scene.train_cameras, scene.recording.frames
     with progress_bar("evaluate", len(cameras) * len(frames)) as bar:
         scores = evaluate(
-            renderer(model, scene.capture, device),
-            *(scene.capture, cameras, frames, pictures),
+            renderer(model, scene.recording, device),
+            *(scene.recording, cameras, frames, images),
             lpips=find_lpips("alex"),
             lpips_vgg=find_lpips("vgg"),
             progress=lambda done, _: bar.update(done),
@@ -73,7 +71,7 @@ def evaluate_scene(
 
 def evaluate(
     render: RenderView,
-    capture: Capture,
+    recording: Recording,
     cameras: Sequence[str],
     frames: Iterable[int],
     output: Path | None = None,
@@ -82,14 +80,14 @@ def evaluate(
     lpips_vgg: Lpips | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Compare renders with the capture's pictures, one view at a time.
+    """Compare renders with the recording's images, one view at a time.
 
     Args:
         render: draws one view; colours are clamped to 0..1 here.
-        capture: the truth.
+        recording: the truth.
         cameras, frames: what to compare: every camera at every frame.
-        output: folder for one picture per view, `<camera>_<frame>.png`: truth, render, rendered depth and error side
-            by side (and true depth where there is one). No pictures where None.
+        output: folder for one image per view, `<camera>_<frame>.png`: truth, render, rendered depth and error side
+            by side (and true depth where there is one). No images where None.
         lpips, lpips_vgg: from `find_lpips`, on AlexNet and on VGG16; a score is null where its network is None.
         progress: called after every view.
 
@@ -114,13 +112,18 @@ def evaluate(
     before: tuple[str, Tensor, Tensor] | None = None  # camera, render and truth of the view before
     for done, (camera, frame) in enumerate(views, start=1):
         if before is None or before[0] != camera:
-            still, before = still_picture(capture, camera, instants), None
-        truth = torch.from_numpy(capture.image(camera, frame).astype(np.float32) / 255)
+            still, before = still_image(recording, camera, instants), None
+        truth = torch.from_numpy(recording.image(camera, frame).astype(np.float32) / 255)
         color, depth = _checked(render(camera, frame), truth.shape, camera, frame)
-        true_depth = capture.depth(camera, frame)
+        true_depth = recording.depth(camera, frame)
         compared = metrics.Compared(
             *(color, truth, depth, None if true_depth is None else torch.from_numpy(true_depth)),
-            *(_moving(truth, still), None if before is None else before[1:], networks, _inside(capture, camera, frame)),
+            *(
+                _moving(truth, still),
+                None if before is None else before[1:],
+                networks,
+                _inside(recording, camera, frame),
+            ),
         )
         scores = {name: metric.score(compared) for name, metric in metrics.METRICS.items()}
         rows.append({"camera": camera, "frame": frame, **scores})
@@ -139,7 +142,7 @@ def evaluate(
     }
 
 
-def still_picture(capture: Capture, camera: str, frames: Sequence[int], most: int = 9) -> np.ndarray | None:
+def still_image(recording: Recording, camera: str, frames: Sequence[int], most: int = 9) -> np.ndarray | None:
     """What a camera sees where nothing moves, [H, W, 3] in 0..1: the median of up to `most` frames spread in time.
 
     None where there are fewer than three frames: the median of two is neither.
@@ -147,20 +150,20 @@ def still_picture(capture: Capture, camera: str, frames: Sequence[int], most: in
     if len(frames) < 3:
         return None
     chosen = np.unique(np.linspace(0, len(frames) - 1, most).round().astype(int))
-    return np.median([capture.image(camera, frames[i]) for i in chosen], axis=0).astype(np.float32) / 255
+    return np.median([recording.image(camera, frames[i]) for i in chosen], axis=0).astype(np.float32) / 255
 
 
 def _moving(truth: Tensor, still: np.ndarray | None) -> np.ndarray | None:
-    """The pixels [H, W] that differ from the still picture; None where hardly any does."""
+    """The pixels [H, W] that differ from the still image; None where hardly any does."""
     if still is None:
         return None
     moving = np.abs(truth.numpy() - still).max(-1) > CHANGED
     return moving if moving.mean() > MOVING_SHARE else None
 
 
-def _inside(capture: Capture, camera: str, frame: int) -> np.ndarray | None:
+def _inside(recording: Recording, camera: str, frame: int) -> np.ndarray | None:
     """The pixels [H, W] of the foreground mask that were recorded; None where neither is known."""
-    mask, recorded = capture.mask(camera, frame), capture.recorded(camera)
+    mask, recorded = recording.mask(camera, frame), recording.recorded(camera)
     if mask is None:
         return recorded
     inside = mask > 0.5 if recorded is None else (mask > 0.5) & recorded
@@ -176,7 +179,7 @@ def _checked(
     where = f"the render of camera {camera} at frame {frame}"
     if color.shape != shape or (depth is not None and depth.shape != shape[:2]):
         sizes = f"{tuple(color.shape)}" + ("" if depth is None else f" and depth {tuple(depth.shape)}")
-        raise D2Error(f"{where} is {sizes}, expected {tuple(shape)}: render at the size of the capture's camera")
+        raise D2Error(f"{where} is {sizes}, expected {tuple(shape)}: render at the size of the recording's camera")
     if not torch.isfinite(color).all():
         raise D2Error(f"{where} has values that are not finite: the model has diverged, train it again")
     return color.clamp(0, 1), depth
@@ -221,9 +224,9 @@ def _panels(
 def _depth_panel(title: str, depth: np.ndarray, low: float, high: float, error: float | None) -> Panel:
     scale = color_scale("viridis")
     known = np.isfinite(depth) & (depth > 0)
-    picture = colorize(np.where(known, depth, 0), low, high, scale)
+    image = colorize(np.where(known, depth, 0), low, high, scale)
     score = f"  AbsRel {error:.3f}" if error is not None and title == "depth" else ""
-    return Panel(f"{title}  {low:.3g} .. {high:.3g}{score}", np.where(known[..., None], picture, np.uint8(0)), scale)
+    return Panel(f"{title}  {low:.3g} .. {high:.3g}{score}", np.where(known[..., None], image, np.uint8(0)), scale)
 
 
 def _depth_range(depth: np.ndarray) -> tuple[float, float]:
@@ -235,5 +238,5 @@ def _depth_range(depth: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _bytes(picture: np.ndarray) -> np.ndarray:
-    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+def _bytes(image: np.ndarray) -> np.ndarray:
+    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)

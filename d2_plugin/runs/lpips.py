@@ -4,7 +4,7 @@ Two files are needed per network: the feature extractor as torchvision publishes
 the linear layers as the `lpips` package ships them (`alex.pth`, `vgg.pth`). They are looked for in a folder that the
 caller names, in torch's own download cache, and inside an installed `lpips` package.
 
-Convention: that of lpipsPyTorch, which 3DGS codebases report. Pictures go in as 0..1 and are shifted and scaled by
+Convention: that of lpipsPyTorch, which 3DGS codebases report. Images go in as 0..1 and are shifted and scaled by
 constants made for -1..1; the `lpips` package maps to -1..1 first and gives other numbers.
 """
 
@@ -47,7 +47,7 @@ _FILES = {"alex": ("alexnet*.pth", "alex.pth"), "vgg": ("vgg16-*.pth", "vgg.pth"
 
 
 class Lpips:
-    """Learned perceptual distance of two pictures; `net` is `alex` or `vgg`."""
+    """Learned perceptual distance of two images; `net` is `alex` or `vgg`."""
 
     def __init__(self, net: str, features: Path, linear: Path) -> None:
         if net not in _TAPS:
@@ -69,15 +69,15 @@ class Lpips:
     @property
     def variant(self) -> str:
         """The definition behind the number, for metrics.json."""
-        return f"version 0.1, {self.net}, pictures in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)"
+        return f"version 0.1, {self.net}, images in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)"
 
     @torch.no_grad()
     def __call__(self, image: Tensor, truth: Tensor) -> float:
-        """Distance of two pictures [H, W, 3] in 0..1; 0 for equal ones, larger is worse."""
+        """Distance of two images [H, W, 3] in 0..1; 0 for equal ones, larger is worse."""
         if image.shape != truth.shape or min(image.shape[:2]) < SMALLEST:
             raise D2Error(
-                f"LPIPS needs two pictures of one size, at least {SMALLEST}x{SMALLEST} pixels, and got "
-                f"{tuple(image.shape)} and {tuple(truth.shape)}: compare larger pictures"
+                f"LPIPS needs two images of one size, at least {SMALLEST}x{SMALLEST} pixels, and got "
+                f"{tuple(image.shape)} and {tuple(truth.shape)}: compare larger images"
             )
         pairs = zip(self._features(image), self._features(truth), self.weights)
         return sum(((a - b).square() * w[:, None, None]).sum(0).mean().item() for a, b, w in pairs)

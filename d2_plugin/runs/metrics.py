@@ -31,11 +31,11 @@ LEAST_SLOPE = 0.1
 """Contrast of a render, as a share of the truth's, below which no exposure explains it."""
 
 STRIP_ROWS = 32
-"""How many rows of the picture are compared at a time."""
+"""How many rows of the image are compared at a time."""
 
 
 def psnr(image: Tensor, truth: Tensor, within: np.ndarray | None = None) -> float:
-    """Peak signal to noise ratio in dB, 20 log10(1 / sqrt(MSE)); infinite for equal pictures.
+    """Peak signal to noise ratio in dB, 20 log10(1 / sqrt(MSE)); infinite for equal images.
 
     `within` [H, W] bool are the pixels that count; all where None. At least one must.
     """
@@ -75,7 +75,7 @@ def ssim_range2(image: Tensor, truth: Tensor) -> float:
 
 
 def ssim_uniform(image: Tensor, truth: Tensor, data_range: float) -> float:
-    """Structural similarity with a uniform 7x7 window and sample covariance, mean over windows inside the picture."""
+    """Structural similarity with a uniform 7x7 window and sample covariance, mean over windows inside the image."""
     first, second = _pair(image, truth, UNIFORM_WINDOW)
     count = UNIFORM_WINDOW**2
     taps = [1 / UNIFORM_WINDOW] * UNIFORM_WINDOW
@@ -83,12 +83,12 @@ def ssim_uniform(image: Tensor, truth: Tensor, data_range: float) -> float:
 
 
 def ssim_3dgs(image: Tensor, truth: Tensor) -> float:
-    """Structural similarity as 3DGS codebases compute it: Gaussian 11x11 window over a zero-padded picture."""
+    """Structural similarity as 3DGS codebases compute it: Gaussian 11x11 window over a zero-padded image."""
     pair = _pair(image, truth, GAUSSIAN_WINDOW)
     reach = GAUSSIAN_WINDOW // 2
     weights = [math.exp(-0.5 * (offset / GAUSSIAN_SIGMA) ** 2) for offset in range(-reach, reach + 1)]
     taps = [weight / sum(weights) for weight in weights]
-    first, second = (np.pad(picture, ((0, 0), (reach, reach), (reach, reach))) for picture in pair)
+    first, second = (np.pad(image, ((0, 0), (reach, reach), (reach, reach))) for image in pair)
     return _ssim(first, second, taps, data_range=1.0, unbias=1.0)
 
 
@@ -103,7 +103,7 @@ def flicker(image: Tensor, truth: Tensor, image_before: Tensor, truth_before: Te
     first_before, second_before = _pair(image_before, truth_before)
     if first.shape != first_before.shape:
         raise D2Error(
-            f"pictures of shape {tuple(image.shape)} and {tuple(image_before.shape)} are no two frames of one camera: "
+            f"images of shape {tuple(image.shape)} and {tuple(image_before.shape)} are no two frames of one camera: "
             "give frames of equal size"
         )
     return float(np.abs((first - first_before) - (second - second_before)).mean())
@@ -144,9 +144,9 @@ def _known_depths(depth: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _ssim(image: np.ndarray, truth: np.ndarray, taps: Sequence[float], data_range: float, unbias: float) -> float:
-    """Mean SSIM over windows inside the pictures [3, H, W]; `unbias` turns window variances into sample variances.
+    """Mean SSIM over windows inside the images [3, H, W]; `unbias` turns window variances into sample variances.
 
-    Goes over the picture in strips, which stay in the processor's cache and keep memory small for large pictures.
+    Goes over the image in strips, which stay in the processor's cache and keep memory small for large images.
     """
     margin = len(taps) - 1
     rows = image.shape[1] - margin
@@ -158,7 +158,7 @@ def _ssim(image: np.ndarray, truth: np.ndarray, taps: Sequence[float], data_rang
 def _similarity(
     image: np.ndarray, truth: np.ndarray, taps: Sequence[float], data_range: float, unbias: float
 ) -> np.ndarray:
-    """The SSIM of every window inside the pictures, [3, H - w + 1, W - w + 1] for w taps."""
+    """The SSIM of every window inside the images, [3, H - w + 1, W - w + 1] for w taps."""
     c1, c2 = (K1 * data_range) ** 2, (K2 * data_range) ** 2
     products = np.stack([image, truth, image * image, truth * truth, image * truth])
     mean_x, mean_y, square_x, square_y, cross = _filtered(_filtered(products, taps, -1), taps, -2)
@@ -177,20 +177,20 @@ def _filtered(values: np.ndarray, taps: Sequence[float], axis: int) -> np.ndarra
 
 
 def _pair(image: Tensor, truth: Tensor, window: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Both pictures as [3, H, W] float64 (in float32 the variances of flat regions would be rounding noise)."""
+    """Both images as [3, H, W] float64 (in float32 the variances of flat regions would be rounding noise)."""
     if not isinstance(image, Tensor) or not isinstance(truth, Tensor):
         kinds = f"{type(image).__name__} and {type(truth).__name__}"
-        raise D2Error(f"pictures are compared as tensors [H, W, 3], got {kinds}: give two tensors")
+        raise D2Error(f"images are compared as tensors [H, W, 3], got {kinds}: give two tensors")
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
         raise D2Error(
-            f"pictures of shape {tuple(image.shape)} and {tuple(truth.shape)} cannot be compared: give two [H, W, 3]"
+            f"images of shape {tuple(image.shape)} and {tuple(truth.shape)} cannot be compared: give two [H, W, 3]"
         )
     if min(image.shape[:2]) < window:
         raise D2Error(
-            f"a picture of {image.shape[1]}x{image.shape[0]} pixels is smaller than the {window}x{window} window "
-            "of this metric: compare larger pictures"
+            f"an image of {image.shape[1]}x{image.shape[0]} pixels is smaller than the {window}x{window} window "
+            "of this metric: compare larger images"
         )
-    first, second = (picture.detach().cpu().double().permute(2, 0, 1).numpy() for picture in (image, truth))
+    first, second = (image.detach().cpu().double().permute(2, 0, 1).numpy() for image in (image, truth))
     return np.ascontiguousarray(first), np.ascontiguousarray(second)
 
 
@@ -208,7 +208,7 @@ class Compared:
     """Render and truth of the frame before, of the same camera."""
     networks: Mapping[str, Callable[[Tensor, Tensor], float] | None] = field(default_factory=dict)
     inside: np.ndarray | None = None
-    """[H, W] bool, recorded pixels inside the capture's foreground mask; None where it has neither."""
+    """[H, W] bool, recorded pixels inside the recording's foreground mask; None where it has neither."""
 
     @property
     def depths(self) -> tuple[Tensor, Tensor] | None:
@@ -216,7 +216,7 @@ class Compared:
         return None if self.depth is None or self.true_depth is None else (self.depth, self.true_depth)
 
     def by_network(self, name: str) -> float | None:
-        """What a network says of the two pictures; None where it is not there."""
+        """What a network says of the two images; None where it is not there."""
         network = self.networks.get(name)
         return None if network is None else network(self.image, self.truth)
 
@@ -230,7 +230,7 @@ class Metric:
 
 
 NO_DIFFERENCE = 100.0
-"""What counts as the PSNR of equal pictures, dB: their own is infinite, which has no mean and no place in JSON."""
+"""What counts as the PSNR of equal images, dB: their own is infinite, which has no mean and no place in JSON."""
 
 METRICS = {
     "psnr": Metric(
@@ -246,7 +246,7 @@ METRICS = {
         lambda c: None if c.moving is None else min(psnr(c.image, c.truth, c.moving), NO_DIFFERENCE),
     ),
     "psnr_mask": Metric(
-        "PSNR of the recorded pixels inside the capture's foreground mask, where it has one (this project)",
+        "PSNR of the recorded pixels inside the recording's foreground mask, where it has one (this project)",
         lambda c: None if c.inside is None else min(psnr(c.image, c.truth, c.inside), NO_DIFFERENCE),
     ),
     "ssim1": Metric(
@@ -262,11 +262,11 @@ METRICS = {
         lambda c: ssim_3dgs(c.image, c.truth),
     ),
     "lpips": Metric(
-        "version 0.1 on AlexNet, pictures in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)",
+        "version 0.1 on AlexNet, images in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)",
         lambda c: c.by_network("lpips"),
     ),
     "lpips_vgg": Metric(
-        "version 0.1 on VGG16, pictures in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)",
+        "version 0.1 on VGG16, images in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)",
         lambda c: c.by_network("lpips_vgg"),
     ),
     "flicker": Metric(

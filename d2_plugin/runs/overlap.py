@@ -1,4 +1,4 @@
-"""What stereo has to work with: how much of a picture other cameras see, at which angle, and how much has texture."""
+"""What stereo has to work with: how much of an image other cameras see, at which angle, and how much has texture."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from d2_plugin.captures import Camera, Capture
-from d2_plugin.captures.pictures import shrink_picture
 from d2_plugin.priors.geometry import relative_pose, scaled_camera, view_pair, viewing_rays
 from d2_plugin.priors.stereo.filtering.filter import texture_mask
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings import Camera, Recording
+from d2_plugin.recordings.images import shrink_image
 
 GRID = (16, 12)
-"""Pixels across and down at which a picture is asked who else sees it."""
+"""Pixels across and down at which an image is asked who else sees it."""
 
 KNOWN_DEPTHS = 9
 """Depths of each of those pixels where the depth of the scene is known."""
@@ -28,18 +28,18 @@ ANY_RANGE = (0.05, 1000.0)
 """Depths tried where nothing is known about the scene, in distances between the two cameras that are farthest apart."""
 
 ENOUGH_POINTS = 10
-"""Sparse points that a camera must see to tell the depths of its picture."""
+"""Sparse points that a camera must see to tell the depths of its image."""
 
 TEXTURE_PIXELS = 320 * 180
-"""Texture is measured in pictures that were made smaller until they have at most this many pixels."""
+"""Texture is measured in images that were made smaller until they have at most this many pixels."""
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """What the cameras of a rig see of each other's pictures."""
+    """What the cameras of a rig see of each other's images."""
 
     shares: tuple[float, ...]
-    """Of each camera's picture, the part that some other camera sees at an angle that can be matched, 0..1."""
+    """Of each camera's image, the part that some other camera sees at an angle that can be matched, 0..1."""
     angles: tuple[float, ...]
     """Of each camera that shares anything, the angle to the one it shares most with, degrees."""
     depth_known: bool
@@ -54,7 +54,7 @@ def measure_overlap(
     depth_range: tuple[float, float] | None = None,
     points: np.ndarray | None = None,
 ) -> Overlap:
-    """Who sees what of whose picture; occlusion is not known and left out of account.
+    """Who sees what of whose image; occlusion is not known and left out of account.
 
     Args:
         cameras: the cameras that would be matched, at least two that stand apart.
@@ -79,20 +79,20 @@ def measure_overlap(
     return Overlap(tuple(shares), tuple(angles), known)
 
 
-def measure_texture(capture: Capture, cameras: Sequence[str], settings: StereoSettings) -> tuple[float, ...]:
-    """Share of each camera's pictures with enough texture to match, by the test of the stereo filter, 0..1.
+def measure_texture(recording: Recording, cameras: Sequence[str], settings: StereoSettings) -> tuple[float, ...]:
+    """Share of each camera's images with enough texture to match, by the test of the stereo filter, 0..1.
 
     The first and the last frame are looked at, made smaller: a window then covers more of the scene, so the share is
     rather too high than too low.
     """
-    frames = sorted({capture.frames[0], capture.frames[-1]})
-    return tuple(float(np.mean([_textured(capture.image(name, f), settings) for f in frames])) for name in cameras)
+    frames = sorted({recording.frames[0], recording.frames[-1]})
+    return tuple(float(np.mean([_textured(recording.image(name, f), settings) for f in frames])) for name in cameras)
 
 
-def _textured(picture: np.ndarray, settings: StereoSettings) -> float:
-    height, width = picture.shape[:2]
+def _textured(image: np.ndarray, settings: StereoSettings) -> float:
+    height, width = image.shape[:2]
     factor = math.ceil(math.sqrt(height * width / TEXTURE_PIXELS))
-    small = shrink_picture(picture, factor) if factor > 1 else picture
+    small = shrink_image(image, factor) if factor > 1 else image
     return float(texture_mask(gray(small), settings).mean())
 
 
@@ -102,7 +102,7 @@ def _depths(
     depth_range: tuple[float, float] | None,
     points: np.ndarray | None,
 ) -> np.ndarray | None:
-    """Depths [D] at which the things in a camera's picture lie, or None if they are unknown."""
+    """Depths [D] at which the things in a camera's image lie, or None if they are unknown."""
     if depth_range is None and points is not None:
         visible = _visible_depths(camera, points)
         if visible.size >= ENOUGH_POINTS:

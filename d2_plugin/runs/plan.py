@@ -1,4 +1,4 @@
-"""What a capture needs and what is left out, each decision with the measurement behind it."""
+"""What a recording needs and what is left out, each decision with the measurement behind it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from d2_plugin.captures import Capture, MonoKind
-from d2_plugin.captures.checks.exposure import FEWEST, relative_exposures
-from d2_plugin.captures.readers.colmap_model import find_model, read_points
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.depth_on_disk import SensorDepth, find_depth_on_disk
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.settings import NO_MATCHER
+from d2_plugin.recordings import MonoKind, Recording
+from d2_plugin.recordings.checks.exposure import FEWEST, relative_exposures
+from d2_plugin.recordings.readers.colmap_model import find_model, read_points
 from d2_plugin.runs.overlap import Overlap, measure_overlap, measure_texture
 
 CHANGED = 12 / 255
@@ -23,10 +23,10 @@ MOVING_SHARE = 1e-3
 """A camera sees motion when more than this share of its pixels has changed."""
 
 MIN_OVERLAP = 0.02
-"""Cameras overlap when at least one of them shares more than this part of its picture with another."""
+"""Cameras overlap when at least one of them shares more than this part of its image with another."""
 
 MIN_TEXTURE = 0.02
-"""Pictures have texture when at least one camera finds it in more than this part of them."""
+"""Images have texture when at least one camera finds it in more than this part of them."""
 
 DIFFERENT_GAIN = 0.05
 """Exposures differ when a camera's gain in a channel is off the mean by more than this share, and by more than three
@@ -46,10 +46,10 @@ class Decision:
 
 @dataclass(frozen=True)
 class ScenePlan:
-    """The decisions for one capture and its training cameras."""
+    """The decisions for one recording and its training cameras."""
 
     measured: tuple[Decision, ...]
-    """Taken by measurement: temporal, sensor (where one lies beside the pictures), stereo."""
+    """Taken by measurement: temporal, sensor (where one lies beside the images), stereo."""
     mono_source: str | None = None
     """Where monocular depth comes from, or None where there is none."""
     mono_kind: MonoKind | None = None
@@ -101,49 +101,49 @@ class ScenePlan:
 
 
 def plan_scene(
-    capture: Capture,
+    recording: Recording,
     cameras: Sequence[str],
     mono_source: str | None,
     settings: PriorSettings | None = None,
     points: np.ndarray | None = None,
 ) -> ScenePlan:
-    """Decide for `capture` trained with `cameras`.
+    """Decide for `recording` trained with `cameras`.
 
     Args:
-        capture: the recording.
+        recording: the recording.
         cameras: names of the training cameras.
         mono_source: says where monocular depth comes from; None where there is none.
         settings: of the prior builder; its stereo's angles and texture decide what can be matched.
-        points: surface points [P, 3], world; those of the capture's own COLMAP model where None.
+        points: surface points [P, 3], world; those of the recording's own COLMAP model where None.
     """
     settings = settings or PriorSettings()
-    kind = settings.mono_kind if settings.mono_onnx else capture.mono_kind
-    decisions = (_temporal(capture, cameras), *_geometric(capture, cameras, settings, points))
+    kind = settings.mono_kind if settings.mono_onnx else recording.mono_kind
+    decisions = (_temporal(recording, cameras), *_geometric(recording, cameras, settings, points))
     return ScenePlan(decisions, mono_source, kind)
 
 
-def plan_text(capture: Capture, train_cameras: Sequence[str], plan: ScenePlan) -> str:
-    """What a capture is and what is decided for it, one line each: what `d2 plan` prints."""
-    sizes = sorted({(camera.width, camera.height) for camera in capture.cameras.values()})
-    first, last = capture.frames[0], capture.frames[-1]
+def plan_text(recording: Recording, train_cameras: Sequence[str], plan: ScenePlan) -> str:
+    """What a recording is and what is decided for it, one line each: what `d2 plan` prints."""
+    sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
+    first, last = recording.frames[0], recording.frames[-1]
     about = {
-        "layout": capture.layout,
-        "cameras": f"{len(capture.cameras)} ({' '.join(capture.cameras)}); training on {' '.join(train_cameras)}",
-        "frames": f"{len(capture.frames)} ({first} to {last}) at {capture.fps:g} per second"
-        if len(capture.frames) > 1
+        "layout": recording.layout,
+        "cameras": f"{len(recording.cameras)} ({' '.join(recording.cameras)}); training on {' '.join(train_cameras)}",
+        "frames": f"{len(recording.frames)} ({first} to {last}) at {recording.fps:g} per second"
+        if len(recording.frames) > 1
         else f"1 ({first})",
-        "pictures": ", ".join(f"{width}x{height}" for width, height in sizes) + " pixels",
+        "images": ", ".join(f"{width}x{height}" for width, height in sizes) + " pixels",
     }
     lines = [f"{name:>9}  {said}" for name, said in about.items()]
-    lines += [f"{'note':>9}  {note}" for note in capture.notes]
+    lines += [f"{'note':>9}  {note}" for note in recording.notes]
     lines += [f"{'use' if d.use else 'leave out':>9}  {d.name:12} {d.reason}" for d in plan.decisions]
     return "\n".join(lines)
 
 
-def _temporal(capture: Capture, cameras: Sequence[str]) -> Decision:
-    if len(capture.frames) == 1:
+def _temporal(recording: Recording, cameras: Sequence[str]) -> Decision:
+    if len(recording.frames) == 1:
         return Decision("temporal", False, "one instant")
-    share = max(changed_share(capture, camera) for camera in cameras)
+    share = max(changed_share(recording, camera) for camera in cameras)
     moves = share > MOVING_SHARE
     return Decision(
         "temporal", moves, f"{'' if moves else 'no '}motion: up to {share:.2%} of a camera's pixels change over time"
@@ -151,54 +151,58 @@ def _temporal(capture: Capture, cameras: Sequence[str]) -> Decision:
 
 
 def _geometric(
-    capture: Capture, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None
+    recording: Recording, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None
 ) -> tuple[Decision, ...]:
     """Sensor and stereo: depth on disk, from a sensor or COLMAP, is used first."""
-    found = find_depth_on_disk(capture, cameras, settings.stereo)
+    found = find_depth_on_disk(recording, cameras, settings.stereo)
     if found is not None and found.name == SensorDepth.name:
         reason = "a sensor measured the depth: nothing is matched"
         instead = 'the sensor is taken first: choose a matcher, such as stereo.matcher = "patchmatch" in [priors]'
         return Decision("sensor", True, found.about), Decision("stereo", False, reason, instead)
     if found is not None:
         return (Decision("stereo", True, found.about),)
-    stereo = _stereo(capture, cameras, settings, points)
+    stereo = _stereo(recording, cameras, settings, points)
     folder = settings.stereo.folder or "depth"
-    if capture.path is None or not (capture.path / folder / "depth.json").is_file():
+    if recording.path is None or not (recording.path / folder / "depth.json").is_file():
         return (stereo,)
     reason = f"{folder}/ does not serve every training camera, or the settings name another source"
     return Decision("sensor", False, reason), stereo
 
 
-def _stereo(capture: Capture, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None) -> Decision:
+def _stereo(
+    recording: Recording, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None
+) -> Decision:
     if len(cameras) < 2:
         return Decision("stereo", False, "one training camera", "it takes a second training camera")
     if settings.stereo.matcher == NO_MATCHER:
         return Decision("stereo", False, "the settings of the priors say so", "the settings of the priors rule it out")
-    calibrations = [capture.cameras[name] for name in cameras]
+    calibrations = [recording.cameras[name] for name in cameras]
     if np.ptp(np.stack([camera.centre for camera in calibrations]), axis=0).max() == 0:
         return Decision("stereo", False, "all training cameras stand at one point", "it takes cameras that stand apart")
-    points = _own_points(capture) if points is None else points
+    points = _own_points(recording) if points is None else points
     seen = measure_overlap(calibrations, settings.stereo, depth_range=settings.depth_range, points=points)
-    texture = measure_texture(capture, cameras, settings.stereo)
+    texture = measure_texture(recording, cameras, settings.stereo)
     overlap, textured = max(seen.shares) > MIN_OVERLAP, max(texture) > MIN_TEXTURE
     lacking = "" if overlap and textured else f"no {'texture' if overlap else 'overlap'}: "
     figures = f"{len(cameras)} training cameras, {_in_words(seen)}, {np.mean(texture):.0%} textured"
     return Decision("stereo", overlap and textured, lacking + figures)
 
 
-def appearance_decision(capture: Capture, cameras: Sequence[str], positions: np.ndarray, times: np.ndarray) -> Decision:
+def appearance_decision(
+    recording: Recording, cameras: Sequence[str], positions: np.ndarray, times: np.ndarray
+) -> Decision:
     """Whether each training camera learns a change of colour: only where their exposures differ.
 
     Args:
-        capture: the recording.
+        recording: the recording.
         cameras: names of the training cameras.
         positions, times: triangulated points [P, 3] and the seconds at which each was seen.
     """
     if len(cameras) < 2:
         return Decision("appearance", False, "one training camera", "it takes a second training camera")
-    if set(cameras) <= capture.exposures.keys():
-        return _measured_at_import(capture, cameras)
-    found = relative_exposures(capture, cameras, positions, times)
+    if set(cameras) <= recording.exposures.keys():
+        return _measured_at_import(recording, cameras)
+    found = relative_exposures(recording, cameras, positions, times)
     if found is None:
         return Decision("appearance", False, f"exposures not known: a camera shares fewer than {FEWEST} points")
     gain, error = found.largest
@@ -208,10 +212,10 @@ def appearance_decision(capture: Capture, cameras: Sequence[str], positions: np.
     return Decision("appearance", differ, f"the cameras' exposures {agree}: {figures}")
 
 
-def _measured_at_import(capture: Capture, cameras: Sequence[str]) -> Decision:
+def _measured_at_import(recording: Recording, cameras: Sequence[str]) -> Decision:
     """The decision by the gains that the import of the videos found."""
-    gains = np.log([capture.exposures[name].gain for name in cameras])
-    errors = np.array([capture.exposures[name].error for name in cameras])
+    gains = np.log([recording.exposures[name].gain for name in cameras])
+    errors = np.array([recording.exposures[name].error for name in cameras])
     off = np.abs(gains - gains.mean(0))
     worst = np.unravel_index(off.argmax(), off.shape)
     gain, error = float(off[worst]), float(errors[worst])
@@ -221,25 +225,25 @@ def _measured_at_import(capture: Capture, cameras: Sequence[str]) -> Decision:
 
 
 def _in_words(seen: Overlap) -> str:
-    share = f"{np.mean(seen.shares):.0%} of each picture seen by another"
+    share = f"{np.mean(seen.shares):.0%} of each image seen by another"
     angles = sorted({round(angle) for angle in seen.angles})
     apart = f", {angles[0]} to {angles[-1]} degrees apart" if len(angles) > 1 else ""
     apart = f", {angles[0]} degrees apart" if len(angles) == 1 else apart
     return f"{share}{apart}" if seen.depth_known else f"at most {share} (depths unknown){apart}"
 
 
-def _own_points(capture: Capture) -> np.ndarray | None:
-    """The sparse points of a capture that is a COLMAP model, [P, 3], or None."""
-    model = find_model(capture.path) if capture.layout == "colmap" and capture.path is not None else None
+def _own_points(recording: Recording) -> np.ndarray | None:
+    """The sparse points of a recording that is a COLMAP model, [P, 3], or None."""
+    model = find_model(recording.path) if recording.layout == "colmap" and recording.path is not None else None
     return None if model is None else read_points(model).positions
 
 
-def changed_share(capture: Capture, camera: str, samples: int = 5) -> float:
+def changed_share(recording: Recording, camera: str, samples: int = 5) -> float:
     """Largest share of a camera's pixels that differ from the first frame, over a few frames spread in time."""
-    chosen = np.unique(np.linspace(0, len(capture.frames) - 1, samples).round().astype(int))
-    first = capture.image(camera, capture.frames[0]).astype(np.int16)
+    chosen = np.unique(np.linspace(0, len(recording.frames) - 1, samples).round().astype(int))
+    first = recording.image(camera, recording.frames[0]).astype(np.int16)
     shares = [
-        np.mean(np.abs(capture.image(camera, capture.frames[i]).astype(np.int16) - first).max(-1) > CHANGED * 255)
+        np.mean(np.abs(recording.image(camera, recording.frames[i]).astype(np.int16) - first).max(-1) > CHANGED * 255)
         for i in chosen[1:]
     ]
     return float(max(shares))

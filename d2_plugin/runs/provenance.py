@@ -78,8 +78,8 @@ def about(run: Run, trainer: Any) -> dict[str, Any]:
         "clocks": None if getattr(trainer.model, "clocks", None) is None else trainer.model.clocks.in_frames(),
         "prior": run.prior,
         "plan": scene.plan.as_dict(),
-        "capture": scene.capture.name,
-        "mono_emulated": scene.capture.mono_emulated,
-        "notes": list(scene.capture.notes),
+        "recording": scene.recording.name,
+        "mono_emulated": scene.recording.mono_emulated,
+        "notes": list(scene.recording.notes),
         "made": circumstances(),
     }

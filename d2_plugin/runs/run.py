@@ -1,4 +1,4 @@
-"""One run from a capture to a held-out score: plan, points, priors, training, evaluation, in one resumable folder."""
+"""One run from a recording to a held-out score: plan, points, priors, training, evaluation, in one resumable folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from d2_plugin.durable import remove_leftovers, write_table, write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.plugin import D2Hooks
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.prior.alongside import OPEN_BY, PriorAlongside, alongside
@@ -35,6 +34,7 @@ from d2_plugin.runs.start import (
     scene_extent,
     triangulated_points,
 )
+from d2_plugin.store.store import PriorStore
 from d2_plugin.values import checked_arguments
 
 CHECKPOINTS = 10
@@ -42,7 +42,7 @@ CHECKPOINTS = 10
 
 
 class Run:
-    """A run folder: run.json (settings), points.npz, priors/, checkpoint.pt, metrics.json, pictures/."""
+    """A run folder: run.json (settings), points.npz, priors/, checkpoint.pt, metrics.json, images/."""
 
     @checked_arguments
     def __init__(self, settings: RunSettings, folder: Path, guidance: Guidance | None = None) -> None:
@@ -127,11 +127,11 @@ class Run:
                 self._finish_prior(told)
             self.retired = {} if trainer.d2 is None else dict(trainer.d2.retired)
 
-    def evaluate(self, pictures: bool = True) -> dict[str, Any]:
+    def evaluate(self, images: bool = True) -> dict[str, Any]:
         """Score every held-out camera at every frame; returns the metrics.
 
         Writes metrics.json (per view, per frame, per camera, mean), the same as tables in metrics.md and metrics.tex,
-        and pictures/.
+        and images/.
         """
         from d2_plugin.runs.evaluation import evaluate_scene
         from d2_plugin.runs.tables import write_tables
@@ -139,7 +139,7 @@ class Run:
         with self._writing():
             trainer = self.trained()
             with self._timed("eval"):
-                shown = self.folder / "pictures" if pictures else None
+                shown = self.folder / "images" if images else None
                 scores = evaluate_scene(trainer.model, self.scene, self.settings.device, shown)
             metrics = scores | about(self, trainer)
             write_tables(metrics, self.folder)
@@ -150,8 +150,8 @@ class Run:
         """One 3DGS PLY per frame under ply/; a background is left out, for which it has no place."""
         from d2_plugin.runs.gaussian_ply import write_frames
 
-        capture, camera = self.scene.capture, self.scene.train_cameras[0]
-        views = [make_view(capture, camera, frame, self.settings.device) for frame in capture.frames]
+        recording, camera = self.scene.recording, self.scene.train_cameras[0]
+        views = [make_view(recording, camera, frame, self.settings.device) for frame in recording.frames]
         with self._writing():
             return write_frames(self.trained().model, views, self.folder / "ply")
 
@@ -169,31 +169,31 @@ class Run:
         """The triangulated points, kept in points.npz."""
         path = self.folder / "points.npz"
         if not path.is_file():
-            triangulated_points(self.scene.capture, self.scene.train_cameras).save(path)
+            triangulated_points(self.scene.recording, self.scene.train_cameras).save(path)
         return TimedPoints.load(path)
 
     def _trainer(self, triangulated: TimedPoints, attach: bool = True) -> Any:
         """A new trainer of the backbone, with hooks where the run has some and `attach` allows it."""
         backbone: Any = registry.load(registry.BACKBONES, self.settings.backbone)
         self.scene = self.scene.with_points(triangulated, self.settings)
-        capture, cameras = self.scene.capture, self.scene.train_cameras
-        extent = scene_extent(capture, cameras, triangulated.positions)
+        recording, cameras = self.scene.recording, self.scene.train_cameras
+        extent = scene_extent(recording, cameras, triangulated.positions)
         if self.guidance is not None and attach:
             triangulated = self.guidance.start(self.scene, triangulated, self.priors)
-        start = initial_points(capture, cameras, triangulated, extent, self.settings.seed)
+        start = initial_points(recording, cameras, triangulated, extent, self.settings.seed)
         model = backbone.create(
             *start.tensors(self.settings.device),
             extent=extent.radius,
-            duration=capture.seconds(capture.frames[-1]),
+            duration=recording.seconds(recording.frames[-1]),
             temporal=self.scene.plan.uses("temporal"),
             settings=(self._needed() if attach else {}) | dict(self.settings.overrides.get("backbone", {})),
         )
-        begin_with_exposures(model, capture, cameras, self.scene.test_cameras)
+        begin_with_exposures(model, recording, cameras, self.scene.test_cameras)
         training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
         weight = self.settings.background_weight
-        pictures = TrainingFrames(capture, cameras, self.settings.device, background_weight=weight)
-        trainer = backbone.Trainer(model, pictures, training, self._attach if attach and self.uses_prior else None)
-        pictures.awaited = self._building  # only now: what a model begins with needs no prior
+        images = TrainingFrames(recording, cameras, self.settings.device, background_weight=weight)
+        trainer = backbone.Trainer(model, images, training, self._attach if attach and self.uses_prior else None)
+        images.awaited = self._building  # only now: what a model begins with needs no prior
         return trainer
 
     def _needed(self) -> dict[str, Any]:
@@ -249,7 +249,7 @@ class Run:
             yield
             return
         with only_writer(self.folder):
-            for folder in (self.folder, self.folder / "pictures", self.folder / "ply"):
+            for folder in (self.folder, self.folder / "images", self.folder / "ply"):
                 remove_leftovers(folder, below=False)
             self._writes = True
             try:

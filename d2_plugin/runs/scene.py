@@ -1,4 +1,4 @@
-"""A capture with its split into training and test cameras, and the plan for it."""
+"""A recording with its split into training and test cameras, and the plan for it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from d2_plugin.captures import Capture, open_capture
-from d2_plugin.captures.checks.calibrated import check_capture
-from d2_plugin.captures.checks.masked import check_background_weight
-from d2_plugin.captures.checks.memory import check_memory
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks import Hook
+from d2_plugin.recordings import Recording, open_recording
+from d2_plugin.recordings.cameras.check import check_recording
+from d2_plugin.recordings.checks.masked import check_background_weight
+from d2_plugin.recordings.checks.memory import check_memory
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
 from d2_plugin.runs.saved.kinds import RUN
 from d2_plugin.runs.settings import RunSettings, prior_settings
@@ -24,31 +24,35 @@ from d2_plugin.values import shown
 class Scene:
     """What a run is about: the recording, who trains and who tests, and what is left out."""
 
-    capture: Capture
+    recording: Recording
     train_cameras: tuple[str, ...]
     test_cameras: tuple[str, ...]
     plan: ScenePlan
 
     @classmethod
     def open(cls, settings: RunSettings) -> Scene:
-        """Open the capture that `settings` name, split its cameras, and measure what it needs.
+        """Open the recording that `settings` name, split its cameras, and measure what it needs.
 
         Where training and test cameras are both named, as a camera preset does, only those are read and checked: a
-        preset passes over cameras without calibration or pictures, so the run must not refuse them.
+        preset passes over cameras without calibration or images, so the run must not refuse them.
         """
         test = settings.test_cameras
         named = None if test is None else dict.fromkeys((*settings.train_cameras, *test))
-        capture = open_capture(settings.capture, cameras=named, frames=settings.frames, downscale=settings.downscale)
-        train, test = _split(capture, settings)
-        check_memory(capture, train)
-        check_background_weight(capture, train, settings.background_weight)
-        capture = replace(capture, notes=(*capture.notes, *check_capture(capture, (*train, *test), scored=test)))
-        plan = plan_scene(capture, train, _mono_source(capture, settings), prior_settings(settings))
-        return cls(capture, train, test, plan.override(**settings.overrides.get("plan", {})))
+        recording = open_recording(
+            settings.recording, cameras=named, frames=settings.frames, downscale=settings.downscale
+        )
+        train, test = _split(recording, settings)
+        check_memory(recording, train)
+        check_background_weight(recording, train, settings.background_weight)
+        recording = replace(
+            recording, notes=(*recording.notes, *check_recording(recording, (*train, *test), scored=test))
+        )
+        plan = plan_scene(recording, train, _mono_source(recording, settings), prior_settings(settings))
+        return cls(recording, train, test, plan.override(**settings.overrides.get("plan", {})))
 
     def with_points(self, points: TimedPoints, settings: RunSettings) -> Scene:
         """The same scene with what triangulated points decide: whether the cameras' exposures differ."""
-        decision = appearance_decision(self.capture, self.train_cameras, points.positions, points.times)
+        decision = appearance_decision(self.recording, self.train_cameras, points.positions, points.times)
         plan = self.plan.with_decision(decision).override(**settings.overrides.get("plan", {}))
         return replace(self, plan=plan)
 
@@ -89,23 +93,23 @@ class Remembered:
         raise D2Error(f"this run is guided by '{self.found['name']}': continue it with the command that began it")
 
 
-def _split(capture: Capture, settings: RunSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _split(recording: Recording, settings: RunSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Training cameras as named, test cameras as named or all others."""
     test = settings.test_cameras
     if test is None:
-        test = tuple(name for name in capture.cameras if name not in settings.train_cameras)
+        test = tuple(name for name in recording.cameras if name not in settings.train_cameras)
     for name in (*settings.train_cameras, *test):
-        if name not in capture.cameras:
-            raise unknown_name("camera", name, capture.cameras)
+        if name not in recording.cameras:
+            raise unknown_name("camera", name, recording.cameras)
     both = sorted(set(settings.train_cameras) & set(test))
     if both:
         raise D2Error(f"camera {both[0]} is named for training and for test: leave it out of one")
     return settings.train_cameras, test
 
 
-def _mono_source(capture: Capture, settings: RunSettings) -> str | None:
+def _mono_source(recording: Recording, settings: RunSettings) -> str | None:
     if settings.mono_onnx:
         return f"ONNX model {Path(settings.mono_onnx).name}"
-    if capture.mono_kind is None:
+    if recording.mono_kind is None:
         return None
-    return f"{capture.mono_kind} maps on disk" + (" (emulated)" if capture.mono_emulated else "")
+    return f"{recording.mono_kind} maps on disk" + (" (emulated)" if recording.mono_emulated else "")

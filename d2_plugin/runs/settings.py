@@ -42,10 +42,10 @@ OVERRIDABLE = tuple(choice.name for choice in declared(PlanChoices))
 class RunSettings(Settings):
     """What is trained, on what, for how long. Two runs with equal settings are the same run."""
 
-    capture: Annotated[str, Positional()]
-    """Folder of the capture, or a file that describes it."""
+    recording: Annotated[str, Positional()]
+    """Folder of the recording, or a file that describes it."""
     train_cameras: tuple[str, ...]
-    """Cameras to train with, as the capture names them."""
+    """Cameras to train with, as the recording names them."""
     backbone: str = "yang4d"
     """Name of a registered backbone."""
     iterations: Annotated[int, Range(1, 10**9, unit="steps")] = 3000
@@ -55,7 +55,7 @@ class RunSettings(Settings):
     seed: Seed = 0
     """Seed of everything that is drawn at random."""
     downscale: Annotated[int, Range(1, 65_535)] = 1
-    """Make pictures this many times smaller along each side."""
+    """Make images this many times smaller along each side."""
     frames: tuple[Count, ...] | None = None
     """Numbers of the frames to use; all if not given."""
     test_cameras: tuple[str, ...] | None = None
@@ -71,7 +71,7 @@ class RunSettings(Settings):
     accept_empty_prior: bool = False
     """Train even where no view has a usable prior."""
     background_weight: Share = 1.0
-    """Weight in the photometric loss of pixels outside the capture's foreground masks; 1 looks at no mask, 0 learns the
+    """Photometric weight of pixels outside the recording's foreground masks; 1 looks at no mask, 0 learns the
     foreground alone."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the trainer runs."""
@@ -101,7 +101,7 @@ def check(settings: RunSettings) -> RunSettings:
         raise D2Error("--mono-onnx needs --mono-kind relative (inverse depth) or metric (depth): the file names none")
     _check_device(settings.device)
     _check_overrides(settings)
-    paths = ("capture", "mono_onnx", "priors")
+    paths = ("recording", "mono_onnx", "priors")
     absolute = {name: _absolute(path, name) for name in paths if (path := getattr(settings, name)) is not None}
     return replace(settings, **absolute)  # type: ignore[arg-type]  # a run is found again from any folder
 

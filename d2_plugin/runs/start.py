@@ -1,4 +1,4 @@
-"""From a capture to what a trainer takes: views, pictures, the points that Gaussians start from."""
+"""From a recording to what a trainer takes: views, images, the points that Gaussians start from."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from d2_plugin.captures import Camera, Capture
 from d2_plugin.durable import archive_problem, write
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.colmap.points import triangulate_frames
 from d2_plugin.protocol import View
+from d2_plugin.recordings import Camera, Recording
 
 POINTS_FORMAT = 1
 """Of points.npz."""
@@ -91,24 +91,24 @@ class TimedPoints:
         return positions, colors, times
 
 
-def make_view(capture: Capture, camera: str, frame: int, device: torch.device | str = "cpu") -> View:
+def make_view(recording: Recording, camera: str, frame: int, device: torch.device | str = "cpu") -> View:
     """The view of one camera at one frame; time is in seconds since the first frame, as this camera took it."""
-    calibration = capture.cameras[camera]
+    calibration = recording.cameras[camera]
     pose = torch.tensor(calibration.T_camera_world, dtype=torch.float32, device=device)
     intrinsics = torch.tensor(calibration.K, dtype=torch.float32, device=device)
-    time = capture.seconds(frame, camera)
+    time = recording.seconds(frame, camera)
     return View(camera, frame, time, pose, intrinsics, calibration.width, calibration.height)
 
 
-KEPT_PICTURES = 320 << 20
-"""Bytes of decoded pictures that training keeps: four cameras of 20 frames at 1352x1014. A longer recording takes no
+KEPT_IMAGES = 320 << 20
+"""Bytes of decoded images that training keeps: four cameras of 20 frames at 1352x1014. A longer recording takes no
 more memory than that; what it re-reads is a small part of a step at its size."""
 
 
-def begin_with_exposures(model: Any, capture: Capture, training: Sequence[str], held_out: Sequence[str]) -> None:
+def begin_with_exposures(model: Any, recording: Recording, training: Sequence[str], held_out: Sequence[str]) -> None:
     """Let a model that learns exposures begin with the gains that the import of the videos measured."""
     begin = getattr(getattr(model, "appearance", None), "start_from", None)
-    known = {name: one.gain for name, one in capture.exposures.items() if name in (*training, *held_out)}
+    known = {name: one.gain for name, one in recording.exposures.items() if name in (*training, *held_out)}
     if begin is not None and known:
         begin(known, training)
 
@@ -121,22 +121,22 @@ class Awaited(Protocol):
 
 
 class TrainingFrames:
-    """Views and pictures of the training cameras; decoded pictures are kept up to `keep_bytes`, the rest re-read."""
+    """Views and images of the training cameras; decoded images are kept up to `keep_bytes`, the rest re-read."""
 
     def __init__(
         self,
-        capture: Capture,
+        recording: Recording,
         cameras: Sequence[str],
         device: torch.device | str = "cpu",
-        keep_bytes: int = KEPT_PICTURES,
+        keep_bytes: int = KEPT_IMAGES,
         background_weight: float = 1.0,
     ) -> None:
-        self.capture, self.device, self.keep_bytes = capture, device, keep_bytes
+        self.recording, self.device, self.keep_bytes = recording, device, keep_bytes
         self.background_weight = background_weight
-        self._recorded = {camera: capture.recorded(camera) for camera in cameras}
-        self.views = [make_view(capture, camera, frame, device) for frame in capture.frames for camera in cameras]
+        self._recorded = {camera: recording.recorded(camera) for camera in cameras}
+        self.views = [make_view(recording, camera, frame, device) for frame in recording.frames for camera in cameras]
         self.awaited: Awaited | None = None
-        """What is built while these pictures are trained on, if anything is."""
+        """What is built while these images are trained on, if anything is."""
         self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
 
     def opened(self, step: int) -> int:
@@ -144,17 +144,17 @@ class TrainingFrames:
         return len(self.views) if self.awaited is None else self.awaited.opened(step)
 
     def image(self, index: int) -> Tensor:
-        """Picture [H, W, 3] in 0..1 of `views[index]`."""
-        return self.picture(index).float() / 255
+        """Image [H, W, 3] in 0..1 of `views[index]`."""
+        return self.image_bytes(index).float() / 255
 
-    def picture(self, index: int) -> Tensor:
+    def image_bytes(self, index: int) -> Tensor:
         """The same as it is kept: uint8, 0..255."""
         view = self.views[index]
         if self.awaited is not None:
             self.awaited.wait_for(view.frame)
         if index not in self._kept:
-            self._kept[index] = self.capture.image(view.camera, view.frame)
-            while len(self._kept) > 1 and sum(image.nbytes for image in self._kept.values()) > self.keep_bytes:
+            self._kept[index] = self.recording.image(view.camera, view.frame)
+            while len(self._kept) > 1 and sum(kept.nbytes for kept in self._kept.values()) > self.keep_bytes:
                 self._kept.popitem(last=False)
         else:
             self._kept.move_to_end(index)
@@ -164,7 +164,7 @@ class TrainingFrames:
         """How much each pixel [H, W] of `views[index]` counts: `background_weight` outside the foreground mask, 0 where
         nothing was recorded; None where all pixels count alike."""
         view = self.views[index]
-        mask = self.capture.mask(view.camera, view.frame) if self.background_weight < 1 else None
+        mask = self.recording.mask(view.camera, view.frame) if self.background_weight < 1 else None
         recorded = self._recorded[view.camera]
         if mask is None and recorded is None:
             return None
@@ -186,21 +186,21 @@ class Extent:
     """What learning rates and size limits of Gaussians are relative to."""
 
 
-def scene_extent(capture: Capture, cameras: Sequence[str], points: np.ndarray) -> Extent:
+def scene_extent(recording: Recording, cameras: Sequence[str], points: np.ndarray) -> Extent:
     """From triangulated points [P, 3] where there are at least ten, else from declared bounds, else from the rig.
 
     The radius is half the median depth: the spread of the cameras, which dense-rig code uses, says little about the
     scene when there are two of them.
     """
-    depths = [z for name in cameras for z in _depths(capture.cameras[name], points)]
+    depths = [z for name in cameras for z in _depths(recording.cameras[name], points)]
     if len(depths) >= 10:
         low, middle, high = np.percentile(depths, [1, 50, 99])
         return Extent(0.75 * float(low), 1.25 * float(high), 0.5 * float(middle))
-    bounds = [near_far for name in cameras if (near_far := capture.cameras[name].near_far) is not None]
+    bounds = [near_far for name in cameras if (near_far := recording.cameras[name].near_far) is not None]
     if bounds:
         near, far = min(b[0] for b in bounds), max(b[1] for b in bounds)
         return Extent(0.8 * near, 1.2 * far, 0.5 * float(np.sqrt(near * far)))
-    centres = np.stack([capture.cameras[name].centre for name in cameras])
+    centres = np.stack([recording.cameras[name].centre for name in cameras])
     spread = float(np.linalg.norm(centres - centres.mean(0), axis=1).max()) or 1.0
     return Extent(0.2 * spread, 20 * spread, 2 * spread)
 
@@ -211,7 +211,7 @@ def _depths(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 
 def initial_points(
-    capture: Capture,
+    recording: Recording,
     cameras: Sequence[str],
     triangulated: TimedPoints,
     extent: Extent,
@@ -220,12 +220,12 @@ def initial_points(
 ) -> TimedPoints:
     """Where Gaussians start: the triangulated points, filled up to `minimum` with random ones.
 
-    A random point lies on the ray of a random pixel of a random training picture, at a depth drawn uniformly in
+    A random point lies on the ray of a random pixel of a random training image, at a depth drawn uniformly in
     inverse depth between near and far, and takes the pixel's colour.
     """
     missing = max(minimum - len(triangulated), 0)
     rng = np.random.default_rng(seed)
-    fill = [_random_points(capture, camera, extent, n, rng) for camera, n in _shares(cameras, missing)]
+    fill = [_random_points(recording, camera, extent, n, rng) for camera, n in _shares(cameras, missing)]
     return TimedPoints.joined([triangulated, *fill])
 
 
@@ -233,28 +233,30 @@ def _shares(cameras: Sequence[str], count: int) -> list[tuple[str, int]]:
     return [(camera, len(range(i, count, len(cameras)))) for i, camera in enumerate(cameras)]
 
 
-def _random_points(capture: Capture, camera: str, extent: Extent, count: int, rng: np.random.Generator) -> TimedPoints:
-    calibration, frame = capture.cameras[camera], capture.frames[int(rng.integers(len(capture.frames)))]
+def _random_points(
+    recording: Recording, camera: str, extent: Extent, count: int, rng: np.random.Generator
+) -> TimedPoints:
+    calibration, frame = recording.cameras[camera], recording.frames[int(rng.integers(len(recording.frames)))]
     columns, rows = rng.integers(calibration.width, size=count), rng.integers(calibration.height, size=count)
     depth = 1 / rng.uniform(1 / extent.far, 1 / extent.near, count)
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(count)], -1)
     in_camera = pixels @ np.linalg.inv(calibration.K).T * depth[:, None]
     rotation, translation = calibration.T_camera_world[:3, :3], calibration.T_camera_world[:3, 3]
-    colors = capture.image(camera, frame)[rows, columns] / 255
-    times = rng.uniform(0, max(capture.seconds(capture.frames[-1]), 1e-9), count)
+    colors = recording.image(camera, frame)[rows, columns] / 255
+    times = rng.uniform(0, max(recording.seconds(recording.frames[-1]), 1e-9), count)
     return TimedPoints((in_camera - translation) @ rotation, colors, times)
 
 
-def triangulated_points(capture: Capture, cameras: Sequence[str], instants: int = 5) -> TimedPoints:
+def triangulated_points(recording: Recording, cameras: Sequence[str], instants: int = 5) -> TimedPoints:
     """Points triangulated with the known poses at up to `instants` frames spread over the recording.
 
     There are none for a single camera, or where pycolmap is not installed; the latter gives a warning.
     """
-    chosen = np.unique(np.linspace(0, len(capture.frames) - 1, instants).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(recording.frames) - 1, instants).round().astype(int))
     try:
-        found = triangulate_frames(capture, cameras, [capture.frames[i] for i in chosen])
+        found = triangulate_frames(recording, cameras, [recording.frames[i] for i in chosen])
     except MissingExtra as error:
         warnings.warn(f"{error}; Gaussians start from random points instead", stacklevel=2)
         return TimedPoints(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0))
-    times = np.array([capture.seconds(int(frame)) for frame in found.frames], dtype=float)
+    times = np.array([recording.seconds(int(frame)) for frame in found.frames], dtype=float)
     return TimedPoints(found.positions, found.colors, times)

@@ -19,10 +19,9 @@ from collections.abc import Callable, Iterator, Sequence
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import RasterSettings
-
-from .editing import EDITING, state_round_trip
-from .example import Check, Example
-from .reading import READING
+from d2_plugin.testing.editing import EDITING, state_round_trip
+from d2_plugin.testing.example import Check, Example
+from d2_plugin.testing.reading import READING
 
 __all__ = ["CHECKS", "ContractError", "Example", "check_backbone"]
 

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.protocol import Backbone, Points, Splats, View
-
-from .example import Check, Example, matrices, some_points, some_rows
+from d2_plugin.testing.example import Check, Example, matrices, some_points, some_rows
 
 PLACED = 0.5
 """Share of inserted Gaussians that must be where they were asked for: a deformation field cannot always be inverted."""

@@ -8,8 +8,7 @@ import torch
 
 from d2_plugin.protocol import Splats, View
 from d2_plugin.rasterizer import rasterize
-
-from .example import Check, Example, matrices, some_points, some_rows
+from d2_plugin.testing.example import Check, Example, matrices, some_points, some_rows
 
 
 def _views(example: Example) -> Iterator[str]:

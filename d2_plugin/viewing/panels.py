@@ -1,4 +1,4 @@
-"""The kinds of picture that can be shown of one view, in one table: what each needs, and how it is drawn."""
+"""The kinds of image that can be shown of one view, in one table: what each needs, and how it is drawn."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.pictures import opencv
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.sheet import LABEL_COLORS, SURE, UNKNOWN, UNSURE, label_colors, sigma_colors
 from d2_plugin.protocol import DepthPrior, Label, View
+from d2_plugin.recordings.images import opencv
 from d2_plugin.runs.drawing import Panel, color_scale, colorize
 from d2_plugin.viewing.look import Look, gaussians_per_pixel, look
 from d2_plugin.viewing.paths import Lens
@@ -33,7 +33,7 @@ class Shot:
     subject: Subject
     view: View
     depths: Scale
-    """Depths at both ends of the colours: the same for all pictures of a film, or it would flicker."""
+    """Depths at both ends of the colours: the same for all images of a video, or it would flicker."""
 
     @cached_property
     def look(self) -> Look:
@@ -42,9 +42,9 @@ class Shot:
 
     @cached_property
     def truth(self) -> np.ndarray:
-        """The recorded picture, RGB uint8 [H, W, 3] at the view's size."""
-        picture = self.subject.capture.image(self.view.camera, self.view.frame)
-        return fitted(picture, self.view.width, self.view.height)
+        """The recorded image, RGB uint8 [H, W, 3] at the view's size."""
+        image = self.subject.recording.image(self.view.camera, self.view.frame)
+        return fitted(image, self.view.width, self.view.height)
 
     @cached_property
     def prior(self) -> DepthPrior | None:
@@ -55,7 +55,7 @@ class Shot:
 
 
 class Kind(NamedTuple):
-    """One kind of picture."""
+    """One kind of image."""
 
     draw: Callable[[Shot], Panel]
     about: str
@@ -69,7 +69,7 @@ def rgb(shot: Shot) -> Panel:
 
 
 def truth(shot: Shot) -> Panel:
-    """The recorded picture."""
+    """The recorded image."""
     return Panel("recorded", shot.truth)
 
 
@@ -80,14 +80,14 @@ def depth(shot: Shot) -> Panel:
 
 def true_depth(shot: Shot) -> Panel:
     """The recording's true depth; black where it is unknown."""
-    found = shot.subject.capture.depth(shot.view.camera, shot.view.frame)
+    found = shot.subject.recording.depth(shot.view.camera, shot.view.frame)
     size = shot.view.width, shot.view.height
     exact = np.zeros(size[::-1], np.float32) if found is None else fitted(found, *size, nearest=True)
     return _depth_panel("true depth", exact, shot.depths)
 
 
 def error(shot: Shot) -> Panel:
-    """Absolute error of the render against the recorded picture."""
+    """Absolute error of the render against the recorded image."""
     difference = np.abs(shot.look.color.numpy() - shot.truth / np.float32(255))
     scale = color_scale("inferno")
     noise = float(np.mean(difference**2))
@@ -115,18 +115,18 @@ def prior(shot: Shot) -> Panel:
 
 def sigma(shot: Shot) -> Panel:
     """How wrong the prior says it may be."""
-    picture = _of_prior(shot, lambda found: sigma_colors(_sigma_of(found), found.depth.numpy()))
+    image = _of_prior(shot, lambda found: sigma_colors(_sigma_of(found), found.depth.numpy()))
     rows = np.geomspace(SURE, UNSURE, 256, dtype=np.float32)[None]
     bar = sigma_colors(rows, np.ones_like(rows))[0]
-    return Panel(f"sigma {SURE:.1%}..{UNSURE:.0%}", picture, bar)
+    return Panel(f"sigma {SURE:.1%}..{UNSURE:.0%}", image, bar)
 
 
 def labels(shot: Shot) -> Panel:
     """What the prior knows about each pixel."""
-    picture = _of_prior(shot, lambda found: label_colors(found.labels.numpy()))
+    image = _of_prior(shot, lambda found: label_colors(found.labels.numpy()))
     shown = (Label.VERIFIED, Label.AGREED, Label.MONO, Label.FAR, Label.CONFLICT, Label.EMPTY)
     bar = np.array([LABEL_COLORS[label] for label in shown], np.uint8).repeat(64, axis=0)
-    return Panel("verified agreed mono far conflict empty", picture, bar)
+    return Panel("verified agreed mono far conflict empty", image, bar)
 
 
 KINDS = {
@@ -134,7 +134,7 @@ KINDS = {
     "depth": Kind(depth, "rendered depth"),
     "alpha": Kind(alpha, "accumulated opacity"),
     "count": Kind(count, "Gaussians per pixel"),
-    "truth": Kind(truth, "the recorded picture", "truth"),
+    "truth": Kind(truth, "the recorded image", "truth"),
     "error": Kind(error, "absolute error against it", "truth"),
     "true-depth": Kind(true_depth, "the recording's own depth", "truth"),
     "prior": Kind(prior, "the depth prior", "prior"),
@@ -145,13 +145,13 @@ KINDS = {
 
 
 def fitted(array: np.ndarray, width: int, height: int, nearest: bool = False) -> np.ndarray:
-    """A picture or map at another size, as `Lens.fitted` has it: scaled to fill, cut alike on both sides.
+    """An image or map at another size, as `Lens.fitted` has it: scaled to fill, cut alike on both sides.
 
     `nearest` picks one pixel instead of averaging several: for depths and labels, which have no mean across an edge.
     """
     if array.shape[:2] == (height, width):
         return array
-    cv2 = opencv("a picture of another size than the recording's")
+    cv2 = opencv("an image of another size than the recording's")
     scale = Lens(np.eye(3), array.shape[1], array.shape[0]).fitted(width, height).K[0, 0]
     whole = max(round(array.shape[1] * scale), width), max(round(array.shape[0] * scale), height)
     how = cv2.INTER_NEAREST if nearest else cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
@@ -169,25 +169,25 @@ def depth_scale(depths: Sequence[np.ndarray]) -> Scale:
     return float(low), float(high)
 
 
-def depth_picture(depth: np.ndarray, depths: Scale) -> np.ndarray:
+def depth_image(depth: np.ndarray, depths: Scale) -> np.ndarray:
     """RGB uint8 [H, W, 3], near is dark; black where nothing is known."""
     known = np.isfinite(depth) & (depth > 0)
-    picture = colorize(np.where(known, depth, 0), *depths, color_scale("viridis"))
-    return np.where(known[..., None], picture, np.uint8(0))
+    image = colorize(np.where(known, depth, 0), *depths, color_scale("viridis"))
+    return np.where(known[..., None], image, np.uint8(0))
 
 
-def as_bytes(picture: np.ndarray) -> np.ndarray:
-    """RGB uint8 of a picture in 0..1."""
-    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+def as_bytes(image: np.ndarray) -> np.ndarray:
+    """RGB uint8 of an image in 0..1."""
+    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
 def _depth_panel(title: str, depth: np.ndarray, depths: Scale) -> Panel:
     low, high = depths
-    return Panel(f"{title} {low:.3g}..{high:.3g}", depth_picture(depth, depths), color_scale("viridis"))
+    return Panel(f"{title} {low:.3g}..{high:.3g}", depth_image(depth, depths), color_scale("viridis"))
 
 
 def _of_prior(shot: Shot, draw: Callable[[DepthPrior], np.ndarray]) -> np.ndarray:
-    """A picture or map of the prior at the view's size."""
+    """An image or map of the prior at the view's size."""
     if shot.prior is None:
         raise D2Error(
             f"there is no depth prior of camera {shot.view.camera}, frame {shot.view.frame}: leave prior, sigma and "
@@ -200,4 +200,4 @@ def _sigma_of(found: DepthPrior) -> np.ndarray:
     return np.full(found.depth.shape, np.inf, np.float32) if found.sigma is None else found.sigma.numpy()
 
 
-__all__ = ["KINDS", "UNKNOWN", "Kind", "Scale", "Shot", "as_bytes", "depth_picture", "depth_scale", "fitted"]
+__all__ = ["KINDS", "UNKNOWN", "Kind", "Scale", "Shot", "as_bytes", "depth_image", "depth_scale", "fitted"]

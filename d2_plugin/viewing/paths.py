@@ -1,4 +1,4 @@
-"""Camera paths: a camera's pose and lens for each picture of a film, made from the cameras of a recording.
+"""Camera paths: a camera's pose and lens for each image of a video, made from the cameras of a recording.
 
 All poses are `T_camera_world` [4, 4] float64 in OpenCV axes. Two to four cameras cover a small part of the sphere
 around a scene, and what they did not see cannot be shown: orbit and spiral stay inside the angle that they span.
@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures import Camera
-from d2_plugin.captures.rotations import quaternion_of_rotation, rotation_of_quaternion, rotation_of_vector
+from d2_plugin.recordings import Camera
+from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation, rotation_of_quaternion, rotation_of_vector
 
 ALL_AROUND = 270.0
 """Cameras that span more than this many degrees stand all around: an orbit is then a whole turn."""
@@ -28,7 +28,7 @@ class Lens(NamedTuple):
     height: int
 
     def fitted(self, width: int, height: int) -> Lens:
-        """The lens for pictures of another size: scaled to fill them, cut alike on both sides, never stretched."""
+        """The lens for images of another size: scaled to fill them, cut alike on both sides, never stretched."""
         if (width, height) == (self.width, self.height):
             return self
         scale = max(width / self.width, height / self.height)

@@ -1,4 +1,4 @@
-"""A recording where none is at hand: from a prior store, which keeps the pictures, or from the views of a trainer."""
+"""A recording where none is at hand: from a prior store, which keeps the images, or from the views of a trainer."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.captures import Camera, Capture
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import View
+from d2_plugin.recordings import Camera, Recording
+from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.subject import Subject
 
 UNSEEN = 60
-"""Grey of a picture that nobody kept."""
+"""Grey of an image that nobody kept."""
 
 
 @dataclass(frozen=True)
-class KeptPictures:
-    """Pictures as the depth prior kept them; grey where there is none."""
+class KeptImages:
+    """Images as the depth prior kept them; grey where there is none."""
 
     cameras: dict[str, Camera]
     store: Any = None
@@ -44,16 +44,16 @@ class KeptPictures:
 
 
 def subject_of_store(store: PriorStore, fps: float = 30.0) -> Subject:
-    """The cameras that a prior was built for, with the pictures that it kept.
+    """The cameras that a prior was built for, with the images that it kept.
 
     Raises:
         D2Error: the store is empty, or does not say where its cameras stood.
     """
     found = {name: camera for name in store.cameras if (camera := _stored_camera(store, name)) is not None}
     if not found:
-        raise D2Error(f"{store.path} has no prior that says where its camera stood: give --capture, or build it anew")
-    capture = Capture(store.path.name, found, store.frames, fps, KeptPictures(found, store))
-    return Subject(store.path.name, capture, tuple(found), store=store)
+        raise D2Error(f"{store.path} has no prior that says where its camera stood: give --recording, or build it anew")
+    recording = Recording(store.path.name, found, store.frames, fps, KeptImages(found, store))
+    return Subject(store.path.name, recording, tuple(found), store=store)
 
 
 def _stored_camera(store: PriorStore, name: str) -> Camera | None:
@@ -73,10 +73,10 @@ def subject_of_views(views: Sequence[View], backbone: Any, store: Any, name: str
     first, last = times[frames[0]], times[frames[-1]]
     span = last - first
     fps = (frames[-1] - frames[0]) / span if len(frames) > 1 and span > 0 else 1.0
-    capture = Capture(name, cameras, frames, fps, KeptPictures(cameras, store))
+    recording = Recording(name, cameras, frames, fps, KeptImages(cameras, store))
     device = str(views[0].T_camera_world.device)
     kept = store if isinstance(store, PriorStore) else None
-    return Subject(name, capture, tuple(cameras), (), backbone, kept, device=device, time_offset=first)
+    return Subject(name, recording, tuple(cameras), (), backbone, kept, device=device, time_offset=first)
 
 
 def _camera_of(view: View) -> Camera:

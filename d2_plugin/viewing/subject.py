@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from d2_plugin import registry
-from d2_plugin.captures import Camera, Capture
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import View
+from d2_plugin.recordings import Camera, Recording
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.start import TimedPoints
+from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.paths import Lens, Pose
 
 
@@ -25,7 +25,7 @@ class Subject:
     """One set of Gaussians, or none yet, and what belongs to it."""
 
     name: str
-    capture: Capture
+    recording: Recording
     train_cameras: tuple[str, ...]
     test_cameras: tuple[str, ...] = ()
     backbone: Any = None
@@ -46,16 +46,16 @@ class Subject:
     @property
     def training(self) -> list[Camera]:
         """The cameras that train."""
-        return [self.capture.cameras[name] for name in self.train_cameras]
+        return [self.recording.cameras[name] for name in self.train_cameras]
 
     @property
     def duration(self) -> float:
         """Seconds from the first frame to the last."""
-        return self.capture.seconds(self.capture.frames[-1])
+        return self.recording.seconds(self.recording.frames[-1])
 
     def frame_at(self, time: float) -> int:
         """The recorded frame that is nearest to an instant, in seconds."""
-        return min(self.capture.frames, key=lambda frame: abs(self.capture.seconds(frame) - time))
+        return min(self.recording.frames, key=lambda frame: abs(self.recording.seconds(frame) - time))
 
     def view(self, pose: Pose, time: float, size: tuple[int, int], camera: str = "") -> View:
         """The view of a pose at an instant; `camera` names the camera of the recording that it is, if it is one."""
@@ -90,7 +90,7 @@ def subject_of_run(folder: Path) -> Subject:
     note = "" if trained.step >= total else f"{folder.name} still trains: this is step {trained.step} of {total}"
     return Subject(
         folder.name,
-        run.scene.capture,
+        run.scene.recording,
         run.scene.train_cameras,
         run.scene.test_cameras,
         adapter(trained.model),
@@ -109,25 +109,25 @@ def _inserted_at(checkpoint: Path, count: int) -> Tensor | None:
     return found if found is not None and len(found) == count else None
 
 
-def subject_of_capture(capture: Capture) -> Subject:
+def subject_of_recording(recording: Recording) -> Subject:
     """A recording alone."""
-    return Subject(capture.name, capture, tuple(capture.cameras))
+    return Subject(recording.name, recording, tuple(recording.cameras))
 
 
 def with_priors(subject: Subject, folder: Path) -> Subject:
     """The same with the depth prior in `folder`, whose cameras are the training cameras."""
     store = PriorStore.open(folder)
-    unknown = [camera for camera in store.cameras if camera not in subject.capture.cameras]
+    unknown = [camera for camera in store.cameras if camera not in subject.recording.cameras]
     if unknown:
         raise D2Error(
-            f"{folder} has priors of camera {unknown[0]}, which {subject.capture.name} does not have: "
+            f"{folder} has priors of camera {unknown[0]}, which {subject.recording.name} does not have: "
             "give the recording that they were built for"
         )
     return replace(subject, store=store, train_cameras=store.cameras)
 
 
 def size_of(lens: Lens, width: int | None, height: int | None) -> tuple[int, int]:
-    """The size of a picture: as given, the other side in proportion, by default the lens's own."""
+    """The size of an image: as given, the other side in proportion, by default the lens's own."""
     if width is None and height is None:
         return lens.width, lens.height
     if height is None:

@@ -205,7 +205,7 @@ class TestEveryRepository:
 
 def saved(first: SimpleNamespace) -> object:
     """What the repository's checkpoint holds (for Deformable-3D, what it would have to)."""
-    params = first.gaussians.capture()
+    params = first.gaussians.recording()
     if hasattr(first, "deform"):
         return params, first.deform.deform.state_dict(), first.deform.optimizer.state_dict()
     return params

@@ -31,7 +31,7 @@ def camera(scene) -> dict:
     return inria_camera(scene.view)
 
 
-def test_pictures_are_contiguous(camera: dict, scene) -> None:
+def test_images_are_contiguous(camera: dict, scene) -> None:
     """A permuted one breaks `.view(-1)`, which trainers call."""
     raster = depth.GaussianRasterizer(depth.GaussianRasterizationSettings(**camera))
     given = {"means3D": scene.means, "opacities": scene.opacities[:, None], "means2D": torch.zeros(40, 3)}
@@ -111,17 +111,17 @@ class TestEx4DGS:
 
 
 class TestPackages:
-    def test_pictures_go_there_and_back(self, tmp_path: Path) -> None:
+    def test_images_go_there_and_back(self, tmp_path: Path) -> None:
         from PIL import Image
 
-        picture = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(0))
-        vision.save_image(picture, tmp_path / "a.png")
+        image = torch.rand(3, 5, 7, generator=torch.Generator().manual_seed(0))
+        vision.save_image(image, tmp_path / "a.png")
         again = vision.ToTensor()(Image.open(tmp_path / "a.png"))
-        torch.testing.assert_close(again, picture, atol=0.5 / 255 + 1e-6, rtol=0)
-        grid = vision.make_grid([picture, picture], nrow=2)
+        torch.testing.assert_close(again, image, atol=0.5 / 255 + 1e-6, rtol=0)
+        grid = vision.make_grid([image, image], nrow=2)
         assert grid.shape == (3, 5 + 4, 2 * (7 + 2) + 2)
-        assert torch.equal(grid[:, 2:7, 2:9], picture)
-        assert vision.resize(picture, (10, 14)).shape == (3, 10, 14)
+        assert torch.equal(grid[:, 2:7, 2:9], image)
+        assert vision.resize(image, (10, 14)).shape == (3, 10, 14)
 
     def test_a_python_configuration_lies_over_its_base(self, tmp_path: Path) -> None:
         (tmp_path / "base.py").write_text("A = dict(x=1, y=dict(z=2))\nB = 3\n")

@@ -1,4 +1,4 @@
-"""Who trains from an export finds the priors of its source: by the path of the pictures, or by the configuration."""
+"""Who trains from an export finds the priors of its source: by the path of the images, or by the configuration."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from stand_in_captures import smooth_capture
+from stand_in_recordings import smooth_recording
 
 from d2_plugin.adapters.inria import InriaAdapter, RenderedCamera
-from d2_plugin.captures.export.export import EXPORT_FILE, export_capture
-from d2_plugin.captures.export.ply import PointCloud
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.disk.exported import export_read, opened, renamed_by
-from d2_plugin.priors.frame import describe_capture
+from d2_plugin.priors.frame import describe_recording
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.store import PriorStore
+from d2_plugin.recordings.export.export import EXPORT_FILE, export_recording
+from d2_plugin.recordings.export.ply import PointCloud
+from d2_plugin.store.exported import export_read, opened, renamed_by
+from d2_plugin.store.store import PriorStore
 
 
 @pytest.fixture
 def exported(tmp_path: Path) -> SimpleNamespace:
-    """A capture, an export of it in which every camera and frame has another name, and a prior of the capture."""
-    capture = smooth_capture(("05", "07", "11"), frames=2, width=32, height=24)
+    """A recording, an export of it in which every camera and frame has another name, and a prior of the recording."""
+    recording = smooth_recording(("05", "07", "11"), frames=2, width=32, height=24)
     cloud = PointCloud(np.random.default_rng(0).random((200, 3)) + [0, 0, 2.0], np.full((200, 3), 0.5))
-    first = [*capture.cameras][:1]
-    folder = export_capture(capture, "colmap_frames", tmp_path / "data", test_cameras=first, cloud=cloud)
-    store = PriorStore.create(tmp_path / "prior", [*capture.cameras], capture.frames, describe_capture(capture))
-    for camera, calibrated in capture.cameras.items():
-        for frame in capture.frames:
+    first = [*recording.cameras][:1]
+    folder = export_recording(recording, "colmap_frames", tmp_path / "data", test_cameras=first, cloud=cloud)
+    store = PriorStore.create(tmp_path / "prior", [*recording.cameras], recording.frames, describe_recording(recording))
+    for camera, calibrated in recording.cameras.items():
+        for frame in recording.frames:
             shape = (calibrated.height, calibrated.width)
             depth = np.full(shape, 2.0 + frame, np.float32)
             labels, sigma = np.full(shape, 2, np.uint8), np.full(shape, 0.01, np.float32)
             store.write(camera, frame, FusedPrior(depth, labels, sigma, np.zeros((*shape, 3), np.uint8)), {})
     names = json.loads((folder / EXPORT_FILE).read_text())
-    return SimpleNamespace(capture=capture, folder=folder, prior=tmp_path / "prior", names=names)
+    return SimpleNamespace(recording=recording, folder=folder, prior=tmp_path / "prior", names=names)
 
 
-def test_the_path_of_a_picture_leads_to_the_names(exported, caplog) -> None:
-    source = [*exported.capture.cameras][1]
-    name, frame = exported.names["cameras"][source], exported.capture.frames[-1]
+def test_the_path_of_a_image_leads_to_the_names(exported, caplog) -> None:
+    source = [*exported.recording.cameras][1]
+    name, frame = exported.names["cameras"][source], exported.recording.frames[-1]
     number = exported.names["frames"][str(frame)]
     assert name != source
     store = PriorStore.open(exported.prior)
@@ -57,12 +57,14 @@ def test_the_path_of_a_picture_leads_to_the_names(exported, caplog) -> None:
 
 def test_a_prior_of_the_export_itself_keeps_its_names(exported, tmp_path: Path) -> None:
     described = {name: {"size": [1, 1], "K": [[1]], "T_camera_world": [[1]]} for name in ("cam00", "cam01")}
-    store = PriorStore.create(tmp_path / "own", ["cam00", "cam01"], [0], {"capture": "data", "calibrations": described})
+    store = PriorStore.create(
+        tmp_path / "own", ["cam00", "cam01"], [0], {"recording": "data", "calibrations": described}
+    )
     assert renamed_by(store, str(exported.folder / "cam00" / "0.png")) is store
 
 
 def test_the_configuration_and_the_launcher_find_it_too(exported) -> None:
-    name = exported.names["cameras"][[*exported.capture.cameras][1]]
+    name = exported.names["cameras"][[*exported.recording.cameras][1]]
     assert opened(str(exported.prior), str(exported.folder)).prior(name, 0) is not None
     assert export_read(exported.prior, exported.folder / "colmap_0") == exported.folder
     assert export_read(exported.prior, exported.folder.parent) is None
@@ -73,15 +75,15 @@ def test_an_unknown_name_says_the_way_out(exported) -> None:
         PriorStore.open(exported.prior).prior("cam09", 0)
 
 
-def test_a_camera_of_the_capture_without_a_prior_has_none(exported, tmp_path: Path) -> None:
-    some = [*exported.capture.cameras][1:]
-    about = describe_capture(exported.capture)
-    PriorStore.create(tmp_path / "part", some, exported.capture.frames, about)
+def test_a_camera_of_the_recording_without_a_prior_has_none(exported, tmp_path: Path) -> None:
+    some = [*exported.recording.cameras][1:]
+    about = describe_recording(exported.recording)
+    PriorStore.create(tmp_path / "part", some, exported.recording.frames, about)
     renamed = opened(str(tmp_path / "part"), str(exported.folder))
     assert renamed.prior("cam00", 0) is None
 
 
-def test_adapters_say_the_picture_of_a_camera() -> None:
+def test_adapters_say_the_image_of_a_camera() -> None:
     camera = SimpleNamespace(image_path=Path("/d/cam01/3.png"))
-    assert InriaAdapter.picture(None, RenderedCamera(camera, {})) == "/d/cam01/3.png"
-    assert InriaAdapter.picture(None, SimpleNamespace()) is None
+    assert InriaAdapter.image_name(None, RenderedCamera(camera, {})) == "/d/cam01/3.png"
+    assert InriaAdapter.image_name(None, SimpleNamespace()) is None

@@ -19,11 +19,11 @@ from d2_plugin.adapters.gsplat_dict import GsplatAdapter
 from d2_plugin.adapters.keys import ViewsByPose
 from d2_plugin.attach.gsplat import GsplatSession, put_in_place
 from d2_plugin.attach.recipes import recipe
-from d2_plugin.captures.export.gsplat import test_every as every_nth
 from d2_plugin.compat import gsplat as stand_in
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.protocol import RasterSettings
 from d2_plugin.rasterizer import reference
+from d2_plugin.recordings.export.gsplat import test_every as every_nth
 
 FILES = {
     "gsplat/__init__.py": "from .rendering import rasterization\n",
@@ -154,7 +154,7 @@ def test_hooks_insert_remove_and_pull_on_depth() -> None:
 
 @pytest.mark.usefixtures("checkout")
 def test_the_export_that_the_parser_reads_renames_the_cameras(tmp_path: Path, monkeypatch) -> None:
-    """As a run of the real script showed: its pictures are called cam05 where the prior says 01."""
+    """As a run of the real script showed: its images are called cam05 where the prior says 01."""
     from d2_plugin.priors.disk import exported
 
     read: list[Path] = []
@@ -186,16 +186,16 @@ class TestViewsByPose:
         assert (found.camera, found.frame, found.width, found.height) == (view.camera, view.frame, 32, 24)
         torch.testing.assert_close(found.T_camera_world, view.T_camera_world)
 
-    def test_a_pose_of_two_pictures_or_of_none_is_refused(self) -> None:
+    def test_a_pose_of_two_images_or_of_none_is_refused(self) -> None:
         view = make_views()[0]
         item = {"camtoworld": torch.linalg.inv(view.T_camera_world), "K": view.K, "width": 32, "height": 24}
         twice = SimpleNamespace(
             camtoworlds=np.repeat(self.PARSER.camtoworlds[:1], 2, 0), image_names=["cam0_0000.png", "cam0_0001.png"]
         )
-        with pytest.raises(D2Error, match="2 pictures have the pose of this view"):
+        with pytest.raises(D2Error, match="2 images have the pose of this view"):
             ViewsByPose(twice)(item)
         item["camtoworld"] = item["camtoworld"] + 0.5
-        with pytest.raises(D2Error, match="0 pictures have the pose of this view"):
+        with pytest.raises(D2Error, match="0 images have the pose of this view"):
             ViewsByPose(self.PARSER)(item)
 
     def test_the_adapter_takes_the_parser(self) -> None:
@@ -225,7 +225,7 @@ class TestRasterization:
 
     def test_it_draws_what_the_reference_draws(self, given: tuple[dict, object]) -> None:
         named, view = given
-        picture, alpha, _ = stand_in.rasterization(**named, render_mode="RGB+D", packed=False)
+        image, alpha, _ = stand_in.rasterization(**named, render_mode="RGB+D", packed=False)
         adapter = GsplatAdapter(
             {"means": named["means"], "scales": named["scales"].log(), "quats": named["quats"],
              "opacities": torch.logit(named["opacities"])}, {},
@@ -233,8 +233,8 @@ class TestRasterization:
         splats = adapter.slice_at(view)
         settings = RasterSettings(near=0.01, alpha_max=stand_in.ALPHA_MAX)
         expected = reference.rasterize(splats, named["colors"], view, settings)
-        torch.testing.assert_close(picture[0, ..., :3], expected.color, atol=2e-5, rtol=1e-4)
-        torch.testing.assert_close(picture[0, ..., 3], expected.depth_sum, atol=2e-4, rtol=1e-4)
+        torch.testing.assert_close(image[0, ..., :3], expected.color, atol=2e-5, rtol=1e-4)
+        torch.testing.assert_close(image[0, ..., 3], expected.depth_sum, atol=2e-4, rtol=1e-4)
         torch.testing.assert_close(alpha[0, ..., 0], expected.alpha, atol=2e-5, rtol=1e-4)
         assert expected.alpha.max() > 0.5
 
@@ -244,16 +244,16 @@ class TestRasterization:
         target = torch.rand(1, view.height, view.width, 3, generator=torch.Generator().manual_seed(5))
         found = []
         for arguments in (full, packed):
-            picture, _, meta = stand_in.rasterization(**arguments)
+            image, _, meta = stand_in.rasterization(**arguments)
             meta["means2d"].retain_grad()
-            (picture - target).square().sum().backward()
+            (image - target).square().sum().backward()
             found.append(meta)
         dense, sparse = found
         assert dense["means2d"].grad.abs().max() > 0
         torch.testing.assert_close(dense["means2d"].grad[0, sparse["gaussian_ids"]], sparse["means2d"].grad)
         assert torch.equal(dense["radii"][0, sparse["gaussian_ids"]], sparse["radii"])
         moved = named | {"means": named["means"] + 0.0}
-        picture, _, meta = stand_in.rasterization(**moved, packed=False)
+        image, _, meta = stand_in.rasterization(**moved, packed=False)
         homogeneous = torch.cat([named["means"], torch.ones(40, 1)], 1) @ view.T_camera_world.float().T
         pixels = (homogeneous[:, :3] @ view.K.float().T)[:, :2] / homogeneous[:, 2:3]
         torch.testing.assert_close(meta["means2d"][0].detach(), pixels, atol=1e-3, rtol=1e-4)
@@ -268,7 +268,7 @@ class TestRasterization:
 
 
 @pytest.mark.parametrize(("trained_on", "held_out", "every"), [(4, 1, 5), (4, 4, 2), (7, 1, 8), (8, 2, 9), (6, 3, 4)])
-def test_every_nth_picture_is_held_out(trained_on: int, held_out: int, every: int) -> None:
+def test_every_nth_image_is_held_out(trained_on: int, held_out: int, every: int) -> None:
     assert every_nth(trained_on, held_out) == every
     assert len([i for i in range(trained_on + held_out) if i % every == 0]) == held_out
 

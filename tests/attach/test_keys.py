@@ -14,7 +14,7 @@ from d2_plugin.adapters.deformable3d import Deformable3DAdapter
 from d2_plugin.adapters.ex4dgs import Ex4DGSAdapter
 from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
-from d2_plugin.adapters.keys import KeysByPose, PriorKey, frame_of_time, key_from_picture, one_picture_each
+from d2_plugin.adapters.keys import KeysByPose, PriorKey, frame_of_time, key_from_image_name, one_image_each
 from d2_plugin.adapters.spacetime import SpacetimeAdapter
 
 READERS = [
@@ -47,7 +47,7 @@ def default_key(name: str, camera: SimpleNamespace) -> PriorKey:
 
 class TestNames:
     @pytest.mark.parametrize(
-        ("picture", "key"),
+        ("image", "key"),
         [
             ("cam01_0003", ("cam01", 3)),
             ("/data/scene/images/cam01_0003.png", ("cam01", 3)),
@@ -57,15 +57,15 @@ class TestNames:
             (r"C:\scene\cam02\images\0004.png", ("cam02", 4)),
         ],
     )
-    def test_pictures_tell_camera_and_frame(self, picture: str, key: tuple[str, int]) -> None:
-        assert key_from_picture(picture) == key
+    def test_images_tell_camera_and_frame(self, image: str, key: tuple[str, int]) -> None:
+        assert key_from_image_name(image) == key
 
     def test_a_name_without_a_camera_is_refused_with_the_way_out(self) -> None:
-        with pytest.raises(D2Error, match=r"picture '0003.png' does not say its camera.*function `key`"):
-            key_from_picture("0003.png")
+        with pytest.raises(D2Error, match=r"image '0003.png' does not say its camera.*function `key`"):
+            key_from_image_name("0003.png")
 
-    def test_a_moving_camera_has_a_prior_for_each_picture(self) -> None:
-        assert one_picture_each(SimpleNamespace(image_name="r_014.png")) == ("r_014", 0)
+    def test_a_moving_camera_has_a_prior_for_each_image(self) -> None:
+        assert one_image_each(SimpleNamespace(image_name="r_014.png")) == ("r_014", 0)
 
     def test_a_time_between_frames_is_refused(self) -> None:
         assert frame_of_time(0.06, 50, first=10) == 13
@@ -96,7 +96,7 @@ class TestNames:
         model, scene = spacetime.make()
         assert SpacetimeAdapter(model, 2).view(scene.cameras[4]).frame == 1
 
-    def test_ex4dgs_reads_the_path_of_the_picture(self) -> None:
+    def test_ex4dgs_reads_the_path_of_the_image(self) -> None:
         """Its `timestamp` is no frame number: it starts at 0 wherever the clip starts, and padding mirrors it."""
         model, scene = ex4dgs.make()
         camera = scene.cameras[4]
@@ -110,7 +110,7 @@ class TestNames:
         assert default_key(adapter, SimpleNamespace(**fields)) == key
 
     def test_hypernerf_of_hust_says_the_folder_and_the_file_apart(self) -> None:
-        """scene/hyper_loader.py:165; its order of training pictures is another than that of all pictures."""
+        """scene/hyper_loader.py:165; its order of training images is another than that of all images."""
         files = [SimpleNamespace(image_path="/data/vrig/rgb/2x", image_name=f"left1_00000{i}.png") for i in (7, 9)]
         scene = SimpleNamespace(train_camera=SimpleNamespace(dataset=files))
         model, _ = hust4d.make()

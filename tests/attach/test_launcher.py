@@ -23,7 +23,7 @@ from d2_plugin.attach.launch import main
 from d2_plugin.attach.recipes import Original, recipe
 from d2_plugin.attach.session import AddGradient, Session
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
-from d2_plugin.priors.disk.exported import RenamedStore
+from d2_plugin.store.exported import RenamedStore
 
 DEPTH_LOSS = D2Config(depth_loss=DepthLossConfig(start=2))
 EDITS = D2Config(
@@ -158,12 +158,12 @@ def _fudan_with_three_lines(config: D2Config) -> torch.Tensor:
         fudan.render, fudan.l1_loss = original, loss_of
 
 
-def test_the_picture_passes_unchanged_and_the_term_gets_its_weight() -> None:
-    picture, x = torch.rand(3, 2, 2, requires_grad=True), torch.tensor(2.0, requires_grad=True)
-    out = AddGradient.apply(picture, x**2, 0.25)
-    assert torch.equal(out, picture)
+def test_the_image_passes_unchanged_and_the_term_gets_its_weight() -> None:
+    image, x = torch.rand(3, 2, 2, requires_grad=True), torch.tensor(2.0, requires_grad=True)
+    out = AddGradient.apply(image, x**2, 0.25)
+    assert torch.equal(out, image)
     (3 * out).sum().backward()
-    assert torch.equal(picture.grad, torch.full_like(picture, 3.0))
+    assert torch.equal(image.grad, torch.full_like(image, 3.0))
     assert x.grad == 0.25 * 4
 
 
@@ -201,7 +201,7 @@ class TestNames:
         assert store.camera("cam01", 2) is None  # TinyStore does not say
 
     def test_a_folder_without_export_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(D2Error, match="give the folder that `d2 export-capture` wrote"):
+        with pytest.raises(D2Error, match="give the folder that `d2 export-recording` wrote"):
             RenamedStore.of_export(TinyStore(), tmp_path)
 
 

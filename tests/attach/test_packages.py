@@ -101,7 +101,7 @@ def test_names_that_numpy_dropped_are_given_back(monkeypatch) -> None:
     assert repairs._numpy() is None
 
 
-def test_signed_bytes_become_a_picture(monkeypatch) -> None:
+def test_signed_bytes_become_a_image(monkeypatch) -> None:
     """As fudan hands them over (utils/data_utils.py:22)."""
     image = pytest.importorskip("PIL.Image")
     monkeypatch.setattr(image, "fromarray", image.fromarray)

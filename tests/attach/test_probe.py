@@ -21,7 +21,7 @@ DEPTH_ALONE = D2Config(depth_loss=DepthLossConfig(every=1))
 
 
 def fudan_model(**attributes: object):
-    """Gaussians large enough to cover the pictures."""
+    """Gaussians large enough to cover the images."""
     model, scene = fudan.make()
     model._scaling.data += 1.0
     vars(model).update(attributes)

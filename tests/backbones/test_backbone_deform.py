@@ -16,8 +16,8 @@ from d2_plugin.backbones.deform import Deform, DeformSettings, create
 from d2_plugin.backbones.deform_fields import (
     Box,
 )
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 
@@ -161,18 +161,20 @@ def test_defaults_are_documented_settings() -> None:
 def test_d2_train_runs_resumes_and_scores_it(field: str, tmp_path: Path) -> None:
     pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
     pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-    capture = save_capture(synthetic_capture(cameras=2, held_out=1, frames=2, width=64, height=36), tmp_path / "room")
+    recording = save_recording(
+        synthetic_recording(cameras=2, held_out=1, frames=2, width=64, height=36), tmp_path / "room"
+    )
     settings = RunSettings(
-        *(str(capture), ("train0", "train1")),
+        *(str(recording), ("train0", "train1")),
         backbone="deform",
         iterations=24,
         overrides={"backbone": {"field": field}},
-        accept_empty_prior=True,  # pictures this small have no stereo
+        accept_empty_prior=True,  # images this small have no stereo
     )
     run = Run(settings, tmp_path / "run")
     run.train()
     again = Run.load(tmp_path / "run")
-    metrics = again.evaluate(pictures=False)
+    metrics = again.evaluate(images=False)
     assert metrics["backbone"] == "deform"
     assert metrics["iterations"] == 24
     assert metrics["test"]["psnr"] > 8

@@ -124,7 +124,7 @@ class TestPhotometricLoss:
         ours = ssim(torch.from_numpy(a), torch.from_numpy(b)).item()
         assert ours == pytest.approx(float(ssim_3dgs(torch.from_numpy(a), torch.from_numpy(b))), abs=1e-9)
 
-    def test_equal_pictures_cost_nothing(self) -> None:
+    def test_equal_images_cost_nothing(self) -> None:
         image = torch.rand(20, 20, 3, dtype=torch.float64)
         assert photometric_loss(image, image).item() == pytest.approx(0, abs=1e-12)
 

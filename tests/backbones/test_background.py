@@ -1,4 +1,4 @@
-"""The colour at infinity: the same from every camera, begun with the pictures, saved with the model, no surface."""
+"""The colour at infinity: the same from every camera, begun with the images, saved with the model, no surface."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ class TestColour:
             found = sky_of(sky, replace(other, K=K, width=1, height=1))
             torch.testing.assert_close(found[0, 0], expected[row, column], atol=1e-5, rtol=0)
 
-    def test_a_large_picture_is_interpolated_between_a_few_directions(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_large_image_is_interpolated_between_a_few_directions(self, monkeypatch: pytest.MonkeyPatch) -> None:
         view = make_views()[0]
         K = view.K * torch.tensor([10.0, 10, 1])[:, None]
         large = replace(view, K=K, width=10 * view.width, height=10 * view.height)
@@ -275,19 +275,19 @@ def test_the_bare_trainer_takes_a_model_with_a_background() -> None:
 
 
 class TestStart:
-    """It begins with what the pictures show, as if all were at infinity."""
+    """It begins with what the images show, as if all were at infinity."""
 
     @staticmethod
-    def started(pictures: list[Tensor], views: list[View]) -> Background:
+    def started(images: list[Tensor], views: list[View]) -> Background:
         sky = Background(torch.device("cpu"))
-        sky.start_from(views, lambda index: pictures[index])
+        sky.start_from(views, lambda index: images[index])
         return sky
 
     @staticmethod
     def flat(view: View, color: tuple[float, float, float]) -> Tensor:
         return torch.tensor(color).expand(view.height, view.width, 3)
 
-    def test_pictures_of_one_colour_are_that_colour_also_where_no_camera_looks(self) -> None:
+    def test_images_of_one_colour_are_that_colour_also_where_no_camera_looks(self) -> None:
         views, color = make_views()[:2], (0.2, 0.5, 0.9)
         sky = self.started([self.flat(view, color) for view in views], views)
         for angle in (0.0, 1.5, 3.0):
@@ -295,7 +295,7 @@ class TestStart:
             torch.testing.assert_close(shown, self.flat(views[0], color), atol=1e-4, rtol=0)
 
     @pytest.mark.parametrize("seed", range(3))
-    def test_no_direction_is_brighter_or_darker_than_a_picture_can_be(self, seed: int) -> None:
+    def test_no_direction_is_brighter_or_darker_than_a_image_can_be(self, seed: int) -> None:
         views = make_views()[:2]
         generator = torch.Generator().manual_seed(seed)
         noise = [(torch.rand(view.height, view.width, 3, generator=generator) > 0.5).float() for view in views]
@@ -306,16 +306,16 @@ class TestStart:
 
     def test_left_and_right_are_told_apart(self) -> None:
         view = make_views()[0]
-        picture = torch.zeros(view.height, view.width, 3)
-        picture[:, view.width // 2 :] = 1
-        shown = sky_of(self.started([picture], [view]), view)
+        image = torch.zeros(view.height, view.width, 3)
+        image[:, view.width // 2 :] = 1
+        shown = sky_of(self.started([image], [view]), view)
         assert shown[:, : view.width // 4].mean() < 0.35
         assert shown[:, -view.width // 4 :].mean() > 0.65
 
     def test_nothing_to_look_at_leaves_it_grey(self) -> None:
         assert not self.started([], []).constant.any()
 
-    def test_a_checkpoint_wins_over_the_pictures(self, backbone: str) -> None:
+    def test_a_checkpoint_wins_over_the_images(self, backbone: str) -> None:
         first = make_trainer(iterations=4, backbone=backbone, background=True)
         first.run()
         second = make_trainer(iterations=4, backbone=backbone, background=True)

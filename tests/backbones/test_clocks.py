@@ -14,7 +14,7 @@ from d2_plugin.backbones.trainer import Trainer, TrainSettings
 from d2_plugin.protocol import View
 
 FRAMES, LATE = 9, {"cam0": 0.0, "cam1": 0.0, "cam2": 1.0}
-"""How many frames later than they are named the pictures of a camera were taken."""
+"""How many frames later than they are named the images of a camera were taken."""
 LEARN = ClockSettings(learn=True, rate=0.02)
 
 

@@ -1,4 +1,4 @@
-"""Gaussians left out at random in training: the mean picture stays, evaluation sees all, a resume is bitwise."""
+"""Gaussians left out at random in training: the mean image stays, evaluation sees all, a resume is bitwise."""
 
 from __future__ import annotations
 

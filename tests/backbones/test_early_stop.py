@@ -35,7 +35,7 @@ def test_it_stops_when_the_smallest_error_is_old() -> None:
 
 
 class Worse(TinyFrames):
-    """Pictures that are other ones in every round: what is learnt in one does not hold in the next."""
+    """Images that are other ones in every round: what is learnt in one does not hold in the next."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Relocation: nothing dead is left, the picture stays, whoever follows the rows is told, and a resume is bitwise."""
+"""Relocation: nothing dead is left, the image stays, whoever follows the rows is told, and a resume is bitwise."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_the_dead_are_gone_and_reported_as_new_rows(backbone: str) -> None:
     assert copies.all(-1).any(1).all(), "a copy starts where its source is"
 
 
-def test_a_picture_is_nearly_what_it_was() -> None:
+def test_a_image_is_nearly_what_it_was() -> None:
     """One view changes by less than a clone, which doubles what was there, would change it."""
     model, cloned = (make_model(40, temporal=False) for _ in range(2))
     view, nobody = make_views()[0], torch.zeros(40, dtype=torch.bool)

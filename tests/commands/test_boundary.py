@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 from small_layouts import write_layout
 
-from d2_plugin.captures.pictures import write_png
 from d2_plugin.commands import cli
 from d2_plugin.commands.arguments import boundary
 from d2_plugin.commands.arguments.boundary import one_line, sentence
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.images import write_png
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
@@ -44,13 +44,13 @@ def told(capsys: pytest.CaptureFixture[str]) -> str:
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_layout("folder", tmp_path_factory.mktemp("recording") / "small")
 
 
 @pytest.fixture
-def copy(capture: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(capture, tmp_path / "copy"))
+def copy(recording: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(recording, tmp_path / "copy"))
 
 
 class TestTheBoundary:
@@ -153,9 +153,9 @@ class TestWords:
         ],
     )
     def test_values_that_cannot_be(
-        self, capture: Path, tmp_path: Path, refused: Refused, words: list[str], says: str
+        self, recording: Path, tmp_path: Path, refused: Refused, words: list[str], says: str
     ) -> None:
-        fixed = ["train", str(capture), "--train-cameras", "cam00", "--output", str(tmp_path / "x")]
+        fixed = ["train", str(recording), "--train-cameras", "cam00", "--output", str(tmp_path / "x")]
         assert says in refused(*fixed, *words)
         assert not (tmp_path / "x").exists()
 
@@ -167,39 +167,41 @@ class TestWords:
             "x = " + "[" * 3000, "= 1", "\x00", "[plan]\ntemporal = \"maybe\"", "[priors]\ndepth_range = [1, 2, 3]",
         ],
     )  # fmt: skip
-    def test_configurations_that_cannot_be(self, capture: Path, tmp_path: Path, refused: Refused, text: str) -> None:
+    def test_configurations_that_cannot_be(self, recording: Path, tmp_path: Path, refused: Refused, text: str) -> None:
         (tmp_path / "d2.toml").write_text(text)
-        refused("plan", str(capture), "--train-cameras", "cam00", "--config", str(tmp_path / "d2.toml"))
+        refused("plan", str(recording), "--train-cameras", "cam00", "--config", str(tmp_path / "d2.toml"))
 
 
 class TestPlaces:
     """Files, folders and other things where the other is expected."""
 
-    def test_a_configuration_that_is_a_pipe_or_a_folder(self, capture: Path, tmp_path: Path, refused: Refused) -> None:
+    def test_a_configuration_that_is_a_pipe_or_a_folder(
+        self, recording: Path, tmp_path: Path, refused: Refused
+    ) -> None:
         os.mkfifo(tmp_path / "pipe.toml")
-        plan = ["plan", str(capture), "--train-cameras", "cam00", "--config"]
+        plan = ["plan", str(recording), "--train-cameras", "cam00", "--config"]
         assert "is a pipe, expected a file" in refused(*plan, str(tmp_path / "pipe.toml"))
         assert "is a folder, expected a file" in refused(*plan, str(tmp_path))
         assert "no configuration at" in refused(*plan, str(tmp_path / "none.toml"))
 
     @pytest.mark.parametrize("output", ["file", "file/below", "x" * 300, "a/" + "y" * 5000])
-    def test_an_output_that_cannot_be(self, capture: Path, tmp_path: Path, refused: Refused, output: str) -> None:
+    def test_an_output_that_cannot_be(self, recording: Path, tmp_path: Path, refused: Refused, output: str) -> None:
         (tmp_path / "file").write_text("mine")
-        words = ["train", str(capture), "--train-cameras", "cam00", "--hooks", "none", "--iterations", "1"]
+        words = ["train", str(recording), "--train-cameras", "cam00", "--hooks", "none", "--iterations", "1"]
         refused(*words, "--output", str(tmp_path / output))
         assert (tmp_path / "file").read_text() == "mine"
 
-    def test_a_picture_that_is_a_pipe(self, copy: Path, refused: Refused) -> None:
-        picture = copy / "images" / "cam00" / "00000.png"
-        picture.unlink()
-        os.mkfifo(picture)
+    def test_a_image_that_is_a_pipe(self, copy: Path, refused: Refused) -> None:
+        image = copy / "images" / "cam00" / "00000.png"
+        image.unlink()
+        os.mkfifo(image)
         assert "is a pipe, expected a file" in refused("plan", str(copy), "--train-cameras", "cam00,cam01")
 
-    def test_a_picture_that_claims_to_be_huge(self, copy: Path, refused: Refused) -> None:
-        picture = copy / "images" / "cam01" / "00001.png"
-        data = bytearray(picture.read_bytes())
+    def test_a_image_that_claims_to_be_huge(self, copy: Path, refused: Refused) -> None:
+        image = copy / "images" / "cam01" / "00001.png"
+        data = bytearray(image.read_bytes())
         data[16:24] = (100_000).to_bytes(4, "big") * 2
-        picture.write_bytes(data)
+        image.write_bytes(data)
         assert "says 100000x100000 pixels" in refused("plan", str(copy), "--train-cameras", "cam00,cam01")
 
     @pytest.mark.parametrize("name", ["a,b", "../x", "a/b", " a", "", "x" * 300, "a\nb"])
@@ -238,7 +240,7 @@ class TestPlaces:
             rows.write_text(text)
             assert "runs.jsonl" in refused("report", str(rows), "--output", str(tmp_path / "report"))
 
-    def test_black_pictures_and_absurd_views_are_named(self, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_black_images_and_absurd_views_are_named(self, copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
         import numpy as np
 
         write_png(copy / "images" / "cam01" / "00001.png", np.zeros((32, 48, 3), np.uint8))

@@ -1,4 +1,4 @@
-"""The `d2` command as a person uses it: one run from capture to score, and one sentence for every mistake."""
+"""The `d2` command as a person uses it: one run from recording to score, and one sentence for every mistake."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.store import PriorStore
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
+from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
@@ -25,23 +25,23 @@ CAMERAS = "train0,train1,train2"
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording small enough to train in seconds."""
     path = tmp_path_factory.mktemp("recording") / "room"
-    return save_capture(synthetic_capture(cameras=3, held_out=1, frames=2, width=96, height=54), path)
+    return save_recording(synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54), path)
 
 
 @pytest.fixture(scope="module")
-def finished(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a finished run with all hooks."""
     output = tmp_path_factory.mktemp("runs") / "full"
-    assert train(capture, output) == 0
+    assert train(recording, output) == 0
     return output
 
 
-def train(capture: Path, output: Path, *more: str, cameras: str = CAMERAS) -> int:
+def train(recording: Path, output: Path, *more: str, cameras: str = CAMERAS) -> int:
     fixed = ["--train-cameras", cameras, "--iterations", "40", "--output", str(output)]
-    return main(["train", str(capture), *fixed, *more])
+    return main(["train", str(recording), *fixed, *more])
 
 
 def refused(capsys: pytest.CaptureFixture[str], code: int) -> str:
@@ -58,13 +58,13 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def damaged_copy(capture: Path, tmp_path: Path) -> Path:
+def damaged_copy(recording: Path, tmp_path: Path) -> Path:
     copy = tmp_path / "copy"
-    shutil.copytree(capture, copy)
+    shutil.copytree(recording, copy)
     return copy
 
 
-def test_a_run_leaves_scores_pictures_configuration_and_checkpoint(finished: Path) -> None:
+def test_a_run_leaves_scores_images_configuration_and_checkpoint(finished: Path) -> None:
     metrics = json.loads((finished / "metrics.json").read_text())
     assert set(metrics["test"]) >= {"psnr", "ssim1", "ssim2", "lpips", "depth_absrel"}
     assert metrics["test"]["psnr"] > 10
@@ -79,13 +79,13 @@ def test_a_run_leaves_scores_pictures_configuration_and_checkpoint(finished: Pat
     assert metrics["plan"]["temporal"]["use"] is True
     assert metrics["mono_emulated"] is True
     assert len(metrics["per_view"]) == 2
-    assert len(list((finished / "pictures").glob("test0_*.png"))) == 2
+    assert len(list((finished / "images").glob("test0_*.png"))) == 2
     assert (finished / "d2.toml").is_file()
     assert (finished / "checkpoint.pt").is_file()
 
 
 def test_a_cut_off_run_continues_to_the_same_score(
-    capture: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recording: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class CutOff(BaseException):  # what ends the process; an Exception is a sentence
         pass
@@ -102,9 +102,9 @@ def test_a_cut_off_run_continues_to_the_same_score(
     with monkeypatch.context() as patch:
         patch.setattr(Run, "_save", cut_off)
         with pytest.raises(CutOff):
-            train(capture, output)
+            train(recording, output)
         steps.clear()
-        assert train(capture, output) == 0
+        assert train(recording, output) == 0
     assert steps == [28, 32, 36, 40], "it goes on from where it was cut off"
     ends = [torch.load(folder / "checkpoint.pt", weights_only=True)["model"] for folder in (finished, output)]
     for name, value in ends[0]["parameters"].items():
@@ -113,16 +113,16 @@ def test_a_cut_off_run_continues_to_the_same_score(
 
 def test_evaluating_again_gives_the_same_scores(finished: Path) -> None:
     before = json.loads((finished / "metrics.json").read_text())
-    assert main(["eval", str(finished), "--no-pictures"]) == 0
+    assert main(["eval", str(finished), "--no-images"]) == 0
     after = json.loads((finished / "metrics.json").read_text())
     assert after["test"] == before["test"]
     assert after["per_view"] == before["per_view"]
 
 
 def test_priors_are_built_in_parts_and_shown_on_a_sheet(
-    capture: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    recording: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    build = ["priors", str(capture), "--train-cameras", CAMERAS, "--output", str(tmp_path)]
+    build = ["priors", str(recording), "--train-cameras", CAMERAS, "--output", str(tmp_path)]
     assert main([*build, "--shard", "2/2"]) == 0
     assert not (tmp_path / "contact_sheet.png").exists()
     assert "held against" not in capsys.readouterr().out, "a part is not the whole"
@@ -137,18 +137,18 @@ def test_priors_are_built_in_parts_and_shown_on_a_sheet(
 
 
 def test_a_hook_that_changes_nothing_retires_and_the_scores_say_so(
-    capture: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    recording: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = tmp_path / "config.toml"
     config.write_text("[d2]\nretire_after = 2\n[densify]\nmax_gaussians = 0\n")
     hooks = ["--hooks", "densify", "--priors", str(finished / "priors"), "--config", str(config)]
-    assert train(capture, tmp_path / "idle", *hooks) == 0
+    assert train(recording, tmp_path / "idle", *hooks) == 0
     assert "densify retired at step 6: it changed next to nothing" in capsys.readouterr().out
     assert json.loads((tmp_path / "idle" / "metrics.json").read_text())["retired"] == {"densify": 6}
 
 
-def test_a_part_is_not_built_on_a_cluster(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    build = ["priors", str(capture), "--train-cameras", CAMERAS, "--output", str(tmp_path / "priors")]
+def test_a_part_is_not_built_on_a_cluster(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    build = ["priors", str(recording), "--train-cameras", CAMERAS, "--output", str(tmp_path / "priors")]
     assert "leave it out" in refused(capsys, main([*build, "--shard", "1/2", "--workers", "2"]))
 
 
@@ -169,11 +169,11 @@ def test_doctor_names_compiler_device_and_extras(capsys: pytest.CaptureFixture[s
     assert {line.split()[0] for line in lines} >= {"device", "compiler", "cache", "backbones", "onnxruntime", "cv2"}
 
 
-def test_plan_names_each_decision_with_its_measurement(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["plan", str(capture), "--train-cameras", CAMERAS]) == 0
+def test_plan_names_each_decision_with_its_measurement(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", str(recording), "--train-cameras", CAMERAS]) == 0
     notes, lines = [], []
-    recording, *rest = capsys.readouterr().out.splitlines()
-    assert recording == (
+    first, *rest = capsys.readouterr().out.splitlines()
+    assert first == (
         "recording  room: layout folder, 4 cameras (train0, train1, train2, test0), frames 0 to 1 (2) "
         "at 12 per second, 96x54 pixels"
     )
@@ -185,33 +185,33 @@ def test_plan_names_each_decision_with_its_measurement(capture: Path, capsys: py
     assert "(emulated)" in lines[2]
 
 
-def test_one_instant_leaves_the_temporal_dimension_out(capture: Path, tmp_path: Path) -> None:
-    assert train(capture, tmp_path / "still", "--frames", "1:1", "--hooks", "none", "--export-ply") == 0
+def test_one_instant_leaves_the_temporal_dimension_out(recording: Path, tmp_path: Path) -> None:
+    assert train(recording, tmp_path / "still", "--frames", "1:1", "--hooks", "none", "--export-ply") == 0
     metrics = json.loads((tmp_path / "still" / "metrics.json").read_text())
     assert metrics["plan"]["temporal"] == {"use": False, "reason": "one instant"}
     assert [path.name for path in (tmp_path / "still" / "ply").iterdir()] == ["frame_00001.ply"]
 
 
-def test_the_temporal_dimension_can_be_left_out_by_the_user(capture: Path, tmp_path: Path) -> None:
+def test_the_temporal_dimension_can_be_left_out_by_the_user(recording: Path, tmp_path: Path) -> None:
     config = tmp_path / "still.toml"
     config.write_text("[plan]\ntemporal = false\n")
-    assert train(capture, tmp_path / "still", "--hooks", "none", "--config", str(config)) == 0
+    assert train(recording, tmp_path / "still", "--hooks", "none", "--config", str(config)) == 0
     decision = json.loads((tmp_path / "still" / "metrics.json").read_text())["plan"]["temporal"]
     assert decision["use"] is False
     assert "overridden by the user (measured: motion" in decision["reason"]
 
 
 def test_one_training_camera_without_metric_depth_is_refused_or_trains_bare(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert train(capture, tmp_path / "bare", "--hooks", "none", cameras="train0") == 0
+    assert train(recording, tmp_path / "bare", "--hooks", "none", cameras="train0") == 0
     plan = json.loads((tmp_path / "bare" / "metrics.json").read_text())["plan"]
     assert plan["stereo"] == {"use": False, "reason": "one training camera"}
     assert plan["verification"]["use"] is False
 
 
-def test_all_cameras_may_train(capture: Path, tmp_path: Path) -> None:
-    assert train(capture, tmp_path / "all", "--hooks", "none", cameras=CAMERAS + ",test0") == 0
+def test_all_cameras_may_train(recording: Path, tmp_path: Path) -> None:
+    assert train(recording, tmp_path / "all", "--hooks", "none", cameras=CAMERAS + ",test0") == 0
     metrics = json.loads((tmp_path / "all" / "metrics.json").read_text())
     assert metrics["test"] is None
     assert metrics["test_cameras"] == []
@@ -220,78 +220,78 @@ def test_all_cameras_may_train(capture: Path, tmp_path: Path) -> None:
 
 class TestMistakes:
     def test_an_output_folder_of_another_run_is_left_alone(
-        self, capture: Path, finished: Path, capsys: pytest.CaptureFixture[str]
+        self, recording: Path, finished: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         before = contents(finished)
-        message = refused(capsys, train(capture, finished, "--seed", "5"))
+        message = refused(capsys, train(recording, finished, "--seed", "5"))
         assert "holds another run, made with other settings of seed" in message
         assert contents(finished) == before
 
     def test_a_folder_with_other_files_is_left_alone(
-        self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         (tmp_path / "notes.txt").write_text("mine")
-        assert "is not empty and holds no run" in refused(capsys, train(capture, tmp_path))
+        assert "is not empty and holds no run" in refused(capsys, train(recording, tmp_path))
         assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
-    def test_unknown_hook(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        message = refused(capsys, train(capture, tmp_path / "x", "--hooks", "densify,depthloss"))
+    def test_unknown_hook(self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        message = refused(capsys, train(recording, tmp_path / "x", "--hooks", "densify,depthloss"))
         assert "unknown hook 'depthloss'" in message
         assert "did you mean 'depth_loss'?" in message
         assert not (tmp_path / "x").exists()
 
-    def test_unknown_backbone(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        message = refused(capsys, train(capture, tmp_path / "x", "--backbone", "yang"))
+    def test_unknown_backbone(self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        message = refused(capsys, train(recording, tmp_path / "x", "--backbone", "yang"))
         assert "unknown backbone 'yang'" in message
         assert "did you mean 'yang4d'?" in message
 
     def test_a_device_that_is_not_there(
-        self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         if torch.cuda.is_available():
             pytest.skip("this machine has a CUDA device")
-        code = train(capture, tmp_path / "run", "--device", "cuda")
+        code = train(recording, tmp_path / "run", "--device", "cuda")
         assert "leave out --device" in refused(capsys, code)
-        code = train(capture, tmp_path / "run", "--device", "cdua")
+        code = train(recording, tmp_path / "run", "--device", "cdua")
         assert "cuda" in refused(capsys, code)
 
-    def test_no_training_camera(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "no training camera" in refused(capsys, train(capture, tmp_path / "x", cameras=","))
+    def test_no_training_camera(self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "no training camera" in refused(capsys, train(recording, tmp_path / "x", cameras=","))
 
-    def test_unknown_training_camera(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        message = refused(capsys, train(capture, tmp_path / "x", cameras="train0,trian1"))
+    def test_unknown_training_camera(self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        message = refused(capsys, train(recording, tmp_path / "x", cameras="train0,trian1"))
         assert "unknown camera 'trian1'" in message
         assert "did you mean 'train1'?" in message
 
-    def test_no_such_capture(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "no such capture" in refused(capsys, train(tmp_path / "nowhere", tmp_path / "x"))
+    def test_no_such_recording(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "no such recording" in refused(capsys, train(tmp_path / "nowhere", tmp_path / "x"))
 
     def test_camera_missing_in_cameras_json(
-        self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        copy = damaged_copy(capture, tmp_path)
+        copy = damaged_copy(recording, tmp_path)
         description = json.loads((copy / "cameras.json").read_text())
         description["cameras"] = [c for c in description["cameras"] if c["name"] != "train1"]
         (copy / "cameras.json").write_text(json.dumps(description))
         assert "train1" in refused(capsys, train(copy, tmp_path / "x"))
 
-    def test_unreadable_frame(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        copy = damaged_copy(capture, tmp_path)
+    def test_unreadable_frame(self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        copy = damaged_copy(recording, tmp_path)
         frame = copy / "images" / "train1" / "00001.png"
         frame.write_bytes(frame.read_bytes()[:100])
         assert "00001.png" in refused(capsys, train(copy, tmp_path / "x"))
 
-    def test_images_of_two_sizes(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        from d2_plugin.captures.pictures import write_png
+    def test_images_of_two_sizes(self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        from d2_plugin.recordings.images import write_png
 
-        copy = damaged_copy(capture, tmp_path)
+        copy = damaged_copy(recording, tmp_path)
         write_png(copy / "images" / "train2" / "00001.png", np.zeros((20, 30, 3), np.uint8))
         message = refused(capsys, train(copy, tmp_path / "x"))
         assert "30x20" in message
         assert "96x54" in message
 
     def test_a_damaged_prior_is_named_and_that_frame_alone_is_built_again(
-        self, capture: Path, finished: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+        self, recording: Path, finished: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
     ) -> None:
         priors = tmp_path / "priors"
         shutil.copytree(finished / "priors", priors)
@@ -300,28 +300,28 @@ class TestMistakes:
         written = {path: path.stat().st_mtime_ns for path in (priors / "priors").rglob("*.npy")}
         with pytest.raises(D2Error, match="camera train1, frame 0 is damaged"):
             PriorStore.open(priors)
-        assert train(capture, tmp_path / "run", "--priors", str(priors)) == 0
+        assert train(recording, tmp_path / "run", "--priors", str(priors)) == 0
         assert "train1/00000" in caplog.text
         assert "is damaged" in caplog.text
         again = {path for path, time in written.items() if path.stat().st_mtime_ns != time}
         assert again == {array}
         assert array.read_bytes() == (finished / "priors" / "priors" / "train1" / "00000.npy").read_bytes()
 
-    def test_onnx_without_its_kind(self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "--mono-kind" in refused(capsys, train(capture, tmp_path / "x", "--mono-onnx", "net.onnx"))
+    def test_onnx_without_its_kind(self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert "--mono-kind" in refused(capsys, train(recording, tmp_path / "x", "--mono-onnx", "net.onnx"))
 
     def test_wrong_setting_in_the_configuration(
-        self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         config = tmp_path / "d2.toml"
         config.write_text("[prune]\ntau_pp = 0.5\n")
-        message = refused(capsys, train(capture, tmp_path / "x", "--config", str(config)))
+        message = refused(capsys, train(recording, tmp_path / "x", "--config", str(config)))
         assert "unknown setting of prune 'tau_pp'" in message
         config.write_text("[plan]\nverification = false\n")
-        message = refused(capsys, train(capture, tmp_path / "x", "--config", str(config)))
+        message = refused(capsys, train(recording, tmp_path / "x", "--config", str(config)))
         assert "'verification': have appearance, stereo, temporal" in message
         config.write_text("[backbone]\nsh_degre = 1\n")
-        message = refused(capsys, train(capture, tmp_path / "y", "--hooks", "none", "--config", str(config)))
+        message = refused(capsys, train(recording, tmp_path / "y", "--hooks", "none", "--config", str(config)))
         assert "did you mean 'sh_degree'?" in message
         assert not (tmp_path / "y").exists()
 

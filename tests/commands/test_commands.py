@@ -12,27 +12,27 @@ from pathlib import Path
 
 import pytest
 
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
+from benchmarks import BENCHMARKS
 from d2_plugin.commands import cli
 from d2_plugin.commands.arguments.form import Form, Given
 from d2_plugin.commands.arguments.recording import all_tables
 from d2_plugin.commands.cli import COMMANDS, main
 from d2_plugin.config import DensifyConfig
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import OVERRIDABLE, TABLES, hook_config, prior_settings
 from d2_plugin.settings import declared
-from d2_plugin.study.bench import BENCHMARKS
 
 CAMERAS = ["--train-cameras", "train0,train1,train2"]
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording small enough to train in seconds."""
     path = tmp_path_factory.mktemp("recording") / "room"
-    return save_capture(synthetic_capture(cameras=3, held_out=1, frames=2, width=96, height=54), path)
+    return save_recording(synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54), path)
 
 
 def form_of(command: str, words: list[str]) -> Form:
@@ -108,13 +108,13 @@ class TestTables:
             setting.name for setting in declared(PriorSettings)
         }
 
-    def test_flags_stand_over_the_file_and_the_file_over_the_defaults(self, capture: Path, tmp_path: Path) -> None:
+    def test_flags_stand_over_the_file_and_the_file_over_the_defaults(self, recording: Path, tmp_path: Path) -> None:
         config = tmp_path / "d2.toml"
         config.write_text(
             "[densify]\nbudget_per_view = 7\nopacity = 0.2\n[priors]\ntau_c = 0.05\n[priors.stereo]\nmin_angle = 3.0\n"
         )
         flags = "--densify.budget-per-view 500 --priors.stereo.min-angle 2 --backbone.sh-degree 1 --plan.temporal false"
-        words = [str(capture), *CAMERAS, "--config", str(config), *flags.split(), "--d2.retire-after", "0"]
+        words = [str(recording), *CAMERAS, "--config", str(config), *flags.split(), "--d2.retire-after", "0"]
         output = tmp_path / "run"
         assert main(["train", *words, "--iterations", "4", "--hooks", "none", "--output", str(output)]) == 0
         settings = Run.load(output).settings
@@ -130,9 +130,9 @@ class TestTables:
         assert metrics["plan"]["temporal"]["use"] is False
 
     def test_the_same_flags_continue_a_run_and_others_are_refused(
-        self, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        words = ["train", str(capture), *CAMERAS, "--iterations", "4", "--hooks", "none", "--output", str(tmp_path)]
+        words = ["train", str(recording), *CAMERAS, "--iterations", "4", "--hooks", "none", "--output", str(tmp_path)]
         lists = ["--priors.stereo.patchmatch-rounds", "3,1"]
         assert main([*words, *lists]) == 0
         assert main([*words, *lists]) == 0
@@ -154,7 +154,7 @@ OLD = {
     "train": "room --train-cameras a,b --test-cameras c --frames 0:8:2 --downscale 2 --mono-onnx n.onnx "
     "--mono-kind relative --config c.toml --backbone deform --iterations 7 --hooks prior,densify --output o "
     "--priors p --seed 3 --device cuda --export-ply",
-    "eval": "folder --no-pictures",
+    "eval": "folder --no-images",
     "compare": "one two three",
     "ablate": "room --train-cameras a,b --test-cameras c --frames 0:8 --downscale 2 --mono-onnx n --mono-kind metric "
     "--config c.toml --rows main --backbones yang4d,deform --seeds 0,1 --iterations 5 --jobs 99 --output o",
@@ -163,17 +163,17 @@ OLD = {
     "plan": "room --train-cameras preset:4 --frames 0:8 --downscale 2 --mono-onnx n --mono-kind metric --config c.toml",
     "demo": "--output o --iterations 5",
     "doctor": "",
-    "export-capture": "room --format colmap --output o --train-cameras a --test-cameras b --frames 0:1 --downscale 2 "
+    "export-recording": "room --format colmap --output o --train-cameras a --test-cameras b --frames 0:1 --downscale 2 "
     "--points 0 --seed 1",
     "bench align": "--output o --anchors 10 20 --outliers 0 .2 --methods a b --seeds 1 --seconds .1 --threads 1",
-    "bench gpu": "--output o --steps static shim --repository r --capture c --train-cameras a --iterations 5",
+    "bench gpu": "--output o --steps static shim --repository r --recording c --train-cameras a --iterations 5",
     "bench raster": "--output o --scenes synth:30 garden --sizes 64x36 --garden g.npz --device cuda --seconds 1 "
     "--threads 1 --error-limit 5 --no-memory",
     "bench scaling": "--output o --frames 5 20 --width 64 --iterations 5",
     "bench stereo": "--output o --rigs pair --data d --makers sweep --defaults-only --width 64 --widen 2 --repeats 2 "
     "--threads 2",
     "stability": "--output o --sweeps epsilon",
-    "report": "runs.jsonl folder --output o --no-pictures",
+    "report": "runs.jsonl folder --output o --no-images",
     "plan --verify": "room --train-cameras a,b --frames 0:8 --downscale 2 --mono-onnx n --mono-kind metric "
     "--iterations 5 --prior-frames 2 --seeds 0,1 --output o",
 }
@@ -233,10 +233,10 @@ class TestFlagsOfARun:
 
 
 def test_a_preset_passes_over_a_camera_without_calibration_and_so_does_the_run(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     room = tmp_path / "room"
-    shutil.copytree(capture, room)
+    shutil.copytree(recording, room)
     names = {"train0": "cam01", "train1": "cam13", "train2": "cam10", "test0": "cam00"}
     for kind in ("images", "depth", "mono"):
         for old, new in names.items():
@@ -245,7 +245,7 @@ def test_a_preset_passes_over_a_camera_without_calibration_and_so_does_the_run(
     for old, new in names.items():
         description = description.replace(f'"{old}"', f'"{new}"')
     (room / "cameras.json").write_text(description)
-    shutil.copytree(room / "images" / "cam01", room / "images" / "cam07")  # pictures without calibration
+    shutil.copytree(room / "images" / "cam01", room / "images" / "cam07")  # images without calibration
     words = ["--train-cameras", "preset:2", "--iterations", "4", "--hooks", "none", "--output", str(tmp_path / "run")]
     assert main(["train", str(room), *words]) == 0
     assert "missing: cam07" in capsys.readouterr().out
@@ -255,7 +255,7 @@ def test_a_preset_passes_over_a_camera_without_calibration_and_so_does_the_run(
     assert "cam07" in capsys.readouterr().err
 
 
-def test_an_exported_recording_reads_back(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_exported_recording_reads_back(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--format", "transforms", "--output", str(tmp_path / "scene"), "--test-cameras", "test0", "--points", "0"]
-    assert main(["export-capture", str(capture), *words]) == 0
+    assert main(["export-recording", str(recording), *words]) == 0
     assert "4 cameras, 2 frames, no initial points in" in capsys.readouterr().out

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from d2_plugin.captures import open_capture
-from d2_plugin.captures.export import folder as folder_layout
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.gaussians import native_slice, native_ssim
 from d2_plugin.rasterizer import native
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.export import folder as folder_layout
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.study import demo
 from d2_plugin.viewing.export.page import read_page
 
@@ -26,8 +26,8 @@ class Stopped(BaseException):
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """The demo on a recording of two frames."""
-    tiny = synthetic_capture(cameras=3, held_out=1, frames=2, width=96, height=54)
-    monkeypatch.setattr(demo, "synthetic_capture", lambda: tiny)
+    tiny = synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54)
+    monkeypatch.setattr(demo, "synthetic_recording", lambda: tiny)
 
 
 def test_a_demo_cut_off_while_it_writes_its_recording_goes_on(
@@ -51,8 +51,8 @@ def test_a_demo_cut_off_while_it_writes_its_recording_goes_on(
     assert all(f"| {name}" in out for name in demo.VARIANTS)
     assert (tmp_path / "demo" / "comparison.png").is_file()
     assert f"Player: {tmp_path / 'demo' / 'player.html'}" in out
-    assert read_page(tmp_path / "demo" / "player.html").header["name"] == "capture"
-    assert len(open_capture(tmp_path / "demo" / "capture").frames) == 2
+    assert read_page(tmp_path / "demo" / "player.html").header["name"] == "recording"
+    assert len(open_recording(tmp_path / "demo" / "recording").frames) == 2
     assert not list((tmp_path / "demo").glob("*unfinished*"))
 
 

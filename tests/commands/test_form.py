@@ -55,7 +55,7 @@ class Work(Settings):
     """How long."""
     share: Share = 0.5
     """How much."""
-    no_pictures: bool = False
+    no_images: bool = False
     """Less."""
 
 
@@ -95,10 +95,10 @@ class TestValues:
             (["--steps", "1_000"], "steps", 1000),
             (["--share", "1"], "share", 1.0),
             (["--share", "1e-3"], "share", 0.001),
-            (["--no-pictures"], "no_pictures", True),
-            (["--no-pictures", "false"], "no_pictures", False),
-            (["--no_pictures"], "no_pictures", True),
-            (["--no-pic"], "no_pictures", True),
+            (["--no-images"], "no_images", True),
+            (["--no-images", "false"], "no_images", False),
+            (["--no_images"], "no_images", True),
+            (["--no-pic"], "no_images", True),
             (["--steps", "1", "--steps", "2"], "steps", 2),
         ],
     )
@@ -108,7 +108,7 @@ class TestValues:
         assert type(found) is type(value)
 
     def test_a_word_behind_a_switch_or_a_list_is_taken_by_its_place(self) -> None:
-        for flag in (["--no-pictures"], ["--names", "a,b"]):
+        for flag in (["--no-images"], ["--names", "a,b"]):
             found = form_of().parse([*flag, "room", "--output", "out"]).make(Work)
             assert found.place == Path("room")
 
@@ -133,7 +133,7 @@ class TestMistakes:
             (["--zzz"], "unknown flag --zzz of d2 work: `d2 work --help` lists the flags"),
             (["--n", "a"], "unknown flag --n of d2 work"),
             (["--steps"], "--steps needs a value"),
-            (["--steps", "--no-pictures"], "--steps needs a value"),
+            (["--steps", "--no-images"], "--steps needs a value"),
             (["--steps", "ten"], "setting --steps must be a whole number, got 'ten'"),
             (["--steps", "-3"], "setting --steps must be at least 0 steps, got -3"),
             (["--share", "1.5"], "--share must be at least 0 and at most 1, got 1.5"),
@@ -165,7 +165,7 @@ class TestHelp:
         assert "--steps N How long. (steps, at least 0; default 10)" in text
         assert "--share X How much. (at least 0 and at most 1; default 0.5)" in text
         assert "--kind relative|metric What." in text
-        assert "--no-pictures Less. --" not in text
+        assert "--no-images Less. --" not in text
         assert "--output PATH Where it goes. (needed)" in text
 
     def test_tables_stand_with_a_line_each_and_open_on_demand(self) -> None:

@@ -18,14 +18,14 @@ FEW, MANY = 60, 2000
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_layout("folder", tmp_path_factory.mktemp("recording") / "small")
 
 
-def random_words(rng: random.Random, capture: Path, output: Path) -> list[str]:
+def random_words(rng: random.Random, recording: Path, output: Path) -> list[str]:
     """A command line that a person might have meant, with a few words replaced."""
     command = rng.choice([name for name in COMMANDS if name not in ("demo", "bench", "stability", "doctor", "ablate")])
-    words = [command, str(capture), "--train-cameras", "cam00,cam01", "--output", str(output), "--iterations", "1"]
+    words = [command, str(recording), "--train-cameras", "cam00,cam01", "--output", str(output), "--iterations", "1"]
     flags = ("seed", "frames", "downscale", "hooks", "config", "mono-onnx", "mono-kind", "test-cameras", "shard")
     tables = ("densify.cell", "prune.tau-p", "priors.stereo.min-angle", "plan.temporal", "backbone.sh-degree")
     odd = [str(value) for value in ODD_VALUES] + list(ODD_TEXTS) + ["preset:4", "1/0", "cam00", "none", "all", "true"]
@@ -60,18 +60,18 @@ def expect_an_answer(words: list[str], capsys: pytest.CaptureFixture[str], seed:
     assert len(lines) == (1 if code else 0), (seed, words, captured.err)
 
 
-def fuzz_words(count: int, seed: int, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def fuzz_words(count: int, seed: int, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Run mutated command lines; what would work for long is refused beforehand, by a place that cannot be written."""
     (tmp_path / "file").write_text("in the way of every output")
     with bounded_memory():
         for number in range(count):
             rng = random.Random(f"words {seed} {number}")
-            words = random_words(rng, capture, tmp_path / "file" / "out")
+            words = random_words(rng, recording, tmp_path / "file" / "out")
             expect_an_answer(words, capsys, f"words {seed} {number}")
 
 
 def fuzz_configurations(
-    count: int, seed: int, capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    count: int, seed: int, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Plan with a mutated configuration."""
     from d2_plugin.config import for_iterations
@@ -83,7 +83,7 @@ def fuzz_configurations(
     )
     whole += "\n[plan]\ntemporal = true\n[priors]\ndepth_range = [1.0, 9.0]\n[priors.stereo]\nmin_angle = 1.0\n"
     whole += "[backbone]\nsh_degree = 1\n[d2]\nretire_after = 3\n"
-    words = ["plan", str(capture), "--train-cameras", "cam00,cam01", "--config", str(path)]
+    words = ["plan", str(recording), "--train-cameras", "cam00,cam01", "--config", str(path)]
     path.write_text(whole)
     assert main(words) == 0, capsys.readouterr().err
     with bounded_memory():
@@ -94,24 +94,24 @@ def fuzz_configurations(
 
 
 def test_command_lines_at_random(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    fuzz_words(FEW, 0, capture, tmp_path, capsys)
+    fuzz_words(FEW, 0, recording, tmp_path, capsys)
 
 
-def test_configurations_at_random(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fuzz_configurations(FEW, 0, capture, tmp_path, capsys)
+def test_configurations_at_random(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fuzz_configurations(FEW, 0, recording, tmp_path, capsys)
 
 
 @pytest.mark.slow
 def test_two_thousand_command_lines(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    fuzz_words(MANY, 1, capture, tmp_path, capsys)
+    fuzz_words(MANY, 1, recording, tmp_path, capsys)
 
 
 @pytest.mark.slow
-def test_two_thousand_configurations(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fuzz_configurations(MANY, 1, capture, tmp_path, capsys)
+def test_two_thousand_configurations(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fuzz_configurations(MANY, 1, recording, tmp_path, capsys)

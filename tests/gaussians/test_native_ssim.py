@@ -22,7 +22,7 @@ def compiled() -> None:
         pytest.skip("there is no C++ compiler")
 
 
-def pictures(height: int, width: int, channels: int = 3, seed: int = 0, noise: float = 0.1) -> tuple[Tensor, Tensor]:
+def images(height: int, width: int, channels: int = 3, seed: int = 0, noise: float = 0.1) -> tuple[Tensor, Tensor]:
     """A textured target and a noisy version of it."""
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(height, width, channels, generator=generator)
@@ -48,26 +48,26 @@ def assert_agree(image: Tensor, target: Tensor, **options) -> None:
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_value_and_gradient_are_those_of_torch_in_float64_for_any_size(height: int, width: int) -> None:
-    assert_agree(*pictures(height, width))
+    assert_agree(*images(height, width))
 
 
 @pytest.mark.parametrize("channels", [1, 2, 4])
 def test_any_number_of_channels(channels: int) -> None:
-    assert_agree(*pictures(20, 30, channels))
+    assert_agree(*images(20, 30, channels))
 
 
 @pytest.mark.parametrize("weight", [1e-3, 0.5, 1.0])
 def test_any_weight_of_the_structural_part(weight: float) -> None:
-    assert_agree(*pictures(20, 30), ssim_weight=weight)
+    assert_agree(*images(20, 30), ssim_weight=weight)
 
 
-def test_pictures_need_not_be_contiguous() -> None:
-    image, target = pictures(30, 20)
+def test_images_need_not_be_contiguous() -> None:
+    image, target = images(30, 20)
     assert_agree(image.transpose(0, 1), target.flip(0).transpose(0, 1))
 
 
 @pytest.mark.parametrize("level", [0.1, 0.9])
-def test_flat_pictures_lose_fewer_digits_than_in_torch(level: float) -> None:
+def test_flat_images_lose_fewer_digits_than_in_torch(level: float) -> None:
     """Variances near zero are differences of nearly equal numbers; c2 = 9e-4 hides little of their rounding."""
     generator = torch.Generator().manual_seed(0)
     target = torch.full((60, 60, 3), level)
@@ -76,13 +76,13 @@ def test_flat_pictures_lose_fewer_digits_than_in_torch(level: float) -> None:
     _, plain = loss_with_gradient(reference_photometric_loss, image, target, torch.float32)
     _, exact = loss_with_gradient(reference_photometric_loss, image, target, torch.float64)
     assert (gradient - exact).norm() < 2e-5 * exact.norm()
-    if level > 0.5:  # dark pictures have little to lose
+    if level > 0.5:  # dark images have little to lose
         assert (gradient - exact).norm() < (plain - exact).norm()
 
 
 def test_the_structural_part_is_that_of_scikit_image() -> None:
     """Inside a margin of zeros, where reflecting and padding with zeros are the same."""
-    image, target = (torch.nn.functional.pad(part, (0, 0, 12, 12, 12, 12)) for part in pictures(40, 30))
+    image, target = (torch.nn.functional.pad(part, (0, 0, 12, 12, 12, 12)) for part in images(40, 30))
     expected = structural_similarity(
         *(np.asarray(part, np.float64) for part in (image, target)),
         data_range=1.0, channel_axis=-1, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True,
@@ -90,8 +90,8 @@ def test_the_structural_part_is_that_of_scikit_image() -> None:
     np.testing.assert_allclose(1 - photometric_loss(image, target, 1.0), expected, rtol=1e-6)
 
 
-def test_equal_pictures_have_no_loss_and_no_gradient() -> None:
-    _, target = pictures(40, 50)
+def test_equal_images_have_no_loss_and_no_gradient() -> None:
+    _, target = images(40, 50)
     loss, gradient = loss_with_gradient(photometric_loss, target, target, torch.float32)
     assert abs(loss) < 1e-7
     assert gradient.abs().max() * gradient.numel() < 1e-4
@@ -103,12 +103,12 @@ def test_one_and_more_threads_give_the_same_bits(height: int) -> None:
     results = []
     for count in (1, 2, 4):
         torch.set_num_threads(count)
-        results.append(loss_with_gradient(photometric_loss, *pictures(height, 50), torch.float32))
+        results.append(loss_with_gradient(photometric_loss, *images(height, 50), torch.float32))
     assert all(torch.equal(one, other) for result in results[1:] for one, other in zip(results[0], result))
 
 
 def test_a_nan_pixel_spoils_only_its_surroundings() -> None:
-    image, target = pictures(60, 60)
+    image, target = images(60, 60)
     _, clean = loss_with_gradient(photometric_loss, image, target, torch.float32)
     image[30, 20, 1] = math.nan
     loss, gradient = loss_with_gradient(photometric_loss, image, target, torch.float32)
@@ -120,7 +120,7 @@ def test_a_nan_pixel_spoils_only_its_surroundings() -> None:
 
 
 def test_the_gradient_scales_with_what_comes_back_and_may_be_asked_for_twice() -> None:
-    image, target = pictures(30, 30)
+    image, target = images(30, 30)
     _, once = loss_with_gradient(photometric_loss, image, target, torch.float32)
     image.requires_grad_()
     loss = photometric_loss(image, target)
@@ -130,7 +130,7 @@ def test_the_gradient_scales_with_what_comes_back_and_may_be_asked_for_twice() -
 
 
 def test_without_gradients_the_value_is_the_same() -> None:
-    image, target = pictures(30, 30)
+    image, target = images(30, 30)
     loss = photometric_loss(image, target)
     assert not loss.requires_grad
     with torch.no_grad():
@@ -139,7 +139,7 @@ def test_without_gradients_the_value_is_the_same() -> None:
 
 
 def test_torch_takes_over_where_the_kernel_does_not_apply(monkeypatch: pytest.MonkeyPatch) -> None:
-    image, target = pictures(20, 20)
+    image, target = images(20, 20)
     native = photometric_loss(image, target)
     learned = target.clone().requires_grad_()
     photometric_loss(image, learned).backward()
@@ -152,7 +152,7 @@ def test_torch_takes_over_where_the_kernel_does_not_apply(monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("height", [20, 70])
 def test_a_target_of_bytes_is_the_same_as_its_numbers_to_the_bit(height: int) -> None:
-    image, target = pictures(height, 45)
+    image, target = images(height, 45)
     kept = (255 * target).round().to(torch.uint8)
     exact = loss_with_gradient(photometric_loss, image, kept.float() / 255, torch.float32)
     image.requires_grad_()

@@ -46,7 +46,7 @@ int main() {
 """
 
 
-def test_no_number_outside_of_the_pictures_is_touched(tmp_path: Path) -> None:
+def test_no_number_outside_of_the_images_is_touched(tmp_path: Path) -> None:
     """A band of rows read up to three rows beyond its copy of the target: most times harmless, now and then a crash."""
     compiler = shutil.which("g++")
     if compiler is None or sys.platform != "linux":

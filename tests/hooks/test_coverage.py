@@ -1,4 +1,4 @@
-"""Insertion covers what the prior knows: one Gaussian per square of the picture, from every camera, at once."""
+"""Insertion covers what the prior knows: one Gaussian per square of the image, from every camera, at once."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def proposed(views: list[View], **settings: float) -> Points:
 
 
 def squares(points: Points, view: View, side: float) -> list[tuple[int, int]]:
-    """The square of the picture that each point lies in."""
+    """The square of the image that each point lies in."""
     camera = points.positions + view.T_camera_world[:3, 3]
     pixels = (camera / camera[:, 2:] @ view.K.T)[:, :2] / side
     return [(int(column), int(row)) for column, row in pixels.tolist()]
 
 
 @pytest.mark.parametrize("spacing", [1.0, 2.0, 4.0, 8.0])
-def test_every_square_of_a_bare_picture_gets_one_gaussian(spacing: float) -> None:
+def test_every_square_of_a_bare_image_gets_one_gaussian(spacing: float) -> None:
     view = make_views()[0]
     found = squares(proposed([view], spacing=spacing), view, spacing)
     every = {(c, r) for c in range(math.ceil(WIDTH / spacing)) for r in range(math.ceil(HEIGHT / spacing))}
@@ -55,12 +55,12 @@ def test_a_gaussian_is_as_large_as_the_distance_to_the_next() -> None:
 
 
 @given(budget=st.integers(1, 400))
-def test_a_budget_is_kept_and_spreads_its_samples_over_the_picture(budget: int) -> None:
+def test_a_budget_is_kept_and_spreads_its_samples_over_the_image(budget: int) -> None:
     view = make_views()[0]
     points = proposed([view], spacing=1.0, budget_per_view=budget)
     spacing = math.sqrt(KNOWN / budget)
     assert len(points.positions) <= budget
-    # Of the squares that fit into the picture at this spacing all are filled but those in the column in conflict.
+    # Of the squares that fit into the image at this spacing all are filled but those in the column in conflict.
     columns, rows = math.floor(WIDTH / spacing), math.floor(HEIGHT / spacing)
     assert len(points.positions) >= min(budget, (columns - 1) * rows) - 1
     expected = torch.full_like(points.scales, DensifyConfig().scale * spacing * 3.0 / 30)

@@ -81,7 +81,7 @@ class TestDepthLoss:
         scaled = depth_loss(tensor(1.1, 3.0) * scale, mask, tensor(1.0, 4.0) * scale, mask, 0.01)
         torch.testing.assert_close(scaled, reference, rtol=2e-5, atol=0)
 
-    def test_depths_a_billion_apart_in_one_picture_weigh_alike(self) -> None:
+    def test_depths_a_billion_apart_in_one_image_weigh_alike(self) -> None:
         mask = torch.ones(2, dtype=torch.bool)
         loss = depth_loss(tensor(1.1e-3, 1.1e6), mask, tensor(1e-3, 1e6), mask, 0.01)
         torch.testing.assert_close(loss, charbonnier(tensor(0.1), 0.01).squeeze(), rtol=1e-4, atol=0)

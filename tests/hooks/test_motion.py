@@ -1,4 +1,4 @@
-"""What moves in the picture lives as long as its instant; what stands still lives as the backbone lets it."""
+"""What moves in the image lives as long as its instant; what stands still lives as the backbone lets it."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ class Crossing:
     def prior(self, camera: str, frame: int) -> DepthPrior:
         """D* of any view."""
         labels = torch.full((HEIGHT, WIDTH), int(Label.VERIFIED), dtype=torch.uint8)
-        return DepthPrior(torch.full((HEIGHT, WIDTH), DISTANCE), labels, self.picture(frame) if self.colors else None)
+        return DepthPrior(torch.full((HEIGHT, WIDTH), DISTANCE), labels, self.image(frame) if self.colors else None)
 
-    def picture(self, frame: int) -> Tensor:
+    def image(self, frame: int) -> Tensor:
         """uint8 [H, W, 3]."""
         grey = 100 + (self.flicker if frame % 2 else 0)
-        picture = torch.full((HEIGHT, WIDTH, 3), grey)
-        picture[:, BAR * frame : BAR * (frame + 1)] = 255
-        return picture.to(torch.uint8)
+        image = torch.full((HEIGHT, WIDTH, 3), grey)
+        image[:, BAR * frame : BAR * (frame + 1)] = 255
+        return image.to(torch.uint8)
 
 
 def context_of(store: Crossing, known: list[View], count: int = 1) -> Context:

@@ -66,7 +66,7 @@ def scattered(seed: int) -> Splats:
 
 
 def compositing_weights(splats: Splats, view: View) -> Tensor:
-    """w_{k,p} [H, W, N]: the picture in which every Gaussian has a colour channel of its own."""
+    """w_{k,p} [H, W, N]: the image in which every Gaussian has a colour channel of its own."""
     return rasterize(splats, torch.eye(len(splats.means)).double(), view).color
 
 

@@ -242,7 +242,7 @@ class TestStiff:
 
 
 class TestOutline:
-    def test_the_outline_of_a_sky_says_nothing_and_the_rim_of_the_picture_is_no_outline(
+    def test_the_outline_of_a_sky_says_nothing_and_the_rim_of_the_image_is_no_outline(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(loading, "OUTLINE", 2)

@@ -156,8 +156,8 @@ class GaussianModel(InriaModel):
         if self._xyz.isnan().any():
             self.prune_points(self._xyz.isnan().any(1))
 
-    def capture(self) -> tuple[object, ...]:
-        return super().capture(), tuple(getattr(self, name) for name in (*self.kept, "_parent", "_level"))
+    def recording(self) -> tuple[object, ...]:
+        return super().recording(), tuple(getattr(self, name) for name in (*self.kept, "_parent", "_level"))
 
     def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
         super().restore(model_args[0], training_args)

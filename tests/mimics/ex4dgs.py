@@ -153,8 +153,8 @@ class GaussianModel(InriaModel):
         if any(mask.any() for mask in masks):
             self.prune_points(*masks)
 
-    def capture(self) -> tuple[object, ...]:
-        return super().capture(), tuple(getattr(self, name) for name in self.kept)
+    def recording(self) -> tuple[object, ...]:
+        return super().recording(), tuple(getattr(self, name) for name in self.kept)
 
     def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
         super().restore(model_args[0], training_args)

@@ -106,9 +106,7 @@ class Gaussians(nn.Module):
         """Copies of small Gaussians at the end, then one prune of what is faint."""
         info = self._densification_info
         chosen = info[1] >= grad_threshold * info[0].clamp_min(1.0)
-        self._swap(
-            lambda _, p: torch.cat([p, p[chosen]]), lambda _, m: torch.cat([m, torch.zeros_like(m[chosen])])
-        )
+        self._swap(lambda _, p: torch.cat([p, p[chosen]]), lambda _, m: torch.cat([m, torch.zeros_like(m[chosen])]))
         self._densification_info = None
         self.prune(self._opacities.flatten() < math.log(min_opacity / (1 - min_opacity)))
 
@@ -130,7 +128,7 @@ class NerficgView:
 
 
 def render_image_training(gaussians: Gaussians, view: NerficgView) -> tuple[Tensor, Tensor]:
-    """A picture and nothing else; the conditional Gaussian by Schur's complement, as the rasterizer computes it."""
+    """An image and nothing else; the conditional Gaussian by Schur's complement, as the rasterizer computes it."""
     g, lens = gaussians, view.camera
     R = build_4d_rotation(g._left_isoclinic_rotations, g._right_isoclinic_rotations)
     RS = R * torch.cat([g._spatial_scales, g._temporal_scales], 1).exp()[:, None]
@@ -186,7 +184,7 @@ class Trainer:
         self.model.gaussians.optimizer.load_state_dict(saved["optimizer"])
         self.model.gaussians._densification_info = saved["info"].clone()
 
-    def capture(self) -> dict[str, object]:
+    def recording(self) -> dict[str, object]:
         g = self.model.gaussians
         values = {name: getattr(g, f"_{name}").detach().clone() for name in RATES}
         return {"values": values, "optimizer": g.optimizer.state_dict(), "info": g._densification_info}

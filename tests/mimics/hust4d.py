@@ -87,8 +87,8 @@ class GaussianModel(InriaModel):
         self._deformation_accum = self._deformation_accum[~mask]
         self._deformation_table = self._deformation_table[~mask]
 
-    def capture(self) -> tuple[object, ...]:
-        return super().capture(), self._deformation.state_dict(), self._deformation_table
+    def recording(self) -> tuple[object, ...]:
+        return super().recording(), self._deformation.state_dict(), self._deformation_table
 
     def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
         model_args, field, self._deformation_table = model_args
@@ -167,5 +167,5 @@ def scene_reconstruction(gaussians, scene, stage, opt, checkpoint, stop, train_i
                     gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005, scene.cameras_extent, None)
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
-                gaussians.optimizer.zero_grad(set_to_none = True)
+                gaussians.optimizer.zero_grad(set_to_none=True)
     return SimpleNamespace(**locals())

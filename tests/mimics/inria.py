@@ -271,7 +271,7 @@ class InriaModel:
                 value = torch.logit(self.get_opacity.clamp(max=0.3))
                 self._swap(group, value, {key: torch.zeros_like(value) for key in moments})
 
-    def capture(self) -> tuple[object, ...]:
+    def recording(self) -> tuple[object, ...]:
         values = tuple(getattr(self, attribute) for _, attribute in self.columns)
         evidence = tuple(getattr(self, name) for name in (*self.accumulated, "max_radii2D"))
         return values, evidence, self.optimizer.state_dict()

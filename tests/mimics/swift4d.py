@@ -87,10 +87,10 @@ class GaussianModel(InriaModel):
         self.prune_points(self._max_weight < weight_threshold)
         self._max_weight = self._max_weight * 0.0
 
-    def capture(self) -> tuple[object, ...]:
+    def recording(self) -> tuple[object, ...]:
         """With what the repository's own leaves out: without logits and field nothing could go on."""
         field = self._FDhash.state_dict(), self.hash_optimizer.state_dict()
-        return super().capture(), self._dynamic.detach().clone(), self._max_weight.clone(), field
+        return super().recording(), self._dynamic.detach().clone(), self._max_weight.clone(), field
 
     def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
         model_args, dynamic, self._max_weight, (field, moments) = model_args
@@ -166,7 +166,7 @@ def scene_reconstruction(gaussians, scene, stage, opt, checkpoint, stop, args=No
                     gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005, scene.cameras_extent, None)
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
-                gaussians.optimizer.zero_grad(set_to_none = True)
+                gaussians.optimizer.zero_grad(set_to_none=True)
                 gaussians.hash_optimizer.step()
-                gaussians.hash_optimizer.zero_grad(set_to_none = True)
+                gaussians.hash_optimizer.zero_grad(set_to_none=True)
     return SimpleNamespace(**locals())

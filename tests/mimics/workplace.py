@@ -12,8 +12,8 @@ from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_views
 
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Points
+from d2_plugin.store.store import PriorStore
 
 HOOKS = replace(
     ALL_HOOKS,
@@ -25,13 +25,13 @@ HOOKS = replace(
 
 def furnish(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Write the exact prior of the tiny scene and all hooks, and make `folder` the working directory."""
-    store = PriorStore.create(folder / "prior", ["cam0", "cam1", "cam2"], [0, 1], {"capture": "tiny"})
+    store = PriorStore.create(folder / "prior", ["cam0", "cam1", "cam2"], [0, 1], {"recording": "tiny"})
     for view in make_views():
         prior = TinyStore().prior(view.camera, view.frame)
         camera = {"K": view.K.tolist(), "T_camera_world": view.T_camera_world.tolist()}
-        picture = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+        image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
         sigma = np.where(prior.trusted.numpy(), np.float32(0), np.float32(np.inf))
-        fused = FusedPrior(prior.depth.numpy(), prior.labels.numpy(), sigma, picture)
+        fused = FusedPrior(prior.depth.numpy(), prior.labels.numpy(), sigma, image)
         store.write(view.camera, view.frame, fused, {"camera": camera})
     (folder / "d2.toml").write_text(replace(HOOKS, prior="prior").to_toml())
     monkeypatch.chdir(folder)

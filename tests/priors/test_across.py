@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d2_plugin.captures import open_capture
-from d2_plugin.captures.capture import Camera, Capture, MonoKind
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.monocular.across import Shown, aligned_across, is_open
 from d2_plugin.priors.monocular.align import Alignment, AlignStatus, align
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.priors.store import PriorStore
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.recording import Camera, MonoKind, Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.store import PriorStore
 
 cv2 = pytest.importorskip("cv2")
 
@@ -29,8 +29,8 @@ SIDE = 16
 
 
 @pytest.fixture(scope="module")
-def room() -> Capture:
-    return synthetic_capture(cameras=3, held_out=0, frames=1, width=160, height=90, arc_degrees=80)
+def room() -> Recording:
+    return synthetic_recording(cameras=3, held_out=0, frames=1, width=160, height=90, arc_degrees=80)
 
 
 def patch(depth: np.ndarray, seed: int, bend: float = 0.0) -> np.ndarray:
@@ -45,7 +45,7 @@ def patch(depth: np.ndarray, seed: int, bend: float = 0.0) -> np.ndarray:
 
 
 def shown(
-    room: Capture,
+    room: Recording,
     kind: MonoKind = "relative",
     names: tuple[str, ...] | None = None,
     turned: Callable[[str, np.ndarray], np.ndarray] | None = None,
@@ -65,7 +65,7 @@ def shown(
     return views
 
 
-def error(room: Capture, name: str, view: Shown, scale: float, shift: float, kind: MonoKind = "relative") -> float:
+def error(room: Recording, name: str, view: Shown, scale: float, shift: float, kind: MonoKind = "relative") -> float:
     """Median relative error of the depth that a line gives."""
     turned = scale * view.mono.astype(np.float64) + shift
     depth = 1 / np.maximum(turned, 1e-6) if kind == "relative" else turned
@@ -73,7 +73,7 @@ def error(room: Capture, name: str, view: Shown, scale: float, shift: float, kin
 
 
 @pytest.mark.parametrize("kind", ["relative", "metric"])
-def test_the_slopes_are_found_that_one_patch_of_depth_leaves_open(room: Capture, kind: MonoKind) -> None:
+def test_the_slopes_are_found_that_one_patch_of_depth_leaves_open(room: Recording, kind: MonoKind) -> None:
     views = shown(room, kind)
     assert all(is_open(view) for view in views.values())
     found = aligned_across(views, kind, ALIGN)
@@ -95,7 +95,7 @@ def line(alignment: Alignment) -> tuple[float, float]:
 @settings(max_examples=6, deadline=None)
 @given(st.floats(-6, 6), st.floats(-6, 6), st.floats(-5, 5))
 def test_neither_the_unit_of_the_world_nor_that_of_a_map_matters(world: float, scale: float, shift: float) -> None:
-    room = synthetic_capture(cameras=2, held_out=0, frames=1, width=96, height=54, arc_degrees=60)
+    room = synthetic_recording(cameras=2, held_out=0, frames=1, width=96, height=54, arc_degrees=60)
 
     def other(name: str, mono: np.ndarray) -> np.ndarray:
         return (mono + shift) * 10**scale
@@ -109,7 +109,7 @@ def test_neither_the_unit_of_the_world_nor_that_of_a_map_matters(world: float, s
         assert np.median(np.abs(depth / expected - 1)) < 0.02
 
 
-def test_maps_with_spread_anchors_keep_their_lines_and_help_the_others(room: Capture) -> None:
+def test_maps_with_spread_anchors_keep_their_lines_and_help_the_others(room: Recording) -> None:
     views = shown(room)
     spread = {}
     for name, view in views.items():
@@ -139,13 +139,13 @@ def turned(name: str, mono: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("wrong", [noise, turned, lambda name, mono: mono.max() - mono])
 def test_maps_that_show_no_common_surface_are_told_nothing(
-    room: Capture, wrong: Callable[[str, np.ndarray], np.ndarray]
+    room: Recording, wrong: Callable[[str, np.ndarray], np.ndarray]
 ) -> None:
     views = shown(room, turned=wrong)
     assert not [view for view in aligned_across(views, "relative", ALIGN).values() if view.status is AlignStatus.ACROSS]
 
 
-def test_one_wrong_map_is_left_out_and_the_others_are_told(room: Capture) -> None:
+def test_one_wrong_map_is_left_out_and_the_others_are_told(room: Recording) -> None:
     last = list(room.cameras)[-1]
     views = shown(room, turned=lambda name, mono: mono[::-1, ::-1] if name == last else mono)
     found = aligned_across(views, "relative", ALIGN)
@@ -154,10 +154,10 @@ def test_one_wrong_map_is_left_out_and_the_others_are_told(room: Capture) -> Non
 
 
 class TestStiff:
-    def test_one_camera_alone_is_told_nothing(self, room: Capture) -> None:
+    def test_one_camera_alone_is_told_nothing(self, room: Recording) -> None:
         assert aligned_across(shown(room, names=tuple(room.cameras)[:1]), "relative", ALIGN) == {}
 
-    def test_a_map_without_anchors_is_left_out(self, room: Capture) -> None:
+    def test_a_map_without_anchors_is_left_out(self, room: Recording) -> None:
         views = shown(room)
         first = next(iter(views))
         empty = np.zeros_like(views[first].geometric)
@@ -168,7 +168,7 @@ class TestStiff:
         assert set(found) == set(views) - {first}
 
     @pytest.mark.parametrize("value", [np.nan, 0.0])
-    def test_pixels_without_a_prediction_are_asked_nothing(self, room: Capture, value: float) -> None:
+    def test_pixels_without_a_prediction_are_asked_nothing(self, room: Recording, value: float) -> None:
         def half(name: str, mono: np.ndarray) -> np.ndarray:
             holes = np.indices(mono.shape).sum(0) % 2 == 0
             return np.where(holes, value, mono)
@@ -176,7 +176,7 @@ class TestStiff:
         found = aligned_across(shown(room, turned=half), "relative", ALIGN)
         assert max(error(room, name, shown(room)[name], *line(found[name])) for name in found) < 0.03
 
-    def test_a_constant_map_is_not_open_and_anchors_of_one_depth_are(self, room: Capture) -> None:
+    def test_a_constant_map_is_not_open_and_anchors_of_one_depth_are(self, room: Recording) -> None:
         view = next(iter(shown(room).values()))
         constant = np.full_like(view.mono, 0.5)
         flat = align(constant, view.geometric, kind="relative", settings=ALIGN)
@@ -185,7 +185,7 @@ class TestStiff:
         alignment = align(view.mono, level, kind="relative", settings=ALIGN)
         assert is_open(view._replace(geometric=level, alignment=alignment))
 
-    def test_cameras_that_look_away_from_each_other_tell_nothing(self, room: Capture) -> None:
+    def test_cameras_that_look_away_from_each_other_tell_nothing(self, room: Recording) -> None:
         views = shown(room, names=tuple(room.cameras)[:2])
         name, view = list(views.items())[1]
         back = np.array(view.camera.T_camera_world)
@@ -196,14 +196,14 @@ class TestStiff:
 
 def test_two_cameras_far_apart_outdoors(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
     """plaza from 02 and 05, 64 degrees apart, stereo looking far away alone: it knows a tower, the maps know more."""
-    capture = replace(open_capture(shared_data("plaza")), frames=(10,))
+    recording = replace(open_recording(shared_data("plaza")), frames=(10,))
     errors = {}
     for across in (False, True):
         prior = PriorSettings(depth_range=(15.0, 40.0), align=AlignSettings(across=across))
-        build_priors(capture, ["02", "05"], tmp_path / str(across), prior)
+        build_priors(recording, ["02", "05"], tmp_path / str(across), prior)
         for camera in ("02", "05"):
             found = PriorStore.open(tmp_path / str(across)).prior(camera, 10)
-            known, truth = found.depth.numpy() > 0, capture.depth(camera, 10)
+            known, truth = found.depth.numpy() > 0, recording.depth(camera, 10)
             known &= truth > 0
             apart = np.abs(found.depth.numpy() / np.where(known, truth, 1) - 1)[known]
             errors[across, camera] = float(np.median(apart)), known.mean()

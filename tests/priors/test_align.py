@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.align_measure import align_problem
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.monocular.align import Alignment, AlignStatus, align, aligned_depth, not_aligned, rank_correlation
 from d2_plugin.priors.settings import AlignSettings
-from d2_plugin.study.bench.align_measure import align_problem
 
 SHAPE = (90, 120)
 

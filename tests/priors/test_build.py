@@ -14,16 +14,16 @@ import pytest
 import tiny_onnx
 import torch
 
-from d2_plugin.captures.capture import Capture, Source
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, PriorSummary, build_priors
 from d2_plugin.priors.construct import NO_MAP, SCALE_UNKNOWN
 from d2_plugin.priors.monocular.align import align
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo import match
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.recording import Recording, Source
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")
 
@@ -58,24 +58,24 @@ class Recorder:
 
 
 @pytest.fixture(scope="module")
-def plain() -> Capture:
-    return synthetic_capture(cameras=3, held_out=1, frames=2, width=160, height=90, arc_degrees=20)
+def plain() -> Recording:
+    return synthetic_recording(cameras=3, held_out=1, frames=2, width=160, height=90, arc_degrees=20)
 
 
 @pytest.fixture
-def capture(plain: Capture) -> Capture:
+def recording(plain: Recording) -> Recording:
     return replace(plain, source=Recorder(plain.source, set()))
 
 
 @pytest.fixture(scope="module")
-def built(plain: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PriorSummary]:
+def built(plain: Recording, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, PriorSummary]:
     """A finished store that tests may read but not change."""
     path = tmp_path_factory.mktemp("built") / "priors"
     return path, build_priors(plain, NAMES, path, SETTINGS)
 
 
-def lying(capture: Capture, **lies: tuple) -> Capture:
-    return replace(capture, source=replace(capture.source, **lies))
+def lying(recording: Recording, **lies: tuple) -> Recording:
+    return replace(recording, source=replace(recording.source, **lies))
 
 
 def contents(path: Path) -> dict[str, bytes]:
@@ -89,17 +89,17 @@ def no_stereo(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(match, "geometric_depth", refuse)
 
 
-def errors_of(capture: Capture, store: PriorStore, *labels: Label) -> np.ndarray:
+def errors_of(recording: Recording, store: PriorStore, *labels: Label) -> np.ndarray:
     """Relative errors at frame 0 of all pixels that carry one of the labels."""
     found = []
     for camera in NAMES:
-        truth, prior = capture.depth(camera, 0), store.prior(camera, 0)
+        truth, prior = recording.depth(camera, 0), store.prior(camera, 0)
         mask = np.isin(prior.labels.numpy(), labels)
         found.append(np.abs(prior.depth.numpy() - truth)[mask] / truth[mask])
     return np.concatenate(found)
 
 
-def test_verified_pixels_are_right_and_mono_only_ones_roughly(plain: Capture, built: tuple) -> None:
+def test_verified_pixels_are_right_and_mono_only_ones_roughly(plain: Recording, built: tuple) -> None:
     store = PriorStore.open(built[0])
     verified, mono = errors_of(plain, store, Label.VERIFIED), errors_of(plain, store, Label.MONO, Label.AGREED)
     assert verified.size > 0.1 * 3 * 160 * 90
@@ -108,7 +108,9 @@ def test_verified_pixels_are_right_and_mono_only_ones_roughly(plain: Capture, bu
     assert np.median(mono) < 0.08
 
 
-def test_where_two_cameras_agree_monocular_depth_is_better_than_where_they_do_not(plain: Capture, built: tuple) -> None:
+def test_where_two_cameras_agree_monocular_depth_is_better_than_where_they_do_not(
+    plain: Recording, built: tuple
+) -> None:
     store = PriorStore.open(built[0])
     agreed, alone = errors_of(plain, store, Label.AGREED), errors_of(plain, store, Label.MONO)
     assert agreed.size > 0.02 * 3 * 160 * 90
@@ -139,13 +141,13 @@ def test_the_record_tells_everything_that_decided(built: tuple) -> None:
     assert record["refused"] == ""
 
 
-def test_only_training_cameras_are_read_and_no_true_depth(capture: Capture, tmp_path: Path) -> None:
-    build_priors(capture, NAMES[:2], tmp_path, SETTINGS)
-    assert capture.source.reads == {("image", camera, frame) for camera in NAMES[:2] for frame in (0, 1)}
+def test_only_training_cameras_are_read_and_no_true_depth(recording: Recording, tmp_path: Path) -> None:
+    build_priors(recording, NAMES[:2], tmp_path, SETTINGS)
+    assert recording.source.reads == {("image", camera, frame) for camera in NAMES[:2] for frame in (0, 1)}
 
 
 def test_a_frame_is_matched_within_its_own_timestamp(
-    capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     matched = []
     original = match.geometric_depth
@@ -155,14 +157,14 @@ def test_a_frame_is_matched_within_its_own_timestamp(
         return original(images, *rest)
 
     monkeypatch.setattr(match, "geometric_depth", watch)
-    build_priors(capture, NAMES[:2], tmp_path, SETTINGS)
-    for frame, images in zip(capture.frames, matched, strict=True):
+    build_priors(recording, NAMES[:2], tmp_path, SETTINGS)
+    for frame, images in zip(recording.frames, matched, strict=True):
         for camera, image in zip(NAMES, images):
-            np.testing.assert_array_equal(image, capture.image(camera, frame))
+            np.testing.assert_array_equal(image, recording.image(camera, frame))
 
 
 def test_a_second_build_computes_nothing_and_changes_nothing(
-    plain: Capture, built: tuple, monkeypatch: pytest.MonkeyPatch
+    plain: Recording, built: tuple, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     no_stereo(monkeypatch)
     before = contents(built[0])
@@ -173,13 +175,13 @@ def test_a_second_build_computes_nothing_and_changes_nothing(
 
 
 def test_a_build_that_is_up_to_date_reads_each_monocular_map_once(
-    capture: Capture, built: tuple, monkeypatch: pytest.MonkeyPatch
+    recording: Recording, built: tuple, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Cameras that must agree depend on each other's maps, which are hashed once per frame and not once per pair."""
     read = []
     original = Recorder.mono
     monkeypatch.setattr(Recorder, "mono", lambda self, *view: read.append(view) or original(self, *view))
-    assert build_priors(capture, NAMES, built[0], SETTINGS).kept == 6
+    assert build_priors(recording, NAMES, built[0], SETTINGS).kept == 6
     assert sorted(read) == [(camera, frame) for camera in NAMES for frame in (0, 1)]
 
 
@@ -191,7 +193,7 @@ def test_a_build_that_is_up_to_date_reads_each_monocular_map_once(
     ],
 )
 def test_other_fusion_settings_reuse_the_stereo_cache(
-    plain: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strict: dict, loose: dict
+    plain: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strict: dict, loose: dict
 ) -> None:
     strict = build_priors(plain, NAMES, tmp_path, replace(SETTINGS, agreement=0.0, **strict))
     no_stereo(monkeypatch)
@@ -201,13 +203,15 @@ def test_other_fusion_settings_reuse_the_stereo_cache(
     assert loose.shares["train0"]["mono"] == strict.shares["train0"]["mono"]
 
 
-def test_a_changed_picture_rebuilds_its_timestamp_and_no_other(capture: Capture, tmp_path: Path) -> None:
-    build_priors(capture, NAMES, tmp_path, SETTINGS)
-    summary = build_priors(lying(capture, brighter=(("train1", 1),)), NAMES, tmp_path, SETTINGS)
+def test_a_changed_image_rebuilds_its_timestamp_and_no_other(recording: Recording, tmp_path: Path) -> None:
+    build_priors(recording, NAMES, tmp_path, SETTINGS)
+    summary = build_priors(lying(recording, brighter=(("train1", 1),)), NAMES, tmp_path, SETTINGS)
     assert (summary.built, summary.kept) == (3, 3)
 
 
-def test_a_damaged_prior_is_rebuilt_and_named(plain: Capture, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_damaged_prior_is_rebuilt_and_named(
+    plain: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     build_priors(plain, NAMES, tmp_path, SETTINGS)
     intact = contents(tmp_path)
     file = tmp_path / "priors" / "train2" / "00001.npy"
@@ -222,18 +226,18 @@ def test_a_damaged_prior_is_rebuilt_and_named(plain: Capture, tmp_path: Path, ca
     }
 
 
-def test_a_kill_in_the_middle_loses_only_the_frame_in_work(plain: Capture, built: tuple, tmp_path: Path) -> None:
+def test_a_kill_in_the_middle_loses_only_the_frame_in_work(plain: Recording, built: tuple, tmp_path: Path) -> None:
     script = (
-        "from d2_plugin.captures.synthetic.room import synthetic_capture\n"
+        "from d2_plugin.recordings.synthetic.room import synthetic_recording\n"
         "from d2_plugin.priors.build import *\n"
         "from d2_plugin.priors.settings import StereoSettings\n"
         "import sys, time\n"
-        "capture = synthetic_capture(cameras=3, held_out=1, frames=2, width=160, height=90, arc_degrees=20)\n"
+        "recording = synthetic_recording(cameras=3, held_out=1, frames=2, width=160, height=90, arc_degrees=20)\n"
         "def progress(done, total, note):\n"
         "    print(done, flush=True)\n"
         "    time.sleep(60 if done == 4 else 0)\n"
         "settings = PriorSettings(stereo=StereoSettings(matcher='sweep'))\n"
-        f"build_priors(capture, {NAMES}, sys.argv[1], settings, progress=progress)"
+        f"build_priors(recording, {NAMES}, sys.argv[1], settings, progress=progress)"
     )
     process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     for line in process.stdout:
@@ -247,11 +251,11 @@ def test_a_kill_in_the_middle_loses_only_the_frame_in_work(plain: Capture, built
     assert contents(tmp_path) == contents(built[0])
 
 
-def test_a_refused_map_leaves_stereo_as_it_is(capture: Capture, tmp_path: Path) -> None:
-    lies = lying(capture, flip_mono=(("train0", 1),), no_mono=(("train2", 0),))
+def test_a_refused_map_leaves_stereo_as_it_is(recording: Recording, tmp_path: Path) -> None:
+    lies = lying(recording, flip_mono=(("train0", 1),), no_mono=(("train2", 0),))
     summary = build_priors(lies, NAMES, tmp_path / "refused", SETTINGS)
     assert {(camera, frame) for camera, frame, _ in summary.refused} == {("train0", 1), ("train2", 0)}
-    build_priors(capture, NAMES, tmp_path / "stereo", replace(SETTINGS, variant="mvs"))
+    build_priors(recording, NAMES, tmp_path / "stereo", replace(SETTINGS, variant="mvs"))
     refused, stereo = PriorStore.open(tmp_path / "refused"), PriorStore.open(tmp_path / "stereo")
     for view in (("train0", 1), ("train2", 0)):
         found, expected = refused.prior(*view), stereo.prior(*view)
@@ -264,9 +268,9 @@ def test_a_refused_map_leaves_stereo_as_it_is(capture: Capture, tmp_path: Path) 
 
 @pytest.mark.parametrize("settings", [PriorSettings(uncertainty=False), PriorSettings.paper()])
 def test_in_the_paper_a_refused_view_is_empty_with_its_reason_and_the_others_are_not(
-    capture: Capture, tmp_path: Path, settings: PriorSettings
+    recording: Recording, tmp_path: Path, settings: PriorSettings
 ) -> None:
-    lies = lying(capture, flip_mono=(("train0", 1),), no_mono=(("train2", 0),))
+    lies = lying(recording, flip_mono=(("train0", 1),), no_mono=(("train2", 0),))
     summary = build_priors(lies, NAMES, tmp_path, replace(settings, stereo=SETTINGS.stereo))
     assert summary.built == 6
     refused = {(camera, frame) for camera, frame, _ in summary.refused}
@@ -282,13 +286,15 @@ def test_in_the_paper_a_refused_view_is_empty_with_its_reason_and_the_others_are
     assert "refused 1x (train0/1)" in str(summary)
 
 
-def test_progress_counts_pictures(plain: Capture, built: tuple) -> None:
+def test_progress_counts_images(plain: Recording, built: tuple) -> None:
     seen: list[tuple[int, int]] = []
     build_priors(plain, NAMES, built[0], SETTINGS, progress=lambda done, total, note: seen.append((done, total)))
     assert seen == [(done, 6) for done in range(1, 7)]
 
 
-def test_without_monocular_depth_geometric_depth_stands_alone_and_that_is_said(plain: Capture, tmp_path: Path) -> None:
+def test_without_monocular_depth_geometric_depth_stands_alone_and_that_is_said(
+    plain: Recording, tmp_path: Path
+) -> None:
     summary = build_priors(replace(plain, mono_kind=None), NAMES, tmp_path, SETTINGS)
     assert "without a second source" in str(summary)
     store = PriorStore.open(tmp_path)
@@ -296,13 +302,13 @@ def test_without_monocular_depth_geometric_depth_stands_alone_and_that_is_said(p
     assert set(np.unique(store.prior("train0", 0).labels)) == {Label.EMPTY, Label.VERIFIED}
 
 
-def test_one_camera_has_no_depth_from_a_relative_map(plain: Capture, tmp_path: Path) -> None:
+def test_one_camera_has_no_depth_from_a_relative_map(plain: Recording, tmp_path: Path) -> None:
     summary = build_priors(plain, NAMES[:1], tmp_path, SETTINGS)
     assert [reason for _, _, reason in summary.refused] == [SCALE_UNKNOWN] * 2
     assert "one camera" in str(summary)
 
 
-def test_one_camera_has_mono_only_depth_from_a_metric_map(plain: Capture, tmp_path: Path) -> None:
+def test_one_camera_has_mono_only_depth_from_a_metric_map(plain: Recording, tmp_path: Path) -> None:
     class Metric(Recorder):
         def mono(self, camera: str, frame: int) -> np.ndarray:
             return self.inner.depth(camera, frame)
@@ -316,14 +322,14 @@ def test_one_camera_has_mono_only_depth_from_a_metric_map(plain: Capture, tmp_pa
     np.testing.assert_allclose(prior.depth.numpy()[alone], plain.depth("train0", 0)[alone], rtol=1e-4)
 
 
-def test_no_source_at_all_is_an_error(plain: Capture, tmp_path: Path) -> None:
+def test_no_source_at_all_is_an_error(plain: Recording, tmp_path: Path) -> None:
     with pytest.raises(D2Error, match="has no depth source"):
         build_priors(replace(plain, mono_kind=None), NAMES[:1], tmp_path / "p", SETTINGS)
     assert not (tmp_path / "p").exists()
 
 
 @pytest.mark.parametrize("variant", ["mono", "mvs", "dual_unaligned", "dual_unverified"])
-def test_each_ablation_row_can_be_built(plain: Capture, tmp_path: Path, variant: str) -> None:
+def test_each_ablation_row_can_be_built(plain: Recording, tmp_path: Path, variant: str) -> None:
     alone = replace(SETTINGS, agreement=0.0)  # the other cameras' evidence is no part of the table
     dual = build_priors(plain, NAMES, tmp_path, alone).shares["train0"]
     shares = build_priors(plain, NAMES, tmp_path, replace(alone, variant=variant)).shares["train0"]
@@ -339,7 +345,7 @@ def test_each_ablation_row_can_be_built(plain: Capture, tmp_path: Path, variant:
         assert shares["verified"] == pytest.approx(dual["verified"] + dual["conflict"])
 
 
-def test_the_papers_preset_is_the_papers_equations_and_nothing_else(plain: Capture, tmp_path: Path) -> None:
+def test_the_papers_preset_is_the_papers_equations_and_nothing_else(plain: Recording, tmp_path: Path) -> None:
     """One line fitted to the anchors, e < tau_c, D^g where verified, the aligned map where alone, no evidence."""
     settings = PriorSettings.paper(stereo=SETTINGS.stereo)
     build_priors(plain, NAMES, tmp_path / "dual", settings)
@@ -368,7 +374,9 @@ def test_the_papers_preset_is_the_papers_equations_and_nothing_else(plain: Captu
     assert accepted
 
 
-def test_the_papers_plain_construction_is_a_preset_and_less_exact(plain: Capture, built: tuple, tmp_path: Path) -> None:
+def test_the_papers_plain_construction_is_a_preset_and_less_exact(
+    plain: Recording, built: tuple, tmp_path: Path
+) -> None:
     summary = build_priors(plain, NAMES, tmp_path, PriorSettings.paper(stereo=SETTINGS.stereo))
     conflict, less = (np.mean([share["conflict"] for share in s.shares.values()]) for s in (summary, built[1]))
     assert conflict > less
@@ -378,7 +386,7 @@ def test_the_papers_plain_construction_is_a_preset_and_less_exact(plain: Capture
     assert corrected < 0.9 * plain_error
 
 
-def test_a_network_is_asked_once_per_picture(plain: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_network_is_asked_once_per_image(plain: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("onnxruntime")
     from d2_plugin.priors.monocular.network import MonocularModel
 
@@ -407,7 +415,7 @@ def test_a_network_is_asked_once_per_picture(plain: Capture, tmp_path: Path, mon
     ],
 )
 def test_mistakes_are_told_before_anything_is_written(
-    plain: Capture, tmp_path: Path, names: list[str], change: dict, message: str
+    plain: Recording, tmp_path: Path, names: list[str], change: dict, message: str
 ) -> None:
     with pytest.raises(D2Error, match=message):
         build_priors(plain, names, tmp_path / "p", replace(SETTINGS, **change))

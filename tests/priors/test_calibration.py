@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures import open_capture
-from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.calibration import Calibration, held_against_truth, truth_rounding
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.protocol import Label
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")
 
@@ -28,8 +28,8 @@ TRAINING = ["00", "02", "05", "07"]
 class WithTruth:
     """A source that has a truth of its own, or none."""
 
-    def __init__(self, capture: Capture, truth: np.ndarray | None) -> None:
-        self.inner, self.truth = capture.source, truth
+    def __init__(self, recording: Recording, truth: np.ndarray | None) -> None:
+        self.inner, self.truth = recording.source, truth
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         return self.inner.image(camera, frame)
@@ -42,26 +42,26 @@ class WithTruth:
 
 
 @pytest.fixture(scope="module")
-def small() -> Capture:
-    return synthetic_capture(cameras=1, held_out=0, frames=1, width=40, height=20)
+def small() -> Recording:
+    return synthetic_recording(cameras=1, held_out=0, frames=1, width=40, height=20)
 
 
-def store_of(path: Path, capture: Capture, depth: np.ndarray, labels: np.ndarray, sigma: np.ndarray) -> PriorStore:
-    (name,) = capture.cameras
+def store_of(path: Path, recording: Recording, depth: np.ndarray, labels: np.ndarray, sigma: np.ndarray) -> PriorStore:
+    (name,) = recording.cameras
     store = PriorStore.create(path, [name], [0], {})
-    store.write(name, 0, FusedPrior(depth, labels, sigma, capture.image(name, 0)), {})
+    store.write(name, 0, FusedPrior(depth, labels, sigma, recording.image(name, 0)), {})
     return store
 
 
 def test_the_table_counts_normal_errors_as_normal(tmp_path: Path) -> None:
-    capture = synthetic_capture(cameras=1, held_out=0, frames=1, width=400, height=200)
+    recording = synthetic_recording(cameras=1, held_out=0, frames=1, width=400, height=200)
     truth = np.full((200, 400), 5.0)
     labels = np.full(truth.shape, Label.MONO, np.uint8)
     labels[:, :100] = Label.VERIFIED
     sigma = np.where(labels == Label.MONO, 0.1, 0.01).astype(np.float32)
     depth = truth * np.exp(sigma * np.random.default_rng(0).standard_normal(truth.shape))
-    store = store_of(tmp_path, capture, depth.astype(np.float32), labels, sigma)
-    found = held_against_truth(store, replace(capture, source=WithTruth(capture, truth)))
+    store = store_of(tmp_path, recording, depth.astype(np.float32), labels, sigma)
+    found = held_against_truth(store, replace(recording, source=WithTruth(recording, truth)))
     assert found.views == 1
     assert set(found.labels) == {Label.MONO, Label.VERIFIED}
     for label, share, declared in ((Label.MONO, 0.75, 0.1), (Label.VERIFIED, 0.25, 0.01)):
@@ -78,7 +78,7 @@ def test_the_table_counts_normal_errors_as_normal(tmp_path: Path) -> None:
     assert "far" not in str(found)
 
 
-def test_far_pixels_count_against_the_sky_and_infinite_sigma_promises_nothing(tmp_path: Path, small: Capture) -> None:
+def test_far_pixels_count_against_the_sky_and_infinite_sigma_promises_nothing(tmp_path: Path, small: Recording) -> None:
     truth = np.full((20, 40), 5.0)
     truth[:10] = 0
     labels = np.full(truth.shape, Label.MONO, np.uint8)
@@ -93,7 +93,7 @@ def test_far_pixels_count_against_the_sky_and_infinite_sigma_promises_nothing(tm
     assert "far: 80.0% of the pixels without a true depth, 10.0% of the others" in str(found)
 
 
-def test_without_truth_or_without_priors_there_is_no_table(tmp_path: Path, small: Capture) -> None:
+def test_without_truth_or_without_priors_there_is_no_table(tmp_path: Path, small: Recording) -> None:
     depth = np.full((20, 40), 5.0, np.float32)
     store = store_of(tmp_path / "a", small, depth, np.full(depth.shape, 1, np.uint8), depth)
     assert held_against_truth(store, replace(small, source=WithTruth(small, None))) is None
@@ -139,9 +139,9 @@ def test_a_rounded_truth_is_told_by_its_steps_and_an_exact_one_is_not() -> None:
     assert (truth_rounding(np.zeros((4, 4))) == 0).all()
 
 
-def measured(capture: Capture, names: list[str], path: Path) -> Calibration:
-    build_priors(capture, names, path, PriorSettings())
-    found = held_against_truth(PriorStore.open(path), capture)
+def measured(recording: Recording, names: list[str], path: Path) -> Calibration:
+    build_priors(recording, names, path, PriorSettings())
+    found = held_against_truth(PriorStore.open(path), recording)
     assert found is not None
     return found
 
@@ -158,8 +158,8 @@ def check(found: Calibration) -> None:
 def test_sigma_holds_on_a_recording_with_true_depth(
     shared_data: Callable[[str], Path], tmp_path: Path, name: str
 ) -> None:
-    capture = replace(open_capture(shared_data(name)), frames=(5,))
-    found = measured(capture, TRAINING, tmp_path)
+    recording = replace(open_recording(shared_data(name)), frames=(5,))
+    found = measured(recording, TRAINING, tmp_path)
     check(found)
     assert set(found.labels) == {Label.VERIFIED, Label.AGREED, Label.MONO}
     assert found.false_far <= 0.01
@@ -168,7 +168,7 @@ def test_sigma_holds_on_a_recording_with_true_depth(
 
 
 def test_sigma_holds_in_a_rendered_room(tmp_path: Path) -> None:
-    capture = synthetic_capture(cameras=4, held_out=0, frames=1, width=240, height=135, seed=1)
-    found = measured(capture, list(capture.cameras), tmp_path)
+    recording = synthetic_recording(cameras=4, held_out=0, frames=1, width=240, height=135, seed=1)
+    found = measured(recording, list(recording.cameras), tmp_path)
     check(found)
     assert found.false_far == 0

@@ -15,7 +15,7 @@ SHAPE = (40, 60)
 
 
 def plane(slope_x: float, slope_y: float, inverse: float = 0.25) -> np.ndarray:
-    """Depth of a plane: inverse depth is linear over the picture."""
+    """Depth of a plane: inverse depth is linear over the image."""
     v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     return (1 / (inverse + slope_x * (u - 30) + slope_y * (v - 20))).astype(np.float32)
 
@@ -45,11 +45,11 @@ def test_a_wrong_piece_of_a_plane_is_not_coherent_and_leaves_its_surroundings_al
     assert found[18:22, 38:52].min() > 0.9
 
 
-def test_a_depth_edge_along_an_edge_of_the_picture_stays_coherent() -> None:
+def test_a_depth_edge_along_an_edge_of_the_image_stays_coherent() -> None:
     depth, gray = plane(0.0, 0.0), np.full(SHAPE, 80, np.uint8)
     depth[:, 30:], gray[:, 30:] = 8.0, 200
     assert coherence(depth, gray)[10:-10, 28].min() > 0.9
-    assert coherence(depth)[10:-10, 29].max() < 0.7  # without the picture's help the far side counts against it
+    assert coherence(depth)[10:-10, 29].max() < 0.7  # without the image's help the far side counts against it
 
 
 def test_where_there_is_no_depth_there_is_no_coherence() -> None:

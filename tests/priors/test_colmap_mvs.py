@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures.capture import Camera
+from benchmarks.stereo_measure import score
+from benchmarks.stereo_rigs import Rig, textured_rig
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.colmap import mvs as colmap_mvs
 from d2_plugin.priors.colmap.dense_arrays import read_dense_array, write_dense_array
@@ -26,8 +27,7 @@ from d2_plugin.priors.colmap.mvs import (
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.filtering.filter import filter_depths
 from d2_plugin.priors.stereo.geometric_depth import MATCHERS, choose_matcher, gray
-from d2_plugin.study.bench.stereo_measure import score
-from d2_plugin.study.bench.stereo_rigs import Rig, textured_rig
+from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("cv2")
 
@@ -157,7 +157,7 @@ def test_cameras_on_one_spot_need_no_colmap_to_have_no_depth(rig: Rig, grays: li
     ("left", "message"),
     [
         (None, "left no 0001.png.geometric.bin for camera"),
-        (np.ones((45, 80), np.float32), r"is \(80, 45\) pixels but its picture is \(160, 90\)"),
+        (np.ones((45, 80), np.float32), r"is \(80, 45\) pixels but its image is \(160, 90\)"),
         (np.full((90, 160), np.nan, np.float32), "14400 values that are not finite"),
     ],
 )
@@ -236,5 +236,5 @@ def test_a_mistake_is_told_before_anything_is_written(rig: Rig, grays: list[np.n
     with pytest.raises(D2Error, match="at least 2 cameras"):
         colmap_patch_match(grays[:1], rig.cameras[:1], (1.0, 9.0), SETTINGS, run=oracle(rig))
     turned: Camera = replace(rig.cameras[0], width=90, height=160)
-    with pytest.raises(D2Error, match="resize the picture"):
+    with pytest.raises(D2Error, match="resize the image"):
         colmap_patch_match(grays, [turned, *rig.cameras[1:]], (1.0, 9.0), SETTINGS, run=oracle(rig))

@@ -10,32 +10,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures import open_capture
-from d2_plugin.captures.calibration import pinhole, rigid
-from d2_plugin.captures.capture import Camera, Capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.colmap.matching import fundamental_matrix, sampson_distance
 from d2_plugin.priors.colmap.points import SparsePoints, triangulate, triangulate_frames
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.cameras.calibration import pinhole, rigid
+from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("pycolmap")
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
-    return synthetic_capture(frames=4)
+def recording() -> Recording:
+    return synthetic_recording(frames=4)
 
 
-def points_of(capture: Capture, names: list[str], frame: int = 0) -> SparsePoints:
-    images = [capture.image(name, frame) for name in names]
-    return triangulate(images, [capture.cameras[name] for name in names], frame)
+def points_of(recording: Recording, names: list[str], frame: int = 0) -> SparsePoints:
+    images = [recording.image(name, frame) for name in names]
+    return triangulate(images, [recording.cameras[name] for name in names], frame)
 
 
-def depth_errors(capture: Capture, names: list[str], points: SparsePoints, frame: int = 0) -> np.ndarray:
+def depth_errors(recording: Recording, names: list[str], points: SparsePoints, frame: int = 0) -> np.ndarray:
     """Relative depth error of each point in the camera that agrees best (the others may not see it)."""
     errors = np.full(len(points), np.inf)
     for name in names:
-        camera, depth = capture.cameras[name], capture.depth(name, frame)
+        camera, depth = recording.cameras[name], recording.depth(name, frame)
         in_camera = points.positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
         pixels = in_camera @ camera.K.T
         column, row = np.floor(pixels[:, :2] / pixels[:, 2:]).astype(int).T
@@ -46,10 +46,10 @@ def depth_errors(capture: Capture, names: list[str], points: SparsePoints, frame
 
 
 @pytest.mark.parametrize("names", [["train0", "train1", "train2", "train3"], ["train1", "train2"]])
-def test_points_lie_on_the_true_surfaces(capture: Capture, names: list[str]) -> None:
-    points = points_of(capture, names)
+def test_points_lie_on_the_true_surfaces(recording: Recording, names: list[str]) -> None:
+    points = points_of(recording, names)
     assert len(points) > 100
-    errors = depth_errors(capture, names, points)
+    errors = depth_errors(recording, names, points)
     assert np.median(errors) < 0.005
     assert np.mean(errors < 0.05) > 0.9
     assert points.errors.max() <= 2.0
@@ -57,9 +57,9 @@ def test_points_lie_on_the_true_surfaces(capture: Capture, names: list[str]) -> 
     assert points.track_lengths.max() <= len(names)
 
 
-def test_points_carry_the_colour_of_their_surface(capture: Capture) -> None:
-    points = points_of(capture, ["train1", "train2"])
-    camera, image = capture.cameras["train1"], capture.image("train1", 0) / 255
+def test_points_carry_the_colour_of_their_surface(recording: Recording) -> None:
+    points = points_of(recording, ["train1", "train2"])
+    camera, image = recording.cameras["train1"], recording.image("train1", 0) / 255
     in_camera = points.positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
     pixels = in_camera @ camera.K.T
     column, row = np.floor(pixels[:, :2] / pixels[:, 2:]).astype(int).T
@@ -69,21 +69,21 @@ def test_points_carry_the_colour_of_their_surface(capture: Capture) -> None:
     assert np.median(np.abs(points.colors - seen)) < 0.06
 
 
-def test_the_same_pictures_give_the_same_points(capture: Capture) -> None:
-    first, second = (points_of(capture, ["train0", "train1", "train2"]) for _ in range(2))
+def test_the_same_images_give_the_same_points(recording: Recording) -> None:
+    first, second = (points_of(recording, ["train0", "train1", "train2"]) for _ in range(2))
     for name in ("positions", "colors", "errors", "track_lengths", "frames"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
-def test_points_of_several_frames_carry_their_frame(capture: Capture) -> None:
-    joined = triangulate_frames(capture, ["train1", "train2"], [0, 3])
+def test_points_of_several_frames_carry_their_frame(recording: Recording) -> None:
+    joined = triangulate_frames(recording, ["train1", "train2"], [0, 3])
     assert set(joined.frames) == {0, 3}
-    single = points_of(capture, ["train1", "train2"], frame=3)
+    single = points_of(recording, ["train1", "train2"], frame=3)
     np.testing.assert_array_equal(joined.positions[joined.frames == 3], single.positions)
 
 
-def test_points_survive_a_file(capture: Capture, tmp_path: Path) -> None:
-    points = points_of(capture, ["train1", "train2"])
+def test_points_survive_a_file(recording: Recording, tmp_path: Path) -> None:
+    points = points_of(recording, ["train1", "train2"])
     points.save(tmp_path / "points.cache")
     again = SparsePoints.load(tmp_path / "points.cache")
     for name in ("positions", "colors", "errors", "track_lengths", "frames"):
@@ -95,9 +95,9 @@ def test_points_survive_a_file(capture: Capture, tmp_path: Path) -> None:
             SparsePoints.load(tmp_path / "points.cache")
 
 
-def test_hopeless_input_gives_no_points_and_no_abort(capture: Capture) -> None:
-    first, second = capture.cameras["train1"], capture.cameras["train2"]
-    image = capture.image("train1", 0)
+def test_hopeless_input_gives_no_points_and_no_abort(recording: Recording) -> None:
+    first, second = recording.cameras["train1"], recording.cameras["train2"]
+    image = recording.image("train1", 0)
     black, noise = np.zeros_like(image), np.random.default_rng(0).integers(0, 256, image.shape, dtype=np.uint8)
     for images, cameras in (
         ([], []),
@@ -115,9 +115,9 @@ def test_hopeless_input_gives_no_points_and_no_abort(capture: Capture) -> None:
         assert points.positions.shape == points.colors.shape == (0, 3)
 
 
-def test_as_many_pictures_as_cameras_are_wanted(capture: Capture) -> None:
-    with pytest.raises(D2Error, match="1 pictures for 2 cameras"):
-        triangulate([capture.image("train0", 0)], [capture.cameras["train0"], capture.cameras["train1"]])
+def test_as_many_images_as_cameras_are_wanted(recording: Recording) -> None:
+    with pytest.raises(D2Error, match="1 images for 2 cameras"):
+        triangulate([recording.image("train0", 0)], [recording.cameras["train0"], recording.cameras["train1"]])
 
 
 def test_sampson_distance_is_the_pixel_distance_for_a_pure_sideways_move() -> None:
@@ -131,8 +131,8 @@ def test_sampson_distance_is_the_pixel_distance_for_a_pure_sideways_move() -> No
     np.testing.assert_allclose(sampson_distance(fundamental, pixels, moved + [0, 3.0]), 3 / np.sqrt(2))
 
 
-def test_epipolar_geometry_holds_for_projected_points(capture: Capture) -> None:
-    first, second = capture.cameras["train0"], capture.cameras["test2"]
+def test_epipolar_geometry_holds_for_projected_points(recording: Recording) -> None:
+    first, second = recording.cameras["train0"], recording.cameras["test2"]
     points = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 2], (50, 3))
     pixels = []
     for camera in (first, second):
@@ -158,14 +158,14 @@ def test_compression_works_after_pycolmap_was_imported(later: str) -> None:
     assert (done.returncode, done.stdout.strip()) == (0, "alive"), done.stderr
 
 
-def test_colmap_is_quiet(capture: Capture, capfd: pytest.CaptureFixture) -> None:
-    points_of(capture, ["train1", "train2"])
+def test_colmap_is_quiet(recording: Recording, capfd: pytest.CaptureFixture) -> None:
+    points_of(recording, ["train1", "train2"])
     told = capfd.readouterr()
     assert told.out == told.err == ""
 
 
-def test_real_pictures_of_studio_give_accurate_points(shared_data) -> None:
-    studio = open_capture(shared_data("studio"))
+def test_real_images_of_studio_give_accurate_points(shared_data) -> None:
+    studio = open_recording(shared_data("studio"))
     points = points_of(studio, ["00", "02", "05", "07"])
     assert len(points) > 150
     errors = depth_errors(studio, ["00", "02", "05", "07"], points)
@@ -176,7 +176,7 @@ def test_real_pictures_of_studio_give_accurate_points(shared_data) -> None:
 @pytest.mark.slow
 def test_points_of_sear_steak_agree_with_the_checked_ones(shared_data) -> None:
     path = shared_data("n3dv_sear_steak_t0")
-    scene = open_capture(path)
+    scene = open_recording(path)
     points = points_of(scene, list(scene.cameras))
     assert len(points) > 1000
     checked = np.load(path / "sift_points.npz")["xyz"].astype(float)

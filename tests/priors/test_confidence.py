@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.disk.confidence import ConfidenceMaps, divided
 from d2_plugin.priors.disk.stored import planar
 from d2_plugin.priors.geometry import back_project
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.store import PriorStore
 
 cv2 = pytest.importorskip("cv2")
 
@@ -27,42 +27,42 @@ SENSOR = StereoSettings(matcher="sensor")
 
 
 @pytest.fixture
-def capture(tmp_path: Path) -> Capture:
+def recording(tmp_path: Path) -> Recording:
     """One camera with a depth sensor and no monocular maps of its own."""
-    room = synthetic_capture(cameras=1, held_out=0, frames=1, width=96, height=54)
+    room = synthetic_recording(cameras=1, held_out=0, frames=1, width=96, height=54)
     room = replace(room, path=tmp_path, mono_kind=None)
     write_sensor(room, room.depth(NAME, 0), {"scale": 1.0})
     return room
 
 
-def write_sensor(room: Capture, depth: np.ndarray, description: dict) -> None:
+def write_sensor(room: Recording, depth: np.ndarray, description: dict) -> None:
     folder = room.path / "depth" / NAME
     folder.mkdir(parents=True, exist_ok=True)
     np.save(folder / "00000.npy", depth)
     (folder.parent / "depth.json").write_text(json.dumps(description))
 
 
-def write_confidence(room: Capture, values: np.ndarray, suffix: str = ".npy") -> None:
+def write_confidence(room: Recording, values: np.ndarray, suffix: str = ".npy") -> None:
     folder = room.path / "depth_confidence" / NAME
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"00000{suffix}"
     assert cv2.imwrite(str(path), values) if suffix == ".png" else np.save(path, values) is None
 
 
-def built(room: Capture, settings: PriorSettings | None = None) -> PriorStore:
+def built(room: Recording, settings: PriorSettings | None = None) -> PriorStore:
     build_priors(room, [NAME], room.path / "store", settings or PriorSettings(stereo=SENSOR))
     return PriorStore.open(room.path / "store")
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".png"])
 def test_a_sensor_is_as_sure_as_it_says_and_a_pixel_it_does_not_trust_is_no_depth(
-    capture: Capture, suffix: str
+    recording: Recording, suffix: str
 ) -> None:
-    before = built(capture).prior(NAME, 0)
+    before = built(recording).prior(NAME, 0)
     sure = np.ones((54, 96))
     sure[:, 30:60], sure[:, 60:] = 0.5, 0
-    write_confidence(capture, np.rint(sure * 65535).astype(np.uint16) if suffix == ".png" else sure, suffix)
-    after = built(capture).prior(NAME, 0)
+    write_confidence(recording, np.rint(sure * 65535).astype(np.uint16) if suffix == ".png" else sure, suffix)
+    after = built(recording).prior(NAME, 0)
     kept = (before.depth > 0).numpy() & (sure > 0)
     assert kept.any()
     assert (after.depth.numpy()[:, 60:] == 0).all()
@@ -73,52 +73,52 @@ def test_a_sensor_is_as_sure_as_it_says_and_a_pixel_it_does_not_trust_is_no_dept
     np.testing.assert_allclose(after.sigma.numpy()[both], expected, rtol=0.05)
 
 
-def test_a_confidence_that_changes_builds_the_prior_anew_and_one_that_does_not_does_not(capture: Capture) -> None:
-    write_confidence(capture, np.ones((54, 96)))
+def test_a_confidence_that_changes_builds_the_prior_anew_and_one_that_does_not_does_not(recording: Recording) -> None:
+    write_confidence(recording, np.ones((54, 96)))
     settings = PriorSettings(stereo=SENSOR)
-    assert build_priors(capture, [NAME], capture.path / "store", settings).built == 1
-    assert build_priors(capture, [NAME], capture.path / "store", settings).built == 0
-    write_confidence(capture, np.full((54, 96), 0.5))
-    assert build_priors(capture, [NAME], capture.path / "store", settings).built == 1
+    assert build_priors(recording, [NAME], recording.path / "store", settings).built == 1
+    assert build_priors(recording, [NAME], recording.path / "store", settings).built == 0
+    write_confidence(recording, np.full((54, 96), 0.5))
+    assert build_priors(recording, [NAME], recording.path / "store", settings).built == 1
 
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.5, np.nan])
-def test_a_confidence_outside_of_0_to_1_is_refused_with_its_file(capture: Capture, wrong: float) -> None:
-    write_confidence(capture, np.full((54, 96), wrong))
+def test_a_confidence_outside_of_0_to_1_is_refused_with_its_file(recording: Recording, wrong: float) -> None:
+    write_confidence(recording, np.full((54, 96), wrong))
     with pytest.raises(D2Error, match=r"depth_confidence.*00000.npy .*a confidence is in 0..1"):
-        built(capture)
+        built(recording)
 
 
-def test_without_a_map_or_a_folder_nothing_is_said(capture: Capture) -> None:
-    camera = capture.cameras[NAME]
+def test_without_a_map_or_a_folder_nothing_is_said(recording: Recording) -> None:
+    camera = recording.cameras[NAME]
     assert ConfidenceMaps.beside(None, "depth_confidence", [NAME]).of(camera, 0) is None
-    assert ConfidenceMaps.beside(capture.path, "depth_confidence", [NAME]).of(camera, 0) is None
+    assert ConfidenceMaps.beside(recording.path, "depth_confidence", [NAME]).of(camera, 0) is None
     sigma = np.array([[0.1, np.inf]], np.float32)
     assert divided(sigma, None) is sigma
     np.testing.assert_array_equal(divided(sigma, np.array([[0.0, 0.5]])), [[np.inf, np.inf]])
 
 
-def test_distances_along_the_ray_become_planar_depth_once(capture: Capture) -> None:
-    truth = capture.depth(NAME, 0)
-    camera = capture.cameras[NAME]
+def test_distances_along_the_ray_become_planar_depth_once(recording: Recording) -> None:
+    truth = recording.depth(NAME, 0)
+    camera = recording.cameras[NAME]
     distance = np.linalg.norm(back_project(camera, truth) - camera.centre, axis=-1)
     assert np.abs(distance / truth - 1).max() > 0.05
     np.testing.assert_allclose(planar(distance, camera), truth, rtol=1e-5)
-    before = built(capture).prior(NAME, 0).depth
-    write_sensor(capture, distance, {"scale": 1.0, "along": "ray"})
-    np.testing.assert_allclose(built(capture).prior(NAME, 0).depth, before, rtol=1e-3)
+    before = built(recording).prior(NAME, 0).depth
+    write_sensor(recording, distance, {"scale": 1.0, "along": "ray"})
+    np.testing.assert_allclose(built(recording).prior(NAME, 0).depth, before, rtol=1e-3)
 
 
-def test_an_unknown_direction_is_refused(capture: Capture) -> None:
-    write_sensor(capture, capture.depth(NAME, 0), {"scale": 1.0, "along": "rays"})
+def test_an_unknown_direction_is_refused(recording: Recording) -> None:
+    write_sensor(recording, recording.depth(NAME, 0), {"scale": 1.0, "along": "rays"})
     with pytest.raises(D2Error, match=r"unknown along in .*depth.json 'rays'.*ray"):
-        built(capture)
+        built(recording)
 
 
 class Monocular:
     """A source whose monocular map is given."""
 
-    def __init__(self, room: Capture, map_: np.ndarray) -> None:
+    def __init__(self, room: Recording, map_: np.ndarray) -> None:
         self.inner, self.map = room.source, map_
 
     def image(self, camera: str, frame: int) -> np.ndarray:
@@ -132,7 +132,7 @@ class Monocular:
 
 
 def test_metric_maps_may_measure_along_the_ray_and_relative_ones_may_not(tmp_path: Path) -> None:
-    room = synthetic_capture(cameras=1, held_out=0, frames=1, width=96, height=54)
+    room = synthetic_recording(cameras=1, held_out=0, frames=1, width=96, height=54)
     truth, camera = room.depth(NAME, 0), room.cameras[NAME]
     distance = np.linalg.norm(back_project(camera, truth) - camera.centre, axis=-1).astype(np.float32)
     metric = replace(room, path=tmp_path, mono_kind="metric", source=Monocular(room, distance))

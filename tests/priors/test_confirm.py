@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.geometry import Projection, viewing_rays
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.filtering.confirm import confirm, sample_nearest, sample_surface
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("cv2")
 
@@ -45,7 +45,7 @@ def test_a_ground_at_a_grazing_angle_is_confirmed_between_pixels_and_not_at_them
     for between in (False, True):
         confirmed, depth = sources(1.0, between)
         grazing = (depth > 2) & (depth < 8)
-        grazing[:, :30] = False  # leaves the other picture
+        grazing[:, :30] = False  # leaves the other image
         found[between] = float((confirmed[grazing] > 0).mean())
     assert found[True] > 0.9
     assert found[False] < 0.7

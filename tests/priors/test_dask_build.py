@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from d2_plugin.captures import open_capture
-from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors import dask_build as module
 from d2_plugin.priors.build import PriorSummary, build_priors
 from d2_plugin.priors.dask_build import build_priors_on_cluster
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
 
@@ -32,16 +32,16 @@ pytestmark = pytest.mark.filterwarnings("default")  # distributed deprecates its
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    rendered = synthetic_capture(cameras=2, held_out=0, frames=10, width=128, height=72, arc_degrees=10)
-    return open_capture(save_capture(rendered, tmp_path_factory.mktemp("capture") / "room"))
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    rendered = synthetic_recording(cameras=2, held_out=0, frames=10, width=128, height=72, arc_degrees=10)
+    return open_recording(save_recording(rendered, tmp_path_factory.mktemp("recording") / "room"))
 
 
 @pytest.fixture(scope="module")
-def alone(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], PriorSummary]:
+def alone(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], PriorSummary]:
     """What one process builds."""
     path = tmp_path_factory.mktemp("alone") / "priors"
-    summary = build_priors(capture, NAMES, path, SETTINGS)
+    summary = build_priors(recording, NAMES, path, SETTINGS)
     return contents(path), summary
 
 
@@ -64,7 +64,7 @@ def worker_pids(cluster: object) -> list[int]:
 
 @needs_dask
 def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(
-    capture: Capture, alone: tuple, two_workers: object, tmp_path: Path
+    recording: Recording, alone: tuple, two_workers: object, tmp_path: Path
 ) -> None:
     before, killed, seen = worker_pids(two_workers), [], []
 
@@ -76,7 +76,7 @@ def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(
 
     store = tmp_path / "priors"
     summary = build_priors_on_cluster(
-        capture, NAMES, store, SETTINGS, scheduler=two_workers.scheduler_address, progress=kill_one
+        recording, NAMES, store, SETTINGS, scheduler=two_workers.scheduler_address, progress=kill_one
     )
     assert killed
     assert killed[0] not in worker_pids(two_workers)
@@ -90,42 +90,48 @@ def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(
 
 
 @needs_dask
-def test_a_second_build_on_the_cluster_computes_nothing(capture: Capture, two_workers: object, tmp_path: Path) -> None:
+def test_a_second_build_on_the_cluster_computes_nothing(
+    recording: Recording, two_workers: object, tmp_path: Path
+) -> None:
     store = tmp_path / "priors"
-    build_priors(capture, NAMES, store, SETTINGS)
+    build_priors(recording, NAMES, store, SETTINGS)
     before = contents(store)
-    summary = build_priors_on_cluster(capture, NAMES, store, SETTINGS, scheduler=two_workers.scheduler_address)
+    summary = build_priors_on_cluster(recording, NAMES, store, SETTINGS, scheduler=two_workers.scheduler_address)
     assert (summary.built, summary.kept) == (0, 20)
     assert contents(store) == before
 
 
 @needs_dask
 def test_what_a_single_build_refuses_the_cluster_refuses_in_the_same_words(
-    capture: Capture, two_workers: object, tmp_path: Path
+    recording: Recording, two_workers: object, tmp_path: Path
 ) -> None:
     with pytest.raises(D2Error, match="unknown camera 'train7'.*did you mean"):
-        build_priors_on_cluster(capture, ["train7"], tmp_path / "p", SETTINGS, scheduler=two_workers.scheduler_address)
+        build_priors_on_cluster(
+            recording, ["train7"], tmp_path / "p", SETTINGS, scheduler=two_workers.scheduler_address
+        )
     with pytest.raises(D2Error, match="no dask scheduler answers at tcp://127.0.0.1:1 "):
-        build_priors_on_cluster(capture, NAMES, tmp_path / "p", SETTINGS, scheduler="tcp://127.0.0.1:1")
+        build_priors_on_cluster(recording, NAMES, tmp_path / "p", SETTINGS, scheduler="tcp://127.0.0.1:1")
     with pytest.raises(D2Error, match="give at least 1"):
-        build_priors_on_cluster(capture, NAMES, tmp_path / "p", SETTINGS, workers=0)
+        build_priors_on_cluster(recording, NAMES, tmp_path / "p", SETTINGS, workers=0)
 
 
-def test_without_dask_its_extra_is_named(capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_dask_its_extra_is_named(recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingExtra, match=r"dask.distributed, which is not installed: .*d2-4dgs\[cluster\]"):
-        build_priors_on_cluster(capture, NAMES, tmp_path / "p", SETTINGS)
+        build_priors_on_cluster(recording, NAMES, tmp_path / "p", SETTINGS)
 
 
-def test_parts_are_blocks_and_few_enough_to_load_a_network_seldom(capture: Capture) -> None:
-    assert module._part_count(capture, SETTINGS, workers=8) == 5
-    assert module._part_count(capture, SETTINGS, workers=1) == module.PARTS_PER_WORKER
+def test_parts_are_blocks_and_few_enough_to_load_a_network_seldom(recording: Recording) -> None:
+    assert module._part_count(recording, SETTINGS, workers=8) == 5
+    assert module._part_count(recording, SETTINGS, workers=1) == module.PARTS_PER_WORKER
 
 
-def test_summaries_of_parts_join_to_the_summary_of_the_whole(capture: Capture, alone: tuple, tmp_path: Path) -> None:
+def test_summaries_of_parts_join_to_the_summary_of_the_whole(
+    recording: Recording, alone: tuple, tmp_path: Path
+) -> None:
     joined = PriorSummary()
     for index in (1, 0, 2):
-        joined.add_part(build_priors(capture, NAMES, tmp_path / "p", SETTINGS, shard=(index, 3)))
+        joined.add_part(build_priors(recording, NAMES, tmp_path / "p", SETTINGS, shard=(index, 3)))
     whole = alone[1]
     assert (joined.built, joined.kept, joined.notes) == (whole.built, whole.kept, whole.notes)
     for camera in NAMES:

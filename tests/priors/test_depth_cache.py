@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures.capture import Camera
-from d2_plugin.priors.files import write_entry
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.stereo.cache import DepthCache, StoredDepth
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
+from d2_plugin.recordings.recording import Camera
+from d2_plugin.store.files import write_entry
 
 CAMERAS = [Camera(name, 7, 5, np.eye(3), np.eye(4)) for name in ("a", "b")]
 FRAME = Frame(3, {}, {})

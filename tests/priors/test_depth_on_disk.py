@@ -9,9 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures.calibration import pinhole
-from d2_plugin.captures.capture import Camera, Capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.colmap.dense_arrays import write_dense_array
@@ -20,8 +17,11 @@ from d2_plugin.priors.colmap.workspace import WorkspaceDepth, scale_of_world, se
 from d2_plugin.priors.depth_on_disk import FilteredDepthOnDisk, SensorDepth, find_depth_on_disk
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.cameras.calibration import pinhole
+from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.store import PriorStore
 
 cv2 = pytest.importorskip("cv2")
 
@@ -31,28 +31,28 @@ SENSOR = StereoSettings(matcher="sensor")
 
 
 @pytest.fixture(scope="module")
-def plain() -> Capture:
-    return synthetic_capture(cameras=3, held_out=0, frames=2, width=160, height=90, arc_degrees=20)
+def plain() -> Recording:
+    return synthetic_recording(cameras=3, held_out=0, frames=2, width=160, height=90, arc_degrees=20)
 
 
 @pytest.fixture
-def capture(plain: Capture, tmp_path: Path) -> Capture:
+def recording(plain: Recording, tmp_path: Path) -> Recording:
     return replace(plain, path=tmp_path)
 
 
 @pytest.fixture
-def still(capture: Capture) -> Capture:
+def still(recording: Recording) -> Recording:
     """One instant of it."""
-    return replace(capture, frames=(0,))
+    return replace(recording, frames=(0,))
 
 
-def write_sensor(capture: Capture, description: dict, step: float = 1e-3, suffix: str = ".png") -> Path:
+def write_sensor(recording: Recording, description: dict, step: float = 1e-3, suffix: str = ".png") -> Path:
     """Sensor maps of the first two cameras, `step` world units a number."""
-    folder = capture.path / "depth"
+    folder = recording.path / "depth"
     for name in NAMES[:2]:
         (folder / name).mkdir(parents=True)
-        for frame in capture.frames:
-            stored = capture.depth(name, frame) / step
+        for frame in recording.frames:
+            stored = recording.depth(name, frame) / step
             path = folder / name / f"{frame:05d}{suffix}"
             if suffix == ".npy":
                 np.save(path, stored)
@@ -62,18 +62,18 @@ def write_sensor(capture: Capture, description: dict, step: float = 1e-3, suffix
     return folder
 
 
-def write_maps(capture: Capture, place: str, frame: int, scale: float = 1.0, kind: str = "geometric") -> Path:
+def write_maps(recording: Recording, place: str, frame: int, scale: float = 1.0, kind: str = "geometric") -> Path:
     """A workspace with the true depth of all cameras in a world of another scale."""
-    folder = capture.path / place
+    folder = recording.path / place
     maps = folder / "stereo" / "depth_maps"
     maps.mkdir(parents=True)
     (folder / "sparse").mkdir()
     cameras = []
-    for camera in capture.cameras.values():
+    for camera in recording.cameras.values():
         pose = camera.T_camera_world.copy()
         pose[:3, 3] *= scale
         cameras.append(replace(camera, T_camera_world=pose))
-        write_dense_array(maps / f"{camera.name}.png.{kind}.bin", capture.depth(camera.name, frame) * scale)
+        write_dense_array(maps / f"{camera.name}.png.{kind}.bin", recording.depth(camera.name, frame) * scale)
     write_model(folder / "sparse", cameras)
     images = (folder / "sparse" / "images.txt").read_text()
     for index, camera in enumerate(cameras):
@@ -82,9 +82,9 @@ def write_maps(capture: Capture, place: str, frame: int, scale: float = 1.0, kin
     return folder
 
 
-def workspace(capture: Capture, place: str = "") -> WorkspaceDepth:
+def workspace(recording: Recording, place: str = "") -> WorkspaceDepth:
     settings = StereoSettings(matcher="workspace", folder=place)
-    found = find_depth_on_disk(capture, NAMES, settings)
+    found = find_depth_on_disk(recording, NAMES, settings)
     assert isinstance(found, WorkspaceDepth)
     return found
 
@@ -93,41 +93,41 @@ def workspace(capture: Capture, place: str = "") -> WorkspaceDepth:
     ("description", "step", "suffix"),
     [({"unit": "mm"}, 1e-3, ".png"), ({"scale": 0.0005}, 5e-4, ".png"), ({"unit": "m"}, 1.0, ".npy")],
 )
-def test_sensor_depth_comes_in_world_units(capture: Capture, description: dict, step: float, suffix: str) -> None:
-    write_sensor(capture, description, step, suffix)
-    found = find_depth_on_disk(capture, NAMES, SENSOR)
+def test_sensor_depth_comes_in_world_units(recording: Recording, description: dict, step: float, suffix: str) -> None:
+    write_sensor(recording, description, step, suffix)
+    found = find_depth_on_disk(recording, NAMES, SENSOR)
     assert found.name == "sensor"
-    depth = found.depth(capture.cameras["train1"], 1)
-    np.testing.assert_allclose(depth, capture.depth("train1", 1), atol=0.51 * step if suffix == ".png" else 1e-6)
-    assert found.depth(capture.cameras["train2"], 1) is None
-    assert found.depth(capture.cameras["train1"], 7) is None
+    depth = found.depth(recording.cameras["train1"], 1)
+    np.testing.assert_allclose(depth, recording.depth("train1", 1), atol=0.51 * step if suffix == ".png" else 1e-6)
+    assert found.depth(recording.cameras["train2"], 1) is None
+    assert found.depth(recording.cameras["train1"], 7) is None
 
 
-def test_what_a_sensor_does_not_know_is_empty(capture: Capture, tmp_path: Path) -> None:
-    folder = write_sensor(capture, {"unit": "m"}, 1.0, ".npy")
+def test_what_a_sensor_does_not_know_is_empty(recording: Recording, tmp_path: Path) -> None:
+    folder = write_sensor(recording, {"unit": "m"}, 1.0, ".npy")
     stored = np.load(folder / "train0" / "00000.npy")
     stored[0, :4] = np.nan, np.inf, -1, 0
     np.save(folder / "train0" / "00000.npy", stored)
-    depth = SensorDepth(folder, NAMES).depth(capture.cameras["train0"], 0)
+    depth = SensorDepth(folder, NAMES).depth(recording.cameras["train0"], 0)
     assert not depth[0, :4].any()
     assert depth[1:].all()
 
 
 @pytest.mark.parametrize("factor", [2, 3])
-def test_sensor_depth_follows_pictures_that_are_made_smaller(capture: Capture, factor: int) -> None:
-    from d2_plugin.captures.selection import downscale
+def test_sensor_depth_follows_images_that_are_made_smaller(recording: Recording, factor: int) -> None:
+    from d2_plugin.recordings.selection import downscale
 
-    folder = write_sensor(capture, {"unit": "m"}, 1.0, ".npy")
-    smaller = downscale(capture, factor)
+    folder = write_sensor(recording, {"unit": "m"}, 1.0, ".npy")
+    smaller = downscale(recording, factor)
     depth = SensorDepth(folder, NAMES).depth(smaller.cameras["train0"], 0)
     np.testing.assert_allclose(depth, smaller.depth("train0", 0), rtol=1e-6)
 
 
-def test_a_sensor_of_fewer_pixels_gives_each_picture_pixel_its_nearest(capture: Capture) -> None:
-    folder = write_sensor(capture, {"unit": "m"}, 1.0, ".npy")
-    np.save(folder / "train0" / "00000.npy", capture.depth("train0", 0)[::2, ::2])
-    depth = SensorDepth(folder, NAMES).depth(capture.cameras["train0"], 0)
-    np.testing.assert_array_equal(depth, capture.depth("train0", 0)[::2, ::2].repeat(2, 0).repeat(2, 1))
+def test_a_sensor_of_fewer_pixels_gives_each_image_pixel_its_nearest(recording: Recording) -> None:
+    folder = write_sensor(recording, {"unit": "m"}, 1.0, ".npy")
+    np.save(folder / "train0" / "00000.npy", recording.depth("train0", 0)[::2, ::2])
+    depth = SensorDepth(folder, NAMES).depth(recording.cameras["train0"], 0)
+    np.testing.assert_array_equal(depth, recording.depth("train0", 0)[::2, ::2].repeat(2, 0).repeat(2, 1))
 
 
 @pytest.mark.parametrize(
@@ -141,21 +141,21 @@ def test_a_sensor_of_fewer_pixels_gives_each_picture_pixel_its_nearest(capture: 
         ([], "either scale .* or unit"),
     ],
 )
-def test_what_a_stored_number_means_must_be_declared(capture: Capture, description: object, message: str) -> None:
-    write_sensor(capture, description)
+def test_what_a_stored_number_means_must_be_declared(recording: Recording, description: object, message: str) -> None:
+    write_sensor(recording, description)
     with pytest.raises(D2Error, match=message):
-        find_depth_on_disk(capture, NAMES, SENSOR)
+        find_depth_on_disk(recording, NAMES, SENSOR)
 
 
-def test_sensors_are_taken_unasked_only_where_every_camera_has_one(capture: Capture) -> None:
-    write_sensor(capture, {"unit": "mm"})
-    assert find_depth_on_disk(capture, NAMES, AUTO) is None
-    assert find_depth_on_disk(capture, NAMES[:2], AUTO).name == "sensor"
+def test_sensors_are_taken_unasked_only_where_every_camera_has_one(recording: Recording) -> None:
+    write_sensor(recording, {"unit": "mm"})
+    assert find_depth_on_disk(recording, NAMES, AUTO) is None
+    assert find_depth_on_disk(recording, NAMES[:2], AUTO).name == "sensor"
 
 
-def test_a_map_that_is_no_depth_is_named(capture: Capture) -> None:
-    folder = write_sensor(capture, {"unit": "mm"})
-    camera, sensor = capture.cameras["train0"], SensorDepth(folder, NAMES)
+def test_a_map_that_is_no_depth_is_named(recording: Recording) -> None:
+    folder = write_sensor(recording, {"unit": "mm"})
+    camera, sensor = recording.cameras["train0"], SensorDepth(folder, NAMES)
     path = folder / "train0" / "00000.png"
     assert cv2.imwrite(str(path), np.zeros((90, 160), np.uint8))
     with pytest.raises(D2Error, match=r"00000.png is uint8 .* 16 bits"):
@@ -164,14 +164,14 @@ def test_a_map_that_is_no_depth_is_named(capture: Capture) -> None:
     with pytest.raises(D2Error, match="not a readable PNG"):
         sensor.depth(camera, 0)
     assert cv2.imwrite(str(path), np.zeros((90, 90), np.uint16))
-    with pytest.raises(D2Error, match="90x90 but its picture 160x90: register"):
+    with pytest.raises(D2Error, match="90x90 but its image 160x90: register"):
         sensor.depth(camera, 0)
 
 
 @pytest.mark.parametrize("noise", [0, 0.01])
 def test_pixels_that_fly_between_two_surfaces_are_dropped_and_plain_walls_are_kept(noise: float) -> None:
     """A sensor mixes both depths of an edge; a wall without texture is what it is there for."""
-    room = synthetic_capture(cameras=1, held_out=0, frames=1, width=320, height=180)
+    room = synthetic_recording(cameras=1, held_out=0, frames=1, width=320, height=180)
     (camera,) = room.cameras.values()
     truth = room.depth(camera.name, 0)
     mixed = cv2.blur(truth, (3, 3))
@@ -191,13 +191,13 @@ def test_pixels_that_fly_between_two_surfaces_are_dropped_and_plain_walls_are_ke
     assert (depth[right] > 0).mean() > 0.95
 
 
-def test_one_camera_with_a_depth_sensor_has_a_verified_prior(capture: Capture) -> None:
-    write_sensor(capture, {"unit": "mm"})
-    summary = build_priors(capture, NAMES[:1], capture.path / "priors", PriorSettings())
+def test_one_camera_with_a_depth_sensor_has_a_verified_prior(recording: Recording) -> None:
+    write_sensor(recording, {"unit": "mm"})
+    summary = build_priors(recording, NAMES[:1], recording.path / "priors", PriorSettings())
     assert summary.shares["train0"]["verified"] > 0.5
     assert "sensor depth of train0 in depth/" in str(summary)
-    store = PriorStore.open(capture.path / "priors")
-    prior, truth = store.prior("train0", 0), capture.depth("train0", 0)
+    store = PriorStore.open(recording.path / "priors")
+    prior, truth = store.prior("train0", 0), recording.depth("train0", 0)
     verified = prior.labels.numpy() == Label.VERIFIED
     error = np.abs(prior.depth.numpy() - truth)[verified] / truth[verified]
     assert np.median(error) < 1e-3
@@ -207,80 +207,80 @@ def test_one_camera_with_a_depth_sensor_has_a_verified_prior(capture: Capture) -
 
 
 def test_depth_on_disk_is_read_again_where_it_changed_and_only_there(
-    capture: Capture, monkeypatch: pytest.MonkeyPatch
+    recording: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, settings = write_sensor(capture, {"unit": "mm"}), PriorSettings(stereo=SENSOR)
-    build_priors(capture, NAMES, capture.path / "priors", settings)
+    folder, settings = write_sensor(recording, {"unit": "mm"}), PriorSettings(stereo=SENSOR)
+    build_priors(recording, NAMES, recording.path / "priors", settings)
     filtered = []
     original = FilteredDepthOnDisk.depths
     monkeypatch.setattr(FilteredDepthOnDisk, "depths", lambda *a: filtered.append(1) or original(*a))
-    assert build_priors(capture, NAMES, capture.path / "priors", settings).built == 0
+    assert build_priors(recording, NAMES, recording.path / "priors", settings).built == 0
     assert cv2.imwrite(str(folder / "train0" / "00001.png"), np.full((90, 160), 3000, np.uint16))
-    assert build_priors(capture, NAMES, capture.path / "priors", settings).built == 3
+    assert build_priors(recording, NAMES, recording.path / "priors", settings).built == 3
     assert filtered == [1]
 
 
-def test_the_depth_range_of_the_settings_bounds_depth_on_disk_too(capture: Capture) -> None:
-    write_sensor(capture, {"unit": "mm"})
-    middle = float(np.median(capture.depth("train0", 0)))
-    build_priors(capture, NAMES[:1], capture.path / "p", PriorSettings(variant="mvs", depth_range=(middle, 99.0)))
-    depth = PriorStore.open(capture.path / "p").prior("train0", 0).depth.numpy()
+def test_the_depth_range_of_the_settings_bounds_depth_on_disk_too(recording: Recording) -> None:
+    write_sensor(recording, {"unit": "mm"})
+    middle = float(np.median(recording.depth("train0", 0)))
+    build_priors(recording, NAMES[:1], recording.path / "p", PriorSettings(variant="mvs", depth_range=(middle, 99.0)))
+    depth = PriorStore.open(recording.path / "p").prior("train0", 0).depth.numpy()
     assert depth[depth > 0].min() >= 0.999 * middle
     with pytest.raises(D2Error, match="swap or correct"):
-        build_priors(capture, NAMES[:1], capture.path / "q", PriorSettings(depth_range=(9.0, 1.0)))
+        build_priors(recording, NAMES[:1], recording.path / "q", PriorSettings(depth_range=(9.0, 1.0)))
 
 
 @pytest.mark.parametrize("scale", [1.0, 37.5])
-def test_a_workspace_in_another_unit_comes_back_in_ours(capture: Capture, scale: float) -> None:
-    write_maps(capture, "colmap/00001", 1, scale)
-    depth = workspace(capture).depth(capture.cameras["train2"], 1)
-    np.testing.assert_allclose(depth, capture.depth("train2", 1), rtol=1e-5)
-    assert workspace(capture).depth(capture.cameras["train2"], 0) is None
+def test_a_workspace_in_another_unit_comes_back_in_ours(recording: Recording, scale: float) -> None:
+    write_maps(recording, "colmap/00001", 1, scale)
+    depth = workspace(recording).depth(recording.cameras["train2"], 1)
+    np.testing.assert_allclose(depth, recording.depth("train2", 1), rtol=1e-5)
+    assert workspace(recording).depth(recording.cameras["train2"], 0) is None
 
 
-def test_a_workspace_is_found_where_it_usually_lies_or_where_the_settings_say(capture: Capture) -> None:
-    assert find_depth_on_disk(capture, NAMES, AUTO) is None
-    write_maps(capture, "elsewhere/f1", 1)
-    assert find_depth_on_disk(capture, NAMES, AUTO) is None
-    assert workspace(capture, "elsewhere/f{frame}").depth(capture.cameras["train0"], 1).any()
-    write_maps(capture, "dense", 0)
-    assert find_depth_on_disk(replace(capture, frames=(0,)), NAMES, AUTO).about.endswith("dense")
-    assert find_depth_on_disk(capture, NAMES, StereoSettings(matcher="patchmatch")) is None
+def test_a_workspace_is_found_where_it_usually_lies_or_where_the_settings_say(recording: Recording) -> None:
+    assert find_depth_on_disk(recording, NAMES, AUTO) is None
+    write_maps(recording, "elsewhere/f1", 1)
+    assert find_depth_on_disk(recording, NAMES, AUTO) is None
+    assert workspace(recording, "elsewhere/f{frame}").depth(recording.cameras["train0"], 1).any()
+    write_maps(recording, "dense", 0)
+    assert find_depth_on_disk(replace(recording, frames=(0,)), NAMES, AUTO).about.endswith("dense")
+    assert find_depth_on_disk(recording, NAMES, StereoSettings(matcher="patchmatch")) is None
     with pytest.raises(D2Error, match="braces around other than frame"):
-        workspace(capture, "elsewhere/{number}")
+        workspace(recording, "elsewhere/{number}")
 
 
-def test_a_workspace_of_one_instant_is_not_the_depth_of_all(capture: Capture) -> None:
-    """Many captures keep the workspace that their initial points come from."""
-    write_maps(capture, "colmap", 0)
-    assert find_depth_on_disk(capture, NAMES, AUTO) is None
-    with pytest.raises(D2Error, match="at frame 1: name pictures CAMERA/FRAME.png"):
-        workspace(capture).depth(capture.cameras["train0"], 1)
-    write_maps(capture, "colmap/00000", 0)
-    assert find_depth_on_disk(capture, NAMES, AUTO) is None
-    write_maps(capture, "colmap/00001", 1)
-    assert find_depth_on_disk(capture, NAMES, AUTO).place == "colmap/{frame:05d}"
+def test_a_workspace_of_one_instant_is_not_the_depth_of_all(recording: Recording) -> None:
+    """Many recordings keep the workspace that their initial points come from."""
+    write_maps(recording, "colmap", 0)
+    assert find_depth_on_disk(recording, NAMES, AUTO) is None
+    with pytest.raises(D2Error, match="at frame 1: name images CAMERA/FRAME.png"):
+        workspace(recording).depth(recording.cameras["train0"], 1)
+    write_maps(recording, "colmap/00000", 0)
+    assert find_depth_on_disk(recording, NAMES, AUTO) is None
+    write_maps(recording, "colmap/00001", 1)
+    assert find_depth_on_disk(recording, NAMES, AUTO).place == "colmap/{frame:05d}"
 
 
-def test_pictures_of_all_frames_may_share_one_workspace(capture: Capture) -> None:
-    folder = write_maps(capture, "colmap", 0)
+def test_images_of_all_frames_may_share_one_workspace(recording: Recording) -> None:
+    folder = write_maps(recording, "colmap", 0)
     maps, images = folder / "stereo" / "depth_maps", folder / "sparse" / "images.txt"
     lines = [line for line in images.read_text().splitlines() if line]
     rows = []
-    for frame in capture.frames:
+    for frame in recording.frames:
         for name, line in zip(NAMES, lines):
             number = len(rows) + 1
             rows.append(f"{number} {line.split(' ', 1)[1].replace(f'{name}.png', f'{name}/{frame:05d}.png')}\n\n")
             (maps / name).mkdir(exist_ok=True)
             path = maps / name / f"{frame:05d}.png.photometric.bin"
-            write_dense_array(path, capture.depth(name, frame))
+            write_dense_array(path, recording.depth(name, frame))
     images.write_text("".join(rows))
-    source = workspace(capture)
-    for frame in capture.frames:
-        np.testing.assert_allclose(source.depth(capture.cameras["train1"], frame), capture.depth("train1", frame))
+    source = workspace(recording)
+    for frame in recording.frames:
+        np.testing.assert_allclose(source.depth(recording.cameras["train1"], frame), recording.depth("train1", frame))
 
 
-def test_maps_of_the_geometric_pass_come_first(still: Capture) -> None:
+def test_maps_of_the_geometric_pass_come_first(still: Recording) -> None:
     folder = write_maps(still, "colmap", 0)
     write_dense_array(folder / "stereo" / "depth_maps" / "train0.png.photometric.bin", np.ones((90, 160)))
     depth = [
@@ -291,8 +291,8 @@ def test_maps_of_the_geometric_pass_come_first(still: Capture) -> None:
     assert (depth[1] == 1).all()
 
 
-def test_a_map_of_another_size_and_lens_is_looked_up_ray_by_ray(capture: Capture) -> None:
-    camera = capture.cameras["train0"]
+def test_a_map_of_another_size_and_lens_is_looked_up_ray_by_ray(recording: Recording) -> None:
+    camera = recording.cameras["train0"]
     v, u = np.mgrid[:90, :160] + 0.5
     K = camera.K
     tilted = 4 / (1 + 0.2 * (u - K[0, 2]) / K[0, 0] + 0.1 * (v - K[1, 2]) / K[1, 1])
@@ -306,13 +306,15 @@ def test_a_map_of_another_size_and_lens_is_looked_up_ray_by_ray(capture: Capture
 
 
 @pytest.mark.parametrize("turn", [0.5, 3.0])
-def test_cameras_of_a_workspace_may_differ_by_a_bundle_adjustment_and_no_more(capture: Capture, turn: float) -> None:
-    poses = {name: camera.T_camera_world.copy() for name, camera in capture.cameras.items()}
+def test_cameras_of_a_workspace_may_differ_by_a_bundle_adjustment_and_no_more(
+    recording: Recording, turn: float
+) -> None:
+    poses = {name: camera.T_camera_world.copy() for name, camera in recording.cameras.items()}
     angle = np.deg2rad(turn)
     turned = np.eye(4)
     turned[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     poses["train1"] = turned @ poses["train1"]
-    cameras = list(capture.cameras.values())
+    cameras = list(recording.cameras.values())
     if turn < 1:
         assert scale_of_world(cameras, poses, Path("w")) == pytest.approx(1, abs=0.01)
     else:
@@ -320,13 +322,13 @@ def test_cameras_of_a_workspace_may_differ_by_a_bundle_adjustment_and_no_more(ca
             scale_of_world(cameras, poses, Path("w"))
 
 
-def test_a_workspace_of_another_rig_is_refused(capture: Capture) -> None:
+def test_a_workspace_of_another_rig_is_refused(recording: Recording) -> None:
     def moved(camera: Camera) -> np.ndarray:
         pose = camera.T_camera_world.copy()
         pose[:3, 3] += np.random.default_rng(len(camera.name)).normal(0, 0.3, 3) * (camera.name == "train1")
         return pose
 
-    cameras = list(capture.cameras.values())
+    cameras = list(recording.cameras.values())
     with pytest.raises(D2Error, match="another arrangement"):
         scale_of_world(cameras, {camera.name: moved(camera) for camera in cameras}, Path("w"))
     alone = {"train0": np.diag([1.0, 1.0, 1.0, 1.0])}
@@ -335,15 +337,15 @@ def test_a_workspace_of_another_rig_is_refused(capture: Capture) -> None:
     assert scale_of_world(cameras[:1], {"train0": cameras[0].T_camera_world}, Path("w")) == 1
 
 
-def test_a_workspace_of_other_pictures_says_how_to_name_them(still: Capture) -> None:
+def test_a_workspace_of_other_images_says_how_to_name_them(still: Recording) -> None:
     folder = write_maps(still, "colmap", 0)
     images = folder / "sparse" / "images.txt"
     images.write_text(images.read_text().replace("train", "view"))
-    with pytest.raises(D2Error, match="has no picture of train0, train1, train2 at frame 0: name pictures"):
+    with pytest.raises(D2Error, match="has no image of train0, train1, train2 at frame 0: name images"):
         workspace(still).depth(still.cameras["train0"], 0)
 
 
-def test_a_workspace_that_saw_other_cameras_is_warned_of(still: Capture, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_workspace_that_saw_other_cameras_is_warned_of(still: Recording, caplog: pytest.LogCaptureFixture) -> None:
     """Held-out cameras must not reach training by way of somebody's depth maps."""
     write_maps(still, "colmap", 0)
     source = find_depth_on_disk(still, NAMES[:2], StereoSettings(matcher="workspace"))
@@ -351,7 +353,7 @@ def test_a_workspace_that_saw_other_cameras_is_warned_of(still: Capture, caplog:
     assert "saw train2.png as well" in caplog.text
 
 
-def test_pictures_with_lens_distortion_are_refused(still: Capture) -> None:
+def test_images_with_lens_distortion_are_refused(still: Recording) -> None:
     folder = write_maps(still, "colmap", 0)
     cameras = folder / "sparse" / "cameras.txt"
     lines = [line.replace("PINHOLE", "OPENCV") + " 0.1 0 0 0" for line in cameras.read_text().splitlines()]
@@ -360,42 +362,42 @@ def test_pictures_with_lens_distortion_are_refused(still: Capture) -> None:
         workspace(still).depth(still.cameras["train0"], 0)
 
 
-def test_priors_from_a_workspace_pass_the_common_filter(capture: Capture) -> None:
-    write_maps(capture, "colmap/00000", 0, 3.0)
-    write_maps(capture, "colmap/00001", 1, 0.2)
-    summary = build_priors(capture, NAMES, capture.path / "priors", PriorSettings(agreement=0.0))
+def test_priors_from_a_workspace_pass_the_common_filter(recording: Recording) -> None:
+    write_maps(recording, "colmap/00000", 0, 3.0)
+    write_maps(recording, "colmap/00001", 1, 0.2)
+    summary = build_priors(recording, NAMES, recording.path / "priors", PriorSettings(agreement=0.0))
     assert min(share["verified"] for share in summary.shares.values()) > 0.3
-    store = PriorStore.open(capture.path / "priors")
-    for frame in capture.frames:
-        prior, truth = store.prior("train1", frame), capture.depth("train1", frame)
+    store = PriorStore.open(recording.path / "priors")
+    for frame in recording.frames:
+        prior, truth = store.prior("train1", frame), recording.depth("train1", frame)
         verified = prior.verified.numpy()
         np.testing.assert_allclose(prior.depth.numpy()[verified], truth[verified], rtol=2e-4)
     survivors = store.record("train1", 0)["stereo"]["survivors"]
     assert 0 < survivors["kept"] <= survivors["confirmed"] < survivors["matched"]
 
 
-def test_what_other_cameras_saw_adds_to_the_depth_of_a_workspace_and_is_right(capture: Capture) -> None:
-    write_maps(capture, "colmap/00000", 0, 3.0)
-    write_maps(capture, "colmap/00001", 1, 0.2)
+def test_what_other_cameras_saw_adds_to_the_depth_of_a_workspace_and_is_right(recording: Recording) -> None:
+    write_maps(recording, "colmap/00000", 0, 3.0)
+    write_maps(recording, "colmap/00001", 1, 0.2)
     verified = {}
     for agreement in (0.0, 0.02):
-        build_priors(capture, NAMES, capture.path / "p", PriorSettings(agreement=agreement))
-        prior = PriorStore.open(capture.path / "p").prior("train1", 0)
+        build_priors(recording, NAMES, recording.path / "p", PriorSettings(agreement=agreement))
+        prior = PriorStore.open(recording.path / "p").prior("train1", 0)
         verified[agreement] = prior.verified.numpy()
     assert not (verified[0.0] & ~verified[0.02]).any()
     added = verified[0.02] & ~verified[0.0]
     assert added.any()
-    truth = capture.depth("train1", 0)
+    truth = recording.depth("train1", 0)
     assert np.median(np.abs(prior.depth.numpy() / truth - 1)[added]) < 0.002
 
 
 @pytest.mark.parametrize(
     ("matcher", "message"), [("sensor", "has no depth.json"), ("workspace", "say where it is with stereo.folder")]
 )
-def test_depth_that_is_asked_for_and_absent_is_told(capture: Capture, matcher: str, message: str) -> None:
+def test_depth_that_is_asked_for_and_absent_is_told(recording: Recording, matcher: str, message: str) -> None:
     with pytest.raises(D2Error, match=message):
-        build_priors(capture, NAMES, capture.path / "p", PriorSettings(stereo=StereoSettings(matcher=matcher)))
-    assert not (capture.path / "p").exists()
+        build_priors(recording, NAMES, recording.path / "p", PriorSettings(stereo=StereoSettings(matcher=matcher)))
+    assert not (recording.path / "p").exists()
 
 
 @pytest.mark.parametrize(

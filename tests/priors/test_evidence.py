@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.cross_view.ask import BESIDE, LIKE, NEAR, WITHIN
 from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, with_evidence
 from d2_plugin.priors.fuse import FusedPrior, empty_prior
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import DepthPrior, Label
+from d2_plugin.recordings.recording import Camera
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.store import PriorStore
 
 WIDTH, HEIGHT, WALL, SIGMA = 40, 30, 4.0, 0.05
 TOLERANCE = 0.02
@@ -53,7 +53,7 @@ def left_of(left: FusedPrior, right: FusedPrior) -> FusedPrior:
 
 
 def painted(prior: FusedPrior, color: int) -> FusedPrior:
-    """With a picture of one grey value."""
+    """With an image of one grey value."""
     return replace(prior, colors=np.full((HEIGHT, WIDTH, 3), color, np.uint8))
 
 
@@ -63,7 +63,7 @@ def share(prior: FusedPrior, label: Label) -> float:
 
 def test_maps_that_put_a_wall_at_one_place_agree_where_both_cameras_see_it() -> None:
     agreed = with_evidence({"left": prior_of(WALL), "right": prior_of(WALL)}, CAMERAS, TOLERANCE)
-    shift = 30 * 0.5 / WALL  # pixels between the two pictures
+    shift = 30 * 0.5 / WALL  # pixels between the two images
     for prior in agreed.values():
         assert share(prior, Label.AGREED) == pytest.approx(1 - shift / WIDTH, abs=1 / WIDTH)
         both = prior.labels == Label.AGREED
@@ -147,7 +147,7 @@ def test_far_and_empty_pixels_have_no_say_and_agreed_ones_do(label: Label) -> No
         np.testing.assert_array_equal(asked.sigma, np.float32(SIGMA))
 
 
-def test_points_behind_another_camera_or_off_its_picture_are_not_looked_up() -> None:
+def test_points_behind_another_camera_or_off_its_image_are_not_looked_up() -> None:
     turned = camera(0.0)
     turned.T_camera_world[:3, :3] = np.diag([-1.0, 1, -1])  # looks away
     for there in (turned, camera(1e6), camera(-1e6)):
@@ -158,7 +158,7 @@ def test_points_behind_another_camera_or_off_its_picture_are_not_looked_up() -> 
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 5), (5, 1), (2, 2)])
-def test_pictures_of_a_pixel_or_a_row_are_possible(height: int, width: int) -> None:
+def test_images_of_a_pixel_or_a_row_are_possible(height: int, width: int) -> None:
     rig = {"left": camera(0, width, height), "right": camera(1e-3, width, height)}
     full = np.full((height, width), WALL, np.float32)
     sigma = np.full_like(full, SIGMA)
@@ -191,7 +191,7 @@ def test_the_unit_of_the_world_does_not_matter(unit: float) -> None:
         TOLERANCE,
     )["left"]
     same = scaled.labels == asked.labels
-    assert same.mean() > 0.97, "but for points that rounding moves across the rim of the picture"
+    assert same.mean() > 0.97, "but for points that rounding moves across the rim of the image"
     np.testing.assert_allclose(scaled.depth[same] / unit, asked.depth[same], rtol=1e-5)
     np.testing.assert_allclose(scaled.sigma[same], asked.sigma[same], rtol=1e-3)
 
@@ -206,13 +206,13 @@ def test_trusted_is_verified_and_agreed_and_far_is_neither_trusted_nor_supported
 
 def test_the_builder_asks_other_cameras_for_the_dual_prior_alone(tmp_path: Path) -> None:
     pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-    capture = synthetic_capture(cameras=3, held_out=0, frames=1, width=160, height=90)
-    names = list(capture.cameras)
+    recording = synthetic_recording(cameras=3, held_out=0, frames=1, width=160, height=90)
+    names = list(recording.cameras)
 
     def labels(folder: str, settings: PriorSettings) -> np.ndarray:
-        build_priors(capture, names, tmp_path / folder, settings)
+        build_priors(recording, names, tmp_path / folder, settings)
         store = PriorStore.open(tmp_path / folder)
-        return np.stack([store.prior(name, capture.frames[0]).labels.numpy() for name in names])
+        return np.stack([store.prior(name, recording.frames[0]).labels.numpy() for name in names])
 
     with_it, without = labels("on", PriorSettings()), labels("off", PriorSettings(agreement=0.0))
     assert (with_it == Label.AGREED).any()
@@ -232,7 +232,7 @@ def test_a_surface_of_another_colour_is_not_the_thing_that_the_ray_sees() -> Non
         asked = left_of(painted(ours, 100), painted(theirs, 100 + int(apart * LIKE * 255)))
         assert (share(asked, Label.VERIFIED) > 0.5) is taken
         assert taken or (asked.depth == ours.depth).all()
-    assert share(left_of(ours, theirs), Label.VERIFIED) > 0.5, "without pictures nothing speaks against it"
+    assert share(left_of(ours, theirs), Label.VERIFIED) > 0.5, "without images nothing speaks against it"
 
 
 @pytest.mark.parametrize(("mine", "seen", "taken"), [(100, 120, True), (100, 100, False), (120, 100, False)])

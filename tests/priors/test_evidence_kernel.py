@@ -10,11 +10,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.cross_view import kernel
 from d2_plugin.priors.evidence import with_evidence
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("cv2")
 pytestmark = pytest.mark.skipif(kernel.library() is None, reason="no C++ compiler")
@@ -25,7 +25,7 @@ Rig = tuple[dict[str, FusedPrior], dict[str, Camera]]
 
 
 def camera(center: np.ndarray, angle: float, width: int, height: int, principal: tuple[float, float]) -> Camera:
-    """At `center`, turned by `angle` about the vertical; the principal point in shares of the picture's size."""
+    """At `center`, turned by `angle` about the vertical; the principal point in shares of the image's size."""
     T = np.eye(4)
     T[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
     T[:3, 3] = -T[:3, :3] @ center
@@ -43,7 +43,7 @@ def wall(view: Camera, distance: float) -> np.ndarray:
 
 
 def random_rig(count: int, sizes: list[tuple[int, int]], unit: float, noise: float, colored: bool, seed: int) -> Rig:
-    """Views of one wall: maps that differ, surfaces, holes, infinite sigmas, pictures of different brightness."""
+    """Views of one wall: maps that differ, surfaces, holes, infinite sigmas, images of different brightness."""
     random, priors, cameras = np.random.default_rng(seed), {}, {}
     for index in range(count):
         width, height = sizes[index]
@@ -138,9 +138,7 @@ PLACES = {
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("turned", [0.0, np.pi / 2, np.pi])
 @pytest.mark.parametrize("principal", [(0.5, 0.5), (-2.0, 9.0)])
-def test_both_agree_wherever_the_other_camera_stands(
-    place: str, turned: float, principal: tuple[float, float]
-) -> None:
+def test_both_agree_wherever_the_other_camera_stands(place: str, turned: float, principal: tuple[float, float]) -> None:
     priors, cameras = random_rig(2, [(40, 30)] * 2, 1.0, 0.02, True, 3)
     cameras["0"] = camera(np.zeros(3), 0.0, 40, 30, (0.5, 0.5))
     cameras["1"] = camera(np.array(PLACES[place]), turned, 40, 30, principal)
@@ -148,7 +146,7 @@ def test_both_agree_wherever_the_other_camera_stands(
         assert_same(with_evidence(priors, cameras, TOLERANCE), without_compiler((priors, cameras)))
 
 
-def test_a_point_at_the_centre_of_another_camera_is_nowhere_in_its_picture() -> None:
+def test_a_point_at_the_centre_of_another_camera_is_nowhere_in_its_image() -> None:
     ours = camera(np.zeros(3), 0.0, 41, 31, (20.5 / 41, 15.5 / 31))
     theirs = camera(np.array([0, 0, 2.0]), 0.0, 41, 31, (20.5 / 41, 15.5 / 31))
     shape = (31, 41)
@@ -171,7 +169,7 @@ def test_maps_of_another_order_in_memory_are_read_alike_and_left_as_they_are() -
 
 
 def test_the_gain_is_the_median_halfway_between_the_middle_two_of_an_even_number() -> None:
-    """Both verified the left half, where the other picture is 1 to 1.3 times brighter; the right half tells."""
+    """Both verified the left half, where the other image is 1 to 1.3 times brighter; the right half tells."""
     view, shape = camera(np.zeros(3), 0.0, 40, 30, (0.5, 0.5)), (30, 40)
     left, top = np.arange(40)[None] < 20, np.arange(30)[:, None] < 15
     labels = np.broadcast_to(np.where(left, Label.VERIFIED, Label.MONO), shape).astype(np.uint8)

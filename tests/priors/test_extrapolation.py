@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from d2_plugin.captures.capture import MonoKind
 from d2_plugin.priors.monocular.align import align, aligned_depth
 from d2_plugin.priors.monocular.extrapolation import extrapolation_error
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.priors.monocular.uncertainty import monocular_uncertainty
+from d2_plugin.recordings.recording import MonoKind
 
 SETTINGS = AlignSettings()
 FAR = 12.0

@@ -14,7 +14,7 @@ HEIGHT, WIDTH, HORIZON, WALL = 90, 160, 40, 10.0
 
 
 def scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Inverse depth, geometric depth and picture of a smooth sky above a textured wall that stereo measured."""
+    """Inverse depth, geometric depth and image of a smooth sky above a textured wall that stereo measured."""
     rng = np.random.default_rng(0)
     inverse = np.full((HEIGHT, WIDTH), 1 / WALL)
     inverse[:HORIZON] = 1e-3 * rng.standard_normal((HORIZON, WIDTH)) / WALL
@@ -98,7 +98,7 @@ def test_a_metric_map_that_puts_the_sky_far_away_finds_it_and_one_that_says_noth
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (3, 3)])
-def test_pictures_of_a_pixel_or_a_row_are_possible(shape: tuple[int, int]) -> None:
+def test_images_of_a_pixel_or_a_row_are_possible(shape: tuple[int, int]) -> None:
     far = far_pixels(np.zeros(shape), np.full(shape, 2.0, np.float32), np.zeros((*shape, 3), np.uint8))
     assert far.shape == shape
     assert not far.any()

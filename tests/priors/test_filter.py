@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.filtering.confirm import confirm
 from d2_plugin.priors.stereo.filtering.filter import filter_depths, remove_speckles, texture_mask
 from d2_plugin.priors.stereo.geometric_depth import gray
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
 
@@ -20,20 +20,20 @@ SETTINGS = StereoSettings()
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
-    return synthetic_capture(cameras=3, frames=1, width=160, height=90, arc_degrees=30)
+def recording() -> Recording:
+    return synthetic_recording(cameras=3, frames=1, width=160, height=90, arc_degrees=30)
 
 
-def views(capture: Capture) -> tuple[list, list, list, list]:
-    """Grey pictures, cameras, true depths and perfect costs of the training views."""
+def views(recording: Recording) -> tuple[list, list, list, list]:
+    """Grey images, cameras, true depths and perfect costs of the training views."""
     names = ["train0", "train1", "train2"]
-    depths = [capture.depth(name, 0) for name in names]
-    grays = [gray(capture.image(name, 0)) for name in names]
-    return grays, [capture.cameras[name] for name in names], depths, [np.zeros_like(depth) for depth in depths]
+    depths = [recording.depth(name, 0) for name in names]
+    grays = [gray(recording.image(name, 0)) for name in names]
+    return grays, [recording.cameras[name] for name in names], depths, [np.zeros_like(depth) for depth in depths]
 
 
-def test_true_depth_survives_where_another_view_sees_it(capture: Capture) -> None:
-    grays, cameras, depths, costs = views(capture)
+def test_true_depth_survives_where_another_view_sees_it(recording: Recording) -> None:
+    grays, cameras, depths, costs = views(recording)
     results = filter_depths(grays, cameras, depths, costs, SETTINGS)
     for result, depth in zip(results, depths):
         assert result.valid.mean() > 0.5
@@ -42,8 +42,8 @@ def test_true_depth_survives_where_another_view_sees_it(capture: Capture) -> Non
         assert result.survivors["kept"] == result.valid.sum()
 
 
-def test_depth_that_is_wrong_in_one_view_is_dropped_there(capture: Capture) -> None:
-    grays, cameras, depths, costs = views(capture)
+def test_depth_that_is_wrong_in_one_view_is_dropped_there(recording: Recording) -> None:
+    grays, cameras, depths, costs = views(recording)
     wrong = np.zeros(depths[1].shape, bool)
     wrong[20:60, 40:90] = True
     depths[1] = np.where(wrong, depths[1] * 1.15, depths[1]).astype(np.float32)
@@ -52,16 +52,16 @@ def test_depth_that_is_wrong_in_one_view_is_dropped_there(capture: Capture) -> N
     assert result.valid[~wrong].mean() > 0.4
 
 
-def test_random_depth_leaves_nearly_nothing(capture: Capture) -> None:
-    grays, cameras, depths, costs = views(capture)
+def test_random_depth_leaves_nearly_nothing(recording: Recording) -> None:
+    grays, cameras, depths, costs = views(recording)
     rng = np.random.default_rng(0)
     noise = [rng.uniform(2, 8, depth.shape).astype(np.float32) for depth in depths]
     for result in filter_depths(grays, cameras, noise, costs, SETTINGS):
         assert result.valid.mean() < 0.001
 
 
-def test_bad_matches_are_dropped(capture: Capture) -> None:
-    grays, cameras, depths, costs = views(capture)
+def test_bad_matches_are_dropped(recording: Recording) -> None:
+    grays, cameras, depths, costs = views(recording)
     costs[0] = np.full_like(costs[0], SETTINGS.cost_max + 0.01)
     results = filter_depths(grays, cameras, depths, costs, SETTINGS)
     assert not results[0].valid.any()
@@ -69,8 +69,8 @@ def test_bad_matches_are_dropped(capture: Capture) -> None:
     assert results[1].confirmations.max() == 1
 
 
-def test_nan_and_negative_depths_are_no_depths(capture: Capture) -> None:
-    grays, cameras, depths, costs = views(capture)
+def test_nan_and_negative_depths_are_no_depths(recording: Recording) -> None:
+    grays, cameras, depths, costs = views(recording)
     depths[0] = depths[0].copy()
     depths[0][:30], depths[0][30:50], depths[0][50:60] = np.nan, -1, np.inf
     result = filter_depths(grays, cameras, depths, costs, SETTINGS)[0]
@@ -79,15 +79,15 @@ def test_nan_and_negative_depths_are_no_depths(capture: Capture) -> None:
     assert np.isfinite(result.depth).all()
 
 
-def test_cameras_with_one_centre_confirm_nothing(capture: Capture) -> None:
-    grays, cameras, depths, costs = views(capture)
+def test_cameras_with_one_centre_confirm_nothing(recording: Recording) -> None:
+    grays, cameras, depths, costs = views(recording)
     same = [cameras[0]] * 3
     for result in filter_depths([grays[0]] * 3, same, [depths[0]] * 3, costs, SETTINGS):
         assert not result.valid.any()
 
 
-def test_views_that_meet_at_too_wide_an_angle_do_not_confirm_each_other(capture: Capture) -> None:
-    grays, cameras, depths, costs = views(capture)
+def test_views_that_meet_at_too_wide_an_angle_do_not_confirm_each_other(recording: Recording) -> None:
+    grays, cameras, depths, costs = views(recording)
     outer = [0, 2]  # 30 degrees apart
     kept = {}
     for limit in (60, 15):
@@ -97,8 +97,8 @@ def test_views_that_meet_at_too_wide_an_angle_do_not_confirm_each_other(capture:
     assert kept[60] > 0.3 > 10 * kept[15]
 
 
-def test_more_confirmations_can_be_asked_for(capture: Capture) -> None:
-    grays, cameras, depths, costs = views(capture)
+def test_more_confirmations_can_be_asked_for(recording: Recording) -> None:
+    grays, cameras, depths, costs = views(recording)
     kept = []
     for needed in (1, 2, 3):
         settings = replace(SETTINGS, min_sources=needed)
@@ -110,9 +110,9 @@ def test_more_confirmations_can_be_asked_for(capture: Capture) -> None:
 
 
 def test_texture_is_the_spread_of_grey_values_in_a_window() -> None:
-    picture = np.full((40, 80), 120, np.uint8)
-    picture[:, 40:] = np.random.default_rng(0).integers(0, 255, (40, 40))
-    mask = texture_mask(picture, StereoSettings(texture_window=11, texture_min=0.02))
+    image = np.full((40, 80), 120, np.uint8)
+    image[:, 40:] = np.random.default_rng(0).integers(0, 255, (40, 40))
+    mask = texture_mask(image, StereoSettings(texture_window=11, texture_min=0.02))
     assert not mask[:, :34].any()
     assert mask[:, 46:].all()
 

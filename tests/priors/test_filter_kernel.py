@@ -12,20 +12,20 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d2_plugin.captures import open_capture
-from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.stereo.filtering import kernel
 from d2_plugin.priors.stereo.filtering.coherence import surface_coherence
 from d2_plugin.priors.stereo.filtering.confirm import Confirmation, confirm
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.patchmatch import patchmatch
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("cv2")
 pytestmark = pytest.mark.skipif(kernel.library() is None, reason="no C++ compiler")
 
 Rig = tuple[list[np.ndarray], list[Camera], list[np.ndarray]]
-"""Grey pictures, cameras, depth maps."""
+"""Grey images, cameras, depth maps."""
 
 
 def cameras(count: int, width: int, height: int, unit: float, seed: int) -> list[Camera]:
@@ -128,10 +128,10 @@ def test_rays_meet_between_the_limits(limits: tuple[float, float]) -> None:
 
 @pytest.mark.parametrize("name", ["studio", "plaza"])
 def test_a_real_rig_has_the_same_bits(name: str, shared_data: Callable[[str], Path]) -> None:
-    capture = open_capture(shared_data(name))
+    recording = open_recording(shared_data(name))
     chosen = ("00", "02", "05")
-    grays = [gray(capture.image(camera, 3)) for camera in chosen]
-    views = [capture.cameras[camera] for camera in chosen]
+    grays = [gray(recording.image(camera, 3)) for camera in chosen]
+    views = [recording.cameras[camera] for camera in chosen]
     raw = patchmatch(grays, views, (1.0, 80.0))
     rig = grays, views, [depth for depth, _ in raw]
     assert_same(judged(rig), without_compiler(rig))

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from d2_plugin.captures.capture import Camera, Capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
+from benchmarks.stereo_rigs import textured_rig
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo import geometric_depth as stereo
@@ -16,7 +15,8 @@ from d2_plugin.priors.stereo.depth_range import depth_bounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
 from d2_plugin.priors.stereo.geometric_depth import choose_matcher, enlarged, geometric_depth, gray
 from d2_plugin.priors.stereo.sweep import RunningMinimum
-from d2_plugin.study.bench.stereo_rigs import textured_rig
+from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
 
@@ -24,39 +24,39 @@ SWEEP = StereoSettings(matcher="sweep")
 
 
 @pytest.fixture(scope="module")
-def pair() -> Capture:
+def pair() -> Recording:
     """Two views 10 degrees apart: what the sweep is for."""
-    return synthetic_capture(cameras=2, held_out=0, frames=1, width=256, height=144, arc_degrees=10)
+    return synthetic_recording(cameras=2, held_out=0, frames=1, width=256, height=144, arc_degrees=10)
 
 
-def run(capture: Capture, bounds: tuple[float, float], settings: StereoSettings = SWEEP) -> list[GeometricDepth]:
-    names = list(capture.cameras)
-    images = [capture.image(name, 0) for name in names]
-    return geometric_depth(images, list(capture.cameras.values()), bounds, settings)
+def run(recording: Recording, bounds: tuple[float, float], settings: StereoSettings = SWEEP) -> list[GeometricDepth]:
+    names = list(recording.cameras)
+    images = [recording.image(name, 0) for name in names]
+    return geometric_depth(images, list(recording.cameras.values()), bounds, settings)
 
 
-def scores(results: list[GeometricDepth], capture: Capture) -> tuple[float, float, float]:
+def scores(results: list[GeometricDepth], recording: Recording) -> tuple[float, float, float]:
     """Completeness, median relative error and share of errors above 5 % over all views."""
-    truths = [capture.depth(name, 0) for name in capture.cameras]
+    truths = [recording.depth(name, 0) for name in recording.cameras]
     errors = [np.abs(r.depth - t)[r.valid] / t[r.valid] for r, t in zip(results, truths)]
     found = np.concatenate(errors)
     return float(np.mean([r.valid.mean() for r in results])), float(np.median(found)), float((found > 0.05).mean())
 
 
-def test_the_sweep_finds_a_good_part_of_a_narrow_pair(pair: Capture) -> None:
+def test_the_sweep_finds_a_good_part_of_a_narrow_pair(pair: Recording) -> None:
     completeness, median, wrong = scores(run(pair, (2.0, 9.0)), pair)
     assert completeness > 0.2
     assert median < 0.006
     assert wrong < 0.02
 
 
-def test_a_range_ten_times_too_wide_does_no_harm(pair: Capture) -> None:
+def test_a_range_ten_times_too_wide_does_no_harm(pair: Recording) -> None:
     narrow, wide = (scores(run(pair, bounds), pair) for bounds in ((2.0, 9.0), (0.2, 90.0)))
     assert wide[0] > 0.8 * narrow[0]
     assert wide[1] < 1.3 * narrow[1]
 
 
-def test_half_resolution_comes_back_at_full_size(pair: Capture) -> None:
+def test_half_resolution_comes_back_at_full_size(pair: Recording) -> None:
     results = run(pair, (2.0, 9.0), replace(SWEEP, max_pixels=128 * 72))
     assert results[0].depth.shape == (144, 256)
     completeness, median, wrong = scores(results, pair)
@@ -117,7 +117,7 @@ def test_the_minimum_of_a_parabola_is_found_between_planes() -> None:
     assert minimum.result()[0][0, 0] == pytest.approx(4.3, abs=1e-4)
 
 
-def test_the_depth_range_comes_from_points_then_the_data_set_then_the_baselines(pair: Capture) -> None:
+def test_the_depth_range_comes_from_points_then_the_data_set_then_the_baselines(pair: Recording) -> None:
     cameras = list(pair.cameras.values())
     rng = np.random.default_rng(0)
     local = np.stack([rng.uniform(-0.3, 0.3, 500), rng.uniform(-0.2, 0.2, 500), np.linspace(3, 5, 500)], axis=1)
@@ -151,7 +151,7 @@ def test_the_range_from_triangulated_points_holds_what_two_views_see(views: int)
 
 def test_cameras_that_look_at_each_other_across_a_room_have_a_range_that_holds_it() -> None:
     """At wide angles disparity says nothing about the near end, but the frusta do."""
-    room = synthetic_capture(cameras=3, held_out=0, frames=1, width=160, height=90, arc_degrees=120)
+    room = synthetic_recording(cameras=3, held_out=0, frames=1, width=160, height=90, arc_degrees=120)
     cameras = [replace(camera, near_far=None) for camera in room.cameras.values()]
     bounds = depth_bounds(cameras)
     truth = np.concatenate([room.depth(name, 0).ravel() for name in room.cameras])
@@ -159,7 +159,7 @@ def test_cameras_that_look_at_each_other_across_a_room_have_a_range_that_holds_i
     assert bounds.far > truth.max()
 
 
-def test_points_behind_or_beside_the_camera_do_not_count(pair: Capture) -> None:
+def test_points_behind_or_beside_the_camera_do_not_count(pair: Recording) -> None:
     cameras = list(pair.cameras.values())
     backwards = -5 * cameras[0].T_camera_world[2, :3]
     behind = cameras[0].centre + backwards + np.random.default_rng(0).normal(0, 0.1, (200, 3))
@@ -181,11 +181,11 @@ def test_auto_without_a_gpu_is_patchmatch_where_there_is_a_compiler(monkeypatch:
     assert choose_matcher("auto") == "sweep"
     with pytest.raises(D2Error, match="did you mean 'patchmatch'"):
         choose_matcher("patch-match")
-    with pytest.raises(D2Error, match="matcher = sensor reads depth that lies beside a capture"):
+    with pytest.raises(D2Error, match="matcher = sensor reads depth that lies beside a recording"):
         choose_matcher("sensor")
 
 
-def test_any_function_can_be_a_matcher(pair: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_function_can_be_a_matcher(pair: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     truths = [pair.depth(name, 0) for name in pair.cameras]
 
     def oracle(grays: list, cameras: list[Camera], bounds: tuple, settings: StereoSettings, wanted: None) -> list:

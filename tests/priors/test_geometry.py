@@ -7,8 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import (
     back_project,
@@ -21,6 +19,8 @@ from d2_plugin.priors.geometry import (
     view_pair,
     viewing_rays,
 )
+from d2_plugin.recordings.recording import Camera
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 
 def camera(name: str = "a", x: float = 0.0, turn: float = 0.0, width: int = 64, height: int = 48) -> Camera:
@@ -40,7 +40,7 @@ def test_a_projection_agrees_with_world_points_and_half_pixel_centres(
 ) -> None:
     reference, source = camera(), camera("b", x, turn)
     at = view_pair(reference, source).project(np.array([u]), np.array([v]), np.array([depth]))
-    # Index u has its centre at u + 0.5 in the capture's pixel coordinates.
+    # Index u has its centre at u + 0.5 in the recording's pixel coordinates.
     local = np.linalg.inv(reference.K) @ [u + 0.5, v + 0.5, 1] * depth
     world = reference.T_camera_world[:3, :3].T @ (local - reference.T_camera_world[:3, 3])
     seen = source.T_camera_world[:3, :3] @ world + source.T_camera_world[:3, 3]
@@ -62,9 +62,9 @@ def test_there_and_back_is_the_identity() -> None:
 
 
 def test_true_depth_of_one_view_lands_on_true_depth_of_the_other() -> None:
-    capture = synthetic_capture(cameras=2, frames=1, width=96, height=54)
-    first, second = (capture.cameras[name] for name in ("train0", "train1"))
-    depth, other = capture.depth("train0", 0), capture.depth("train1", 0)
+    recording = synthetic_recording(cameras=2, frames=1, width=96, height=54)
+    first, second = (recording.cameras[name] for name in ("train0", "train1"))
+    depth, other = recording.depth("train0", 0), recording.depth("train1", 0)
     at = view_pair(first, second).project(*pixel_grid(first), depth)
     inside = (at.x >= 0) & (at.y >= 0) & (at.x <= 95) & (at.y <= 53) & (at.z > 0)
     there = other[np.rint(at.y[inside]).astype(int), np.rint(at.x[inside]).astype(int)]
@@ -113,7 +113,7 @@ def test_a_range_ten_times_too_wide_keeps_the_spacing_where_the_views_overlap() 
     narrow, wide = (inverse_depth_planes(left, [right], bounds, 0.5) for bounds in ((2.0, 20.0), (0.2, 200.0)))
     inside = wide[(wide > 1 / 20) & (wide < 1 / 2)]
     assert len(inside) == pytest.approx(len(narrow), rel=0.1)
-    assert len(wide) < 64 / 0.5 * 2  # never more planes than the picture is wide
+    assert len(wide) < 64 / 0.5 * 2  # never more planes than the image is wide
 
 
 @pytest.mark.parametrize("bounds", [(5.0, 1.0), (0.0, 1.0), (-1.0, 1.0), (1.0, 1.0), (1.0, np.inf), (np.nan, 2.0)])
@@ -122,9 +122,9 @@ def test_an_impossible_depth_range_is_refused(bounds: tuple[float, float]) -> No
         check_depth_range(bounds)
 
 
-def test_pictures_that_do_not_belong_to_the_cameras_are_refused() -> None:
+def test_images_that_do_not_belong_to_the_cameras_are_refused() -> None:
     image = np.zeros((48, 64, 3), np.uint8)
-    with pytest.raises(D2Error, match="one picture per camera"):
+    with pytest.raises(D2Error, match="one image per camera"):
         check_views([image], [camera(), camera("b", 1)])
     with pytest.raises(D2Error, match="at least 2 cameras"):
         check_views([image], [camera()])

@@ -16,7 +16,7 @@ EPSILON = 0.02
 def recording(
     frames: int, anchors: int, ties: int, noise: float = 0.01, wrong: float = 0.0, seed: int = 0
 ) -> tuple[list[Anchors], list[Tie], np.ndarray]:
-    """Frames of one still picture, each with a line of its own; (anchors, ties, true scales).
+    """Frames of one still image, each with a line of its own; (anchors, ties, true scales).
 
     Noise is that of the anchors: that of ties would make the lines flatter (`together` averages it out).
     """

@@ -11,7 +11,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d2_plugin.captures.capture import MonoKind
 from d2_plugin.priors.fuse import fuse
 from d2_plugin.priors.monocular.affine import fit_affine
 from d2_plugin.priors.monocular.align import (
@@ -26,6 +25,7 @@ from d2_plugin.priors.monocular.align import (
 from d2_plugin.priors.monocular.correct import corrected_without
 from d2_plugin.priors.monocular.native import library, points
 from d2_plugin.priors.settings import AlignSettings
+from d2_plugin.recordings.recording import MonoKind
 
 pytest.importorskip("cv2")
 pytestmark = pytest.mark.skipif(library.library() is None, reason="no C++ compiler")
@@ -73,7 +73,7 @@ def test_corrected_maps_are_those_of_numpy_to_the_last_digits(
     np.testing.assert_allclose(views.corrected(**changes), expected, rtol=2e-6)
 
 
-def test_the_field_of_a_picture_is_the_bits_of_numpy_where_its_sums_run_along_the_same_way() -> None:
+def test_the_field_of_a_image_is_the_bits_of_numpy_where_its_sums_run_along_the_same_way() -> None:
     """So it is on the machines of the project: 80 cells across fill whole vectors of its BLAS."""
     views = Views(90, 160, 0.3, 0.1, seed=1)
     expected = without_compiler(views.corrected)

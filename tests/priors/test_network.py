@@ -15,7 +15,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.monocular.align import align, aligned_depth
 from d2_plugin.priors.monocular.network import (
@@ -26,6 +25,7 @@ from d2_plugin.priors.monocular.network import (
     upsample,
 )
 from d2_plugin.priors.settings import AlignSettings
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("onnxruntime")
 pytest.importorskip("cv2")
@@ -134,30 +134,30 @@ def test_a_missing_onnxruntime_is_told_with_the_command_that_mends_it(
 def test_a_real_network_sees_the_nearer_thing_as_nearer(shared_data: Callable[[str], Path]) -> None:
     model = MonocularModel(shared_data("weights") / "mobile_pydnet.onnx", "relative")
     assert (model.input.height, model.input.width, model.preprocessing) == (192, 640, "unit")
-    capture = synthetic_capture(cameras=1, frames=1, width=320, height=180)
-    depth = capture.depth("train0", 0)
-    alignment = align(model(capture.image("train0", 0)), depth, kind="relative", settings=AlignSettings())
+    recording = synthetic_recording(cameras=1, frames=1, width=320, height=180)
+    depth = recording.depth("train0", 0)
+    alignment = align(model(recording.image("train0", 0)), depth, kind="relative", settings=AlignSettings())
     assert alignment.accepted, alignment.status
     assert alignment.rank_correlation > 0.4
-    aligned = aligned_depth(model(capture.image("train0", 0)), alignment, 30.0)
+    aligned = aligned_depth(model(recording.image("train0", 0)), alignment, 30.0)
     spread = np.median(np.abs(depth - np.median(depth)) / depth)
     assert np.median(np.abs(aligned - depth) / depth) < 0.8 * spread  # better than one depth for all
 
 
 def test_a_batch_of_four_and_an_input_that_fills_the_memory_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(D2Error, match="takes 4 pictures at once: export it with a batch of 1"):
+    with pytest.raises(D2Error, match="takes 4 images at once: export it with a batch of 1"):
         MonocularModel(tiny_onnx.mean_network(tmp_path / "four.onnx", 32, 48, batch=4), "relative")
-    with pytest.raises(D2Error, match="takes pictures of 200000x200000, expected at most 8192 a side"):
+    with pytest.raises(D2Error, match="takes images of 200000x200000, expected at most 8192 a side"):
         MonocularModel(tiny_onnx.mean_network(tmp_path / "large.onnx", 200_000, 200_000), "relative")
     free = MonocularModel(tiny_onnx.mean_network(tmp_path / "free.onnx", "h", "w"), "relative")
-    with pytest.raises(D2Error, match="a picture of 60000x10 would enter .* at most 8192 a side"):
+    with pytest.raises(D2Error, match="an image of 60000x10 would enter .* at most 8192 a side"):
         free.input_size(10, 60_000)
 
 
-def test_a_network_that_fails_on_a_picture_names_itself(tmp_path: Path) -> None:
+def test_a_network_that_fails_on_a_image_names_itself(tmp_path: Path) -> None:
     model = MonocularModel(tiny_onnx.mean_network(tmp_path / "net.onnx", 32, 48), "relative")
     model.input = replace(model.input, height=16)  # as a file that does not keep what it says
-    with pytest.raises(D2Error, match=r"cannot read what .*net.onnx makes of a picture of 48x16"):
+    with pytest.raises(D2Error, match=r"cannot read what .*net.onnx makes of an image of 48x16"):
         model.predict(np.zeros((32, 48, 3), np.uint8))
 
 

@@ -18,9 +18,7 @@ from d2_plugin.priors.monocular.native.order import median, quantile
     share=st.sampled_from([0, 0.02, 0.68, 0.995, 1]) | st.floats(0, 1),
     seed=st.integers(0, 99),
 )
-def test_they_are_those_of_numpy(
-    count: int, dtype: type, levels: int, infinite: bool, share: float, seed: int
-) -> None:
+def test_they_are_those_of_numpy(count: int, dtype: type, levels: int, infinite: bool, share: float, seed: int) -> None:
     random = np.random.default_rng(seed)
     values = (random.integers(-levels, levels, count, endpoint=True) / 7).astype(dtype)
     before = values.copy()

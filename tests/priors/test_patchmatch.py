@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from d2_plugin.captures.capture import Camera
+from benchmarks.stereo_measure import Method, measure, score
+from benchmarks.stereo_rigs import MIDDLEBURY, Rig, load_rigs, textured_rig
 from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import pixel_grid, scaled_camera
@@ -22,8 +23,7 @@ from d2_plugin.priors.stereo.geometric_depth import MATCHERS, gray
 from d2_plugin.priors.stereo.patchmatch import patchmatch
 from d2_plugin.priors.stereo.pyramid import NO_MATCH, refined_planes, shrunk
 from d2_plugin.priors.stereo.source_views import choose_sources
-from d2_plugin.study.bench.stereo_measure import Method, measure, score
-from d2_plugin.study.bench.stereo_rigs import MIDDLEBURY, Rig, load_rigs, textured_rig
+from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("cv2")
 try:
@@ -73,7 +73,7 @@ def test_studio_is_a_quarter_complete_although_two_walls_are_plain(shared_data) 
 
 @pytest.mark.slow
 def test_on_middlebury_patchmatch_beats_the_sweep_and_semi_global_matching(shared_data) -> None:
-    from d2_plugin.study.bench.stereo_measure import methods
+    from benchmarks.stereo_measure import methods
 
     rigs = [load_rigs(name, shared_data("middlebury").parent) for name in MIDDLEBURY]
     defaults = [method for method in methods() if method.setting == "default"]
@@ -163,17 +163,17 @@ def test_planes_are_carried_to_a_finer_resolution_exactly(width: int, height: in
 
 @given(st.integers(0, 2**31), st.integers(1, 60), st.integers(1, 60), st.floats(0, 1), st.floats(0, 1))
 @hypothesis_settings(max_examples=60, deadline=None)
-def test_a_picture_shrinks_to_the_bits_of_torch(seed: int, height: int, width: int, down: float, across: float) -> None:
+def test_a_image_shrinks_to_the_bits_of_torch(seed: int, height: int, width: int, down: float, across: float) -> None:
     shape = (1 + int(down * (height - 1)), 1 + int(across * (width - 1)))  # hardly ever a divisor: pixels are shared
-    picture = np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
-    pixels = torch.from_numpy(picture)[None, None].to(torch.float32)
+    image = np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
+    pixels = torch.from_numpy(image)[None, None].to(torch.float32)
     expected = torch.nn.functional.interpolate(pixels, shape, mode="area")[0, 0].round()
-    np.testing.assert_array_equal(shrunk(picture, shape), expected.numpy())
+    np.testing.assert_array_equal(shrunk(image, shape), expected.numpy())
 
 
 def test_the_mean_of_a_block_is_rounded_half_to_even() -> None:
-    picture = np.array([[0, 1, 255, 254], [0, 1, 255, 254]], np.uint8)
-    np.testing.assert_array_equal(shrunk(picture, (1, 2)), [[0, 254]])
+    image = np.array([[0, 1, 255, 254], [0, 1, 255, 254]], np.uint8)
+    np.testing.assert_array_equal(shrunk(image, (1, 2)), [[0, 254]])
     np.testing.assert_array_equal(shrunk(np.full((512, 1024), 255, np.uint8), (2, 1)), [[255], [255]])
 
 
@@ -196,7 +196,7 @@ def score_of(rig: Rig, settings: StereoSettings):
 
 
 def test_pixels_that_are_not_wanted_are_left_alone(rig: Rig) -> None:
-    wanted = [np.zeros(picture.shape, bool) for picture in grays(rig)]
+    wanted = [np.zeros(image.shape, bool) for image in grays(rig)]
     for mask in wanted:
         mask[:, 60:120] = True
     result = raw(rig, wanted=wanted)
@@ -232,14 +232,14 @@ def test_a_view_that_no_other_meets_has_no_depth_and_spoils_nothing(rig: Rig) ->
         assert not depth.any()
         assert (cost == NO_MATCH).all()
     away = at(0, facing=-1, name="away")
-    pictures = [*grays(rig), grays(rig)[0]]
-    away = scaled_camera(away, *pictures[0].shape[::-1])
-    with_stranger = patchmatch(pictures, [*rig.cameras, away], rig.depth_range)
+    images = [*grays(rig), grays(rig)[0]]
+    away = scaled_camera(away, *images[0].shape[::-1])
+    with_stranger = patchmatch(images, [*rig.cameras, away], rig.depth_range)
     assert not with_stranger[3][0].any()
     np.testing.assert_array_equal(with_stranger[0][0], raw(rig)[0][0])
 
 
-def test_pictures_may_differ_in_size(rig: Rig) -> None:
+def test_images_may_differ_in_size(rig: Rig) -> None:
     small = grays(rig)[1][::1, ::1].reshape(45, 2, 80, 2).mean(axis=(1, 3)).round().astype(np.uint8)
     cameras = [rig.cameras[0], scaled_camera(rig.cameras[1], 80, 45), rig.cameras[2]]
     result = patchmatch([grays(rig)[0], small, grays(rig)[2]], cameras, rig.depth_range)
@@ -249,11 +249,11 @@ def test_pictures_may_differ_in_size(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (7, 5), (13, 11)])
-def test_pictures_smaller_than_a_window_do_not_crash(size: tuple[int, int]) -> None:
+def test_images_smaller_than_a_window_do_not_crash(size: tuple[int, int]) -> None:
     rng = np.random.default_rng(0)
     cameras = [scaled_camera(at(0), *size), scaled_camera(at(0.7), *size)]
-    pictures = [rng.integers(0, 255, size[::-1]).astype(np.uint8) for _ in cameras]
-    for depth, cost in patchmatch(pictures, cameras, (3.0, 5.0)):
+    images = [rng.integers(0, 255, size[::-1]).astype(np.uint8) for _ in cameras]
+    for depth, cost in patchmatch(images, cameras, (3.0, 5.0)):
         assert depth.shape == cost.shape == size[::-1]
         assert np.isfinite(depth).all()
         assert ((cost >= 0) & (cost <= NO_MATCH)).all()
@@ -269,7 +269,7 @@ def test_a_processor_without_wide_vectors_finds_the_same(rig: Rig, tmp_path, mon
 
 
 def test_a_mistake_is_one_sentence(rig: Rig) -> None:
-    floats = [picture / 255 for picture in grays(rig)]
+    floats = [image / 255 for image in grays(rig)]
     with pytest.raises(D2Error, match=r"uint8 \[H, W\], got float64"):
         patchmatch(floats, rig.cameras, rig.depth_range)
     with pytest.raises(D2Error, match="0 < near < far"):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from d2_plugin.captures.capture import Camera
+from benchmarks.stereo_rigs import Rig, textured_rig
 from d2_plugin.compiler import NoCompiler, load_library, nvrtc
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
@@ -25,7 +25,7 @@ from d2_plugin.priors.stereo.gpu.call import PROGRAM, Call, flags_for
 from d2_plugin.priors.stereo.patchmatch import patchmatch
 from d2_plugin.priors.stereo.pyramid import NO_MATCH
 from d2_plugin.priors.stereo.source_views import choose_sources
-from d2_plugin.study.bench.stereo_rigs import Rig, textured_rig
+from d2_plugin.recordings.recording import Camera
 
 HERE = Path(__file__).parent
 SETTINGS = StereoSettings()
@@ -81,7 +81,7 @@ def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
         use_shim(monkeypatch)
 
 
-def pictures(rig: Rig) -> list[np.ndarray]:
+def grays(rig: Rig) -> list[np.ndarray]:
     return [gray(image) for image in rig.images]
 
 
@@ -96,7 +96,7 @@ def assert_same(found: Maps, expected: Maps) -> None:
 
 @pytest.mark.parametrize("views", [2, 3])
 def test_the_gpu_returns_the_bits_of_the_cpu(backend: None, rig: Rig, views: int) -> None:
-    images, cameras = pictures(rig)[:views], rig.cameras[:views]
+    images, cameras = grays(rig)[:views], rig.cameras[:views]
     on_gpu, on_cpu = (
         patchmatch(images, cameras, rig.depth_range, replace(SETTINGS, patchmatch_device=device))
         for device in ("cuda", "cpu")
@@ -106,19 +106,19 @@ def test_the_gpu_returns_the_bits_of_the_cpu(backend: None, rig: Rig, views: int
 
 
 def test_wanted_pixels_and_geometric_rounds_as_well(backend: None, rig: Rig) -> None:
-    wanted = [np.zeros(picture.shape, bool) for picture in pictures(rig)]
+    wanted = [np.zeros(image.shape, bool) for image in grays(rig)]
     for mask in wanted:
         mask[5:31, 10:40] = True
     dense = replace(SETTINGS, patchmatch_geometric_rounds=1)
     found, expected = (
-        patchmatch(pictures(rig), rig.cameras, rig.depth_range, replace(dense, patchmatch_device=device), wanted)
+        patchmatch(grays(rig), rig.cameras, rig.depth_range, replace(dense, patchmatch_device=device), wanted)
         for device in ("cuda", "cpu")
     )
     assert_same(found, expected)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (13, 11)])
-def test_pictures_smaller_than_a_window(backend: None, size: tuple[int, int]) -> None:
+def test_images_smaller_than_a_window(backend: None, size: tuple[int, int]) -> None:
     K = np.array([[140.0, 0, size[0] / 2], [0, 140.0, size[1] / 2], [0, 0, 1]])
     moved = np.eye(4)
     moved[0, 3] = -0.7
@@ -130,7 +130,7 @@ def test_pictures_smaller_than_a_window(backend: None, size: tuple[int, int]) ->
 
 def test_many_sources_and_scattered_pixels(backend: None, rig: Rig) -> None:
     # Seven sources fill no vector; of the wanted pixels many stand alone, at the border too.
-    cameras, images = [], [pictures(rig)[number % 3] for number in range(10)]
+    cameras, images = [], [grays(rig)[number % 3] for number in range(10)]
     for number in range(10):
         camera, pose = rig.cameras[number % 3], rig.cameras[number % 3].T_camera_world.copy()
         pose[0, 3] += 0.02 * number
@@ -149,7 +149,7 @@ def test_many_sources_and_scattered_pixels(backend: None, rig: Rig) -> None:
 
 
 def test_flat_pixels_among_textured_ones(backend: None, rig: Rig) -> None:
-    images = [image.copy() for image in pictures(rig)]
+    images = [image.copy() for image in grays(rig)]
     for image in images:
         image[:, 20:45] = 128
     found, expected = (
@@ -166,7 +166,7 @@ def test_no_result_depends_on_the_order_of_blocks_warps_and_lanes(rig: Rig, monk
     for order in (0, 1, 2):
         try:
             launcher = use_shim(monkeypatch, order)
-            results.append(patchmatch(pictures(rig)[:2], rig.cameras[:2], rig.depth_range, SETTINGS))
+            results.append(patchmatch(grays(rig)[:2], rig.cameras[:2], rig.depth_range, SETTINGS))
         except NoCompiler as error:
             pytest.skip(str(error))
         assert launcher.launched == {f"d2_patchmatch_{name}" for name in ("begin", "update", "average")}
@@ -179,7 +179,7 @@ def test_a_missing_gpu_is_one_sentence(rig: Rig, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     asked = replace(SETTINGS, patchmatch_device="cuda")
     with pytest.raises(D2Error, match="patchmatch_device = 'cuda', but torch sees no CUDA device: set it to") as error:
-        patchmatch(pictures(rig), rig.cameras, rig.depth_range, asked)
+        patchmatch(grays(rig), rig.cameras, rig.depth_range, asked)
     assert "\n" not in str(error.value)
     gpu.why_not_usable.cache_clear()
 
@@ -213,4 +213,4 @@ def test_as_many_sources_as_there_may_be_are_refused_by_number_of_pixels(rig: Ri
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(patchmatch_kernel, "MOST_PIXELS", 1000)
         with pytest.raises(D2Error, match="pixels together, at most 1000 are possible: lower max_pixels"):
-            patchmatch(pictures(rig), rig.cameras, rig.depth_range, CPU)
+            patchmatch(grays(rig), rig.cameras, rig.depth_range, CPU)

@@ -19,13 +19,13 @@ pytest.importorskip("cv2")
 
 
 def plane(height: int, width: int, unit: float = 1.0) -> np.ndarray:
-    """Depth float32 [H, W] of a slanted plane: inverse depth is linear over the picture."""
+    """Depth float32 [H, W] of a slanted plane: inverse depth is linear over the image."""
     v, u = np.mgrid[:height, :width]
     return (unit / (0.2 + 0.1 * u / width + 0.05 * v / height)).astype(np.float32)
 
 
 def sigma_of(depth: np.ndarray, **changes: np.ndarray | float) -> np.ndarray:
-    """Sigma with full coherence, no spread, a textured picture and a parallax of 100 pixels, but for `changes`."""
+    """Sigma with full coherence, no spread, a textured image and a parallax of 100 pixels, but for `changes`."""
     values = {"coherence": 1.0, "parallax": 100.0, "spread": 0.0, "gradient": 0.05} | changes
     return geometric_sigma(depth, **{name: np.broadcast_to(value, depth.shape) for name, value in values.items()})
 
@@ -54,7 +54,7 @@ def test_sigma_is_the_matching_error_over_the_parallax_and_falls_with_it() -> No
     assert found[-1] == pytest.approx(FLOOR, rel=1e-3)
 
 
-def test_flat_pictures_incoherence_and_spread_all_make_it_less_sure() -> None:
+def test_flat_images_incoherence_and_spread_all_make_it_less_sure() -> None:
     depth = plane(40, 60)
     best = np.median(sigma_of(depth, parallax=20.0))
     for worse in ({"gradient": 0.01}, {"coherence": 0.5}, {"spread": 0.05}):
@@ -85,7 +85,7 @@ def test_values_outside_of_their_range_count_as_its_ends() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (2, 2), (7, 5)])
-def test_pictures_of_a_pixel_or_a_row_have_a_sigma(shape: tuple[int, int]) -> None:
+def test_images_of_a_pixel_or_a_row_have_a_sigma(shape: tuple[int, int]) -> None:
     sigma = sigma_of(plane(*shape))
     assert np.isfinite(sigma).all()
     assert np.isinf(sigma_of(np.zeros(shape, np.float32))).all()
@@ -109,8 +109,8 @@ def test_the_gradient_is_that_of_the_grey_value_whatever_its_direction() -> None
 
 
 def test_a_flat_part_beside_a_textured_one_has_a_gradient() -> None:
-    picture = np.zeros((180, 320), np.uint8)
-    picture[:, :107] = np.random.default_rng(2).integers(0, 255, (180, 107))
-    gradient = grey_gradient(picture)
+    image = np.zeros((180, 320), np.uint8)
+    image[:, :107] = np.random.default_rng(2).integers(0, 255, (180, 107))
+    gradient = grey_gradient(image)
     assert np.isfinite(gradient).all()
     assert gradient[:, 150:].max() < 1e-6

@@ -10,8 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, build_priors
 from d2_plugin.priors.frame import Frame
@@ -20,8 +18,10 @@ from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.geometric_depth import geometric_depth
 from d2_plugin.priors.stereo.match import MatchedDepth
 from d2_plugin.priors.stereo.reuse import MEMORY_DTYPE, MatchMemory, changed, covering_boxes
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")
 
@@ -31,14 +31,14 @@ NAMES = ["train0", "train1"]
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
-    return synthetic_capture(cameras=2, held_out=0, frames=5, width=128, height=72, arc_degrees=10)
+def recording() -> Recording:
+    return synthetic_recording(cameras=2, held_out=0, frames=5, width=128, height=72, arc_degrees=10)
 
 
 @pytest.fixture(scope="module")
-def built(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("built") / "priors"
-    build_priors(capture, NAMES, path, SETTINGS)
+    build_priors(recording, NAMES, path, SETTINGS)
     return path
 
 
@@ -105,7 +105,7 @@ def test_a_saved_memory_comes_back_under_its_key_only_and_only_intact(tmp_path: 
 
 
 def test_a_scene_that_stands_still_is_matched_once() -> None:
-    still = synthetic_capture(cameras=2, held_out=0, frames=2, width=128, height=72, arc_degrees=10, moving=False)
+    still = synthetic_recording(cameras=2, held_out=0, frames=2, width=128, height=72, arc_degrees=10, moving=False)
     memory, results = MatchMemory(), []
     for frame in still.frames:
         images = [still.image(name, frame) for name in NAMES]
@@ -121,16 +121,18 @@ def test_the_share_that_was_matched_is_recorded_and_small(built: Path) -> None:
     assert max(shares[1], shares[2], shares[4]) < 0.4
 
 
-def test_carrying_over_does_not_change_what_is_verified_by_much(capture: Capture, built: Path, tmp_path: Path) -> None:
+def test_carrying_over_does_not_change_what_is_verified_by_much(
+    recording: Recording, built: Path, tmp_path: Path
+) -> None:
     full = replace(SETTINGS, stereo=replace(STEREO, reuse_static=False))
-    build_priors(capture, NAMES, tmp_path, full)
+    build_priors(recording, NAMES, tmp_path, full)
     results = {}
     for path in (built, tmp_path):
         store = PriorStore.open(path)
         errors = []
         for camera in NAMES:
             for frame in (1, 2, 4):
-                truth, prior = capture.depth(camera, frame), store.prior(camera, frame)
+                truth, prior = recording.depth(camera, frame), store.prior(camera, frame)
                 mask = prior.labels.numpy() == Label.VERIFIED
                 errors.append((np.abs(prior.depth.numpy() - truth) / truth)[mask])
         results[path] = np.concatenate(errors)
@@ -141,7 +143,7 @@ def test_carrying_over_does_not_change_what_is_verified_by_much(capture: Capture
 
 
 def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(
-    capture: Capture, built: Path, tmp_path: Path
+    recording: Recording, built: Path, tmp_path: Path
 ) -> None:
     class Stopped(Exception):
         pass
@@ -151,39 +153,41 @@ def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(
             raise Stopped
 
     with pytest.raises(Stopped):
-        build_priors(capture, NAMES, tmp_path, SETTINGS, progress=stop)
-    build_priors(capture, NAMES, tmp_path, SETTINGS)
+        build_priors(recording, NAMES, tmp_path, SETTINGS, progress=stop)
+    build_priors(recording, NAMES, tmp_path, SETTINGS)
     assert priors_of(tmp_path) == priors_of(built)
 
 
 def test_without_its_saved_memory_a_block_is_matched_again_to_the_same_store(
-    capture: Capture, built: Path, tmp_path: Path
+    recording: Recording, built: Path, tmp_path: Path
 ) -> None:
-    build_priors(capture, NAMES, tmp_path, SETTINGS)
+    build_priors(recording, NAMES, tmp_path, SETTINGS)
     memory = list((tmp_path / "cache" / "matches").rglob("*.npy"))
     assert memory
     for file in [*memory, *(tmp_path / "cache" / "stereo").rglob("*2.npy")]:
         file.unlink()
     (tmp_path / "priors" / "train1" / "00002.npy").unlink()
-    build_priors(capture, NAMES, tmp_path, SETTINGS)
+    build_priors(recording, NAMES, tmp_path, SETTINGS)
     assert priors_of(tmp_path) == priors_of(built)
 
 
-def test_shards_built_in_any_order_join_to_the_same_store(capture: Capture, built: Path, tmp_path: Path) -> None:
-    parts = [build_priors(capture, NAMES, tmp_path, SETTINGS, shard=(index, 2)) for index in (1, 0)]
+def test_shards_built_in_any_order_join_to_the_same_store(recording: Recording, built: Path, tmp_path: Path) -> None:
+    parts = [build_priors(recording, NAMES, tmp_path, SETTINGS, shard=(index, 2)) for index in (1, 0)]
     assert [part.built for part in parts] == [4, 6]
     assert priors_of(tmp_path) == priors_of(built)
     assert (tmp_path / "store.json").read_bytes() == (built / "store.json").read_bytes()
 
 
 @pytest.mark.parametrize("shard", [(2, 2), (-1, 2), (0, 0)])
-def test_a_shard_that_does_not_exist_is_refused(capture: Capture, tmp_path: Path, shard: tuple[int, int]) -> None:
+def test_a_shard_that_does_not_exist_is_refused(recording: Recording, tmp_path: Path, shard: tuple[int, int]) -> None:
     with pytest.raises(D2Error, match="does not exist"):
-        build_priors(capture, NAMES, tmp_path, SETTINGS, shard=shard)
+        build_priors(recording, NAMES, tmp_path, SETTINGS, shard=shard)
 
 
-def test_the_sweep_matches_only_boxes_around_what_is_wanted(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    images, cameras = [capture.image(name, 0) for name in NAMES], list(capture.cameras.values())
+def test_the_sweep_matches_only_boxes_around_what_is_wanted(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images, cameras = [recording.image(name, 0) for name in NAMES], list(recording.cameras.values())
     grays = [image.mean(axis=-1).astype(np.uint8) for image in images]
     from d2_plugin.priors.stereo.sweep import sweep
 
@@ -196,19 +200,19 @@ def test_the_sweep_matches_only_boxes_around_what_is_wanted(capture: Capture, mo
     assert not part[1][0].any()
 
 
-def test_a_source_is_asked_in_order_even_from_the_middle_of_a_block(capture: Capture, tmp_path: Path) -> None:
+def test_a_source_is_asked_in_order_even_from_the_middle_of_a_block(recording: Recording, tmp_path: Path) -> None:
     """The key of a frame covers the frames before it in its block."""
 
     def source(frames: tuple[int, ...]) -> MatchedDepth:
         return MatchedDepth(
-            list(capture.cameras.values()),
+            list(recording.cameras.values()),
             DepthBounds(2, 9, "test"),
             STEREO,
             tmp_path,
             frames,
-            lambda number: Frame.read(capture, NAMES, number),
+            lambda number: Frame.read(recording, NAMES, number),
         )
 
-    frame = Frame.read(capture, NAMES, 2)
+    frame = Frame.read(recording, NAMES, 2)
     assert source((0, 1, 2)).key(frame) == source((0, 1, 2, 3, 4)).key(frame)
     assert source((0, 1, 2)).key(frame) != source((1, 2)).key(frame)

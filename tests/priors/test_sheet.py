@@ -7,32 +7,34 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.sheet import LABEL_COLORS, UNKNOWN, contact_sheet, depth_colors, label_colors, sigma_colors
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.store import PriorStore
 
 cv2 = pytest.importorskip("cv2")
 
 
-def test_the_sheet_shows_picture_depth_and_labels_of_every_view(tmp_path: Path) -> None:
-    capture = synthetic_capture(cameras=2, held_out=0, frames=2, width=64, height=36)
-    store = PriorStore.create(tmp_path / "priors", list(capture.cameras), capture.frames, {"capture": capture.name})
-    for camera in capture.cameras:
+def test_the_sheet_shows_image_depth_and_labels_of_every_view(tmp_path: Path) -> None:
+    recording = synthetic_recording(cameras=2, held_out=0, frames=2, width=64, height=36)
+    store = PriorStore.create(
+        tmp_path / "priors", list(recording.cameras), recording.frames, {"recording": recording.name}
+    )
+    for camera in recording.cameras:
         labels = np.full((36, 64), Label.MONO, np.uint8)
         labels[:, 32:] = Label.CONFLICT
         labels[:8] = Label.FAR
-        depth = np.where(labels == Label.CONFLICT, 0, capture.depth(camera, 0))
+        depth = np.where(labels == Label.CONFLICT, 0, recording.depth(camera, 0))
         sigma = np.where(labels == Label.MONO, 0.05, np.inf).astype(np.float32)
-        prior = FusedPrior(depth, labels, sigma, capture.image(camera, 0))
+        prior = FusedPrior(depth, labels, sigma, recording.image(camera, 0))
         record = {"shares": prior.shares(), "refused": "", "monocular": "maps"}
         store.write(camera, 0, prior, record)
-    sheet = cv2.imread(str(contact_sheet(store, capture, tmp_path / "out" / "sheet.png", width=64)))[..., ::-1]
+    sheet = cv2.imread(str(contact_sheet(store, recording, tmp_path / "out" / "sheet.png", width=64)))[..., ::-1]
     assert sheet.shape == (18 + 2 * (18 + 36), 4 * 64, 3)
     row = sheet[36 : 36 + 36]
-    np.testing.assert_allclose(row[:, :64].astype(int), capture.image("train0", 0), atol=1)
+    np.testing.assert_allclose(row[:, :64].astype(int), recording.image("train0", 0), atol=1)
     assert tuple(row[10, 2 * 64 + 10]) == LABEL_COLORS[Label.MONO]
     assert tuple(row[10, 2 * 64 + 50]) == LABEL_COLORS[Label.CONFLICT]
     assert not row[8:, 64 + 32 : 128].any()
@@ -42,7 +44,7 @@ def test_the_sheet_shows_picture_depth_and_labels_of_every_view(tmp_path: Path) 
     np.testing.assert_allclose(shown, np.broadcast_to(expected, shown.shape), atol=3)
     assert not row[8:, 3 * 64 + 32 :].any()
     with pytest.raises(D2Error, match="no prior at frames 1"):
-        contact_sheet(store, capture, tmp_path / "none.png", frames=[1])
+        contact_sheet(store, recording, tmp_path / "none.png", frames=[1])
 
 
 def test_near_is_red_far_is_blue_and_empty_is_black() -> None:

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.store import FORMAT, SIGMA, DepthRange, PriorStore, encode_sigma
 from d2_plugin.protocol import Label
+from d2_plugin.store.store import FORMAT, SIGMA, DepthRange, PriorStore, encode_sigma
 
 SHAPE = (12, 17)
 IMAGE = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3)).astype(np.uint8)
@@ -32,7 +32,7 @@ def some_prior(seed: int = 0) -> FusedPrior:
 
 @pytest.fixture
 def store(tmp_path: Path) -> PriorStore:
-    made = PriorStore.create(tmp_path / "priors", ["a", "b"], [0, 3], {"capture": "test"})
+    made = PriorStore.create(tmp_path / "priors", ["a", "b"], [0, 3], {"recording": "test"})
     for camera in ("a", "b"):
         made.write(camera, 0, some_prior(), {"key": "k", "shares": some_prior().shares()})
     return made
@@ -114,7 +114,7 @@ def test_labels_that_contradict_depth_are_refused(store: PriorStore) -> None:
     prior.labels[0, 0] = 9
     with pytest.raises(D2Error, match="label 9"):
         store.write("a", 0, prior, {})
-    with pytest.raises(D2Error, match="build the prior at the picture's size"):
+    with pytest.raises(D2Error, match="build the prior at the image's size"):
         store.write("a", 0, replace(some_prior(), colors=IMAGE[:5]), {})
     with pytest.raises(D2Error, match="its colours none"):
         store.write("a", 0, replace(some_prior(), colors=None), {})
@@ -189,9 +189,9 @@ def test_the_store_is_memory_mapped(store: PriorStore) -> None:
     assert isinstance(store.entries.find("a", 0).array(), np.memmap)
 
 
-def test_stores_of_other_captures_formats_and_other_folders_are_refused(store: PriorStore, tmp_path: Path) -> None:
+def test_stores_of_other_recordings_formats_and_other_folders_are_refused(store: PriorStore, tmp_path: Path) -> None:
     with pytest.raises(D2Error, match="holds the priors of test, not of other"):
-        PriorStore.create(store.path, ["a"], [0], {"capture": "other"})
+        PriorStore.create(store.path, ["a"], [0], {"recording": "other"})
     with pytest.raises(D2Error, match="no depth priors at"):
         PriorStore.open(tmp_path / "nowhere")
     described = json.loads((store.path / "store.json").read_text())
@@ -201,11 +201,11 @@ def test_stores_of_other_captures_formats_and_other_folders_are_refused(store: P
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("do not lose me")
     with pytest.raises(D2Error, match="holds no prior store"):
-        PriorStore.create(tmp_path / "mine", ["a"], [0], {"capture": "test"})
+        PriorStore.create(tmp_path / "mine", ["a"], [0], {"recording": "test"})
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
 
 
 def test_frames_built_before_stay_part_of_the_store(store: PriorStore) -> None:
-    again = PriorStore.create(store.path, ["a", "b"], [5], {"capture": "test"})
+    again = PriorStore.create(store.path, ["a", "b"], [5], {"recording": "test"})
     assert again.frames == (0, 3, 5)
     assert PriorStore.open(store.path).prior("a", 0) is not None

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.monocular.align import align
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.priors.monocular.together import Seen, aligned_together
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
-from d2_plugin.priors.store import PriorStore
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")
 
@@ -26,8 +26,8 @@ TOGETHER = PriorSettings(stereo=STEREO, align=AlignSettings(together=True, **ANY
 
 
 @pytest.fixture(scope="module")
-def room() -> Capture:
-    return synthetic_capture(cameras=3, held_out=0, frames=3, width=128, height=72, arc_degrees=20)
+def room() -> Recording:
+    return synthetic_recording(cameras=3, held_out=0, frames=3, width=128, height=72, arc_degrees=20)
 
 
 def nothing_moves(image: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -35,7 +35,7 @@ def nothing_moves(image: np.ndarray, before: np.ndarray) -> np.ndarray:
 
 
 def still(frames: int, noise: float = 0.0, share: float = 0.02) -> tuple[dict[int, Seen], np.ndarray, np.ndarray]:
-    """A still picture seen `frames` times, each map with a line of its own; (frames, true inverse depth, scales)."""
+    """A still image seen `frames` times, each map with a line of its own; (frames, true inverse depth, scales)."""
     rng = np.random.default_rng(0)
     inverse = np.tile(np.linspace(0.1, 1, 80), (60, 1))
     scales = rng.uniform(0.5, 2, frames)
@@ -57,7 +57,7 @@ def test_the_lines_are_found_and_recorded_with_one_certificate() -> None:
     assert all(alignment.accepted and alignment.gap < 1e-8 for alignment in found.values())
 
 
-def test_lines_of_a_still_picture_are_steadier_together() -> None:
+def test_lines_of_a_still_image_are_steadier_together() -> None:
     seen, inverse, _ = still(6, noise=0.05)
     settings = AlignSettings()
     alone = {number: align(f.mono, f.geometric, kind="relative", settings=settings) for number, f in seen.items()}
@@ -87,7 +87,7 @@ def test_a_frame_that_is_refused_alone_stays_refused_and_tells_nothing() -> None
     assert found[20] == rest[20]
 
 
-def test_shards_make_the_store_that_a_single_build_makes(room: Capture, tmp_path: Path) -> None:
+def test_shards_make_the_store_that_a_single_build_makes(room: Recording, tmp_path: Path) -> None:
     names = list(room.cameras)
     build_priors(room, names, tmp_path / "whole", TOGETHER)
     for index in (1, 0):

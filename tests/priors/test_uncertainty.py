@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.fuse import FusedPrior, fuse
 from d2_plugin.priors.monocular.align import align, aligned_depth
 from d2_plugin.priors.monocular.correct import corrected_depth
@@ -15,6 +14,7 @@ from d2_plugin.priors.monocular.error_shape import FLOOR, ErrorShape
 from d2_plugin.priors.monocular.uncertainty import HARDER, USUAL, _scale, monocular_uncertainty
 from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 cv2 = pytest.importorskip("cv2")
 
@@ -40,13 +40,13 @@ def scenes() -> list[Scene]:
 
 
 def room(seed: int) -> Scene:
-    capture = synthetic_capture(cameras=4, held_out=0, frames=5, width=240, height=135, seed=seed)
-    truth, random = capture.depth("train1", 0), np.random.default_rng(seed)
+    recording = synthetic_recording(cameras=4, held_out=0, frames=5, width=240, height=135, seed=seed)
+    truth, random = recording.depth("train1", 0), np.random.default_rng(seed)
     blobs = cv2.GaussianBlur(random.standard_normal(truth.shape), (0, 0), 12)
     edge = cv2.dilate(np.abs(cv2.Laplacian(np.log(truth), cv2.CV_32F)), np.ones((5, 5))) > 0.05
     noisy = truth * np.exp(0.001 * random.standard_normal(truth.shape))
     anchors = np.where((blobs > np.quantile(blobs, 0.6)) & ~edge, noisy, 0).astype(np.float32)
-    return Scene(truth, anchors, *(aligned(capture.mono(*view), anchors) for view in (("train1", 0), ("train3", 4))))
+    return Scene(truth, anchors, *(aligned(recording.mono(*view), anchors) for view in (("train1", 0), ("train3", 4))))
 
 
 def aligned(mono: np.ndarray, anchors: np.ndarray) -> np.ndarray:
@@ -76,7 +76,7 @@ def test_the_declared_sigma_holds_and_one_twice_too_large_or_small_would_not(sce
     assert not holds(error, sigma * 2)
 
 
-def test_each_picture_alone_is_roughly_right(scenes: list[Scene]) -> None:
+def test_each_image_alone_is_roughly_right(scenes: list[Scene]) -> None:
     for scene in scenes:
         error, sigma = held(scene, scene.aligned)
         assert (error <= sigma).mean() > 0.5
@@ -183,7 +183,7 @@ def test_twice_the_same_bits_and_the_inputs_are_left_alone(scenes: list[Scene]) 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (7, 5)])
 @pytest.mark.parametrize("anchors", ["none", "one", "all"])
-def test_small_pictures_and_few_anchors_declare_nothing(shape: tuple[int, int], anchors: str) -> None:
+def test_small_images_and_few_anchors_declare_nothing(shape: tuple[int, int], anchors: str) -> None:
     depth = np.full(shape, 3.0, np.float32)
     known = np.zeros_like(depth)
     if anchors == "one":
@@ -195,7 +195,7 @@ def test_small_pictures_and_few_anchors_declare_nothing(shape: tuple[int, int], 
     assert found.skill.as_json() == {"scale": None, "error": None, "gain": None, "tail": None}
 
 
-def test_too_few_anchors_declare_nothing_however_large_the_picture(scenes: list[Scene]) -> None:
+def test_too_few_anchors_declare_nothing_however_large_the_image(scenes: list[Scene]) -> None:
     scene = scenes[0]
     few = np.zeros_like(scene.anchors)
     few[::40, ::40] = scene.truth[::40, ::40]
@@ -309,7 +309,7 @@ def test_more_allowed_sigmas_are_fewer_conflicts_and_never_another_depth(scenes:
 
 
 def test_a_map_that_misses_some_things_is_less_sure_everywhere_and_vetoes_less(scenes: list[Scene]) -> None:
-    """A tenth of the picture, in blocks of a tenth of its width, is off by a factor of two."""
+    """A tenth of the image, in blocks of a tenth of its width, is off by a factor of two."""
     for scene in scenes[:3]:
         random = np.random.default_rng(5)
         height, width = scene.truth.shape

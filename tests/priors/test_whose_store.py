@@ -1,4 +1,4 @@
-"""A store is known by what its capture shows, and by its cameras: nobody else's priors are ever written over."""
+"""A store is known by what its recording shows, and by its cameras: nobody else's priors are ever written over."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, PriorSummary, build_priors
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")
 
@@ -24,38 +24,38 @@ NAMES = ["train0", "train1", "train2"]
 SETTINGS = PriorSettings(stereo=StereoSettings(matcher="sweep"))
 
 
-def room(**changes: object) -> Capture:
+def room(**changes: object) -> Recording:
     chosen = {"cameras": 3, "held_out": 0, "frames": 2, "width": 64, "height": 36, "arc_degrees": 20} | changes
-    return synthetic_capture(**chosen)
+    return synthetic_recording(**chosen)
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
+def recording() -> Recording:
     return room()
 
 
-def built(capture: Capture, folder: Path, names: list[str] = NAMES) -> PriorSummary:
-    return build_priors(capture, names, folder, SETTINGS)
+def built(recording: Recording, folder: Path, names: list[str] = NAMES) -> PriorSummary:
+    return build_priors(recording, names, folder, SETTINGS)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def moved(capture: Capture, name: str) -> Capture:
-    camera = capture.cameras[name]
+def moved(recording: Recording, name: str) -> Recording:
+    camera = recording.cameras[name]
     pose = camera.T_camera_world.copy()
     pose[0, 3] += 0.01
-    return replace(capture, cameras={**capture.cameras, name: replace(camera, T_camera_world=pose)})
+    return replace(recording, cameras={**recording.cameras, name: replace(camera, T_camera_world=pose)})
 
 
-@pytest.mark.parametrize("other", ["pictures", "a pose", "a size", "a rig"])
-def test_another_capture_of_the_same_name_changes_no_byte(capture: Capture, tmp_path: Path, other: str) -> None:
-    built(capture, tmp_path)
+@pytest.mark.parametrize("other", ["images", "a pose", "a size", "a rig"])
+def test_another_recording_of_the_same_name_changes_no_byte(recording: Recording, tmp_path: Path, other: str) -> None:
+    built(recording, tmp_path)
     before = contents(tmp_path)
     others = {
-        "pictures": lambda: room(seed=5),
-        "a pose": lambda: moved(capture, "train1"),
+        "images": lambda: room(seed=5),
+        "a pose": lambda: moved(recording, "train1"),
         "a size": lambda: room(width=48, height=27),
         "a rig": lambda: room(arc_degrees=30),
     }
@@ -64,74 +64,74 @@ def test_another_capture_of_the_same_name_changes_no_byte(capture: Capture, tmp_
     assert contents(tmp_path) == before
 
 
-def test_a_capture_that_was_renamed_is_the_same(capture: Capture, tmp_path: Path) -> None:
-    built(capture, tmp_path)
+def test_a_recording_that_was_renamed_is_the_same(recording: Recording, tmp_path: Path) -> None:
+    built(recording, tmp_path)
     before = contents(tmp_path)
-    summary = built(replace(capture, name="other"), tmp_path)
+    summary = built(replace(recording, name="other"), tmp_path)
     assert (summary.built, summary.kept) == (0, 6)
     assert contents(tmp_path) == before
 
 
 @pytest.mark.parametrize("first", [NAMES, ["train0", "train2"]], ids=["fewer", "more"])
-def test_other_cameras_of_the_capture_are_added_and_nothing_is_removed(
-    capture: Capture, tmp_path: Path, first: list[str]
+def test_other_cameras_of_the_recording_are_added_and_nothing_is_removed(
+    recording: Recording, tmp_path: Path, first: list[str]
 ) -> None:
     second = ["train0", "train2"] if first == NAMES else NAMES
-    built(capture, tmp_path / "store", first)
+    built(recording, tmp_path / "store", first)
     before = contents(tmp_path / "store")
-    summary = built(capture, tmp_path / "store", second)
+    summary = built(recording, tmp_path / "store", second)
     after = contents(tmp_path / "store")
     assert {name: after[name] for name in before} == before
     assert summary.folder == tmp_path / "store" / "cameras" / "+".join(second)
     assert PriorStore.open(tmp_path / "store").cameras == tuple(first)
-    alone = built(capture, tmp_path / "alone", second)
+    alone = built(recording, tmp_path / "alone", second)
     for name in second:  # what was built beside others is what is built alone
         ours, theirs = PriorStore.open(summary.folder).prior(name, 1), PriorStore.open(alone.folder).prior(name, 1)
         assert all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True) if a is not None)
-    again = built(capture, tmp_path / "store", second)
+    again = built(recording, tmp_path / "store", second)
     assert (again.built, again.kept) == (0, 2 * len(second))
     assert contents(tmp_path / "store") == after
     assert PriorStore.located(tmp_path / "store", second) == summary.folder
     assert PriorStore.located(tmp_path / "store", first) == tmp_path / "store"
 
 
-def test_the_same_cameras_in_another_order_are_read(capture: Capture, tmp_path: Path) -> None:
-    built(capture, tmp_path)
+def test_the_same_cameras_in_another_order_are_read(recording: Recording, tmp_path: Path) -> None:
+    built(recording, tmp_path)
     before = contents(tmp_path)
-    assert built(capture, tmp_path, NAMES[::-1]).kept == 6
+    assert built(recording, tmp_path, NAMES[::-1]).kept == 6
     assert contents(tmp_path) == before
 
 
 def test_names_that_no_folder_can_have_get_one(tmp_path: Path) -> None:
-    about = {"capture": "room"}
+    about = {"recording": "room"}
     PriorStore.create(tmp_path, ["a"], [0], about)
     for names in (["a", "b/../.."], [".", "a"], ["a", "b" * 90], ["a", "."]):
         store = PriorStore.create(tmp_path, names, [0], about)
         assert store.path.parent == tmp_path / "cameras"
 
 
-def test_a_store_that_is_complete_is_not_written_again(capture: Capture, tmp_path: Path) -> None:
-    built(capture, tmp_path)
+def test_a_store_that_is_complete_is_not_written_again(recording: Recording, tmp_path: Path) -> None:
+    built(recording, tmp_path)
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
-    built(capture, tmp_path)
+    built(recording, tmp_path)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
-def test_what_a_killed_build_left_is_removed_by_the_next(capture: Capture, tmp_path: Path) -> None:
-    built(capture, tmp_path)
+def test_what_a_killed_build_left_is_removed_by_the_next(recording: Recording, tmp_path: Path) -> None:
+    built(recording, tmp_path)
     left = tmp_path / "priors" / "train0" / ".0123456789abcdef.part"
     left.write_bytes(b"half a file")
-    built(capture, tmp_path)
+    built(recording, tmp_path)
     assert not left.exists()
 
 
 class TestARecordThatLies:
     @pytest.fixture
-    def record(self, capture: Capture, tmp_path: Path) -> Path:
-        built(capture, tmp_path)
+    def record(self, recording: Recording, tmp_path: Path) -> Path:
+        built(recording, tmp_path)
         return tmp_path / "priors" / "train0" / "00000.json"
 
-    def test_a_range_times_five_is_refused_and_built_again(self, capture: Capture, record: Path) -> None:
+    def test_a_range_times_five_is_refused_and_built_again(self, recording: Recording, record: Path) -> None:
         store = record.parents[2]
         before = contents(store)
         table = json.loads(record.read_text())
@@ -139,7 +139,7 @@ class TestARecordThatLies:
         record.write_text(json.dumps(table, indent=1, sort_keys=True))
         with pytest.raises(D2Error, match="00000.json is damaged .its content differs from its checksum"):
             PriorStore.open(store)
-        assert built(capture, store).built == 1
+        assert built(recording, store).built == 1
         assert contents(store) == before
 
     def test_a_header_that_lies_is_refused(self, record: Path) -> None:
@@ -160,7 +160,7 @@ class TestARecordThatLies:
             with pytest.raises(D2Error, match="camera train0, frame 0 is damaged"):
                 PriorStore.open(record.parents[2])
 
-    def test_a_flipped_bit_of_a_cached_map_is_never_used(self, capture: Capture, record: Path) -> None:
+    def test_a_flipped_bit_of_a_cached_map_is_never_used(self, recording: Recording, record: Path) -> None:
         store = record.parents[2]
         before = contents(store)
         for path in [*store.glob("cache/**/*.json"), *store.glob("cache/**/*.npy")]:
@@ -169,7 +169,7 @@ class TestARecordThatLies:
             path.write_bytes(damaged)
         for path in store.glob("priors/**/*.npy"):
             path.unlink()
-        built(capture, store)
+        built(recording, store)
         priors = {name: content for name, content in before.items() if name.startswith("priors/")}
         assert {name: (store / name).read_bytes() for name in priors} == priors
 

@@ -50,12 +50,12 @@ def test_gradients_are_those_of_the_image(seed, radius):
 
 
 def weight_of_one(variance: float, depth: float, settings: RasterSettings) -> float:
-    """Sum of alpha over the picture: what one faint Gaussian adds to it."""
+    """Sum of alpha over the image: what one faint Gaussian adds to it."""
     return single(depth=depth, opacity=0.02, variance=variance).render(settings).alpha.sum().item()
 
 
-def test_what_a_small_gaussian_adds_to_the_picture_falls_with_the_square_of_its_distance():
-    """The weight over the picture is 2 pi o sqrt(det S): a quarter at twice the distance. The blur alone keeps it."""
+def test_what_a_small_gaussian_adds_to_the_image_falls_with_the_square_of_its_distance():
+    """The weight over the image is 2 pi o sqrt(det S): a quarter at twice the distance. The blur alone keeps it."""
     faint = {"alpha_min": 1e-9}
     near, far = (weight_of_one(0.0009, z, RasterSettings(antialiased=True, **faint)) for z in (2.0, 4.0))
     assert near / far == pytest.approx(4, rel=0.02)

@@ -145,7 +145,7 @@ def test_the_share_of_alpha_that_stands_in_front_has_gradients_though_it_is_0_by
 
 
 @both_paths
-def test_edges_of_nine_decades_in_one_picture(dtype):
+def test_edges_of_nine_decades_in_one_image(dtype):
     scene = random_scene(4, 200, 40, 30).to(dtype).requires_grad()
     edge = everywhere(scene, 1e-3)
     edge[:, 20:] = 1e6

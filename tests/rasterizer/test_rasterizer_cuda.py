@@ -42,7 +42,7 @@ from d2_plugin.rasterizer import cuda, native, ops, rasterize, reference, survey
 
 @pytest.fixture(autouse=True)
 def one_thread() -> Iterator[None]:
-    """The pictures are too small for two: the reference would mostly wait."""
+    """The images are too small for two: the reference would mostly wait."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

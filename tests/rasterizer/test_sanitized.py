@@ -68,13 +68,13 @@ def test_no_kernel_leaves_its_arrays(module: str, chosen: str, environment: dict
 WHOLE = """
 import sys
 import torch
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.commands.cli import main
 
 torch.set_num_threads(3)
-room = synthetic_capture(cameras=3, held_out=1, frames=2, width=133, height=99, arc_degrees=25)
-save_capture(room, sys.argv[1] + "/c")
+room = synthetic_recording(cameras=3, held_out=1, frames=2, width=133, height=99, arc_degrees=25)
+save_recording(room, sys.argv[1] + "/c")
 words = ["train", sys.argv[1] + "/c", "--train-cameras", "train0,train1,train2", "--output", sys.argv[1] + "/run"]
 sys.exit(main([*words, "--iterations", "30"]))
 """

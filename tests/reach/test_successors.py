@@ -142,12 +142,12 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
 def saved(name: str, first: SimpleNamespace) -> object:
     """What a checkpoint has to hold for a run to go on."""
     if name == "fastergs4d":
-        return first.trainer.capture()
+        return first.trainer.recording()
     if name == "gsplat_dynamic":
         moments = {key: optimizer.state_dict() for key, optimizer in first.optimizers.items()}
         nets = first.hexplane.state_dict(), first.deform_net.state_dict()
         return snapshot(first), moments, first.state, nets, first.hex_optimizer.state_dict()
-    return first.gaussians.capture()
+    return first.gaussians.recording()
 
 
 @pytest.fixture

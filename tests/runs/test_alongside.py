@@ -16,14 +16,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny import make_trainer, parameters, same
 
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.store import PriorStore
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.prior.alongside import MOST_FIRST, OPEN_BY, PriorAlongside, frames_open
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TrainingFrames
+from d2_plugin.store.store import PriorStore
 
 CAMERAS, FRAMES, STEPS = ("train0", "train1"), 4, 20
 
@@ -81,8 +81,8 @@ class TestTheTrainer:
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("cv2", reason="opencv is in the `image` extra")
     pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
-    capture = synthetic_capture(cameras=2, held_out=1, frames=FRAMES, width=96, height=54, arc_degrees=20)
-    return save_capture(capture, tmp_path_factory.mktemp("recording") / "room")
+    recording = synthetic_recording(cameras=2, held_out=1, frames=FRAMES, width=96, height=54, arc_degrees=20)
+    return save_recording(recording, tmp_path_factory.mktemp("recording") / "room")
 
 
 def run_of(room: Path, folder: Path, **changes: object) -> Run:
@@ -139,7 +139,7 @@ class TestARun:
 
     def test_without_a_usable_prior_is_refused(self, tmp_path: Path) -> None:
         pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
-        blind = save_capture(synthetic_capture(cameras=2, frames=2, width=64, height=36), tmp_path / "blind")
+        blind = save_recording(synthetic_recording(cameras=2, frames=2, width=64, height=36), tmp_path / "blind")
         settings = RunSettings(str(blind), ("train0", "train1"), iterations=STEPS, priors_in_step=True)
         run = Run(settings, tmp_path / "run")
         with pytest.raises(D2Error, match="no view has a usable prior"):
@@ -162,7 +162,7 @@ class TestTheProcess:
         building = object.__new__(PriorAlongside)
         building._told, telling = multiprocessing.Pipe(duplex=False)
         building.cameras, building.frames, building.iterations = 1, range(20_000), 1000
-        building._summary, building._pictures = None, 0
+        building._summary, building._images = None, 0
         teller = threading.Thread(target=lambda: [telling.send(count + 1) for count in range(20_000)], daemon=True)
         teller.start()
         for _ in range(1000):
@@ -193,7 +193,7 @@ class Awaited:
 
 
 def test_a_trainer_that_draws_without_asking_waits_for_the_frame() -> None:
-    frames = TrainingFrames(synthetic_capture(cameras=2, frames=3, width=32, height=18), ("train0", "train1"))
+    frames = TrainingFrames(synthetic_recording(cameras=2, frames=3, width=32, height=18), ("train0", "train1"))
     frames.image(4)
     frames.awaited = Awaited()
     assert frames.opened(1) == 1

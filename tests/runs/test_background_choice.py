@@ -10,15 +10,15 @@ import torch
 from tiny import make_model
 
 from d2_plugin.backbones import yang4d
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.evaluation import renderer
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TimedPoints
+from d2_plugin.store.store import PriorStore
 
 CAMERAS, FRAMES, HEIGHT, WIDTH = ("train0", "train1"), (0, 1), 54, 96
 PIXELS = HEIGHT * WIDTH
@@ -27,13 +27,13 @@ NO_POINTS = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    capture = synthetic_capture(cameras=2, frames=2, width=WIDTH, height=HEIGHT)
-    return save_capture(capture, tmp_path_factory.mktemp("scene") / "room")
+    recording = synthetic_recording(cameras=2, frames=2, width=WIDTH, height=HEIGHT)
+    return save_recording(recording, tmp_path_factory.mktemp("scene") / "room")
 
 
 def store(folder: Path, far_pixels: dict[str, int], frames: tuple[int, ...] = FRAMES) -> Path:
-    """A prior with so many far pixels in each camera's pictures."""
-    made = PriorStore.create(folder, list(far_pixels), list(FRAMES), {"capture": "room"})
+    """A prior with so many far pixels in each camera's images."""
+    made = PriorStore.create(folder, list(far_pixels), list(FRAMES), {"recording": "room"})
     for camera, count in far_pixels.items():
         for frame in frames:
             labels = np.full((HEIGHT, WIDTH), Label.VERIFIED, np.uint8)
@@ -62,12 +62,12 @@ def test_there_is_one_with_and_without_d2_so_that_runs_compare(
     assert trainer_of(run).model.background is not None
 
 
-def test_it_begins_with_the_colours_of_the_pictures(scene: Path, tmp_path: Path) -> None:
+def test_it_begins_with_the_colours_of_the_images(scene: Path, tmp_path: Path) -> None:
     run = run_of(scene, tmp_path / "run", None, hooks=())
-    model, capture = trainer_of(run).model, run.scene.capture
+    model, recording = trainer_of(run).model, run.scene.recording
     for camera in CAMERAS:
-        shown = renderer(model, capture, "cpu")(camera, 0)[0]
-        mean = torch.from_numpy(capture.image(camera, 0)).float().mean((0, 1)) / 255
+        shown = renderer(model, recording, "cpu")(camera, 0)[0]
+        mean = torch.from_numpy(recording.image(camera, 0)).float().mean((0, 1)) / 255
         torch.testing.assert_close(shown.mean((0, 1)), mean, atol=0.1, rtol=0)
 
 
@@ -101,7 +101,7 @@ class TestAFinishedRun:
     def test_the_checkpoint_says_whether_there_is_a_background(self, trained: Run) -> None:
         model = trained.trained().model
         assert model.background is not None
-        assert trained.evaluate(pictures=False)["background"] is True
+        assert trained.evaluate(images=False)["background"] is True
         assert model.background.constant.detach().any()
 
     def test_the_exported_files_hold_the_gaussians_alone(self, trained: Run) -> None:
@@ -113,7 +113,7 @@ class TestAFinishedRun:
 
     def test_a_held_out_camera_is_rendered_with_it(self, trained: Run) -> None:
         model = trained.trained().model
-        render = renderer(model, trained.scene.capture, "cpu")
+        render = renderer(model, trained.scene.recording, "cpu")
         color, depth = render("test0", 0)
         model.background = None
         without, same_depth = render("test0", 0)

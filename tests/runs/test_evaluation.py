@@ -1,4 +1,4 @@
-"""Evaluation: the right means, honest depth errors, pictures that can be looked at."""
+"""Evaluation: the right means, honest depth errors, images that can be looked at."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from d2_plugin.captures.capture import Capture
-from d2_plugin.captures.pictures import picture_size, read_picture
-from d2_plugin.captures.selection import select_cameras
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.images import image_size, read_image
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.selection import select_cameras
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs import drawing, metrics
 from d2_plugin.runs.evaluation import RenderView, evaluate
 
@@ -22,27 +22,27 @@ NAMES = ["test0", "test1"]
 
 
 @pytest.fixture(scope="module")
-def capture() -> Capture:
-    return select_cameras(synthetic_capture(cameras=3, frames=2, width=72, height=40), NAMES)
+def recording() -> Recording:
+    return select_cameras(synthetic_recording(cameras=3, frames=2, width=72, height=40), NAMES)
 
 
-def renderer(capture: Capture, offset: float = 0.0, depth_factor: float = 1.0, hole: int = 0) -> RenderView:
+def renderer(recording: Recording, offset: float = 0.0, depth_factor: float = 1.0, hole: int = 0) -> RenderView:
     """Renders the truth plus an offset per colour; depth is scaled, and missing in the first `hole` columns."""
 
     def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
-        color = torch.from_numpy(capture.image(camera, frame).astype(np.float32) / 255) + offset
-        depth = depth_factor * torch.from_numpy(capture.depth(camera, frame))
+        color = torch.from_numpy(recording.image(camera, frame).astype(np.float32) / 255) + offset
+        depth = depth_factor * torch.from_numpy(recording.depth(camera, frame))
         depth[:, :hole] = 0
         return color, depth
 
     return render
 
 
-def test_the_mean_over_views_is_the_mean_of_the_rows(capture: Capture) -> None:
+def test_the_mean_over_views_is_the_mean_of_the_rows(recording: Recording) -> None:
     def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
-        return renderer(capture, offset=0.02 * (1 + frame))(camera, frame)
+        return renderer(recording, offset=0.02 * (1 + frame))(camera, frame)
 
-    result = evaluate(render, capture, NAMES, capture.frames)
+    result = evaluate(render, recording, NAMES, recording.frames)
     assert [(row["camera"], row["frame"]) for row in result["per_view"]] == [(n, f) for n in NAMES for f in (0, 1)]
     for name in ("psnr", "ssim1", "ssim2", "ssim_3dgs", "depth_absrel", "depth_delta1"):
         assert result["test"][name] == pytest.approx(np.mean([row[name] for row in result["per_view"]]))
@@ -52,11 +52,11 @@ def test_the_mean_over_views_is_the_mean_of_the_rows(capture: Capture) -> None:
     json.dumps(result)
 
 
-def test_every_frame_and_every_camera_has_its_mean(capture: Capture) -> None:
+def test_every_frame_and_every_camera_has_its_mean(recording: Recording) -> None:
     def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
-        return renderer(capture, offset=0.02 * (1 + frame) + 0.1 * (camera == "test1"))(camera, frame)
+        return renderer(recording, offset=0.02 * (1 + frame) + 0.1 * (camera == "test1"))(camera, frame)
 
-    result = evaluate(render, capture, NAMES, iter(capture.frames))
+    result = evaluate(render, recording, NAMES, iter(recording.frames))
     assert [row["frame"] for row in result["per_frame"]] == [0, 1]
     assert [row["camera"] for row in result["per_camera"]] == NAMES
     for key, name in (("frame", "per_frame"), ("camera", "per_camera")):
@@ -65,19 +65,19 @@ def test_every_frame_and_every_camera_has_its_mean(capture: Capture) -> None:
             assert row["psnr"] == pytest.approx(np.mean(views))
 
 
-def test_flicker_is_the_error_of_change_and_belongs_to_one_camera(capture: Capture) -> None:
+def test_flicker_is_the_error_of_change_and_belongs_to_one_camera(recording: Recording) -> None:
     def blinking(camera: str, frame: int) -> tuple[Tensor, Tensor]:
-        return renderer(capture)(camera, frame)[0] * (0.5 if frame else 1.0), None
+        return renderer(recording)(camera, frame)[0] * (0.5 if frame else 1.0), None
 
-    rows = evaluate(blinking, capture, NAMES, capture.frames)["per_view"]
+    rows = evaluate(blinking, recording, NAMES, recording.frames)["per_view"]
     assert [row["flicker"] is None for row in rows] == [True, False, True, False]
-    second = torch.from_numpy(capture.image("test1", 1).astype(np.float64) / 255)
+    second = torch.from_numpy(recording.image("test1", 1).astype(np.float64) / 255)
     assert rows[3]["flicker"] == pytest.approx((0.5 * second).mean().item(), abs=1e-6)
-    steady = evaluate(renderer(capture, offset=-0.0), capture, ["test0"], capture.frames)
+    steady = evaluate(renderer(recording, offset=-0.0), recording, ["test0"], recording.frames)
     assert steady["test"]["flicker"] == 0
 
 
-def test_both_lpips_networks_are_kept_apart(capture: Capture) -> None:
+def test_both_lpips_networks_are_kept_apart(recording: Recording) -> None:
     class Fixed:
         def __init__(self, value: float, variant: str) -> None:
             self.value, self.variant = value, variant
@@ -86,50 +86,50 @@ def test_both_lpips_networks_are_kept_apart(capture: Capture) -> None:
             return self.value
 
     nets = {"lpips": Fixed(0.25, "on one"), "lpips_vgg": Fixed(0.5, "on another")}
-    result = evaluate(renderer(capture), capture, ["test0"], [0], **nets)
+    result = evaluate(renderer(recording), recording, ["test0"], [0], **nets)
     assert (result["test"]["lpips"], result["test"]["lpips_vgg"]) == (0.25, 0.5)
     assert (result["variants"]["lpips"], result["variants"]["lpips_vgg"]) == ("on one", "on another")
-    alone = evaluate(renderer(capture), capture, ["test0"], [0], lpips=nets["lpips"])
+    alone = evaluate(renderer(recording), recording, ["test0"], [0], lpips=nets["lpips"])
     assert alone["test"]["lpips_vgg"] is None
     assert alone["variants"]["lpips_vgg"] == metrics.VARIANTS["lpips_vgg"]
 
 
-def test_scores_are_those_of_the_metric_functions(capture: Capture) -> None:
-    [row] = evaluate(renderer(capture, 0.05, 1.1), capture, ["test1"], [1])["per_view"]
-    color, depth = renderer(capture, 0.05, 1.1)("test1", 1)
-    truth = torch.from_numpy(capture.image("test1", 1).astype(np.float32) / 255)
+def test_scores_are_those_of_the_metric_functions(recording: Recording) -> None:
+    [row] = evaluate(renderer(recording, 0.05, 1.1), recording, ["test1"], [1])["per_view"]
+    color, depth = renderer(recording, 0.05, 1.1)("test1", 1)
+    truth = torch.from_numpy(recording.image("test1", 1).astype(np.float32) / 255)
     assert row["psnr"] == metrics.psnr(color.clamp(0, 1), truth)
     assert row["ssim1"] == metrics.ssim_range1(color.clamp(0, 1), truth)
     assert row["depth_absrel"] == pytest.approx(0.1, abs=1e-5)
     assert row["depth_delta1"] == 1
-    assert row["depth_absrel"] == metrics.depth_absrel(depth, torch.from_numpy(capture.depth("test1", 1)))
+    assert row["depth_absrel"] == metrics.depth_absrel(depth, torch.from_numpy(recording.depth("test1", 1)))
 
 
-def test_a_hole_in_the_rendered_depth_counts_as_wrong(capture: Capture) -> None:
-    [row] = evaluate(renderer(capture, hole=18), capture, ["test0"], [0])["per_view"]
+def test_a_hole_in_the_rendered_depth_counts_as_wrong(recording: Recording) -> None:
+    [row] = evaluate(renderer(recording, hole=18), recording, ["test0"], [0])["per_view"]
     assert row["depth_absrel"] == pytest.approx(18 / 72)
     assert row["depth_delta1"] == pytest.approx(1 - 18 / 72)
 
 
-def test_without_truth_or_without_rendered_depth_there_is_no_depth_score(capture: Capture) -> None:
+def test_without_truth_or_without_rendered_depth_there_is_no_depth_score(recording: Recording) -> None:
     def color_only(camera: str, frame: int) -> tuple[Tensor, None]:
-        return renderer(capture)(camera, frame)[0] + 0.1, None
+        return renderer(recording)(camera, frame)[0] + 0.1, None
 
-    assert evaluate(color_only, capture, ["test0"], [0])["test"]["depth_absrel"] is None
+    assert evaluate(color_only, recording, ["test0"], [0])["test"]["depth_absrel"] is None
 
 
-def test_colours_are_clamped_before_they_are_compared(capture: Capture) -> None:
+def test_colours_are_clamped_before_they_are_compared(recording: Recording) -> None:
     def bright(camera: str, frame: int) -> tuple[Tensor, None]:
         return torch.full((40, 72, 3), 7.0), None
 
     def white(camera: str, frame: int) -> tuple[Tensor, None]:
         return torch.ones(40, 72, 3), None
 
-    scores = [evaluate(render, capture, ["test0"], [0])["test"]["psnr"] for render in (bright, white)]
+    scores = [evaluate(render, recording, ["test0"], [0])["test"]["psnr"] for render in (bright, white)]
     assert scores[0] == scores[1]
 
 
-def test_renders_that_cannot_be_compared_are_refused(capture: Capture) -> None:
+def test_renders_that_cannot_be_compared_are_refused(recording: Recording) -> None:
     def small(camera: str, frame: int) -> tuple[Tensor, None]:
         return torch.ones(20, 36, 3), None
 
@@ -137,40 +137,42 @@ def test_renders_that_cannot_be_compared_are_refused(capture: Capture) -> None:
         return torch.full((40, 72, 3), torch.nan), None
 
     with pytest.raises(D2Error, match=r"render of camera test0 at frame 1 is \(20, 36, 3\), expected \(40, 72, 3\)"):
-        evaluate(small, capture, ["test0"], [1])
+        evaluate(small, recording, ["test0"], [1])
     with pytest.raises(D2Error, match="not finite: the model has diverged"):
-        evaluate(diverged, capture, ["test0"], [1])
+        evaluate(diverged, recording, ["test0"], [1])
     with pytest.raises(D2Error, match="nothing to evaluate"):
-        evaluate(small, capture, [], [1])
+        evaluate(small, recording, [], [1])
 
 
-def test_every_view_gets_one_picture_of_all_panels(capture: Capture, tmp_path: Path) -> None:
+def test_every_view_gets_one_image_of_all_panels(recording: Recording, tmp_path: Path) -> None:
     seen: list[tuple[int, int]] = []
-    evaluate(renderer(capture, 0.1), capture, NAMES, [0, 1], tmp_path / "a" / "b", progress=lambda *n: seen.append(n))
+    evaluate(
+        renderer(recording, 0.1), recording, NAMES, [0, 1], tmp_path / "a" / "b", progress=lambda *n: seen.append(n)
+    )
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
     names = [path.name for path in sorted((tmp_path / "a" / "b").iterdir())]
     assert names == ["test0_00000.png", "test0_00001.png", "test1_00000.png", "test1_00001.png"]
     # truth, render, depth, true depth, error
-    assert picture_size(tmp_path / "a" / "b" / names[0]) == (5 * 72 + 4 * drawing.GAP, 40 + 20)
+    assert image_size(tmp_path / "a" / "b" / names[0]) == (5 * 72 + 4 * drawing.GAP, 40 + 20)
 
 
-def test_the_panels_show_truth_render_and_error(capture: Capture, tmp_path: Path) -> None:
+def test_the_panels_show_truth_render_and_error(recording: Recording, tmp_path: Path) -> None:
     pytest.importorskip("cv2")
-    evaluate(renderer(capture), capture, ["test0"], [0], tmp_path)
-    picture = read_picture(tmp_path / "test0_00000.png")
-    panels = [picture[20:, i * (72 + drawing.GAP) : i * (72 + drawing.GAP) + 72] for i in range(5)]
-    np.testing.assert_array_equal(panels[0], capture.image("test0", 0))
+    evaluate(renderer(recording), recording, ["test0"], [0], tmp_path)
+    image = read_image(tmp_path / "test0_00000.png")
+    panels = [image[20:, i * (72 + drawing.GAP) : i * (72 + drawing.GAP) + 72] for i in range(5)]
+    np.testing.assert_array_equal(panels[0], recording.image("test0", 0))
     np.testing.assert_array_equal(panels[1], panels[0])
     np.testing.assert_array_equal(panels[2], panels[3])  # the rendered depth is the true one here
     assert len(np.unique(panels[2].reshape(-1, 3), axis=0)) > 30
     assert (panels[4] == drawing.color_scale("inferno")[0]).all()  # no error: black
 
 
-def test_missing_depth_is_drawn_black(capture: Capture, tmp_path: Path) -> None:
+def test_missing_depth_is_drawn_black(recording: Recording, tmp_path: Path) -> None:
     pytest.importorskip("cv2")
-    evaluate(renderer(capture, hole=10), capture, ["test0"], [0], tmp_path)
+    evaluate(renderer(recording, hole=10), recording, ["test0"], [0], tmp_path)
     left = 2 * (72 + drawing.GAP)
-    depth = read_picture(tmp_path / "test0_00000.png")[20:, left : left + 72]
+    depth = read_image(tmp_path / "test0_00000.png")[20:, left : left + 72]
     assert (depth[:, :10] == 0).all()
     assert (depth[:, 10:].max(axis=-1) > 0).all()
 
@@ -194,22 +196,22 @@ def test_colour_scales_run_from_dark_to_bright() -> None:
     np.testing.assert_array_equal(ends[0], colors[[0, 0, -1, -1]])
 
 
-def test_captions_of_large_pictures_are_larger() -> None:
+def test_captions_of_large_images_are_larger() -> None:
     small, large = (drawing.Panel("caption", np.zeros((30, width, 3), np.uint8)) for width in (240, 1352))
     assert drawing.side_by_side([small]).shape == (30 + 20, 240, 3)
     assert drawing.side_by_side([large, large]).shape == (30 + 80, 2 * 1352 + drawing.GAP, 3)
 
 
-def moving_capture(share: float) -> Capture:
+def moving_recording(share: float) -> Recording:
     """Five frames of one camera: noise that stands still, and a white bar that moves over `share` of the rows."""
     still = np.random.default_rng(0).integers(40, 120, (40, 72, 3)).astype(np.uint8)
-    base = synthetic_capture(cameras=3, frames=5, width=72, height=40)
+    base = synthetic_recording(cameras=3, frames=5, width=72, height=40)
 
-    class Moving(Capture):
+    class Moving(Recording):
         def image(self, camera: str, frame: int) -> np.ndarray:
-            picture = still.copy()
-            picture[: round(40 * share), 10 * frame : 10 * frame + 8] = 255
-            return picture
+            image = still.copy()
+            image[: round(40 * share), 10 * frame : 10 * frame + 8] = 255
+            return image
 
     moving = object.__new__(Moving)
     moving.__dict__.update(base.__dict__)
@@ -217,20 +219,20 @@ def moving_capture(share: float) -> Capture:
 
 
 def test_what_moves_is_scored_by_itself() -> None:
-    capture = moving_capture(0.5)
+    recording = moving_recording(0.5)
 
     def render(camera: str, frame: int) -> tuple[Tensor, None]:
         """Right where nothing moves; the bar is too dark."""
-        truth = torch.from_numpy(capture.image(camera, frame).astype(np.float32) / 255)
+        truth = torch.from_numpy(recording.image(camera, frame).astype(np.float32) / 255)
         return torch.where(truth == 1, 0.9, truth), None
 
-    scores = evaluate(render, capture, ["test0"], capture.frames)["test"]
+    scores = evaluate(render, recording, ["test0"], recording.frames)["test"]
     assert scores["psnr_moving"] == pytest.approx(20, abs=1e-4)
     assert scores["psnr"] > 25
 
 
 @pytest.mark.parametrize(("share", "frames"), [(0.0, 5), (0.5, 2)], ids=["nothing moves", "two frames"])
 def test_where_nothing_moves_there_is_no_such_score(share: float, frames: int) -> None:
-    capture = moving_capture(share)
+    recording = moving_recording(share)
     render = lambda camera, frame: (torch.zeros(40, 72, 3), None)  # noqa: E731
-    assert evaluate(render, capture, ["test0"], capture.frames[:frames])["test"]["psnr_moving"] is None
+    assert evaluate(render, recording, ["test0"], recording.frames[:frames])["test"]["psnr_moving"] is None

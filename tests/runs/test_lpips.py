@@ -54,7 +54,7 @@ def alex(tmp_path_factory: pytest.TempPathFactory) -> tuple[Lpips, dict[str, tor
     return found, weights
 
 
-def test_equal_pictures_have_no_distance_and_the_order_does_not_matter(alex) -> None:
+def test_equal_images_have_no_distance_and_the_order_does_not_matter(alex) -> None:
     a, b = torch.rand(2, 70, 80, 3, generator=torch.Generator().manual_seed(1))
     distance, _ = alex
     assert distance(a, a) == 0
@@ -62,7 +62,7 @@ def test_equal_pictures_have_no_distance_and_the_order_does_not_matter(alex) -> 
     assert distance(a, b) > distance(a, (0.9 * a + 0.1 * b)) > 0
 
 
-def test_the_distance_is_the_published_formula_on_pictures_in_0_to_1(alex) -> None:
+def test_the_distance_is_the_published_formula_on_images_in_0_to_1(alex) -> None:
     distance, weights = alex
     a, b = torch.rand(2, 66, 66, 3, generator=torch.Generator().manual_seed(2))
     shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
@@ -135,6 +135,6 @@ def test_files_that_are_no_weights_are_refused(tmp_path: Path) -> None:
         find_lpips("squeeze", tmp_path)
 
 
-def test_pictures_too_small_for_the_network_are_refused(alex) -> None:
+def test_images_too_small_for_the_network_are_refused(alex) -> None:
     with pytest.raises(D2Error, match="at least 64x64 pixels"):
         alex[0](torch.rand(32, 80, 3), torch.rand(32, 80, 3))

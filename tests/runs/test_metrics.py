@@ -42,7 +42,7 @@ GOLDEN = {
         "SSIM_gauss": 0.7412550126021009,
     },
 }
-"""Of noise, of waves moved by a pixel and of a Middlebury picture blurred by two: PSNR = 20 log10(1 / rms), SSIM of
+"""Of noise, of waves moved by a pixel and of a Middlebury image blurred by two: PSNR = 20 log10(1 / rms), SSIM of
 scikit-image 0.26 with data ranges of 1 and 2, and that of 3DGS's own torch code."""
 
 
@@ -75,9 +75,9 @@ def test_metrics_agree_with_the_golden_values(shared_data, case: str, key: str) 
     if case == "motorcycle_blur2":
         cv2 = pytest.importorskip("cv2")
         [path] = (shared_data("middlebury") / "motorcycle" / "images" / "left").glob("*.png")
-        picture = cv2.imread(str(path))[..., ::-1]
-        blurred = cv2.GaussianBlur(picture, (0, 0), 2.0)
-        a, b = (torch.from_numpy(image.astype(np.float32) / 255) for image in (picture, blurred))
+        image = cv2.imread(str(path))[..., ::-1]
+        blurred = cv2.GaussianBlur(image, (0, 0), 2.0)
+        a, b = (torch.from_numpy(image.astype(np.float32) / 255) for image in (image, blurred))
     else:
         a, b = tensors(noise_pair() if case == "rng0" else sine_pair())
     assert KEYS[key](a, b) == pytest.approx(GOLDEN[case][key], abs=1e-6)
@@ -110,7 +110,7 @@ def test_the_gaussian_ssim_is_the_convolution_of_3dgs() -> None:
 
 
 @pytest.mark.parametrize("metric", [metrics.ssim_range1, metrics.ssim_range2, metrics.ssim_3dgs])
-def test_equal_pictures_score_one_and_the_order_does_not_matter(metric: Callable[..., float]) -> None:
+def test_equal_images_score_one_and_the_order_does_not_matter(metric: Callable[..., float]) -> None:
     a, b = tensors(noise_pair())
     assert metric(a, a) == pytest.approx(1, abs=1e-12)
     assert metric(a, b) == pytest.approx(metric(b, a), abs=1e-12)
@@ -123,27 +123,27 @@ def test_range_two_is_the_milder_one() -> None:
         assert metrics.ssim_range2(a, b) > metrics.ssim_range1(a, b)
 
 
-def test_the_strips_of_a_tall_picture_make_one_mean() -> None:
+def test_the_strips_of_a_tall_image_make_one_mean() -> None:
     generator = torch.Generator().manual_seed(3)
     a, b = torch.rand(2, 150, 20, 3, generator=generator)
     assert metrics.ssim_range1(a, b) == pytest.approx(scikit_image(a, b, 1.0), abs=1e-9)
 
 
-def test_psnr_is_in_decibel_and_infinite_for_equal_pictures() -> None:
+def test_psnr_is_in_decibel_and_infinite_for_equal_images() -> None:
     truth = torch.zeros(4, 5, 3)
     assert metrics.psnr(truth + 0.1, truth) == pytest.approx(20, abs=1e-5)
     assert metrics.psnr(truth, truth) == math.inf
 
 
 @pytest.mark.parametrize(("metric", "size"), [(metrics.ssim_range1, 7), (metrics.ssim_3dgs, 11)])
-def test_a_window_larger_than_the_picture_is_refused(metric: Callable[..., float], size: int) -> None:
+def test_a_window_larger_than_the_image_is_refused(metric: Callable[..., float], size: int) -> None:
     assert math.isfinite(metric(torch.rand(size, size, 3), torch.rand(size, size, 3)))
     small = torch.rand(size - 1, 40, 3)
     with pytest.raises(D2Error, match=f"40x{size - 1} pixels is smaller than the {size}x{size} window"):
         metric(small, small)
 
 
-def test_pictures_of_two_sizes_are_refused() -> None:
+def test_images_of_two_sizes_are_refused() -> None:
     with pytest.raises(D2Error, match="cannot be compared"):
         metrics.psnr(torch.rand(8, 8, 3), torch.rand(8, 9, 3))
     with pytest.raises(D2Error, match="cannot be compared"):
@@ -192,32 +192,32 @@ def test_every_metric_has_its_definition_in_words() -> None:
 
 
 @pytest.fixture(scope="module")
-def picture() -> torch.Tensor:
-    """A smooth picture between .2 and .8."""
+def image() -> torch.Tensor:
+    """A smooth image between .2 and .8."""
     rows, columns = torch.meshgrid(torch.linspace(0, 6, 40), torch.linspace(0, 9, 50), indexing="ij")
     return 0.5 + 0.3 * torch.stack([torch.sin(columns), torch.cos(rows), torch.sin(rows + columns)], -1)
 
 
-def test_another_exposure_and_white_balance_are_no_error_after_colour_correction(picture: torch.Tensor) -> None:
-    other = picture * torch.tensor([1.2, 0.9, 1.05]) + torch.tensor([0.02, 0.05, -0.04])
-    assert metrics.psnr(other, picture) < 25
-    assert metrics.psnr_color_corrected(other, picture) > 90
-    assert metrics.psnr_color_corrected(picture, picture) > 90
+def test_another_exposure_and_white_balance_are_no_error_after_colour_correction(image: torch.Tensor) -> None:
+    other = image * torch.tensor([1.2, 0.9, 1.05]) + torch.tensor([0.02, 0.05, -0.04])
+    assert metrics.psnr(other, image) < 25
+    assert metrics.psnr_color_corrected(other, image) > 90
+    assert metrics.psnr_color_corrected(image, image) > 90
 
 
-def test_colour_correction_neither_flatters_a_blurred_render_nor_invents_contrast(picture: torch.Tensor) -> None:
+def test_colour_correction_neither_flatters_a_blurred_render_nor_invents_contrast(image: torch.Tensor) -> None:
     """Noise is divided by the slope as well: no fit in the other direction, which would fade it out."""
-    noise = 0.2 * torch.rand(picture.shape, generator=torch.Generator().manual_seed(0)) - 0.1
-    noisy = picture + noise
-    assert metrics.psnr_color_corrected(noisy, picture) == pytest.approx(metrics.psnr(noisy, picture), abs=0.2)
-    flat = torch.full_like(picture, 0.3)
-    mean = picture.mean((0, 1)).expand_as(picture)
-    assert metrics.psnr_color_corrected(flat, picture) == pytest.approx(metrics.psnr(mean, picture))
+    noise = 0.2 * torch.rand(image.shape, generator=torch.Generator().manual_seed(0)) - 0.1
+    noisy = image + noise
+    assert metrics.psnr_color_corrected(noisy, image) == pytest.approx(metrics.psnr(noisy, image), abs=0.2)
+    flat = torch.full_like(image, 0.3)
+    mean = image.mean((0, 1)).expand_as(image)
+    assert metrics.psnr_color_corrected(flat, image) == pytest.approx(metrics.psnr(mean, image))
 
 
-def test_psnr_within_a_mask_counts_those_pixels_alone(picture: torch.Tensor) -> None:
+def test_psnr_within_a_mask_counts_those_pixels_alone(image: torch.Tensor) -> None:
     within = torch.zeros(40, 50, dtype=torch.bool)
     within[5:9, 10:30] = True
-    worse = picture + torch.where(within, 0.1, 0.0)[..., None]
-    assert metrics.psnr(worse, picture, within.numpy()) == pytest.approx(20, abs=1e-4)
-    assert metrics.psnr(worse, picture, ~within.numpy()) == math.inf
+    worse = image + torch.where(within, 0.1, 0.0)[..., None]
+    assert metrics.psnr(worse, image, within.numpy()) == pytest.approx(20, abs=1e-4)
+    assert metrics.psnr(worse, image, ~within.numpy()) == math.inf

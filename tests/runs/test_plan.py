@@ -10,29 +10,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures import Camera, Capture, open_capture, select_frames
-from d2_plugin.captures.calibration import pinhole, rigid
-from d2_plugin.captures.export.export import export_capture
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.export.ply import PointCloud
-from d2_plugin.captures.rotations import rotation_of_vector
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo import match
 from d2_plugin.priors.stereo.settings import NO_MATCHER
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
+from d2_plugin.recordings import Camera, Recording, open_recording, select_frames
+from d2_plugin.recordings.cameras.calibration import pinhole, rigid
+from d2_plugin.recordings.cameras.rotations import rotation_of_vector
+from d2_plugin.recordings.export.export import export_recording
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.export.ply import PointCloud
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.overlap import measure_overlap, measure_texture
 from d2_plugin.runs.plan import changed_share, plan_scene, plan_text
 from d2_plugin.runs.run import build_priors_for
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings
+from d2_plugin.store.store import PriorStore
 
 
 @pytest.fixture(scope="module")
 def moving():
-    return synthetic_capture(cameras=3, frames=4, width=96, height=54)
+    return synthetic_recording(cameras=3, frames=4, width=96, height=54)
 
 
 def test_motion_keeps_the_temporal_dimension(moving) -> None:
@@ -40,7 +40,7 @@ def test_motion_keeps_the_temporal_dimension(moving) -> None:
 
 
 def test_no_motion_leaves_the_temporal_dimension_out() -> None:
-    still = synthetic_capture(cameras=2, frames=4, width=96, height=54, moving=False)
+    still = synthetic_recording(cameras=2, frames=4, width=96, height=54, moving=False)
     plan = plan_scene(still, ["train0", "train1"], "maps")
     assert not plan.uses("temporal")
     assert changed_share(still, "train0") == 0
@@ -97,7 +97,7 @@ def camera(name: str, x: float = 0.0, turn: float = 0.0, near_far: tuple[float, 
 AT_TWO = (1.999, 2.001)
 
 
-def test_overlap_is_the_share_of_the_picture_that_another_camera_sees() -> None:
+def test_overlap_is_the_share_of_the_image_that_another_camera_sees() -> None:
     pair = [camera("a", near_far=AT_TWO), camera("b", 0.5, near_far=AT_TWO)]  # a shift by 25 of 100 pixels
     found = measure_overlap(pair, StereoSettings())
     assert found.depth_known
@@ -126,30 +126,30 @@ def test_points_tell_the_depths_where_no_range_is_declared() -> None:
 def test_unknown_depths_give_the_most_that_could_be_seen() -> None:
     found = measure_overlap([camera("a", 0, 10), camera("b", 0.5, -10)], StereoSettings())
     assert not found.depth_known
-    assert min(found.shares) > 0.9  # from some depth on, each pixel lies in the other picture
+    assert min(found.shares) > 0.9  # from some depth on, each pixel lies in the other image
     assert found.angles == pytest.approx((20, 20))
     apart = measure_overlap([camera("a", 0, -90), camera("b", 0.5, 90)], StereoSettings())
     assert apart.shares == (0, 0)
     assert apart.angles == ()
 
 
-def rig(capture: Capture, *cameras: Camera) -> Capture:
-    """The capture with other cameras for train0 and train1; its pictures stay."""
+def rig(recording: Recording, *cameras: Camera) -> Recording:
+    """The recording with other cameras for train0 and train1; its images stay."""
     sized = [replace(c, width=96, height=54, K=pinhole(96, 96, 48, 27)) for c in cameras]
-    return replace(capture, cameras={name: replace(c, name=name) for name, c in zip(("train0", "train1"), sized)})
+    return replace(recording, cameras={name: replace(c, name=name) for name, c in zip(("train0", "train1"), sized)})
 
 
 def test_cameras_that_share_nothing_have_no_stereo_and_the_reason_says_how_little(moving) -> None:
     apart = rig(moving, camera("a", 0, -90), camera("b", 0.5, 90))
     plan = plan_scene(apart, ["train0", "train1"], "relative maps")
     assert not plan.uses("stereo")
-    assert plan.as_dict()["stereo"]["reason"].startswith("no overlap: 2 training cameras, at most 0% of each picture")
+    assert plan.as_dict()["stereo"]["reason"].startswith("no overlap: 2 training cameras, at most 0% of each image")
     assert not plan.uses("verification")
     assert plan.override(stereo=True).uses("verification")
 
 
 class Plain:
-    """Pictures of one colour."""
+    """Images of one colour."""
 
     def __init__(self, inner) -> None:
         self.inner = inner
@@ -161,7 +161,7 @@ class Plain:
         return getattr(self.inner, name)
 
 
-def test_pictures_without_texture_have_no_stereo_and_the_reason_says_so(moving) -> None:
+def test_images_without_texture_have_no_stereo_and_the_reason_says_so(moving) -> None:
     plain = replace(moving, source=Plain(moving.source))
     assert measure_texture(plain, ["train0"], StereoSettings()) == (0,)
     plan = plan_scene(plain, ["train0", "train1"], "maps")
@@ -174,7 +174,7 @@ def test_the_reason_for_stereo_has_the_figures(moving) -> None:
     cameras = (camera("a", near_far=AT_TWO), camera("b", 0.5, near_far=AT_TWO))
     reason = plan_scene(rig(moving, *cameras), ["train0", "train1"], "maps").as_dict()["stereo"]["reason"]
     texture = np.mean(measure_texture(moving, ["train0", "train1"], StereoSettings()))
-    expected = f"2 training cameras, 75% of each picture seen by another, 13 degrees apart, {texture:.0%} textured"
+    expected = f"2 training cameras, 75% of each image seen by another, 13 degrees apart, {texture:.0%} textured"
     assert reason == expected.replace("13 degrees", f"{reason.split(', ')[2].split(' ')[0]} degrees")
     assert texture > 0.5
 
@@ -187,22 +187,22 @@ def test_a_colmap_model_brings_the_points_that_tell_the_depths(moving, tmp_path:
     rays = np.stack([columns + 0.5, rows + 0.5, np.ones(rows.size)], -1) @ np.linalg.inv(first.K).T
     points = (rays * depth[rows, columns, None] - first.T_camera_world[:3, 3]) @ first.T_camera_world[:3, :3]
     cloud = PointCloud(points, np.full(points.shape, 0.5))
-    model = open_capture(export_capture(still, "colmap", tmp_path / "model", cloud=cloud))
+    model = open_recording(export_recording(still, "colmap", tmp_path / "model", cloud=cloud))
     names = ["train0", "train1"]
     assert "depths unknown" not in plan_scene(model, names, None).as_dict()["stereo"]["reason"]
     assert "depths unknown" in plan_scene(still, names, None).as_dict()["stereo"]["reason"]
 
 
-def with_sensor(capture: Capture, folder: Path, *cameras: str) -> Capture:
-    """The capture on disk, with depth of a sensor beside the pictures of `cameras`."""
-    path = save_capture(capture, folder / "scene")
+def with_sensor(recording: Recording, folder: Path, *cameras: str) -> Recording:
+    """The recording on disk, with depth of a sensor beside the images of `cameras`."""
+    path = save_recording(recording, folder / "scene")
     shutil.rmtree(path / "depth")
     for name in cameras:
         (path / "depth" / name).mkdir(parents=True)
-        for frame in capture.frames:
-            np.save(path / "depth" / name / f"{frame:05d}.npy", capture.depth(name, frame))
+        for frame in recording.frames:
+            np.save(path / "depth" / name / f"{frame:05d}.npy", recording.depth(name, frame))
     (path / "depth" / "depth.json").write_text('{"unit": "m"}')
-    return open_capture(path)
+    return open_recording(path)
 
 
 def test_a_sensor_is_the_geometric_source_of_one_camera(moving, tmp_path: Path) -> None:
@@ -215,18 +215,18 @@ def test_a_sensor_is_the_geometric_source_of_one_camera(moving, tmp_path: Path) 
 
 
 def test_a_sensor_beside_one_of_two_cameras_leaves_stereo(moving, tmp_path: Path) -> None:
-    capture = with_sensor(moving, tmp_path, "train0")
-    plan = plan_scene(capture, ["train0", "train1"], None)
+    recording = with_sensor(moving, tmp_path, "train0")
+    plan = plan_scene(recording, ["train0", "train1"], None)
     assert [plan.uses(name) for name in ("sensor", "stereo")] == [False, True]
     assert "does not serve every training camera" in plan.as_dict()["sensor"]["reason"]
     settings = PriorSettings(stereo=StereoSettings(matcher="sweep"))
-    assert plan_scene(capture, ["train0", "train1"], None, settings).uses("stereo")
+    assert plan_scene(recording, ["train0", "train1"], None, settings).uses("stereo")
 
 
 def test_no_stereo_reaches_the_priors(moving, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is matched, and monocular depth stands alone where its scale is known."""
     apart = replace(select_frames(moving, [0, 1]), mono_kind="metric")
-    path = save_capture(rig(apart, camera("a", 0, -90), camera("b", 0.5, 90)), tmp_path / "scene")
+    path = save_recording(rig(apart, camera("a", 0, -90), camera("b", 0.5, 90)), tmp_path / "scene")
     for name in ("train0", "train1"):
         for frame in (0, 1):
             np.save(path / "mono" / name / f"{frame:05d}.npy", moving.depth(name, frame))
@@ -248,34 +248,34 @@ def test_stereo_changes_no_setting_of_the_priors(moving) -> None:
     assert plan.override(stereo=False).obeyed_by(settings).stereo == StereoSettings(matcher=NO_MATCHER)
 
 
-def test_the_text_of_a_plan_says_what_the_capture_is(moving, tmp_path: Path) -> None:
-    capture = open_capture(save_capture(moving, tmp_path / "scene"))
+def test_the_text_of_a_plan_says_what_the_recording_is(moving, tmp_path: Path) -> None:
+    recording = open_recording(save_recording(moving, tmp_path / "scene"))
     train = ["train0", "train1"]
-    lines = plan_text(capture, train, plan_scene(capture, train, "maps")).splitlines()
+    lines = plan_text(recording, train, plan_scene(recording, train, "maps")).splitlines()
     assert lines[:4] == [
         "   layout  folder",
         "  cameras  5 (train0 train1 train2 test0 test1); training on train0 train1",
         "   frames  4 (0 to 3) at 12 per second",
-        " pictures  96x54 pixels",
+        " images  96x54 pixels",
     ]
     assert lines[4] == "     note  monocular maps are emulated, not predicted"
     assert lines[5].startswith("      use  temporal     motion: up to")
-    assert json.dumps(plan_scene(capture, train, "maps").as_dict())
+    assert json.dumps(plan_scene(recording, train, "maps").as_dict())
 
 
-def test_a_capture_of_one_instant_on_disk_has_no_temporal_dimension(moving, tmp_path: Path) -> None:
-    path = save_capture(select_frames(moving, [2]), tmp_path / "scene")
-    assert not plan_scene(open_capture(path), ["train0", "train1"], None).uses("temporal")
+def test_a_recording_of_one_instant_on_disk_has_no_temporal_dimension(moving, tmp_path: Path) -> None:
+    path = save_recording(select_frames(moving, [2]), tmp_path / "scene")
+    assert not plan_scene(open_recording(path), ["train0", "train1"], None).uses("temporal")
 
 
-def test_the_real_one_instant_capture_has_no_temporal_dimension(shared_data) -> None:
-    capture = open_capture(shared_data("n3dv_sear_steak_t0"))
-    assert not plan_scene(capture, ["cam03", "cam05"], None).uses("temporal")
+def test_the_real_one_instant_recording_has_no_temporal_dimension(shared_data) -> None:
+    recording = open_recording(shared_data("n3dv_sear_steak_t0"))
+    assert not plan_scene(recording, ["cam03", "cam05"], None).uses("temporal")
 
 
-def test_the_real_moving_capture_has_one(shared_data) -> None:
-    capture = open_capture(shared_data("pose2sim_single"), frames=[0, 20, 40])
-    assert plan_scene(capture, ["cam01", "cam02"], None).uses("temporal")
+def test_the_real_moving_recording_has_one(shared_data) -> None:
+    recording = open_recording(shared_data("pose2sim_single"), frames=[0, 20, 40])
+    assert plan_scene(recording, ["cam01", "cam02"], None).uses("temporal")
 
 
 @pytest.mark.parametrize(
@@ -288,7 +288,7 @@ def test_the_real_moving_capture_has_one(shared_data) -> None:
         ("pose2sim_single", "cam01 cam02 cam03 cam04"),
     ],
 )
-def test_the_real_captures_keep_stereo(shared_data, name: str, cameras: str) -> None:
-    plan = plan_scene(open_capture(shared_data(name)), cameras.split(), None)
+def test_the_real_recordings_keep_stereo(shared_data, name: str, cameras: str) -> None:
+    plan = plan_scene(open_recording(shared_data(name)), cameras.split(), None)
     assert plan.uses("stereo")
     assert "textured" in plan.as_dict()["stereo"]["reason"]

@@ -15,13 +15,13 @@ import pytest
 import torch
 from tiny import ALL_HOOKS, make_model, make_trainer
 
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.durable import write_table
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.trained import trained_tensors
 from d2_plugin.locks import only_writer
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs import run as run_module
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved.checkpoint import load_checkpoint, save_checkpoint
@@ -35,8 +35,8 @@ pytest.importorskip("cv2")
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    capture = synthetic_capture(cameras=2, frames=2, width=48, height=27)
-    return save_capture(capture, tmp_path_factory.mktemp("scene") / "room")
+    recording = synthetic_recording(cameras=2, frames=2, width=48, height=27)
+    return save_recording(recording, tmp_path_factory.mktemp("scene") / "room")
 
 
 def bare(scene: Path, folder: Path, **changes: Any) -> Run:
@@ -51,7 +51,7 @@ def bare(scene: Path, folder: Path, **changes: Any) -> Run:
 def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = bare(scene, tmp_path_factory.mktemp("runs") / "bare")
     run.train()
-    run.evaluate(pictures=False)
+    run.evaluate(images=False)
     return run.folder
 
 
@@ -77,7 +77,7 @@ class TestADamagedFile:
     @pytest.mark.parametrize("name", ["checkpoint.pt", "run.json", "points.npz"])
     def test_is_one_sentence(self, copied: Path, capsys: pytest.CaptureFixture[str], name: str, how: str) -> None:
         (copied / name).write_bytes(BROKEN[how]((copied / name).read_bytes()))
-        assert main(["eval", str(copied), "--no-pictures"]) == 2
+        assert main(["eval", str(copied), "--no-images"]) == 2
         told = capsys.readouterr().err
         assert name in told
         assert len(told.splitlines()) == 1
@@ -125,7 +125,7 @@ class TestADamagedFile:
         path = copied / "checkpoint.pt"
         torch.save({"step": 4}, path)
         with pytest.raises(D2Error, match="has format None but this version reads format 1"):
-            Run.load(copied).evaluate(pictures=False)
+            Run.load(copied).evaluate(images=False)
         torch.save({"format": 9}, path)
         with pytest.raises(D2Error, match="has format 9"):
             load_checkpoint(path, "cpu")
@@ -134,7 +134,7 @@ class TestADamagedFile:
     def test_a_checkpoint_of_another_shape_is_told(self, copied: Path, state: dict[str, Any]) -> None:
         save_checkpoint(copied / "checkpoint.pt", state)
         with pytest.raises(D2Error, match="is not one of this run"):
-            Run.load(copied).evaluate(pictures=False)
+            Run.load(copied).evaluate(images=False)
 
     def test_points_of_another_shape_version_or_with_nan_are_told(self, tmp_path: Path) -> None:
         path = tmp_path / "points.npz"
@@ -236,7 +236,7 @@ class TestARunThatDiverges:
         state["model"]["parameters"]["positions"][1:] = math.nan
         save_checkpoint(copied / "checkpoint.pt", state)
         with pytest.raises(D2Error, match=r"diverged before step 4 \(99.* of positions is NaN or infinite\)"):
-            Run.load(copied).evaluate(pictures=False)
+            Run.load(copied).evaluate(images=False)
 
 
 class TestOneWriter:
@@ -293,7 +293,7 @@ class TestThePriorOfARun:
         prior = read_metrics(tmp_path / "run")["prior"]
         assert prior["headline"] == last
         assert [refusal["frame"] for refusal in prior["refused"]] == [0, 1]
-        assert main(["eval", str(tmp_path / "run"), "--no-pictures"]) == 0
+        assert main(["eval", str(tmp_path / "run"), "--no-images"]) == 0
         assert read_metrics(tmp_path / "run")["prior"] == prior
 
     def test_without_hooks_none_is_needed(self, scene: Path, tmp_path: Path) -> None:

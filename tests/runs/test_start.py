@@ -1,4 +1,4 @@
-"""From a capture to views, pictures and the points that Gaussians start from."""
+"""From a recording to views, images and the points that Gaussians start from."""
 
 from __future__ import annotations
 
@@ -6,71 +6,71 @@ import numpy as np
 import pytest
 import torch
 
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.start import TimedPoints, TrainingFrames, initial_points, make_view, scene_extent
 
 CAMERAS = ("train0", "train1")
 
 
 @pytest.fixture(scope="module")
-def capture():
-    return synthetic_capture(cameras=2, frames=3, width=96, height=54, fps=10)
+def recording():
+    return synthetic_recording(cameras=2, frames=3, width=96, height=54, fps=10)
 
 
-def surface_points(capture, count: int) -> np.ndarray:
+def surface_points(recording, count: int) -> np.ndarray:
     """Points on the surfaces that train0 sees."""
-    depth, camera = capture.depth("train0", 0), capture.cameras["train0"]
+    depth, camera = recording.depth("train0", 0), recording.cameras["train0"]
     rows, columns = np.unravel_index(np.linspace(0, depth.size - 1, count).astype(int), depth.shape)
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(count)], -1)
     in_camera = pixels @ np.linalg.inv(camera.K).T * depth[rows, columns, None]
     return (in_camera - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
 
 
-def test_time_is_in_seconds_since_the_first_frame(capture) -> None:
-    assert make_view(capture, "train1", 2).time == pytest.approx(0.2)
+def test_time_is_in_seconds_since_the_first_frame(recording) -> None:
+    assert make_view(recording, "train1", 2).time == pytest.approx(0.2)
 
 
-def test_kept_pictures_do_not_grow_with_the_number_of_frames(capture) -> None:
-    picture = 96 * 54 * 3
-    frames = TrainingFrames(capture, CAMERAS, keep_bytes=2 * picture)
+def test_kept_images_do_not_grow_with_the_number_of_frames(recording) -> None:
+    image = 96 * 54 * 3
+    frames = TrainingFrames(recording, CAMERAS, keep_bytes=2 * image)
     for index in range(len(frames.views)):
         image = frames.image(index)
         assert image.shape == (54, 96, 3)
         assert len(frames._kept) <= 2
     view = frames.views[0]
-    expected = torch.from_numpy(capture.image(view.camera, view.frame)).float() / 255
+    expected = torch.from_numpy(recording.image(view.camera, view.frame)).float() / 255
     assert torch.equal(frames.image(0), expected)
 
 
-def test_extent_comes_from_points_where_there_are_enough(capture) -> None:
-    points = surface_points(capture, 500)
-    extent = scene_extent(capture, CAMERAS, points)
-    depth = capture.depth("train0", 0)
+def test_extent_comes_from_points_where_there_are_enough(recording) -> None:
+    points = surface_points(recording, 500)
+    extent = scene_extent(recording, CAMERAS, points)
+    depth = recording.depth("train0", 0)
     assert extent.near < np.percentile(depth, 5)
     assert extent.far > np.percentile(depth, 95)
     assert 0.3 < extent.radius / (0.5 * np.median(depth)) < 3
 
 
-def test_extent_falls_back_to_declared_bounds_and_then_to_the_rig(capture) -> None:
+def test_extent_falls_back_to_declared_bounds_and_then_to_the_rig(recording) -> None:
     from dataclasses import replace
 
     nothing = np.zeros((0, 3))
-    declared = scene_extent(capture, CAMERAS, nothing)
-    near = min(capture.cameras[name].near_far[0] for name in CAMERAS)
+    declared = scene_extent(recording, CAMERAS, nothing)
+    near = min(recording.cameras[name].near_far[0] for name in CAMERAS)
     assert declared.near == pytest.approx(0.8 * near)
-    bare = {name: replace(camera, near_far=None) for name, camera in capture.cameras.items()}
-    from_rig = scene_extent(replace(capture, cameras=bare), CAMERAS, nothing)
+    bare = {name: replace(camera, near_far=None) for name, camera in recording.cameras.items()}
+    from_rig = scene_extent(replace(recording, cameras=bare), CAMERAS, nothing)
     assert 0 < from_rig.near < from_rig.far
-    single = scene_extent(replace(capture, cameras=bare), CAMERAS[:1], nothing)
+    single = scene_extent(replace(recording, cameras=bare), CAMERAS[:1], nothing)
     assert 0 < single.near < single.far
 
 
-def test_too_few_points_are_filled_up_inside_the_views(capture) -> None:
-    points = surface_points(capture, 50)
+def test_too_few_points_are_filled_up_inside_the_views(recording) -> None:
+    points = surface_points(recording, 50)
     sparse = TimedPoints(points, np.full((50, 3), 0.5), np.zeros(50))
-    extent = scene_extent(capture, CAMERAS, points)
-    start = initial_points(capture, CAMERAS, sparse, extent, minimum=400)
+    extent = scene_extent(recording, CAMERAS, points)
+    start = initial_points(recording, CAMERAS, sparse, extent, minimum=400)
     positions, _, _ = start.tensors()
     assert positions.shape == (400, 3)
     assert torch.equal(positions[:50], torch.tensor(points, dtype=torch.float32))
@@ -78,24 +78,24 @@ def test_too_few_points_are_filled_up_inside_the_views(capture) -> None:
     assert (start.colors <= 1).all()
     assert (start.times <= 0.2).all()
     for name, rows in (("train0", slice(50, 225)), ("train1", slice(225, 400))):
-        view = make_view(capture, name, 0)
+        view = make_view(recording, name, 0)
         camera = positions[rows] @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
         image = camera @ view.K.T
         assert ((camera[:, 2] > 0.99 * extent.near) & (camera[:, 2] < 1.01 * extent.far)).all()
         assert ((image[:, 0] / image[:, 2] > -0.01) & (image[:, 0] / image[:, 2] < 96.01)).all()
 
 
-def test_the_same_seed_gives_the_same_start(capture) -> None:
+def test_the_same_seed_gives_the_same_start(recording) -> None:
     sparse = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    extent = scene_extent(capture, CAMERAS, sparse.positions)
-    first, second, third = (initial_points(capture, CAMERAS, sparse, extent, seed, 100) for seed in (4, 4, 5))
+    extent = scene_extent(recording, CAMERAS, sparse.positions)
+    first, second, third = (initial_points(recording, CAMERAS, sparse, extent, seed, 100) for seed in (4, 4, 5))
     for one, same, other in zip(first.tensors(), second.tensors(), third.tensors(), strict=True):
         assert torch.equal(one, same)
         assert not torch.equal(one, other)
 
 
-def test_points_come_back_from_their_file_and_a_damaged_one_is_told(capture, tmp_path) -> None:
-    points = TimedPoints(surface_points(capture, 20), np.full((20, 3), 0.25), np.linspace(0, 0.2, 20))
+def test_points_come_back_from_their_file_and_a_damaged_one_is_told(recording, tmp_path) -> None:
+    points = TimedPoints(surface_points(recording, 20), np.full((20, 3), 0.25), np.linspace(0, 0.2, 20))
     points.save(tmp_path / "points.npz")
     again = TimedPoints.load(tmp_path / "points.npz")
     for name in ("positions", "colors", "times"):

@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from d2_plugin.captures.selection import select_cameras
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.selection import select_cameras
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.evaluation import evaluate
 from d2_plugin.runs.tables import latex_table, metrics_table, read_metrics, view_tables, write_tables
 
@@ -22,13 +22,13 @@ NAMES = ["test0", "test1"]
 @pytest.fixture(scope="module")
 def metrics() -> dict[str, Any]:
     """Real scores of renders that get worse with time and flicker."""
-    capture = select_cameras(synthetic_capture(cameras=3, frames=3, width=40, height=30), NAMES)
+    recording = select_cameras(synthetic_recording(cameras=3, frames=3, width=40, height=30), NAMES)
 
     def render(camera: str, frame: int) -> tuple[Tensor, None]:
-        color = torch.from_numpy(capture.image(camera, frame).astype(np.float32) / 255)
+        color = torch.from_numpy(recording.image(camera, frame).astype(np.float32) / 255)
         return color * (1 - 0.1 * (1 + frame)), None
 
-    scores = evaluate(render, capture, NAMES, capture.frames)
+    scores = evaluate(render, recording, NAMES, recording.frames)
     return scores | {"gaussians": 7, "seconds": {"priors": 1.0, "train": 2.0}, "backbone": "yang4d", "hooks": ["prune"]}
 
 

@@ -134,7 +134,7 @@ def test_sixty_per_cent_outliers_move_the_scale_by_a_few_per_cent_only() -> None
     assert alignment.inliers == pytest.approx(0.45, abs=0.05)
 
 
-def test_a_network_that_saturates_over_half_of_the_picture_is_fitted_on_the_other_half() -> None:
+def test_a_network_that_saturates_over_half_of_the_image_is_fitted_on_the_other_half() -> None:
     rng = np.random.default_rng(0)
     depth = rng.uniform(1, 20, (100, 200))
     mono = np.maximum((1 / depth - 0.1) / 0.2, 0)

@@ -84,7 +84,7 @@ def gradients(model: SplatModel) -> dict[str, torch.Tensor]:
 
 
 def step(model: SplatModel, view_index: int = 0, time: float | None = None) -> torch.Tensor:
-    """The picture loss of one view, differentiated, and one optimizer step; everything must stay finite."""
+    """The image loss of one view, differentiated, and one optimizer step; everything must stay finite."""
     frames = TinyFrames()
     view = frames.views[view_index] if time is None else replace(frames.views[view_index], time=time)
     loss = photometric_loss(model.render(view).color, frames.image(view_index))

@@ -1,4 +1,4 @@
-"""Stiff and extreme cases around rendered depth, its loss, starting points and pictures, numbered as in the list of
+"""Stiff and extreme cases around rendered depth, its loss, starting points and images, numbered as in the list of
 cases that broke other codebases; those of the rasterizer and of the slice have files of their own."""
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from torch.autograd import gradcheck
 
 from d2_plugin import D2Error
 from d2_plugin.backbones.starting import nearest_neighbour_scales
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.gaussians.photometric import photometric_loss, ssim
 from d2_plugin.gaussians.slicing import reference_slice
 from d2_plugin.hooks.depth_loss import charbonnier, depth_loss
 from d2_plugin.hooks.rendered_depth import EPSILON, rendered_depth
 from d2_plugin.priors.geometry import back_project, pixel_grid, view_pair
 from d2_plugin.rasterizer import Splats, rasterize
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs import metrics
 
 TAU_V = 0.5
@@ -113,7 +113,7 @@ def test_case_23_half_a_gaussian_at_depth_4_is_at_depth_4(dtype) -> None:
 
 
 @both
-def test_case_24_a_millimetre_and_a_thousand_kilometres_in_one_picture_weigh_alike(dtype) -> None:
+def test_case_24_a_millimetre_and_a_thousand_kilometres_in_one_image_weigh_alike(dtype) -> None:
     prior = torch.tensor([[1e-3, 1e6]], dtype=dtype)
     depth, everywhere = (1.1 * prior).requires_grad_(), torch.ones(1, 2, dtype=torch.bool)
     loss = depth_loss(depth, everywhere, prior, everywhere, 0.01)
@@ -164,7 +164,7 @@ def test_case_37_ties_are_drawn_alike_on_one_and_two_threads() -> None:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (3, 40)])
-def test_case_38_a_picture_smaller_than_the_window_of_ssim_is_compared_or_refused_in_a_sentence(size) -> None:
+def test_case_38_a_image_smaller_than_the_window_of_ssim_is_compared_or_refused_in_a_sentence(size) -> None:
     g = torch.Generator().manual_seed(0)
     a, b = (torch.rand(*size, 3, generator=g) for _ in range(2))
     assert ssim(a, a).item() == pytest.approx(1, abs=1e-5)
@@ -176,8 +176,8 @@ def test_case_38_a_picture_smaller_than_the_window_of_ssim_is_compared_or_refuse
 
 
 def test_case_39_a_point_comes_back_from_its_pixel_to_a_hundred_thousandth_of_a_pixel() -> None:
-    camera = next(iter(synthetic_capture(frames=1).cameras.values()))
-    K = np.array([[180.0, 0, -40.0], [0, 150.0, 300.0], [0, 0, 1]])  # fx != fy, principal point outside the picture
+    camera = next(iter(synthetic_recording(frames=1).cameras.values()))
+    K = np.array([[180.0, 0, -40.0], [0, 150.0, 300.0], [0, 0, 1]])  # fx != fy, principal point outside the image
     camera = replace(camera, K=K)
     depth = np.random.default_rng(0).uniform(0.5, 50, (camera.height, camera.width))
     points = back_project(camera, depth) @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
@@ -188,9 +188,9 @@ def test_case_39_a_point_comes_back_from_its_pixel_to_a_hundred_thousandth_of_a_
 
 
 def test_case_39_true_depth_carries_the_pixels_of_one_view_onto_the_same_surface_in_another() -> None:
-    capture = synthetic_capture(2, 0, frames=1, width=160, height=90, arc_degrees=8)
-    one, other = capture.cameras.values()
-    depth, truth = (capture.depth(camera.name, 0).astype(np.float64) for camera in (one, other))
+    recording = synthetic_recording(2, 0, frames=1, width=160, height=90, arc_degrees=8)
+    one, other = recording.cameras.values()
+    depth, truth = (recording.depth(camera.name, 0).astype(np.float64) for camera in (one, other))
     there = view_pair(one, other).project(*pixel_grid(one, np.float64), depth)
     points = back_project(one, depth) @ other.T_camera_world[:3, :3].T + other.T_camera_world[:3, 3]
     pixels = points @ other.K.T

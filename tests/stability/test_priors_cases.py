@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.synthetic.room import arc_cameras
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.colmap.mvs import colmap_patch_match, run_patch_match, why_not_usable
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.geometric_depth import geometric_depth
+from d2_plugin.recordings.recording import Camera
+from d2_plugin.recordings.synthetic.room import arc_cameras
 
 pytest.importorskip("cv2")
 

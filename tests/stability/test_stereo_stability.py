@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.colmap.mvs import why_not_usable
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import depth_bounds
 from d2_plugin.priors.stereo.geometric_depth import geometric_depth
+from d2_plugin.recordings.recording import Camera
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
 
@@ -36,8 +36,8 @@ def matcher(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="module")
 def views() -> tuple[list[np.ndarray], list[Camera]]:
-    capture = synthetic_capture(cameras=3, held_out=0, frames=1, width=160, height=90, arc_degrees=20)
-    return [capture.image(name, 0) for name in capture.cameras], list(capture.cameras.values())
+    recording = synthetic_recording(cameras=3, held_out=0, frames=1, width=160, height=90, arc_degrees=20)
+    return [recording.image(name, 0) for name in recording.cameras], list(recording.cameras.values())
 
 
 def valid_share(images: list[np.ndarray], cameras: list[Camera], matcher: str) -> float:
@@ -77,7 +77,7 @@ def test_a_pure_rotation_has_no_depth(views: tuple, matcher: str) -> None:
     assert valid_share([images[0], images[0]], [cameras[0], turned], matcher) == 0
 
 
-def test_one_black_picture_neither_has_depth_nor_takes_it_from_the_others(views: tuple, matcher: str) -> None:
+def test_one_black_image_neither_has_depth_nor_takes_it_from_the_others(views: tuple, matcher: str) -> None:
     images, cameras = views
     results = geometric_depth(
         [images[0], np.zeros_like(images[1]), images[2]], cameras, BOUNDS, StereoSettings(matcher=matcher)

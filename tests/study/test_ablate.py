@@ -7,23 +7,23 @@ from pathlib import Path
 
 import pytest
 
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import VARIANTS
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.runs.ablation import tables
+from d2_plugin.runs.ablation.claims import Claim, claims
+from d2_plugin.runs.ablation.job import Job
+from d2_plugin.runs.ablation.presets import PRESETS, TABLES, rows_named
 from d2_plugin.runs.settings import RunSettings, check, hook_config, prior_settings
 from d2_plugin.runs.tables import STUDY_COLUMNS
-from d2_plugin.study.ablation import tables
-from d2_plugin.study.ablation.claims import Claim, claims
-from d2_plugin.study.ablation.job import Job
-from d2_plugin.study.ablation.presets import PRESETS, TABLES, rows_named
-from d2_plugin.study.verdict import Estimate
+from d2_plugin.runs.verdict import Estimate
 
 
-def settings_of(name: str, capture: str = "room", **tables: object) -> RunSettings:
+def settings_of(name: str, recording: str = "room", **tables: object) -> RunSettings:
     preset = PRESETS[name]
-    return RunSettings(capture, ("a",), hooks=preset.hooks, overrides=preset.merged(tables))
+    return RunSettings(recording, ("a",), hooks=preset.hooks, overrides=preset.merged(tables))
 
 
 class TestPresets:
@@ -72,7 +72,7 @@ def results(**psnr: list[float]) -> dict[Job, dict]:
     def metrics(value: float) -> dict:
         scores = {"psnr": value, "ssim1": 0.9, "ssim2": 0.95, "lpips": None, "depth_absrel": 0.04}
         seconds = {"train": 10.0, "priors": 2.0}
-        return {"test": scores, "gaussians": 1000, "seconds": seconds, "iterations": 5, "capture": "room"} | {
+        return {"test": scores, "gaussians": 1000, "seconds": seconds, "iterations": 5, "recording": "room"} | {
             "train_cameras": ["a", "b"]
         }
 
@@ -160,10 +160,10 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(
 ) -> None:
     pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
     pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-    capture = save_capture(
-        synthetic_capture(cameras=3, held_out=1, frames=2, width=96, height=54), tmp_path / "captures" / "room"
+    recording = save_recording(
+        synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54), tmp_path / "recordings" / "room"
     )
-    command = ["ablate", str(capture), "--train-cameras", "train0,train1,train2", "--rows", "main,no_pruning"]
+    command = ["ablate", str(recording), "--train-cameras", "train0,train1,train2", "--rows", "main,no_pruning"]
     command += ["--seeds", "0,1", "--iterations", "20", "--jobs", "1", "--output", str(tmp_path / "out")]
     assert main(command) == 0
     table = (tmp_path / "out" / "ablation.md").read_text()

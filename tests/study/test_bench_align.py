@@ -9,10 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.errors import D2Error
-from d2_plugin.priors.settings import AlignSettings
-from d2_plugin.study.bench.align import AlignBench, bench_align, run, table
-from d2_plugin.study.bench.align_measure import (
+from benchmarks.align import AlignBench, bench_align, run, table
+from benchmarks.align_measure import (
     TRUE_LINE,
     AlignMethod,
     align_problem,
@@ -22,7 +20,9 @@ from d2_plugin.study.bench.align_measure import (
     weights_and_epsilon,
     without_noise,
 )
-from d2_plugin.study.rows import read_rows
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.settings import AlignSettings
+from d2_plugin.runs.rows import read_rows
 
 SMALL = {"anchors": (60, 300), "outliers": (0.0, 0.4), "seeds": 1, "seconds": 0.0}
 

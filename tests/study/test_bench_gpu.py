@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks.gpu import proof as gpu
+from benchmarks.gpu import static as gpu_static
+from benchmarks.gpu.loops import smallest_loops
 from d2_plugin.errors import D2Error
-from d2_plugin.study.bench.gpu import proof as gpu
-from d2_plugin.study.bench.gpu import static as gpu_static
-from d2_plugin.study.bench.gpu.loops import smallest_loops
-from d2_plugin.study.rows import read_rows
+from d2_plugin.runs.rows import read_rows
 
 PTXAS = """ptxas info    : Compiling entry function 'd2_render' for 'sm_90'
 ptxas info    : Function properties for d2_render

@@ -9,24 +9,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
-from d2_plugin.commands.study.bench import form
+from benchmarks.priors import Case, PriorsBench, cases, rows_of, run
+from d2_plugin.commands.bench import form
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.calibration import NORMAL_SHARE, Calibration, frames_with_truth, reliability_curve
-from d2_plugin.study.bench.priors import Case, PriorsBench, cases, rows_of, run
-from d2_plugin.study.report.priors import COUNTED, DIAGONAL, priors
-from d2_plugin.study.report.report import make_report
-from d2_plugin.study.rows import Row, make_row, read_rows
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.runs.report.priors import COUNTED, DIAGONAL, priors
+from d2_plugin.runs.report.report import make_report
+from d2_plugin.runs.rows import Row, make_row, read_rows
 
 pytest.importorskip("cv2")
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two cameras, three frames, true depth at the first and the last."""
-    room = synthetic_capture(2, held_out=0, frames=3, width=96, height=54)
-    path = save_capture(room, tmp_path_factory.mktemp("recordings") / "den")
+    room = synthetic_recording(2, held_out=0, frames=3, width=96, height=54)
+    path = save_recording(room, tmp_path_factory.mktemp("recordings") / "den")
     for depth in path.glob("depth/*/00001.*"):
         depth.unlink()
     return path
@@ -82,40 +82,40 @@ def test_a_rendered_rig_is_measured_without_any_data(measured: tuple[str, list[R
     )
 
 
-def test_the_default_is_the_rig_of_four_and_captures_replace_it(recording: Path) -> None:
+def test_the_default_is_the_rig_of_four_and_recordings_replace_it(folder: Path) -> None:
     (default,) = cases(PriorsBench(width=32))
     assert default.name == "synthetic4, 4 views"
-    assert len(default.capture.frames) == 2, "the first and the last"
-    (named,) = cases(PriorsBench((str(recording),)))
-    assert named.capture.name == "den"
-    assert named.capture.frames == (0, 2), "those with a true depth"
-    both = cases(PriorsBench((str(recording),), ("synthetic3",), width=32))
+    assert len(default.recording.frames) == 2, "the first and the last"
+    (named,) = cases(PriorsBench((str(folder),)))
+    assert named.recording.name == "den"
+    assert named.recording.frames == (0, 2), "those with a true depth"
+    both = cases(PriorsBench((str(folder),), ("synthetic3",), width=32))
     assert [case.name for case in both] == ["den, 2 views", "synthetic3, 3 views"]
 
 
-def test_named_cameras_are_those_of_the_captures_that_have_them_all(recording: Path) -> None:
-    settings = PriorsBench((str(recording),), ("synthetic3",), ("train0", "train2"), width=32)
+def test_named_cameras_are_those_of_the_recordings_that_have_them_all(folder: Path) -> None:
+    settings = PriorsBench((str(folder),), ("synthetic3",), ("train0", "train2"), width=32)
     assert [case.cameras for case in cases(settings)] == [("train0", "train1"), ("train0", "train2")]
 
 
-def test_what_cannot_be_compared_is_refused_in_a_sentence(recording: Path, tmp_path: Path) -> None:
-    blind = shutil.copytree(recording, tmp_path / "blind")
+def test_what_cannot_be_compared_is_refused_in_a_sentence(folder: Path, tmp_path: Path) -> None:
+    blind = shutil.copytree(folder, tmp_path / "blind")
     shutil.rmtree(blind / "depth")
-    with pytest.raises(D2Error, match=r"^blind has no true depth, .*: name captures that have one$"):
+    with pytest.raises(D2Error, match=r"^blind has no true depth, .*: name recordings that have one$"):
         cases(PriorsBench((str(blind),)))
     with pytest.raises(D2Error, match="den has no true depth at frame 1: choose from frames 0, 2 by --frames"):
-        cases(PriorsBench((str(recording),), frames=(1,)))
+        cases(PriorsBench((str(folder),), frames=(1,)))
     with pytest.raises(D2Error, match="unknown camera 'train9'"):
-        cases(PriorsBench((str(recording),), train_cameras=("train9",)))
+        cases(PriorsBench((str(folder),), train_cameras=("train9",)))
     with pytest.raises(D2Error, match="unknown rig 'synthetc2'.*did you mean 'synthetic2'"):
         cases(PriorsBench(rigs=("synthetc2",)))
 
 
-def test_frames_with_truth_are_those_of_any_of_the_cameras(recording: Path) -> None:
-    capture = cases(PriorsBench((str(recording),)))[0].capture
-    assert frames_with_truth(capture, ["train0"]) == [0, 2]
-    assert frames_with_truth(capture, []) == []
-    long = synthetic_capture(1, held_out=0, frames=9, width=16, height=9)
+def test_frames_with_truth_are_those_of_any_of_the_cameras(folder: Path) -> None:
+    recording = cases(PriorsBench((str(folder),)))[0].recording
+    assert frames_with_truth(recording, ["train0"]) == [0, 2]
+    assert frames_with_truth(recording, []) == []
+    long = synthetic_recording(1, held_out=0, frames=9, width=16, height=9)
     assert frames_with_truth(long, ["train0"], most=3) == [0, 4, 8], "spread over the recording"
     assert frames_with_truth(long, ["train0"], most=9) == list(range(9))
 
@@ -123,7 +123,7 @@ def test_frames_with_truth_are_those_of_any_of_the_cameras(recording: Path) -> N
 def test_its_flags_are_lists_joined_by_commas() -> None:
     words = ["room", "den", "--rigs", "synthetic3", "--train-cameras", "a,b", "--frames", "0,8", "--output", "o"]
     values = form(["priors"]).parse(words).values
-    assert values["captures"] == ("room", "den")
+    assert values["recordings"] == ("room", "den")
     assert values["train_cameras"] == ("a", "b")
     assert values["frames"] == (0, 8)
 
@@ -177,11 +177,11 @@ def test_the_headline_counts_the_labels_that_meet_the_goal_and_names_the_others(
     assert "not for" not in priors(rows[:1]).headlines[0]
 
 
-def test_a_capture_without_any_label_has_a_row_and_no_curve() -> None:
-    capture = synthetic_capture(1, held_out=0, frames=1, width=32, height=18)
-    rows = rows_of(Case("sky, 1 views", capture, ("train0",)), Calibration(1, {}, 0.9, 0.01), 1.0)
+def test_a_recording_without_any_label_has_a_row_and_no_curve() -> None:
+    recording = synthetic_recording(1, held_out=0, frames=1, width=32, height=18)
+    rows = rows_of(Case("sky, 1 views", recording, ("train0",)), Calibration(1, {}, 0.9, 0.01), 1.0)
     assert [(row["method"], row["error"]) for row in rows] == [("far", 0.01)]
     section = priors(rows)
     assert "nothing was measured" in section.figures["priors"]
-    assert [title for title, _ in section.tables] == ["Far pixels"], "every capture has a row, also without labels"
+    assert [title for title, _ in section.tables] == ["Far pixels"], "every recording has a row, also without labels"
     assert section.tables[0][1].rows == (("sky, 1 views", "90.0%", "1.0%"),)

@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.sgbm import sgbm
+from benchmarks.stereo import StereoBench, bench_stereo, run, table
+from benchmarks.stereo_measure import Method, measure, methods, score
+from benchmarks.stereo_rigs import Rig, load_rigs, textured_rig
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.filtering.filter import filter_depths
 from d2_plugin.priors.stereo.geometric_depth import gray
-from d2_plugin.study.bench.sgbm import sgbm
-from d2_plugin.study.bench.stereo import StereoBench, bench_stereo, run, table
-from d2_plugin.study.bench.stereo_measure import Method, measure, methods, score
-from d2_plugin.study.bench.stereo_rigs import Rig, load_rigs, textured_rig
 
 pytest.importorskip("cv2")
 
@@ -68,11 +68,11 @@ def test_the_outsider_is_right_about_most_of_what_the_filter_leaves_it(rig: Rig)
 
 def test_a_method_that_fails_on_a_rig_says_why_and_counts_as_nothing(rig: Rig) -> None:
     def refuses(*_: object) -> list:
-        raise D2Error("disparities span more than the picture")
+        raise D2Error("disparities span more than the image")
 
     broken = Method("broken", "default", refuses, StereoSettings())
     row = measure(broken, [rig])
-    assert row["failed"] == "disparities span more than the picture"
+    assert row["failed"] == "disparities span more than the image"
     working = {**measure(methods()[-1], [rig]), "method": "broken"}
     circumstances = {"device": "cpu", "threads": 1, "torch": "2", "commit": "abc", "version": "1", "command": "x"}
     lines = table([{**row, **circumstances}, {**working, **circumstances}]).splitlines()
@@ -82,7 +82,7 @@ def test_a_method_that_fails_on_a_rig_says_why_and_counts_as_nothing(rig: Rig) -
 
 
 def test_bench_writes_rows_table_and_plot(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("d2_plugin.study.bench.stereo._set_threads", lambda count: None)
+    monkeypatch.setattr("benchmarks.stereo._set_threads", lambda count: None)
     settings = StereoBench(
         rigs=("synthetic2",), width=96, makers=("sweep", "sgbm"), defaults_only=True, output=tmp_path
     )
@@ -105,5 +105,5 @@ def test_an_unknown_rig_or_maker_is_told(tmp_path) -> None:
         load_rigs("studi", None)
     with pytest.raises(D2Error, match="unknown stereo matcher 'patchmach'.*did you mean 'patchmatch'"):
         bench_stereo(tmp_path, rigs=["synthetic2"], makers=["patchmach"])
-    with pytest.raises(D2Error, match="no such capture"):
+    with pytest.raises(D2Error, match="no such recording"):
         load_rigs("studio", tmp_path)

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import BENCHMARKS
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
+from d2_plugin.runs.rows import begin_rows
 from d2_plugin.settings import Settings, declared
-from d2_plugin.study.bench import BENCHMARKS
-from d2_plugin.study.rows import begin_rows
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
@@ -47,13 +47,13 @@ def test_rows_can_begin_where_nothing_is(tmp_path: Path) -> None:
 
 
 def test_the_table_is_read_without_importing_torch() -> None:
-    code = "import sys, d2_plugin.study.bench; print('torch' in sys.modules)"
+    code = "import sys, benchmarks; print('torch' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "False"
 
 
 def test_a_step_too_small_to_be_measured_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    from d2_plugin.study.bench import training_step
+    from benchmarks import training_step
 
     monkeypatch.setattr(training_step, "timed", lambda *_: {training_step.RASTER: {"cpu_ms": 0.0}})
     with pytest.raises(D2Error, match="took no CPU time that can be measured: give more --gaussians"):

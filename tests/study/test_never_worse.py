@@ -7,31 +7,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.captures import open_capture
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
+from benchmarks.never_worse.bench import NeverWorseBench, run
+from benchmarks.never_worse.maps import SPOILED, Spoiled, spoiled_recording
+from benchmarks.never_worse.section import BACKBONE, STEREO, never_worse, table
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.study.never_worse.bench import NeverWorseBench, run
-from d2_plugin.study.never_worse.maps import SPOILED, Spoiled, spoiled_capture
-from d2_plugin.study.never_worse.section import BACKBONE, STEREO, never_worse, table
-from d2_plugin.study.report.page import markdown
-from d2_plugin.study.rows import Row, make_row, read_rows
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.runs.report.page import markdown
+from d2_plugin.runs.rows import Row, make_row, read_rows
 
 pytest.importorskip("cv2")
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    capture = synthetic_capture(2, held_out=1, frames=2, width=64, height=36)
-    return save_capture(capture, tmp_path_factory.mktemp("recordings") / "room")
+    recording = synthetic_recording(2, held_out=1, frames=2, width=64, height=36)
+    return save_recording(recording, tmp_path_factory.mktemp("recordings") / "room")
 
 
 @pytest.mark.parametrize("kind", SPOILED)
 def test_a_spoiled_recording_differs_in_its_maps_alone(room: Path, tmp_path: Path, kind: Spoiled) -> None:
-    before = open_capture(room)
+    before = open_recording(room)
     cameras = list(before.cameras)[:2]
-    after = open_capture(spoiled_capture(room, cameras, None, kind, tmp_path, PriorSettings()))
+    after = open_recording(spoiled_recording(room, cameras, None, kind, tmp_path, PriorSettings()))
     assert after.name == before.name
     assert after.mono_kind == before.mono_kind
     assert after.mono_emulated == before.mono_emulated
@@ -44,12 +44,12 @@ def test_a_spoiled_recording_differs_in_its_maps_alone(room: Path, tmp_path: Pat
 
 
 def test_each_map_is_what_its_name_says(room: Path, tmp_path: Path) -> None:
-    before = open_capture(room)
+    before = open_recording(room)
     cameras = list(before.cameras)[:2]
 
     def spoiled(kind: Spoiled, frames: tuple[int, ...] | None = None, folder: str = "all") -> np.ndarray:
-        path = spoiled_capture(room, cameras, frames, kind, tmp_path / folder, PriorSettings())
-        return open_capture(path).mono(cameras[0], 0)
+        path = spoiled_recording(room, cameras, frames, kind, tmp_path / folder, PriorSettings())
+        return open_recording(path).mono(cameras[0], 0)
 
     assert np.ptp(spoiled("constant")) == 0
     assert np.std(np.diff(spoiled("noise", folder="noise"))) > 2 * np.std(np.diff(spoiled("smooth", folder="smooth")))
@@ -60,14 +60,14 @@ def test_each_map_is_what_its_name_says(room: Path, tmp_path: Path) -> None:
 
 
 def test_a_recording_without_maps_needs_a_network(room: Path, tmp_path: Path) -> None:
-    capture = synthetic_capture(2, held_out=0, frames=1, width=32, height=18)
-    path = save_capture(capture, tmp_path / "den")
+    recording = synthetic_recording(2, held_out=0, frames=1, width=32, height=18)
+    path = save_recording(recording, tmp_path / "den")
     for map_ in path.glob("mono/*/*"):
         map_.unlink()
     for folder in (*path.glob("mono/*"), path / "mono"):
         folder.rmdir() if folder.is_dir() else folder.unlink()
     with pytest.raises(D2Error, match="--mono-onnx"):
-        spoiled_capture(path, list(capture.cameras), None, "other", tmp_path / "out", PriorSettings())
+        spoiled_recording(path, list(recording.cameras), None, "other", tmp_path / "out", PriorSettings())
 
 
 def row(method: str, psnr: float, seed: int = 0) -> Row:
@@ -100,7 +100,7 @@ def test_a_seed_that_was_repeated_counts_once() -> None:
 
 @pytest.mark.slow
 def test_rows_are_written_once_and_a_rerun_does_nothing(room: Path, tmp_path: Path) -> None:
-    names = list(open_capture(room).cameras)
+    names = list(open_recording(room).cameras)
     given = f"{room}@{names[0]}+{names[1]}@{names[2]}"
     settings = NeverWorseBench((given,), maps=("own", "noise"), steps=3, jobs=1, output=tmp_path)
     told = run(settings)
@@ -114,6 +114,6 @@ def test_rows_are_written_once_and_a_rerun_does_nothing(room: Path, tmp_path: Pa
     assert read_rows([tmp_path / "never-worse.jsonl"]) == rows
 
 
-def test_a_capture_is_asked_for_by_an_example(tmp_path: Path) -> None:
+def test_a_recording_is_asked_for_by_an_example(tmp_path: Path) -> None:
     with pytest.raises(D2Error, match="PATH@00"):
         run(NeverWorseBench(output=tmp_path))

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from d2_plugin.errors import D2Error
-from d2_plugin.study.ablation.paper_tables import DATASETS, MARK, ROWS, TABLES, PaperRow, paper_rows, paper_table
-from d2_plugin.study.ablation.presets import PRESETS
-from d2_plugin.study.ablation.presets import TABLES as OUR_TABLES
+from d2_plugin.runs.ablation.paper_tables import DATASETS, MARK, ROWS, TABLES, PaperRow, paper_rows, paper_table
+from d2_plugin.runs.ablation.presets import PRESETS
+from d2_plugin.runs.ablation.presets import TABLES as OUR_TABLES
 
 LABELS = {"main": "tab:main_results", "ablation": "tab:ablation", "pruning": "tab:pruning_criteria"}
 

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
+from benchmarks import memory
+from benchmarks import scaling as bench_scaling
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.runs.memory import Measured, in_fresh_process
+from d2_plugin.runs.plan_verify import LEFT_OUT, USED, PlanVerification, questions, table, verify
+from d2_plugin.runs.rows import Row, make_row
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings, check
 from d2_plugin.study import plan_verify
-from d2_plugin.study.bench import memory
-from d2_plugin.study.bench import scaling as bench_scaling
-from d2_plugin.study.bench.memory import Measured, in_fresh_process
-from d2_plugin.study.plan_verify import LEFT_OUT, USED, PlanVerification, questions, table, verify
-from d2_plugin.study.rows import Row, make_row
 
 LINUX = pytest.mark.skipif(not memory._RESET.exists(), reason="peak memory is measured on Linux")
 
@@ -28,7 +28,7 @@ LINUX = pytest.mark.skipif(not memory._RESET.exists(), reason="peak memory is me
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two training cameras, one held out, three frames of things that move."""
     path = tmp_path_factory.mktemp("room")
-    save_capture(synthetic_capture(2, 1, frames=3, width=96, height=54, arc_degrees=15), path)
+    save_recording(synthetic_recording(2, 1, frames=3, width=96, height=54, arc_degrees=15), path)
     return path
 
 

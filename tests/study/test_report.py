@@ -12,16 +12,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d2_plugin.captures.pictures import write_png
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.images import write_png
 from d2_plugin.runs.markup import Table, markdown
-from d2_plugin.study.report.page import Picture
-from d2_plugin.study.report.plots import Axis, Plot, Point, Series, number
-from d2_plugin.study.report.report import BUILDERS, ReportSettings, collect, make_report, run
-from d2_plugin.study.report.svg import bars, figure
-from d2_plugin.study.report.work_precision import means, pareto_front, work_precision
-from d2_plugin.study.rows import KINDS, Row, append_rows, make_row, read_rows, told_apart
-from d2_plugin.study.training_rows import training_rows
+from d2_plugin.runs.report.page import Image
+from d2_plugin.runs.report.plots import Axis, Plot, Point, Series, number
+from d2_plugin.runs.report.report import BUILDERS, ReportSettings, collect, make_report, run
+from d2_plugin.runs.report.svg import bars, figure
+from d2_plugin.runs.report.work_precision import means, pareto_front, work_precision
+from d2_plugin.runs.rows import KINDS, Row, append_rows, make_row, read_rows, told_apart
+from d2_plugin.runs.training_rows import training_rows
 
 RUNS = Path(__file__).parents[1] / "data" / "runs.jsonl"
 
@@ -37,12 +37,12 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def write_run(folder: Path, psnr: float | None = 25.0, **more: object) -> Path:
     """A run folder with what the report reads of it."""
-    (folder / "pictures").mkdir(parents=True)
-    write_png(folder / "pictures" / "cam0_00001.png", np.full((6, 8, 3), 90, np.uint8))
+    (folder / "images").mkdir(parents=True)
+    write_png(folder / "images" / "cam0_00001.png", np.full((6, 8, 3), 90, np.uint8))
     metrics = {
         "test": None if psnr is None else {"psnr": psnr, "ssim1": 0.8},
         "seconds": {"priors": 60.0, "train": 30.0},
-        **{"gaussians": 1234, "iterations": 500, "capture": "den", "train_cameras": ["a", "b"], "backbone": "yang4d"},
+        **{"gaussians": 1234, "iterations": 500, "recording": "den", "train_cameras": ["a", "b"], "backbone": "yang4d"},
         "hooks": ["prior", "densify", "prune", "depth_loss"],
         "made": {"device": "a CPU", "threads": 2, "version": "1", "commit": "abc", "torch": "2"},
         **more,
@@ -288,15 +288,15 @@ def test_a_run_without_held_out_cameras_or_circumstances_says_so(tmp_path: Path)
     assert row["method"] == "yang4d + densify"
 
 
-def test_folders_of_runs_are_searched_and_a_picture_of_each_method_is_kept(tmp_path: Path) -> None:
+def test_folders_of_runs_are_searched_and_a_image_of_each_method_is_kept(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_run(tmp_path / "runs" / name)
     write_run(tmp_path / "runs" / "bare", psnr=20.0, hooks=[])
-    rows, pictures = collect([RUNS, tmp_path / "runs"])
+    rows, images = collect([RUNS, tmp_path / "runs"])
     assert sum(row["case"] == "den, 2 views" for row in rows) == 3
-    assert [picture.caption.split(":")[0] for picture in pictures] == ["den, yang4d", "den, yang4d + D2"]
-    assert all(picture.uri.startswith("data:image/") for picture in pictures)
-    page = make_report(rows, tmp_path / "report", pictures)[0].read_text()
+    assert [image.caption.split(":")[0] for image in images] == ["den, yang4d", "den, yang4d + D2"]
+    assert all(image.uri.startswith("data:image/") for image in images)
+    page = make_report(rows, tmp_path / "report", images)[0].read_text()
     assert page.count("<img ") == 2
     with pytest.raises(D2Error, match="no finished run lies in"):
         collect([tmp_path / "report"])
@@ -314,7 +314,7 @@ def test_rows_of_which_none_has_a_result_still_make_a_report(tmp_path: Path, kin
 
 def test_what_names_hold_is_text_and_never_markup(tmp_path: Path) -> None:
     row = make_row("plan", "<b>room</b>", "a & b", error=0.0, seconds=1.0, planned="used: x", cost=None, unit="dB")
-    page, *_ = make_report([row], tmp_path, [Picture("<i>x</i>", "data:image/png;base64,")])
+    page, *_ = make_report([row], tmp_path, [Image("<i>x</i>", "data:image/png;base64,")])
     assert "&lt;b&gt;room&lt;/b&gt;" in page.read_text()
     assert "<i>x" not in page.read_text()
 
@@ -368,7 +368,7 @@ def test_axes_hold_their_values_and_ticks_are_round() -> None:
     assert [number(v) for v in (0.0, 0.5, 1e-6, 2.5e-7, 1e5)] == ["0", "0.5", "10⁻⁶", "2.5·10⁻⁷", "10⁵"]
 
 
-def test_marks_lie_inside_the_picture_and_carry_their_numbers() -> None:
+def test_marks_lie_inside_the_image_and_carry_their_numbers() -> None:
     points = (Point(1.0, 2.0, "the first"), Point(3.0, 4.0, "the <second>", "label"))
     series = Series("one", points, ((1.0, 2.0), (3.0, 4.0)))
     plot = Plot("title", Axis.around("x", [1, 3]), Axis.around("y", [2, 4]), (series,))

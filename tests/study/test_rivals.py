@@ -15,24 +15,24 @@ from numpy.lib.stride_tricks import sliding_window_view
 from tiny import TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
 
+from benchmarks.rivals.dense_start import back_projected
+from benchmarks.rivals.inputs import Inputs, expected_depth
+from benchmarks.rivals.patch_norm import patch_norm_loss
+from benchmarks.rivals.pearson import PearsonConfig, pearson_correlation, pearson_depth_loss
+from benchmarks.rivals.scale_shift import fitted_scale_and_shift, scale_shift_loss
+from benchmarks.rivals.sparse_points import Seen, at_pixels, sparse_point_loss
+from benchmarks.rivals.table import RIVALS, rival
 from d2_plugin import D2Config, D2Hooks
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
-from d2_plugin.priors.store import PriorStore
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved.kinds import read_run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import make_view
-from d2_plugin.study.rivals.dense_start import back_projected
-from d2_plugin.study.rivals.inputs import Inputs, expected_depth
-from d2_plugin.study.rivals.patch_norm import patch_norm_loss
-from d2_plugin.study.rivals.pearson import PearsonConfig, pearson_correlation, pearson_depth_loss
-from d2_plugin.study.rivals.scale_shift import fitted_scale_and_shift, scale_shift_loss
-from d2_plugin.study.rivals.sparse_points import Seen, at_pixels, sparse_point_loss
-from d2_plugin.study.rivals.table import RIVALS, rival
+from d2_plugin.store.store import PriorStore
 
 RNG = np.random.default_rng(7)
 DEPTH = RNG.uniform(2, 9, (23, 31))
@@ -232,7 +232,7 @@ def test_expected_depth_is_zero_without_gradient_where_little_is_drawn() -> None
 
 
 def test_back_projected_points_project_onto_their_pixels_with_their_colours() -> None:
-    room = synthetic_capture(cameras=2, frames=1, width=48, height=27)
+    room = synthetic_recording(cameras=2, frames=1, width=48, height=27)
     name = next(iter(room.cameras))
     depth = np.where(room.depth(name, 0) > 0, room.depth(name, 0), 0)
     points = back_projected(room, name, 0, depth, 100, np.random.default_rng(0))
@@ -260,8 +260,8 @@ def tensors_in(state: object) -> list[Tensor]:
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    capture = synthetic_capture(cameras=3, held_out=1, frames=2, width=96, height=54)
-    return save_capture(capture, tmp_path_factory.mktemp("captures") / "room")
+    recording = synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54)
+    return save_recording(recording, tmp_path_factory.mktemp("recordings") / "room")
 
 
 @pytest.fixture(scope="module")
@@ -292,9 +292,9 @@ class TestOnARecording:
         run = Run.load(ablation / "yang4d" / "dense_start" / "seed0")
         points = run.prepare(priors=False)
         started = rival("dense_start", 24).start(run.scene, points, ablation / "priors" / "dual")
-        assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of six pictures rounds
+        assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of six images rounds
         np.testing.assert_array_equal(started.positions[: len(points)], points.positions)
-        assert set(started.times) == {0.0, run.scene.capture.seconds(1)}
+        assert set(started.times) == {0.0, run.scene.recording.seconds(1)}
 
     def test_the_store_is_opened_once_for_all_maps(self, ablation: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """A rival is charged for its own work: opening the store costs more than a step."""
@@ -302,7 +302,9 @@ class TestOnARecording:
         inputs = Inputs(run.scene, run.prepare(priors=False), ablation / "priors" / "dual")
         open_store = PriorStore.open
         monkeypatch.setattr(PriorStore, "open", lambda path: opened.append(path) or open_store(path))
-        views = [make_view(run.scene.capture, c, f) for c in run.scene.train_cameras for f in run.scene.capture.frames]
+        views = [
+            make_view(run.scene.recording, c, f) for c in run.scene.train_cameras for f in run.scene.recording.frames
+        ]
         assert len([m for view in views if (m := inputs.inverse_depth(view)) is not None]) > 1
         assert len(opened) == 1
 
@@ -326,7 +328,7 @@ class TestOnARecording:
 
     def test_a_rivals_run_can_be_scored_but_not_trained_by_others(self, ablation: Path) -> None:
         run = Run.load(ablation / "yang4d" / "pearson" / "seed0")
-        assert run.evaluate(pictures=False)["guidance"]["name"] == "pearson"
+        assert run.evaluate(images=False)["guidance"]["name"] == "pearson"
         with pytest.raises(D2Error, match="guided by 'pearson'"):
             run._trainer(run.prepare(priors=False))
 

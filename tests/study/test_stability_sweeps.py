@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks.stability.gaussians import difference, largest, random_rotation, random_scene
+from benchmarks.stability.sweep import PRECISIONS, SWEEPS, StabilitySettings, measure, run, run_sweeps, summary
 from d2_plugin.errors import D2Error
-from d2_plugin.study.rows import Row
-from d2_plugin.study.stability.gaussians import difference, largest, random_rotation, random_scene
-from d2_plugin.study.stability.sweep import PRECISIONS, SWEEPS, StabilitySettings, measure, run, run_sweeps, summary
+from d2_plugin.runs.rows import Row
 
 RANGES = {
     "temporal variance": (1e-20, 1e20),

@@ -14,13 +14,13 @@ import pytest
 import torch
 from mimics.workplace import furnish
 
+from benchmarks.trainers import inside, prepare, trial_run
+from benchmarks.trainers.bench import TrainersBench, run
+from benchmarks.trainers.page import read_rows, replaced, table
+from benchmarks.trainers.prepare import Prepared, Source
+from benchmarks.trainers.trials import TRIALS, Job, Trial, gsplat_stats, reported, scored_after
 from d2_plugin import D2Error
 from d2_plugin.attach.recipes import RECIPES
-from d2_plugin.study.trainers import inside, prepare, trial_run
-from d2_plugin.study.trainers.bench import TrainersBench, run
-from d2_plugin.study.trainers.page import read_rows, replaced, table
-from d2_plugin.study.trainers.prepare import Prepared, Recording
-from d2_plugin.study.trainers.trials import TRIALS, Job, Trial, gsplat_stats, reported, scored_after
 
 TESTS = Path(__file__).parents[1]
 
@@ -31,7 +31,14 @@ def job(folder: Path) -> Job:
 
 
 def row(method: str, psnr: dict, seed: int | None = 0, **more: object) -> dict:
-    common = {"repository": "fudan", "capture": "studio", "frames": 3, "downscale": 2, "iterations": 200, "seed": seed}
+    common = {
+        "repository": "fudan",
+        "recording": "studio",
+        "frames": 3,
+        "downscale": 2,
+        "iterations": 200,
+        "seed": seed,
+    }
     counts = {"gaussians": 1000, "inserted": 0, "removed": 0, "digest": "a", "failed": None}
     return common | counts | {"method": method, "psnr": psnr} | more
 
@@ -150,11 +157,11 @@ def test_a_trainer_runs_in_its_own_process_and_leaves_rows_and_a_table(
 ) -> None:
     prior = furnish(tmp_path, monkeypatch) / "prior"
 
-    def prepared(recording: Recording, trial: Trial, work: Path) -> Prepared:
-        return Prepared(recording, tmp_path, None, prior)
+    def prepared(source: Source, trial: Trial, work: Path) -> Prepared:
+        return Prepared(source, tmp_path, None, prior)
 
-    monkeypatch.setattr("d2_plugin.study.trainers.bench.prepare", prepared)
-    monkeypatch.setattr(Recording, "seconds", 0.1)
+    monkeypatch.setattr("benchmarks.trainers.bench.prepare", prepared)
+    monkeypatch.setattr(Source, "seconds", 0.1)
     monkeypatch.setenv("PYTHONPATH", str(TESTS))
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     page = tmp_path / "page.md"
@@ -230,7 +237,7 @@ def test_the_official_trainer_bare_without_hooks_and_attached(
         pytest.skip("D2_CHECKOUTS is not set: give a folder with one checkout per repository")
     if not (Path(CHECKOUTS) / TRIALS[name].folder).is_dir():
         pytest.skip(f"no {TRIALS[name].folder} in {CHECKOUTS}")
-    scale = 1 if name == "fudan" else 2  # its report measures MS-SSIM, which needs pictures more than 160 pixels high
+    scale = 1 if name == "fudan" else 2  # its report measures MS-SSIM, which needs images more than 160 pixels high
     settings = TrainersBench(
         Path(CHECKOUTS), (shared_data("studio"),), (name,), iterations=ITERATIONS, frames=3, downscale=scale,
         work=tmp_path / "work", output=tmp_path / "rows.jsonl",
@@ -258,8 +265,8 @@ def test_exports_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(prepare, "export", export)
     (tmp_path / "priors" / "studio-4-2").mkdir(parents=True)
     (tmp_path / "priors" / "studio-4-2" / "store.json").touch()
-    recording = Recording(tmp_path / "studio", 4, 2)
-    first, second = (prepare.prepare(recording, TRIALS["hust4d"], tmp_path) for _ in range(2))
+    source = Source(tmp_path / "studio", 4, 2)
+    first, second = (prepare.prepare(source, TRIALS["hust4d"], tmp_path) for _ in range(2))
     assert first == second
     assert [settings.frames for settings in asked] == [(0, 1, 2, 3)] * 2
     assert [settings.train_cameras[0] for settings in asked] == ["00", "01"]

@@ -15,16 +15,16 @@ from hypothesis import strategies as st
 
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
+from d2_plugin.runs.ablation.job import Job
+from d2_plugin.runs.ablation.presets import PRESETS
+from d2_plugin.runs.rows import Row, make_row
 from d2_plugin.runs.settings import RunSettings
-from d2_plugin.study.ablation.job import Job
-from d2_plugin.study.ablation.presets import PRESETS
-from d2_plugin.study.rows import Row, make_row
-from d2_plugin.study.shared import Shared
-from d2_plugin.study.training.bench import TrainingBench, _line, _targets
-from d2_plugin.study.training.budget import PILOT, TOLERANCE, fits, nearest, next_steps
-from d2_plugin.study.training.cases import Case, case_of
-from d2_plugin.study.training.measured import TRY, Work, fingerprint
-from d2_plugin.study.training.spread import follow
+from d2_plugin.runs.shared import Shared
+from d2_plugin.runs.training.bench import TrainingBench, _line, _targets
+from d2_plugin.runs.training.budget import PILOT, TOLERANCE, fits, nearest, next_steps
+from d2_plugin.runs.training.cases import Case, case_of
+from d2_plugin.runs.training.measured import TRY, Work, fingerprint
+from d2_plugin.runs.training.spread import follow
 
 SETTINGS = RunSettings("room", ("a", "b"))
 
@@ -61,7 +61,7 @@ class TestCases:
         assert case_of("studio@00", SETTINGS).settings.test_cameras is None
 
     @pytest.mark.parametrize("text", ["studio", "@00", "a@b@c@d", ""])
-    def test_a_capture_without_cameras_is_refused_with_an_example(self, text: str) -> None:
+    def test_a_recording_without_cameras_is_refused_with_an_example(self, text: str) -> None:
         with pytest.raises(D2Error, match="PATH@00"):
             case_of(text, SETTINGS)
 
@@ -129,8 +129,8 @@ class TestPlan:
         def job(settings: RunSettings, rival: str | None = None) -> str:
             return fingerprint(Job("full", "yang4d", 0, settings, Path("x"), rival))
 
-        elsewhere = replace(SETTINGS, capture="/elsewhere/room", priors="/elsewhere/dual")
-        assert job(elsewhere) == job(replace(SETTINGS, capture="room", priors="dual"))
+        elsewhere = replace(SETTINGS, recording="/elsewhere/room", priors="/elsewhere/dual")
+        assert job(elsewhere) == job(replace(SETTINGS, recording="room", priors="dual"))
         others = [replace(SETTINGS, seed=1), replace(SETTINGS, iterations=5), replace(SETTINGS, downscale=2)]
         assert len({job(SETTINGS), *map(job, others), job(SETTINGS, "pearson"), job(SETTINGS, "patch_norm")}) == 6
 

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from trust_commands import Commands, compiled_faults, contents
 
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 ROWS = Path(__file__).parents[1] / "data" / "runs.jsonl"
 TRAINED = ["--train-cameras", "train0,train1", "--priors.stereo.matcher", "sweep"]
@@ -44,7 +44,7 @@ class Workplace:
     """The work by its name, and what each leaves when nothing goes wrong."""
 
     folder: Path
-    capture: Path
+    recording: Path
     commands: Commands
     work: dict[str, Work]
     whole: dict[str, dict[str, Any]]
@@ -68,20 +68,20 @@ def commands(tmp_path_factory: pytest.TempPathFactory) -> Commands:
 
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    capture = synthetic_capture(cameras=2, held_out=1, frames=2, width=96, height=54, arc_degrees=15)
-    return save_capture(capture, tmp_path_factory.mktemp("trust") / "room")
+    recording = synthetic_recording(cameras=2, held_out=1, frames=2, width=96, height=54, arc_degrees=15)
+    return save_recording(recording, tmp_path_factory.mktemp("trust") / "room")
 
 
 def filmed(folder: Path) -> Path:
     """Videos of the first two cameras of the recording beside it, six frames each."""
-    from films import write_film
+    from videos import write_video
 
-    capture = synthetic_capture(cameras=2, held_out=1, frames=6, width=96, height=54, arc_degrees=15)
-    (folder / "films").mkdir()
+    recording = synthetic_recording(cameras=2, held_out=1, frames=6, width=96, height=54, arc_degrees=15)
+    (folder / "videos").mkdir()
     for name in ("train0", "train1"):
-        pictures = [capture.image(name, frame) for frame in capture.frames]
-        write_film(folder / "films" / f"{name}.mp4", pictures, [frame / capture.fps for frame in capture.frames])
-    return folder / "films"
+        images = [recording.image(name, frame) for frame in recording.frames]
+        write_video(folder / "videos" / f"{name}.mp4", images, [frame / recording.fps for frame in recording.frames])
+    return folder / "videos"
 
 
 @pytest.fixture(scope="session")
@@ -100,10 +100,10 @@ def workplace(commands: Commands, recording: Path) -> Workplace:
         shutil.copytree(run, out)
         (out / "metrics.json").unlink()
 
-    export = ["export-capture", str(recording), "--format", "transforms", "--points", "50", "--output"]
-    films = ["import", str(filmed(folder)), "--calibration", str(folder / "room" / "cameras.json")]
+    export = ["export-recording", str(recording), "--format", "transforms", "--points", "50", "--output"]
+    videos = ["import", str(filmed(folder)), "--calibration", str(folder / "room" / "cameras.json")]
     work = {
-        "import": Work([*films, "--offsets", "none", "--output", str(out)], out, lambda: None),
+        "import": Work([*videos, "--offsets", "none", "--output", str(out)], out, lambda: None),
         "priors": Work(["priors", str(recording), *TRAINED, "--output", str(out)], out, lambda: None),
         "train": Work([*train, "--output", str(out)], out, lambda: None),
         "eval": Work(["eval", str(out)], out, trained),

@@ -77,34 +77,34 @@ ARRAYS = {"0x0": np.zeros((0, 0)), "words": np.array(["a"]), "structured": np.ze
 def camera_with(values: dict[str, Any]) -> Change:
     """The first camera says something else."""
 
-    def change(capture: Path) -> None:
-        table = json.loads((capture / "cameras.json").read_text())
+    def change(recording: Path) -> None:
+        table = json.loads((recording / "cameras.json").read_text())
         assert {"fx", "t", "R", "width", "name"} <= set(table["cameras"][0])
         table["cameras"][0].update(values)
-        (capture / "cameras.json").write_text(json.dumps(table))
+        (recording / "cameras.json").write_text(json.dumps(table))
 
     return change
 
 
-def picture(capture: Path) -> Path:
-    return sorted((capture / "images").rglob("*.png"))[0]
+def image(recording: Path) -> Path:
+    return sorted((recording / "images").rglob("*.png"))[0]
 
 
-def fifo(capture: Path) -> None:
-    path = picture(capture)
+def fifo(recording: Path) -> None:
+    path = image(recording)
     path.unlink()
     os.mkfifo(path)
 
 
-def enormous(capture: Path) -> None:
-    data = bytearray(picture(capture).read_bytes())
+def enormous(recording: Path) -> None:
+    data = bytearray(image(recording).read_bytes())
     data[16:24] = struct.pack(">II", 100000, 100000)
     data[29:33] = struct.pack(">I", zlib.crc32(bytes(data[12:29])))
-    picture(capture).write_bytes(bytes(data))
+    image(recording).write_bytes(bytes(data))
 
 
 def depths_with(write: Callable[[Path], object]) -> Change:
-    return lambda capture: [write(path) for path in (capture / "depth").rglob("*.np*")]
+    return lambda recording: [write(path) for path in (recording / "depth").rglob("*.np*")]
 
 
 def saved(array: np.ndarray) -> Callable[[Path], object]:
@@ -118,13 +118,13 @@ def saved(array: np.ndarray) -> Callable[[Path], object]:
 CHANGES: dict[str, Change] = {
     **{f"a camera with {name}": camera_with(values) for name, values in CAMERA.items()},
     **{
-        f"cameras.json is {name}": (lambda capture, data=data: (capture / "cameras.json").write_bytes(data))
+        f"cameras.json is {name}": (lambda recording, data=data: (recording / "cameras.json").write_bytes(data))
         for name, data in CALIBRATIONS.items()
     },
-    "a picture is empty": lambda capture: picture(capture).write_bytes(b""),
-    "a picture is cut off": lambda capture: picture(capture).write_bytes(picture(capture).read_bytes()[:200]),
-    "a picture is a pipe": fifo,
-    "a picture says that it is enormous": enormous,
+    "an image is empty": lambda recording: image(recording).write_bytes(b""),
+    "an image is cut off": lambda recording: image(recording).write_bytes(image(recording).read_bytes()[:200]),
+    "an image is a pipe": fifo,
+    "an image says that it is enormous": enormous,
     **{
         f"depth is {name}": depths_with(lambda path, data=data: path.write_bytes(data)) for name, data in DEPTHS.items()
     },
@@ -145,8 +145,8 @@ def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return f"it is called our fault: {said[0]}" if "fault of d2" in said[0] else ""
 
 
-def train(capture: Path, output: Path) -> list[str]:
-    words = ["train", str(capture), "--train-cameras", "train0,train1", "--iterations", "3"]
+def train(recording: Path, output: Path) -> list[str]:
+    words = ["train", str(recording), "--train-cameras", "train0,train1", "--iterations", "3"]
     return [*words, "--priors.stereo.matcher", "sweep", "--output", str(output)]
 
 
@@ -169,7 +169,7 @@ def test_configurations(recording: Path, tmp_path: Path, capsys: pytest.CaptureF
 def test_recordings(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     wrong = {}
     for index, (name, change) in enumerate(CHANGES.items()):
-        capture = shutil.copytree(recording, tmp_path / f"capture{index}")
-        change(capture)
-        wrong[name] = refused([*train(capture, tmp_path / f"run{index}"), "--hooks", "none"], capsys)
+        spoiled = shutil.copytree(recording, tmp_path / f"recording{index}")
+        change(spoiled)
+        wrong[name] = refused([*train(spoiled, tmp_path / f"run{index}"), "--hooks", "none"], capsys)
     assert {name: found for name, found in wrong.items() if found} == {}

@@ -1,4 +1,4 @@
-"""The hostile user of `test_hostile.py` at the commands for videos, films, pages, exports, doctors and benches."""
+"""The hostile user of `test_hostile.py` at the commands for videos, videos, pages, exports, doctors and benches."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from test_hostile import refused
 
-from d2_plugin.captures.export.folder import described
-from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.recordings.export.folder import described
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("av")
 pytest.importorskip("cv2")
@@ -24,12 +24,12 @@ Words = list[str]
 IMPORTS = """
 --times 5,1 | --times 0,1e300 | --times nan,1 | --times 1 | --times 100,200 | --frames 0:3000000000 | --frames 0:11:0
 --rate nan | --rate 0 | --rate 1e-300 | --scale 0 | --scale 1e-9 | --scale nan | --crop 0x0+0+0 | --crop 9x9 --crop zz
---crop 999999x999999+0+0 | --crop zz=10x10+0+0 | --crop 10x10+95+0 | --pictures gif | --unit mile
+--crop 999999x999999+0+0 | --crop zz=10x10+0+0 | --crop 10x10+95+0 | --images gif | --unit mile
 --offsets zz=1 | --offsets train0=1e300 | --offsets train0=nan | --offsets train0 | --offsets train0=x
 --offsets timecode | --offsets sound | --exposure maybe | --output /dev/null/x | --calibration /dev/zero
 --calibration /nope | --calibration /
 """
-FILMS = """
+VIDEOS = """
 --path nope | --path /nope.json | --path /dev/zero | --degrees 0 --path orbit | --show nope | --show truth --path orbit
 --cameras nope | --at 1e300 | --at nan | --at -1 | --speed 0 | --speed 1e-300 | --speed nan | --seconds 1e300
 --seconds 0 | --fps 1e300 | --fps 1e-300 | --fps nan | --width 0 | --width 99999 | --downscale 0 | --quality 99
@@ -37,35 +37,35 @@ FILMS = """
 """
 ELSEWHERE = """
 view /nope | view /dev/null | view RUN --port 0 | view RUN --host 999.1.1.1 | view RUN --height 1 | doctor /nope
-doctor /dev/null | doctor FILMS | doctor --attach nope | doctor --attach fudan | doctor --attach fudan /nope
+doctor /dev/null | doctor VIDEOS | doctor --attach nope | doctor --attach fudan | doctor --attach fudan /nope
 export RUN --format nope | export RUN --frames 0:1 | export RUN --megabytes 0 | export RUN --output /dev/null/x
-export /nope | export FILMS | eval /nope | eval /dev/null | compare | compare /nope | report /nope | report /dev/zero
-render | render /nope | render /dev/null | render FILMS | bench | bench nope | bench training | bench training x
+export /nope | export VIDEOS | eval /nope | eval /dev/null | compare | compare /nope | report /nope | report /dev/zero
+render | render /nope | render /dev/null | render VIDEOS | bench | bench nope | bench training | bench training x
 bench training /nope@a+b | bench training ROOM@train0+train1 --seconds nan | bench training ROOM@train0@@x
 bench training ROOM@train0+train1 --jobs 9999999 | bench training ROOM@train0+train1 --config /nope --steps 1
 bench training-step --gaussians 1000000000000 | bench training-step --sizes 0x0 | bench training-step --sizes x
 bench training-step --sizes 99999x99999 | bench training-step --threads 1000000000000 | bench gpu --steps nope
 bench training-step --frames 1000000000000 | bench training-step --seconds nan | bench gpu --output /dev/null/x
 stability --sweeps nope | demo --iterations 0 | demo --output /dev/null/x
-export-capture ROOM --format nope --output x | ablate ROOM --train-cameras train0,train1 --rows nope --output x
- export-capture ROOM --format n3dv --output ROOM
+export-recording ROOM --format nope --output x | ablate ROOM --train-cameras train0,train1 --rows nope --output x
+ export-recording ROOM --format n3dv --output ROOM
 """
 
 
 @pytest.fixture(scope="module")
 def place(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """films/ with a video of each camera and cameras.json, a capture `room` and a trained `run`."""
-    from films import write_film
+    """videos/ with a video of each camera and cameras.json, a filmed `room` and a trained `run`."""
+    from videos import write_video
 
     from d2_plugin.commands.cli import main
 
     folder = tmp_path_factory.mktemp("newer")
-    capture = synthetic_capture(cameras=2, held_out=0, frames=12, width=96, height=54, arc_degrees=15)
-    (folder / "films").mkdir()
-    for name in capture.cameras:
-        pictures = [capture.image(name, frame) for frame in capture.frames]
-        write_film(folder / "films" / f"{name}.mp4", pictures, [frame / capture.fps for frame in capture.frames])
-    (folder / "cameras.json").write_text(json.dumps(described(capture)))
+    filmed = synthetic_recording(cameras=2, held_out=0, frames=12, width=96, height=54, arc_degrees=15)
+    (folder / "videos").mkdir()
+    for name in filmed.cameras:
+        images = [filmed.image(name, frame) for frame in filmed.frames]
+        write_video(folder / "videos" / f"{name}.mp4", images, [frame / filmed.fps for frame in filmed.frames])
+    (folder / "cameras.json").write_text(json.dumps(described(filmed)))
     shutil.copytree(recording, folder / "room")
     words = ["train", str(folder / "room"), "--train-cameras", "train0,train1", "--iterations", "3", "--hooks", "none"]
     assert main([*words, "--output", str(folder / "run")]) == 0
@@ -87,19 +87,19 @@ def imported(place: Path, videos: Path, output: Path) -> Words:
 
 
 def test_imports(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    begin = imported(place, place / "films", tmp_path / "out")
+    begin = imported(place, place / "videos", tmp_path / "out")
     all_refused([[*begin, *words] for words in lines(IMPORTS)], capsys)
 
 
-def test_films(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_videos(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     begin = ["render", str(place / "run"), "--output", str(tmp_path / "a.mp4")]
-    all_refused([[*begin, *words] for words in lines(FILMS)], capsys)
+    all_refused([[*begin, *words] for words in lines(VIDEOS)], capsys)
     assert not list(tmp_path.iterdir())
 
 
 def test_other_commands(place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place)
-    named = {"RUN": "run", "FILMS": "films", "ROOM": "room"}
+    named = {"RUN": "run", "VIDEOS": "videos", "ROOM": "room"}
     cases = [[named.get(word, word).replace("ROOM@", "room@") for word in words] for words in lines(ELSEWHERE)]
     all_refused(cases, capsys)
 
@@ -143,7 +143,7 @@ DAMAGES: tuple[Callable[[Path], Any], ...] = (emptied, noise, cut, piped, a_fold
 def test_damaged_videos(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cases = []
     for number, damage in enumerate(DAMAGES):
-        videos = shutil.copytree(place / "films", tmp_path / str(number))
+        videos = shutil.copytree(place / "videos", tmp_path / str(number))
         damage(videos / "train0.mp4")
         cases.append(imported(place, videos, tmp_path / f"out{number}"))
     all_refused(cases, capsys)

@@ -11,42 +11,42 @@ from typing import Any
 import numpy as np
 import pytest
 
-from d2_plugin.captures import Capture, open_capture, select_cameras, select_frames
-from d2_plugin.captures.calibrate import Board, refine, scaled_by_board, solve_rig
-from d2_plugin.captures.calibrations import Undistortion, read_calibration, scaled
-from d2_plugin.captures.export.export import export_capture
-from d2_plugin.captures.export.folder import described, save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
-from d2_plugin.captures.videos.importing import import_videos
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.store import PriorStore
+from d2_plugin.recordings import Recording, open_recording, select_cameras, select_frames
+from d2_plugin.recordings.cameras.calibrating import Board, refine, scaled_by_board, solve_rig
+from d2_plugin.recordings.cameras.formats import Undistortion, read_calibration, scaled
+from d2_plugin.recordings.export.export import export_recording
+from d2_plugin.recordings.export.folder import described, save_recording
+from d2_plugin.recordings.importing.importing import import_videos
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
+from d2_plugin.store.store import PriorStore
 from d2_plugin.values import checked_arguments
 from d2_plugin.viewing.checkpoints import open_subject, read_ply
 from d2_plugin.viewing.export.page import read_page
-from d2_plugin.viewing.films.video import write_film
+from d2_plugin.viewing.videos.video import write_video
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
 WRONG: tuple[Any, ...] = (None, 5, 1.5, math.nan, True, b"x", "", "\0", "/nope", ["a", 5], {"a": 1}, object(), 10**30)
-PICTURE = np.zeros((48, 64, 3), np.uint8)
+IMAGE = np.zeros((48, 64, 3), np.uint8)
 
 Call = Callable[[Any], object]
 
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    capture = synthetic_capture(cameras=2, held_out=0, frames=2, width=64, height=48)
-    path = save_capture(capture, tmp_path_factory.mktemp("library") / "room")
-    (path / "calibration.json").write_text(json.dumps(described(capture)))
+    recording = synthetic_recording(cameras=2, held_out=0, frames=2, width=64, height=48)
+    path = save_recording(recording, tmp_path_factory.mktemp("library") / "room")
+    (path / "calibration.json").write_text(json.dumps(described(recording)))
     return path
 
 
 def as_a_path(path: Path) -> dict[str, Call]:
     """What takes the place of a file or folder."""
     return {
-        "open_capture": open_capture,
+        "open_recording": open_recording,
         "read_calibration": read_calibration,
         "PriorStore.open": PriorStore.open,
         "D2Config.from_toml": D2Config.from_toml,
@@ -57,33 +57,33 @@ def as_a_path(path: Path) -> dict[str, Call]:
     }
 
 
-def of_a_recording(path: Path, capture: Capture) -> dict[str, Call]:
+def of_a_recording(path: Path, recording: Recording) -> dict[str, Call]:
     """What stands for a recording, its cameras, frames and sizes."""
     (first, *_) = read_calibration(path / "calibration.json")
     folder = path.parent / "never"
     return {
-        "cameras": lambda wrong: open_capture(path, cameras=wrong if wrong is not None else "train0"),
-        "frames": lambda wrong: open_capture(path, frames=wrong if wrong is not None else "01"),
-        "downscale": lambda wrong: open_capture(path, downscale=0 if wrong == 5 else wrong),
-        "layout": lambda wrong: open_capture(path, layout=wrong or "x"),
-        "select_cameras": lambda wrong: select_cameras(capture, wrong),
-        "select_frames": lambda wrong: select_frames(capture, wrong),
-        "a camera's picture": lambda wrong: capture.image(wrong, 0),
-        "a frame's picture": lambda wrong: capture.image("train0", "0" if wrong is True or wrong == 5 else wrong),
+        "cameras": lambda wrong: open_recording(path, cameras=wrong if wrong is not None else "train0"),
+        "frames": lambda wrong: open_recording(path, frames=wrong if wrong is not None else "01"),
+        "downscale": lambda wrong: open_recording(path, downscale=0 if wrong == 5 else wrong),
+        "layout": lambda wrong: open_recording(path, layout=wrong or "x"),
+        "select_cameras": lambda wrong: select_cameras(recording, wrong),
+        "select_frames": lambda wrong: select_frames(recording, wrong),
+        "a camera's image": lambda wrong: recording.image(wrong, 0),
+        "a frame's image": lambda wrong: recording.image("train0", "0" if wrong is True or wrong == 5 else wrong),
         "sizes": lambda wrong: read_calibration(path / "calibration.json", wrong if wrong is not None else {}),
         "scaled": lambda wrong: scaled([first], -1 if wrong in (5, 1.5) else wrong),
         "Undistortion": Undistortion.of,
-        "an undistorted picture": Undistortion.of(first).picture,
+        "an undistorted image": Undistortion.of(first).image,
         "columns of a board": lambda wrong: Board(2 if wrong == 5 else wrong, 5, 0.04),
-        "a board's picture": Board(7, 5, 0.04).corners,
+        "a board's image": Board(7, 5, 0.04).corners,
         "scaled_by_board": lambda wrong: scaled_by_board(wrong, {}, Board(7, 5, 0.04)),
         "refine": refine,
         "solve_rig": lambda wrong: solve_rig(wrong, {}),
-        "intrinsics": lambda wrong: solve_rig({"train0": [PICTURE]}, wrong),
+        "intrinsics": lambda wrong: solve_rig({"train0": [IMAGE]}, wrong),
         "import_videos": import_videos,
-        "save_capture": lambda wrong: save_capture(wrong, folder),
-        "export_capture": lambda wrong: export_capture(wrong, "transforms", folder),
-        "held out": lambda wrong: export_capture(capture, "n3dv", folder, test_cameras=wrong),
+        "save_recording": lambda wrong: save_recording(wrong, folder),
+        "export_recording": lambda wrong: export_recording(wrong, "transforms", folder),
+        "held out": lambda wrong: export_recording(recording, "n3dv", folder, test_cameras=wrong),
     }
 
 
@@ -103,8 +103,8 @@ def test_what_is_no_path(room: Path) -> None:
     assert {case: why for case, why in found.items() if why} == {}
 
 
-def test_what_is_no_recording_camera_frame_or_picture(room: Path) -> None:
-    calls = of_a_recording(room, open_capture(room))
+def test_what_is_no_recording_camera_frame_or_image(room: Path) -> None:
+    calls = of_a_recording(room, open_recording(room))
     found = {(name, str(w)): refused(call, w) for name, call in calls.items() for w in WRONG}
     assert {case: why for case, why in found.items() if why} == {}
 
@@ -122,21 +122,19 @@ def test_what_is_no_recording_camera_frame_or_picture(room: Path) -> None:
 )
 def test_a_board_that_cannot_be(values: dict[str, Any], says: str) -> None:
     with pytest.raises(D2Error, match=says):
-        Board(**values).corners(PICTURE)
+        Board(**values).corners(IMAGE)
 
 
-@pytest.mark.parametrize(
-    "picture", [PICTURE.astype(float), PICTURE[..., 0], PICTURE[:0], np.zeros((4, 4, 4), np.uint8)]
-)
-def test_what_is_no_picture(picture: np.ndarray, tmp_path: Path) -> None:
+@pytest.mark.parametrize("image", [IMAGE.astype(float), IMAGE[..., 0], IMAGE[:0], np.zeros((4, 4, 4), np.uint8)])
+def test_what_is_no_image(image: np.ndarray, tmp_path: Path) -> None:
     pytest.importorskip("av")
     with pytest.raises(D2Error, match=r"expected RGB uint8 \[H, W, 3\]"):
-        Board(7, 5, 0.04).corners(picture)
+        Board(7, 5, 0.04).corners(image)
     with (
         pytest.raises(D2Error, match=r"expected RGB uint8 \[H, W, 3\]"),
-        write_film(tmp_path / "a.mp4", "mp4", 24) as film,
+        write_video(tmp_path / "a.mp4", "mp4", 24) as video,
     ):
-        film.add(picture)
+        video.add(image)
     assert not list(tmp_path.iterdir())
 
 

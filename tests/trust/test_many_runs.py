@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from trust_commands import Ended, Started, contents, killed
 
-from d2_plugin.priors.store import PriorStore
+from d2_plugin.store.store import PriorStore
 
 SEEDS = 200
 AT_ONCE = 3

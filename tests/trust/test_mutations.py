@@ -15,11 +15,11 @@ import torch
 from d2_plugin.durable import write_table
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import Label
 from d2_plugin.runs.saved.checkpoint import load_checkpoint, save_checkpoint
 from d2_plugin.runs.saved.kinds import METRICS, RUN, read_metrics, read_run
 from d2_plugin.runs.start import TimedPoints
+from d2_plugin.store.store import PriorStore
 
 FEW, MANY = 40, 2000
 
@@ -84,7 +84,7 @@ def a_store(folder: Path) -> tuple[Path, Callable[[], Any]]:
         np.full((9, 12), 0.02, np.float32),
         np.zeros((9, 12, 3), np.uint8),
     )
-    store = PriorStore.create(folder / "store", ["a", "b"], [0], {"capture": "room"})
+    store = PriorStore.create(folder / "store", ["a", "b"], [0], {"recording": "room"})
     for camera in ("a", "b"):
         store.write(camera, 0, maps, {"key": "k", "shares": maps.shares(), "refused": ""})
 
@@ -129,12 +129,12 @@ def points(folder: Path) -> tuple[Path, Callable[[], Any]]:
 
 
 def run_table(folder: Path) -> tuple[Path, Callable[[], Any]]:
-    write_table(folder / "run.json", {"capture": "/x", "seed": 3, "overrides": {"d2": {"seed": 1}}}, RUN)
+    write_table(folder / "run.json", {"recording": "/x", "seed": 3, "overrides": {"d2": {"seed": 1}}}, RUN)
     return folder / "run.json", lambda: read_run(folder)
 
 
 def scores(folder: Path) -> tuple[Path, Callable[[], Any]]:
-    table = {"test": {"psnr": 25.5}, "seconds": {"train": 1.0}, "gaussians": 3, "iterations": 4, "capture": "room"}
+    table = {"test": {"psnr": 25.5}, "seconds": {"train": 1.0}, "gaussians": 3, "iterations": 4, "recording": "room"}
     write_table(folder / "metrics.json", {**table, "train_cameras": ["a"], "backbone": "b", "hooks": []}, METRICS)
     return folder / "metrics.json", lambda: read_metrics(folder)
 

@@ -81,7 +81,7 @@ def browser(width: int = 960, height: int = 600) -> Iterator[Any]:
             program.close()
 
 
-def picture(address: str) -> np.ndarray:
+def image(address: str) -> np.ndarray:
     """RGB uint8 [H, W, 3] of a PNG in a data: address, as canvas.toDataURL gives it."""
     cv2 = pytest.importorskip("cv2", reason="opencv is in the `image` extra")
     data = np.frombuffer(base64.b64decode(address.partition(",")[2]), np.uint8)

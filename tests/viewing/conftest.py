@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.viewing.subject import Subject, subject_of_run
@@ -20,7 +20,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of three cameras and a held-out one, four frames of 96x54 at 12 per second."""
     pytest.importorskip("cv2", reason="opencv is in the `image` extra")
     path = tmp_path_factory.mktemp("recording") / "room"
-    return save_capture(synthetic_capture(cameras=3, held_out=1, frames=4, width=96, height=54), path)
+    return save_recording(synthetic_recording(cameras=3, held_out=1, frames=4, width=96, height=54), path)
 
 
 @pytest.fixture(scope="session")

@@ -14,8 +14,8 @@ from d2_plugin.backbones.deform import DeformSettings
 from d2_plugin.backbones.deform_fields import Box, HexPlaneSettings
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.yang4d import Yang4DSettings
-from d2_plugin.captures import Camera
 from d2_plugin.protocol import View
+from d2_plugin.recordings import Camera
 from d2_plugin.viewing.export.scene import Clip, ExportScene, background_of, slicer
 
 WIDTH, HEIGHT, FOCAL = 640, 360, 560.0

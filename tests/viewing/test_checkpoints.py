@@ -34,7 +34,7 @@ SIZE = (96, 54)
 
 def seen(subject: Subject, time: float, camera: str = "train0") -> Any:
     """The subject's view of a camera of the recording."""
-    return subject.view(pose_of(subject.capture.cameras[camera]), time, SIZE)
+    return subject.view(pose_of(subject.recording.cameras[camera]), time, SIZE)
 
 
 def close(a: Tensor, b: Any, within: float = 2e-5) -> bool:
@@ -67,7 +67,7 @@ class TestTuples:
         view = seen(found, 0.1)
         assert torch.equal(look(found.backbone, view).color, look(FudanAdapter(model), view).color)
         assert found.note == "times are taken to be seconds since the first frame"
-        with pytest.raises(D2Error, match="name its recording with --capture"):
+        with pytest.raises(D2Error, match="name its recording with --recording"):
             open_subject(tmp_path / "chkpnt30000.pth")
 
     @pytest.mark.parametrize("layout", [STATIC, FOUR_C_STATIC], ids=["3DGS", "4C4D without time"])
@@ -165,7 +165,7 @@ class TestDeformable3D:
         self, room: Path, tmp_path: Path
     ) -> None:
         self.output(tmp_path)
-        assert len(subject_at(ViewSettings(tmp_path, capture=room)).backbone) == 40
+        assert len(subject_at(ViewSettings(tmp_path, recording=room)).backbone) == 40
         with pytest.raises(D2Error, match=r"point_cloud\.ply does not say where its cameras stood"):
             subject_at(ViewSettings(tmp_path))
 
@@ -199,8 +199,8 @@ class Test4DGaussians:
         model = self.output(tmp_path)
         found = open_subject(tmp_path, room)
         # Frame 2 of 4 is at its time 2 / 4: readers of several cameras divide by the number of frames.
-        assert seen(found, found.capture.seconds(2)).time == pytest.approx(0.5)
-        at = seen(found, official.TIME * 4 / found.capture.fps)
+        assert seen(found, found.recording.seconds(2)).time == pytest.approx(0.5)
+        at = seen(found, official.TIME * 4 / found.recording.fps)
         drawn = found.backbone.slice_at(at)
         assert close(drawn.means[:3], official.BENT["as by default"][1])
         assert close(drawn.opacities, torch.sigmoid(model["_opacity"][:, 0]))
@@ -222,8 +222,8 @@ class Test4DGaussians:
         torch.save((tuple(values), 14000), tmp_path / "chkpnt_fine_14000.pth")
         both = [open_subject(path, room) for path in (tmp_path, tmp_path / "chkpnt_fine_14000.pth")]
         views = [seen(found, 0.1) for found in both]
-        pictures = [look(found.backbone, view) for found, view in zip(both, views, strict=True)]
-        assert torch.equal(pictures[0].color, pictures[1].color)
+        images = [look(found.backbone, view) for found, view in zip(both, views, strict=True)]
+        assert torch.equal(images[0].color, images[1].color)
         torch.save((tuple(values), 3000), tmp_path / "chkpnt_coarse_3000.pth")
         still = open_subject(tmp_path / "chkpnt_coarse_3000.pth", room)
         assert close(still.backbone.slice_at(seen(still, 0.1)).means, model["_xyz"])
@@ -287,7 +287,7 @@ class TestClouds:
         official.write_ply(tmp_path / "point_cloud.ply", columns)
         found = open_subject(tmp_path / "point_cloud.ply", room)
         # Frame 2 of 4 is at the trainer's time 0.5.
-        view = seen(found, found.capture.seconds(2))
+        view = seen(found, found.recording.seconds(2))
         assert view.time == pytest.approx(0.5)
         expected = SpacetimeAdapter(gaussians, 4).slice_at(view)
         assert torch.allclose(found.backbone.slice_at(view).means, expected.means, atol=1e-6)
@@ -383,7 +383,7 @@ class TestRefused:
         with pytest.raises(D2Error) as refusal:
             open_subject(tmp_path / "a.ply", room)
         assert len(str(refusal.value)) < 1000
-        assert main(["render", str(path), "--capture", str(room)]) == 2
+        assert main(["render", str(path), "--recording", str(room)]) == 2
         assert capsys.readouterr().err.count("\n") == 1
 
     @pytest.mark.parametrize(
@@ -424,7 +424,7 @@ class TestExport:
 
         path = tmp_path / "chkpnt30000.pth"
         model = TestTuples.checkpoint(path)
-        assert main(["export", str(path), "--capture", str(room), "--train-cameras", "train0,train1"]) == 0
+        assert main(["export", str(path), "--recording", str(room), "--train-cameras", "train0,train1"]) == 0
         said = capsys.readouterr().out
         assert "times are taken to be seconds since the first frame" in said
         assert "moves on a straight line and fades in time, exactly as it was trained" in said
@@ -438,12 +438,12 @@ class TestExport:
 
     def test_a_network_is_baked(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         Test4DGaussians.output(tmp_path)
-        assert main(["export", str(tmp_path), "--capture", str(room)]) == 0
+        assert main(["export", str(tmp_path), "--recording", str(room)]) == 0
         assert "a deformation field at" in capsys.readouterr().out
         found = open_subject(tmp_path, room)
         page = read_page(tmp_path / "export" / "scene.html")
         assert page.coefficients.shape[1:] == (16, 3)
-        at = found.capture.seconds(found.capture.frames[-1])
+        at = found.recording.seconds(found.recording.frames[-1])
         true, told = found.backbone.slice_at(seen(found, at)), page.at(at)
         drawn = told.positions[told.opacities >= 1 / 255]
         assert torch.cdist(true.means[true.opacities >= 1 / 255].double(), drawn).amin(1).max() < 1e-3
@@ -451,7 +451,7 @@ class TestExport:
     def test_without_its_recording_it_is_refused(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         TestTuples.checkpoint(tmp_path / "chkpnt1.pth")
         assert main(["export", str(tmp_path / "chkpnt1.pth")]) == 2
-        assert "name its recording with --capture" in capsys.readouterr().err
+        assert "name its recording with --recording" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["hust4d", "swift4d"])

@@ -1,4 +1,4 @@
-"""Looking: the same picture as the backbone's own render, and nothing of the trainer is touched."""
+"""Looking: the same image as the backbone's own render, and nothing of the trainer is touched."""
 
 from __future__ import annotations
 

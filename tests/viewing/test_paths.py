@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d2_plugin.captures import Camera
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.errors import D2Error
-from d2_plugin.viewing.films.path_file import OPENGL, read_camera_path
+from d2_plugin.recordings import Camera
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.viewing.paths import Lens, Pose, focus_of, look_at, orbit, pose_of, spiral, through
+from d2_plugin.viewing.videos.path_file import OPENGL, read_camera_path
 
-ARC = list(synthetic_capture(cameras=4, held_out=0, frames=1, width=96, height=54).cameras.values())
+ARC = list(synthetic_recording(cameras=4, held_out=0, frames=1, width=96, height=54).cameras.values())
 
 
 def ring(count: int, radius: float = 3.0) -> list[Camera]:
@@ -98,7 +98,7 @@ def test_look_at_is_upright_and_looks_there(x: float, y: float, z: float) -> Non
     T = look_at(position, target, np.array([0.0, -1, 0]))
     assert is_rotation(T[:3, :3])
     assert np.allclose((T[:3, :3] @ target + T[:3, 3])[:2], 0, atol=1e-6)
-    assert T[1, 1] >= -1e-9  # the picture's y axis does not point up
+    assert T[1, 1] >= -1e-9  # the image's y axis does not point up
 
 
 @pytest.mark.parametrize("size", [(192, 108), (48, 27), (100, 54), (54, 96)])

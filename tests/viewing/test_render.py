@@ -1,4 +1,4 @@
-"""`d2 render`: films of a run that agree with its model, and one sentence for what cannot be shown."""
+"""`d2 render`: videos of a run that agree with its model, and one sentence for what cannot be shown."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from d2_plugin.errors import D2Error
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import make_view
-from d2_plugin.viewing.films.film import RenderSettings, run
-from d2_plugin.viewing.films.plan import Wishes, plan_film
 from d2_plugin.viewing.panels import KINDS, Shot
 from d2_plugin.viewing.paths import pose_of
 from d2_plugin.viewing.subject import Subject
+from d2_plugin.viewing.videos.plan import Wishes, plan_video
+from d2_plugin.viewing.videos.render import RenderSettings, run
 
 av = pytest.importorskip("av", reason="PyAV is in the `video` extra")
 
 
-def film_of(path: Path) -> list[np.ndarray]:
+def video_of(path: Path) -> list[np.ndarray]:
     with av.open(str(path)) as container:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
@@ -39,11 +39,11 @@ def decibels(a: np.ndarray, b: np.ndarray) -> float:
 def rendered(trained: Path) -> Callable[[str, int], np.ndarray]:
     """The backbone's own render at a camera of the recording, through the rasterizer, [H, W, 3] in 0..1."""
     opened = Run.load(trained)
-    model, capture = opened.trained().model, opened.scene.capture
+    model, recording = opened.trained().model, opened.scene.recording
 
     def at(camera: str, frame: int) -> np.ndarray:
         with torch.no_grad():
-            return model.render(make_view(capture, camera, frame)).color.clamp(0, 1).numpy()
+            return model.render(make_view(recording, camera, frame)).color.clamp(0, 1).numpy()
 
     return at
 
@@ -60,13 +60,13 @@ def test_a_held_out_camera_plays_the_whole_recording_as_the_rasterizer_draws_it(
     trained: Path, tmp_path: Path, rendered: Callable[[str, int], np.ndarray]
 ) -> None:
     said = run(RenderSettings((trained,), output=tmp_path / "a.mp4", quality=10))
-    assert "4 pictures of 96x54, 12 per second" in said
-    found = film_of(tmp_path / "a.mp4")
+    assert "4 images of 96x54, 12 per second" in said
+    found = video_of(tmp_path / "a.mp4")
     assert len(found) == 4
     assert found[0].shape == (54, 96, 3)
     assert decibels(found[0], rendered("test0", 0)) >= 35
     assert decibels(found[-1], rendered("test0", 3)) >= 35
-    assert decibels(found[0], rendered("train0", 0)) < 30, "another camera is another picture"
+    assert decibels(found[0], rendered("train0", 0)) < 30, "another camera is another image"
 
 
 def test_a_path_through_the_training_cameras_begins_and_ends_as_the_rasterizer_draws_them(
@@ -74,10 +74,10 @@ def test_a_path_through_the_training_cameras_begins_and_ends_as_the_rasterizer_d
 ) -> None:
     words = ["render", str(trained), "--path", "through", "--at", "0", "--seconds", "1", "--quality", "10"]
     assert main([*words, "--output", str(tmp_path / "a.mp4")]) == 0
-    found = film_of(tmp_path / "a.mp4")
+    found = video_of(tmp_path / "a.mp4")
     assert len(found) == 12
-    stops = plan_film(subject, Wishes("through", at=0.0, seconds=1.0)).stops
-    cameras = subject.capture.cameras
+    stops = plan_video(subject, Wishes("through", at=0.0, seconds=1.0)).stops
+    cameras = subject.recording.cameras
     ends = [next(n for n in cameras if cameras[n].T_camera_world is stop.pose.T_camera_world) for stop in stops[::11]]
     assert decibels(found[0], rendered(ends[0], 0)) >= 35
     assert decibels(found[-1], rendered(ends[1], 0)) >= 35
@@ -97,7 +97,7 @@ def test_moving_paths_have_the_asked_length_rate_and_odd_size(trained: Path, tmp
 def test_a_camera_path_of_nerfstudio_is_followed(
     trained: Path, tmp_path: Path, subject: Subject, rendered: Callable[[str, int], np.ndarray]
 ) -> None:
-    camera = subject.capture.cameras["train1"]
+    camera = subject.recording.cameras["train1"]
     opengl = np.linalg.inv(camera.T_camera_world) @ np.diag([1.0, -1, -1, 1])
     fov = float(np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1])))
     entry = {"camera_to_world": opengl.flatten().tolist(), "fov": fov, "aspect": 16 / 9}
@@ -105,16 +105,16 @@ def test_a_camera_path_of_nerfstudio_is_followed(
     entries = [entry | {"render_time": 0.0}, entry | {"render_time": 1.0}]
     path.write_text(json.dumps({"render_width": 96, "render_height": 54, "fps": 5, "camera_path": entries}))
     run(RenderSettings((trained,), output=tmp_path / "png", path=str(path), format="png"))
-    from d2_plugin.captures.pictures import read_picture
+    from d2_plugin.recordings.images import read_image
 
-    found = [read_picture(tmp_path / "png" / name) for name in ("00000.png", "00001.png")]
+    found = [read_image(tmp_path / "png" / name) for name in ("00000.png", "00001.png")]
     assert decibels(found[0], rendered("train1", 0)) > 45
     assert decibels(found[1], rendered("train1", 3)) > 45
 
 
 def test_time_plays_bounces_slows_and_freezes(subject: Subject) -> None:
     def times(**wishes: object) -> list[float]:
-        return [round(12 * stop.time, 6) for stop in plan_film(subject, Wishes(**wishes)).stops]
+        return [round(12 * stop.time, 6) for stop in plan_video(subject, Wishes(**wishes)).stops]
 
     assert times() == [0, 1, 2, 3]
     assert times(speed=0.5) == [0, 0.5, 1, 1.5, 2, 2.5, 3]
@@ -125,34 +125,34 @@ def test_time_plays_bounces_slows_and_freezes(subject: Subject) -> None:
     assert max(abs(time - 0.5 * i) for i, time in enumerate(nearest)) <= 0.5
     assert len(times(path="training")) == 3 * 4
     with pytest.raises(D2Error, match="lies outside the recording, which lasts 0.25 s"):
-        plan_film(subject, Wishes(at=3.0))
+        plan_video(subject, Wishes(at=3.0))
 
 
 @pytest.mark.parametrize(
     ("wishes", "said"),
     [
-        ({"seconds": 1e300}, "would have 1.2e.301 pictures, at most 1000000"),
-        ({"speed": 1e-6}, "pictures, at most 1000000: choose fewer --seconds"),
-        ({"path": "orbit", "seconds": 1e300}, "pictures, at most 1000000"),
-        ({"fps": 1e300}, "a film of 1e.300 pictures per second cannot be written"),
+        ({"seconds": 1e300}, "would have 1.2e.301 images, at most 1000000"),
+        ({"speed": 1e-6}, "images, at most 1000000: choose fewer --seconds"),
+        ({"path": "orbit", "seconds": 1e300}, "images, at most 1000000"),
+        ({"fps": 1e300}, "a video of 1e.300 images per second cannot be written"),
         ({"fps": 1e-5}, "give --fps from 0.001 to 1000"),
     ],
 )
-def test_a_film_without_end_is_refused_before_it_is_laid_out(subject: Subject, wishes: dict, said: str) -> None:
+def test_a_video_without_end_is_refused_before_it_is_laid_out(subject: Subject, wishes: dict, said: str) -> None:
     with pytest.raises(D2Error, match=said):
-        plan_film(subject, Wishes(**wishes))
+        plan_video(subject, Wishes(**wishes))
 
 
-def test_pictures_that_memory_does_not_hold_are_refused(
+def test_images_that_memory_does_not_hold_are_refused(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("d2_plugin.captures.checks.memory.available_bytes", lambda: 2**30)
-    with pytest.raises(D2Error, match=r"pictures of 16384x9216 pixels need about 14.1 GiB .* smaller --width"):
+    monkeypatch.setattr("d2_plugin.recordings.checks.memory.available_bytes", lambda: 2**30)
+    with pytest.raises(D2Error, match=r"images of 16384x9216 pixels need about 14.1 GiB .* smaller --width"):
         run(RenderSettings(runs=(trained,), output=tmp_path / "a.mp4", width=16384))
     assert not list(tmp_path.iterdir())
 
 
-def test_every_kind_of_picture_stands_beside_the_others_and_runs_below(trained: Path, tmp_path: Path) -> None:
+def test_every_kind_of_image_stands_beside_the_others_and_runs_below(trained: Path, tmp_path: Path) -> None:
     again = tmp_path / "again"
     shutil.copytree(trained, again)
     show = tuple(KINDS)
@@ -160,24 +160,24 @@ def test_every_kind_of_picture_stands_beside_the_others_and_runs_below(trained: 
         (trained, again), output=tmp_path / "a.mp4", path="training", cameras=("train1",), show=show, seconds=0.1
     )
     run(settings)
-    [picture] = film_of(tmp_path / "a.mp4")
+    [image] = video_of(tmp_path / "a.mp4")
     width = len(show) * 96 + (len(show) - 1) * 4
-    assert picture.shape == (2 * (54 + 20) + 4, width, 3)
-    assert min(panel.std() for panel in np.array_split(picture[24:74], len(show), axis=1)) > 3, "no panel is empty"
+    assert image.shape == (2 * (54 + 20) + 4, width, 3)
+    assert min(panel.std() for panel in np.array_split(image[24:74], len(show), axis=1)) > 3, "no panel is empty"
 
 
 def test_panels_show_what_they_say(subject: Subject) -> None:
-    camera = subject.capture.cameras["train1"]
+    camera = subject.recording.cameras["train1"]
     shot = Shot(subject, subject.view(pose_of(camera), 0.0, (96, 54), "train1"), (1.0, 9.0))
-    assert np.array_equal(KINDS["truth"].draw(shot).picture, subject.capture.image("train1", 0))
-    difference = np.abs(shot.look.color.numpy() - subject.capture.image("train1", 0) / np.float32(255))
+    assert np.array_equal(KINDS["truth"].draw(shot).image, subject.recording.image("train1", 0))
+    difference = np.abs(shot.look.color.numpy() - subject.recording.image("train1", 0) / np.float32(255))
     expected = -10 * np.log10(np.mean(difference**2))
     assert f"{expected:.1f} dB" in KINDS["error"].draw(shot).caption
     depth = KINDS["true-depth"].draw(shot)
     assert "1..9" in depth.caption
     assert depth.bar is not None
     half = Shot(subject, subject.view(pose_of(camera), 0.0, (48, 27), "train1"), (1.0, 9.0))
-    assert KINDS["labels"].draw(half).picture.shape == (27, 48, 3)
+    assert KINDS["labels"].draw(half).image.shape == (27, 48, 3)
 
 
 class TestSentences:
@@ -187,12 +187,12 @@ class TestSentences:
         assert "d2 render needs RUN" in refused(capsys)
 
     def test_a_run_knows_its_recording(self, trained: Path, room: Path, tmp_path: Path, capsys) -> None:
-        for more in (["--capture", str(room)], ["--train-cameras", "train0"], ["--downscale", "2"]):
+        for more in (["--recording", str(room)], ["--train-cameras", "train0"], ["--downscale", "2"]):
             words = ["render", str(trained), "--output", str(tmp_path / "a.mp4"), *more]
             assert main(words) == 2
             assert "is a folder of a run, which knows its recording" in capsys.readouterr().err
 
-    def test_an_unknown_path_picture_or_camera(self, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_an_unknown_path_image_or_camera(self, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "did you mean 'orbit'?" in refused(capsys, trained, "--path", "orbti")
         assert "did you mean 'depth'?" in refused(capsys, trained, "--show", "rgb,deph")
         assert "did you mean 'test0'?" in refused(capsys, trained, "--cameras", "test")

@@ -1,4 +1,4 @@
-"""The viewer without a browser: training stays bitwise what it is, pictures keep to their share, names stay names."""
+"""The viewer without a browser: training stays bitwise what it is, images keep to their share, names stay names."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ class Folder:
 
 class Scene:
     def __init__(self) -> None:
-        self.pictures: list[np.ndarray | None] = []
+        self.images: list[np.ndarray | None] = []
 
     def set_background_image(self, image: np.ndarray | None, **_: Any) -> None:
-        self.pictures.append(image)
+        self.images.append(image)
 
     def __getattr__(self, name: str) -> Any:
         nothing = {"on_click": lambda react: None, "remove": lambda: None}
@@ -86,9 +86,9 @@ def test_one_line_shows_any_trainer_and_training_stays_bitwise_the_same(config: 
     try:
         viewer._connected(client)
         watched.run()
-        assert len(client.scene.pictures) >= 1
-        assert client.scene.pictures[-1].std() > 5
-        assert set(viewer.subject.capture.cameras) == {"cam0", "cam1", "cam2"}
+        assert len(client.scene.images) >= 1
+        assert client.scene.images[-1].std() > 5
+        assert set(viewer.subject.recording.cameras) == {"cam0", "cam1", "cam2"}
         assert viewer.subject.duration == 0.5
     finally:
         viewer.close()
@@ -108,12 +108,12 @@ class Clock:
 
 
 class TestWhoOnlyLooks:
-    """Pictures take a twentieth of the time of a training that somebody only looks at."""
+    """Images take a twentieth of the time of a training that somebody only looks at."""
 
     STEPS, SECONDS_OF_A_STEP = 4000, 0.01
 
-    def spent_on_pictures(self, subject: Subject, patch: pytest.MonkeyPatch, seconds: float, moves: bool) -> float:
-        """Share of the whole time that pictures of `seconds` each take."""
+    def spent_on_images(self, subject: Subject, patch: pytest.MonkeyPatch, seconds: float, moves: bool) -> float:
+        """Share of the whole time that images of `seconds` each take."""
         clock, drawn = Clock(), []
         patch.setattr("d2_plugin.viewing.live.viewer.time", clock)
         viewer, client = Viewer(subject=subject, port=18190, height=48, iterations=self.STEPS), looker()
@@ -135,14 +135,14 @@ class TestWhoOnlyLooks:
         return sum(drawn) / clock.now
 
     @pytest.mark.parametrize("seconds", [0.001, 0.02, 0.2])
-    def test_pictures_keep_to_their_share(
+    def test_images_keep_to_their_share(
         self, subject: Subject, monkeypatch: pytest.MonkeyPatch, seconds: float
     ) -> None:
-        share = self.spent_on_pictures(subject, monkeypatch, seconds, moves=False)
+        share = self.spent_on_images(subject, monkeypatch, seconds, moves=False)
         assert 0.5 * WATCHED < share < 1.1 * WATCHED + seconds / (self.STEPS * self.SECONDS_OF_A_STEP)
 
     def test_who_moves_gets_more(self, subject: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
-        share = self.spent_on_pictures(subject, monkeypatch, 0.02, moves=True)
+        share = self.spent_on_images(subject, monkeypatch, 0.02, moves=True)
         assert 2 * WATCHED < share < 1.1 * MOVED
 
     @pytest.mark.slow
@@ -193,7 +193,7 @@ def test_d2_knows_which_gaussians_it_inserted_across_all_edits_and_a_resume() ->
     assert len(trainer.d2.inserted_at) == len(trainer.model)
 
 
-def test_a_moving_picture_is_as_large_as_fits_its_time() -> None:
+def test_a_moving_image_is_as_large_as_fits_its_time() -> None:
     resolution = Resolution()
     for _ in range(40):
         resolution.drew(640 * 360, 0.2)
@@ -206,7 +206,7 @@ def test_a_moving_picture_is_as_large_as_fits_its_time() -> None:
     assert resolution.size(1.0, 360, 0.06) == (72, 72)
 
 
-def test_pictures_of_many_gaussians_are_not_made_small_for_nothing() -> None:
+def test_images_of_many_gaussians_are_not_made_small_for_nothing() -> None:
     """What Gaussians cost before the first pixel does not get less with fewer pixels."""
 
     def seconds(size: tuple[int, int]) -> float:
@@ -234,13 +234,13 @@ def test_a_share_pays_off_what_was_spent_and_saves_little() -> None:
     assert share.due
     share.passes(1e6)
     share.spend(0.2)
-    assert not share.due, "an hour without pictures is not an hour of pictures"
+    assert not share.due, "an hour without images is not an hour of images"
 
 
 def test_the_browsers_camera_becomes_the_view_of_the_same_camera(subject: Subject) -> None:
-    from d2_plugin.captures.rotations import quaternion_of_rotation
+    from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
 
-    camera = subject.capture.cameras["train1"]
+    camera = subject.recording.cameras["train1"]
     q = quaternion_of_rotation(camera.T_camera_world[:3, :3].T)
     fov = 2 * np.arctan(camera.height / 2 / camera.K[1, 1])
     wanted = Wanted((*camera.centre, *q, fov), 96 / 54, 0.0, "rgb", 0.0, False, 54)
@@ -253,8 +253,8 @@ def test_the_prior_as_points_lies_where_its_pixels_say(subject: Subject) -> None
     cloud = cloud_of(subject, 0, "label", most=500)
     assert 50 < len(cloud.positions) <= 700
     assert np.isfinite(cloud.positions).all()
-    exact = subject.capture.depth("train0", 0)
-    camera = subject.capture.cameras["train0"]
+    exact = subject.recording.depth("train0", 0)
+    camera = subject.recording.cameras["train0"]
     seen = cloud.positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
     pixels = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
     inside = (seen[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
@@ -271,7 +271,7 @@ def test_controls_are_those_that_the_subject_has(subject: Subject) -> None:
     bare = Page(looker(), subject_of_store(subject.store), None, 360, lambda: None)
     bare.build()
     assert "show" not in bare.controls
-    assert bare.value("cloud") == "picture"
+    assert bare.value("cloud") == "image"
 
 
 def test_play_goes_on_with_the_clock_and_begins_again(subject: Subject) -> None:
@@ -297,7 +297,7 @@ class TestSentences:
 
     def test_what_cannot_be_shown(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "is empty: give the folder of a run" in self.refused(capsys, tmp_path)
-        assert "no such capture" in self.refused(capsys, tmp_path / "none")
+        assert "no such recording" in self.refused(capsys, tmp_path / "none")
         (tmp_path / "store.json").write_text('{"format": 1}')
         assert "has format 1 but this version reads format" in self.refused(capsys, tmp_path)
 
@@ -320,12 +320,12 @@ class TestSentences:
         assert page.controls["marked"].value is False
 
     def test_a_prior_of_another_recording(self, trained: Path, tmp_path: Path, room: Path) -> None:
-        found = subject_at(ViewSettings(trained / "priors", capture=room))
+        found = subject_at(ViewSettings(trained / "priors", recording=room))
         assert found.train_cameras == ("train0", "train1", "train2")
         assert found.backbone is None
         alone = subject_at(ViewSettings(trained / "priors"))
-        assert np.array_equal(alone.capture.image("train0", 0), found.capture.image("train0", 0))
-        assert np.allclose(alone.capture.cameras["train0"].K, found.capture.cameras["train0"].K)
+        assert np.array_equal(alone.recording.image("train0", 0), found.recording.image("train0", 0))
+        assert np.allclose(alone.recording.cameras["train0"].K, found.recording.cameras["train0"].K)
 
     @pytest.mark.parametrize("host", ["192.0.2.1", "no such host", "a" * 300, "\u200b.."])
     def test_an_address_that_is_not_ours(self, subject: Subject, host: str) -> None:

@@ -1,4 +1,4 @@
-"""The page in a real browser: it opens, a person moves camera and time, pictures change, two look at once."""
+"""The page in a real browser: it opens, a person moves camera and time, images change, two look at once."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tiny import ALL_HOOKS, make_trainer
 
 from d2_plugin.viewing.live import Viewer
 from d2_plugin.viewing.stand_in import subject_of_store
-from d2_plugin.viewing.subject import Subject, subject_of_capture
+from d2_plugin.viewing.subject import Subject, subject_of_recording
 
 pytest.importorskip("viser", reason="viser is in the `view` extra")
 api = pytest.importorskip("playwright.sync_api", reason="playwright is in the `test` extra")
@@ -45,7 +45,7 @@ def browser() -> Iterator[Any]:
 
 @contextmanager
 def showing(subject: Subject) -> Iterator[Viewer]:
-    """A viewer whose pictures are drawn by a thread of its own, as `d2 view` draws them in its only one."""
+    """A viewer whose images are drawn by a thread of its own, as `d2 view` draws them in its only one."""
     viewer, stop = Viewer(subject=subject, port=18080, height=180), threading.Event()
     thread = threading.Thread(target=viewer.stay, args=(stop.is_set,))
     thread.start()
@@ -68,7 +68,7 @@ def opened(browser: Any, viewer: Viewer) -> Any:
     return page
 
 
-def picture(page: Any, name: str = "") -> np.ndarray:
+def image(page: Any, name: str = "") -> np.ndarray:
     """What the page shows, RGB [H, W, 3]; kept where D2_SCREENSHOTS names a folder."""
     cv2 = pytest.importorskip("cv2")
     data = page.screenshot(clip=FREE)
@@ -78,13 +78,13 @@ def picture(page: Any, name: str = "") -> np.ndarray:
 
 
 def until(page: Any, condition: Callable[[np.ndarray], bool], name: str = "", seconds: float = 30) -> np.ndarray:
-    """The first picture that fulfils a condition."""
+    """The first image that fulfils a condition."""
     for _ in range(int(seconds / 0.25)):
         page.wait_for_timeout(250)
-        if condition(found := picture(page)):
-            picture(page, name)
+        if condition(found := image(page)):
+            image(page, name)
             return found
-    picture(page, name)
+    image(page, name)
     raise AssertionError(f"the page never showed it: {name}")
 
 
@@ -97,15 +97,15 @@ def is_drawn(now: np.ndarray) -> bool:
 
 
 def settled(page: Any) -> np.ndarray:
-    """The picture once it no longer changes."""
+    """The image once it no longer changes."""
     before = until(page, lambda now: now.std() > 5)
     for _ in range(40):
         page.wait_for_timeout(500)
-        now = picture(page)
+        now = image(page)
         if np.abs(now - before).mean() < 0.05:
             return now
         before = now
-    raise AssertionError("the picture never came to rest")
+    raise AssertionError("the image never came to rest")
 
 
 def drag(page: Any, dx: int, dy: int) -> None:
@@ -132,7 +132,7 @@ def test_a_person_moves_camera_and_time_while_another_only_looks(browser: Any, s
         assert viewer.clients == 2
         drag(one, 12, 4)
         turned = until(one, changed(first), "turned")
-        assert np.abs(picture(two) - other).mean() < 0.5, "the other one's camera stays"
+        assert np.abs(image(two) - other).mean() < 0.5, "the other one's camera stays"
         turned = settled(one)
         assert np.abs(turned - first).mean() > 2
         slider = one.get_by_role("slider").first
@@ -154,8 +154,8 @@ def test_depth_opacity_number_and_the_prior_as_points(browser: Any, subject: Sub
         for show in ("depth", "opacity", "number of Gaussians"):
             choose(page, "show", show)
             before = until(page, changed(before), show)
-        choose(page, "show", "picture")
-        before = until(page, changed(before), "picture")
+        choose(page, "show", "image")
+        before = until(page, changed(before), "image")
         control(page, "inserted by D2 in orange").click()
         orange = until(page, changed(before), "inserted")
         assert orange[..., 0].mean() > orange[..., 2].mean()
@@ -166,9 +166,9 @@ def test_depth_opacity_number_and_the_prior_as_points(browser: Any, subject: Sub
 
 
 def test_names_stay_text_and_only_this_machine_may_look(browser: Any, subject: Subject) -> None:
-    cameras = {EVIL if name == "train0" else name: camera for name, camera in subject.capture.cameras.items()}
-    recording = replace(subject.capture, cameras=cameras, source=Plain())
-    named = replace(subject, name=EVIL, capture=recording, train_cameras=tuple(cameras), store=None, test_cameras=())
+    cameras = {EVIL if name == "train0" else name: camera for name, camera in subject.recording.cameras.items()}
+    recording = replace(subject.recording, cameras=cameras, source=Plain())
+    named = replace(subject, name=EVIL, recording=recording, train_cameras=tuple(cameras), store=None, test_cameras=())
     with showing(named) as viewer:
         page = opened(browser, viewer)
         settled(page)
@@ -220,10 +220,10 @@ def test_a_training_is_watched_paused_and_goes_on(browser: Any) -> None:
 
 
 def test_a_recording_and_a_prior_are_shown_without_gaussians(browser: Any, subject: Subject) -> None:
-    with showing(subject_of_capture(subject.capture)) as viewer:
+    with showing(subject_of_recording(subject.recording)) as viewer:
         page = opened(browser, viewer)
-        until(page, lambda now: now.std() > 4, "capture")
-        assert not page.get_by_text("Picture", exact=True).count()
+        until(page, lambda now: now.std() > 4, "recording")
+        assert not page.get_by_text("Image", exact=True).count()
         page.close()
     with showing(subject_of_store(subject.store)) as viewer:
         page = opened(browser, viewer)
@@ -233,7 +233,7 @@ def test_a_recording_and_a_prior_are_shown_without_gaussians(browser: Any, subje
 
 
 class Plain:
-    """Grey pictures for cameras of any name."""
+    """Grey images for cameras of any name."""
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         return np.full((54, 96, 3), 99, np.uint8)

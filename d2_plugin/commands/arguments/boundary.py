@@ -52,7 +52,7 @@ def sentence(failure: BaseException) -> str:
     if isinstance(failure, KeyboardInterrupt):
         return "stopped: continue with the same command"
     if isinstance(failure, MemoryError) or any(words in str(failure).lower() for words in OUT_OF_MEMORY):
-        return "more memory is needed than there is: make pictures smaller with --downscale 2, or take fewer --frames"
+        return "more memory is needed than there is: make images smaller with --downscale 2, or take fewer --frames"
     if isinstance(failure, OSError):
         places = [shown_path(name) for name in (failure.filename, failure.filename2) if isinstance(name, str | bytes)]
         where = " and ".join(places) or "a file or a connection"

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from d2_plugin.runs.plan import ScenePlan
     from d2_plugin.runs.settings import RunSettings
 
-CAPTURE = ("capture", "train_cameras", "frames", "downscale", "mono_onnx", "mono_kind")
+RECORDING = ("recording", "train_cameras", "frames", "downscale", "mono_onnx", "mono_kind")
 """Settings of a run that say what is trained on."""
 
 WRITTEN = {
-    "capture": "images/CAMERA/FRAME.png with cameras.json, or as N3DV, Technicolor, ENeRF-Outdoor, COLMAP or "
+    "recording": "images/CAMERA/FRAME.png with cameras.json, or as N3DV, Technicolor, ENeRF-Outdoor, COLMAP or "
     "transforms.json lay it out.",
     "train_cameras": "Names joined by commas, as in 00,02,05,07; all; preset:2, preset:3, preset:4 for a data set; "
     "or protocol:gc-4dgs-4, protocol:4c4d and others for a published split.",
@@ -58,7 +58,7 @@ def recording_form(
         command: as it is typed.
         about: the text above its help.
         run: what it does.
-        more: settings of a run that it takes beside those in `CAPTURE`.
+        more: settings of a run that it takes beside those in `RECORDING`.
         options: the dataclass of the command's own settings; they replace settings of a run with the same name.
         tables: which tables of settings may be given by dotted flags.
     """
@@ -66,7 +66,7 @@ def recording_form(
 
     own = declared(options)
     of_run = {setting.name: _spelled(setting) for setting in declared(RunSettings)}
-    taken = [of_run[name] for name in (*CAPTURE, *more) if name not in {setting.name for setting in own}]
+    taken = [of_run[name] for name in (*RECORDING, *more) if name not in {setting.name for setting in own}]
 
     def groups(typed: Mapping[str, str]) -> dict[str, Group]:
         return {name: group for name, group in all_tables(_backbone(typed)).items() if name in tables}
@@ -77,9 +77,9 @@ def recording_form(
 def all_tables(backbone: str) -> dict[str, Group]:
     """Every table of settings of a run, with the class that declares it."""
     from d2_plugin import registry
-    from d2_plugin.captures.videos.settings import ImportChoices
     from d2_plugin.config import D2Config
     from d2_plugin.priors.settings import PriorSettings
+    from d2_plugin.recordings.importing.settings import ImportChoices
     from d2_plugin.runs.settings import PlanChoices
 
     hooks = {s.name: kind for s in declared(D2Config) for kind in (s.kind, *get_args(s.kind)) if is_dataclass(kind)}
@@ -96,11 +96,11 @@ def all_tables(backbone: str) -> dict[str, Group]:
 
 def run_settings(given: Given, **more: Any) -> RunSettings:
     """The settings of a run that were given, with camera presets resolved and the tables of file and flags."""
-    from d2_plugin.captures.presets import resolve_cameras, split_name
+    from d2_plugin.recordings.presets import resolve_cameras, split_name
     from d2_plugin.runs.settings import RunSettings
 
     train, test, notes = resolve_cameras(
-        given.values["capture"], given.values["train_cameras"], given.values.get("test_cameras")
+        given.values["recording"], given.values["train_cameras"], given.values.get("test_cameras")
     )
     say_notes(notes)
     overrides = _over(read_toml(given.values["config"]), given.tables)

@@ -3,7 +3,7 @@
 // Deformable-3D-Gaussians). The sum that an ordinary backward pass leaves lets gradients of opposite sign cancel.
 //
 // Fragments are those of the rasterizer (kernels/splat.h), which keeps sums only, so they are walked again here, front
-// to back: behind a Gaussian lies what the finished picture has and the walk has not yet seen.
+// to back: behind a Gaussian lies what the finished image has and the walk has not yet seen.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -20,8 +20,8 @@ struct Walk {
   const float *x, *y, *ux, *uy, *vy;  // centre, pixels; u = ux dx + uy dy, v = vy dy, alpha = o exp(-(u^2 + v^2) / 2)
   const float *opacity, *reach_x, *reach_y;
   const float* values;    // [M, C]
-  const float* picture;   // [H, W, C] finished, what shines through included
-  const float* gradient;  // [H, W, C] dL/d(picture)
+  const float* image;   // [H, W, C] finished, what shines through included
+  const float* gradient;  // [H, W, C] dL/d(image)
   float* sums;            // [M, 2] in and out
 };
 
@@ -32,7 +32,7 @@ class Pixel {
       : walk_(walk), column_(column + 0.5f), row_(row + 0.5f) {
     const int64_t first = (int64_t(row) * walk.width + column) * walk.channels;
     gradient_ = walk.gradient + first;
-    for (int c = 0; c < walk.channels; c++) behind_ += double(gradient_[c]) * walk.picture[first + c];
+    for (int c = 0; c < walk.channels; c++) behind_ += double(gradient_[c]) * walk.image[first + c];
   }
 
   // False once the pixel is finished.

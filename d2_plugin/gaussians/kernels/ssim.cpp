@@ -1,7 +1,7 @@
 // The photometric loss (1 - w) mean |a - b| + w (1 - mean SSIM(a, b)) and its gradient with respect to a, in one walk
 // over the rows: what photometric.py does in torch.
 //
-// Pictures stay as they are, [H, W, C] with channels interleaved: a step of one pixel is a step of C numbers. LANES
+// Images stay as they are, [H, W, C] with channels interleaved: a step of one pixel is a step of C numbers. LANES
 // rows are worked on together, along the row unit by unit, where a unit is LANES pixels. Going down the columns a
 // vector holds neighbours of one row; going along the row it holds the same number of LANES rows, so that either way a
 // blur adds up whole vectors, each of them read once for LANES sums. A row of the gradient needs 11 rows of the
@@ -22,10 +22,10 @@ constexpr int SPAN = TAPS - 1 + LANES;             // what LANES blurred values 
 constexpr int LAG = (RADIUS + LANES - 1) / LANES;  // units that must lie beyond one that is blurred along the row
 constexpr int HELD = 2 * LAG + 1;                  // units of blurred maps and of derivatives that are in use at a time
 constexpr int RUN = 16;                            // vectors that are added up in float32, before float64
-constexpr int AHEAD = 4 * LANES;                   // numbers of a picture's row that are asked for before their turn
+constexpr int AHEAD = 4 * LANES;                   // numbers of an image's row that are asked for before their turn
 constexpr float C1 = 0.01f * 0.01f, C2 = 0.03f * 0.03f;
 
-// Variances are differences of nearly equal numbers where a picture is flat. They do not change if both pictures, and
+// Variances are differences of nearly equal numbers where an image is flat. They do not change if both images, and
 // the zeros around them, are shifted; numbers in -1/2..1/2 leave a quarter of the rounding.
 constexpr float SHIFT = 0.5f;
 
@@ -42,7 +42,7 @@ struct Photometric {
   int64_t row_length() const { return int64_t(width) * channels; }
 };
 
-// A picture's row from number x on; zeros beyond its end.
+// An image's row from number x on; zeros beyond its end.
 D2_INLINE Floats load_row(const float* row, int64_t x, int64_t length) {
   if (x + LANES <= length) return Floats::load(row + x);
   alignas(64) float lane[LANES] = {};
@@ -136,7 +136,7 @@ class Band {
     const int64_t step = int64_t(LANES) * channels_;
     blur(p_.window, [&](int t) D2_FLAT { return Floats::load(from[t / LANES] + t % LANES * step); }, out);
   }
-  // What lies outside of the picture, from pixel first to last - 1 of maps that are blurred down the columns.
+  // What lies outside of the image, from pixel first to last - 1 of maps that are blurred down the columns.
   void fill(float* maps, int count, const float* outside, int64_t first, int64_t last) const {
     for (int m = 0; m < count; m++)
       for (int64_t pixel = first; pixel < last; pixel++) std::fill_n(held(maps, m, pixel, 0), unit_, outside[m]);

@@ -1,4 +1,4 @@
-"""Features of two pictures matched under known poses: mutual nearest neighbours on each other's epipolar lines."""
+"""Features of two images matched under known poses: mutual nearest neighbours on each other's epipolar lines."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
+from d2_plugin.recordings.recording import Camera
 
 
 class Features(NamedTuple):
-    """Feature points of one picture."""
+    """Feature points of one image."""
 
     pixels: np.ndarray  # [F, 2] float64, pixel centres at i + 0.5
     descriptors: np.ndarray  # [F, 128] float32, unit length
@@ -27,7 +27,7 @@ def epipolar_matches(
     """Pairs of feature indices [M, 2] that are each other's nearest, unambiguous, and fit the known geometry.
 
     Args:
-        first, second: features of the two pictures.
+        first, second: features of the two images.
         fundamental: F [3, 3], see `fundamental_matrix`.
         max_ratio: largest angle to the best match over the angle to the second best.
         max_angle: largest angle between matching descriptors, radians.

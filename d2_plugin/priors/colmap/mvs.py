@@ -1,6 +1,6 @@
 """COLMAP's PatchMatch as a matcher of geometric depth: the paper's own choice where there is a CUDA device.
 
-For each timestamp a workspace is written whose cameras are known (pictures, sparse model without points, explicit
+For each timestamp a workspace is written whose cameras are known (images, sparse model without points, explicit
 sources per view), COLMAP matches it in a process of its own, and its depth maps are checked before anyone believes
 them: without sources or memory COLMAP returns success and no output.
 
@@ -21,8 +21,6 @@ from pathlib import Path
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.rotations import quaternion_of_rotation
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.extras import import_pycolmap
 from d2_plugin.priors.colmap.dense_arrays import read_dense_array
@@ -33,10 +31,12 @@ from d2_plugin.priors.stereo.pyramid import NO_MATCH
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.priors.stereo.source_views import choose_sources
 from d2_plugin.reading import json_text
+from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
+from d2_plugin.recordings.recording import Camera
 
 CHILD = Path(__file__).with_name("mvs_process.py")
 CACHE_GIGABYTES = 8.0
-"""Memory that COLMAP may keep pictures and maps in; four views of ten megapixels take less than one."""
+"""Memory that COLMAP may keep images and maps in; four views of ten megapixels take less than one."""
 
 Runner = Callable[[Path, float], None]
 """(workspace, seconds after which to give up): leaves depth maps in the workspace, or raises `D2Error`."""
@@ -87,7 +87,7 @@ def colmap_patch_match(
         depth_range: near and far in world units. COLMAP draws its first depths uniformly between them (in depth, so a
             far end that is far too large wastes them) and may leave the range; what leaves it is dropped.
         settings: the `colmap_*` fields, `patchmatch_sources`, `min_angle` and `max_angle`.
-        wanted: not used, since COLMAP matches whole pictures.
+        wanted: not used, since COLMAP matches whole images.
         run: what runs COLMAP on a workspace; a process of its own where None.
 
     Returns:
@@ -162,17 +162,17 @@ def write_workspace(
 ) -> None:
     """Write what COLMAP's PatchMatch reads: images/, sparse/ (without points), stereo/patch-match.cfg, options.json.
 
-    Pictures are named by position (`0000.png`), so that no name of a camera can be one that COLMAP's text files or the
+    Images are named by position (`0000.png`), so that no name of a camera can be one that COLMAP's text files or the
     file system would not take. A view without sources is not listed: COLMAP would find none in a model without points.
     """
     cv2 = opencv("COLMAP's PatchMatch")
     for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps", "stereo/consistency_graphs"):
         (folder / name).mkdir(parents=True)
     for index, gray in enumerate(grays):
-        if not cv2.imwrite(str(folder / "images" / _picture(index)), gray):
-            raise D2Error(f"a picture could not be written to {folder}: make room for temporary files")
+        if not cv2.imwrite(str(folder / "images" / _image(index)), gray):
+            raise D2Error(f"an image could not be written to {folder}: make room for temporary files")
     write_model(folder / "sparse", cameras)
-    listed = {_picture(index): ", ".join(map(_picture, others)) for index, others in enumerate(sources) if others}
+    listed = {_image(index): ", ".join(map(_image, others)) for index, others in enumerate(sources) if others}
     problems = "".join(f"{reference}\n{names}\n" for reference, names in listed.items())
     (folder / "stereo" / "patch-match.cfg").write_text(problems)
     (folder / OPTIONS).write_text(json_text(options, OPTIONS, indent=1))
@@ -184,15 +184,15 @@ def write_model(folder: Path, cameras: Sequence[Camera]) -> None:
     COLMAP's PatchMatch addresses pixels by integers and uses K as it stands, so the principal point goes in array
     indices: with the half pixel of COLMAP's own convention depth is off by up to .2 %.
     """
-    lenses, pictures = [], []
+    lenses, images = [], []
     for index, camera in enumerate(cameras):
         K = index_intrinsics(camera)
         numbers = " ".join(repr(float(value)) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
         lenses.append(f"{index + 1} PINHOLE {camera.width} {camera.height} {numbers}\n")
         pose = (*quaternion_of_rotation(camera.T_camera_world[:3, :3]), *camera.T_camera_world[:3, 3])
-        pictures.append(f"{index + 1} {' '.join(repr(float(v)) for v in pose)} {index + 1} {_picture(index)}\n\n")
+        images.append(f"{index + 1} {' '.join(repr(float(v)) for v in pose)} {index + 1} {_image(index)}\n\n")
     (folder / "cameras.txt").write_text("".join(lenses))
-    (folder / "images.txt").write_text("".join(pictures))
+    (folder / "images.txt").write_text("".join(images))
     (folder / "points3D.txt").write_text("")
 
 
@@ -246,7 +246,7 @@ def _checked_maps(
 ) -> list[np.ndarray]:
     """The maps that COLMAP left, zeros for views that it was not asked for."""
     return [
-        _checked_map(folder / f"{_picture(index)}.{kind}.bin", camera)
+        _checked_map(folder / f"{_image(index)}.{kind}.bin", camera)
         if sources[index]
         else np.zeros((camera.height, camera.width), np.float32)
         for index, camera in enumerate(cameras)
@@ -262,8 +262,8 @@ def _checked_map(path: Path, camera: Camera) -> np.ndarray:
     depth = read_dense_array(path)
     if depth.shape != (camera.height, camera.width):
         raise D2Error(
-            f"COLMAP's depth map of camera {camera.name} is {depth.shape[::-1]} pixels but its picture is "
-            f"{(camera.width, camera.height)}: let COLMAP keep the size of the pictures"
+            f"COLMAP's depth map of camera {camera.name} is {depth.shape[::-1]} pixels but its image is "
+            f"{(camera.width, camera.height)}: let COLMAP keep the size of the images"
         )
     if not np.isfinite(depth).all():
         raise D2Error(
@@ -273,5 +273,5 @@ def _checked_map(path: Path, camera: Camera) -> np.ndarray:
     return depth
 
 
-def _picture(index: int) -> str:
+def _image(index: int) -> str:
     return f"{index:04d}.png"

@@ -16,7 +16,7 @@ OPTIONS = "options.json"
 
 
 def main(workspace: Path) -> None:
-    """Match all pictures that the workspace's patch-match.cfg names."""
+    """Match all images that the workspace's patch-match.cfg names."""
     import pycolmap
 
     options = pycolmap.PatchMatchOptions()

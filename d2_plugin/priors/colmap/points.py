@@ -1,6 +1,6 @@
 """Sparse surface points from cameras whose poses are known: SIFT features, matched, triangulated by COLMAP.
 
-COLMAP would estimate the geometry of every pair of pictures anew to tell good matches from bad ones. The poses are
+COLMAP would estimate the geometry of every pair of images anew to tell good matches from bad ones. The poses are
 known here, so a match is kept when it lies on its epipolar line: no random sampling, and pairs with a handful of
 matches still count.
 
@@ -25,14 +25,14 @@ from typing import Annotated, Any
 import numpy as np
 
 from d2_plugin.arrays import read_array
-from d2_plugin.captures.capture import Camera, Capture
 from d2_plugin.errors import D2Error
 from d2_plugin.extras import import_pycolmap
 from d2_plugin.priors.colmap.matching import Features, epipolar_matches, fundamental_matrix, same_spot
+from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.settings import Angle, Positive, Range, Settings, Share
 
 LUMA = np.array([0.299, 0.587, 0.114])
-"""Weights of red, green and blue in the grey picture that features are found in (ITU-R BT.601)."""
+"""Weights of red, green and blue in the grey image that features are found in (ITU-R BT.601)."""
 
 DESCRIPTOR_LENGTH = 128
 """Numbers in a SIFT descriptor."""
@@ -47,7 +47,7 @@ class TriangulationSettings(Settings):
     peak_threshold: Positive = 0.0033
     """SIFT contrast threshold; half of COLMAP's, since the epipolar test is strict."""
     max_features: Annotated[int, Range(1)] = 8192
-    """Strongest features kept per picture."""
+    """Strongest features kept per image."""
     max_ratio: Share = 0.8
     """Angle to the best match over angle to the second best (Lowe's ratio test)."""
     max_angle: Annotated[float, Range(0, math.pi, unit="radians")] = 0.7
@@ -65,9 +65,9 @@ class SparsePoints:
     """Triangulated surface points of one or several frames."""
 
     positions: np.ndarray  # [P, 3] float64, world
-    colors: np.ndarray  # [P, 3] float32 in 0..1, mean over the pictures that see the point
+    colors: np.ndarray  # [P, 3] float32 in 0..1, mean over the images that see the point
     errors: np.ndarray  # [P] float32, mean reprojection error in pixels
-    track_lengths: np.ndarray  # [P] int32, number of pictures that see the point
+    track_lengths: np.ndarray  # [P] int32, number of images that see the point
     frames: np.ndarray  # [P] int64, frame the point was seen in
 
     def __len__(self) -> int:
@@ -123,13 +123,13 @@ def triangulate(
 
     Returns:
         The points, in an order that does not depend on threads; none for a single camera, cameras that stand on one
-        spot, or pictures without texture.
+        spot, or images without texture.
 
     Raises:
         MissingExtra: pycolmap is not installed.
     """
     if len(images) != len(cameras):
-        raise D2Error(f"{len(images)} pictures for {len(cameras)} cameras: give one picture per camera")
+        raise D2Error(f"{len(images)} images for {len(cameras)} cameras: give one image per camera")
     settings = settings or TriangulationSettings()
     pycolmap = import_pycolmap("triangulating sparse points", "stereo")
     with _quiet(pycolmap), tempfile.TemporaryDirectory(prefix="d2_sparse_") as folder:
@@ -142,16 +142,16 @@ def triangulate(
 
 
 def triangulate_frames(
-    capture: Capture,
+    recording: Recording,
     cameras: Sequence[str],
     frames: Iterable[int],
     settings: TriangulationSettings | None = None,
 ) -> SparsePoints:
-    """`triangulate` for each of `frames` of a capture, joined; pictures are read one instant at a time."""
-    calibrations = [capture.cameras[name] for name in cameras]
+    """`triangulate` for each of `frames` of a recording, joined; images are read one instant at a time."""
+    calibrations = [recording.cameras[name] for name in cameras]
     parts = []
     for frame in frames:
-        images = [capture.image(name, frame) for name in cameras]
+        images = [recording.image(name, frame) for name in cameras]
         parts.append(triangulate(images, calibrations, frame, settings))
     return SparsePoints.joined(parts)
 
@@ -184,7 +184,7 @@ def _extract(pycolmap: ModuleType, image: np.ndarray, settings: TriangulationSet
 def _matched_pairs(
     features: Sequence[Features], cameras: Sequence[Camera], settings: TriangulationSettings
 ) -> dict[tuple[int, int], np.ndarray]:
-    """Matches [M, 2] of every pair of pictures that has any."""
+    """Matches [M, 2] of every pair of images that has any."""
     pairs = {}
     for i, j in itertools.combinations(range(len(cameras)), 2):
         if not same_spot(cameras[i], cameras[j]):
@@ -208,7 +208,7 @@ def _triangulated(
     pairs: dict[tuple[int, int], np.ndarray],
     settings: TriangulationSettings,
 ) -> Any:
-    """The pycolmap.Reconstruction with points; picture i has the id i + 1."""
+    """The pycolmap.Reconstruction with points; image i has the id i + 1."""
     model = _posed_model(pycolmap, cameras)
     _write_database(pycolmap, folder / "database.db", model, features, pairs)
     options = pycolmap.IncrementalPipelineOptions()
@@ -232,8 +232,8 @@ def _posed_model(pycolmap: ModuleType, cameras: Sequence[Camera]) -> Any:
         )
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(transform[:3, :3]), transform[:3, 3])
         model.add_camera_with_trivial_rig(lens)
-        picture = pycolmap.Image(name=f"{number}", camera_id=number, image_id=number)
-        model.add_image_with_trivial_frame(picture, pose)
+        image = pycolmap.Image(name=f"{number}", camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(image, pose)
     return model
 
 

@@ -1,6 +1,6 @@
 """Depth maps of COLMAP workspaces that the user has: `sparse/` with the cameras, `stereo/depth_maps/` with the maps.
 
-A workspace holds pinhole pictures of its own, seldom the size or the intrinsics of ours, and often a world of its own
+A workspace holds pinhole images of its own, seldom the size or the intrinsics of ours, and often a world of its own
 scale. So maps are looked up ray by ray, and depth is scaled by the ratio of the baselines, after the poses were checked
 to be the same up to a similarity.
 """
@@ -16,17 +16,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.readers.colmap_model import ColmapImage, ColmapModel, read_model
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.colmap.dense_arrays import read_dense_array
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.readers.colmap_model import ColmapImage, ColmapModel, read_model
+from d2_plugin.recordings.recording import Camera
 
 PLACES = ("colmap/{frame:05d}", "colmap", "dense", "colmap/{frame:05d}/dense", "colmap/dense")
-"""Where a workspace is looked for below a capture, in this order."""
+"""Where a workspace is looked for below a recording, in this order."""
 
 ROTATION = 1.0
-"""Relative rotations of two cameras may differ by this between capture and workspace, degrees: bundle adjustment
+"""Relative rotations of two cameras may differ by this between recording and workspace, degrees: bundle adjustment
 moves them by a few tenths."""
 
 TRANSLATION = 0.03
@@ -47,8 +47,8 @@ class WorkspaceDepth:
         place: path of the workspace; `{frame}` in it stands for the frame number.
         settings: `colmap_geometric` says whether maps of the geometric pass are wanted where there are any.
         cameras: the cameras whose poses are compared.
-        frames: of the capture. Where there are several, a picture serves only the frame that its name tells: a
-            workspace of one instant, as many captures have for their initial points, must not become the depth of all
+        frames: of the recording. Where there are several, an image serves only the frame that its name tells: a
+            workspace of one instant, as many recordings have for their initial points, must not become the depth of all
             instants.
     """
 
@@ -99,7 +99,7 @@ class WorkspaceDepth:
         """The map of one camera at one frame, at its size and in its world's units; None where there is none.
 
         Raises:
-            D2Error: poses that are not those of the capture, a lens that is no pinhole, a damaged map.
+            D2Error: poses that are not those of the recording, a lens that is no pinhole, a damaged map.
         """
         folder = self._folder(frame)
         if not self.has_maps(frame):
@@ -125,7 +125,7 @@ class WorkspaceDepth:
         return self.root / self.place.format(frame=frame)
 
     def _read_model(self, folder: Path) -> ColmapModel:
-        """The cameras and pictures of a workspace; the one that was read last is kept."""
+        """The cameras and images of a workspace; the one that was read last is kept."""
         if self._model is None or folder != self._read:
             sparse = folder / "sparse"
             self._model = read_model(sparse / "0" if (sparse / "0").is_dir() else sparse)
@@ -139,7 +139,7 @@ class WorkspaceDepth:
         poses = {name: image.T_camera_world for name, image in found.items() if image is not None}
         if not poses:
             raise D2Error(
-                f"the workspace {folder} has no picture of {', '.join(found)} at frame {frame}: name pictures "
+                f"the workspace {folder} has no image of {', '.join(found)} at frame {frame}: name images "
                 "CAMERA/FRAME.png, or CAMERA.png where the folder is of one frame, or set matcher = patchmatch"
             )
         self._scale = scale_of_world([camera for camera in self.cameras if camera.name in poses], poses, folder)
@@ -152,7 +152,7 @@ class WorkspaceDepth:
             )
 
     def _image(self, camera: str, frame: int) -> ColmapImage | None:
-        """The picture of one camera and frame, or of one camera where the workspace is of one instant."""
+        """The image of one camera and frame, or of one camera where the workspace is of one instant."""
         found = self._images.get((camera, frame))
         return self._images.get((camera, None)) if found is None and self.one_instant else found
 
@@ -162,20 +162,18 @@ class WorkspaceDepth:
 
 
 def _intrinsics(model: ColmapModel, image: ColmapImage, shape: tuple[int, ...]) -> np.ndarray:
-    """K [3, 3] of a map, which COLMAP may have computed at less than the size of its picture."""
+    """K [3, 3] of a map, which COLMAP may have computed at less than the size of its image."""
     recorded = model.cameras[image.camera]
     lens = recorded.lens(str(model.folder))
     if lens.bends:
-        raise D2Error(
-            f"{model.folder} has pictures with lens distortion: give the output of `colmap image_undistorter`"
-        )
+        raise D2Error(f"{model.folder} has images with lens distortion: give the output of `colmap image_undistorter`")
     return np.diag([shape[1] / recorded.width, shape[0] / recorded.height, 1.0]) @ lens.K
 
 
 def _by_camera_and_frame(
     model: ColmapModel, cameras: Sequence[str]
 ) -> tuple[dict[tuple[str, int | None], ColmapImage], list[str]]:
-    """Pictures by camera and frame (None where the name tells none), and the names of those of no camera of ours.
+    """Images by camera and frame (None where the name tells none), and the names of those of no camera of ours.
 
     CAMERA/FRAME.png, CAMERA_FRAME.png (with letters before the number, if any) and CAMERA.png are understood.
     """
@@ -241,6 +239,6 @@ def scale_of_world(cameras: Sequence[Camera], poses: dict[str, np.ndarray], fold
 
 def _other_poses(folder: Path, difference: str) -> D2Error:
     return D2Error(
-        f"the cameras of the workspace {folder} are not those of the capture ({difference}): compute it from the "
-        "capture's poses, or set matcher = patchmatch"
+        f"the cameras of the workspace {folder} are not those of the recording ({difference}): compute it from the "
+        "recording's poses, or set matcher = patchmatch"
     )

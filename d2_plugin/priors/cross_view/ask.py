@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.geometry import ViewPair, interpolated_surface, view_pair
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.recording import Camera
 
 WITHIN = 1.2
 """A surface confirms a monocular depth within this many of its standard deviations. Farther ones are often another
@@ -24,7 +24,7 @@ NEAR = 0.1
 BESIDE = 0.03
 """Share of the step to the surface that may remain as error."""
 LIKE = 0.04
-"""Largest difference of the colours (0..1, mean of 3x3 pixels) of one place in two pictures. A ray that passes a near
+"""Largest difference of the colours (0..1, mean of 3x3 pixels) of one place in two images. A ray that passes a near
 thing which the map does not know meets the surface behind it. Measured on the surfaces that rays meet, those off by
 more than 5 %: studio 1.3 % and .4 % with this test, with a weak network (PyDNet) 48 and 13 %; plaza with it 1.5 and
 .1 %. It keeps 88 to 96 % of the right ones."""
@@ -35,7 +35,7 @@ FEWEST = 100
 ONE_PLACE = 0.02
 """Nor does a pixel whose depth in the other view is off by more, in log depth."""
 COMPARED = 8000
-"""About how many verified pixels are compared for it, evenly over the picture."""
+"""About how many verified pixels are compared for it, evenly over the image."""
 STEPS = 3
 """Secant steps along the ray."""
 NUDGE = 1.001
@@ -60,7 +60,7 @@ class Points(NamedTuple):
     depth: np.ndarray
     sigma: np.ndarray
     colors: np.ndarray | None
-    """Mean of 3x3 pixels, uint8 [K, 3]; None where there is no picture."""
+    """Mean of 3x3 pixels, uint8 [K, 3]; None where there is no image."""
 
     def only(self, chosen: np.ndarray) -> Points:
         return Points._make(None if values is None else values[chosen] for values in self)
@@ -76,7 +76,7 @@ class Answer(NamedTuple):
     agreed: np.ndarray
     """Whether the monocular depth of another camera agrees, and the colours are alike, bool."""
     seen: np.ndarray
-    """Whether another camera has a depth where the point lies in its picture, bool."""
+    """Whether another camera has a depth where the point lies in its image, bool."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class View:
     sigma: np.ndarray
     """float32."""
     colors: np.ndarray | None
-    """Mean of 3x3 pixels, uint8 [H, W, 3]; None where there is no picture."""
+    """Mean of 3x3 pixels, uint8 [H, W, 3]; None where there is no image."""
 
     @functools.cached_property
     def surface(self) -> np.ndarray:
@@ -101,14 +101,12 @@ class View:
 
     @functools.cached_property
     def compared(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of some verified pixels, evenly over the picture."""
+        """Rows and columns of some verified pixels, evenly over the image."""
         known = np.flatnonzero(self.surface)
         rows, columns = np.divmod(known[:: max(len(known) // COMPARED, 1)], self.surface.shape[1])
         return rows, columns
 
-    def apart(
-        self, at: tuple[np.ndarray, np.ndarray], logs: np.ndarray, labels: tuple[Label, ...]
-    ) -> np.ndarray:
+    def apart(self, at: tuple[np.ndarray, np.ndarray], logs: np.ndarray, labels: tuple[Label, ...]) -> np.ndarray:
         """|log difference| [K] of points to the depths of pixels with one of the labels; infinite at others."""
         found = self.labels[at]
         labelled = functools.reduce(np.logical_or, [found == label for label in labels])
@@ -153,7 +151,7 @@ def ask(
 def _inside(
     points: Points, pair: ViewPair, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """(indices [I] of the points that fall into another view's picture, nearest pixels there, log depth there)."""
+    """(indices [I] of the points that fall into another view's image, nearest pixels there, log depth there)."""
     x, y, z = pair.project(points.columns, points.rows, points.depth)
     height, width = shape
     place = np.flatnonzero((z > 0) & (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5))
@@ -188,7 +186,7 @@ def _intersection(points: Points, pair: ViewPair, theirs: View) -> tuple[np.ndar
 
 
 def _alike(points: Points, theirs: View, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Whether the points [K] have the colour of another view's pixels; True where there is no picture."""
+    """Whether the points [K] have the colour of another view's pixels; True where there is no image."""
     if points.colors is None or theirs.colors is None:
         return np.ones(len(points.depth), bool)
     apart = np.abs(points.colors.astype(np.float32) - theirs.colors[row, column])

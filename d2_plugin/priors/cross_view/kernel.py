@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.compiler import NoCompiler, load_library
 from d2_plugin.priors.cross_view import ask
 from d2_plugin.priors.geometry import CONTINUOUS, view_pair
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.recording import Camera
 
 SOURCE = Path(__file__).parent / "kernels" / "ask.cpp"
 HEADERS = (Path(__file__).parents[2] / "rasterizer" / "kernels" / "parallel.h",)  # no import: only its header is shared

@@ -3,7 +3,7 @@
     FOLDER/CAMERA/FRAME.npy      [H, W], 0..1
     FOLDER/CAMERA/FRAME.png      16 bits, one channel, 65535 stands for 1
 
-A confidence c says how errors are spread over a picture, not how large they are: the declared sigma is divided by c, so
+A confidence c says how errors are spread over an image, not how large they are: the declared sigma is divided by c, so
 a pixel at .5 may be twice as wrong as one at 1, and one at 0 is no depth at all. Where there is no map, c is 1.
 """
 
@@ -14,15 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.files import FrameFiles, numbered_files
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.disk.stored import SUFFIXES, at_picture_size, stored_numbers
+from d2_plugin.priors.disk.stored import SUFFIXES, at_image_size, stored_numbers
+from d2_plugin.recordings.files import FrameFiles, numbered_files
+from d2_plugin.recordings.recording import Camera
 
 FULL = 65535
 """What a 16-bit number is divided by."""
 OF_DEPTH, OF_MONO = "depth_confidence", "mono_confidence"
-"""Folders beside the pictures: of geometric depth on disk, and of monocular maps."""
+"""Folders beside the images: of geometric depth on disk, and of monocular maps."""
 
 
 class ConfidenceMaps:
@@ -34,9 +34,9 @@ class ConfidenceMaps:
         }
 
     @classmethod
-    def beside(cls, capture_folder: Path | None, name: str, cameras: Sequence[str]) -> ConfidenceMaps:
-        """Those in the folder `name` of a capture, none where the capture lies on no disk."""
-        return cls(capture_folder / name, cameras) if capture_folder is not None else cls(Path(), ())
+    def beside(cls, recording_folder: Path | None, name: str, cameras: Sequence[str]) -> ConfidenceMaps:
+        """Those in the folder `name` of a recording, none where the recording lies on no disk."""
+        return cls(recording_folder / name, cameras) if recording_folder is not None else cls(Path(), ())
 
     def of(self, camera: Camera, frame: int) -> np.ndarray | None:
         """Confidence float32 [H, W] in 0..1 at the camera's size, or None: no map, which is 1 everywhere.
@@ -51,7 +51,7 @@ class ConfidenceMaps:
         values = stored / np.float32(FULL) if path.suffix == ".png" else stored
         if not ((values >= 0) & (values <= 1)).all():
             raise D2Error(f"{path} has values from {values.min():g} to {values.max():g}: a confidence is in 0..1")
-        return at_picture_size(values, camera, path)
+        return at_image_size(values, camera, path)
 
 
 def divided(sigma: np.ndarray, confidence: np.ndarray | None) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Maps of numbers that lie beside the pictures, as .npy or 16-bit .png, brought to the picture's size."""
+"""Maps of numbers that lie beside the images, as .npy or 16-bit .png, brought to the image's size."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 
 from d2_plugin.arrays import read_array
-from d2_plugin.captures.capture import Camera
-from d2_plugin.captures.pictures import read_numbers, shrink_depth
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import viewing_rays
+from d2_plugin.recordings.images import read_numbers, shrink_depth
+from d2_plugin.recordings.recording import Camera
 
 SUFFIXES = (".npy", ".png")
 """Of the files that are read."""
 
 ASPECT = 0.01
-"""Sensor and picture may differ by this share in their ratio of width to height: a pixel or two of rounding."""
+"""Sensor and image may differ by this share in their ratio of width to height: a pixel or two of rounding."""
 
 
 def stored_numbers(path: Path) -> np.ndarray:
@@ -35,8 +35,8 @@ def stored_numbers(path: Path) -> np.ndarray:
     return values
 
 
-def at_picture_size(depth: np.ndarray, camera: Camera, path: Path) -> np.ndarray:
-    """The map at the camera's size: blocks where the picture was made smaller by a whole number, else nearest pixels.
+def at_image_size(depth: np.ndarray, camera: Camera, path: Path) -> np.ndarray:
+    """The map at the camera's size: blocks where the image was made smaller by a whole number, else nearest pixels.
 
     Nearest on purpose: a depth interpolated across an edge belongs to no surface.
     """
@@ -46,8 +46,8 @@ def at_picture_size(depth: np.ndarray, camera: Camera, path: Path) -> np.ndarray
         return shrink_depth(depth, factor) if factor > 1 else depth.astype(np.float32)
     if abs(width * camera.height / (height * camera.width) - 1) > ASPECT:
         raise D2Error(
-            f"{path} is {width}x{height} but its picture {camera.width}x{camera.height}: register the depth map to the "
-            "picture of its camera first"
+            f"{path} is {width}x{height} but its image {camera.width}x{camera.height}: register the depth map to the "
+            "image of its camera first"
         )
     rows = ((np.arange(camera.height) + 0.5) * (height / camera.height)).astype(np.int64)
     columns = ((np.arange(camera.width) + 0.5) * (width / camera.width)).astype(np.int64)

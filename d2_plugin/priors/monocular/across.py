@@ -1,7 +1,7 @@
 """Slopes of maps whose anchors cannot tell them, from what two cameras' maps must share; an addition to the paper.
 
 Where cameras stand far apart stereo may know one tree and nothing else. Such anchors fix the depth at one value of the
-map and leave the slope of its line open: drawn on to the rest of the picture it may be wrong by any factor. But the
+map and leave the slope of its line open: drawn on to the rest of the image it may be wrong by any factor. But the
 ground and the walls that two maps show are one surface, and with the wrong slopes they part. So the slopes are those
 with which most pixels of one map, seen by the other camera, lie where its map says:
 
@@ -25,11 +25,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera, MonoKind
 from d2_plugin.priors.geometry import view_pair
 from d2_plugin.priors.monocular.align import Alignment, AlignStatus, predicted
 from d2_plugin.priors.monocular.native.order import quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
+from d2_plugin.recordings.recording import Camera, MonoKind
 
 SPAN = 0.15
 """Anchors whose values span a smaller share of the map's cannot tell its slope."""
@@ -45,7 +45,7 @@ LEAST_REACH = 0.05
 SAMPLES = 5000
 """Pixels of each map that are asked."""
 SPREAD = 0.07
-"""s: how far two maps that belong to their pictures differ, in log depth."""
+"""s: how far two maps that belong to their images differ, in log depth."""
 MATCHED = 0.35
 """Mean of exp(-r^2 / 2 s^2) over the pixels that another camera sees, below which the maps show no common surface."""
 SEEN = 0.05
@@ -254,9 +254,7 @@ def _apart(ours: _Map, theirs: _Map, line: _Line, their_lines: Sequence[_Line]) 
     return np.log(at.z[inside][told] / theirs.depth(there[told].astype(np.float64), their_lines))
 
 
-def _through(
-    alignment: Alignment, view: Shown, line: _Line, kind: MonoKind, settings: AlignSettings
-) -> Alignment:
+def _through(alignment: Alignment, view: Shown, line: _Line, kind: MonoKind, settings: AlignSettings) -> Alignment:
     """The view's own fit with another line."""
     anchors = predicted(view.mono) & (view.geometric > 0)
     turned = line.scale * view.mono[anchors].astype(np.float64) + line.shift

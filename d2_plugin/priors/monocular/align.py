@@ -15,13 +15,13 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from d2_plugin.captures.capture import MonoKind
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.monocular.affine import AffineFit, fit_affine
 from d2_plugin.priors.monocular.leverage import near_best_line
 from d2_plugin.priors.monocular.native import library, pixels
 from d2_plugin.priors.monocular.native.order import median, quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
+from d2_plugin.recordings.recording import MonoKind
 
 KINDS: tuple[MonoKind, ...] = get_args(MonoKind)
 RANKED = 4000  # anchors whose ranks are compared: its standard error is .016, and sorting stays below a millisecond
@@ -266,7 +266,7 @@ def _judge(fit: AffineFit, correlation: float, t: float, inliers: float, setting
 
 
 def _subsample(count: int, limit: int, seed: int) -> np.ndarray | slice:
-    """One row from each of `limit` equal strata: even over the picture, without the aliasing of a fixed stride."""
+    """One row from each of `limit` equal strata: even over the image, without the aliasing of a fixed stride."""
     if count <= limit:
         return slice(None)
     jitter = np.random.default_rng(seed).random(limit)

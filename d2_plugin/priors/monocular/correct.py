@@ -1,13 +1,13 @@
 """Local correction of aligned monocular depth by the geometric depths around it; an addition to the paper.
 
-One scale and one shift per picture cannot undo what a network bends: walls, people and tables are each off by their own
+One scale and one shift per image cannot undo what a network bends: walls, people and tables are each off by their own
 few per cent. The logarithm of D^g / D-bar^m at the anchors shows that bend. It is averaged robustly over windows from
 coarse to fine, each correcting what the coarser ones left, and fades to none where no anchor is near. An anchor that
 disagrees with the many around it is outvoted there, so verification by the corrected map is sharper, not weaker.
 
 Measured:
 
-| capture | quantity | before | after |
+| recording | quantity | before | after |
 |---|---|---|---|
 | studio (emulated maps, 4 training views, 5 frames) | median error of mono-only pixels | .0425 | .027 |
 | | verified pixels | 31.6 % | 33.8 % |
@@ -27,7 +27,7 @@ from d2_plugin.priors.monocular.native import library
 from d2_plugin.priors.monocular.native.field import smooth_fields
 from d2_plugin.priors.monocular.settings import AlignSettings
 
-GRID = 80  # cells across the picture: twice as many change the median error by less than .0002 and take 8 times longer
+GRID = 80  # cells across the image: twice as many change the median error by less than .0002 and take 8 times longer
 OUTLIER = 0.03  # of log depth: an anchor this far from the average of its window has 0.7 of its weight
 ROUNDS = 2  # of reweighting; two more change no digit that is reported
 

@@ -13,7 +13,7 @@ from d2_plugin.priors.monocular.native.order import median
 FLOOR, DISTANCE, GAP, EDGE, WIDE_EDGE, BEYOND = 0.051, 1.19, 0.79, 2.76, 0.16, 0.086
 """f0 and fd (of d itself) to fr; fitted once to the true errors of studio, plaza and a rendered room together."""
 NEXT = 0.003
-"""How far the next anchor lies where a pixel's own is left out, picture widths."""
+"""How far the next anchor lies where a pixel's own is left out, image widths."""
 EVER = 1e3
 """Beyond any logarithm of a float32 depth: neutral in a minimum or, negated, in a maximum."""
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from d2_plugin.captures.capture import MonoKind
 from d2_plugin.priors.monocular.align import unjudged_line
 from d2_plugin.priors.monocular.native.order import median, quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
+from d2_plugin.recordings.recording import MonoKind
 
 THIRD = 1 / 3
 """Share of the anchors that are left out, the nearest or the farthest. Measured on plaza with the cameras 03 and 04, of

@@ -1,7 +1,7 @@
 """Sky and whatever else lies beyond any parallax; an addition to the paper.
 
 No one thing tells a sky. Four together do: the monocular map puts it beyond the farthest depth that stereo measured,
-near the smallest value it has in the picture; no stereo depth lies in it; the picture is smooth there; and it reaches
+near the smallest value it has in the image; no stereo depth lies in it; the image is smooth there; and it reaches
 the rim. From pixels where the first holds clearly, the region grows to the outline that blurred maps give to it, as far
 as the colour is that of the sky beside it.
 """
@@ -24,9 +24,9 @@ SMOOTH = 0.04
 COLOR = 0.06
 """Largest distance of a colour (RGB, 0..1) from the mean sky around it."""
 LEAST = 0.005
-"""Smallest share of the picture that a sky has."""
+"""Smallest share of the image that a sky has."""
 AROUND = 0.04
-"""Reach of "around", picture widths."""
+"""Reach of "around", image widths."""
 
 
 def far_pixels(inverse: np.ndarray, geometric: np.ndarray, image: np.ndarray) -> np.ndarray:
@@ -61,7 +61,7 @@ def far_pixels(inverse: np.ndarray, geometric: np.ndarray, image: np.ndarray) ->
 
 
 def _large(cv2: Any, mask: np.ndarray, rim: bool) -> np.ndarray:
-    """The connected pieces that are large enough and reach the rim of the picture."""
+    """The connected pieces that are large enough and reach the rim of the image."""
     _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     left, top, width, height, area = stats.T
     at_rim = (left == 0) | (top == 0) | (left + width == mask.shape[1]) | (top + height == mask.shape[0])

@@ -1,10 +1,10 @@
-"""The lines of neighbouring frames fitted together: where the picture did not change, aligned maps must agree.
+"""The lines of neighbouring frames fitted together: where the image did not change, aligned maps must agree.
 
     minimise over a_f, b_f:   sum_f sum_i rho(w_fi (a_f x_fi + b_f - y_fi))                      anchors of each frame
                   + sum_(f, g) sum_j rho(w_j (a_f x_fj + b_f - a_g x_gj - b_g))                  static pixels of a pair
 
 with rho(r) = sqrt(r^2 + eps^2) - eps as in `affine`. A camera that stands still sees the same depth at the pixels of
-the second sum, all over the picture, where stereo may know little: so anchors of every frame tell the line of each.
+the second sum, all over the image, where stereo may know little: so anchors of every frame tell the line of each.
 All residuals are linear in the lines, so F is convex. Written r = A theta - t over both sums, every u with |u_i| <= 1
 and A^T u = 0 certifies
 

@@ -1,4 +1,4 @@
-"""Where monocular maps come from: a network, whose predictions are cached, or maps that lie beside the pictures."""
+"""Where monocular maps come from: a network, whose predictions are cached, or maps that lie beside the images."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Protocol
 
 import numpy as np
 
-from d2_plugin.captures.capture import Capture, MonoKind
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.files import EntryFolder
 from d2_plugin.priors.frame import Frame, digest, hash_of
 from d2_plugin.priors.monocular.network import MonocularModel, upsample
 from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.recordings.recording import MonoKind, Recording
+from d2_plugin.store.files import EntryFolder
 
 MONO_VERSION = 1  # raise it when prediction changes what it returns, so that caches are not trusted
 
@@ -27,24 +27,24 @@ class MonoSource(Protocol):
         """Hash of everything the map depends on."""
 
     def map(self, camera: str, frame: Frame) -> np.ndarray | None:
-        """The map float32 [H, W] at the picture's size, or None where there is none."""
+        """The map float32 [H, W] at the image's size, or None where there is none."""
 
 
 class MapsOnDisk:
-    """Monocular maps that lie beside the pictures of a capture; `kind` says what they are."""
+    """Monocular maps that lie beside the images of a recording; `kind` says what they are."""
 
-    def __init__(self, capture: Capture, kind: MonoKind) -> None:
-        self.capture, self.kind = capture, kind
-        self.about = f"{kind} maps on disk" + (" (emulated)" if capture.mono_emulated else "")
+    def __init__(self, recording: Recording, kind: MonoKind) -> None:
+        self.recording, self.kind = recording, kind
+        self.about = f"{kind} maps on disk" + (" (emulated)" if recording.mono_emulated else "")
 
     def key(self, camera: str, frame: Frame) -> str:
         """Hash of the map itself."""
-        stored = self.capture.mono(camera, frame.number)
+        stored = self.recording.mono(camera, frame.number)
         return "none" if stored is None else digest(stored)
 
     def map(self, camera: str, frame: Frame) -> np.ndarray | None:
-        """The stored map, enlarged to the picture."""
-        stored = self.capture.mono(camera, frame.number)
+        """The stored map, enlarged to the image."""
+        stored = self.recording.mono(camera, frame.number)
         return None if stored is None else upsample(stored, *frame.images[camera].shape[:2])
 
 
@@ -57,7 +57,7 @@ class MapsFromNetwork:
         self._fingerprint = model.fingerprint()
 
     def key(self, camera: str, frame: Frame) -> str:
-        """Hash of network and picture."""
+        """Hash of network and image."""
         return hash_of(MONO_VERSION, self._fingerprint, frame.hashes[camera])
 
     def map(self, camera: str, frame: Frame) -> np.ndarray:
@@ -72,14 +72,14 @@ class MapsFromNetwork:
         return upsample(prediction, *frame.images[camera].shape[:2])
 
 
-def mono_source(capture: Capture, settings: PriorSettings, cache: Path) -> MonoSource | None:
-    """The monocular source that settings and capture name, or None where there is none.
+def mono_source(recording: Recording, settings: PriorSettings, cache: Path) -> MonoSource | None:
+    """The monocular source that settings and recording name, or None where there is none.
 
     Raises:
-        D2Error: a network without a declared kind, a declared kind that contradicts the capture's, or relative maps
+        D2Error: a network without a declared kind, a declared kind that contradicts the recording's, or relative maps
             along the ray.
     """
-    source = _named_source(capture, settings, cache)
+    source = _named_source(recording, settings, cache)
     if source is not None and source.kind == "relative" and settings.mono_along == "ray":
         raise D2Error(
             "mono_along = ray needs metric maps but these are relative, whose shift is that of planar inverse depth: "
@@ -88,7 +88,7 @@ def mono_source(capture: Capture, settings: PriorSettings, cache: Path) -> MonoS
     return source
 
 
-def _named_source(capture: Capture, settings: PriorSettings, cache: Path) -> MonoSource | None:
+def _named_source(recording: Recording, settings: PriorSettings, cache: Path) -> MonoSource | None:
     if settings.mono_onnx:
         if settings.mono_kind is None:
             raise D2Error(
@@ -99,11 +99,11 @@ def _named_source(capture: Capture, settings: PriorSettings, cache: Path) -> Mon
             settings.mono_onnx, settings.mono_kind, settings.mono_preprocessing, settings.mono_threads
         )
         return MapsFromNetwork(model, cache)
-    if capture.mono_kind is None:
+    if recording.mono_kind is None:
         return None
-    if settings.mono_kind not in (None, capture.mono_kind):
+    if settings.mono_kind not in (None, recording.mono_kind):
         raise D2Error(
-            f"mono_kind = {settings.mono_kind} but the maps of {capture.name} are declared {capture.mono_kind}: "
+            f"mono_kind = {settings.mono_kind} but the maps of {recording.name} are declared {recording.mono_kind}: "
             "leave mono_kind out, or correct cameras.json"
         )
-    return MapsOnDisk(capture, capture.mono_kind)
+    return MapsOnDisk(recording, recording.mono_kind)

@@ -16,12 +16,12 @@ from typing import Any, get_args
 
 import numpy as np
 
-from d2_plugin.captures.capture import MonoKind
 from d2_plugin.errors import D2Error, missing_extra, unknown_name
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.monocular.align import KINDS
 from d2_plugin.priors.settings import Preprocessing
 from d2_plugin.reading import parsing, said
+from d2_plugin.recordings.recording import MonoKind
 from d2_plugin.values import shown
 
 PREPROCESSINGS: tuple[Preprocessing, ...] = get_args(Preprocessing)
@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class NetworkInput:
-    """What the session says about its picture input; `height` or `width` is None where the size is free."""
+    """What the session says about its image input; `height` or `width` is None where the size is free."""
 
     name: str
     height: int | None
@@ -52,17 +52,17 @@ class NetworkInput:
         """
         inputs = session.get_inputs()
         if len(inputs) != 1:
-            raise D2Error(f"{path} has {len(inputs)} inputs: export a network with one picture input [1, 3, H, W]")
+            raise D2Error(f"{path} has {len(inputs)} inputs: export a network with one image input [1, 3, H, W]")
         shape, dtypes = inputs[0].shape, {"tensor(float)": np.float32, "tensor(float16)": np.float16}
         if len(shape) != 4 or (shape[1] not in (3, None) and isinstance(shape[1], int)):
             raise D2Error(f"{path} takes {shown(shape)}: export a network whose input is [1, 3, H, W]")
         if isinstance(shape[0], int) and shape[0] > 1:
-            raise D2Error(f"{path} takes {shape[0]} pictures at once: export it with a batch of 1, or of free size")
+            raise D2Error(f"{path} takes {shape[0]} images at once: export it with a batch of 1, or of free size")
         if inputs[0].type not in dtypes:
             raise D2Error(f"{path} takes {inputs[0].type}: export a network that takes float32 or float16")
         if max((size for size in shape[2:] if isinstance(size, int)), default=0) > LARGEST_INPUT:
             raise D2Error(
-                f"{path} takes pictures of {shape[3]}x{shape[2]}, expected at most {LARGEST_INPUT} a side: export it "
+                f"{path} takes images of {shape[3]}x{shape[2]}, expected at most {LARGEST_INPUT} a side: export it "
                 "for a smaller input, or a free one"
             )
         height, width = (size if isinstance(size, int) and size > 0 else None for size in shape[2:])
@@ -70,7 +70,7 @@ class NetworkInput:
 
 
 class MonocularModel:
-    """A monocular depth network; call it with a picture.
+    """A monocular depth network; call it with an image.
 
     Args:
         path: the ONNX file.
@@ -79,7 +79,7 @@ class MonocularModel:
         threads: of one inference; one per worker process is fastest for frames that are independent.
 
     Raises:
-        D2Error: no such file, no ONNX network, an input that is no picture, or an unknown kind.
+        D2Error: no such file, no ONNX network, an input that is no image, or an unknown kind.
         MissingExtra: onnxruntime is not installed.
     """
 
@@ -98,14 +98,14 @@ class MonocularModel:
         logger.info("%s: %s, preprocessing %s", self.path.name, self.provider, self.preprocessing)
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """The prediction for an RGB uint8 picture [H, W, 3], float32 [H, W] at its size."""
+        """The prediction for an RGB uint8 image [H, W, 3], float32 [H, W] at its size."""
         return upsample(self.predict(image), *image.shape[:2])
 
     def predict(self, image: np.ndarray) -> np.ndarray:
         """The prediction float32 [h, w] at the size the network returns."""
         tensor = self.prepare(image)
         height, width = tensor.shape[2:]
-        with parsing(f"what {self.path} makes of a picture of {width}x{height}", "export the network for this size"):
+        with parsing(f"what {self.path} makes of an image of {width}x{height}", "export the network for this size"):
             output = np.asarray(self.session.run(None, {self.input.name: tensor})[0], np.float32)
         prediction = np.squeeze(output, axis=tuple(axis for axis in range(output.ndim - 2) if output.shape[axis] == 1))
         if prediction.ndim != 2 or min(prediction.shape) < 2:
@@ -113,7 +113,7 @@ class MonocularModel:
         return prediction
 
     def prepare(self, image: np.ndarray) -> np.ndarray:
-        """The network's input [1, 3, h, w] for an RGB uint8 picture."""
+        """The network's input [1, 3, h, w] for an RGB uint8 image."""
         cv2 = opencv("monocular depth")
         height, width = self.input_size(*image.shape[:2])
         unit = image.astype(np.float32) / 255
@@ -125,7 +125,7 @@ class MonocularModel:
         return np.ascontiguousarray(unit.transpose(2, 0, 1)[None], dtype=self.input.dtype)
 
     def input_size(self, height: int, width: int) -> tuple[int, int]:
-        """Height and width that a picture of this size is resized to: the network's own, or 518 on the short side."""
+        """Height and width that an image of this size is resized to: the network's own, or 518 on the short side."""
         if self.input.height and self.input.width:
             return self.input.height, self.input.width
         enlarge = SHORT_SIDE / min(height, width)
@@ -133,13 +133,13 @@ class MonocularModel:
         columns = self.input.width or _multiple_of_patch(width * enlarge)
         if max(rows, columns) > LARGEST_INPUT:
             raise D2Error(
-                f"a picture of {width}x{height} would enter {self.path} as {columns}x{rows}, at most {LARGEST_INPUT} a "
-                "side: give a network of fixed size, or pictures that are less long"
+                f"an image of {width}x{height} would enter {self.path} as {columns}x{rows}, at most {LARGEST_INPUT} a "
+                "side: give a network of fixed size, or images that are less long"
             )
         return rows, columns
 
     def fingerprint(self) -> str:
-        """What the prediction depends on besides the picture: files, provider and preprocessing."""
+        """What the prediction depends on besides the image: files, provider and preprocessing."""
         digest = hashlib.sha256()
         for path in (self.path, *external_weights(self.path)):
             with path.open("rb") as file:

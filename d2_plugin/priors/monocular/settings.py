@@ -41,7 +41,7 @@ class AlignSettings(Settings):
     wrong_kind_correlation: Correlation = -0.3
     """Rank correlation of the map with what it is declared to be; below this the declared kind is contradicted."""
     local_scales: tuple[Positive, ...] = (0.25, 0.12, 0.06, 0.03)
-    """Standard deviations of the windows of the local correction, coarse to fine, in picture widths; none is the paper.
+    """Standard deviations of the windows of the local correction, coarse to fine, in image widths; none is the paper.
     Measured on studio: mono-only error .0425 without, .027 with; see `d2_plugin.priors.monocular.correct`."""
     local_prior: Positive = 0.05
     """Weight of "no correction": a window in which this share of the pixels is known is corrected by half."""
@@ -53,8 +53,8 @@ class AlignSettings(Settings):
     20 to 60 % wrong anchors the error of the line is .001 to .003 with, .007 to .16 without, in the same time. Off,
     because filtered anchors are wrong at 1 % (studio) and the guard has not been measured on recordings."""
     together: bool = False
-    """Fit the lines of all frames of a block (`stereo.reuse_block`) together: aligned maps must agree where the picture
-    did not change. Off: on studio and plaza errors stay the same and maps are steadier by a hundredth, while pictures
+    """Fit the lines of all frames of a block (`stereo.reuse_block`) together: aligned maps must agree where the image
+    did not change. Off: on studio and plaza errors stay the same and maps are steadier by a hundredth, while images
     are read twice; docs/priors.md, "Alignment", has the figures."""
     across: bool = True
     """Where the anchors of a map span too little of it to tell a slope, take the slope with which it shows the same

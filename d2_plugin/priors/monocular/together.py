@@ -13,20 +13,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.capture import MonoKind
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.monocular.align import Alignment, align, predicted
 from d2_plugin.priors.monocular.joint import Anchors, Tie, fit_joint
 from d2_plugin.priors.monocular.settings import AlignSettings
+from d2_plugin.recordings.recording import MonoKind
 
 ANCHORS, STATIC = 2000, 5000
-"""Anchors per frame and static pixels per pair of frames that are used; all lie evenly over the picture."""
+"""Anchors per frame and static pixels per pair of frames that are used; all lie evenly over the image."""
 GROUPS = 50
 """Static pixels are averaged in so many groups of like predictions: noise of the maps makes lines that must agree
 flatter, and its mean does not."""
 
 Changed = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""(grey picture, the one before) -> pixels whose neighbourhood changed, bool [H, W]."""
+"""(grey image, the one before) -> pixels whose neighbourhood changed, bool [H, W]."""
 
 
 class Seen(NamedTuple):
@@ -85,7 +85,7 @@ def _anchors(frame: Seen, kind: MonoKind, settings: AlignSettings) -> Anchors:
 
 
 def _tie(place: int, first: Seen, second: Seen, weight: float, changed: Changed) -> Tie:
-    """What two frames share: pixels around which the picture did not change."""
+    """What two frames share: pixels around which the image did not change."""
     cv2 = opencv("aligning frames together")
     before, after = (cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY) for frame in (first, second))
     still = ~changed(after, before) & predicted(first.mono) & predicted(second.mono)

@@ -4,11 +4,11 @@ The residual at an anchor says nothing: the anchor shaped the map that it is com
 left out of the local correction, and the corrected map is held against them. Their errors follow one shape in every
 recording measured: they grow with the distance to the nearest anchor, with how far the depth lies from that anchor's
 (the map extrapolates), and at the edges of the map. How large they are differs from network to network and from
-picture to picture; that one number, the scale, is measured in each picture.
+image to image; that one number, the scale, is measured in each image.
 
     sigma^2 = (K scale)^2 (f0^2 + fd^2 d + (fg g)^2 + (fe e)^2 + (fw e')^2 + (fr r)^2) + S(D)^2
 
-with d the distance to the nearest anchor (picture widths), g = |log(D / D of that anchor)|, e and e' the span of log D
+with d the distance to the nearest anchor (image widths), g = |log(D / D of that anchor)|, e and e' the span of log D
 within 0.5 % and 2 % of the width, r = log(D / median anchor) where it is positive, and S how far the line may be off
 beyond the depths of the anchors (`extrapolation`). A pixel without an anchor is harder than an anchor that was left out
 (no texture, an edge, seen once): K = 1.25; on recordings with truth 1.3 left a room too cautious.
@@ -27,7 +27,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.capture import MonoKind
 from d2_plugin.priors.disk.confidence import divided
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.monocular.correct import corrected_depth, corrected_without
@@ -35,19 +34,20 @@ from d2_plugin.priors.monocular.error_shape import ErrorShape
 from d2_plugin.priors.monocular.extrapolation import extrapolation_error
 from d2_plugin.priors.monocular.native.order import median, quantile
 from d2_plugin.priors.settings import AlignSettings
+from d2_plugin.recordings.recording import MonoKind
 
 HARDER = 1.25
 """K of a pixel without an anchor."""
 AT_ANCHORS = 1.25
 """K of a pixel that is compared with its anchor."""
 WIDTH = 160
-"""Columns of the picture at which all this is computed: its terms are in picture widths."""
+"""Columns of the image at which all this is computed: its terms are in image widths."""
 PATTERNS, REGIONS = 6, 4
 """How often regions are left out, and how many at a time."""
 COMPARED = 3
 """Patterns in which the map is also compared with no network at all."""
 SMALLEST, LARGEST = 0.05, 0.6
-"""Sides of the regions, picture widths; drawn evenly in their logarithm."""
+"""Sides of the regions, image widths; drawn evenly in their logarithm."""
 NIL = 0.8
 """A map whose errors are larger than a constant one's by this factor adds nothing. Measured: noise .3 to .5, constant
 maps 1, a right map of a narrow pair (where anchors are dense and a constant bends as well) .9 to 2.8, others above."""
@@ -58,7 +58,7 @@ USUAL, EVIDENCE = 0.12, 3000
 by, and do not make a map surer than usual. Measured on plaza, two views, 400 anchors: scale .03 where .1 is true; 2600
 anchors of another pair there: .065 where .1 is true."""
 IN_TAIL, USUAL_TAIL = 0.98, 3.0
-"""A quantile far out, and where it lies in maps that belong to their pictures, in units of the scale (2.33 if errors
+"""A quantile far out, and where it lies in maps that belong to their images, in units of the scale (2.33 if errors
 were normal). Measured in these units: 2.3 to 2.9, once 3.4; PyDNet, or the maps of another camera, 5 to 6. There errors
 away from anchors are 2.5 to 6 times what the scale alone declares, and 3 to 6 % of right stereo would be vetoed."""
 HOPELESS = 0.5
@@ -182,7 +182,7 @@ def _scale(ratios: np.ndarray, anchors: int) -> float:
 
 @functools.cache
 def left_out_regions(shape: tuple[int, int]) -> np.ndarray:
-    """Masks [patterns, H, W] of squares, the same for every picture of that size."""
+    """Masks [patterns, H, W] of squares, the same for every image of that size."""
     height, width = shape
     random = np.random.default_rng(0)
     holes = np.zeros((PATTERNS, *shape), bool)

@@ -9,11 +9,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
-from d2_plugin.priors.files import Entry, EntryFolder
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
-from d2_plugin.priors.store import SIGMA, DepthRange, encode_sigma
+from d2_plugin.recordings.recording import Camera
+from d2_plugin.store.files import Entry, EntryFolder
+from d2_plugin.store.store import SIGMA, DepthRange, encode_sigma
 
 STEREO_DTYPE = np.dtype([("depth", "<u2"), ("sigma", "u1")])
 """Geometric depth as it is stored, pixel by pixel."""

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import check_depth_range, scaled_camera, view_pair, viewing_rays
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.recording import Camera
 
 FEWEST = 100
 """Points that a camera must see for their depths to bound its scene. plaza from two cameras 64 degrees apart has 15, on

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.colmap import mvs
 from d2_plugin.priors.extras import opencv
@@ -20,6 +19,7 @@ from d2_plugin.priors.stereo.patchmatch_kernel import compiles as patchmatch_com
 from d2_plugin.priors.stereo.reuse import MatchMemory, widened
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.priors.stereo.sweep import sweep
+from d2_plugin.recordings.recording import Camera
 
 RawDepth = tuple[np.ndarray, np.ndarray]
 """Planar depth float32 [H, W] (0 = none) and matching cost 1 - NCC float32 [H, W] in 0..2."""
@@ -30,15 +30,15 @@ Matcher = Callable[..., list[RawDepth]]
 `wanted` is None or bool [H, W] per camera: a matcher may leave out all other pixels, and should where that saves time.
 """
 
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601, as every codec of the captures uses
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601, as every codec of the recordings uses
 
 MATCHERS: dict[str, Matcher] = {"patchmatch": patchmatch, "sweep": sweep, "colmap": mvs.colmap_patch_match}
 """Matchers by their name in the settings."""
 
 ON_DISK = ("sensor", "workspace")
-"""What the setting `matcher` may name besides: depth beside a capture (`d2_plugin.priors.depth_on_disk`)."""
+"""What the setting `matcher` may name besides: depth beside a recording (`d2_plugin.priors.depth_on_disk`)."""
 
-WHOLE_PICTURES = ("colmap",)
+WHOLE_IMAGES = ("colmap",)
 """Matchers that match every pixel whatever is wanted: carrying matches over would only make them older."""
 
 
@@ -58,14 +58,14 @@ def geometric_depth(
         depth_range: near and far in world units; ten times too wide does no harm.
         settings: matching and filtering.
         matcher: name in `MATCHERS` or `auto`; settings.matcher where None.
-        memory: matches of the frames before, which are carried over where the pictures did not change, and which this
+        memory: matches of the frames before, which are carried over where the images did not change, and which this
             frame's are added to.
 
     Returns:
         Per camera the filtered depth; empty everywhere where nothing can be known (no texture, one centre).
 
     Raises:
-        D2Error: fewer than two views, pictures of another size than their camera, an inverted range, an unknown
+        D2Error: fewer than two views, images of another size than their camera, an inverted range, an unknown
             matcher.
     """
     check_views(images, cameras)
@@ -89,7 +89,7 @@ def choose_matcher(name: str) -> str:
         D2Error: an unknown name, or one that stands for depth on disk.
     """
     if name in ON_DISK:
-        raise D2Error(f"matcher = {name} reads depth that lies beside a capture: build the priors of that capture")
+        raise D2Error(f"matcher = {name} reads depth that lies beside a recording: build the priors of that recording")
     if name != "auto":
         if name not in MATCHERS:
             raise unknown_name("stereo matcher", name, [*MATCHERS, *ON_DISK, "auto"])
@@ -100,12 +100,12 @@ def choose_matcher(name: str) -> str:
 
 
 def gray(image: np.ndarray) -> np.ndarray:
-    """Luma uint8 [H, W] of an RGB uint8 picture [H, W, 3]."""
+    """Luma uint8 [H, W] of an RGB uint8 image [H, W, 3]."""
     return np.rint(image.astype(np.float32) @ LUMA).astype(np.uint8)
 
 
 def _shrunk(gray: np.ndarray, camera: Camera, max_pixels: int) -> tuple[np.ndarray, Camera]:
-    """Picture and camera at the largest of full, half, a third, ... of the size that has at most `max_pixels`."""
+    """Image and camera at the largest of full, half, a third, ... of the size that has at most `max_pixels`."""
     divisor = math.ceil(math.sqrt(gray.size / max(max_pixels, 1)))
     if divisor <= 1:
         return gray, camera

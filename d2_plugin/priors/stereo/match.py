@@ -1,6 +1,6 @@
 """Geometric depth of a recording by matching, frame after frame: what did not change is carried over (`reuse`).
 
-Frames come in blocks within which matches of static pixels are carried over, so a frame depends on the pictures before
+Frames come in blocks within which matches of static pixels are carried over, so a frame depends on the images before
 it in its block and on no other.
 """
 
@@ -11,13 +11,13 @@ from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.frame import Frame, describe_camera, hash_of
 from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
-from d2_plugin.priors.stereo.geometric_depth import WHOLE_PICTURES, choose_matcher, geometric_depth
+from d2_plugin.priors.stereo.geometric_depth import WHOLE_IMAGES, choose_matcher, geometric_depth
 from d2_plugin.priors.stereo.reuse import MatchMemory
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.recording import Camera
 
 MATCH_VERSION = 7  # raise it when matchers or filter change what they return, so that caches are not trusted
 
@@ -31,7 +31,7 @@ class MatchedDepth:
         settings: matching, filtering, carrying over.
         folder: where the matches of unfinished blocks are kept, so that a build that is killed goes on with them.
         frames: all frame numbers of the build, ascending.
-        read: reads the pictures of one frame.
+        read: reads the images of one frame.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class MatchedDepth:
         read: Callable[[int], Frame],
     ) -> None:
         self.matcher = choose_matcher(settings.matcher)
-        if self.matcher in WHOLE_PICTURES:
+        if self.matcher in WHOLE_IMAGES:
             settings = replace(settings, reuse_static=False)
         self.cameras, self.bounds, self.settings = list(cameras), bounds, settings
         self.folder, self.read = folder, read
@@ -59,7 +59,7 @@ class MatchedDepth:
         return self._memory.matched_share if self.settings.reuse_static else 1.0
 
     def key(self, frame: Frame) -> str:
-        """Hash of pictures, cameras, range and settings: of all views, since each depends on all."""
+        """Hash of images, cameras, range and settings: of all views, since each depends on all."""
         if frame.number not in self._keys:
             before = self._before.get(frame.number)
             if before is not None and before not in self._keys:

@@ -1,6 +1,6 @@
 """PatchMatch multi-view stereo on the GPU or the CPU, compiled at first use: the same planes on both.
 
-Each pixel carries a plane, linear in inverse depth over the picture, and keeps the best of what it draws at random and
+Each pixel carries a plane, linear in inverse depth over the image, and keeps the best of what it draws at random and
 of what its neighbours found (`kernels/spread.h`). Resolution doubles from level to level, and planes are carried
 over exactly. In the end each plane has fitted the noise of its own window; averaging those that agree takes that out.
 Coordinates are array indices, as in `d2_plugin.priors.geometry`.
@@ -12,7 +12,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import check_depth_range, check_views
 from d2_plugin.priors.stereo.gpu import kernel as gpu
@@ -20,6 +19,7 @@ from d2_plugin.priors.stereo.patchmatch_kernel import PatchMatchKernel
 from d2_plugin.priors.stereo.pyramid import LevelView, at_resolution, levels, plane_depth
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.priors.stereo.source_views import choose_sources
+from d2_plugin.recordings.recording import Camera
 
 GEOMETRIC_SWEEPS = 1
 """Red-black sweeps of one geometric round. Measured: a second one changes mean F at 1 % by less than .001."""
@@ -48,7 +48,7 @@ def patchmatch(
         that no other one meets at an angle has no depth anywhere.
 
     Raises:
-        D2Error: fewer than two views, a picture of another size or type, an inverted depth range.
+        D2Error: fewer than two views, an image of another size or type, an inverted depth range.
         NoCompiler: there is neither a GPU nor a C++ compiler; `d2_plugin.priors.stereo.sweep` needs none.
     """
     settings = settings or StereoSettings()
@@ -90,6 +90,6 @@ def _check(grays: Sequence[np.ndarray]) -> None:
     for gray in grays:
         if gray.dtype != np.uint8 or gray.ndim != 2:
             raise D2Error(
-                f"PatchMatch needs grey pictures as uint8 [H, W], got {gray.dtype} with {gray.ndim} dimensions: "
+                f"PatchMatch needs grey images as uint8 [H, W], got {gray.dtype} with {gray.ndim} dimensions: "
                 f"convert them with d2_plugin.priors.stereo.geometric_depth.gray"
             )

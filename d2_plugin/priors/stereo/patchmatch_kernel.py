@@ -11,12 +11,12 @@ import numpy as np
 import torch
 
 from d2_plugin import compiler
-from d2_plugin.captures.capture import Camera
 from d2_plugin.compiler.prebuilt import find as find_prebuilt
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import index_intrinsics, view_pair
 from d2_plugin.priors.stereo.pyramid import NO_MATCH, LevelView
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.recording import Camera
 
 KERNELS = Path(__file__).parent / "kernels"
 FLAGS = ("-fopenmp-simd", "-ffp-contract=off")
@@ -162,7 +162,7 @@ class PatchMatchKernel:
         first = np.cumsum([0, *(source.gray.size for source in chosen)])
         if first[-1] > MOST_PIXELS:
             raise D2Error(
-                f"the pictures that a view is matched with have {first[-1]} pixels together, at most {MOST_PIXELS} are "
+                f"the images that a view is matched with have {first[-1]} pixels together, at most {MOST_PIXELS} are "
                 "possible: lower max_pixels"
             )
         sources = (Source * len(chosen))(*(_source(view, *pair) for pair in zip(chosen, first.tolist())))

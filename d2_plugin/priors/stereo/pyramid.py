@@ -1,4 +1,4 @@
-"""A picture and its planes from coarse to fine: each resolution twice the one before, planes carried over exactly."""
+"""An image and its planes from coarse to fine: each resolution twice the one before, planes carried over exactly."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.geometry import pixel_grid, scaled_camera
+from d2_plugin.recordings.recording import Camera
 
 NO_MATCH = 2.0
 """Worst matching cost; such a pixel has no depth."""
@@ -55,14 +55,14 @@ def at_resolution(
 
 
 def shrunk(gray: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """A grey picture uint8 at a smaller size: each pixel is the mean of those that it touches, rounded half to even."""
+    """A grey image uint8 at a smaller size: each pixel is the mean of those that it touches, rounded half to even."""
     sums, rows = _sums(gray, shape[0])
     sums, columns = _sums(sums.T, shape[1])
     return np.rint(sums.T / rows[:, None] / columns).astype(np.uint8)
 
 
 def _sums(values: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Per row of a picture with `size` rows the sum of those that it touches, and float32 how many there are."""
+    """Per row of an image with `size` rows the sum of those that it touches, and float32 how many there are."""
     number = np.arange(size)
     first, end = number * len(values) // size, -(-(number + 1) * len(values) // size)
     step = len(values) // size
@@ -88,7 +88,7 @@ def _any_within(mask: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def refined_planes(planes: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Planes [h, w, 3] of a coarse picture as planes [H, W, 3] of a finer one: the same planes in space, exactly.
+    """Planes [h, w, 3] of a coarse image as planes [H, W, 3] of a finer one: the same planes in space, exactly.
 
     The centre of fine pixel u is at s (u + 1/2) - 1/2 in coarse indices, s = w / W, so a u' + b v' + c stays linear.
     """

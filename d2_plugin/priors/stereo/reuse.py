@@ -1,4 +1,4 @@
-"""Reuse: matches are carried from frame to frame where the picture did not change.
+"""Reuse: matches are carried from frame to frame where the image did not change.
 
 Matching takes nearly all of the time, and in a room with fixed cameras most pixels look the same from one frame to the
 next. Where a pixel's neighbourhood has not changed since its depth was matched, raw depth and cost are carried over;
@@ -24,14 +24,14 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.files import Entry, read_record, write_entry
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.store.files import Entry, read_record, write_entry
 
 SMOOTHING = 3  # side of the box over which a change is averaged, pixels: noise cancels, moving things do not
 MEMORY_DTYPE = np.dtype([("gray", "u1"), ("depth", "<f4"), ("cost", "<f4")])
 
 Box = tuple[slice, slice]
-"""Rows and columns of a part of a picture."""
+"""Rows and columns of a part of an image."""
 
 
 @dataclass(eq=False)
@@ -85,7 +85,7 @@ class MatchMemory:
 
 
 def changed(gray: np.ndarray, before: np.ndarray, settings: StereoSettings) -> np.ndarray:
-    """Pixels in whose neighbourhood the picture changed, bool [H, W]."""
+    """Pixels in whose neighbourhood the image changed, bool [H, W]."""
     cv2 = opencv("reusing matches of static pixels")
     difference = cv2.blur(gray.astype(np.float32) - before, (SMOOTHING, SMOOTHING))
     return widened(np.abs(difference) > 255 * settings.reuse_change, settings.reuse_radius)

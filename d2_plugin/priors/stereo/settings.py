@@ -29,10 +29,10 @@ class StereoSettings(Settings):
     camera), workspace, colmap, patchmatch and sweep that there is. Measured on eight rigs of 2 to 4 views: F of
     patchmatch is above the sweep's on each, narrow pairs too."""
     folder: str = ""
-    """Where the depth on disk lies, relative to the capture; `{frame}` (as in `mvs/{frame:05d}`) stands for the frame
+    """Where the depth on disk lies, relative to the recording; `{frame}` (as in `mvs/{frame:05d}`) stands for the frame
     number. Where empty: `depth` for `sensor`, `colmap/FRAME`, `colmap` or `dense` for `workspace`."""
     max_pixels: Annotated[int, Range(1, unit="pixels")] = 500_000
-    """Pictures with more pixels are matched at a half, a third, ... of their size; depth comes back at full size.
+    """Images with more pixels are matched at a half, a third, ... of their size; depth comes back at full size.
     Windows of 11 pixels see more of a wall at half size. Measured on n3dv_sear_steak_t0 (1352x1014, 4 views): at half
     size 35 % verified in 14 CPU seconds, in full 28 % in 47, with the same median deviation from SIFT points."""
     patchmatch_device: Literal["auto", "cuda", "cpu"] = "auto"
@@ -65,7 +65,7 @@ class StereoSettings(Settings):
     sweep_guide_radius: Pixels = 4
     """Radius of the guided filter over the sweep's cost slices."""
     sweep_guide_epsilon: Positive = 0.02
-    """Contrast below which the guided filter averages across an edge of the picture, in 0..1."""
+    """Contrast below which the guided filter averages across an edge of the image, in 0..1."""
     cost_max: Annotated[float, Range(0, 2)] = 0.5
     """A depth survives when its matching cost 1 - NCC is below this."""
     texture_window: Side = 11
@@ -102,7 +102,7 @@ class StereoSettings(Settings):
     speckle_size: Pixels = 20
     """Connected pieces of the depth map with fewer pixels are dropped."""
     reuse_static: bool = True
-    """Carry matches over where the picture did not change; off matches every frame in full."""
+    """Carry matches over where the image did not change; off matches every frame in full."""
     reuse_change: Share = 12 / 255
     """Change of the grey value (0..1, mean of 3x3 pixels) above which a pixel is matched anew."""
     reuse_radius: Pixels = 6

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.geometry import pixel_grid, scaled_camera, triangulation_angle, view_pair
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.recording import Camera
 
 BEST_ANGLE = 10.0
 """Angle between viewing rays, degrees, that sources are preferred for: wider ones match worse, narrower ones tell

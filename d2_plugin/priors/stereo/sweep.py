@@ -2,7 +2,7 @@
 
 For each inverse depth one homography warps every source onto the reference, a small window correlates, the source that
 matches best is taken (the others may be occluded, or too oblique), and a guided filter aggregates the cost along the
-edges of the picture. The minimum over planes is refined by a parabola. Planes stand a source pixel apart, which makes
+edges of the image. The minimum over planes is refined by a parabola. Planes stand a source pixel apart, which makes
 the result insensitive to the range; only the running minimum and its two neighbours are kept in memory.
 
 Fronto-parallel planes see little of a wide rig. Measured on studio (16 to 33 degrees between neighbours): completeness
@@ -17,12 +17,12 @@ from types import ModuleType
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.errors import missing_extra
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import ViewPair, check_depth_range, cropped_camera, inverse_depth_planes, view_pair
 from d2_plugin.priors.stereo.reuse import Box, covering_boxes
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.recording import Camera
 
 WORST_COST = 2.0
 MIN_VARIANCE = 1e-5  # of grey values in 0..1 over one window: below it NCC correlates sensor noise

@@ -54,12 +54,12 @@ class PriorAlongside:
     """
 
     def __init__(self, settings: RunSettings, scene: Scene, folder: Path, points: np.ndarray) -> None:
-        self.cameras, self.frames = len(scene.train_cameras), scene.capture.frames
+        self.cameras, self.frames = len(scene.train_cameras), scene.recording.frames
         self.iterations = settings.iterations
         self.seconds = self.cpu_seconds = 0.0
         """What the build took, once it is finished."""
         self._summary: PriorSummary | None = None
-        self._pictures, self._start = 0, time.monotonic()
+        self._images, self._start = 0, time.monotonic()
         context = multiprocessing.get_context("spawn")
         self._told, telling = context.Pipe(duplex=False)
         self._process = context.Process(target=_build, args=(telling, settings, points, folder), daemon=True)
@@ -79,20 +79,20 @@ class PriorAlongside:
         self.wait(self.frames.index(frame) + 1)
 
     def wait(self, frames: int, told: Callable[[int], None] | None = None) -> None:
-        """Return once the prior of so many frames is there; `told` is called with the pictures that are done.
+        """Return once the prior of so many frames is there; `told` is called with the images that are done.
 
         Raises:
             D2Error: what the build refuses, or its process was killed.
         """
-        while self._pictures < frames * self.cameras and self._summary is None:
+        while self._images < frames * self.cameras and self._summary is None:
             self._hear()
             if told is not None:
-                told(min(self._pictures, frames * self.cameras))
+                told(min(self._images, frames * self.cameras))
 
     @property
     def share(self) -> float:
         """How much of the prior is known to be there."""
-        return 1.0 if self._summary is not None else self._pictures / (self.cameras * len(self.frames))
+        return 1.0 if self._summary is not None else self._images / (self.cameras * len(self.frames))
 
     def finish(self) -> PriorSummary:
         """What the prior became, once all of it is there.
@@ -119,7 +119,7 @@ class PriorAlongside:
                 "on where it stopped, and without --priors-in-step it builds the prior first"
             ) from None
         if isinstance(told, int):
-            self._pictures = told
+            self._images = told
         elif isinstance(told, str):
             raise D2Error(told)
         else:
@@ -128,7 +128,7 @@ class PriorAlongside:
 
 
 def _build(telling: Connection, settings: RunSettings, points: np.ndarray, folder: Path) -> None:
-    """What the process does: tells how many pictures are done, at last what the prior became or why it did not."""
+    """What the process does: tells how many images are done, at last what the prior became or why it did not."""
     end_with_parent()
     be_silent()
     try:
@@ -143,7 +143,7 @@ def _build(telling: Connection, settings: RunSettings, points: np.ndarray, folde
 def alongside(settings: RunSettings, scene: Scene, folder: Path, points: np.ndarray) -> Iterator[PriorAlongside]:
     """A `PriorAlongside` that has finished its first frames, and ends with the block."""
     building = PriorAlongside(settings, scene, folder, points)
-    first = frames_open(1, settings.iterations, len(scene.capture.frames))
+    first = frames_open(1, settings.iterations, len(scene.recording.frames))
     try:
         with progress_bar("priors of the first frames", first * building.cameras) as bar:
             building.wait(first, bar.update)

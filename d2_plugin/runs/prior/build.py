@@ -30,9 +30,9 @@ def build_priors_for(
 
     `shard` (index from 0, count) builds one part, so that any scheduler can run the parts beside each other. `cluster`
     (`scheduler` or `workers`) hands the frames to dask.distributed instead. `told` is called with the number of
-    pictures that are done: all cameras of one frame after the other, the frames in order.
+    images that are done: all cameras of one frame after the other, the frames in order.
     """
-    with progress_bar("priors", len(scene.capture.frames) * len(scene.train_cameras)) as bar:
+    with progress_bar("priors", len(scene.recording.frames) * len(scene.train_cameras)) as bar:
 
         def report(done: int, total: int, note: str = "") -> None:
             bar.update(done, note)
@@ -46,7 +46,7 @@ def build_priors_for(
 
             build = partial(build_priors_on_cluster, **cluster)
         return build(
-            *(scene.capture, scene.train_cameras, folder, scene.plan.obeyed_by(prior_settings(settings))),
+            *(scene.recording, scene.train_cameras, folder, scene.plan.obeyed_by(prior_settings(settings))),
             sparse_points=points,
             progress=report,
         )

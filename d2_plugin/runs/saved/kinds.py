@@ -19,7 +19,7 @@ SHAPE: dict[str, tuple[type, ...]] = {
     "seconds": (dict,),
     "gaussians": (int,),
     "iterations": (int,),
-    "capture": (str,),
+    "recording": (str,),
     "train_cameras": (list,),
     "backbone": (str,),
     "hooks": (list,),

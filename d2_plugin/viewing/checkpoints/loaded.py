@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from d2_plugin import registry
-from d2_plugin.captures import Capture
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians, moving_gaussians
 from d2_plugin.gaussians.spherical_harmonics import channel_count
 from d2_plugin.protocol import RasterSettings
+from d2_plugin.recordings import Recording
 
 
 class Loaded(NamedTuple):
@@ -61,14 +61,14 @@ def gsplat_model(parameters: Mapping[str, Tensor], settings: RasterSettings, not
     return Loaded(backbone, 1.0, note, moving.harmonics, moving)
 
 
-def planes_model(values: dict[str, Any], field: Any, stage: str, capture: Capture) -> Loaded:
+def planes_model(values: dict[str, Any], field: Any, stage: str, recording: Recording) -> Loaded:
     """Gaussians of 4DGaussians with their field; in the coarse stage there is none."""
-    count = max(len(capture.frames), 1)
+    count = max(len(recording.frames), 1)
     backbone = with_adapter("hust4d", frozen(values | {"_deformation": field}), None, stage)
     if stage == "coarse":
         return Loaded(backbone, 1.0, "the coarse stage of 4DGaussians stands still", harmonics_of(values))
     note = "a frame's time is taken to be its number / the number of frames, as the trainer reads several cameras"
-    return Loaded(backbone, capture.fps / count, note, harmonics_of(values))
+    return Loaded(backbone, recording.fps / count, note, harmonics_of(values))
 
 
 def harmonics_of(values: Mapping[str, Any], time_degree: int = 0) -> Harmonics:

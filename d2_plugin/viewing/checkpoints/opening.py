@@ -8,19 +8,18 @@ from pathlib import Path
 
 import torch
 
-from d2_plugin.captures import Capture, open_capture
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import RasterSettings
 from d2_plugin.reading import parsing, shown_path
+from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.values import checked_arguments
+from d2_plugin.viewing.checkpoints.clouds import newest_cloud, of_cloud
+from d2_plugin.viewing.checkpoints.files import read_tensors
+from d2_plugin.viewing.checkpoints.loaded import Loaded, gsplat_model
+from d2_plugin.viewing.checkpoints.tuples import of_tuple
 from d2_plugin.viewing.look import look
 from d2_plugin.viewing.paths import pose_of
 from d2_plugin.viewing.subject import Subject, subject_of_run
-
-from .clouds import newest_cloud, of_cloud
-from .files import read_tensors
-from .loaded import Loaded, gsplat_model
-from .tuples import of_tuple
 
 RUN, OUTPUT = "run.json", "point_cloud"
 """What a folder of ours has, and what that of another trainer has."""
@@ -33,7 +32,7 @@ def is_output_folder(folder: Path) -> bool:
 
 @checked_arguments
 def open_subject(
-    path: Path, capture: Path | None = None, train_cameras: Sequence[str] | None = None, downscale: int = 1
+    path: Path, recording: Path | None = None, train_cameras: Sequence[str] | None = None, downscale: int = 1
 ) -> Subject:
     """A run folder, or a checkpoint of another trainer together with its recording.
 
@@ -41,15 +40,15 @@ def open_subject(
         D2Error: one sentence for what cannot be opened, and why.
     """
     if path.is_dir() and not is_output_folder(path):
-        if capture is not None or train_cameras or downscale != 1:
+        if recording is not None or train_cameras or downscale != 1:
             raise D2Error(f"{path} is a folder of a run, which knows its recording: leave out what is for checkpoints")
         return subject_of_run(path)
-    return open_checkpoint(path, capture, train_cameras, downscale)[0]
+    return open_checkpoint(path, recording, train_cameras, downscale)[0]
 
 
 @checked_arguments
 def open_checkpoint(
-    path: Path, capture: Path | None = None, train_cameras: Sequence[str] | None = None, downscale: int = 1
+    path: Path, recording: Path | None = None, train_cameras: Sequence[str] | None = None, downscale: int = 1
 ) -> tuple[Subject, Loaded]:
     """What another trainer wrote, with its recording, and what its file says beside.
 
@@ -60,9 +59,9 @@ def open_checkpoint(
         path = newest_cloud(path)
     if not path.is_file():
         raise D2Error(f"no run at {path}: give the --output folder of `d2 train`, or a trainer's checkpoint")
-    if capture is None:
-        raise D2Error(f"{path.name} does not say where its cameras stood: name its recording with --capture")
-    opened = open_capture(capture, downscale=downscale)
+    if recording is None:
+        raise D2Error(f"{path.name} does not say where its cameras stood: name its recording with --recording")
+    opened = open_recording(recording, downscale=downscale)
     with parsing(f"checkpoint {shown_path(path)}", "give one of the trainers that docs/see.md names"):
         loaded = _loaded(path, opened)
     names = tuple(opened.cameras)
@@ -80,21 +79,21 @@ def open_checkpoint(
 
 def _try(subject: Subject, path: Path) -> None:
     """Look once at what a file of somebody else's holds, so that what does not fit together is said now."""
-    view = subject.view(pose_of(next(iter(subject.capture.cameras.values()))), 0.0, (16, 16))
+    view = subject.view(pose_of(next(iter(subject.recording.cameras.values()))), 0.0, (16, 16))
     with parsing(f"checkpoint {shown_path(path)}", "give one whose tensors fit together"):
         shown = look(subject.backbone, view).splats
     if not all(bool(torch.isfinite(part).all()) for part in (shown.means, shown.covariances, shown.opacities)):
         raise D2Error(f"{path} has numbers that are not finite: its training diverged, give an earlier checkpoint")
 
 
-def _loaded(path: Path, capture: Capture) -> Loaded:
+def _loaded(path: Path, recording: Recording) -> Loaded:
     if path.suffix == ".ply":
-        return of_cloud(path, capture)
+        return of_cloud(path, recording)
     stored = read_tensors(path)
     if isinstance(stored, dict) and "splats" in stored:
         return gsplat_model(stored["splats"], RasterSettings(near=0.01), "gsplat's Gaussians stand still")
     if isinstance(stored, (tuple, list)) and len(stored) == 2 and isinstance(stored[0], (tuple, list)):
-        return of_tuple(stored[0], path, capture)
+        return of_tuple(stored[0], path, recording)
     raise D2Error(
         f"{path} is no checkpoint that can be shown: have those of fudan, 4C4D, 4DGaussians, 3D Gaussian Splatting and "
         "gsplat, and point clouds (.ply); inside another trainer, Viewer(d2) shows the model as it trains"

@@ -22,9 +22,8 @@ from torch import Tensor
 
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
-
-from .codes import BLOCK, COMPRESSION, Coded, decode, encode, morton_order
-from .keys import ALPHA_MIN, Keys, Offset, State, cholesky
+from d2_plugin.viewing.export.codes import BLOCK, COMPRESSION, Coded, decode, encode, morton_order
+from d2_plugin.viewing.export.keys import ALPHA_MIN, Keys, Offset, State, cholesky
 
 MARGINAL_REACH = math.sqrt(-2 * math.log(MARGINAL_CUT))
 """Standard deviations from mu_t at which a Gaussian is cut off: F = `MARGINAL_CUT`."""

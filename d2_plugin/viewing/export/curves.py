@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from d2_plugin.gaussians.moving import LinearMotion, MovingGaussians
-
-from .keys import ALPHA_MIN, Offset, covariances_of, distance, state_at
-from .scene import ExportScene
+from d2_plugin.viewing.export.keys import ALPHA_MIN, Offset, covariances_of, distance, state_at
+from d2_plugin.viewing.export.scene import ExportScene
 
 FOREVER = 1e4
 """Temporal standard deviation, in clips, of Gaussians that never fade: F differs from 1 by less than 1e-8."""

@@ -19,15 +19,14 @@ from d2_plugin.runs.gaussian_ply import write_ply
 from d2_plugin.runs.run import Run
 from d2_plugin.settings import AtLeastOne, Count, Positional, Positive, Settings
 from d2_plugin.viewing.checkpoints import is_output_folder
-
-from .coded_scene import seen_rows
-from .curves import fit_curves
-from .linear_files import read_ftgs, read_splatv, write_ftgs, write_splatv
-from .of_checkpoint import scene_of_checkpoint
-from .page import write_page
-from .rounding import rounding, states_of
-from .scene import ExportScene, scene_of
-from .spz import write_spz
+from d2_plugin.viewing.export.coded_scene import seen_rows
+from d2_plugin.viewing.export.curves import fit_curves
+from d2_plugin.viewing.export.linear_files import read_ftgs, read_splatv, write_ftgs, write_splatv
+from d2_plugin.viewing.export.of_checkpoint import scene_of_checkpoint
+from d2_plugin.viewing.export.page import write_page
+from d2_plugin.viewing.export.rounding import rounding, states_of
+from d2_plugin.viewing.export.scene import ExportScene, scene_of
+from d2_plugin.viewing.export.spz import write_spz
 
 Shapes = tuple[Tensor, Tensor]
 """Scales [M, 3] and quaternions [M, 4]."""
@@ -38,7 +37,7 @@ class Export(Settings):
     """Which run is exported, as what."""
 
     run_folder: Annotated[Path, Positional()]
-    """The --output of `d2 train`; or what an official trainer wrote, with --capture."""
+    """The --output of `d2 train`; or what an official trainer wrote, with --recording."""
     format: Literal["html", "ply", "spz", "splatv", "ftgs"] = "html"
     """html: one page that plays the scene without a network. ply, spz: a file for each frame. splatv: the moving scene
     for splaTV and gsplat.js. ftgs: the same without loss, as .ftgs.ply; 4D Gaussians only."""
@@ -50,12 +49,12 @@ class Export(Settings):
     """Size of an html page that key times of a deformation field, or harmonics in 8 bits, may bring it to."""
     unfinished: bool = False
     """Export a run that has not been trained to its end."""
-    capture: Path | None = None
+    recording: Path | None = None
     """The recording of a checkpoint of an official trainer."""
     train_cameras: tuple[str, ...] | None = None
     """Cameras that such a checkpoint was trained with; all but these are held out."""
     downscale: AtLeastOne = 1
-    """For such a checkpoint: the recording's cameras with pictures this many times smaller."""
+    """For such a checkpoint: the recording's cameras with images this many times smaller."""
 
 
 class Made(NamedTuple):
@@ -86,7 +85,7 @@ def _scene(settings: Export) -> tuple[ExportScene, str]:
     """What is exported, and what a person should know of it."""
     path = settings.run_folder
     if path.is_file() or is_output_folder(path):
-        return scene_of_checkpoint(path, settings.capture, settings.train_cameras, settings.downscale)
+        return scene_of_checkpoint(path, settings.recording, settings.train_cameras, settings.downscale)
     return scene_of(Run.load(path), settings.unfinished), ""
 
 

@@ -18,11 +18,10 @@ import torch
 from torch import Tensor
 
 from d2_plugin.protocol import Splats
-
-from .codes import morton_order
+from d2_plugin.viewing.export.codes import morton_order
 
 STILL = 0.05
-"""Pixels of a training picture below which nobody sees that something moves."""
+"""Pixels of a training image below which nobody sees that something moves."""
 GOOD = 0.1
 """Pixels that one Gaussian in a hundred may be off between keys where the size allows it."""
 SAMPLE = 20_000
@@ -197,7 +196,7 @@ def _travel(
         faded = torch.maximum(faded, (state.opacities - first.opacities).abs())
         strongest = torch.maximum(strongest, state.opacities)
         states.append(State(*(part.float() for part in state)))
-    # Outside every picture a moving Gaussian is held to what the others are held to.
+    # Outside every image a moving Gaussian is held to what the others are held to.
     scale = torch.where(scale > 0, scale, scale[scale > 0].median() if bool((scale > 0).any()) else 1.0)
     changes = (changed * scale > STILL) | (faded > 1 / 510)
     return _Travel(first, scale, far * scale > STILL, changes, strongest >= ALPHA_MIN, sample, states)

@@ -16,15 +16,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from d2_plugin.captures import Camera
 from d2_plugin.durable import write
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, LinearMotion, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.reading import json_text
+from d2_plugin.recordings import Camera
 from d2_plugin.runs.gaussian_ply import scales_and_rotations, write_ply
-
-from .ply_files import covariances_from, read_columns, still_gaussians
+from d2_plugin.viewing.export.ply_files import covariances_from, read_columns, still_gaussians
 
 SPLATV_MAGIC, SPLATV_WIDTH = 0x674B, 4096
 FTGS_NAMES = ("time", "log_duration", "velocity_0", "velocity_1", "velocity_2")

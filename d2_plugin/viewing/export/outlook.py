@@ -7,14 +7,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from d2_plugin.captures import Camera
 from d2_plugin.protocol import Splats, View
 from d2_plugin.rasterizer import rasterize
-
-from .scene import ExportScene
+from d2_plugin.recordings import Camera
+from d2_plugin.viewing.export.scene import ExportScene
 
 SIDE = 160
-"""Pixels of the longer side of the pictures by which this is measured."""
+"""Pixels of the longer side of the images by which this is measured."""
 CAMERAS = 4
 """Cameras that are asked at most."""
 SOLID = 0.5
@@ -31,7 +30,7 @@ class Outlook(NamedTuple):
 
 
 def look_around(scene: ExportScene) -> Outlook:
-    """By small pictures of the depth at the first, the middle and the last frame."""
+    """By small images of the depth at the first, the middle and the last frame."""
     cameras = scene.train_cameras[:: -(-len(scene.train_cameras) // CAMERAS)]
     seconds = scene.clip.seconds
     times = sorted({seconds[0], seconds[len(seconds) // 2], seconds[-1]})
@@ -50,7 +49,7 @@ def look_around(scene: ExportScene) -> Outlook:
 
 @torch.no_grad()
 def _depths(scene: ExportScene, camera: Camera, time: float, splats: Splats) -> tuple[np.ndarray, float]:
-    """Depths of the solid pixels, and the median in the middle of the picture (of all, or 1, where nothing is)."""
+    """Depths of the solid pixels, and the median in the middle of the image (of all, or 1, where nothing is)."""
     scale = min(SIDE / max(camera.width, camera.height), 1.0)
     width, height = max(int(camera.width * scale), 1), max(int(camera.height * scale), 1)
     intrinsics = torch.tensor(camera.K, dtype=torch.float32)

@@ -15,21 +15,27 @@ import numpy as np
 import torch
 
 import d2_plugin
-from d2_plugin.captures import Camera
 from d2_plugin.durable import write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
 from d2_plugin.gaussians.spherical_harmonics import colors
 from d2_plugin.reading import parse_json, parsing, read_text
+from d2_plugin.recordings import Camera
 from d2_plugin.runs.drawing import color_scale
 from d2_plugin.values import checked_arguments, shown
-
-from .coded_scene import MARGINAL_REACH, CodedScene, code_keys, code_lines, read_harmonics, read_state
-from .codes import BLOCK, decode, packed, to_json, unpacked
-from .keys import SAMPLE, Keys, Offset, State, bake
-from .outlook import look_around
-from .rounding import rounding, states_of
-from .scene import ExportScene
+from d2_plugin.viewing.export.coded_scene import (
+    MARGINAL_REACH,
+    CodedScene,
+    code_keys,
+    code_lines,
+    read_harmonics,
+    read_state,
+)
+from d2_plugin.viewing.export.codes import BLOCK, decode, packed, to_json, unpacked
+from d2_plugin.viewing.export.keys import SAMPLE, Keys, Offset, State, bake
+from d2_plugin.viewing.export.outlook import look_around
+from d2_plugin.viewing.export.rounding import rounding, states_of
+from d2_plugin.viewing.export.scene import ExportScene
 
 VERSION = 1
 EXPORT = "export it anew"

@@ -7,9 +7,8 @@ from collections.abc import Callable
 import torch
 
 from d2_plugin.gaussians.moving import MovingGaussians
-
-from .keys import ALPHA_MIN, Offset, State, distance, state_at
-from .scene import ExportScene
+from d2_plugin.viewing.export.keys import ALPHA_MIN, Offset, State, distance, state_at
+from d2_plugin.viewing.export.scene import ExportScene
 
 INSTANTS = 5
 """Over the clip, at which both are compared."""

@@ -10,11 +10,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.captures import Camera
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import RasterSettings, Splats, View
+from d2_plugin.recordings import Camera
 from d2_plugin.runs.gaussian_ply import scales_and_rotations
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.start import make_view
@@ -25,7 +25,7 @@ class Clip:
     """The instants of a scene."""
 
     frames: tuple[int, ...]
-    """Numbers of the frames, as the capture has them."""
+    """Numbers of the frames, as the recording has them."""
     seconds: tuple[float, ...]
     """Time of each frame since the first one."""
     fps: float
@@ -126,18 +126,18 @@ def scene_of(run: Run, unfinished: bool = False) -> ExportScene:
 
 def scene_of_model(model: Any, run: Run) -> ExportScene:
     """A model of the run's backbone with the cameras and the clip of the run."""
-    capture = run.scene.capture
+    recording = run.scene.recording
     train, test = (
-        [capture.cameras[name] for name in names] for names in (run.scene.train_cameras, run.scene.test_cameras)
+        [recording.cameras[name] for name in names] for names in (run.scene.train_cameras, run.scene.test_cameras)
     )
-    clip = Clip(capture.frames, tuple(capture.seconds(frame) for frame in capture.frames), capture.fps)
-    view = make_view(capture, train[0].name, capture.frames[0], run.settings.device)
+    clip = Clip(recording.frames, tuple(recording.seconds(frame) for frame in recording.frames), recording.fps)
+    view = make_view(recording, train[0].name, recording.frames[0], run.settings.device)
     raster = getattr(getattr(model, "settings", None), "raster", RasterSettings())
     moving = model.moving() if hasattr(model, "moving") else None
     slice_at = slicer(model, view)
     harmonics = _harmonics(model, view)
     return ExportScene(
-        capture.name, clip, tuple(train), tuple(test), raster, harmonics, slice_at, moving, background_of(model)
+        recording.name, clip, tuple(train), tuple(test), raster, harmonics, slice_at, moving, background_of(model)
     )
 
 

@@ -20,8 +20,7 @@ from d2_plugin.durable import write
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.runs.gaussian_ply import scales_and_rotations
-
-from .ply_files import covariances_from
+from d2_plugin.viewing.export.ply_files import covariances_from
 
 MAGIC, VERSION = 0x5053474E, 3
 MOST_FRACTION_BITS = 12

@@ -7,12 +7,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
-from d2_plugin.captures import Camera
 from d2_plugin.priors.sheet import label_colors, sigma_colors
 from d2_plugin.protocol import DepthPrior, Label
+from d2_plugin.recordings import Camera
 from d2_plugin.viewing.subject import Subject
 
-ColorBy = Literal["picture", "label", "sigma"]
+ColorBy = Literal["image", "label", "sigma"]
 MOST_POINTS = 60_000
 """Of all cameras together: a browser draws them at every frame."""
 
@@ -28,10 +28,10 @@ def cloud_of(subject: Subject, frame: int, by: ColorBy, most: int = MOST_POINTS)
     """The prior of all cameras at one frame, thinned evenly; sky has no place and is left out."""
     store = subject.store
     found = [] if store is None else [(name, prior) for name in store.cameras if (prior := store.prior(name, frame))]
-    kept = [(name, prior) for name, prior in found if name in subject.capture.cameras]
+    kept = [(name, prior) for name, prior in found if name in subject.recording.cameras]
     pixels = sum(prior.depth.numel() for _, prior in kept)
     stride = max(int(np.ceil(np.sqrt(pixels / most))), 1)
-    parts = [_points(subject.capture.cameras[name], prior, by, stride) for name, prior in kept]
+    parts = [_points(subject.recording.cameras[name], prior, by, stride) for name, prior in kept]
     if not parts:
         return Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     return Cloud(*(np.concatenate(values) for values in zip(*parts, strict=True)))

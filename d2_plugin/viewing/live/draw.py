@@ -1,4 +1,4 @@
-"""Draws the picture that a page wants and sends it."""
+"""Draws the image that a page wants and sends it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from d2_plugin.runs.drawing import color_scale, colorize
 from d2_plugin.viewing.live.pace import Resolution
 from d2_plugin.viewing.live.page import Page, Wanted
 from d2_plugin.viewing.look import Look, gaussians_per_pixel, look
-from d2_plugin.viewing.panels import MOST_GAUSSIANS, as_bytes, depth_picture, depth_scale
+from d2_plugin.viewing.panels import MOST_GAUSSIANS, as_bytes, depth_image, depth_scale
 
 MOVING_QUALITY, STILL_QUALITY = 60, 90
 """JPEG quality."""
@@ -20,12 +20,12 @@ MOVING_QUALITY, STILL_QUALITY = 60, 90
 
 @dataclass
 class Drawer:
-    """One for all pages: what a pixel costs is learnt from every picture."""
+    """One for all pages: what a pixel costs is learnt from every image."""
 
     resolution: Resolution = field(default_factory=Resolution)
 
     def draw(self, page: Page, wanted: Wanted, marked: Tensor | None, seconds: float | None) -> None:
-        """Send one picture; where something moves, it is as large as fits `seconds`."""
+        """Send one image; where something moves, it is as large as fits `seconds`."""
         scene = page.client.scene
         if not wanted.show:
             scene.set_background_image(None)
@@ -33,16 +33,16 @@ class Drawer:
             return
         start = time.perf_counter()
         size = self.resolution.size(wanted.aspect, wanted.height, seconds)
-        picture = paint(page, wanted, size, marked)
+        image = paint(page, wanted, size, marked)
         quality = STILL_QUALITY if seconds is None else MOVING_QUALITY
-        scene.set_background_image(picture, format="jpeg", jpeg_quality=quality)
+        scene.set_background_image(image, format="jpeg", jpeg_quality=quality)
         taken = time.perf_counter() - start
         self.resolution.drew(size[0] * size[1], taken)
         page.say("size", f"{size[0]}x{size[1]}, {1000 * taken:.0f} ms")
 
 
 def paint(page: Page, wanted: Wanted, size: tuple[int, int], marked: Tensor | None) -> np.ndarray:
-    """The picture, RGB uint8 [H, W, 3]."""
+    """The image, RGB uint8 [H, W, 3]."""
     subject = page.subject
     view = subject.view(wanted.camera(*size), wanted.time, size)
     chosen = marked if wanted.marked and marked is not None and len(marked) == len(subject.backbone) else None
@@ -56,7 +56,7 @@ def paint(page: Page, wanted: Wanted, size: tuple[int, int], marked: Tensor | No
 def _shown(seen: Look, show: str) -> np.ndarray:
     if show == "depth":
         depth = seen.depth.numpy()
-        return depth_picture(depth, depth_scale([depth]))
+        return depth_image(depth, depth_scale([depth]))
     if show == "alpha":
         return as_bytes(seen.alpha.numpy()[..., None].repeat(3, -1))
     return as_bytes(seen.color.numpy())

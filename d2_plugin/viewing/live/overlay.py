@@ -1,4 +1,4 @@
-"""What lies over the picture of a page: the recording's cameras with their pictures, and the prior as points."""
+"""What lies over the image of a page: the recording's cameras with their images, and the prior as points."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.captures import Camera
-from d2_plugin.captures.rotations import quaternion_of_rotation
+from d2_plugin.recordings import Camera
+from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
 from d2_plugin.viewing.live.cloud import cloud_of
 from d2_plugin.viewing.live.page import Page
 from d2_plugin.viewing.panels import fitted
 from d2_plugin.viewing.subject import Subject
 
 THUMBNAIL = 128
-"""Width of a picture in a frustum, pixels."""
+"""Width of an image in a frustum, pixels."""
 TRAINING, HELD_OUT = (70, 160, 255), (255, 150, 40)
 """RGB of cameras that train and of those that are held out."""
 
@@ -30,11 +30,11 @@ class Overlay:
     """Size of a frustum in world units."""
     frusta: dict[str, Any] = field(default_factory=dict)
     cloud: Any = None
-    _pictures_of: int | None = None
+    _images_of: int | None = None
     _cloud_of: tuple[int, str] | None = None
 
     def refresh(self, subject: Subject, time: float, moving: bool) -> None:
-        """Bring everything up to date; pictures and points wait while something moves."""
+        """Bring everything up to date; images and points wait while something moves."""
         frame = subject.frame_at(time)
         self.page.say("frame", str(frame))
         self._show_frusta(subject, frame, moving)
@@ -43,27 +43,27 @@ class Overlay:
 
     def _show_frusta(self, subject: Subject, frame: int, moving: bool) -> None:
         visible = bool(self.page.value("frusta", True))
-        if visible and (set(self.frusta) != set(subject.capture.cameras)):
+        if visible and (set(self.frusta) != set(subject.recording.cameras)):
             self._add_frusta(subject)
         scale = self.unit * float(self.page.value("size_of_frusta", 1.0))
         eye = np.asarray(self.page.client.camera.position)
         for name, handle in self.frusta.items():
-            # One that stands where we do would fill the screen with its small picture.
-            near = np.linalg.norm(subject.capture.cameras[name].centre - eye) < 1.5 * scale
+            # One that stands where we do would fill the screen with its small image.
+            near = np.linalg.norm(subject.recording.cameras[name].centre - eye) < 1.5 * scale
             if handle.visible != (visible and not near):
                 handle.visible = visible and not near
             if handle.scale != scale:
                 handle.scale = scale
-        if visible and not moving and frame != self._pictures_of:
-            self._pictures_of = frame
+        if visible and not moving and frame != self._images_of:
+            self._images_of = frame
             for name, handle in self.frusta.items():
                 handle.image = _thumbnail(subject, name, frame)
 
     def _add_frusta(self, subject: Subject) -> None:
-        for number, (name, camera) in enumerate(subject.capture.cameras.items()):
+        for number, (name, camera) in enumerate(subject.recording.cameras.items()):
             if name not in self.frusta:
                 self.frusta[name] = self._frustum(number, camera, name in subject.train_cameras)
-        self._pictures_of = None
+        self._images_of = None
 
     def _frustum(self, number: int, camera: Camera, trains: bool) -> Any:
         # Numbered: a name with a slash would be a path in the scene.
@@ -100,7 +100,7 @@ class Overlay:
 
 def frustum_size(subject: Subject) -> float:
     """A tenth of the way from the cameras to what they look at, or less where cameras stand close together."""
-    centres = np.stack([camera.centre for camera in subject.capture.cameras.values()])
+    centres = np.stack([camera.centre for camera in subject.recording.cameras.values()])
     gaps = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     gaps[gaps == 0] = math.inf
     # The usual gap: a held-out camera that nearly touches another must not make all of them too small to see.
@@ -111,14 +111,14 @@ def frustum_size(subject: Subject) -> float:
 
 def rig_of(subject: Subject) -> tuple[np.ndarray, float]:
     """Where the cameras' middle is, [3], and how far one has to be from it to see all of them."""
-    centres = np.stack([camera.centre for camera in subject.capture.cameras.values()])
+    centres = np.stack([camera.centre for camera in subject.recording.cameras.values()])
     middle = centres.mean(axis=0)
     return middle, max(float(np.linalg.norm(centres - middle, axis=1).max()), 3 * frustum_size(subject))
 
 
 def _thumbnail(subject: Subject, name: str, frame: int) -> np.ndarray:
-    picture = subject.capture.image(name, frame)
-    height, width = picture.shape[:2]
+    image = subject.recording.image(name, frame)
+    height, width = image.shape[:2]
     if width <= THUMBNAIL:
-        return picture
-    return fitted(picture, THUMBNAIL, max(round(height * THUMBNAIL / width), 1))
+        return image
+    return fitted(image, THUMBNAIL, max(round(height * THUMBNAIL / width), 1))

@@ -1,30 +1,30 @@
-"""How large a picture may be while something moves, and how much of a training's time may go into pictures."""
+"""How large an image may be while something moves, and how much of a training's time may go into images."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 SMALLEST = 72
-"""Height in pixels below which no picture is drawn, however slow."""
+"""Height in pixels below which no image is drawn, however slow."""
 FIXED = 4e-3
-"""Seconds of a picture that do not depend on its size, before that was measured."""
+"""Seconds of an image that do not depend on its size, before that was measured."""
 KEPT = 0.85
 """What a measurement still weighs when the next one comes."""
 APART = 0.2
-"""Spread of sizes, relative to their mean, from which both costs of a picture can be told apart."""
+"""Spread of sizes, relative to their mean, from which both costs of an image can be told apart."""
 
 
 @dataclass
 class Resolution:
-    """Learns what a picture and a pixel cost, so that a moving picture is as large as fits its time."""
+    """Learns what an image and a pixel cost, so that a moving image is as large as fits its time."""
 
     seconds_per_pixel: float = 1e-7
     fixed: float = FIXED
-    """Seconds of a picture however small: what many Gaussians cost before the first pixel."""
+    """Seconds of an image however small: what many Gaussians cost before the first pixel."""
     _sums: tuple[float, ...] = (0.0,) * 5
 
     def drew(self, pixels: int, seconds: float) -> None:
-        """Note a picture: a straight line through the last measurements, where their sizes differ."""
+        """Note an image: a straight line through the last measurements, where their sizes differ."""
         new = (1.0, pixels, seconds, pixels * pixels, pixels * seconds)
         self._sums = tuple(KEPT * old + added for old, added in zip(self._sums, new, strict=True))
         _, x, y, xx, xy = (part / self._sums[0] for part in self._sums)
@@ -40,7 +40,7 @@ class Resolution:
     def size(self, aspect: float, most: int, seconds: float | None = None) -> tuple[int, int]:
         """Width and height, at most `most` pixels high, that take about `seconds`; None is as large as allowed.
 
-        Where a picture costs as much however small, half as much goes into its pixels: fewer would gain little."""
+        Where an image costs as much however small, half as much goes into its pixels: fewer would gain little."""
         height = most
         if seconds is not None:
             left = max(seconds - self.fixed, 0.5 * self.fixed, 1e-3)

@@ -1,7 +1,7 @@
-"""One browser's page: its controls, what it lays over the picture, and the picture that it wants next.
+"""One browser's page: its controls, what it lays over the image, and the image that it wants next.
 
 viser calls back from threads of its own; they only set plain values here. Everything is drawn by the thread that calls
-`Viewer`, so that no picture is taken of Gaussians that change.
+`Viewer`, so that no image is taken of Gaussians that change.
 
 Names come from folders and files of others. They go into text fields and menus only, which show any text as it is;
 never into Markdown or HTML.
@@ -16,22 +16,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.rotations import quaternion_of_rotation, rotation_of_quaternion
+from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation, rotation_of_quaternion
 from d2_plugin.viewing.paths import Lens, Pose
 from d2_plugin.viewing.subject import Subject
 
 REST = 0.3
-"""Seconds without a change after which a picture is drawn at its full size."""
+"""Seconds without a change after which an image is drawn at its full size."""
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0)
-PICTURES = {"picture": "rgb", "depth": "depth", "opacity": "alpha", "number of Gaussians": "count"}
-"""What the menu says -> the kind of picture."""
-NO_PICTURE = "nothing"
-CLOUDS = ("none", "label", "sigma", "picture")
+IMAGES = {"image": "rgb", "depth": "depth", "opacity": "alpha", "number of Gaussians": "count"}
+"""What the menu says -> the kind of image."""
+NO_IMAGE = "nothing"
+CLOUDS = ("none", "label", "sigma", "image")
 FREE = "free"
 
 
 class Wanted(NamedTuple):
-    """A picture that a page wants."""
+    """An image that a page wants."""
 
     pose: tuple[float, ...]  # position xyz, quaternion wxyz (camera to world), vertical field of view
     aspect: float
@@ -42,7 +42,7 @@ class Wanted(NamedTuple):
     height: int
 
     def camera(self, width: int, height: int) -> Pose:
-        """Where the browser's camera stands, with the lens of a picture of this size."""
+        """Where the browser's camera stands, with the lens of an image of this size."""
         R = rotation_of_quaternion(np.array(self.pose[3:7])).T
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R, -R @ np.array(self.pose[:3])
@@ -88,12 +88,12 @@ class Page:
             with gui.add_folder("Time"):
                 self._time_controls()
         if subject.backbone is not None:
-            with gui.add_folder("Picture"):
-                self._picture_controls()
+            with gui.add_folder("Image"):
+                self._image_controls()
         with gui.add_folder("Recording"):
             self._recording_controls()
         if subject.backbone is not None:
-            self._text("size", "picture size", "")
+            self._text("size", "image size", "")
         for control in self.controls.values():
             if hasattr(control, "on_update"):
                 control.on_update(lambda _: self.wake())
@@ -113,20 +113,20 @@ class Page:
         step = 10.0 ** math.floor(math.log10(subject.duration / 100))
         most = round(math.floor(subject.duration / step + 1e-6) * step, 9)
         self.controls["time"] = gui.add_slider("seconds", 0.0, most, step, 0.0)
-        self._text("frame", "frame", str(subject.capture.frames[0]))
+        self._text("frame", "frame", str(subject.recording.frames[0]))
         self.controls["play"] = gui.add_checkbox("play", False)
         self.controls["speed"] = gui.add_dropdown("speed", [f"{speed:g}" for speed in SPEEDS], initial_value="1")
 
-    def _picture_controls(self) -> None:
+    def _image_controls(self) -> None:
         gui, known = self.client.gui, self.subject.inserted_at is not None
-        self.controls["show"] = gui.add_dropdown("show", [*PICTURES, NO_PICTURE], initial_value="picture")
+        self.controls["show"] = gui.add_dropdown("show", [*IMAGES, NO_IMAGE], initial_value="image")
         self.controls["opacity"] = gui.add_slider("opacity from", 0.0, 0.95, 0.05, 0.0)
         self.controls["marked"] = gui.add_checkbox("inserted by D2 in orange", False, disabled=not known)
         low = min(90, self.most_height)
         self.controls["height"] = gui.add_slider("height", low, max(self.most_height * 2, 720), 1, self.most_height)
 
     def _recording_controls(self) -> None:
-        gui, names = self.client.gui, tuple(self.subject.capture.cameras)
+        gui, names = self.client.gui, tuple(self.subject.recording.cameras)
         self.controls["camera"] = gui.add_dropdown("stand at", [FREE, *names], initial_value=FREE)
         self.controls["camera"].on_update(lambda _: self.stand_at(self.controls["camera"].value))
         self.controls["frusta"] = gui.add_checkbox("cameras", True)
@@ -136,7 +136,7 @@ class Page:
             self.controls["point_size"] = gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
 
     def _first_cloud(self) -> str:
-        return "none" if self.subject.backbone is not None else "picture"
+        return "none" if self.subject.backbone is not None else "image"
 
     def _text(self, name: str, label: str, value: str) -> None:
         self.controls[name] = self.client.gui.add_text(label, value, disabled=True)
@@ -171,7 +171,7 @@ class Page:
 
     def stand_at(self, name: str) -> None:
         """Bring the browser's camera to one of the recording's."""
-        camera = self.subject.capture.cameras.get(name)
+        camera = self.subject.recording.cameras.get(name)
         if camera is None:
             return
         T_world_camera = np.linalg.inv(camera.T_camera_world)
@@ -191,7 +191,7 @@ class Page:
         if self._played_at is not None:
             passed = (now - self._played_at) * float(self.value("speed"))
             slider = self.controls["time"]
-            end = self.subject.duration + 1 / self.subject.capture.fps
+            end = self.subject.duration + 1 / self.subject.recording.fps
             time = (slider.value + passed) % end
             slider.value = float(min(time, slider.max))
         self._played_at = now
@@ -202,7 +202,7 @@ class Page:
         if camera.update_timestamp == 0.0 or camera.image_height == 0:
             return None
         pose = (*camera.position, *camera.wxyz, camera.fov)
-        show = PICTURES.get(self.value("show", NO_PICTURE), "")
+        show = IMAGES.get(self.value("show", NO_IMAGE), "")
         wanted = Wanted(
             tuple(float(number) for number in pose),
             float(camera.aspect),

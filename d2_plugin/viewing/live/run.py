@@ -10,11 +10,11 @@ from typing import Any
 import torch
 
 from d2_plugin import registry
-from d2_plugin.priors.store import PriorStore
 from d2_plugin.runs.metrics import psnr
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved.finite import OnStep
 from d2_plugin.runs.start import TimedPoints
+from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.live.pace import Share
 from d2_plugin.viewing.live.viewer import Viewer
 from d2_plugin.viewing.look import look
@@ -74,7 +74,7 @@ class Scorer:
     def __init__(self, subject: Subject) -> None:
         self.subject = subject
         names = subject.test_cameras or subject.train_cameras
-        self._views = [(name, frame) for frame in subject.capture.frames for name in names]
+        self._views = [(name, frame) for frame in subject.recording.frames for name in names]
         self._scores: deque[float] = deque(maxlen=min(AVERAGED, len(self._views)))
         self._next, self._share, self._last = 0, Share(SCORED), time.monotonic()
 
@@ -88,10 +88,10 @@ class Scorer:
         # Steps that share no factor with the number of views visit all of them, spread over the recording.
         name, frame = self._views[self._next * 7919 % len(self._views)]
         self._next += 1
-        camera = self.subject.capture.cameras[name]
+        camera = self.subject.recording.cameras[name]
         size = camera.width, camera.height
-        view = self.subject.view(pose_of(camera), self.subject.capture.seconds(frame), size, name)
-        truth = torch.from_numpy(self.subject.capture.image(name, frame)).float() / 255
+        view = self.subject.view(pose_of(camera), self.subject.recording.seconds(frame), size, name)
+        truth = torch.from_numpy(self.subject.recording.image(name, frame)).float() / 255
         self._scores.append(psnr(look(self.subject.backbone, view).color, truth))
         self._share.spend(time.monotonic() - now)
         kind = "held-out" if self.subject.test_cameras else "training"
@@ -107,7 +107,7 @@ def subject_of_training(run: Run, trainer: Any) -> Subject:
     points = TimedPoints.load(path) if path.is_file() else None
     return Subject(
         run.folder.name,
-        scene.capture,
+        scene.recording,
         scene.train_cameras,
         scene.test_cameras,
         adapter(trainer.model) if d2 is None else d2.backbone,

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from d2_plugin.captures import open_capture
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.store import PriorStore
+from d2_plugin.recordings import open_recording
 from d2_plugin.settings import AtLeastOne, Positional, Range, Settings
+from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.checkpoints import is_output_folder, open_subject
 from d2_plugin.viewing.live.viewer import Viewer
 from d2_plugin.viewing.stand_in import subject_of_store
-from d2_plugin.viewing.subject import Subject, subject_of_capture, with_priors
+from d2_plugin.viewing.subject import Subject, subject_of_recording, with_priors
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
 
@@ -24,19 +24,19 @@ class ViewSettings(Settings):
     """What is shown, and who may look."""
 
     shown: Annotated[Path, Positional()]
-    """Folder of a run, a recording or a depth prior; or what an official trainer wrote, with --capture."""
+    """Folder of a run, a recording or a depth prior; or what an official trainer wrote, with --recording."""
     host: str = "127.0.0.1"
     """Address to listen at; the default is this machine alone, and 0.0.0.0 lets everybody in."""
     port: Annotated[int, Range(1, 65535)] = 8080
     """Port of the page; the next free one where it is in use."""
     height: Annotated[int, Range(16, 4096, unit="pixels")] = 360
-    """Height of a picture at rest; while something moves it is as small as it must be."""
-    capture: Path | None = None
+    """Height of an image at rest; while something moves it is as small as it must be."""
+    recording: Path | None = None
     """The recording of a prior or of a checkpoint."""
     train_cameras: tuple[str, ...] | None = None
     """Cameras that such a checkpoint was trained with."""
     downscale: AtLeastOne = 1
-    """Make the recording's pictures this many times smaller."""
+    """Make the recording's images this many times smaller."""
 
 
 def run(settings: ViewSettings) -> str:
@@ -63,14 +63,14 @@ def subject_at(settings: ViewSettings) -> Subject:
     """
     path = settings.shown
     if (path / "store.json").is_file():
-        if settings.capture is None:
+        if settings.recording is None:
             return subject_of_store(PriorStore.open(path))
-        return with_priors(subject_of_capture(open_capture(settings.capture, downscale=settings.downscale)), path)
+        return with_priors(subject_of_recording(open_recording(settings.recording, downscale=settings.downscale)), path)
     if path.is_file() or (path / "run.json").is_file() or is_output_folder(path):
-        return open_subject(path, settings.capture, settings.train_cameras, settings.downscale)
+        return open_subject(path, settings.recording, settings.train_cameras, settings.downscale)
     if path.is_dir() and not any(path.iterdir()):
         raise D2Error(f"{path} is empty: give the folder of a run, a recording or a depth prior")
-    return subject_of_capture(open_capture(path, downscale=settings.downscale))
+    return subject_of_recording(open_recording(path, downscale=settings.downscale))
 
 
 def said_of(viewer: Viewer, host: str) -> str:

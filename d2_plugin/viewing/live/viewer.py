@@ -2,7 +2,7 @@
 
     viewer = Viewer(d2)              # after D2Hooks: http://localhost:8080 shows the model as it trains
 
-Pictures are drawn by the thread that trains, between two steps: nothing is locked, and no half-edited model is shown.
+Images are drawn by the thread that trains, between two steps: nothing is locked, and no half-edited model is shown.
 Training is the same with and without: the viewer reads, draws nothing at random, and waits where somebody pauses.
 """
 
@@ -31,9 +31,9 @@ from d2_plugin.viewing.live.page import Page, Training
 from d2_plugin.viewing.subject import Subject
 
 WATCHED, MOVED = 0.05, 0.5
-"""Share of a training's time that pictures may take: for somebody who only looks, and while somebody moves."""
+"""Share of a training's time that images may take: for somebody who only looks, and while somebody moves."""
 MOVING_SECONDS = 0.06
-"""A picture while something moves may take this long."""
+"""An image while something moves may take this long."""
 
 
 class Viewer:
@@ -57,7 +57,7 @@ class Viewer:
             subject: what is shown; of a trainer, its cameras are learnt from the views that it trains on.
             host: address to listen at; the default is this machine alone, and "0.0.0.0" lets everybody in.
             port: the next free one is taken where this one is in use.
-            height: of a picture at rest, pixels; half-open menus let each client choose another.
+            height: of an image at rest, pixels; half-open menus let each client choose another.
             iterations: how long the training lasts, where that is known.
         """
         if d2 is None and subject is None:
@@ -106,7 +106,7 @@ class Viewer:
             self._tell(step, loss)
             self._draw_all()
             self._wait()
-        self._last = time.monotonic()  # a pause is not time in which pictures could have been drawn
+        self._last = time.monotonic()  # a pause is not time in which images could have been drawn
 
     def score(self, text: str) -> None:
         """Show a score beside the step."""
@@ -131,7 +131,7 @@ class Viewer:
         subject = self.subject
         if subject is None:
             return
-        camera = subject.training[0] if subject.train_cameras else next(iter(subject.capture.cameras.values()))
+        camera = subject.training[0] if subject.train_cameras else next(iter(subject.recording.cameras.values()))
         T, initial = camera.T_camera_world, self._server.initial_camera
         eye, up, ahead = camera.centre, -T[1, :3], T[2, :3]
         target = eye + (subject.depth or 3.0) * ahead

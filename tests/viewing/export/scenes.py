@@ -7,8 +7,8 @@ import torch
 from tiny import make_model, make_views
 
 from d2_plugin.backbones.model import SplatModel
-from d2_plugin.captures import Camera
 from d2_plugin.protocol import View
+from d2_plugin.recordings import Camera
 from d2_plugin.viewing.export.scene import Clip, ExportScene, background_of, slicer
 
 NASTY = '</script><script>alert(1)</script> & "tiny"'
@@ -45,7 +45,7 @@ def sharp_model(backbone: str, count: int = 400, **options: object) -> SplatMode
 
 
 def larger(view: View) -> View:
-    """The tiny view in pictures of 160 x 120, off centre so that the principal point matters."""
+    """The tiny view in images of 160 x 120, off centre so that the principal point matters."""
     scale = torch.tensor([[WIDTH / view.width], [HEIGHT / view.height], [1.0]])
     intrinsics = view.K * scale
     intrinsics[:2, 2] += torch.tensor([5.0, -3.0])
@@ -96,5 +96,5 @@ def rasterized(
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """Of pictures in 0..1."""
+    """Of images in 0..1."""
     return float(-10 * np.log10(np.mean((np.asarray(a, float) - b) ** 2)))

@@ -10,9 +10,9 @@ import pytest
 import torch
 from viewing.hostile import emptied, of_another_version, still_training
 
-from d2_plugin.captures.export.folder import save_capture
-from d2_plugin.captures.synthetic.room import synthetic_capture
 from d2_plugin.commands.cli import main
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.viewing.export.export import FORMATS, Export
 from d2_plugin.viewing.export.page import read_page
@@ -22,8 +22,10 @@ from d2_plugin.viewing.export.page import read_page
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of a few steps, and the same with a deformation field beside it."""
     folder = tmp_path_factory.mktemp("exported")
-    capture = save_capture(synthetic_capture(cameras=3, held_out=1, frames=3, width=96, height=54), folder / "room")
-    words = ["train", str(capture), "--train-cameras", "train0,train1,train2", "--hooks", "none", "--iterations", "4"]
+    recording = save_recording(
+        synthetic_recording(cameras=3, held_out=1, frames=3, width=96, height=54), folder / "room"
+    )
+    words = ["train", str(recording), "--train-cameras", "train0,train1,train2", "--hooks", "none", "--iterations", "4"]
     for backbone in ("yang4d", "deform"):
         assert main([*words, "--backbone", backbone, "--output", str(folder / backbone)]) == 0
     return folder

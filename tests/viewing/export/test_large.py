@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import torch
-from viewing.chromium import browser, executable, picture
+from viewing.chromium import browser, executable, image
 from viewing.export.scenes import psnr
 from viewing.large import DURATION, FRAMES, large_model, large_scene, large_view
 
@@ -34,7 +34,7 @@ def exported(model: Any, path: Path) -> tuple[float, float]:
 
 def spent_by_children() -> float:
     """Seconds of CPU of all processes that this one started."""
-    psutil = pytest.importorskip("psutil", reason="what a picture costs is asked of psutil")
+    psutil = pytest.importorskip("psutil", reason="what an image costs is asked of psutil")
     times = [child.cpu_times() for child in psutil.Process().children(recursive=True)]
     return sum(time.user + time.system for time in times)
 
@@ -53,10 +53,10 @@ def test_a_large_scene_is_exported_quickly_and_plays(backbone: str, tmp_path: Pa
         page.page.emulate_media(reduced_motion="reduce")
         begin = time.perf_counter()
         page.open(tmp_path / "scene.html")
-        page.run("d2.then((player) => player.pictures)")
+        page.run("d2.then((player) => player.images)")
         opened = time.perf_counter() - begin
-        address = page.run("(async () => (await d2).picture('cam3', 0.9))()")
-        agreement = psnr(picture(address) / 255, true)
+        address = page.run("(async () => (await d2).image('cam3', 0.9))()")
+        agreement = psnr(image(address) / 255, true)
         page.page.locator("#time").fill("0.5")
         assert page.run("d2.then((player) => player.time)") == pytest.approx(0.5, abs=DURATION / 900)
         before = spent_by_children()
@@ -64,7 +64,7 @@ def test_a_large_scene_is_exported_quickly_and_plays(backbone: str, tmp_path: Pa
         each = (spent_by_children() - before) / frames
     sys.stdout.write(
         f"\n{backbone}: {seconds:.1f} s of CPU, {megabytes:.1f} MB; opened in {opened:.1f} s; {agreement:.1f} dB; "
-        f"{frames} pictures, {rate:.1f} a second of the clock and {1 / each:.1f} a second of CPU, with one pixel for "
+        f"{frames} images, {rate:.1f} a second of the clock and {1 / each:.1f} a second of CPU, with one pixel for "
         f"{coarse:.1f} x {coarse:.1f} of the screen\n"
     )
     assert page.complaints == []
@@ -76,17 +76,17 @@ def test_a_large_scene_is_exported_quickly_and_plays(backbone: str, tmp_path: Pa
 
 
 PLAYED = """(async () => {
-    const player = await d2, before = player.pictures, start = performance.now(), from = player.time;
+    const player = await d2, before = player.images, start = performance.now(), from = player.time;
     player.play(true);
-    while (performance.now() - start < 8000 || player.pictures - before < 3) {
+    while (performance.now() - start < 8000 || player.images - before < 3) {
         await new Promise((resolve) => setTimeout(resolve, 50));
     }
     if (player.time === from) throw new Error("time stands still");
-    const seconds = (performance.now() - start) / 1000, drawn = player.pictures - before;
+    const seconds = (performance.now() - start) / 1000, drawn = player.images - before;
     player.play(false);
     return [drawn / seconds, drawn, player.coarse];
 })()"""
-"""Plays for eight seconds: pictures a second, how many, and how coarse they were."""
+"""Plays for eight seconds: images a second, how many, and how coarse they were."""
 
 
 def test_harmonics_of_fudan_are_coded_as_coarsely_as_the_page_must_be(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from tiny import make_views
-from viewing.chromium import browser, picture
+from viewing.chromium import browser, image
 from viewing.export.scenes import DURATION, HEIGHT, WIDTH, make_scene, psnr, sharp_model
 
 from d2_plugin.backbones.model import SplatModel
@@ -60,7 +60,7 @@ def package() -> Path:
 
 
 def drawn(model: SplatModel, view: View) -> np.ndarray:
-    """Our picture by its rules: nothing is widened by a part of a pixel, and black lies behind."""
+    """Our image by its rules: nothing is widened by a part of a pixel, and black lies behind."""
     with torch.no_grad():
         splats = model.slice_at(view)
         return rasterize(splats, model.colors(view, splats), view, RasterSettings(blur=0.0)).color.clamp(0, 1).numpy()
@@ -97,7 +97,7 @@ def test_gsplat_js_reads_and_draws_our_splatv(tmp_path: Path) -> None:
         view = make_views()[0]
         K = torch.tensor(centred[0].K, dtype=torch.float32)
         for time in (0.1, 0.42):
-            theirs = picture(page.run("(share) => player.at(share)", time / DURATION)) / 255
+            theirs = image(page.run("(share) => player.at(share)", time / DURATION)) / 255
             here = View("left", 0, time, view.T_camera_world, K, WIDTH, HEIGHT)
             assert psnr(theirs, drawn(model, here)) > 35, f"{time} s: {psnr(theirs, drawn(model, here)):.1f} dB"
             other = View("left", 0, DURATION - time, view.T_camera_world, K, WIDTH, HEIGHT)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from viewing.chromium import Page, browser, executable, picture
+from viewing.chromium import Page, browser, executable, image
 from viewing.export.scenes import DURATION, NASTY, make_scene, psnr, rasterized, sharp_model
 
 from d2_plugin.backbones.model import SplatModel
@@ -43,15 +43,15 @@ def opened(new_page: Callable[[], Page], model: SplatModel, path: Path, name: st
 
 
 def shown(page: Page, camera: int, time: float, mode: str = "color") -> np.ndarray:
-    """The page's picture of a camera, in 0..1."""
-    script = "async ([name, time, mode]) => (await d2).picture(name, time, mode)"
-    return picture(page.run(script, [CAMERAS[camera], time, mode])) / 255
+    """The page's image of a camera, in 0..1."""
+    script = "async ([name, time, mode]) => (await d2).image(name, time, mode)"
+    return image(page.run(script, [CAMERAS[camera], time, mode])) / 255
 
 
 def models() -> dict[str, tuple[SplatModel, float]]:
     """Models by name with the least agreement in dB: a baked field is straight between its keys.
 
-    At 30 dB nobody sees a difference, but a missing blur would pass: pictures of the bytes of a screen agree better.
+    At 30 dB nobody sees a difference, but a missing blur would pass: images of the bytes of a screen agree better.
     """
     return {
         "4D Gaussians": (sharp_model("yang4d"), 45.0),
@@ -94,7 +94,7 @@ def test_a_camera_that_looks_away_from_all_gaussians_shows_the_background(new_pa
     assert psnr(shown(page, 2, TIMES[1]), true["color"]) > 45
 
 
-def test_pictures_of_other_times_and_cameras_would_not_pass(new_page: Any, tmp_path: Path) -> None:
+def test_images_of_other_times_and_cameras_would_not_pass(new_page: Any, tmp_path: Path) -> None:
     model = sharp_model("yang4d")
     page = opened(new_page, model, tmp_path / "scene.html")
     here = shown(page, 2, TIMES[1])
@@ -131,18 +131,18 @@ def test_the_depth_view_is_the_expected_depth_on_its_scale(new_page: Any, tmp_pa
 
 def test_the_slider_and_the_play_button_move_time(new_page: Any, tmp_path: Path) -> None:
     page = opened(new_page, sharp_model("yang4d"), tmp_path / "scene.html")
-    canvas = page.page.locator("#picture")
+    canvas = page.page.locator("#image")
     screen = """async () => {
         const p = await d2;
         while (p.busy || !p.drawnSharp) await new Promise((resolve) => setTimeout(resolve, 20));
-        return document.getElementById('picture').toDataURL('image/png');
+        return document.getElementById('image').toDataURL('image/png');
     }"""
-    before = picture(page.run(screen))
+    before = image(page.run(screen))
     page.page.locator("#time").fill("0.4")
     assert page.run("d2.then((player) => player.time)") == pytest.approx(0.4)
     assert "0.40 s · frame 9" in page.page.locator("#clock").inner_text()
     page.page.wait_for_timeout(400)
-    after = picture(page.run(screen))
+    after = image(page.run(screen))
     assert np.abs(after.astype(int) - before).mean() > 1
     page.page.locator("#play").click()
     page.page.wait_for_function("d2.then((player) => player.playing && player.time !== 0.4)")
@@ -159,7 +159,7 @@ def test_the_slider_and_the_play_button_move_time(new_page: Any, tmp_path: Path)
     assert page.complaints == []
 
 
-def test_pictures_are_coarser_only_where_that_makes_them_quicker(new_page: Any, tmp_path: Path) -> None:
+def test_images_are_coarser_only_where_that_makes_them_quicker(new_page: Any, tmp_path: Path) -> None:
     page = opened(new_page, sharp_model("yang4d"), tmp_path / "scene.html")
     paced = """([fixed, pixel]) => {
         const pace = new Pace(), full = 960 * 554;

@@ -52,7 +52,7 @@ struct Place {
 struct Surface {
   std::vector<float> depth;     // 0 elsewhere
   std::vector<double> inverse;  // 0 elsewhere
-  std::vector<int64_t> some;    // pixels, evenly over the picture
+  std::vector<int64_t> some;    // pixels, evenly over the image
 
   void read(const Ask& c, const View& view) {
     const int64_t size = int64_t(view.width) * view.height;
@@ -94,7 +94,7 @@ struct Ray {
   }
 };
 
-// The pixel of another view nearest to a place; -1 outside of the picture and behind the camera.
+// The pixel of another view nearest to a place; -1 outside of the image and behind the camera.
 int64_t nearest(const View& view, Place at) {
   const double right = view.width - 0.5, bottom = view.height - 0.5;
   const bool inside = (at.z > 0) & (at.x > -0.5) & (at.x < right) & (at.y > -0.5) & (at.y < bottom);

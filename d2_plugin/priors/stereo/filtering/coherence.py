@@ -3,7 +3,7 @@
 A wrong match is seldom wrong in the same way as its neighbours, while a right one shares a tangent plane with them.
 The test needs nothing but the depth map, so it judges every matcher alike.
 
-Measured on PatchMatch maps of the studio capture, among pixels that another view confirms: off by more than 5 % are
+Measured on PatchMatch maps of the studio recording, among pixels that another view confirms: off by more than 5 % are
 2.6 % of those with a coherence above .55 and 30 % of the others. Grey-value texture, at the threshold that keeps as
 many pixels, separates 8 % from 12 %.
 """
@@ -22,7 +22,7 @@ SLOPE_REACH = 2  # pixels between the ends of a difference: shorter ones amplify
 def surface_coherence(gray: np.ndarray, depth: np.ndarray, radius: int, relative: float, contrast: float) -> np.ndarray:
     """Share of a pixel's neighbours that lie on its tangent plane, weighted by similarity of grey value.
 
-    A plane in space is linear in inverse depth over the picture, so the tangent is the gradient of inverse depth, taken
+    A plane in space is linear in inverse depth over the image, so the tangent is the gradient of inverse depth, taken
     as a median of 5x5 that a few wrong neighbours cannot turn. Neighbours without depth count as disagreeing.
 
     Args:

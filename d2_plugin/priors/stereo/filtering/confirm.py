@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.geometry import (
     CONTINUOUS,
     Projection,
@@ -19,6 +18,7 @@ from d2_plugin.priors.geometry import (
 )
 from d2_plugin.priors.stereo.filtering import kernel
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.recording import Camera
 
 NUDGE = 1e-3
 """Change of log depth by which the parallax is measured."""

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from d2_plugin.captures.capture import Camera
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.stereo.filtering.coherence import surface_coherence
 from d2_plugin.priors.stereo.filtering.confirm import confirm
 from d2_plugin.priors.stereo.filtering.precision import geometric_sigma, grey_gradient
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.recording import Camera
 
 NEVER = np.float32(1e3)
 """Beyond any logarithm of a float32 depth: neutral in a minimum."""

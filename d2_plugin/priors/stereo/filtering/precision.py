@@ -1,7 +1,7 @@
 """How precise a geometric depth is: matching precision through the parallax, and what neighbours and sources say.
 
 A match that is off by e pixels puts the depth off by e / P, where P is the parallax: by how many pixels the match moves
-in the confirming sources when the depth changes by its own size. The match itself is as sharp as the picture is: grey
+in the confirming sources when the depth changes by its own size. The match itself is as sharp as the image is: grey
 values that are off by n put it off by n / g where they change by g per pixel. Two things that a map knows about itself
 tell where that is too good: how far depths scatter about the plane of their neighbours, and how far the depth of a
 confirming source lies from ours.
@@ -9,7 +9,7 @@ confirming source lies from ours.
     sigma^2 = ((m + n / g + k (1 - coherence)) / P)^2 + (r scatter)^2 + (s spread)^2 + floor^2
 
 What the match cost says is in the other terms already: a fit gives it no weight. The numbers are the same for every
-capture. They are a fit to studio and plaza (4 and 2 views), rendered rooms and Middlebury pairs (art, laundry,
+recording. They are a fit to studio and plaza (4 and 2 views), rendered rooms and Middlebury pairs (art, laundry,
 motorcycle, teddy): the table of docs/priors.md says what share of the errors they hold.
 """
 
@@ -125,7 +125,7 @@ def grey_gradient(gray: np.ndarray) -> np.ndarray:
 def plane_scatter(depth: np.ndarray, window: int = WINDOW) -> np.ndarray:
     """Root mean square relative deviation of inverse depth from the plane fitted to its window, [H, W]; 0 where empty.
 
-    A plane in space is linear in inverse depth over the picture.
+    A plane in space is linear in inverse depth over the image.
 
     Args:
         depth: [H, W], read as float32; 0, infinite or NaN where there is none.

@@ -14,9 +14,8 @@ import torch
 
 from d2_plugin.compiler.driver import Driver
 from d2_plugin.compiler.nvrtc import NoCuda, build
+from d2_plugin.priors.stereo.gpu.call import PROGRAM, THREADS, Call, Launcher, flags_for
 from d2_plugin.priors.stereo.patchmatch_kernel import CONSENSUS_RADIUS, Arrays, PatchMatchKernel, Task
-
-from .call import PROGRAM, THREADS, Call, Launcher, flags_for
 
 LEAST_SOURCES = 2
 """The kernels compiled for so many sources also average planes, which needs none."""

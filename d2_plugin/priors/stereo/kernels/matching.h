@@ -1,4 +1,4 @@
-// How well a plane explains the pictures: bilaterally weighted NCC between a window of the reference and a source.
+// How well a plane explains the images: bilaterally weighted NCC between a window of the reference and a source.
 #pragma once
 
 #include "planes.h"

@@ -41,7 +41,7 @@ struct Reference {
   static constexpr int kMargin = 5;
   static constexpr int kGrays = 256, kDistances = 5;  // of samples from the middle of a window
   int stride;
-  std::vector<unsigned> levels;                // -1 outside of the picture
+  std::vector<unsigned> levels;                // -1 outside of the image
   int offset[kSamples];                        // of the samples, in `levels`
   alignas(64) float weight[kDistances][2 * kGrays];  // by distance and difference of grey values, from -256 on
   int dx[kRegions][kMostPlaces], dy[kRegions][kMostPlaces];

@@ -1,4 +1,4 @@
-// Planes in space as PatchMatch uses them: inverse depth is linear over the picture, 1/z(u, v) = a u + b v + c.
+// Planes in space as PatchMatch uses them: inverse depth is linear over the image, 1/z(u, v) = a u + b v + c.
 // Pixel coordinates are array indices: the centre of pixel i is at i, and the intrinsics passed in say so too.
 //
 // This and the headers beside it are the mathematics of PatchMatch, once, for CPU and GPU. Every sum has one order.

@@ -74,7 +74,7 @@ D2_FN void region_place(int region, int k, int& dx, int& dy) {
   dy = y ? y * forward : middle ? 0 : across;
 }
 
-// The cheapest pixel of a region, negative where all of it lies outside of the picture.
+// The cheapest pixel of a region, negative where all of it lies outside of the image.
 D2_FN int cheapest_of(const Task& t, int x, int y, int region) {
   float lowest = 1e9f;
   int found = -1;

@@ -30,7 +30,7 @@ class FreeCamera {
 
   get distance() { return Math.hypot(...plus(this.focus, this.centre, -1)); }
 
-  // What `Renderer.draw` takes, for a picture of this size: the whole picture of the camera fits into it.
+  // What `Renderer.draw` takes, for an image of this size: the whole image of the camera fits into it.
   view(width, height) {
     const { camera, axes, centre } = this, scale = Math.min(width / camera.width, height / camera.height);
     const principal = [
@@ -42,7 +42,7 @@ class FreeCamera {
     return { rotation: axes.flat(), translation, centre, focal, principal, size: [width, height] };
   }
 
-  // Angles in radians, about what is up and about the picture's horizontal.
+  // Angles in radians, about what is up and about the image's horizontal.
   orbit(right, down) {
     const forward = this.axes[2], steep = Math.acos(Math.min(Math.max(-dot(forward, this.up), -1), 1));
     const tilt = Math.min(Math.max(steep - down, 0.05), Math.PI - 0.05) - steep;
@@ -53,7 +53,7 @@ class FreeCamera {
     this.moved = true;
   }
 
-  // Pixels of a picture with this focal length: what is at the focus follows the pointer.
+  // Pixels of an image with this focal length: what is at the focus follows the pointer.
   shift(right, down, focal) {
     const step = this.distance / focal, by = plus(this.axes[0].map((v) => -v * right * step), this.axes[1], -down * step);
     this.centre = plus(this.centre, by);
@@ -73,7 +73,7 @@ function listen(element, camera, changed) {
   const fingers = new Map();
   const focal = () => camera.view(element.clientWidth, element.clientHeight).focal[0];
   element.addEventListener("pointerdown", (event) => {
-    element.setPointerCapture(event.pointerId);
+    element.setPointerRecording(event.pointerId);
     fingers.set(event.pointerId, event);
   });
   for (const end of ["pointerup", "pointercancel"]) {

@@ -1,9 +1,9 @@
-// How coarse pictures may be while something moves. A straight line through the last measurements tells what a picture
+// How coarse images may be while something moves. A straight line through the last measurements tells what an image
 // costs however small, which many Gaussians make large, and what a pixel costs, which is all that coarser ones save.
 "use strict";
 
-const QUICK = 1 / 15;  // seconds that a picture may take
-const COARSEST = 6;    // pixels of the screen per pixel of the picture, each way
+const QUICK = 1 / 15;  // seconds that an image may take
+const COARSEST = 6;    // pixels of the screen per pixel of the image, each way
 const KEPT = 0.85;     // what a measurement still weighs when the next one comes
 
 class Pace {
@@ -26,7 +26,7 @@ class Pace {
     }
   }
 
-  // For a picture that has `full` pixels at its finest; no sudden jumps from how coarse it was `before`.
+  // For an image that has `full` pixels at its finest; no sudden jumps from how coarse it was `before`.
   coarse(full, before) {
     const left = Math.max(QUICK - this.fixed, 0.5 * this.fixed), wanted = Math.sqrt((full * this.pixel) / left);
     return Math.min(Math.max(wanted, before / 1.25, 1), before * 2, COARSEST);

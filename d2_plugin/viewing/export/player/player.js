@@ -7,18 +7,18 @@ class Player {
   constructor(header, raw) {
     this.header = header;
     this.scene = new Scene(header, raw);
-    this.renderer = new Renderer(byId("picture"), this.scene);
+    this.renderer = new Renderer(byId("image"), this.scene);
     this.camera = new FreeCamera(header);
     this.time = 0;
     this.mode = "color";
     this.speed = 1;
     this.playing = false;
     this.busy = false;       // the worker sorts
-    this.wanted = true;      // something changed since the last picture
+    this.wanted = true;      // something changed since the last image
     this.pace = new Pace();
-    this.coarse = 2;         // pixels of the screen per pixel of the picture, while something moves
-    this.drawnSharp = false; // the last picture has all pixels of the screen
-    this.pictures = 0;       // drawn so far
+    this.coarse = 2;         // pixels of the screen per pixel of the image, while something moves
+    this.drawnSharp = false; // the last image has all pixels of the screen
+    this.images = 0;       // drawn so far
     this.waiting = null;
     this.startWorker(raw);
     this.fillPage();
@@ -64,7 +64,7 @@ class Player {
 
   listen() {
     const on = (id, name, act) => byId(id).addEventListener(name, act);
-    listen(byId("picture"), this.camera, () => this.change());
+    listen(byId("image"), this.camera, () => this.change());
     on("play", "click", () => this.play(!this.playing));
     on("time", "input", () => { this.play(false); this.goTo(Number(byId("time").value)); });
     on("speed", "change", () => { this.speed = Number(byId("speed").value); });
@@ -157,7 +157,7 @@ class Player {
     const { view, time, mode, start } = this.asked;
     this.renderer.setOrder(order, count);
     this.renderer.draw(view, time, mode);
-    this.pictures++;
+    this.images++;
     this.busy = false;
     if (this.waiting) {
       this.renderer.gl.finish();
@@ -176,8 +176,8 @@ class Player {
     this.coarse = this.pace.coarse(size[0] * size[1], this.coarse);
   }
 
-  // The picture of a camera of the recording at a time, in the camera's own size, as the address of a PNG.
-  async picture(name, time, mode = "color") {
+  // The image of a camera of the recording at a time, in the camera's own size, as the address of a PNG.
+  async image(name, time, mode = "color") {
     const camera = this.header.cameras.find((other) => other.name === name);
     if (!camera) throw new Error(`no camera '${name}'`);
     const free = new FreeCamera(this.header);
@@ -191,7 +191,7 @@ class Player {
     const before = [this.time, this.mode];
     [this.time, this.mode] = [time, mode];
     await new Promise((resolve) => { this.waiting = resolve; this.sort(view); });
-    const address = byId("picture").toDataURL("image/png");
+    const address = byId("image").toDataURL("image/png");
     [this.time, this.mode] = before;
     this.change();
     return address;

@@ -102,7 +102,7 @@ class Renderer {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, order.length / WIDTH, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
   }
 
-  // view: rotation [9] row-major, translation [3], centre [3], focal, principal, size, all in pixels of the picture.
+  // view: rotation [9] row-major, translation [3], centre [3], focal, principal, size, all in pixels of the image.
   draw(view, time, mode) {
     const { gl, scene } = this, [width, height] = view.size;
     this.fit(width, height);
@@ -160,7 +160,7 @@ class Renderer {
     return { place, float: each(gl.uniform1f.bind(gl)), whole: each(gl.uniform1i.bind(gl)), pair };
   }
 
-  // Makes canvas and sums as large as the picture. Half floats: bytes would be rounded once for every Gaussian.
+  // Makes canvas and sums as large as the image. Half floats: bytes would be rounded once for every Gaussian.
   fit(width, height) {
     const { gl, canvas, target } = this;
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];

@@ -1,4 +1,4 @@
-// The picture: the same mathematics as the project's rasterizer (elliptical weighted average projection, the blur of
+// The image: the same mathematics as the project's rasterizer (elliptical weighted average projection, the blur of
 // 0.3 pixels squared, alpha at most .99, nothing below 1/255), drawn from the farthest Gaussian to the nearest.
 "use strict";
 
@@ -56,7 +56,7 @@ vec3 harmonics(vec3 d, int first, float phase) {
 }
 
 void main() {
-  gl_Position = vec4(2., 2., 2., 1.);  // outside of the picture
+  gl_Position = vec4(2., 2., 2., 1.);  // outside of the image
   int place = gl_VertexID >> 2;
   int i = int(texelFetch(order, ivec2(place & 4095, place >> 12), 0).r);
   vec4 a = mix(texel(stateFrom, 3 * i), texel(stateTo, 3 * i), share);
@@ -75,7 +75,7 @@ void main() {
   vec3 point = rotation * mean + translation;
   if (point.z <= near || opacity < alphaMin) return;
 
-  // The linearisation explodes beside the camera: slopes are clamped around the middle of the picture.
+  // The linearisation explodes beside the camera: slopes are clamped around the middle of the image.
   vec2 middle = (0.5 * size - principal) / focal, halfway = fovClamp * 0.5 * size / focal;
   vec2 slopes = clamp(point.xy / point.z, middle - halfway, middle + halfway);
   mat3 turned = transpose(rotation);  // its columns are the rows of the rotation

@@ -50,7 +50,7 @@ namespace {
 constexpr int kNoWeight = 256;    // where the table of weights has its zero
 constexpr int kOutside = 100000;  // grey value that differs by more from every other
 
-// The picture with a rim of `radius` pixels on both sides of each row whose grey value weighs nothing, and room for
+// The image with a rim of `radius` pixels on both sides of each row whose grey value weighs nothing, and room for
 // whole vectors at its end.
 struct Rimmed {
   int stride;

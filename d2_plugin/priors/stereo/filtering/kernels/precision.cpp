@@ -31,7 +31,7 @@ struct Sigma {
 
 namespace {
 
-// Sums over the columns of a window, for each column of the picture and `reach` empty ones on both sides: of the weight
+// Sums over the columns of a window, for each column of the image and `reach` empty ones on both sides: of the weight
 // and of inverse depth y, each times powers of the row v, counted from the window's middle.
 struct Columns {
   std::vector<float> weights[3];    // of 1, v and v^2: whole numbers, exact

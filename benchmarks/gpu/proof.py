@@ -1,0 +1,238 @@
+"""`d2 bench gpu`: everything that a GPU has to show, one step after another, in less than 25 minutes.
+
+Each step has a time limit of its own and leaves its output and a row as soon as it ends, so that a machine lent for
+half an hour loses nothing. A step that cannot run here says why in one sentence; what needs no device runs without one.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import torch
+
+from benchmarks.gpu.static import ARCHITECTURES, static_analysis
+from d2_plugin.durable import make_folder
+from d2_plugin.errors import D2Error
+from d2_plugin.runs.command_line import command_line
+from d2_plugin.runs.markup import Table, markdown
+from d2_plugin.runs.rows import Row, append_rows, make_row
+from d2_plugin.settings import Range, Settings
+
+logger = logging.getLogger(__name__)
+
+LONGEST = 25 * 60
+"""What all steps together may take, seconds."""
+
+
+@dataclass(frozen=True)
+class GpuBench(Settings):
+    """Settings of `d2 bench gpu`."""
+
+    steps: tuple[str, ...] = ()
+    """Names of the steps to run; all if not given."""
+    repository: Path = Path()
+    """Checkout of this project, whose tests are run."""
+    recording: Path | None = None
+    """Recording that is trained on the GPU and on the CPU."""
+    train_cameras: str = "preset:4"
+    """Cameras to train with, as `d2 train` takes them."""
+    iterations: Annotated[int, Range(1, unit="steps")] = 600
+    """Steps of each of the two trainings."""
+    output: Path = Path("bench-gpu")
+    """Folder of rows, outputs and profiles."""
+
+
+Need = Callable[[GpuBench], str | None]
+"""Why a step cannot run here, in one sentence; None where it can."""
+
+
+def _device(settings: GpuBench) -> str | None:
+    return None if torch.cuda.is_available() else "torch sees no CUDA device: run it on a machine that has one"
+
+
+def _tests(settings: GpuBench) -> str | None:
+    if (settings.repository / "tests" / "rasterizer").is_dir():
+        return None
+    return f"'{settings.repository}' is no checkout of this project: give one with --repository"
+
+
+def _recording(settings: GpuBench) -> str | None:
+    return None if settings.recording else "no recording was given: add --recording"
+
+
+def _program(name: str) -> Need:
+    return lambda settings: None if shutil.which(name) else f"{name} is not on the path: install the CUDA toolkit"
+
+
+class Step(NamedTuple):
+    """A part of the proof: its time limit, what it needs and its command."""
+
+    limit: int  # seconds
+    needs: tuple[Need, ...]
+    words: Callable[[GpuBench], list[str]] | None
+    """The command; None for the static analysis, which runs in this process."""
+
+
+def _pytest(*words: str) -> Callable[[GpuBench], list[str]]:
+    return lambda settings: [sys.executable, "-m", "pytest", "-q", *words]
+
+
+def _d2(*words: str) -> list[str]:
+    return [str(Path(sys.executable).with_name("d2")), *words]
+
+
+def _sanitizer(tool: str) -> Step:
+    # Small scenes: a sanitizer slows a kernel down a hundred times.
+    chosen = ["-m", "cuda", "tests/rasterizer/test_rasterizer_cuda.py", "-k", "1x1 or 15x33 or empty or survey"]
+    watched = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9"]
+    words = [*watched, sys.executable, "-m", "pytest", "-q", *chosen]
+    return Step(120, (_device, _tests, _program("compute-sanitizer")), lambda settings: words)
+
+
+def _raster(settings: GpuBench) -> list[str]:
+    sizes = ("--sizes", "640x360", "1920x1080", "--scenes", "synth:50000", "synth:200000", "synth:1000000")
+    kind = ("--device", "cuda", "--seconds", "2", "--error-limit", "60000")
+    return _d2("bench", "raster", *kind, *sizes, "--output", str(settings.output / "raster"))
+
+
+def _train(device: str) -> Callable[[GpuBench], list[str]]:
+    def words(settings: GpuBench) -> list[str]:
+        given = ["--device", device, "--iterations", str(settings.iterations)]
+        given += ["--train-cameras", settings.train_cameras]
+        return _d2("train", str(settings.recording), *given, "--output", str(settings.output / f"train-{device}"))
+
+    return words
+
+
+def _compare(settings: GpuBench) -> list[str]:
+    return _d2("compare", *(str(settings.output / f"train-{device}") for device in ("cuda", "cpu")))
+
+
+def _trained(settings: GpuBench) -> str | None:
+    missing = [name for name in ("train-cuda", "train-cpu") if not (settings.output / name).is_dir()]
+    return f"{' and '.join(missing)} did not run: their reasons stand above" if missing else None
+
+
+def _profile(settings: GpuBench) -> list[str]:
+    kernels = "regex:d2_(render|backward|survey)$"
+    options = ["--set", "basic", "-k", kernels, "-c", "6", "-f", "-o", str(settings.output / "profile")]
+    work = ("--device", "cuda", "--scenes", "synth:200000", "--sizes", "1920x1080", "--seconds", "0.1", "--no-memory")
+    raster = _d2("bench", "raster", *work, "--error-limit", "1", "--output", str(settings.output / "profiled"))
+    return ["ncu", *options, *raster]
+
+
+def _stereo(device: str) -> Callable[[GpuBench], list[str]]:
+    def words(settings: GpuBench) -> list[str]:
+        kind = ("--makers", "patchmatch", "--defaults-only", "--rigs", "synthetic4", "--width", "640")
+        return _d2("bench", "stereo", *kind, "--device", device, "--output", str(settings.output / f"stereo-{device}"))
+
+    return words
+
+
+SHIM = ("-k", "shim", "tests/rasterizer/test_rasterizer_cuda.py", "tests/priors/test_patchmatch_gpu.py")
+STEPS = {
+    "static": Step(100, (_program("nvcc"),), None),
+    "tests": Step(180, (_device, _tests), _pytest("-m", "cuda", "tests")),
+    "memcheck": _sanitizer("memcheck"),
+    "racecheck": _sanitizer("racecheck"),
+    "initcheck": _sanitizer("initcheck"),
+    "raster": Step(240, (_device,), _raster),
+    "stereo-cuda": Step(60, (_device,), _stereo("cuda")),
+    "train-cuda": Step(150, (_device, _recording), _train("cuda")),
+    "train-cpu": Step(150, (_device, _recording), _train("cpu")),
+    "compare": Step(20, (_device, _recording, _trained), _compare),
+    "profile": Step(100, (_device, _program("ncu")), _profile),
+    "shim": Step(140, (_tests,), _pytest(*SHIM)),
+}
+"""In the order in which they are worth the time."""
+
+
+def run(settings: GpuBench) -> str:
+    """Run the steps; a table of what each came to, and where rows and outputs lie."""
+    unknown = [name for name in settings.steps if name not in STEPS]
+    if unknown:
+        raise D2Error(f"unknown step '{unknown[0]}': have {', '.join(STEPS)}")
+    make_folder(settings.output)
+    command = command_line("bench gpu", settings)
+    rows = []
+    for name in settings.steps or STEPS:
+        done = _run_step(name, settings, command)
+        append_rows(settings.output / "gpu.jsonl", done)
+        logger.info("%s: %s", name, done[0]["failed"] or "done")
+        rows += done
+    return f"{table(rows)}\n\ngpu.jsonl (rows) and the output of each step are in {settings.output}"
+
+
+def _run_step(name: str, settings: GpuBench, command: str) -> list[Row]:
+    step = STEPS[name]
+    start = time.perf_counter()
+    refused = next((reason for need in step.needs if (reason := need(settings))), None)
+    if refused is None and step.words is None:
+        rows = _static(command)
+        refused = None if rows else "nvcc compiled no kernel: please report this"
+    else:
+        rows = []
+        refused = refused or _call(step, name, settings)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    took = time.perf_counter() - start
+    facts = make_row("gpu", name, "step", error=None, seconds=took, failed=refused, command=command, device=device)
+    return [facts, *rows]
+
+
+def _static(command: str) -> list[Row]:
+    nvcc = shutil.which("nvcc") or ""
+    return [row for architecture in ARCHITECTURES for row in static_analysis(nvcc, architecture, command)]
+
+
+def _call(step: Step, name: str, settings: GpuBench) -> str | None:
+    """Run a step's command with its output in a file; why it failed, or None."""
+    assert step.words is not None
+    log = settings.output.resolve() / f"{name}.log"
+    words = step.words(_resolved(settings))
+    with log.open("w") as output:
+        # A session of its own: what the command started ends with it.
+        process = subprocess.Popen(
+            words, cwd=settings.repository, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
+        )
+        try:
+            code = process.wait(step.limit)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            return f"it took longer than {step.limit} s: {log.name} has what it said until then"
+    return None if code == 0 else f"it ended with {code}: {log.name} says why"
+
+
+def _resolved(settings: GpuBench) -> GpuBench:
+    """The same with folders that mean the same from every folder."""
+    recording = settings.recording.resolve() if settings.recording else None
+    return replace(settings, output=settings.output.resolve(), recording=recording)
+
+
+def table(rows: list[Row]) -> str:
+    """Markdown: what became of each step, and what the compiler says of each kernel."""
+    steps = [row for row in rows if row["method"] == "step"]
+    lines = tuple((row["case"], f"{row['seconds']:.1f}", row["failed"] or "done") for row in steps)
+    parts = [markdown(Table(("step", "s", "outcome"), lines))]
+    kernels = [row for row in rows if row["method"] == "d2"]
+    facts = ("registers", "spill_bytes", "shared_bytes", "instructions", "fragment_instructions")
+    cells = tuple((row["case"], row["setting"], *(_plain(row[fact]) for fact in facts)) for row in kernels)
+    if cells:
+        head = ("static analysis", "for", "registers", "bytes spilled", "bytes shared", "instructions", "a fragment")
+        named = tuple((cell[0].removeprefix("static analysis of "), *cell[1:]) for cell in cells)
+        parts.append(markdown(Table(head, named)))
+    return "\n\n".join(parts)
+
+
+def _plain(value: int | None) -> str:
+    return "-" if value is None else str(value)

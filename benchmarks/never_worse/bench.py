@@ -1,0 +1,163 @@
+"""`d2 bench never-worse`: is D² with wrong monocular maps worse than the backbone alone, or than stereo alone?
+
+Each recording is written with the cameras that train, and those that score where not all others do:
+PATH@00+02+05+07@01+03+04+06. All runs of one recording start from the same points and see the same images; the prior of
+each is built anew from its own maps, with the same geometric depth. Rows are written as runs finish, and the same
+command continues where it was stopped. `d2 report` draws them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+from benchmarks.never_worse.maps import SPOILED, spoiled_recording
+from benchmarks.never_worse.section import BACKBONE, STEREO, never_worse_text
+from d2_plugin.errors import D2Error
+from d2_plugin.progress import progress_bar
+from d2_plugin.runs.ablation.job import Job
+from d2_plugin.runs.ablation.presets import PRESETS, Preset
+from d2_plugin.runs.command_line import command_line
+from d2_plugin.runs.prior.build import build_priors_for
+from d2_plugin.runs.rows import Row, append_rows, read_rows
+from d2_plugin.runs.scene import Scene
+from d2_plugin.runs.settings import RunSettings, check, prior_settings
+from d2_plugin.runs.shared import Shared, share
+from d2_plugin.runs.start import TimedPoints
+from d2_plugin.runs.training.cases import Case, case_of
+from d2_plugin.runs.training.measured import Work
+from d2_plugin.runs.training.spread import Line, follow, workers
+from d2_plugin.settings import AtLeastOne, Count, Positional, Range, Seed, Settings
+
+Maps = Literal["own", "noise", "smooth", "constant", "other", "network"]
+
+
+@dataclass(frozen=True)
+class NeverWorseBench(Settings):
+    """Settings of `d2 bench never-worse`."""
+
+    recordings: Annotated[tuple[str, ...], Positional()] = ()
+    """Recordings with their cameras, as PATH@TRAIN+TRAIN or PATH@TRAIN+TRAIN@SCORE+SCORE."""
+    maps: tuple[Maps, ...] = ("own", "noise", "smooth", "constant", "other", "network")
+    """Monocular maps: the recording's own (a network's where it has none), random pixels, random blobs, one value,
+    those of another frame (of another camera where there is one frame), and a network's."""
+    steps: Annotated[int, Range(1, unit="steps")] = 1000
+    """Optimizer steps of each run, one view each."""
+    seeds: tuple[Seed, ...] = (0,)
+    """Seeds."""
+    backbone: str = "yang4d"
+    """Name of a registered backbone."""
+    frames: tuple[Count, ...] | None = None
+    """Numbers of the frames, in every recording; all if not given."""
+    downscale: AtLeastOne = 1
+    """Make images this many times smaller along each side."""
+    mono_onnx: str | None = None
+    """ONNX model of monocular depth."""
+    mono_kind: Literal["relative", "metric"] | None = None
+    """What the model returns."""
+    jobs: Annotated[int, Range(1)] = os.cpu_count() or 1
+    """Runs at a time, one thread each."""
+    output: Path = Path("never-worse")
+    """Folder of recordings, priors, runs and never-worse.jsonl."""
+
+
+def run(settings: NeverWorseBench) -> str:
+    """Measure what is missing; the table, and where the rows lie."""
+    if not settings.recordings:
+        raise D2Error("d2 bench never-worse needs a recording with its cameras: write PATH@00+02+05+07")
+    path = settings.output / "never-worse.jsonl"
+    known = {(row["case"], row["method"], row["fingerprint"]) for row in _rows(path)}
+    works = [work for text in settings.recordings for work in _works(settings, text)]
+    missing = [work for work in works if (work.case, work.method, work.key[0]) not in known]
+    with progress_bar("bench never-worse", len(missing)) as bar:
+        done = itertools.count(1)
+
+        def write(row: Row) -> None:
+            append_rows(path, [row])
+            bar.update(next(done), f"{row['case']}: {row['method']}, {row['setting']}")
+
+        with workers(settings.jobs, None) as submit:
+            follow([_all_of(missing)] if missing else [], submit, write)
+    return f"{never_worse_text(_rows(path))}\n\nrows are in {path}; `d2 report {path}` draws them"
+
+
+def _rows(path: Path) -> list[Row]:
+    return read_rows([path]) if path.is_file() else []
+
+
+def _all_of(works: Sequence[Work]) -> Line:
+    yield works
+
+
+def _works(settings: NeverWorseBench, text: str) -> Iterator[Work]:
+    """Every run of a case; points and priors are made here, one after the other."""
+    shown = {name: getattr(settings, name) for name in ("backbone", "frames", "downscale")}
+    base = RunSettings("", (), iterations=settings.steps, **shown)
+    network = replace(base, mono_onnx=settings.mono_onnx, mono_kind=settings.mono_kind)
+    case = case_of(text, base)
+    own = _own(case, network)
+    folder = settings.output.absolute() / case.slug
+    shared = share(own, folder)
+    template = _Template(settings, case.name, shared)
+    yield from template.works(BACKBONE, own, PRESETS["backbone"])
+    yield from template.works(STEREO, own, PRESETS["mvs_only"])
+    for maps in settings.maps:
+        used = _with_maps(maps, case, own, network, folder)
+        if used is not None:
+            yield from template.works(maps, used, PRESETS["full"])
+
+
+def _own(case: Case, network: RunSettings) -> RunSettings:
+    """The case with the maps that belong to it: on disk, else the network's."""
+    recording = Scene.open(check(case.settings)).recording
+    if recording.mono_kind is not None:
+        return case.settings
+    if network.mono_onnx is None:
+        raise D2Error(f"{case.name} has no monocular maps: give a network by --mono-onnx FILE --mono-kind relative")
+    return replace(case.settings, mono_onnx=network.mono_onnx, mono_kind=network.mono_kind)
+
+
+def _with_maps(maps: Maps, case: Case, own: RunSettings, network: RunSettings, folder: Path) -> RunSettings | None:
+    """The case with other maps; None where they are those that it has, or where there is no network."""
+    if maps == "own":
+        return own
+    if maps == "network":
+        given = replace(case.settings, mono_onnx=network.mono_onnx, mono_kind=network.mono_kind)
+        return None if network.mono_onnx is None or own.mono_onnx is not None else given
+    assert maps in SPOILED
+    shown = Path(own.recording), own.train_cameras, own.frames
+    path = spoiled_recording(*shown, maps, folder / "maps" / maps, prior_settings(own))
+    return replace(case.settings, recording=str(path))
+
+
+class _Template:
+    """Makes the runs of one case."""
+
+    def __init__(self, settings: NeverWorseBench, case: str, shared: Shared) -> None:
+        self.settings, self.case, self.shared = settings, case, shared
+        listed = {name: ",".join(map(str, getattr(settings, name) or ())) for name in ("maps", "seeds", "frames")}
+        self.command = command_line("bench never-worse", settings, False, **listed)
+
+    def works(self, method: str, base: RunSettings, preset: Preset) -> Iterator[Work]:
+        """The seeds of one method, its prior built where it needs one."""
+        name = method.replace(" ", "_")
+        store = self.shared.folder / "priors" / name
+        used = replace(base, hooks=preset.hooks, overrides=preset.merged(base.overrides), priors=str(store))
+        about = {"prior": self._build(used, store) if preset.hooks else None, "frames": base.frames}
+        for seed in self.settings.seeds:
+            folder = self.shared.folder / "runs" / name / f"{base.iterations}steps" / f"seed{seed}"
+            job = Job(preset.name, base.backbone, seed, replace(used, seed=seed), folder)
+            yield Work(job, self.shared, self.case, method, self.command, "steps", about, "never_worse")
+
+    def _build(self, settings: RunSettings, store: Path) -> str:
+        """The prior of one method, with the geometric depth of the full one; what it became, in a line."""
+        if not store.exists():
+            shutil.copytree(self.shared.priors, store, ignore=shutil.ignore_patterns("priors", "matches", "mono"))
+        points = TimedPoints.load(self.shared.points).positions
+        settings = check(settings)
+        return build_priors_for(settings, Scene.open(settings), points, store).headline()

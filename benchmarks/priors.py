@@ -1,0 +1,170 @@
+"""`d2 bench priors`: declared against true error of the depth prior, on every recording that has true depth.
+
+The prior is built with the default settings, as `d2 priors` does, and every finite sigma is held against the error that
+the pixel has. A normal error lies within sigma at 68 % and within 2 sigma at 95 % of the pixels; 60 to 80 % and at
+least 90 % count as calibrated. `d2 report` draws the reliability diagram of the rows.
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import torch
+
+from benchmarks.stereo_rigs import ARCS
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.priors.build import build_priors
+from d2_plugin.priors.calibration import NORMAL_SHARE, Calibration, frames_with_truth, held_against_truth, shown
+from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.recordings import Recording, open_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.runs.command_line import command_line
+from d2_plugin.runs.rows import Row, append_rows, begin_rows, make_row
+from d2_plugin.runs.start import triangulated_points
+from d2_plugin.settings import AtATime, Count, Positional, Range, Settings
+from d2_plugin.store.store import PriorStore
+
+logger = logging.getLogger(__name__)
+
+RENDERED = tuple(f"synthetic{views}" for views in ARCS)
+RENDERED_FRAMES = 24
+FAR = "far"
+"""Method of the row about far pixels, which every case has."""
+
+
+@dataclass(frozen=True)
+class PriorsBench(Settings):
+    """Settings of `d2 bench priors`."""
+
+    recordings: Annotated[tuple[str, ...], Positional()] = ()
+    """Folders of recordings with true depth; the rendered rig of four cameras if none is named."""
+    rigs: tuple[str, ...] = ()
+    """Rendered rooms to measure as well: synthetic2, synthetic3, synthetic4."""
+    train_cameras: tuple[str, ...] = ()
+    """Cameras that the prior is built for, in every recording that has them all; all cameras in the others."""
+    frames: tuple[Count, ...] = ()
+    """Numbers of the frames, in every recording; the first and the last with a true depth if none is named."""
+    width: Annotated[int, Range(32, unit="pixels")] = 320
+    """Width of rendered images, which are 16:9, pixels."""
+    threads: AtATime = 1
+    """CPU threads."""
+    output: Path = Path("runs.jsonl")
+    """File that the rows are added to."""
+
+
+class Case(NamedTuple):
+    """A recording, cut to the frames that are measured."""
+
+    name: str
+    recording: Recording
+    cameras: tuple[str, ...]
+
+
+def run(settings: PriorsBench) -> str:
+    """Measure and add the rows; a table per recording, and where the rows lie."""
+    begin_rows(settings.output)
+    torch.set_num_threads(settings.threads)
+    command, told = _command(settings), []
+    for case in cases(settings):
+        found, seconds = measure(case)
+        append_rows(settings.output, rows_of(case, found, seconds, command))
+        told.append(f"{case.name}, {seconds:.2f} s per image, {found}")
+        logger.info("the prior of %s is measured", case.name)
+    return "\n\n".join([*told, f"rows are in {settings.output}; `d2 report {settings.output}` draws them"])
+
+
+def _command(settings: PriorsBench) -> str:
+    """As it is typed: recordings stand apart, the values of a flag are joined by commas."""
+    joined = {name: ",".join(map(str, getattr(settings, name))) for name in ("rigs", "train_cameras", "frames")}
+    return command_line("bench priors", settings, False, **joined)
+
+
+def cases(settings: PriorsBench) -> list[Case]:
+    """What is measured, opened and checked before anything is built.
+
+    Raises:
+        D2Error: a recording that is not there or has no true depth, an unknown rig, a camera that no recording has.
+    """
+    rigs = settings.rigs or (() if settings.recordings else (RENDERED[-1],))
+    opened = [open_recording(path) for path in settings.recordings] + [_rendered(name, settings.width) for name in rigs]
+    known = {camera for recording in opened for camera in recording.cameras}
+    for camera in settings.train_cameras:
+        if camera not in known:
+            raise unknown_name("camera", camera, sorted(known))
+    return [_case(recording, settings) for recording in opened]
+
+
+def _rendered(name: str, width: int) -> Recording:
+    """The room of `d2 demo`, with emulated maps, from as many cameras as the name says."""
+    if name not in RENDERED:
+        raise unknown_name("rig", name, RENDERED)
+    views = int(name.removeprefix("synthetic"))
+    height = round(width * 9 / 16)
+    room = synthetic_recording(views, 0, RENDERED_FRAMES, width, height, arc_degrees=ARCS[views])
+    return replace(room, name=name)
+
+
+def _case(recording: Recording, settings: PriorsBench) -> Case:
+    wanted = settings.train_cameras
+    cameras = wanted if wanted and set(wanted) <= recording.cameras.keys() else tuple(recording.cameras)
+    known = frames_with_truth(recording, cameras)
+    chosen = [frame for frame in settings.frames or (*known[:1], *known[1:][-1:]) if frame in known]
+    if not known:
+        raise D2Error(f"{recording.name} has no true depth, so no error is known: name recordings that have one")
+    if not chosen:
+        raise D2Error(
+            f"{recording.name} has no true depth at {_listed(settings.frames)}: choose --frames from {_listed(known)}"
+        )
+    return Case(f"{recording.name}, {len(cameras)} views", replace(recording, frames=tuple(chosen)), cameras)
+
+
+def _listed(frames: Sequence[int]) -> str:
+    shown_frames = ", ".join(map(str, frames[:8])) + (" and more" if len(frames) > 8 else "")
+    return f"frame{'s' if len(frames) > 1 else ''} {shown_frames}"
+
+
+def measure(case: Case) -> tuple[Calibration, float]:
+    """How the prior that the defaults make compares with the truth, and the seconds that it takes per image."""
+    points = triangulated_points(case.recording, case.cameras).positions
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        build_priors(case.recording, case.cameras, folder, PriorSettings(), sparse_points=points)
+        seconds = time.perf_counter() - start
+        found = held_against_truth(PriorStore.open(folder), case.recording)
+    if found is None:
+        raise D2Error(f"no prior of {case.name} has both a sigma and a true depth: choose other cameras or frames")
+    return found, seconds / (len(case.cameras) * len(case.recording.frames))
+
+
+def rows_of(case: Case, found: Calibration, seconds: float, command: str = "") -> list[Row]:
+    """A row per label that a pixel carries, and one about far pixels."""
+    about: dict[str, Any] = {
+        "command": command,
+        "seconds": seconds,
+        "cameras": list(case.cameras),
+        "frames": list(case.recording.frames),
+        "mono_emulated": case.recording.mono_emulated,
+        "compared_views": found.views,
+    }
+    rows = [
+        make_row(
+            *("priors", case.name, shown(label)),
+            error=abs(held.within - NORMAL_SHARE),
+            share=held.share,
+            within=held.within,
+            within_two=held.within_two,
+            median_sigma=held.sigma,
+            median_error=held.error,
+            curve=[list(point) for point in held.curve],
+            **about,
+        )
+        for label, held in found.labels.items()
+    ]
+    far: dict[str, Any] = {"sky_found": found.sky_found, "false_far": found.false_far}
+    return [*rows, make_row("priors", case.name, FAR, error=found.false_far, **far, **about)]

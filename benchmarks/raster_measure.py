@@ -1,0 +1,265 @@
+"""Time, memory and error of one rasterizer on one scene."""
+
+from __future__ import annotations
+
+import importlib.util
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from benchmarks.raster_scenes import Scene, load_scene
+from d2_plugin.rasterizer import DepthPrior, RasterSettings, Render, Splats, rasterize, reference, survey
+from d2_plugin.runs.memory import in_fresh_process, peak_resident
+
+SETTINGS = RasterSettings()
+GRADIENTS = ("means", "covariances", "opacities", "colors")
+THRESHOLD_DEVIATION = 1e-5
+"""Color or alpha that deviates more than this from float64 in a pixel does so because of a threshold."""
+
+REFERENCE_LIMIT = 12_000
+"""Most Gaussians for which the torch path is timed as a peer; with more of them it takes seconds per call."""
+
+
+NEARLY_NO_THRESHOLDS = RasterSettings(alpha_min=1e-7, transmittance_min=1e-9)
+"""What images with thresholds are compared with, in float64."""
+
+THRESHOLDS = {
+    "alpha 1/255, T 1e-4 (default)": SETTINGS,
+    "alpha 1/255, T 1e-2": RasterSettings(transmittance_min=1e-2),
+    "alpha 1/255, T 1e-3": RasterSettings(transmittance_min=1e-3),
+    "alpha 1/64, T 1e-4": RasterSettings(alpha_min=1 / 64),
+    "alpha 1e-3, T 1e-4": RasterSettings(alpha_min=1e-3),
+    "alpha 1e-4, T 1e-5": RasterSettings(alpha_min=1e-4, transmittance_min=1e-5),
+    "alpha 1e-5, T 1e-6": RasterSettings(alpha_min=1e-5, transmittance_min=1e-6),
+}
+"""Which contributions are left out, and when a pixel is finished."""
+
+
+class Case(NamedTuple):
+    """A scene at an image size."""
+
+    scene: str
+    width: int
+    height: int
+    garden: Path | None
+
+    def load(self) -> Scene:
+        """The Gaussians and the camera, float32 on the CPU."""
+        return load_scene(self.scene, self.width, self.height, self.garden)
+
+
+RenderScene = Callable[[Splats, Tensor, Scene], Render]
+
+
+def _d2(splats: Splats, colors: Tensor, scene: Scene) -> Render:
+    return rasterize(splats, colors, scene.view, SETTINGS)
+
+
+def _reference(splats: Splats, colors: Tensor, scene: Scene) -> Render:
+    return reference.rasterize(splats, colors, scene.view, SETTINGS)
+
+
+def _gsplat(splats: Splats, colors: Tensor, scene: Scene) -> Render:
+    """gsplat from covariances, with the same constants; its tiles cut at 3 sigma, so its error is not only rounding."""
+    import gsplat
+
+    view, device = scene.view, colors.device
+    xx, xy, xz, yy, yz, zz = splats.covariances.unbind(-1)
+    full = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
+    image, alpha, _ = gsplat.rasterization(
+        *(splats.means, None, None, splats.opacities, colors),
+        *(view.T_camera_world.to(device)[None], view.K.to(device)[None], view.width, view.height),
+        near_plane=SETTINGS.near,
+        eps2d=SETTINGS.blur,
+        render_mode="RGB+D",
+        covars=full,
+    )
+    return Render(image[0, ..., :-1], image[0, ..., -1], alpha[0, ..., 0])
+
+
+def implementations(device: torch.device, gaussians: int) -> dict[str, RenderScene]:
+    """What is compared on `device`: this package, the torch path up to `REFERENCE_LIMIT`, gsplat where installed."""
+    found: dict[str, RenderScene] = {"d2": _d2}
+    if gaussians <= REFERENCE_LIMIT:
+        found["torch reference"] = _reference
+    if device.type == "cuda" and importlib.util.find_spec("gsplat"):
+        found["gsplat"] = _gsplat
+    return found
+
+
+def leaves_of(scene: Scene, device: torch.device, dtype: torch.dtype) -> list[Tensor]:
+    """Means, covariances, opacities and colors that require gradients."""
+    parts = (*scene.splats()[:3], scene.colors)
+    return [part.to(device, dtype).requires_grad_() for part in parts]
+
+
+def splats_of(leaves: Sequence[Tensor]) -> Splats:
+    """The Gaussians of `leaves_of`, without their colors."""
+    means, covariances, opacities, _ = leaves
+    return Splats(means, covariances, opacities, torch.arange(len(means), device=means.device))
+
+
+def upstream(scene: Scene, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Fixed random gradients of color, depth sum and alpha."""
+    g = torch.Generator().manual_seed(0)
+    size = (scene.view.height, scene.view.width)
+    color, depth, alpha = (torch.randn(shape, generator=g).to(like) for shape in ((*size, 3), size, size))
+    return color, depth, alpha
+
+
+def prior_of(scene: Scene, device: torch.device) -> DepthPrior:
+    """A depth prior with three fifths of its pixels verified, at random."""
+    g = torch.Generator().manual_seed(0)
+    size = (scene.view.height, scene.view.width)
+    labels = torch.where(torch.rand(size, generator=g) < 0.6, 2, 1).to(torch.uint8)
+    return DepthPrior((2 + 8 * torch.rand(size, generator=g)).to(device), labels.to(device))
+
+
+def passes_of(render: RenderScene, scene: Scene, device: torch.device) -> dict[str, Callable[[], object]]:
+    """What is timed: forward, forward and backward (gradients of everything for all three outputs), survey."""
+    leaves = leaves_of(scene, device, torch.float32)
+    splats = splats_of(leaves)
+    fixed = splats_of([leaf.detach() for leaf in leaves])
+    weights, prior = upstream(scene, leaves[0]), prior_of(scene, device)
+
+    def forward() -> object:
+        with torch.no_grad():
+            return render(fixed, leaves[3], scene)
+
+    def forward_backward() -> object:
+        return torch.autograd.grad(render(splats, leaves[3], scene)[:3], leaves, weights)
+
+    passes = {"forward": forward, "forward+backward": forward_backward}
+    if render is _d2:
+        passes["survey"] = lambda: survey(fixed, scene.view, prior, SETTINGS)
+    return passes
+
+
+def timed(works: Mapping[str, Callable[[], object]], device: torch.device, seconds: float) -> dict[str, dict[str, Any]]:
+    """Wall and CPU time of calls in ms, `works` in turn so that each sees the same machine.
+
+    One round that is not counted, then at least three, for about `seconds` per work or until each ran 200 times.
+    """
+    for work in works.values():
+        _finish(work(), device)
+    wall: dict[str, list[float]] = {name: [] for name in works}
+    cpu: dict[str, list[float]] = {name: [] for name in works}
+    end, rounds = time.perf_counter() + seconds * len(works), 0
+    while rounds < 3 or (time.perf_counter() < end and rounds < 200):
+        for name, work in works.items():
+            start, start_cpu = time.perf_counter(), time.process_time()
+            _finish(work(), device)
+            wall[name].append(1e3 * (time.perf_counter() - start))
+            cpu[name].append(1e3 * (time.process_time() - start_cpu))
+        rounds += 1
+    return {name: _summary(wall[name], cpu[name]) for name in works}
+
+
+def _summary(wall: Sequence[float], cpu: Sequence[float]) -> dict[str, Any]:
+    low, middle, high = statistics.quantiles(wall, n=4)
+    return {
+        "median_ms": middle,
+        "iqr_ms": high - low,
+        "min_ms": min(wall),
+        "cpu_ms": statistics.median(cpu),
+        "repeats": len(wall),
+    }
+
+
+def _finish(_result: object, device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+class Truth(NamedTuple):
+    """The reference in float64, with its graph, for `error_of`."""
+
+    render: Render
+    leaves: list[Tensor]
+
+
+def exact(scene: Scene) -> Truth:
+    """Image of the reference in float64."""
+    leaves = leaves_of(scene, torch.device("cpu"), torch.float64)
+    splats = splats_of(leaves)
+    return Truth(reference.rasterize(splats, leaves[3], scene.view, SETTINGS), leaves)
+
+
+def error_of(render: RenderScene, scene: Scene, device: torch.device, truth: Truth) -> dict[str, dict[str, float]]:
+    """Deviation from `exact`: of color, depth sum and alpha as it is; of gradients in units of their own RMS.
+
+    In float32 an alpha or a transmittance just at its threshold may be decided differently, and what depends on that
+    decision jumps. Such pixels are counted apart: `over_1e-4` is the share of pixels of an output that deviate more,
+    and gradients (`relative_l2` is the norm of their deviation over that of the truth) are those of a loss that leaves
+    out the pixels whose color or alpha deviates by more than `THRESHOLD_DEVIATION`, whose share is in `apart`.
+    """
+    leaves = leaves_of(scene, device, torch.float32)
+    found = render(splats_of(leaves), leaves[3], scene)
+    pairs = zip(found[:3], truth.render[:3])
+    deviations = [(part.detach().cpu().double() - true.detach()).abs() for part, true in pairs]
+    apart = (deviations[0].amax(-1) > THRESHOLD_DEVIATION) | (deviations[2] > THRESHOLD_DEVIATION)
+    kept = (~apart[..., None], ~apart, ~apart)
+    weights = [torch.where(keep, w.cpu(), 0) for keep, w in zip(kept, upstream(scene, scene.means))]
+    gradients = torch.autograd.grad(found[:3], leaves, [w.to(device) for w in weights])
+    expected = torch.autograd.grad(truth.render[:3], truth.leaves, [w.double() for w in weights], retain_graph=True)
+    errors = {
+        name: {**_quantiles(deviation), "over_1e-4": (deviation > 1e-4).double().mean().item()}
+        for name, deviation in zip(Render._fields, deviations)
+    }
+    for name, part, true in zip(GRADIENTS, gradients, expected):
+        deviation = part.cpu().double() - true
+        scale = true.square().mean().sqrt().clamp(min=1e-300)
+        relative = deviation.norm() / true.norm().clamp(min=1e-300)
+        errors[f"grad {name}"] = {**_quantiles(deviation.abs() / scale), "relative_l2": relative.item()}
+    errors["pixels"] = {"apart": apart.double().mean().item()}
+    return errors
+
+
+def threshold_errors(scene: Scene, device: torch.device) -> dict[str, float]:
+    """For each of `THRESHOLDS` the 99.9th percentile of the colour's deviation from an image that has nearly none."""
+    exact_splats = scene.to(torch.float64).splats()
+    leaves = leaves_of(scene, device, torch.float32)
+    splats, colors = splats_of(leaves), leaves[3]
+    with torch.no_grad():
+        truth = reference.rasterize(exact_splats, scene.colors.double(), scene.view, NEARLY_NO_THRESHOLDS).color
+        found = {name: rasterize(splats, colors, scene.view, kind).color for name, kind in THRESHOLDS.items()}
+    return {name: _quantiles((color.cpu().double() - truth).abs())["p99.9"] for name, color in found.items()}
+
+
+def with_thresholds(name: str) -> RenderScene:
+    """This package's rasterizer with one of `THRESHOLDS`."""
+    return lambda splats, colors, scene: rasterize(splats, colors, scene.view, THRESHOLDS[name])
+
+
+def _quantiles(deviation: Tensor) -> dict[str, float]:
+    ordered = deviation.flatten().sort().values
+    at = lambda share: ordered[min(int(share * len(ordered)), len(ordered) - 1)].item()  # noqa: E731
+    return {"p50": at(0.5), "p99.9": at(0.999), "max": ordered[-1].item()}
+
+
+def peak_memory(case: Case, name: str, device: torch.device) -> float:
+    """Peak MB that forward and backward take beyond what was there before, inputs excluded.
+
+    On the CPU resident memory in a fresh process (Linux; NaN elsewhere), on CUDA what torch's allocator handed out.
+    """
+    if device.type == "cuda":
+        scene = case.load()
+        work = passes_of(implementations(device, 0)[name], scene, device)["forward+backward"]
+        torch.cuda.synchronize(device)
+        torch.cuda.reset_peak_memory_stats(device)
+        before = torch.cuda.memory_allocated(device)
+        _finish(work(), device)
+        return (torch.cuda.max_memory_allocated(device) - before) / 1e6
+    return in_fresh_process(_peak_resident, case, name).result
+
+
+def _peak_resident(case: Case, name: str) -> float:
+    renderers: Mapping[str, RenderScene] = implementations(torch.device("cpu"), 0)
+    # A small scene first: compiling, loading and thread stacks are not the rasterizer's memory.
+    passes_of(renderers[name], load_scene("synth:100", 64, 48), torch.device("cpu"))["forward+backward"]()
+    return peak_resident(passes_of(renderers[name], case.load(), torch.device("cpu"))["forward+backward"]).peak_mb

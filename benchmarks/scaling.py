@@ -1,0 +1,108 @@
+"""`d2 bench scaling`: how the time of priors and the memory of training grow with the number of frames.
+
+The recording is synthetic, written to disk and read back frame by frame as others are. Priors and training run
+in processes of their own. Training keeps decoded images up to a bound (320 MiB) and re-reads the others.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import split, synthetic_recording
+from d2_plugin.runs.command_line import command_line
+from d2_plugin.runs.growth import exponent, power
+from d2_plugin.runs.memory import in_fresh_process
+from d2_plugin.runs.rows import Row, append_rows, begin_rows, make_row
+from d2_plugin.runs.run import Run
+from d2_plugin.runs.settings import RunSettings
+from d2_plugin.settings import Range, Settings
+
+PARTS, MEASURES = ("priors", "training"), ("seconds", "peak_mb")
+
+
+@dataclass(frozen=True)
+class ScalingBench(Settings):
+    """Settings of `d2 bench scaling`."""
+
+    frames: tuple[Annotated[int, Range(1)], ...] = (5, 20, 80)
+    """Lengths of the recording, frames."""
+    width: Annotated[int, Range(32, unit="pixels")] = 160
+    """Width of the images, which are 16:9, pixels."""
+    iterations: Annotated[int, Range(1, unit="steps")] = 150
+    """Optimizer steps of each training."""
+    output: Path = Path("runs.jsonl")
+    """File that the rows are added to."""
+
+
+def run(settings: ScalingBench) -> str:
+    """Measure and add the rows; how each cost grows, and where the rows lie."""
+    begin_rows(settings.output)
+    command = command_line("bench scaling", settings)
+    rows = bench_scaling(settings.frames, settings.width, settings.iterations, command)
+    append_rows(settings.output, rows)
+    return f"{summary(rows)}\nrows are in {settings.output}; `d2 report {settings.output}` shows them"
+
+
+def bench_scaling(
+    frames: Sequence[int] = ScalingBench.frames, width: int = 160, iterations: int = 150, command: str = ""
+) -> list[Row]:
+    """Two rows per number of frames: building priors (time and memory), and training with all hooks.
+
+    Args:
+        frames: lengths of the recording, at two training cameras and one held out.
+        width: of the images (16:9), pixels.
+        iterations: optimizer steps of each training.
+        command: how this was started.
+    """
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for count in frames:
+            place = Path(folder) / str(count)
+            recording = synthetic_recording(2, frames=count, width=width, height=width * 9 // 16, arc_degrees=20)
+            save_recording(recording, place / "recording")
+            settings = RunSettings(str(place / "recording"), tuple(split(recording)[0]), iterations=iterations)
+            for part, work in (("priors", _priors), ("training", _training)):
+                result, peak = in_fresh_process(work, settings, place / "run")
+                about = {"frames": count, "peak_mb": peak, "width": width, "iterations": iterations, **result}
+                case = f"synthetic, {count} frames"
+                rows.append(make_row("scaling", case, part, f"{count} frames", error=None, command=command, **about))
+    return rows
+
+
+def _priors(settings: RunSettings, folder: Path) -> dict[str, Any]:
+    start = time.perf_counter()
+    Run(settings, folder).prepare()
+    return {"seconds": time.perf_counter() - start}
+
+
+def _training(settings: RunSettings, folder: Path) -> dict[str, Any]:
+    run = Run(settings, folder)
+    run.train()
+    return {"seconds": run.seconds["train"]}
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """One line per part and cost: its value for each length, and the power of the number of frames it grows as."""
+    lines = []
+    for part in PARTS:
+        for measure in MEASURES:
+            places = _places(rows, part, measure)
+            law = power(places, "frames")
+            found = ", ".join(f"{frames:g}: {value:.1f}" for frames, value in places)
+            lines.append(f"{part:9} {measure:8} {found}" + (f"  grows as {law}" if law else ""))
+    return "\n".join(lines)
+
+
+def growth(rows: Sequence[Row], part: str, measure: str) -> float | None:
+    """Exponent p of `measure` ("seconds", "peak_mb") ~ frames^p; None with fewer than two lengths."""
+    return exponent(_places(rows, part, measure))
+
+
+def _places(rows: Sequence[Row], part: str, measure: str) -> list[tuple[float, float]]:
+    return [(row["frames"], row[measure]) for row in rows if row["method"] == part and row[measure]]

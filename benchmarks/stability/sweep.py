@@ -1,0 +1,108 @@
+"""`d2 stability`: parameters swept to where numbers end, in float32 and float64, with the error of every point.
+
+A point is `ok` where its error is below the sweep's limit, a `gap` where it is above and finite, and a `failure` where
+something is not finite or is refused. Nothing is clamped in silence: each sweep names what is guarded, and how.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from benchmarks.stability.definition import Sweep
+from benchmarks.stability.gaussians import gaussian_sweeps
+from benchmarks.stability.priors import prior_sweeps
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.progress import progress_bar
+from d2_plugin.runs.command_line import command_line
+from d2_plugin.runs.rows import Row, append_rows, begin_rows, make_row
+from d2_plugin.settings import Settings
+
+PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
+
+SWEEPS: dict[str, Sweep] = {sweep.name: sweep for sweep in (*gaussian_sweeps(), *prior_sweeps())}
+"""Every sweep of the study by name, Gaussians first, then priors."""
+
+
+@dataclass(frozen=True)
+class StabilitySettings(Settings):
+    """Settings of `d2 stability`."""
+
+    sweeps: tuple[str, ...] = ()
+    """Names of sweeps; all if not given. An unknown name shows the list."""
+    output: Path = Path("runs.jsonl")
+    """File that the rows are added to."""
+
+
+def run(settings: StabilitySettings) -> str:
+    """Sweep and add the rows; a line per sweep, and where the rows lie."""
+    begin_rows(settings.output)
+    rows = run_sweeps(settings.sweeps, command_line("stability", settings))
+    append_rows(settings.output, rows)
+    return f"{summary(rows)}\nrows are in {settings.output}; `d2 report {settings.output}` shows them"
+
+
+def measure(sweep: Sweep, value: float, precision: str, command: str = "") -> Row:
+    """One point of a sweep as a row; whatever goes wrong is recorded in it."""
+    start = time.perf_counter()
+    error, failed = float("nan"), None
+    try:
+        error = float(sweep.measure(value, PRECISIONS[precision]))
+    except D2Error as refusal:
+        failed = f"refused: {refusal}"
+    limit = sweep.limits[precision]
+    row = make_row(
+        *("stability", sweep.name, precision, f"{value:g}"),
+        error=None if failed else error,
+        seconds=time.perf_counter() - start,
+        failed=failed,
+        command=command,
+        parameter=sweep.parameter,
+        value=value,
+        measures=sweep.error,
+        limit=limit,
+        guard=sweep.guard,
+    )
+    row["verdict"] = "failure" if row["failed"] else "ok" if error <= limit else "gap"
+    return row
+
+
+def run_sweeps(names: Sequence[str] = (), command: str = "") -> list[Row]:
+    """All points of the named sweeps, of all sweeps where none is named.
+
+    Raises:
+        D2Error: there is no such sweep.
+    """
+    for name in names:
+        if name not in SWEEPS:
+            raise unknown_name("sweep", name, SWEEPS)
+    points = [
+        (sweep, value, precision)
+        for name, sweep in SWEEPS.items()
+        if not names or name in names
+        for precision in sweep.limits
+        for value in sweep.values
+    ]
+    rows = []
+    with progress_bar("stability", len(points)) as bar:
+        for done, point in enumerate(points, start=1):
+            rows.append(measure(*point, command))
+            bar.update(done, point[0].name)
+    return rows
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """One line per sweep and precision: how many points are ok, which are not, and the largest error."""
+    lines = []
+    for case, method in dict.fromkeys((row["case"], row["method"]) for row in rows):
+        mine = [row for row in rows if (row["case"], row["method"]) == (case, method)]
+        lost = [f"{row['verdict']} at {row['setting']}" for row in mine if row["verdict"] != "ok"]
+        worst = max((row["error"] for row in mine if row["error"] is not None), default=float("nan"))
+        shown = ", ".join([*lost[:4], *([f"and {len(lost) - 4} more"] if len(lost) > 4 else [])])
+        ok = f"{len(mine) - len(lost):2}/{len(mine)} ok, worst {worst:.1e}"
+        lines.append(f"{case:18} {method}  {ok}  {shown}".rstrip())
+    return "\n".join(lines)

@@ -1,0 +1,154 @@
+"""What is measured about geometric depth: which methods, and how good their maps are after the common filter."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.sgbm import sgbm
+from benchmarks.stereo_rigs import Rig
+from d2_plugin.errors import D2Error
+from d2_plugin.priors.colmap.mvs import why_not_usable
+from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths
+from d2_plugin.priors.stereo.geometric_depth import MATCHERS, Matcher, gray
+
+VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
+    "patchmatch": {
+        "default": {},
+        "dense: 1 geometric round": {"patchmatch_geometric_rounds": 1},
+        "2 sweeps at full size": {"patchmatch_rounds": (4, 2, 2, 2)},
+        "8 sweeps, one scale": {"patchmatch_rounds": (8,)},
+        "4 sweeps, one scale": {"patchmatch_rounds": (4,)},
+        "2 scales": {"patchmatch_rounds": (4, 1)},
+        "3 scales": {"patchmatch_rounds": (4, 2, 1)},
+        "fewer sweeps": {"patchmatch_rounds": (2, 1, 1, 1)},
+        "half size only": {"patchmatch_rounds": (4, 2, 1, 0)},
+        "no consensus": {"patchmatch_consensus_passes": 0},
+    },
+    "sweep": {
+        "default": {},
+        "planes half a pixel apart": {"sweep_step": 0.5},
+        "planes 2 pixels apart": {"sweep_step": 2},
+    },
+    "colmap": {"default": {}, "photometric pass alone": {"colmap_geometric": False}},
+}
+"""What is varied about each matcher of this package: its settings that are not the default."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A matcher with one setting."""
+
+    name: str
+    setting: str
+    make: Matcher
+    settings: StereoSettings
+
+
+def methods() -> list[Method]:
+    """Every matcher that runs here and what is varied about it; the first row of each is its default."""
+    default = StereoSettings()
+    rows = [
+        Method(name, setting, MATCHERS[name], replace(default, **changes))
+        for name, variants in VARIANTS.items()
+        if name != "colmap" or not why_not_usable()
+        for setting, changes in variants.items()
+    ]
+    return [*rows, Method("sgbm", "default", sgbm, default)]
+
+
+class Run(NamedTuple):
+    """Filtered depth of a rig's views, and what it took."""
+
+    depths: list[GeometricDepth]
+    cpu: float  # seconds per view, matching alone, over all threads
+    wall: float  # seconds per view, matching alone
+    filter_cpu: float  # seconds per view
+
+
+def run(method: Method, rig: Rig, depth_range: tuple[float, float], repeats: int = 1) -> Run:
+    """Match and filter one rig; times are medians over `repeats`.
+
+    Raises:
+        D2Error: the method cannot match this rig.
+    """
+    grays = [gray(image) for image in rig.images]
+    cpu, wall = [], []
+    for _ in range(max(repeats, 1)):
+        start = time.process_time(), time.perf_counter()
+        raw = method.make(grays, rig.cameras, depth_range, method.settings)
+        cpu.append(time.process_time() - start[0])
+        wall.append(time.perf_counter() - start[1])
+    start_filter = time.process_time()
+    depths, costs = zip(*raw, strict=True)
+    filtered = filter_depths(grays, rig.cameras, depths, costs, method.settings)
+    views = len(rig.cameras)
+    return Run(filtered, median(cpu) / views, median(wall) / views, (time.process_time() - start_filter) / views)
+
+
+class Score(NamedTuple):
+    """How good filtered depth is, over all views with truth of one or more rigs; shares are 0..1."""
+
+    completeness: float  # of the co-visible pixels, those with a depth
+    f1: float  # harmonic mean of: surviving depths within 1 %, co-visible pixels with a depth within 1 %
+    median: float  # relative error of the surviving depths; None of them: NaN
+    within: float  # surviving depths with a relative error below 1 %
+    wrong: float  # surviving depths with a relative error above 5 %
+    pixels: int  # co-visible ones
+
+
+def score(depths: Iterable[np.ndarray], truths: Iterable[np.ndarray | None], covisible: Iterable[np.ndarray]) -> Score:
+    """Compare maps [H, W] (0 = no depth) with the truth (0 = unknown, None = not published)."""
+    errors, found, right, pixels = [], 0, 0, 0
+    for depth, truth, seen in zip(depths, truths, covisible):
+        if truth is None:
+            continue
+        judged = (depth > 0) & (truth > 0)
+        error = np.abs(depth - truth)[judged] / truth[judged]
+        errors.append(error)
+        pixels += int(np.count_nonzero(seen))
+        found += int(np.count_nonzero(judged & seen))
+        right += int(np.count_nonzero(error[seen[judged]] < 0.01))
+    every = np.concatenate(errors) if errors else np.zeros(0)
+    if every.size == 0 or pixels == 0:
+        return Score(0.0, 0.0, float("nan"), float("nan"), float("nan"), pixels)
+    precision, recall = float(np.mean(every < 0.01)), right / pixels
+    f1 = 2 * precision * recall / max(precision + recall, 1e-12)
+    return Score(found / pixels, f1, float(np.median(every)), precision, float(np.mean(every > 0.05)), pixels)
+
+
+def measure(method: Method, rigs: Sequence[Rig], widen: float = 1.0, repeats: int = 1) -> dict[str, Any]:
+    """One row: scores and times of a method over the rigs of one name, or `failed` with the method's own words.
+
+    `widen` divides the near and multiplies the far end of the depth range.
+    """
+    row: dict[str, Any] = {
+        "method": method.name,
+        "setting": method.setting,
+        "rig": rigs[0].name,
+        "views": len(rigs[0].cameras),
+    }
+    row |= {"width": rigs[0].cameras[0].width, "height": rigs[0].cameras[0].height, "failed": None}
+    try:
+        runs = [run(method, rig, _widened(rig.depth_range, widen), repeats) for rig in rigs]
+    except D2Error as error:
+        return {**row, "failed": str(error)}
+    found = score(
+        [result.depth for each in runs for result in each.depths],
+        [truth for rig in rigs for truth in rig.truths],
+        [seen for rig in rigs for seen in rig.covisible],
+    )
+    times = {name: float(np.mean([getattr(each, name) for each in runs])) for name in ("cpu", "wall", "filter_cpu")}
+    pixels = rigs[0].cameras[0].width * rigs[0].cameras[0].height
+    numbers = {name: None if value != value else value for name, value in found._asdict().items()}
+    return {**row, **numbers, **times, "microseconds_per_pixel": times["cpu"] / pixels * 1e6}
+
+
+def _widened(depth_range: tuple[float, float], factor: float) -> tuple[float, float]:
+    return depth_range[0] / factor, depth_range[1] * factor

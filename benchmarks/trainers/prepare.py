@@ -1,0 +1,85 @@
+"""Exports and priors that the trials share: made once in the working folder, used again by every run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.trainers.trials import HELD_OUT, TRAINED, Trial
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.export.export import EXPORT_FILE
+from d2_plugin.runs.recording_export import RecordingExport
+from d2_plugin.runs.recording_export import run as export
+
+
+@dataclass(frozen=True)
+class Source:
+    """What of a recording is trained on."""
+
+    recording: Path
+    frames: int
+    """From the first."""
+    downscale: int
+
+    @property
+    def name(self) -> str:
+        """For folders of the working folder."""
+        return f"{self.recording.name}-{self.frames}-{self.downscale}"
+
+    @property
+    def seconds(self) -> float:
+        """Length of the clip: one frame more than its last begins."""
+        opened = open_recording(self.recording)
+        return self.frames / opened.fps
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """One recording as one trainer reads it."""
+
+    source: Source
+    data: Path
+    held_out: Path | None
+    """A second export, of the cameras that are not trained on, for a repository that has no other way to test."""
+    prior: Path
+
+
+def prepare(source: Source, trial: Trial, work: Path) -> Prepared:
+    """Export the recording in the trainer's layout and build its prior, where they are not there yet."""
+    named = f"{source.name}-{trial.layout}-{len(trial.held_out)}-{trial.points}"
+    data = _exported(source, trial, work / "exports" / named, TRAINED, trial.held_out)
+    held_out = None
+    if trial.also_held_out:
+        held_out = _exported(source, trial, work / "exports" / f"{named}-held-out", HELD_OUT, ())
+    return Prepared(source, data, held_out, _prior(source, work / "priors" / source.name))
+
+
+def _exported(source: Source, trial: Trial, output: Path, trained: tuple[str, ...], held_out: tuple[str, ...]) -> Path:
+    if not output.is_dir():
+        asked = RecordingExport(
+            *(source.recording, trial.layout, output, trained, held_out),  # type: ignore[arg-type]  # a known layout
+            frames=tuple(range(source.frames)),
+            downscale=source.downscale,
+            points=trial.points,
+        )
+        try:
+            export(asked)
+        except D2Error:
+            if not (output / EXPORT_FILE).is_file():  # a run beside this one wrote it meanwhile
+                raise
+    return output.resolve()
+
+
+def _prior(source: Source, output: Path) -> Path:
+    """Built by the command that a user has; a finished one is used again."""
+    if (output / "store.json").is_file():
+        return output.resolve()
+    words = ["priors", str(source.recording), "--train-cameras", ",".join(TRAINED), "--output", str(output)]
+    words += ["--frames", f"0:{source.frames - 1}", "--downscale", str(source.downscale)]
+    done = subprocess.run([str(Path(sys.executable).with_name("d2")), *words], check=False)
+    if done.returncode != 0:
+        raise D2Error(f"`d2 {' '.join(words)}` ended with code {done.returncode}: its output above says why")
+    return output.resolve()

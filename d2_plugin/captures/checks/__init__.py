@@ -1,1 +1,0 @@
-"""What a capture is checked for before work begins: calibration, memory, exposure."""

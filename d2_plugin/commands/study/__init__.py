@@ -1,1 +1,0 @@
-"""The commands that compare: ablations, benchmarks, stability, and their report."""

@@ -1,0 +1,1 @@
+"""Cameras: models, lenses, calibration files, calibrating and checking them."""

@@ -1,0 +1,196 @@
+"""A board that several cameras saw at the same moment: matches that no descriptor is needed for, and the scale.
+
+Boards are ChArUco or plain checkerboards, found by OpenCV. Images are undistorted.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Annotated, Any
+
+import numpy as np
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings.cameras.calibrating.bundle import Tracks, fitting, triangulate
+from d2_plugin.recordings.cameras.calibrating.features import Features, Matches
+from d2_plugin.recordings.cameras.calibrating.rig import SolvedRig
+from d2_plugin.recordings.images import checked_image, opencv
+from d2_plugin.settings import Positive, Range, Settings
+from d2_plugin.values import checked_arguments
+
+FEWEST_SIDES = 4
+"""Sides of squares that must be measured."""
+
+LARGEST_SPREAD = 0.05
+"""Interquartile range of the measured sides, as a share of their median, beyond which they say no scale."""
+
+CORNER_ERROR = 4.0
+"""Reprojection error beyond which a corner is left out, in `pixel_error`."""
+
+
+Squares = Annotated[int, Range(3, 1000)]
+"""How many squares a board has along a side."""
+
+
+@dataclass(frozen=True)
+class Board(Settings):
+    """A board of `columns` x `rows` squares with sides of `square`, in the unit that the world gets.
+
+    With `marker`, the side of its ArUco markers, it is a ChArUco board with markers of `dictionary`; without, a plain
+    checkerboard, which all of its cameras must see the same way up.
+    """
+
+    columns: Squares
+    rows: Squares
+    square: Positive
+    marker: Positive | None = None
+    dictionary: str = "DICT_4X4_50"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.marker is not None and self.marker >= self.square:
+            raise D2Error(
+                f"the board's markers have sides of {self.marker:g} and its squares of {self.square:g}, expected "
+                "smaller markers: give both in the same unit"
+            )
+
+    def corners(self, image: np.ndarray) -> dict[int, np.ndarray]:
+        """Number of an inner corner, row by row -> its pixel [2], centres at i + 0.5."""
+        cv2 = opencv("finding boards", "calibration")
+        grey = cv2.cvtColor(checked_image(image, "the image of a board"), cv2.COLOR_RGB2GRAY)
+        if self.marker is not None:
+            return self._charuco(cv2, grey)
+        found, corners = cv2.findChessboardCornersSB(grey, (self.columns - 1, self.rows - 1))
+        return {i: corner + 0.5 for i, corner in enumerate(corners.reshape(-1, 2))} if found else {}
+
+    def _charuco(self, cv2: Any, grey: np.ndarray) -> dict[int, np.ndarray]:
+        number = getattr(cv2.aruco, self.dictionary, None)
+        if not isinstance(number, int) or not self.dictionary.startswith("DICT_"):
+            raise D2Error(f"unknown marker dictionary '{self.dictionary}': name one of OpenCV's, such as DICT_4X4_50")
+        dictionary = cv2.aruco.getPredefinedDictionary(number)
+        needed, there = self.columns * self.rows // 2, len(dictionary.bytesList)
+        if needed > there:
+            raise D2Error(
+                f"a board of {self.columns} x {self.rows} squares has {needed} markers and {self.dictionary} has "
+                f"{there}: name the board's own dictionary"
+            )
+        board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, dictionary)
+        corners, identities, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(grey)
+        if identities is None:
+            return {}
+        pairs = zip(identities.ravel().tolist(), corners.reshape(-1, 2), strict=True)
+        return {number: corner + 0.5 for number, corner in pairs}
+
+    @classmethod
+    def parsed(cls, text: str) -> Board:
+        """The board of charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY] or checkerboard:COLUMNSxROWS:SQUARE.
+
+        Columns and rows count squares, as printed; sides are in metres.
+        """
+        kind, *parts = text.split(":")
+        match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", parts[0]) if parts else None
+        sides = [_side(part) for part in parts[1:3]]
+        wanted = {"charuco": (2, 3), "checkerboard": (1, 1)}.get(kind)
+        fits = wanted is not None and wanted[0] <= len(parts) - 1 <= wanted[1] and all(sides[: wanted[0]])
+        fits = fits and (len(sides) < 2 or sides[1] < sides[0])
+        if match is None or not fits or min(int(match[1]), int(match[2])) < 3:
+            raise D2Error(
+                f"--board says '{text}', expected charuco:COLUMNSxROWS:SQUARE:MARKER such as charuco:7x5:0.04:0.03, or "
+                "checkerboard:COLUMNSxROWS:SQUARE: count squares, 3 at least, and give their sides in metres"
+            )
+        marker, names = (sides[1], parts[3:]) if kind == "charuco" else (None, [])
+        return cls(int(match[1]), int(match[2]), sides[0], marker, *names)
+
+
+def _side(text: str) -> float:
+    """Metres, 0 for what is none."""
+    try:
+        side = float(text)
+    except ValueError:
+        return 0.0
+    return side if 0 < side < np.inf else 0.0
+
+
+def board_matches(
+    features: Mapping[str, Features], images: Mapping[str, Sequence[np.ndarray]], board: Board
+) -> tuple[dict[str, Features], Matches]:
+    """(the features with the corners of the board behind them, which corners two cameras saw at the same moment)."""
+    seen = {name: _corners_seen(board, taken) for name, taken in images.items()}
+    more = {name: _with_corners(features[name], corners) for name, corners in seen.items()}
+    matches = {}
+    for one, other in combinations(seen, 2):
+        begin, start = len(features[one].pixels), len(features[other].pixels)
+        places = {key: place for place, key in enumerate(seen[other])}
+        pairs = [(begin + i, start + places[key]) for i, key in enumerate(seen[one]) if key in places]
+        matches[one, other] = np.array(pairs, int).reshape(-1, 2)
+    return {**features, **more}, matches
+
+
+def _corners_seen(board: Board, taken: Sequence[np.ndarray]) -> dict[tuple[int, int], np.ndarray]:
+    """(moment, number of the corner) -> its pixel."""
+    found = [(moment, board.corners(image)) for moment, image in enumerate(taken, start=1)]  # 0 is the still
+    return {(moment, number): corner for moment, corners in found for number, corner in corners.items()}
+
+
+def _with_corners(features: Features, corners: Mapping[tuple[int, int], np.ndarray]) -> Features:
+    """Corners have no descriptor, so nothing else is taken for one; a size of 0 says that they stay where they are."""
+    count = len(corners)
+    return replace(
+        features,
+        pixels=np.concatenate([features.pixels, np.array(list(corners.values())).reshape(-1, 2)]),
+        descriptors=np.concatenate([features.descriptors, np.zeros((count, 128), np.float32)]),
+        moments=np.concatenate([features.moments, np.array([moment for moment, _ in corners], int)]),
+        shapes=np.concatenate([features.shapes, np.zeros((count, 2))]),
+    )
+
+
+@checked_arguments
+def scaled_by_board(rig: SolvedRig, images: Mapping[str, Sequence[np.ndarray]], board: Board) -> SolvedRig:
+    """The rig in the unit of the board, from the sides of squares between corners that two cameras saw.
+
+    Raises:
+        D2Error: no moment at which two cameras saw enough of the board, or sides that contradict each other.
+    """
+    seen = {(name, moment): board.corners(image) for name in rig.cameras for moment, image in enumerate(images[name])}
+    moments = max(len(images[name]) for name in rig.cameras)
+    sides = [side for moment in range(moments) for side in _sides(rig, board, moment, seen)]
+    if len(sides) < FEWEST_SIDES:
+        raise D2Error(
+            f"two cameras saw {len(sides)} sides of the board's squares at the same moment, expected {FEWEST_SIDES} at "
+            f"least: show the whole board ({board.columns} x {board.rows} squares) to two cameras, larger and in focus"
+        )
+    low, middle, high = np.percentile(sides, [25, 50, 75])
+    spread = float((high - low) / middle)
+    if spread > LARGEST_SPREAD:
+        raise D2Error(
+            f"the sides of the board's squares differ by {spread:.0%}, expected {LARGEST_SPREAD:.0%} at most: hold it "
+            "still and flat, and check that the cameras are synchronised"
+        )
+    return rig.times(board.square / float(middle), f"from {len(sides)} sides of a board's squares, within {spread:.1%}")
+
+
+def _sides(
+    rig: SolvedRig, board: Board, moment: int, seen: Mapping[tuple[str, int], Mapping[int, np.ndarray]]
+) -> list[float]:
+    """Lengths between neighbouring corners of the board at one moment, in the unit of the rig."""
+    names, across = tuple(rig.cameras), board.columns - 1
+    corners = {name: seen.get((name, moment), {}) for name in names}
+    numbers = sorted({number for found in corners.values() for number in found})
+    features, rows = {}, np.full((len(numbers), len(names)), -1)
+    for column, name in enumerate(names):
+        found = corners[name]
+        places = [i for i, number in enumerate(numbers) if number in found]
+        rows[places, column] = np.arange(len(places))
+        pixels = np.array([found[numbers[i]] for i in places]).reshape(-1, 2)
+        features[name] = Features(pixels, np.zeros((len(places), 128), np.float32), np.full(len(places), moment))
+    bundle = fitting(triangulate(rig.cameras, features, Tracks(names, rows)), features, CORNER_ERROR)
+    where = {tuple(row): number for row, number in zip(rows.tolist(), numbers, strict=True)}
+    points = {}
+    for point, row in zip(bundle.points, bundle.tracks.seen.tolist(), strict=True):
+        if tuple(row) in where:
+            points[where[tuple(row)]] = point
+    neighbours = [(n, n + 1) for n in points if (n + 1) % across] + [(n, n + across) for n in points]
+    return [float(np.linalg.norm(points[a] - points[b])) for a, b in neighbours if a in points and b in points]

@@ -1,0 +1,191 @@
+"""The poses of a rig from its images alone: never one that the images do not settle.
+
+Pairs of cameras give essential matrices, the best pair a start, and the other cameras are added one by one, each time
+with a bundle adjustment. Features are then moved to where their surroundings match best, and the images are cut into
+two halves that must find the same rig by themselves. Each camera has one pose, over all moments and stills. The scale
+is arbitrary until a board or a distance says it. A focal length that is not known is looked for where most matches
+agree with one motion, and bundled with the poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings.cameras.calibrating.align import differences
+from d2_plugin.recordings.cameras.calibrating.boards import Board, board_matches
+from d2_plugin.recordings.cameras.calibrating.bundle import Bundle, Tracks, join_matches
+from d2_plugin.recordings.cameras.calibrating.features import (
+    Features,
+    Matches,
+    find_features,
+    match_all,
+    of_a_still_camera,
+)
+from d2_plugin.recordings.cameras.calibrating.grow import grown
+from d2_plugin.recordings.cameras.calibrating.refine import CELLS, SCHEDULE, bundled
+from d2_plugin.recordings.cameras.calibrating.rig import SolvedRig
+from d2_plugin.recordings.cameras.calibrating.sharpen import sharpened
+from d2_plugin.recordings.cameras.calibrating.verify import verified
+from d2_plugin.recordings.cameras.calibration import pinhole
+from d2_plugin.recordings.images import checked_image
+from d2_plugin.recordings.recording import Camera
+from d2_plugin.values import checked_arguments
+
+FINE = (*SCHEDULE, (1.0, 0.1), (0.5, 0.05))
+"""Rounds of the adjustment for features that were moved to better places."""
+
+LARGEST_DOUBT = (0.2, 0.006)
+"""Degrees, and share of the rig's width, that two halves of the images may differ by about a camera."""
+
+LARGEST_FOCAL_DOUBT = 0.03
+"""Share that they may differ by about a focal length."""
+
+FOCALS = np.geomspace(0.45, 2.4, 9)
+"""Focal lengths that are tried where none is known, in longer sides of the image: 96 to 24 degrees across."""
+
+ADD = (
+    "add stills on the way between the cameras (at most 20 degrees apart), bring neighbouring cameras closer together, "
+    "or video a board that they see at the same moment"
+)
+
+
+@checked_arguments
+def solve_rig(
+    images: Mapping[str, Sequence[np.ndarray]],
+    intrinsics: Mapping[str, Camera],
+    stills: Mapping[str, np.ndarray] | None = None,
+    board: Board | None = None,
+    focal: str | None = None,
+) -> SolvedRig:
+    """The poses of cameras that stand still.
+
+    Args:
+        images: camera -> its images RGB uint8 [H, W, 3] at moments that are the same for all cameras, undistorted.
+        intrinsics: camera -> its size and K, for the stills too; the poses in it are not looked at.
+        stills: more images of the same scene, a camera each: they connect cameras that see too little in common.
+        board: corners of this board, where cameras saw it at the same moment, are matches too.
+        focal: "shared" or "each" where focal lengths are not known: those of `intrinsics` are not looked at then.
+
+    Raises:
+        D2Error: the images do not settle the pose of every camera; the sentence names those, and what to add.
+    """
+    unknown = [name for name in (*images, *(stills or {})) if name not in intrinsics]
+    if unknown or not images:
+        raise D2Error(f"no intrinsics for camera {unknown[0] if unknown else 'any'}: give size and K of every camera")
+    features = {name: of_a_still_camera(_of_one_size(name, taken)) for name, taken in images.items()}
+    features |= {name: find_features([image]) for name, image in (stills or {}).items()}
+    features, corners = (features, {}) if board is None else board_matches(features, images, board)
+    return solve_features(features, intrinsics, tuple(images), corners, focal)
+
+
+def solve_features(
+    features: Mapping[str, Features],
+    intrinsics: Mapping[str, Camera],
+    wanted: Sequence[str],
+    corners: Matches | None = None,
+    focal: str | None = None,
+) -> SolvedRig:
+    """`solve_rig` for features that were found already.
+
+    `wanted` are the cameras that must be settled, `corners` matches that are known beside those of descriptors.
+    """
+    known = {name: replace(intrinsics[name], T_camera_world=np.eye(4)) for name in features}
+    matched = _joined(match_all(features), corners or {})
+    known = known if focal is None else _likely_focal(matched, features, known)
+    matches = verified(matched, features, known)
+    tracks = join_matches(matches, tuple(features))
+    found = grown(matches, tracks, features, known)
+    lost = list(wanted) if found is None else [name for name in wanted if name not in found.cameras]
+    if found is None or lost:
+        raise D2Error(f"the images do not settle where camera {', '.join(lost)} stands: {ADD}")
+    features, tracks = sharpened(features, tracks.within(found.cameras), found.cameras)
+    schedule = SCHEDULE if any(features[name].greys is None for name in tracks.names) else FINE
+    found = bundled(found.cameras, features, tracks, schedule, focal) or found
+    doubt, focals = _doubt(found, tracks, features, schedule, focal)
+    _refuse_unsure(doubt, focals, wanted)
+    return SolvedRig.of(found, features, doubt, focals, tuple(wanted))
+
+
+def _of_one_size(name: str, taken: Sequence[np.ndarray]) -> Sequence[np.ndarray]:
+    shapes = {checked_image(image, f"an image of camera {name}").shape for image in taken}
+    if len(shapes) != 1:
+        raise D2Error(f"camera {name} has images of {len(shapes)} sizes, expected one: give images of one size")
+    return taken
+
+
+def _joined(matches: Matches, more: Matches) -> Matches:
+    return {pair: np.concatenate([pairs, more[pair]]) if pair in more else pairs for pair, pairs in matches.items()}
+
+
+def _likely_focal(matches: Matches, features: Mapping[str, Features], known: Mapping[str, Camera]) -> dict[str, Camera]:
+    """The cameras with the focal length, one for all, with which the most matches agree on a motion."""
+
+    def cameras(factor: float) -> dict[str, Camera]:
+        lengths = {name: factor * max(camera.width, camera.height) for name, camera in known.items()}
+        return {
+            name: replace(camera, K=pinhole(lengths[name], lengths[name], camera.K[0, 2], camera.K[1, 2]))
+            for name, camera in known.items()
+        }
+
+    def agreeing(factor: float) -> int:
+        return sum(len(pairs) for pairs in verified(matches, features, cameras(factor)).values())
+
+    return cameras(float(max(FOCALS, key=agreeing)))
+
+
+def _doubt(
+    found: Bundle,
+    tracks: Tracks,
+    features: Mapping[str, Features],
+    schedule: Sequence[tuple[float, float]],
+    focal: str | None,
+) -> tuple[dict[str, tuple[float, float]], dict[str, float]]:
+    """What two halves of the images differ by about poses and focal lengths; nothing where one does not hold."""
+    halves = _halves(tracks, features, found.cameras)
+    one, other = (bundled(found.cameras, features, half, schedule, focal) for half in halves)
+    if one is None or other is None:
+        return {}, {}
+    doubt = differences(one.cameras, other.cameras)
+    if focal is None:
+        return doubt, {}
+    lengths = {name: (one.cameras[name].K[0, 0], other.cameras[name].K[0, 0]) for name in doubt}
+    return doubt, {name: abs(float(np.log(a / b))) for name, (a, b) in lengths.items()}
+
+
+def _halves(tracks: Tracks, features: Mapping[str, Features], cameras: Mapping[str, Camera]) -> list[Tracks]:
+    """Tracks by the cell, of alternating ones, in which the first camera that has them sees them."""
+    first = (tracks.seen >= 0).argmax(axis=1)
+    which = np.zeros(len(first), int)
+    for column, name in enumerate(tracks.names):
+        rows = np.flatnonzero(first == column)
+        if len(rows):
+            size = np.array([cameras[name].width, cameras[name].height])
+            cells = np.floor(features[name].pixels[tracks.seen[rows, column]] / size * CELLS).astype(int)
+            which[rows] = cells.sum(axis=1) % 2
+    return [Tracks(tracks.names, tracks.seen[which == half]) for half in (0, 1)]
+
+
+def _refuse_unsure(
+    doubt: Mapping[str, tuple[float, float]], focals: Mapping[str, float], wanted: Sequence[str]
+) -> None:
+    unsure = [name for name in wanted if name not in doubt or not _sure(doubt[name])]
+    if unsure:
+        raise D2Error(
+            f"two halves of the images disagree about where camera {', '.join(unsure)} stands, so that is not known: "
+            f"{ADD}"
+        )
+    vague = [name for name in wanted if focals.get(name, 0.0) > LARGEST_FOCAL_DOUBT]
+    if vague:
+        share = max(focals[name] for name in vague)
+        raise D2Error(
+            f"two halves of the images disagree about the focal length of camera {', '.join(vague)} by {share:.0%}: "
+            "say it (--focal PIXELS, --intrinsics FILE), or video a board and calibrate the lens with another tool"
+        )
+
+
+def _sure(doubt: tuple[float, float]) -> bool:
+    return all(value <= limit for value, limit in zip(doubt, LARGEST_DOUBT, strict=True))

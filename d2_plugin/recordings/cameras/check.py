@@ -1,0 +1,266 @@
+"""A recording is looked at once, before work begins: calibrations that contradict the images, empty images.
+
+What cannot be is refused where it is read. This finds what can be and is nearly always a mistake, and says it in notes:
+fields of view and positions out of the ordinary, cameras that see nothing that another one sees, images of one
+colour, and rigs whose epipolar lines miss the features that two images share. Maps of true depth that cannot be read
+are refused here already, not after the training that they are to judge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from d2_plugin.recordings.cameras.calibration import field_of_view
+from d2_plugin.recordings.checks.masked import empty_masks
+from d2_plugin.recordings.images import opencv
+from d2_plugin.recordings.recording import Camera, Recording
+
+USUAL_VIEW = (5.0, 170.0)
+"""Degrees across or down that a camera usually sees."""
+
+FAR_FROM_ORIGIN = 1e4
+"""A rig this many times as far from the origin as it is wide loses digits in float32."""
+
+DEPTHS = np.geomspace(0.05, 1000, 25)
+"""Where cameras without declared bounds may see the same thing, in widths of the rig."""
+
+GRID = 12
+"""Pixels across and down that stand for an image."""
+
+ONE_COLOUR = 2
+"""An image whose channels vary by no more levels of 255 than this shows nothing."""
+
+SPARSE = 8
+"""Where every eighth pixel each way varies, the others need not be asked."""
+
+LOOKED_AT = 1 << 25
+"""Pixels that are read, at most: all images of a small recording, some of each camera of a large one."""
+
+LONG_SIDE = 640
+"""Features are looked for in images of at most this many pixels along the longer side."""
+
+MOST_PAIRS = 12
+"""Pairs of cameras whose features are matched, at most."""
+
+ENOUGH = 12
+"""Matched features on one geometry, any, below which two images say nothing about their calibration."""
+
+ENOUGH_SHARE = 0.5
+"""Share of the matched features that must lie on one geometry: false matches do not."""
+
+MOST_SWAPPED = 6
+"""Cameras of a recording in which two that were swapped are looked for."""
+
+MISSED = 0.01
+"""Median distance from the epipolar lines, in diagonals of the image, beyond which a calibration is named."""
+
+
+class _Pair(NamedTuple):
+    """Two cameras whose images share features, and the median distance in pixels from the calibration's lines."""
+
+    one: str
+    other: str
+    features: int
+    distance: float
+    missed: bool
+
+
+def check_recording(recording: Recording, cameras: Sequence[str], scored: Sequence[str] = ()) -> tuple[str, ...]:
+    """What is most likely wrong with the named cameras of a recording, a sentence each; usually nothing.
+
+    `scored` are those whose true depth will be read as well.
+
+    Raises:
+        D2Error: an image or a map that cannot be read, among those looked at.
+    """
+    rig = [recording.cameras[name] for name in cameras]
+    for name in scored:
+        for frame in _frames(recording, len(scored)):
+            recording.depth(name, frame)
+    masks = empty_masks(recording, cameras, _frames(recording, len(cameras)))
+    seen = (*_views(rig), *_origin(rig), *_alone(rig), *_plain(recording, cameras))
+    return (*seen, *masks, *_contradicted(recording, cameras))
+
+
+def _views(rig: Sequence[Camera]) -> Iterator[str]:
+    for camera in rig:
+        across, down = field_of_view(camera.K, (camera.width, camera.height))
+        if max(across, down) < USUAL_VIEW[0] or max(across, down) > USUAL_VIEW[1]:
+            yield (
+                f"camera {camera.name} sees {across:.3g} x {down:.3g} degrees, expected {USUAL_VIEW[0]:g} to "
+                f"{USUAL_VIEW[1]:g}: are its focal lengths in pixels of these images?"
+            )
+        if not (0 <= camera.K[0, 2] <= camera.width and 0 <= camera.K[1, 2] <= camera.height):
+            yield f"the principal point of camera {camera.name} lies outside of its image: check cx and cy"
+
+
+def _origin(rig: Sequence[Camera]) -> Iterator[str]:
+    centres = np.stack([camera.centre for camera in rig])
+    width = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    distance = float(np.linalg.norm(centres, axis=1).min())
+    if len(rig) > 1 and width > 0 and distance > FAR_FROM_ORIGIN * width:
+        yield (
+            f"the cameras stand {distance:.3g} from the origin and {width:.3g} from their middle: positions lose "
+            "digits in float32, so move the origin to the scene"
+        )
+
+
+def _alone(rig: Sequence[Camera]) -> Iterator[str]:
+    """Cameras that see nothing that another one sees, at any depth."""
+    centres = np.stack([camera.centre for camera in rig])
+    width = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()) or 1.0
+    for camera in rig:
+        near, far = camera.near_far or (0.0, np.inf)
+        depths = np.clip(DEPTHS * width, near, far)
+        if len(rig) > 1 and not any(_shares(camera, other, depths) for other in rig if other is not camera):
+            yield f"camera {camera.name} sees nothing that another camera sees: check its R and t"
+
+
+def _shares(one: Camera, other: Camera, depths: np.ndarray) -> bool:
+    """Whether anything in the image of `one`, at one of the depths, lies in that of `other`."""
+    steps = (np.arange(GRID) + 0.5) / GRID
+    x, y = np.meshgrid(steps * one.width, steps * one.height)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(one.K).T
+    points = (rays * depths[:, None, None] - one.T_camera_world[:3, 3]) @ one.T_camera_world[:3, :3]
+    seen = (points @ other.T_camera_world[:3, :3].T + other.T_camera_world[:3, 3]) @ other.K.T
+    depth = seen[..., 2:]
+    inside = (seen[..., :2] >= 0) & (seen[..., :2] <= depth * (other.width, other.height)) & (depth > 0)
+    return bool(inside.all(axis=-1).any())
+
+
+def _frames(recording: Recording, cameras: int) -> tuple[int, ...]:
+    """Frames to look at, spread over the recording."""
+    pixels = max(camera.width * camera.height for camera in recording.cameras.values())
+    count = min(max(LOOKED_AT // (pixels * max(cameras, 1)), 2), len(recording.frames))
+    return tuple(
+        recording.frames[i] for i in np.unique(np.linspace(0, len(recording.frames) - 1, count).round().astype(int))
+    )
+
+
+def _plain(recording: Recording, cameras: Sequence[str]) -> Iterator[str]:
+    """Images of one colour."""
+    for name in cameras:
+        found: dict[str, list[int]] = {}
+        for frame in _frames(recording, len(cameras)):
+            image = recording.image(name, frame)
+            if all(_range(part).max() <= ONE_COLOUR for part in (image[::SPARSE, ::SPARSE], image)):
+                found.setdefault("black" if image.max() <= ONE_COLOUR else "of one colour", []).append(frame)
+        for what, frames in found.items():
+            listed = ", ".join(map(str, frames[:5])) + (", ..." if len(frames) > 5 else "")
+            yield f"camera {name} is {what} at frame {listed}: nothing can be learned from that"
+
+
+def _range(image: np.ndarray) -> np.ndarray:
+    """How far the levels of each channel are apart, int [3]."""
+    colours = image.reshape(-1, 3)
+    return colours.max(axis=0).astype(int) - colours.min(axis=0)
+
+
+def calibration_contradicted(recording: Recording) -> str:
+    """What `check_recording` says of a calibration that contradicts the images, and whose swap would mend it; or ""."""
+    said = next(iter(_contradicted(recording, list(recording.cameras))), "")
+    swap = _swapped(recording) if said else None
+    return f"cameras {swap[0]} and {swap[1]} are swapped: exchange their videos or their entries" if swap else said
+
+
+def _swapped(recording: Recording) -> tuple[str, str] | None:
+    """Two cameras of few whose calibrations, exchanged, miss nothing."""
+    names = list(recording.cameras)
+    if not 2 < len(names) <= MOST_SWAPPED:
+        return None
+    features = {name: _features(recording, name) for name in names}
+    for one, other in combinations(names, 2):
+        a, b = recording.cameras[one], recording.cameras[other]
+        exchanged = {one: replace(b, name=one), other: replace(a, name=other)}
+        trial = replace(recording, cameras={**recording.cameras, **exchanged})
+        pairs = [_pair(trial, *pair, features) for pair in _neighbours(trial, names)]
+        checked = [pair for pair in pairs if pair is not None]
+        if checked and not any(pair.missed for pair in checked):
+            return one, other
+    return None
+
+
+def _contradicted(recording: Recording, cameras: Sequence[str]) -> Iterator[str]:
+    """Pairs whose calibration misses the features that their images share."""
+    if len(cameras) < 2:
+        return
+    features = {name: _features(recording, name) for name in cameras}
+    pairs = [_pair(recording, one, other, features) for one, other in _neighbours(recording, cameras)]
+    checked = [pair for pair in pairs if pair is not None]
+    wrong = [pair for pair in checked if pair.missed]
+    if not wrong:
+        return
+    suspects = _suspects(checked)
+    listed = ", ".join(f"{pair.one} and {pair.other} by {pair.distance:.0f} pixels" for pair in wrong[:4])
+    whose = f"camera {' and '.join(suspects)}" if suspects else "these cameras"
+    yield (
+        f"the calibration misses features that two images share, {listed}{', ...' if len(wrong) > 4 else ''} "
+        f"(median; good calibrations miss by one): check R, t and K of {whose}"
+    )
+
+
+def _suspects(checked: Sequence[_Pair]) -> list[str]:
+    """Cameras of which every pair is missed, where that leaves pairs that are not, or the one they all share."""
+    names = list(dict.fromkeys(name for pair in checked for name in pair[:2]))
+    all_missed = [name for name in names if all(pair.missed for pair in checked if name in pair[:2])]
+    if len(all_missed) < len(names):
+        return all_missed
+    shared = [name for name in names if all(name in pair[:2] for pair in checked)]
+    return shared if len(checked) > 1 else []
+
+
+def _neighbours(recording: Recording, cameras: Sequence[str]) -> list[tuple[str, str]]:
+    """All pairs of a few cameras; of many, those that stand nearest to each other."""
+    pairs = [(one, other) for i, one in enumerate(cameras) for other in cameras[i + 1 :]]
+    centres = {name: recording.cameras[name].centre for name in cameras}
+    pairs.sort(key=lambda pair: float(np.linalg.norm(centres[pair[0]] - centres[pair[1]])))
+    return pairs[:MOST_PAIRS]
+
+
+def _features(recording: Recording, name: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """Positions [n, 2] in pixels of the recording (centres at i + 0.5) and descriptors of the first image."""
+    cv2 = opencv("looking at a recording")
+    image = recording.image(name, recording.frames[0])
+    factor = min(LONG_SIDE / max(image.shape[:2]), 1.0)
+    small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
+    points, descriptors = cv2.SIFT_create(1000).detectAndCompute(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None)
+    scale = np.array(image.shape[1::-1]) / small.shape[1::-1]
+    return (np.array([point.pt for point in points]).reshape(-1, 2) + 0.5) * scale, descriptors
+
+
+def _pair(recording: Recording, one: str, other: str, features: dict) -> _Pair | None:
+    """How far the calibration misses the features that two images share; None where they share too few."""
+    cv2 = opencv("looking at a recording")
+    (points, descriptors), (others, other_descriptors) = features[one], features[other]
+    if descriptors is None or other_descriptors is None or min(len(points), len(others)) < ENOUGH:
+        return None
+    two_best = cv2.BFMatcher().knnMatch(descriptors, other_descriptors, k=2)
+    good = [best for best, second in two_best if best.distance < 0.8 * second.distance]
+    once = list({match.trainIdx: match for match in good}.values())
+    if len(once) < ENOUGH:
+        return None
+    p, q = points[[match.queryIdx for match in once]], others[[match.trainIdx for match in once]]
+    a, b = recording.cameras[one], recording.cameras[other]
+    diagonal = float(np.hypot(a.width, a.height))
+    found = cv2.findFundamentalMat(p, q, cv2.FM_RANSAC, max(diagonal / 500, 1.0), 0.999, 2000)
+    inside = found[1].ravel() > 0 if found[1] is not None else np.zeros(len(p), bool)
+    if inside.sum() < max(ENOUGH, ENOUGH_SHARE * len(p)) or np.allclose(a.centre, b.centre):
+        return None
+    distance = float(np.median(_epipolar_distance(a, b, p[inside], q[inside])))
+    return _Pair(one, other, int(inside.sum()), distance, distance > max(MISSED * diagonal, 4.0))
+
+
+def _epipolar_distance(one: Camera, other: Camera, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Distance [n], pixels, of each `q` in `other` from the epipolar line of its `p` in `one`."""
+    relative = other.T_camera_world @ np.linalg.inv(one.T_camera_world)
+    x, y, z = relative[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    fundamental = np.linalg.inv(other.K).T @ cross @ relative[:3, :3] @ np.linalg.inv(one.K)
+    ends = np.ones((len(p), 1))
+    lines = np.hstack([p, ends]) @ fundamental.T
+    return np.abs((lines * np.hstack([q, ends])).sum(axis=1)) / np.linalg.norm(lines[:, :2], axis=1).clip(1e-300)

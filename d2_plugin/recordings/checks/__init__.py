@@ -1,0 +1,1 @@
+"""What a recording is checked for before work begins: calibration, memory, exposure."""

@@ -1,0 +1,108 @@
+"""Any recording written out in the input layout of the public 4DGS repositories, from which it reads back the same.
+
+    transforms   fudan-zvg/4d-gaussian-splatting: transforms_train.json, transforms_test.json, images/, points3d.ply
+    n3dv         ingra14m/Deformable-3D-Gaussians: poses_bounds.npy, frames/, points3D.ply
+    multipleview hustvl/4DGaussians, its layout for own recordings: sparse_/, camNN/frame_NNNNN.jpg
+    colmap       everything that reads a COLMAP model: sparse/0, images/
+    colmap_frames oppo-us-research/SpacetimeGaussians, juno181/Ex4DGS: colmap_N/ folders, camNN/N.png
+    gsplat       nerfstudio-project/gsplat's examples: sparse/0, images/, one instant
+
+`export.json` beside the images says which camera and which frame of the source became which of the export.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import json_text
+from d2_plugin.recordings.export.base import Export, Written, refuse_skew, whole_folder
+from d2_plugin.recordings.export.colmap import write_colmap, write_multipleview
+from d2_plugin.recordings.export.colmap_frames import write_colmap_frames
+from d2_plugin.recordings.export.gsplat import write_gsplat
+from d2_plugin.recordings.export.n3dv import write_n3dv
+from d2_plugin.recordings.export.ply import PointCloud
+from d2_plugin.recordings.export.transforms_json import write_transforms
+from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.values import checked_arguments
+
+EXPORT_FILE = "export.json"
+"""Written last: a folder without it is half an export."""
+
+Writer = Callable[[Export], Written]
+
+WRITERS: dict[str, Writer] = {
+    "transforms": write_transforms,
+    "n3dv": write_n3dv,
+    "multipleview": write_multipleview,
+    "colmap": write_colmap,
+    "colmap_frames": write_colmap_frames,
+    "gsplat": write_gsplat,
+}
+"""By the name of the layout. A new layout is one module beside this one and one row here."""
+
+
+@checked_arguments
+def export_recording(
+    recording: Recording,
+    layout: str,
+    path: Path | str,
+    *,
+    test_cameras: Sequence[str] = (),
+    cloud: PointCloud | None = None,
+) -> Path:
+    """Write `recording` under `path` in one of the layouts of `WRITERS`; returns the path.
+
+    Args:
+        recording: cameras and frames to write; restrict it with `select_cameras`, `select_frames` and `downscale`.
+        layout: see the module's description.
+        path: a folder that does not exist or is empty.
+        test_cameras: held out, in the way the layout can say it: a file of their own, or the first place.
+        cloud: initial points; times are seconds since the first frame. None leaves them to the trainer.
+
+    Raises:
+        D2Error: what the layout cannot hold (principal points, several focal lengths, skew), by camera.
+    """
+    if layout not in WRITERS:
+        raise unknown_name("layout", layout, WRITERS)
+    held_out = _known(recording, test_cameras)
+    if cloud is not None:
+        cloud.check()
+    for camera in recording.cameras.values():
+        refuse_skew(camera)
+    with whole_folder(path) as folder:
+        written = WRITERS[layout](Export(recording, held_out, cloud, folder))
+        described = json_text(_description(recording, layout, written, held_out), EXPORT_FILE, indent=1)
+        (folder / EXPORT_FILE).write_text(described + "\n")
+    return Path(path)
+
+
+def _description(recording: Recording, layout: str, written: Written, held_out: tuple[str, ...]) -> dict[str, Any]:
+    return {
+        "source": recording.name,
+        "layout": layout,
+        "cameras": written.cameras,
+        "frames": written.frames,
+        "calibrations": {name: _calibration(camera) for name, camera in recording.cameras.items()},
+        "fps": recording.fps,
+        "test_cameras": [written.cameras[name] for name in held_out if name in written.cameras],
+    }
+
+
+def _calibration(camera: Camera) -> dict[str, Any]:
+    """By which a prior store knows its recording again (d2_plugin.priors.frame.describe_camera)."""
+    K, pose = (np.asarray(matrix, float).tolist() for matrix in (camera.K, camera.T_camera_world))
+    return {"size": [camera.width, camera.height], "K": K, "T_camera_world": pose}
+
+
+def _known(recording: Recording, test_cameras: Sequence[str]) -> tuple[str, ...]:
+    for name in test_cameras:
+        if name not in recording.cameras:
+            raise unknown_name("camera", name, recording.cameras)
+    if set(test_cameras) >= set(recording.cameras):
+        raise D2Error(f"all cameras of {recording.name} are held out: leave at least one to train on")
+    return tuple(test_cameras)

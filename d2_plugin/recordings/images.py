@@ -1,0 +1,204 @@
+"""Images on disk: read, measured without decoding, written without any extra package, and made smaller."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from d2_plugin.durable import write
+from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.reading import opened, parsing, read_bytes, shown_path
+from d2_plugin.values import shown
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+MOST_PIXELS = 1 << 28
+"""Larger images are refused before anything is decoded: 16384 x 16384."""
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_PNG_RGBA = 6  # colour type in the header's byte 25
+_HEAD = 1 << 22  # bytes in which the size of an image stands; profiles of a JPEG may come before it
+_REMEDY = "replace the file or leave this frame out"
+_JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0..15 without DHT, JPG, DAC
+
+
+def opencv(purpose: str, extra: str = "image") -> ModuleType:
+    """The module cv2; `purpose` completes the sentence "<purpose> needs OpenCV".
+
+    Raises:
+        MissingExtra: where it is not installed; the sentence names `extra`, the extra of this package that brings it.
+    """
+    try:
+        import cv2
+    except ImportError:
+        raise missing_extra("OpenCV", extra, purpose) from None
+    return cv2
+
+
+def read_image(path: Path) -> np.ndarray:
+    """RGB uint8 [H, W, 3] of a PNG or JPEG file, in the pixel order it is stored in (no EXIF rotation).
+
+    A transparent PNG, as Blender scenes have, is laid over black.
+    """
+    cv2 = opencv("reading images")
+    encoded = _whole(path)
+    transparent = encoded.startswith(_PNG_SIGNATURE) and len(encoded) > 25 and encoded[25] == _PNG_RGBA
+    # The calibration belongs to the stored pixels: EXIF's orientation is ignored, as IMREAD_UNCHANGED does too.
+    flags = cv2.IMREAD_UNCHANGED if transparent else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = _decoded(path, encoded, flags)
+    return _over_black(image) if transparent else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def checked_image(image: object, what: str) -> np.ndarray:
+    """What somebody handed over as an image; a D2Error where it is no RGB uint8 [H, W, 3]."""
+    if isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.shape[2:] == (3,) and image.size:
+        return image
+    found = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else shown(image)
+    raise D2Error(f"{what} is {found}, expected RGB uint8 [H, W, 3]: give an image as `read_image` returns it")
+
+
+def read_numbers(path: Path) -> np.ndarray:
+    """An image as it is stored, of any depth and number of channels: [H, W] or [H, W, C]."""
+    return _decoded(path, _whole(path), opencv("reading images").IMREAD_UNCHANGED)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) in pixels from the header of a PNG or JPEG file; nothing is decoded."""
+    with opened(path, _REMEDY) as file:
+        return _size(path, file.read(_HEAD))
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write RGB uint8 [H, W, 3] as a PNG; needs nothing but the standard library."""
+    height, width, _ = image.shape
+    rows = np.zeros((height, 1 + 3 * width), np.uint8)
+    flat = image.reshape(height, 3 * width)
+    rows[:, 0] = 1  # filter "sub": differences to the pixel on the left compress better than the pixels
+    rows[:, 1:4] = flat[:, :3]
+    rows[:, 4:] = flat[:, 3:] - flat[:, :-3]
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes(), 3)), (b"IEND", b""))
+    write(path, _PNG_SIGNATURE, *(_png_chunk(kind, body) for kind, body in chunks), synced=False)
+
+
+def shrink_image(image: np.ndarray, factor: int) -> np.ndarray:
+    """Mean over blocks of factor x factor pixels, uint8 [H // factor, W // factor, 3]; an incomplete block is cut off.
+
+    Cutting (instead of stretching) keeps the new pixel grid exactly `factor` times coarser, so that K / factor holds.
+    """
+    blocks = _blocks(image, factor)
+    total = blocks.astype(np.uint32).sum(axis=(1, 3))
+    area = factor * factor
+    return ((total + area // 2) // area).astype(np.uint8)
+
+
+def shrink_mask(mask: np.ndarray, factor: int) -> np.ndarray:
+    """Mean over blocks of factor x factor pixels, float32 [H // factor, W // factor]; see `shrink_image`."""
+    return _blocks(mask, factor).mean(axis=(1, 3), dtype=np.float32)
+
+
+def shrink_depth(depth: np.ndarray, factor: int, tolerance: float = 0.05) -> np.ndarray:
+    """Depth float32 [H // factor, W // factor] of blocks of pixels; 0 (unknown) where no depth in a block is known.
+
+    A plain mean would put points into the air at depth edges: the mean goes over the pixels of a block that lie
+    within the relative `tolerance` of the block's (lower) median, so that every value belongs to one surface.
+    """
+    blocks = np.moveaxis(_blocks(depth, factor), 2, 1)
+    values = np.sort(blocks.reshape(*blocks.shape[:2], factor * factor), axis=-1).astype(np.float64)
+    known = (values > 0).sum(axis=-1, keepdims=True)
+    # The unknown zeros are sorted to the front, the known depths occupy the last `known` places.
+    median_place = np.minimum(values.shape[-1] - known + (known - 1) // 2, values.shape[-1] - 1)
+    median = np.take_along_axis(values, median_place, axis=-1)
+    near = (np.abs(values - median) <= tolerance * median) & (values > 0)
+    return ((values * near).sum(axis=-1) / np.maximum(near.sum(axis=-1), 1)).astype(np.float32)
+
+
+def _blocks(array: np.ndarray, factor: int) -> np.ndarray:
+    """View of [H, W, ...] as [H // factor, factor, W // factor, factor, ...]."""
+    rows, columns = array.shape[0] // factor, array.shape[1] // factor
+    return array[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor, *array.shape[2:])
+
+
+def _whole(path: Path) -> bytes:
+    """The bytes of an image that says a possible size and was not cut off."""
+    encoded = read_bytes(path, _REMEDY)
+    _size(path, encoded)
+    _check_whole(path, encoded)
+    return encoded
+
+
+def _decoded(path: Path, encoded: bytes, flags: int) -> np.ndarray:
+    with parsing(f"image {shown_path(path)}", _REMEDY):
+        image = opencv("reading images").imdecode(np.frombuffer(encoded, np.uint8), flags)
+    if image is None:
+        raise _unreadable(path)
+    return image
+
+
+def _size(path: Path, data: bytes) -> tuple[int, int]:
+    """(width, height) in the header of an image."""
+    if data.startswith(_PNG_SIGNATURE) and len(data) >= 24:
+        width, height = struct.unpack(">II", data[16:24])
+    elif data.startswith(b"\xff\xd8"):
+        width, height = _jpeg_size(path, data)
+    else:
+        raise _unreadable(path)
+    if not 0 < width * height <= MOST_PIXELS:
+        raise D2Error(f"image {shown_path(path)} says {width}x{height} pixels, at most {MOST_PIXELS}: {_REMEDY}")
+    return width, height
+
+
+def _check_whole(path: Path, data: bytes) -> None:
+    """Refuse a file that was cut off or changed: decoders fill in what is missing, without a word."""
+    if data.startswith(_PNG_SIGNATURE):
+        if not _png_is_whole(data):
+            raise _unreadable(path, " (cut off, or its checksums are wrong)")
+    elif b"\xff\xd9" not in data[-(1 << 16) :]:
+        raise _unreadable(path, " (cut off: its end marker is missing)")
+
+
+def _png_is_whole(data: bytes) -> bool:
+    """Whether all chunks of a PNG up to its last one are there with the right checksums."""
+    place = len(_PNG_SIGNATURE)
+    while place + 12 <= len(data):
+        (length,) = struct.unpack(">I", data[place : place + 4])
+        end = place + 8 + length
+        if data[end : end + 4] != struct.pack(">I", zlib.crc32(memoryview(data)[place + 4 : end])):
+            return False
+        if data[place + 4 : place + 8] == b"IEND":
+            return True
+        place = end + 4
+    return False
+
+
+def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
+    position = 2
+    while position + 9 <= len(data) and data[position] == 0xFF:
+        marker, length = data[position + 1], struct.unpack(">H", data[position + 2 : position + 4])[0]
+        if marker in _JPEG_SIZE_MARKERS:
+            height, width = struct.unpack(">HH", data[position + 5 : position + 9])
+            return width, height
+        if marker == 0xFF:  # fill byte before a marker
+            position += 1
+        else:
+            position += 2 + length
+    raise _unreadable(path)
+
+
+def _over_black(image: np.ndarray) -> np.ndarray:
+    """RGB uint8 of blue, green, red and opacity with 8 or 16 bits."""
+    full = np.iinfo(image.dtype).max
+    opaque = image[..., 2::-1].astype(np.float64) * (image[..., 3:].astype(np.float64) / full)
+    return np.rint(opaque * (255 / full)).astype(np.uint8)
+
+
+def _png_chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def _unreadable(path: Path, why: str = "") -> D2Error:
+    return D2Error(f"image {shown_path(path)} is not a readable PNG or JPEG{why}: {_REMEDY}")

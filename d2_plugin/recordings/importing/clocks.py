@@ -1,0 +1,212 @@
+"""One clock for all cameras: timecode, sound and motion, each with its error, weighed and held against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings.importing.files import VideoFile
+from d2_plugin.recordings.importing.motion import offsets_from_motion
+from d2_plugin.recordings.importing.profiles import Watched
+from d2_plugin.recordings.importing.sound import Sound, lag_between, read_sound
+from d2_plugin.recordings.importing.timecode import shortest, timecode_seconds
+
+METHODS = ("auto", "timecode", "sound", "motion", "none")
+"""How offsets are found; `none` says that all clocks begin together."""
+
+APART = 0.75
+"""Frames by which evidence may differ from the whole, beside three times its error: more is a contradiction."""
+
+TIMECODE_ERROR = 12**-0.5
+"""Frames: the standard deviation of what is rounded to whole frames."""
+
+HEARD = 1e-3
+"""Seconds at least that an offset from sound may be wrong: sound travels a third of a metre in that time."""
+
+INSTEAD = "leave the camera out, give the offsets (--offsets NAME=FRAMES,...), or record a clap that all see and hear"
+
+
+@dataclass(frozen=True)
+class Clock:
+    """When the clock of a video began, after that of the first camera."""
+
+    seconds: float
+    error: float
+    """Standard error, seconds; 0 for what was given."""
+    method: str
+    """Where it comes from, such as `sound`."""
+    drift: float = 0.0
+    """Seconds that it loses per second."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+class Evidence(NamedTuple):
+    """That the clock of `other` began so much later than that of `one`."""
+
+    one: str
+    other: str
+    seconds: float
+    error: float
+    method: str
+
+
+Watching = Callable[[], Mapping[str, Watched]]
+"""Small images of all cameras; called only where motion must decide, since all videos are decoded for it."""
+
+
+def common_clock(videos: Mapping[str, VideoFile], how: str, watching: Watching) -> dict[str, Clock]:
+    """When each video's clock began, by the best evidence there is: timecode, then sound, then motion.
+
+    Raises:
+        D2Error: no evidence links a camera to the others, or the evidence contradicts itself.
+    """
+    names = list(videos)
+    if how == "none" or len(names) == 1:
+        return {name: Clock(0.0, 0.0, "none") for name in names}
+    frame = 1 / min(video.rate or 25.0 for video in videos.values())
+    evidence = _of_timecodes(videos) if how in ("auto", "timecode") else []
+    if how in ("auto", "sound"):
+        evidence += _of_sound({name: read_sound(video.path) for name, video in videos.items() if video.sound})
+    if how == "motion" or (how == "auto" and len(_linked(names, evidence)) < len(names)):
+        evidence += _of_motion(watching(), names, videos)
+    linked = _linked(names, evidence)
+    if len(linked) < len(names):
+        lost = ", ".join(name for name in names if name not in linked)
+        raise D2Error(f"nothing in {_what(how)} links {lost} with {', '.join(linked)}: {INSTEAD}")
+    return _solved(names, evidence, frame)
+
+
+def given_clock(videos: Mapping[str, VideoFile], given: Sequence[str]) -> dict[str, Clock]:
+    """Offsets in frames of each camera's own rate, as `NAME=FRAMES`; cameras that are not named begin at 0.
+
+    Raises:
+        D2Error: what is no number, and cameras that there are not.
+    """
+    found = dict.fromkeys(videos, 0.0)
+    for text in given:
+        name, said, frames = text.partition("=")
+        if name not in videos:
+            raise D2Error(f"--offsets names camera '{name}', have {', '.join(videos)}: write NAME=FRAMES,NAME=FRAMES")
+        try:
+            found[name] = float(frames) / (videos[name].rate or 25.0)
+        except ValueError:
+            raise D2Error(f"--offsets says '{text}', expected NAME=FRAMES such as {name}=-7.5: correct it") from None
+        if not said or not np.isfinite(found[name]):
+            raise D2Error(f"--offsets says '{text}', expected NAME=FRAMES with a finite number: correct it")
+    return {name: Clock(seconds, 0.0, "given") for name, seconds in found.items()}
+
+
+def _of_timecodes(videos: Mapping[str, VideoFile]) -> list[Evidence]:
+    read = {name: timecode_seconds(video.timecode or "", video.rate) for name, video in videos.items()}
+    starts = {name: found - float(videos[name].times[0]) for name, found in read.items() if found is not None}
+    error = {name: TIMECODE_ERROR / (videos[name].rate or 25.0) for name in starts}
+    return [
+        Evidence(
+            one, other, shortest(starts[other] - starts[one]), float(np.hypot(error[one], error[other])), "timecode"
+        )
+        for one, other in combinations(starts, 2)
+    ]
+
+
+def _of_sound(sounds: Mapping[str, Sound | None]) -> list[Evidence]:
+    found = []
+    for (one, heard), (other, also) in combinations(sounds.items(), 2):
+        lag = None if heard is None or also is None else lag_between(heard, also)
+        if lag is not None:
+            found.append(Evidence(one, other, lag.seconds, max(lag.error, HEARD), "sound"))
+    return found
+
+
+def _of_motion(watched: Mapping[str, Watched], names: Sequence[str], videos: Mapping[str, VideoFile]) -> list[Evidence]:
+    seen = offsets_from_motion(watched, search=max(float(np.ptp(video.times)) for video in videos.values()))
+    doubtful = {name: one.doubt for name, one in seen.items() if one.doubt}
+    if doubtful and len(names) - len(doubtful) < 2:
+        raise D2Error(f"motion does not say when the cameras started ({next(iter(doubtful.values()))}): {INSTEAD}")
+    if doubtful:
+        name, why = next(iter(doubtful.items()))
+        raise D2Error(f"motion does not say when camera {name} started ({why}): {INSTEAD}")
+    return [
+        Evidence(names[0], name, seen[name].seconds - seen[names[0]].seconds, seen[name].error, "motion")
+        for name in names[1:]
+    ]
+
+
+def _linked(names: Sequence[str], evidence: Sequence[Evidence]) -> list[str]:
+    """Cameras that evidence links, over others or not, with the camera that is linked with most."""
+    groups: list[set[str]] = [{name} for name in names]
+    for one in evidence:
+        first, second = (next(group for group in groups if name in group) for name in (one.one, one.other))
+        if first is not second:
+            groups.remove(second)
+            first |= second
+    largest = max(groups, key=len)
+    return [name for name in names if name in largest]
+
+
+def _solved(names: Sequence[str], evidence: Sequence[Evidence], frame: float) -> dict[str, Clock]:
+    offsets, errors = _least_squares(names, evidence)
+    if _worst(offsets, evidence, frame) is not None:
+        raise D2Error(_contradiction(names, evidence, frame))
+    found = {}
+    for name in names:
+        own = [one for one in evidence if name in (one.one, one.other)]
+        best = min(own, key=lambda one: one.error)
+        found[name] = Clock(offsets[name], errors[name], best.method)
+    return found
+
+
+def _least_squares(names: Sequence[str], evidence: Sequence[Evidence]) -> tuple[dict[str, float], dict[str, float]]:
+    """(offsets, standard errors) by weighted least squares; the first of `names` begins at 0."""
+    place = {name: index for index, name in enumerate(names)}
+    rows = np.zeros((len(evidence), len(names)))
+    for row, one in zip(rows, evidence):
+        row[place[one.other]], row[place[one.one]] = 1 / one.error, -1 / one.error
+    goal = np.array([one.seconds / one.error for one in evidence])
+    normal = rows[:, 1:].T @ rows[:, 1:]
+    inverse = np.linalg.pinv(normal)
+    solved = inverse @ rows[:, 1:].T @ goal
+    errors = np.sqrt(np.maximum(np.diag(inverse), 0))
+    return dict(zip(names, (0.0, *map(float, solved)))), dict(zip(names, (0.0, *map(float, errors))))
+
+
+def _worst(offsets: Mapping[str, float], evidence: Sequence[Evidence], frame: float) -> tuple[Evidence, float] | None:
+    """The evidence that differs most from the whole, and by how many seconds; None where all agree."""
+    found = None
+    for one in evidence:
+        off = abs(offsets[one.other] - offsets[one.one] - one.seconds)
+        if off > APART * frame + 3 * one.error and (found is None or off > found[1]):
+            found = one, off
+    return found
+
+
+def _contradiction(names: Sequence[str], evidence: Sequence[Evidence], frame: float) -> str:
+    """Whose evidence it is, where leaving one camera or one kind of evidence out makes the rest agree."""
+    methods = sorted({one.method for one in evidence})
+    guilty = []
+    for name in names:
+        rest, others = [one for one in evidence if name not in (one.one, one.other)], [n for n in names if n != name]
+        if len(rest) >= len(others) and _worst(_least_squares(others, rest)[0], rest, frame) is None:
+            guilty.append(name)
+    offsets, _ = _least_squares(names, evidence)
+    worst = _worst(offsets, evidence, frame)
+    assert worst is not None
+    one, off = worst
+    said = (
+        f"{' and '.join(methods)} contradict each other" if len(methods) > 1 else f"the {methods[0]} contradicts itself"
+    )
+    between = f"by {off / frame:.1f} frames between {one.one} and {one.other}"
+    if len(guilty) == 1:
+        return f"{said} {between}, and without camera {guilty[0]} all agree (is it of another event?): {INSTEAD}"
+    return f"{said} {between}: choose one with --offsets timecode, sound or motion, or give them, NAME=FRAMES,..."
+
+
+def _what(how: str) -> str:
+    return {"auto": "timecode, sound or motion"}.get(how, f"the {how}")

@@ -1,0 +1,101 @@
+"""The layouts that can be read, in one table, and `open_recording`, which finds the right one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple, Optional
+
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import reaching
+from d2_plugin.recordings.readers.colmap import is_colmap, open_colmap
+from d2_plugin.recordings.readers.enerf import is_enerf, open_enerf
+from d2_plugin.recordings.readers.folder import CALIBRATION, is_folder, open_folder
+from d2_plugin.recordings.readers.n3dv import is_n3dv, open_n3dv
+from d2_plugin.recordings.readers.technicolor import is_technicolor, open_technicolor
+from d2_plugin.recordings.readers.transforms_json import is_transforms, open_transforms
+from d2_plugin.recordings.readers.videos import is_videos, open_videos
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.selection import downscale as downscaled
+from d2_plugin.recordings.selection import select_frames
+from d2_plugin.values import checked_arguments
+
+Reader = Callable[[Path, Optional[tuple[str, ...]], bool], Recording]  # noqa: UP045  at run time, on Python 3.9 too
+"""(folder, cameras to read or None, whether to leave out cameras without counterpart) -> recording."""
+
+
+class Layout(NamedTuple):
+    """One layout of recordings."""
+
+    recognised: Callable[[Path], bool]
+    """Whether a folder looks like this layout; it only asks which files are there."""
+    open: Reader
+
+
+LAYOUTS: dict[str, Layout] = {
+    "folder": Layout(is_folder, open_folder),
+    "videos": Layout(is_videos, open_videos),
+    "n3dv": Layout(is_n3dv, open_n3dv),
+    "technicolor": Layout(is_technicolor, open_technicolor),
+    "enerf": Layout(is_enerf, open_enerf),
+    "transforms": Layout(is_transforms, open_transforms),
+    "colmap": Layout(is_colmap, open_colmap),
+}
+"""By name, in the order in which a folder is tried. A new layout is one module in readers/ and one row here."""
+
+
+@checked_arguments
+def open_recording(
+    path: Path | str,
+    *,
+    cameras: Iterable[str] | None = None,
+    frames: Iterable[int] | None = None,
+    downscale: int = 1,
+    layout: str | None = None,
+    intersect: bool = False,
+) -> Recording:
+    """Open the recording in `path`; images are read when asked for.
+
+    Args:
+        path: a folder in one of the layouts of `LAYOUTS`, which docs/recordings.md describes. The first that fits is
+            taken.
+        cameras: names to read, in this order; all of them otherwise. Only those read are checked.
+        frames: frame numbers to read; all that every camera has otherwise.
+        downscale: every block of this many by this many pixels becomes one.
+        layout: read `path` in this layout whatever else it holds.
+        intersect: leave out, with a note, cameras with images but no calibration or the other way round.
+
+    Raises:
+        D2Error: one sentence for anything that is missing or contradicts itself.
+    """
+    folder = Path(path)
+    if layout is not None and layout not in LAYOUTS:
+        raise unknown_name("layout", layout, LAYOUTS)
+    with reaching(folder, "make the folder readable"):
+        layout = layout or _recognised(folder)
+    names = None if cameras is None else tuple(cameras)
+    if names is not None and len(set(names)) < max(len(names), 1):
+        raise D2Error(f"camera names '{', '.join(names)}' are empty or repeated: name each camera once")
+    with reaching(folder, "make the folder readable"):
+        recording = replace(LAYOUTS[layout].open(folder, names, intersect), layout=layout)
+    if frames is not None:
+        recording = select_frames(recording, frames)
+    return downscaled(recording, downscale)
+
+
+def _recognised(folder: Path) -> str:
+    if not folder.is_dir():
+        raise D2Error(f"no such recording: {folder} is not a folder; give the folder that holds the recording")
+    for name, layout in LAYOUTS.items():
+        if layout.recognised(folder):
+            return name
+    if (folder / CALIBRATION).is_file():
+        raise D2Error(f"{folder} has {CALIBRATION} but no folder images: put images at images/<camera>/<frame>.png")
+    if (folder / "images").is_dir():
+        raise D2Error(f"{folder} has images but no {CALIBRATION}: write the calibration of every camera there")
+    others = ", ".join(name for name in LAYOUTS if name != "folder")
+    raise D2Error(
+        f"{folder} is no recording: expected {CALIBRATION} and images/<camera>/<frame>.png, or the files of another "
+        f"layout ({others}; see docs/recordings.md)"
+    )

@@ -1,0 +1,184 @@
+"""Neural 3D Video: camXX.mp4 beside poses_bounds.npy, or the same frames extracted as images.
+
+Row i of poses_bounds.npy belongs to the i-th camera in sorted order. Its first fifteen numbers are a 3 x 5 matrix whose
+columns are the camera's down, right and back axes, its centre, and (height, width, focal length); the last two are the
+near and far depth. The principal point is the centre of the image.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from d2_plugin.arrays import read_array
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings.assembly import assembled
+from d2_plugin.recordings.cameras.calibration import LARGEST_NUMBER, checked_camera, checked_rate, pinhole, rigid
+from d2_plugin.recordings.files import FrameFiles, cameras_with_images, collect, common_frames, numbered_files
+from d2_plugin.recordings.images import IMAGE_SUFFIXES, image_size
+from d2_plugin.recordings.importing.plain import VideoSource, video_header
+from d2_plugin.recordings.recording import Camera, Recording
+
+log = logging.getLogger(__name__)
+
+POSES = "poses_bounds.npy"
+
+N3DV_FPS = 30.0
+"""Frame rate of the data set, where no video says it."""
+
+UNSYNCHRONISED = {"coffee_martini": ("cam13",)}
+"""Cameras whose video is not synchronised with the others. MixVoxels and K-Planes leave them out, too."""
+
+RIG_SIZE = 21
+"""Cameras of the rig, cam00 to cam20. Scenes with fewer rows lack cameras, and their rows do not say which."""
+
+_NUMBERED_NAME = re.compile(r"cam(\d+)$")
+_EXTRACTED_NAME = re.compile(r"(?P<camera>.+)_\d+$")
+
+
+def is_n3dv(path: Path) -> bool:
+    """Whether `path` looks like the N3DV layout."""
+    return (path / POSES).is_file()
+
+
+def open_n3dv(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Recording:
+    """Read the N3DV layout; frames are decoded when asked for, only headers are opened here.
+
+    A camera whose video or folder is empty is refused by name, and so are rows without a camera. Where `intersect`
+    both are left out with a note: an empty camera keeps its row, and of the whole rig (`RIG_SIZE` rows) the number in
+    a camera's name says which row is its own. Otherwise nothing says which row belongs to which camera.
+    """
+    videos = {video.stem: video for video in sorted(path.glob("cam*.mp4"))}
+    extracted = {} if videos else _extracted(path)
+    listed = list(videos or extracted)
+    if not listed:
+        raise D2Error(f"{path} has {POSES} but no cam*.mp4 and no extracted frames: add the videos")
+    rows, notes = _assigned(_rows(path / POSES), listed, intersect, path / POSES)
+    pictured = {name for name in listed if (videos[name].stat().st_size if videos else extracted[name])}
+    names, missing = cameras_with_images(rows, pictured, cameras, intersect, path / POSES)
+    notes = (*notes, *missing)
+    if videos:
+        return _from_videos(path, rows, videos, names, notes)
+    return _from_images(path, rows, extracted, names, notes)
+
+
+def _assigned(
+    rows: np.ndarray, listed: list[str], intersect: bool, where: Path
+) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """(row of each camera, notes); rows belong to the cameras in sorted order, or to their numbers in a whole rig."""
+    if len(rows) == len(listed):
+        return dict(zip(listed, rows)), ()
+    numbers = {name: int(match[1]) for name in listed if (match := _NUMBERED_NAME.match(name))}
+    if intersect and len(rows) == RIG_SIZE and len(numbers) == len(listed) and max(numbers.values()) < RIG_SIZE:
+        absent = len(rows) - len(listed)
+        note = f"{absent} of {RIG_SIZE} cameras are not there and left out: rows are taken by the cameras' numbers"
+        return {name: rows[number] for name, number in numbers.items()}, (note,)
+    raise D2Error(
+        f"{where} has {len(rows)} rows for {len(listed)} cameras ({', '.join(listed)}): "
+        "rows belong to the cameras in sorted order, so add or remove what does not match"
+    )
+
+
+def camera_from_row(row: np.ndarray, name: str, size: tuple[int, int] | None, where: str) -> Camera:
+    """The OpenCV camera of one row [17] of poses_bounds.npy for images of `size` (width, height).
+
+    `size` None means the size in the row; another one must have the same aspect and scales the focal length.
+    """
+    pose = np.asarray(row[:15], np.float64).reshape(3, 5)
+    height, width, focal = pose[:, 4]
+    if not np.isfinite(row).all() or min(height, width) < 1:
+        raise D2Error(
+            f"the row of camera {name} in {where} has a number that is not finite or a size below one pixel: "
+            "correct the calibration"
+        )
+    if np.abs(row).max() > LARGEST_NUMBER:
+        raise D2Error(
+            f"the row of camera {name} in {where} has the number {np.abs(row).max():g}, expected at most "
+            f"{LARGEST_NUMBER:g} in size: correct the calibration"
+        )
+    size = size or (round(width), round(height))
+    scale = size[0] / width
+    if abs(size[1] / height - scale) > 0.01 * scale:
+        raise D2Error(
+            f"images of camera {name} are {size[0]}x{size[1]} but {where} says {width:g}x{height:g}, another aspect: "
+            "use images that are scaled, not cropped"
+        )
+    # Columns of the row are down, right, back; OpenCV's rows are right, down, forward.
+    rotation = np.stack([pose[:, 1], pose[:, 0], -pose[:, 2]])
+    K = pinhole(focal * scale, focal * scale, size[0] / 2, size[1] / 2)
+    transform = rigid(rotation, -rotation @ pose[:, 3])
+    return checked_camera(name, size, K, transform, (float(row[15]), float(row[16])), where)
+
+
+def _rows(path: Path) -> np.ndarray:
+    rows = read_array(path, "replace the file")
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise D2Error(f"{path} has shape {rows.shape}, expected [cameras, 17]: see the LLFF format")
+    return rows.astype(np.float64)
+
+
+def _from_videos(
+    path: Path, rows: dict[str, np.ndarray], videos: dict[str, Path], names: list[str], notes: tuple[str, ...]
+) -> Recording:
+    found = {name: video_header(videos[name]) for name in names}
+    frames, frame_notes = common_frames({name: range(header.frames) for name, header in found.items()}, path)
+    where = str(path / POSES)
+    return Recording(
+        name=path.resolve().name,
+        cameras={name: camera_from_row(rows[name], name, found[name].size, where) for name in names},
+        frames=frames,
+        fps=checked_rate(found[names[0]].fps or N3DV_FPS, str(videos[names[0]])),
+        source=VideoSource({name: videos[name] for name in names}),
+        path=path,
+        notes=(*notes, *frame_notes, *_known_flaws(path, names)),
+    )
+
+
+def _from_images(
+    path: Path, rows: dict[str, np.ndarray], extracted: dict[str, FrameFiles], names: list[str], notes: tuple[str, ...]
+) -> Recording:
+    files = {name: extracted[name] for name in names}
+    frames, frame_notes = common_frames(files, path)
+    where = str(path / POSES)
+    cameras = {name: camera_from_row(rows[name], name, image_size(files[name][frames[0]]), where) for name in names}
+    return assembled(path, cameras, files, frames, N3DV_FPS, (*notes, *frame_notes, *_known_flaws(path, names)))
+
+
+def _known_flaws(path: Path, names: list[str]) -> tuple[str, ...]:
+    flawed = [name for name in names if name in UNSYNCHRONISED.get(path.resolve().name, ())]
+    notes = tuple(f"{name} is known to be unsynchronised: consider leaving it out" for name in flawed)
+    for note in notes:
+        log.warning("%s", note)
+    return notes
+
+
+def _extracted(path: Path) -> dict[str, FrameFiles]:
+    """Frames extracted as camXX/images/*, camXX/*, images/camXX/* or images/camXX_0000.*, cameras sorted.
+
+    A camera whose folder is empty has no frames.
+    """
+    partly: dict[str, FrameFiles] = {}
+    for pattern in ("cam*/images", "cam*", "images/*"):
+        folders = [folder for folder in sorted(path.glob(pattern)) if folder.is_dir()]
+        cameras = [folder.parent.name if folder.name == "images" else folder.name for folder in folders]
+        found = {camera: numbered_files(folder) for camera, folder in zip(cameras, folders)}
+        if found and all(found.values()):
+            return found
+        if not partly and any(found.values()):
+            partly = found
+    return partly or dict(_by_prefix(path / "images"))
+
+
+def _by_prefix(folder: Path) -> Iterator[tuple[str, FrameFiles]]:
+    images = sorted(file for file in folder.glob("*_*") if file.suffix.lower() in IMAGE_SUFFIXES)
+    prefixes: dict[str, list[Path]] = {}
+    for image in images:
+        match = _EXTRACTED_NAME.match(image.stem)
+        if match:
+            prefixes.setdefault(match["camera"], []).append(image)
+    for camera, paths in sorted(prefixes.items()):
+        yield camera, collect(paths)

@@ -1,0 +1,95 @@
+"""The same recording with fewer cameras, fewer frames or fewer pixels; still read only when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.recordings.images import shrink_depth, shrink_image, shrink_mask
+from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.values import checked_arguments
+
+
+@checked_arguments
+def select_cameras(recording: Recording, cameras: Iterable[str]) -> Recording:
+    """The recording with the named cameras only, in the order given."""
+    names = list(cameras)
+    if not names:
+        raise D2Error(f"no camera chosen from {recording.name}: name at least one of {', '.join(recording.cameras)}")
+    for name in names:
+        if name not in recording.cameras:
+            raise unknown_name("camera", name, recording.cameras)
+    if len(set(names)) < len(names):
+        raise D2Error(f"camera names {', '.join(names)} contain a duplicate: name each camera once")
+    return replace(recording, cameras={name: recording.cameras[name] for name in names})
+
+
+@checked_arguments
+def select_frames(recording: Recording, frames: Iterable[int]) -> Recording:
+    """The recording with the given frame numbers only, ascending."""
+    chosen, there = tuple(sorted(set(frames))), set(recording.frames)
+    missing = [frame for frame in chosen if frame not in there]
+    if missing or not chosen:
+        what = f"frame {missing[0]} is not in {recording.name}" if missing else f"no frame chosen from {recording.name}"
+        raise D2Error(f"{what}: choose among frames {recording.frames[0]} to {recording.frames[-1]}")
+    return replace(recording, frames=chosen)
+
+
+def downscale(recording: Recording, factor: int) -> Recording:
+    """The recording with every `factor` x `factor` block of pixels made one, and K made to fit.
+
+    Rows and columns that fill no block are cut off at the bottom and on the right, so K / factor is exact with pixel
+    centres at i + 0.5. Monocular maps keep the size they are stored in.
+    """
+    if isinstance(factor, bool) or not isinstance(factor, (int, np.integer)) or factor < 1:
+        raise D2Error(f"downscale {factor!r} is no whole number of at least 1: give 1, 2, 4 or the like")
+    if factor == 1:
+        return recording
+    cameras = {name: _smaller_camera(camera, factor) for name, camera in recording.cameras.items()}
+    return replace(recording, cameras=cameras, source=DownscaledSource(recording, factor))
+
+
+@dataclass(frozen=True)
+class DownscaledSource:
+    """The images and depths of a recording, made smaller by a whole factor after their size was checked."""
+
+    recording: Recording
+    factor: int
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        """RGB uint8 [H // factor, W // factor, 3]: the mean of each block."""
+        return shrink_image(self.recording.image(camera, frame), self.factor)
+
+    def depth(self, camera: str, frame: int) -> np.ndarray | None:
+        """True planar z float32 [H // factor, W // factor], 0 where unknown, or None; see `shrink_depth`."""
+        depth = self.recording.depth(camera, frame)
+        return None if depth is None else shrink_depth(depth, self.factor)
+
+    def mono(self, camera: str, frame: int) -> np.ndarray | None:
+        """The monocular map at the size it is stored in, or None."""
+        return self.recording.mono(camera, frame)
+
+    def mask(self, camera: str, frame: int) -> np.ndarray | None:
+        """The mean of each block of the mask, float32 [H // factor, W // factor], or None."""
+        mask = self.recording.mask(camera, frame)
+        return None if mask is None else shrink_mask(mask, self.factor)
+
+    def recorded(self, camera: str) -> np.ndarray | None:
+        """Which blocks were recorded whole, bool [H // factor, W // factor], or None where all were."""
+        valid = self.recording.recorded(camera)
+        return None if valid is None else shrink_mask(valid.astype(np.float32), self.factor) > 1 - 1e-6
+
+
+def _smaller_camera(camera: Camera, factor: int) -> Camera:
+    width, height = camera.width // factor, camera.height // factor
+    if min(width, height) < 1:
+        raise D2Error(
+            f"downscale {factor} leaves no pixel of camera {camera.name} ({camera.width}x{camera.height}): "
+            "choose a smaller factor"
+        )
+    K = camera.K.copy()
+    K[:2] /= factor
+    return replace(camera, width=width, height=height, K=K)

@@ -1,0 +1,102 @@
+"""Every row of the paper's two ablation tables as a preset: which hooks run, and what is set differently."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from benchmarks.rivals.table import RIVALS
+from d2_plugin.errors import unknown_name
+from d2_plugin.runs.settings import HOOK_NAMES
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One variant of the method."""
+
+    name: str
+    title: str
+    """As the paper's table writes it, where it is a row of one."""
+    hooks: tuple[str, ...] = HOOK_NAMES
+    overrides: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Tables over the defaults, as in a configuration file."""
+    rival: str | None = None
+    """What guides the run in place of D2's hooks, see `benchmarks.rivals.table`."""
+
+    def merged(self, tables: Mapping[str, Any]) -> dict[str, Any]:
+        """The user's `tables` with this preset's settings over them; neither is changed."""
+        merged = {name: dict(table) for name, table in tables.items()}
+        for name, table in self.overrides.items():
+            merged[name] = _over(merged.get(name, {}), table)
+        return merged
+
+
+def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    result = dict(below)
+    for key, value in above.items():
+        result[key] = _over(result.get(key, {}), value) if isinstance(value, Mapping) else value
+    return result
+
+
+def _without(hook: str) -> tuple[str, ...]:
+    return tuple(name for name in HOOK_NAMES if name != hook)
+
+
+PRESETS: dict[str, Preset] = {
+    preset.name: preset
+    for preset in (
+        Preset("backbone", "Backbone", ()),
+        Preset("mono_only", "Mono only", overrides={"priors": {"variant": "mono"}}),
+        Preset("mvs_only", "MVS only", overrides={"priors": {"variant": "mvs"}}),
+        Preset("dual_unaligned", "Dual w/o align.", overrides={"priors": {"variant": "dual_unaligned"}}),
+        Preset("dual_unverified", "Dual w/o verify.", overrides={"priors": {"variant": "dual_unverified"}}),
+        Preset("no_densification", "w/o Densification", _without("densify")),
+        Preset("no_pruning", "w/o Pruning", _without("prune")),
+        Preset("no_rgbd", "w/o RGB-D", _without("depth_loss")),
+        Preset("full", "D²-4DGS"),
+        Preset("opacity_only", "Opacity only", overrides={"prune": {"lambda_e": 0.0, "lambda_o": 1.0}}),
+        Preset("depth_only", "Depth only", overrides={"prune": {"lambda_e": 1.0, "lambda_o": 0.0}}),
+        Preset(
+            "full_d2_densification_only",
+            "D²-4DGS, own densification off",
+            overrides={"backbone": {"densify": {"enabled": False}}},
+        ),
+        *(Preset(name, found.title, (), rival=name) for name, found in RIVALS.items()),
+    )
+}
+"""By name. In the prior variants densification, pruning and RGB-D optimization are those of `full`, as in the paper."""
+
+TABLES: dict[str, tuple[str, ...]] = {
+    "ablation": (
+        "backbone",
+        "mono_only",
+        "mvs_only",
+        "dual_unaligned",
+        "dual_unverified",
+        "no_densification",
+        "no_pruning",
+        "no_rgbd",
+        "full",
+        "full_d2_densification_only",
+    ),
+    "pruning": ("no_pruning", "opacity_only", "depth_only", "full"),
+    "main": ("backbone", "full"),
+    "rivals": ("backbone", *RIVALS, "full"),
+}
+"""The rows of each table: the paper's tab:ablation (and one row of ours), its tab:pruning_criteria, the two that its
+tab:main_results compares, and what users would pick instead. A row that two tables share is run once."""
+
+
+def rows_named(names: Sequence[str]) -> tuple[Preset, ...]:
+    """The presets of tables and single presets, each once, in the order of `PRESETS`.
+
+    Raises:
+        D2Error: neither a table nor a preset.
+    """
+    wanted: set[str] = set()
+    for name in names:
+        if name not in TABLES and name not in PRESETS:
+            raise unknown_name("table or preset", name, [*TABLES, *PRESETS])
+        wanted.update(TABLES.get(name, (name,)))
+    return tuple(preset for name, preset in PRESETS.items() if name in wanted)

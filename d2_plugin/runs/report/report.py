@@ -1,0 +1,125 @@
+"""`d2 report`: everything that was measured as one page, with plots, tables and images, from rows and run folders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from benchmarks.never_worse.section import never_worse
+from d2_plugin.durable import make_folder, remove_leftovers, write_text
+from d2_plugin.errors import D2Error
+from d2_plugin.locks import only_writer
+from d2_plugin.reading import parsing
+from d2_plugin.runs.report.ablation import ablation
+from d2_plugin.runs.report.limits import gpu, plan, scaling, stability, step
+from d2_plugin.runs.report.page import Image, html, markdown
+from d2_plugin.runs.report.precision import alignment, raster, stereo
+from d2_plugin.runs.report.priors import priors
+from d2_plugin.runs.report.quality import quality
+from d2_plugin.runs.report.sections import Section
+from d2_plugin.runs.report.training import training
+from d2_plugin.runs.report.versions import versions
+from d2_plugin.runs.rows import Row, read_rows, told_apart
+from d2_plugin.runs.tables import read_metrics
+from d2_plugin.runs.training_rows import image_of, method_of, training_rows
+from d2_plugin.settings import Positional, Settings
+
+BUILDERS: dict[str, Callable[[Sequence[Row]], Section]] = {
+    build.__name__: build
+    for build in (
+        *(training, quality, never_worse, ablation),
+        *(alignment, stereo, priors, raster, step, gpu, stability, plan, scaling),
+    )
+}
+"""The function that makes a section from the rows of a kind, in the order of the page."""
+
+LEAD = (
+    "Every figure here was measured by a command of this package and is shown with the machine, the commit and the "
+    "command that made it. Errors are on the vertical axis, run time on the horizontal one."
+)
+
+
+@dataclass(frozen=True)
+class ReportSettings(Settings):
+    """Settings of `d2 report`."""
+
+    sources: Annotated[tuple[Path, ...], Positional()]
+    """Files of rows (runs.jsonl) and output folders of `d2 train`, in any number."""
+    output: Path = Path("report")
+    """Folder of the report."""
+    no_images: bool = False
+    """Leave the images of the runs out of the page."""
+
+
+def run(settings: ReportSettings) -> str:
+    """Make the report; how many rows it holds, and which files it is."""
+    rows, images = collect(settings.sources)
+    page, markdown_file, *plots = make_report(rows, settings.output, () if settings.no_images else images)
+    return f"{len(rows)} rows; open {page}, or read {markdown_file} with its {len(plots)} plots"
+
+
+def make_report(rows: Sequence[Row], output: Path, images: Sequence[Image] = ()) -> list[Path]:
+    """Write report.html, report.md and one SVG per plot into `output`.
+
+    Args:
+        rows: of any kinds, see `d2_plugin.runs.rows`.
+        output: folder, created where absent; files of the same names are replaced.
+        images: for the page; the Markdown has none.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        D2Error: there is no row.
+    """
+    if not rows:
+        raise D2Error("there is nothing to report: give a runs.jsonl with rows in it, or the folder of a finished run")
+    rows = told_apart(rows)
+    by_kind = {kind: [row for row in rows if row["kind"] == kind] for kind in BUILDERS}
+    sections = [_built(kind, mine) for kind, mine in by_kind.items() if mine]
+    compared = versions(rows)
+    sections += [] if compared is None else [compared]
+    texts = {"report.html": html(sections, images, LEAD), "report.md": markdown(sections, LEAD)}
+    texts |= {f"{name}.svg": svg for section in sections for name, svg in section.figures.items()}
+    with only_writer(make_folder(output)):
+        remove_leftovers(output, below=False)  # of a report that was killed
+        for name, content in texts.items():
+            write_text(output / name, content)
+    return [output / name for name in texts]
+
+
+def _built(kind: str, rows: Sequence[Row]) -> Section:
+    """The section of one kind of row; each reads what else its rows hold, which only it knows."""
+    with parsing(f"the rows of kind {kind}", "measure them again, their form is not that of this version"):
+        return BUILDERS[kind](rows)
+
+
+def collect(sources: Sequence[Path]) -> tuple[list[Row], list[Image]]:
+    """Rows of all files and run folders, and an image of each method; a folder of runs stands for every run in it.
+
+    Raises:
+        D2Error: a folder that holds no finished run, or a file that holds no rows.
+    """
+    folders = [folder for source in sources if source.is_dir() for folder in _runs(source)]
+    rows = read_rows([source for source in sources if not source.is_dir()]) + training_rows(folders)
+    first: dict[tuple[str, str], Image] = {}
+    for folder in folders:
+        metrics = read_metrics(folder)
+        key = (metrics["recording"], method_of(metrics))
+        if key not in first and (image := _image(folder, *key)) is not None:
+            first[key] = image
+    return rows, [first[key] for key in sorted(first)]
+
+
+def _runs(folder: Path) -> list[Path]:
+    found = sorted(path.parent for path in folder.rglob("metrics.json"))
+    if not found:
+        raise D2Error(f"no finished run lies in {folder}: expected metrics.json, as `d2 train` writes it")
+    return found
+
+
+def _image(folder: Path, recording: str, method: str) -> Image | None:
+    found = image_of(folder)
+    return None if found is None else Image(f"{recording}, {method}: {found[0]} of run {folder.name}", found[1])

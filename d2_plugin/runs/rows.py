@@ -1,0 +1,174 @@
+"""The rows of `runs.jsonl`: every measurement of the study in one form, one JSON object a line, only ever appended.
+
+Whatever was measured, a row says what (`kind`, `case`), how (`method`, `setting`), how well (`error`, lower is better;
+`seconds`), or why not (`failed`), and where from (device, threads, versions, commit, command). What else a kind knows
+stands beside these under names of its own; `d2 report` makes tables and plots of all of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from d2_plugin.durable import append
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.reading import field, json_text, opened, parse_json, read_text
+from d2_plugin.runs.provenance import circumstances
+
+Row = dict[str, Any]
+
+KINDS = {
+    "alignment": "relative objective gap F / F* - 1 of the fit",
+    "stereo": "1 - F at 1 % of geometric depth",
+    "priors": "distance of the share of errors within sigma from 68.3 %; of far pixels, the false share",
+    "raster": "99.9th percentile of the colour's deviation from float64, 0..1",
+    "training": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
+    "quality": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
+    "never_worse": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
+    "ablation": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
+    "stability": "as each case defines it",
+    "plan": "loss of what is left out, as each decision defines it",
+    "scaling": "none",
+    "gpu": "none",
+    "step": "none",
+}
+"""What `error` is for each kind of row."""
+
+MEASURED = ("kind", "case", "method", "setting", "error", "seconds", "failed")
+REQUIRED = (*MEASURED, "device", "threads", "version", "commit", "torch", "command")
+FORM = {
+    **dict.fromkeys(("kind", "case", "method", "setting", "command"), str),
+    **dict.fromkeys(("failed", "device", "version", "commit", "torch"), str | None),
+    **dict.fromkeys(("error", "seconds"), float | None),
+    "threads": int | None,
+}
+"""What each of them is."""
+
+
+def make_row(
+    kind: str,
+    case: str,
+    method: str,
+    setting: str = "default",
+    *,
+    error: float | None,
+    seconds: float | None,
+    failed: str | None = None,
+    command: str = "",
+    device: torch.device | str = "cpu",
+    **details: Any,
+) -> Row:
+    """One measurement with its circumstances.
+
+    Args:
+        kind: one of `KINDS`.
+        case: scene, rig, recording or sweep that was measured.
+        method, setting: what was measured, and what was varied about it.
+        error: lower is better; None where it was not measured. Not finite is a failure and is recorded as one.
+        seconds: of the work as the kind defines it; None where it was not measured.
+        failed: why there is no result, in the method's own words.
+        command: how this was started.
+        device: what torch calls it.
+        details: whatever else the kind knows, as JSON can hold it.
+    """
+    if kind not in KINDS:
+        raise unknown_name("kind of row", kind, KINDS)
+    if error is not None and not math.isfinite(error):
+        error, failed = None, failed or f"the error is {error}"
+    row: Row = {"kind": kind, "case": case, "method": method, "setting": setting}
+    row |= {"error": error, "seconds": seconds, "failed": failed}
+    return row | details | circumstances(device) | {"command": command}
+
+
+def told_apart(rows: Sequence[Row]) -> list[Row]:
+    """The rows, with the cameras behind the case where some of one case trained with other ones: their means are not
+    to be mixed. Rows that do not say their `cameras` stay as they are."""
+    cameras: dict[tuple[str, str], set[str]] = {}
+    for row in rows:
+        if row.get("cameras"):
+            cameras.setdefault((row["kind"], row["case"]), set()).add(" ".join(row["cameras"]))
+
+    def told(row: Row) -> Row:
+        several = row.get("cameras") and len(cameras[row["kind"], row["case"]]) > 1
+        return {**row, "case": f"{row['case']}, {' '.join(row['cameras'])}"} if several else row
+
+    return [told(row) for row in rows]
+
+
+def append_rows(path: Path, rows: Iterable[Row]) -> None:
+    """Add rows to the end of a file, which is created where absent.
+
+    Raises:
+        D2Error: the file holds something else; nothing is written.
+    """
+    check_rows_file(path)
+    append(path, "".join(as_line(row) for row in rows))
+
+
+def begin_rows(path: Path) -> None:
+    """Make sure, before anything is measured, that rows can be added to a file.
+
+    Raises:
+        D2Error: it cannot be written, or holds something else.
+    """
+    absent = not path.exists()
+    append_rows(path, [])
+    if absent:
+        with suppress(OSError):
+            path.unlink()
+
+
+def check_rows_file(path: Path) -> None:
+    """Refuse a file that holds something else than rows: they are added to its end."""
+    if not path.exists():
+        return
+    remedy = "give another --output"
+    with opened(path, remedy) as file:
+        begin = file.read(1).strip()
+    if begin not in (b"", b"{"):
+        raise D2Error(f"{path} is no file of rows, one JSON object a line, to which more could be added: {remedy}")
+
+
+def as_line(row: Row) -> str:
+    """A row as one line of JSON."""
+    return json_text(_plain(row), "the row") + "\n"
+
+
+def read_rows(paths: Sequence[Path]) -> list[Row]:
+    """The rows of all files, in order.
+
+    Raises:
+        D2Error: an absent file, a line that is not JSON, or a row that lacks what every row has.
+    """
+    return [_checked(line, f"{path}, line {number}") for path in paths for number, line in _lines(path)]
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    text = read_text(path, "give a file that a `d2` command wrote")
+    return [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+
+
+def _checked(line: str, where: str) -> Row:
+    row = parse_json(line, where, "restore the file, or remove that line")
+    missing = [name for name in REQUIRED if name not in row] if isinstance(row, dict) else list(REQUIRED)
+    if missing:
+        raise D2Error(f"{where} has no {', '.join(missing)}: measure it again, its form is not that of this version")
+    for name, kind in FORM.items():
+        field(row, name, kind, where, "measure it again, its form is not that of this version")
+    if row["kind"] not in KINDS:
+        raise unknown_name(f"kind of row ({where})", row["kind"], KINDS)
+    return row
+
+
+def _plain(value: Any) -> Any:
+    """The same without numbers that JSON does not have: they become null."""
+    if isinstance(value, dict):
+        return {name: _plain(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

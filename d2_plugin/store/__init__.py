@@ -1,0 +1,1 @@
+"""A prior on disk: opened, checked, looked up."""

@@ -1,0 +1,108 @@
+"""A prior store under the names that an export gave to cameras and frames (see d2_plugin.recordings.export.export).
+
+The export says so in `export.json` beside the images. Who trains from an export says where it lies (`exported` in the
+configuration), or it is found above the image's own path.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from d2_plugin.errors import unknown_name
+from d2_plugin.priors.frame import other_recording
+from d2_plugin.protocol import DepthPrior
+from d2_plugin.reading import field, parsing, read_json
+from d2_plugin.recordings.export.export import EXPORT_FILE
+from d2_plugin.store.store import PriorStore
+from d2_plugin.values import fitting
+
+log = logging.getLogger(__name__)
+
+GIVE = "give the folder that `d2 export-recording` wrote"
+
+
+class RenamedStore:
+    """The priors of the source recording, asked for by the names of its export."""
+
+    def __init__(self, store: Any, cameras: dict[str, str], frames: dict[int, int]) -> None:
+        """`cameras` and `frames` map those of the export to those of the source."""
+        self.store, self.sources, self.frames = store, cameras, frames
+
+    @classmethod
+    def of_export(cls, store: Any, folder: Path) -> RenamedStore:
+        """The priors under the names of an exported folder; names that the source uses itself are kept."""
+        path = folder / EXPORT_FILE
+        described = read_json(path, GIVE)
+        names = field(described, "cameras", dict, str(path), GIVE)
+        numbers = field(described, "frames", dict, str(path), GIVE)
+        cameras = {fitting(str, exported, f"a camera in {path}"): source for source, exported in names.items()}
+        with parsing(f"the frames in {path}", GIVE):
+            frames = {int(exported): int(source) for source, exported in numbers.items()}
+        return cls(store, cameras, frames)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names, in the export, of the cameras that have priors."""
+        known = getattr(self.store, "cameras", None)
+        return tuple(name for name, source in self.sources.items() if known is None or source in known)
+
+    def prior(self, camera: str, frame: int) -> DepthPrior | None:
+        """D* of one view, or None where there is none; a camera that the export does not have is refused."""
+        return self._asked("prior", camera, frame)
+
+    def camera(self, camera: str, frame: int) -> Any:
+        """The camera that one prior was built for, or None where the store does not say."""
+        return self._asked("camera", camera, frame)
+
+    def _asked(self, what: str, camera: str, frame: int) -> Any:
+        if camera not in self.sources:
+            raise unknown_name("camera of the export", camera, self.sources)
+        if frame not in self.frames or camera not in self.cameras:
+            return None  # a camera of the recording that the prior was not built for is trained without one
+        ask = getattr(self.store, what, None)
+        return None if ask is None else ask(self.sources[camera], self.frames[frame])
+
+
+def opened(prior: str, exported: str | None) -> Any:
+    """The store in the folder `prior`, under the names of an export of its recording where one is given."""
+    store = PriorStore.open(Path(prior))
+    return store if exported is None else RenamedStore.of_export(store, Path(exported))
+
+
+def renamed_by(store: Any, image: str | None) -> Any:
+    """`store`, or the same one under other names, where the trainer's image lies in an export of its recording."""
+    folder = export_above(image) if image else None
+    if folder is None or isinstance(store, RenamedStore) or not is_source_of(store, folder):
+        return store
+    log.info("the images are an export of the prior's recording: names are translated by %s", folder / EXPORT_FILE)
+    return RenamedStore.of_export(store, folder)
+
+
+def export_read(prior: Path, source: Path) -> Path | None:
+    """The export in which a trainer's `source` lies, if the priors are those of its recording."""
+    folder = export_above(str(source / "image"))
+    if folder is None or not (prior / "store.json").is_file():
+        return None
+    return folder if is_source_of(PriorStore.described(prior), folder) else None
+
+
+def export_above(image: str) -> Path | None:
+    """The folder with an `export.json` that an image lies in, at most three folders below it."""
+    parents = list(Path(image).parents)[:3]
+    return next((folder for folder in parents if (folder / EXPORT_FILE).is_file()), None)
+
+
+def is_source_of(store: Any, folder: Path) -> bool:
+    """Whether the priors of `store` are those of the recording that an export was written from, not of the export.
+
+    Both say the calibrations of their cameras under their own names; where the export kept all names, the name of the
+    recording decides.
+    """
+    about, described = getattr(store, "about", None) or {}, read_json(folder / EXPORT_FILE, GIVE)
+    source = {"calibrations": described.get("calibrations"), "recording": described.get("source")}
+    if not source["calibrations"] or not about.get("calibrations") or other_recording(about, source) is not None:
+        return False
+    kept = all(name == exported for name, exported in described.get("cameras", {}).items())
+    return not kept or about.get("recording") == source["recording"]

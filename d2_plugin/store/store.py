@@ -1,0 +1,297 @@
+"""Depth priors on disk: one memory-mapped array and one record per camera and frame.
+
+    STORE/store.json                     format, and what the store was built for: cameras, frames, the recording
+    STORE/priors/CAMERA/FRAME.npy        structured [H, W]: depth uint16 (logarithmic, 0 = empty), label,
+                                         sigma uint8 (logarithmic, 0 = 0, 255 = infinite), RGB uint8
+    STORE/priors/CAMERA/FRAME.json       record: a, b, gap, status, shares, settings, hashes, depth range, checksum
+    STORE/cache/...                      stereo and monocular maps, so that other fusion settings cost seconds
+    STORE/cameras/NAME+NAME/...          a store of its own for the priors of other cameras of the same recording
+
+Logarithmic depth in 16 bits is exact to 1e-5 in a room and to 1.6e-4 from 1e-3 to 1e6; sigma in 8 bits is exact to 2 %.
+The image lies beside them, at 7 bytes per pixel in all: inserted Gaussians take its colours, and training need not
+open the recording for them. Every file is written under a temporary name and renamed, the array before its record: a
+record therefore vouches for its array, a build that is killed loses the frame in work, and readers never see half a
+file. Every record is sealed and holds the checksum of its array (`d2_plugin.store.files`).
+
+A store belongs to one recording, known by its calibrations and images and not by its folder's name, and to one set of
+cameras, because a prior is what these cameras saw together. Nothing but other settings, a changed image or damage
+ever replaces a file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from d2_plugin.durable import Kind, is_leftover, make_folder, read_table, remove_leftovers, write_table
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.locks import in_turn, one_of_many
+from d2_plugin.priors.frame import hash_of, not_of, other_recording
+from d2_plugin.priors.fuse import FusedPrior
+from d2_plugin.protocol import CameraRecord, DepthPrior, Label
+from d2_plugin.store.files import Entry, EntryFolder
+from d2_plugin.values import checked_arguments
+
+FORMAT = 4
+"""Of store.json and of the arrays; raise it when either changes."""
+
+STORE = Kind("prior store", FORMAT, "build the priors anew in another folder")
+"""The table store.json."""
+
+OTHERS = "cameras"
+"""Folder of a store that holds the stores of other sets of cameras."""
+
+PRIOR_DTYPE = np.dtype([("depth", "<u2"), ("label", "u1"), ("sigma", "u1"), ("color", "u1", (3,))])
+"""The maps of a `FusedPrior` as they are stored, pixel by pixel."""
+
+CODES = 65534  # depth codes 1..65535; 0 is empty
+
+
+@dataclass(frozen=True)
+class DepthRange:
+    """The depths that codes 1 and 65535 stand for."""
+
+    near: float
+    far: float
+
+    @classmethod
+    def of(cls, depth: np.ndarray) -> DepthRange:
+        """Smallest and largest depth of a map; 1, 1 where it has none."""
+        known = depth[depth > 0]
+        return cls(float(known.min()), float(known.max())) if known.size else cls(1.0, 1.0)
+
+    def encode(self, depth: np.ndarray) -> np.ndarray:
+        """Depth float [H, W] (0 = empty) to codes uint16."""
+        known = depth > 0
+        ratio = max(np.log(self.far / self.near), np.finfo(np.float64).tiny)
+        position = np.log(np.where(known, depth, self.near).astype(np.float64) / self.near) / ratio
+        return np.where(known, 1 + np.rint(position * CODES), 0).astype(np.uint16)
+
+    def decode(self, codes: np.ndarray) -> np.ndarray:
+        """Codes uint16 to depth float32, 0 where empty; through a table, since a million exponentials are slow."""
+        table = np.exp(np.linspace(np.log(self.near), np.log(self.far), CODES + 1))
+        return np.concatenate([[0.0], table]).astype(np.float32)[codes]
+
+
+SIGMA = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 254), [np.inf]]).astype(np.float32)
+"""The relative standard deviations that the codes 0 to 255 stand for; 0 is the paper's certainty."""
+
+
+def encode_sigma(sigma: np.ndarray) -> np.ndarray:
+    """Relative standard deviation float [H, W] to codes uint8: the nearest there is, infinite above 1.
+
+    Only an exact 0 stays 0; what is smaller than the smallest step becomes that step.
+    """
+    steps = np.log(SIGMA[254] / SIGMA[1])
+    position = 1 + np.log(np.clip(sigma, SIGMA[1], 1) / SIGMA[1]) * (253 / steps)
+    codes = np.where(sigma <= 1, np.rint(np.minimum(position, 254)), 255)
+    return np.where(sigma == 0, 0, codes).astype(np.uint8)
+
+
+class PriorStore:
+    """Priors of one recording, by camera and frame; safe for many readers, and for writers of different frames."""
+
+    def __init__(self, path: Path | str, cameras: Sequence[str], frames: Sequence[int], about: dict[str, Any]) -> None:
+        """Use `open` or `create`."""
+        self.path, self.about = Path(path), about
+        self.cameras, self.frames = tuple(cameras), tuple(frames)
+        self.entries = EntryFolder(self.path / "priors")
+
+    @classmethod
+    @checked_arguments
+    def open(cls, path: Path | str) -> PriorStore:
+        """Open a store for reading; every record is checked against the header and size of its array.
+
+        Raises:
+            D2Error: no store there, another format, or a damaged entry, which is named.
+        """
+        store = cls.described(Path(path))
+        for camera in store.cameras:
+            for frame in store.frames:
+                entry = store.entries.find(camera, frame)
+                if entry is None:
+                    continue
+                problem = entry.problem(PRIOR_DTYPE)
+                if problem:
+                    raise D2Error(f"the prior of camera {camera}, frame {frame} is damaged ({problem}): {_REBUILD}")
+        return store
+
+    @classmethod
+    @checked_arguments
+    def create(
+        cls, path: Path | str, cameras: Sequence[str], frames: Sequence[int], about: dict[str, Any]
+    ) -> PriorStore:
+        """Open the store at `path` for building, or begin one; `about` says which recording it belongs to.
+
+        Frames that were built for the same cameras before stay part of the store, and so does the order of its
+        cameras. Other cameras of the same recording get a store of their own in it, see `located`. Where nothing has
+        to be added nothing is written: a finished store may lie where nobody can write.
+
+        Raises:
+            D2Error: the folder holds something else, or the priors of another recording.
+            CannotWrite: the disk is full, broken or not ours.
+        """
+        root = Path(path)
+        if root.exists() and not root.is_dir():
+            raise D2Error(f"{root} is a file, and the priors need a folder: choose another output folder")
+        with in_turn(make_folder(root)):
+            found = cls._found(root, about)
+            place = cls.place(root, cameras)
+            if place != root:
+                found = cls._found(make_folder(place), about)
+            if found is None:
+                store = cls(place, cameras, frames, about)
+            else:
+                store = cls(place, found.cameras, sorted({*found.frames, *frames}), found.about)
+            if found is None or store.frames != found.frames:
+                described = {"cameras": store.cameras, "frames": store.frames, "about": store.about}
+                write_table(place / "store.json", described, STORE)
+        return store
+
+    @classmethod
+    def place(cls, path: Path | str, cameras: Sequence[str]) -> Path:
+        """Where priors of exactly these cameras belong: `path`, or a folder within it where the store is of others."""
+        root = Path(path)
+        if not (root / "store.json").is_file() or set(cls.described(root).cameras) == set(cameras):
+            return root
+        return root / OTHERS / _joined(cameras)
+
+    @classmethod
+    def located(cls, path: Path | str, cameras: Sequence[str]) -> Path:
+        """The folder below `path` whose priors were built from exactly these cameras; `path` where there is none."""
+        place = cls.place(path, cameras)
+        return place if (place / "store.json").is_file() else Path(path)
+
+    @classmethod
+    def _found(cls, path: Path, about: dict[str, Any]) -> PriorStore | None:
+        """The store at `path` as it stands, None where nothing is there; another recording's is refused."""
+        if (path / "store.json").is_file():
+            found = cls.described(path)
+            reason = other_recording(found.about, about)
+            if reason is not None:
+                raise not_of(path, found.about, about, reason)
+            return found
+        if path.exists() and not all(is_leftover(inside) for inside in path.iterdir()):
+            raise D2Error(f"{path} is not empty and holds no prior store: choose another output folder")
+        return None
+
+    @classmethod
+    def described(cls, path: Path) -> PriorStore:
+        """The store at `path` by its description alone; no record is looked at."""
+        if not (path / "store.json").is_file():
+            raise D2Error(f"no depth priors at {path}: build them with `d2 priors RECORDING --output {path}`")
+        table = read_table(path / "store.json", STORE)
+        return cls(path, table["cameras"], table["frames"], table["about"])
+
+    @checked_arguments
+    def prior(self, camera: str, frame: int) -> DepthPrior | None:
+        """D* of one view as tensors on the CPU, or None where the store has none.
+
+        Raises:
+            D2Error: an unknown camera, or an array that does not match the checksum of its record.
+        """
+        entry = self._entry(camera, frame)
+        if entry is None:
+            return None
+        codes = entry.array(PRIOR_DTYPE)
+        depth = DepthRange(*entry.record["depth_range"]).decode(codes["depth"])
+        labels, colors = np.ascontiguousarray(codes["label"]), np.ascontiguousarray(codes["color"])
+        sigma = SIGMA[codes["sigma"]]
+        return DepthPrior(*(torch.from_numpy(map_) for map_ in (depth, labels, colors, sigma)))
+
+    @checked_arguments
+    def record(self, camera: str, frame: int) -> dict[str, Any] | None:
+        """What is known about one prior: alignment, shares, settings, hashes; None where the store has none."""
+        entry = self._entry(camera, frame)
+        return None if entry is None else entry.record
+
+    def camera(self, camera: str, frame: int) -> CameraRecord | None:
+        """The camera that one prior was built for; None where the store has none or does not say."""
+        described = (self.record(camera, frame) or {}).get("camera")
+        if described is None:
+            return None
+        pose = torch.tensor(described["T_camera_world"], dtype=torch.float64)
+        return CameraRecord(torch.tensor(described["K"], dtype=torch.float64), pose)
+
+    def is_current(self, camera: str, frame: int, key: str) -> bool:
+        """Whether an intact prior built from exactly these inputs is there; a damaged one is named in the log."""
+        return self.entries.find_current(camera, frame, key) is not None
+
+    def write(self, camera: str, frame: int, prior: FusedPrior, record: dict[str, Any]) -> None:
+        """Store all maps of one prior and its record.
+
+        Raises:
+            D2Error: no colours or those of another size, depth that is not finite or negative, sigma that is NaN or
+                negative, or labels that contradict the depth.
+        """
+        _check(prior, f"the prior of camera {camera}, frame {frame}")
+        depth_range = DepthRange.of(prior.depth)
+        codes = np.empty(prior.depth.shape, PRIOR_DTYPE)
+        codes["depth"], codes["label"], codes["color"] = depth_range.encode(prior.depth), prior.labels, prior.colors
+        codes["sigma"] = encode_sigma(prior.sigma)
+        self.entries.write(camera, frame, codes, {**record, "depth_range": [depth_range.near, depth_range.far]})
+
+    @contextmanager
+    def building(self, root: Path) -> Iterator[None]:
+        """Write priors beside other processes that do; `root` is the folder that `create` was given.
+
+        Whoever finds nobody else there removes what killed builds left, and what is damaged.
+        """
+
+        def tidy() -> None:
+            with in_turn(root):
+                remove_leftovers(root)
+                for camera in self.cameras:
+                    for frame in self.frames:
+                        self.entries.drop_damaged(camera, frame)
+
+        with one_of_many(make_folder(root / "priors"), tidy):
+            yield
+
+    def _entry(self, camera: str, frame: int) -> Entry | None:
+        if camera not in self.cameras:
+            raise D2Error(f"{unknown_name('camera of the prior store', camera, self.cameras)}; {_OTHER_NAMES}")
+        return self.entries.find(camera, frame)
+
+
+_OTHER_NAMES = (
+    "if the images were written by `d2 export-recording`, set `exported` in the configuration to the folder of its "
+    "export.json; else give the adapter a function `key` from a camera object to PriorKey(camera, frame)"
+)
+
+
+def _joined(cameras: Sequence[str]) -> str:
+    """A folder's name for a set of cameras."""
+    names = "+".join(sorted(cameras))
+    plain = re.fullmatch(r"[\w.+-]{1,80}", names) and set(names) != {"."}
+    return names if plain else hash_of(sorted(cameras))
+
+
+_REBUILD = "run `d2 priors` again with the same output folder, which rebuilds what is damaged"
+
+
+def _check(prior: FusedPrior, what: str) -> None:
+    depth, labels = prior.depth, prior.labels
+    if depth.ndim != 2 or depth.shape != labels.shape:
+        raise D2Error(f"{what} has depth {depth.shape} and labels {labels.shape}: both must be [H, W] of one size")
+    if prior.colors is None or prior.colors.shape != (*depth.shape, 3):
+        found = "none" if prior.colors is None else str(prior.colors.shape)
+        raise D2Error(f"{what} is {depth.shape} and its colours {found}: build the prior at the image's size")
+    bad = ~np.isfinite(depth) | (depth < 0)
+    if bad.any():
+        raise D2Error(f"{what} has {int(bad.sum())} depths that are NaN, infinite or negative: use 0 for unknown depth")
+    if labels.max(initial=0) > max(Label):
+        raise D2Error(f"{what} has label {int(labels.max())}: labels are 0 to {int(max(Label))}")
+    if prior.sigma.shape != depth.shape or not (prior.sigma >= 0).all():
+        raise D2Error(f"{what} has a sigma that is no map [H, W] of numbers >= 0: use infinity where nothing is known")
+    supported = np.isin(labels, (Label.MONO, Label.VERIFIED, Label.AGREED, Label.FAR))
+    if not np.array_equal(supported, depth > 0):
+        known = "mono-only, verified, agreed and far"
+        raise D2Error(f"{what} has labels that contradict its depth: exactly {known} pixels have a depth")

@@ -1,0 +1,97 @@
+"""`d2 demo`: a synthetic recording, the backbone alone and with D2, a table, an image and a player."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from d2_plugin.gaussians import native_slice, native_ssim
+from d2_plugin.rasterizer import native as native_rasterizer
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.images import read_image, write_png
+from d2_plugin.recordings.synthetic.room import split, synthetic_recording
+from d2_plugin.runs.drawing import BACKGROUND, text
+from d2_plugin.runs.run import Run
+from d2_plugin.runs.settings import HOOK_NAMES, RunSettings
+from d2_plugin.runs.tables import metrics_table
+from d2_plugin.settings import Range, Settings
+from d2_plugin.viewing.export.page import write_page
+from d2_plugin.viewing.export.scene import scene_of
+
+VARIANTS = {"backbone": (), "backbone + D2": HOOK_NAMES}
+"""Name -> hooks."""
+
+PLAYED = "backbone + D2"
+"""The variant that the demo's player shows."""
+
+
+@dataclass(frozen=True)
+class Demo(Settings):
+    """What the demo writes, and how long it trains."""
+
+    output: Path = Path("d2-demo")
+    """Folder of the recording, the runs and the image."""
+    iterations: Annotated[int, Range(1, unit="steps")] = 1000
+    """Optimizer steps of each of the two runs."""
+
+
+def run(settings: Demo) -> str:
+    """Write the recording, two runs, comparison.png and player.html; returns the table to print.
+
+    All runs start from the same points and take the same number of iterations; a demo that was cut off goes on.
+    """
+    folder = settings.output
+    path = _recording(folder / "recording")
+    _compile_kernels()
+    train, held_out = split(open_recording(path))
+    runs = {}
+    for name, hooks in VARIANTS.items():
+        chosen = RunSettings(
+            *(str(path), tuple(train)),
+            iterations=settings.iterations,
+            hooks=hooks,
+            priors=str(folder / "priors") if hooks else None,
+        )
+        run = Run(chosen, folder / name.replace(" + ", "_").lower())
+        run.train()
+        runs[name] = (run, run.evaluate())
+    image = folder / "comparison.png"
+    _compare({name: run.folder for name, (run, _) in runs.items()}, held_out[len(held_out) // 2], image)
+    table = metrics_table({name: metrics for name, (_, metrics) in runs.items()})
+    page = folder / "player.html"
+    write_page(scene_of(runs[PLAYED][0]), page)
+    return (
+        f"{table}\nThe recording is rendered and its monocular depth is emulated.\nImage: {image}\n"
+        f"Player: {page} (open it in a browser; it plays '{PLAYED}' without a network)"
+    )
+
+
+def _recording(path: Path) -> Path:
+    """The recording at `path`: what stands there is whole, because it is written beside and renamed."""
+    if not path.is_dir():
+        save_recording(synthetic_recording(), path)
+    return path
+
+
+def _compile_kernels() -> None:
+    """Compile what training uses before the clock starts: the first run would pay for all of them."""
+    native_rasterizer.available()
+    native_slice.library()
+    native_ssim.library()
+
+
+def _compare(folders: dict[str, Path], camera: str, image: Path) -> None:
+    """The same held-out view of every run, one row of panels per run."""
+    rows: list[np.ndarray] = []
+    for name, folder in folders.items():
+        found = sorted((folder / "images").glob(f"{camera}_*.png"))
+        panels = read_image(found[len(found) // 2])
+        title = np.full((14, panels.shape[1], 3), BACKGROUND, np.uint8)
+        letters = text(name)
+        title[4 : 4 + len(letters), 2 : 2 + letters.shape[1]] = letters
+        rows += [title, panels]
+    write_png(image, np.concatenate(rows))

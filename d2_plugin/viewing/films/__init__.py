@@ -1,1 +1,0 @@
-"""Films: where the camera stands at each picture, which instant it shows, and the file that holds them."""

@@ -1,0 +1,294 @@
+"""Calibration files as other tools lay them out, written from known cameras without any of the plugin's own code.
+
+Everything goes by way of OpenCV's conventions: pixels whose centres lie at whole numbers, rotation vectors of
+`cv2.Rodrigues`, projections of `cv2.projectPoints`. Numbers are written with all their digits.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+
+class Known(NamedTuple):
+    """A camera that is known: K for OpenCV's pixels, OpenCV's or OpenCV fisheye's coefficients, world to camera."""
+
+    name: str
+    size: tuple[int, int]
+    K: np.ndarray
+    distortion: tuple[float, ...]
+    R: np.ndarray
+    t: np.ndarray
+    fisheye: bool = False
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixels [n, 2] of world points, centres at whole numbers."""
+        vector, coefficients = cv2.Rodrigues(self.R)[0], np.array(self.distortion)
+        if self.fisheye:
+            return cv2.fisheye.projectPoints(points[:, None], vector, self.t, self.K, coefficients)[0][:, 0]
+        return cv2.projectPoints(points, vector, self.t, self.K, coefficients)[0][:, 0]
+
+
+def rig(
+    coefficients: int = 5, fisheye: bool = False, names: Sequence[str] = ("cam_0", "cam_1", "cam_2")
+) -> list[Known]:
+    """Three cameras around the origin that differ in everything."""
+    barrel = (-0.21, 0.07, 1.3e-3, -8e-4, -0.011, 0.013, 0.004, 0.002)
+    equidistant = (-0.03, 0.008, -0.002, 0.0004)
+    found = []
+    for number, name in enumerate(names):
+        angle = 0.4 * (number - 1)
+        R = Rotation.from_euler("yxz", [angle, 0.1 + 0.05 * number, 0.02 * number]).as_matrix()
+        t = np.array([0.1 * number, -0.05, 3.0 + 0.1 * number])
+        width, height = (1280, 720) if number else (1080, 1920)
+        K = np.array([[900.0 + number, 0, width / 2 + 7.3], [0, 903.0 - number, height / 2 - 4.1], [0, 0, 1]])
+        values = equidistant if fisheye else barrel[:coefficients]
+        found.append(Known(name, (width, height), K, values, R, t, fisheye))
+    return found
+
+
+def toml_tables(
+    path: Path, cameras: Sequence[Known], prefix: str = "", metadata: str = "", matrix: bool = False
+) -> None:
+    """Pose2Sim's, Anipose's and Caliscope's tables."""
+    text = ""
+    for number, camera in enumerate(cameras):
+        rotation = camera.R if matrix else cv2.Rodrigues(camera.R)[0].ravel()
+        text += f"[{f'{prefix}{number}' if prefix else camera.name}]\n"
+        text += f"cam_id = {number}\n" if prefix else f'name = "{camera.name}"\n'
+        text += f"size = [ {camera.size[0]}.0, {camera.size[1]}.0]\n" if not prefix else f"size = {list(camera.size)}\n"
+        text += f"matrix = {camera.K.tolist()}\ndistortions = {list(camera.distortion)}\n"
+        text += f"rotation = {np.asarray(rotation).tolist()}\ntranslation = {camera.t.tolist()}\n"
+        text += f"fisheye = {str(camera.fisheye).lower()}\n\n"
+    path.write_text(text + metadata)
+
+
+def pose2sim(path: Path, cameras: Sequence[Known]) -> Path:
+    toml_tables(path / "Calib_board.toml", cameras, metadata="[metadata]\nadjusted = false\nerror = 0.0\n")
+    return path / "Calib_board.toml"
+
+
+def anipose(path: Path, cameras: Sequence[Known]) -> Path:
+    toml_tables(path / "calibration.toml", cameras, metadata="[metadata]\nerror = 0.31\n")
+    return path / "calibration.toml"
+
+
+def caliscope(path: Path, cameras: Sequence[Known]) -> Path:
+    toml_tables(path / "camera_array.toml", cameras, prefix="cameras.")
+    return path / "camera_array.toml"
+
+
+def old_caliscope(path: Path, cameras: Sequence[Known]) -> Path:
+    toml_tables(path / "config.toml", cameras, prefix="cameras.", matrix=True)
+    return path / "config.toml"
+
+
+def easymocap(path: Path, cameras: Sequence[Known]) -> Path:
+    files = {name: cv2.FileStorage(str(path / f"{name}.yml"), cv2.FILE_STORAGE_WRITE) for name in ("intri", "extri")}
+    for file in files.values():
+        file.startWriteStruct("names", cv2.FileNode_SEQ)
+        for camera in cameras:
+            file.write("", camera.name)
+        file.endWriteStruct()
+    for camera in cameras:
+        files["intri"].write(f"K_{camera.name}", camera.K)
+        files["intri"].write(f"dist_{camera.name}", np.array([camera.distortion]))
+        files["intri"].write(f"W_{camera.name}", camera.size[0])
+        files["intri"].write(f"H_{camera.name}", camera.size[1])
+        files["extri"].write(f"R_{camera.name}", cv2.Rodrigues(camera.R)[0])
+        files["extri"].write(f"Rot_{camera.name}", camera.R)
+        files["extri"].write(f"T_{camera.name}", camera.t[:, None])
+    for file in files.values():
+        file.release()
+    return path
+
+
+def kalibr(path: Path, cameras: Sequence[Known]) -> Path:
+    content: dict[str, Any] = {}
+    before = np.eye(4)
+    for number, camera in enumerate(cameras):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = camera.R, camera.t
+        entry: dict[str, Any] = {
+            "cam_overlaps": [other for other in range(len(cameras)) if other != number],
+            "camera_model": "pinhole",
+            "distortion_coeffs": list(camera.distortion),
+            "distortion_model": "equidistant" if camera.fisheye else "radtan",
+            "intrinsics": [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]],
+            "resolution": list(camera.size),
+            "rostopic": f"/cam{number}/image_raw",
+        }
+        if number:
+            entry["T_cn_cnm1"] = (pose @ np.linalg.inv(before)).tolist()
+        content[f"cam{number}"] = json.loads(json.dumps(entry))
+        before = pose
+    (path / "camchain.yaml").write_text(yaml.safe_dump(content))
+    return path / "camchain.yaml"
+
+
+def multical(path: Path, cameras: Sequence[Known]) -> Path:
+    intrinsics = {
+        camera.name: {
+            "model": "standard",
+            "image_size": camera.size,
+            "K": camera.K.tolist(),
+            "dist": [camera.distortion],
+        }
+        for camera in cameras
+    }
+    poses = {camera.name: {"R": camera.R.tolist(), "T": camera.t.tolist()} for camera in cameras}
+    content = {"cameras": intrinsics, "camera_poses": poses, "image_sets": {"rgb": []}}
+    (path / "calibration.json").write_text(json.dumps(content, indent=4))
+    return path / "calibration.json"
+
+
+def panoptic(path: Path, cameras: Sequence[Known]) -> Path:
+    entries = [
+        {"name": camera.name, "type": "hd", "resolution": camera.size, "panel": 0, "node": number,
+         "K": camera.K.tolist(), "distCoef": camera.distortion, "R": camera.R.tolist(),
+         "t": (100 * camera.t)[:, None].tolist()}
+        for number, camera in enumerate(cameras)
+    ]  # fmt: skip
+    content = {"calibDataSource": "160401_calib_norm", "cameras": entries}
+    (path / "calibration_dance.json").write_text(json.dumps(content))
+    return path / "calibration_dance.json"
+
+
+def transforms(path: Path, cameras: Sequence[Known]) -> Path:
+    flip = np.diag([1.0, -1, -1])
+    frames = []
+    for camera in cameras:
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = camera.R.T @ flip, -camera.R.T @ camera.t
+        k1, k2, p1, p2, k3 = camera.distortion
+        frames.append(
+            {"file_path": f"images/{camera.name}/000000.png", "transform_matrix": matrix.tolist(), "w": camera.size[0],
+             "h": camera.size[1], "fl_x": camera.K[0, 0], "fl_y": camera.K[1, 1], "cx": camera.K[0, 2] + 0.5,
+             "cy": camera.K[1, 2] + 0.5, "k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3, "camera_label": camera.name}
+        )  # fmt: skip
+    (path / "transforms.json").write_text(json.dumps({"camera_model": "OPENCV", "frames": frames}))
+    return path / "transforms.json"
+
+
+def cameras_json(path: Path, cameras: Sequence[Known]) -> Path:
+    entries = [
+        {"name": camera.name, "width": camera.size[0], "height": camera.size[1], "fx": camera.K[0, 0],
+         "fy": camera.K[1, 1], "cx": camera.K[0, 2] + 0.5, "cy": camera.K[1, 2] + 0.5, "R": camera.R.tolist(),
+         "t": camera.t.tolist(), "model": "fisheye" if camera.fisheye else "opencv", "distortion": camera.distortion}
+        for camera in cameras
+    ]  # fmt: skip
+    (path / "cameras.json").write_text(json.dumps({"cameras": entries}))
+    return path / "cameras.json"
+
+
+def _reconstruction(cameras: Sequence[Known], one_rig: bool) -> Any:
+    """A model of pycolmap's own: each camera a rig of its own, or all of them one rig that stands in one frame."""
+    import pycolmap
+
+    found, poses = pycolmap.Reconstruction(), {}
+    for number, camera in enumerate(cameras, start=1):
+        values = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2] + 0.5, camera.K[1, 2] + 0.5]
+        k = (*camera.distortion, 0, 0, 0)[:8]
+        model, more = ("OPENCV_FISHEYE", k[:4]) if camera.fisheye else ("FULL_OPENCV", k)
+        found.add_camera(
+            pycolmap.Camera(
+                camera_id=number, model=model, width=camera.size[0], height=camera.size[1], params=[*values, *more]
+            )
+        )
+        poses[number] = pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t)
+    sensors = {number: pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number) for number in poses}
+    for rig_id, members in enumerate([list(poses)] if one_rig else [[number] for number in poses], start=1):
+        rig = pycolmap.Rig(rig_id=rig_id)
+        rig.add_ref_sensor(sensors[members[0]])
+        for number in members[1:]:
+            rig.add_sensor(sensors[number], poses[number] * poses[members[0]].inverse())
+        found.add_rig(rig)
+        frame = pycolmap.Frame(frame_id=rig_id, rig_id=rig_id)
+        for number in members:
+            frame.add_data_id(pycolmap.data_t(sensors[number], number))
+        frame.rig_from_world = poses[members[0]]
+        found.add_frame(frame)
+    for number, camera in enumerate(cameras, start=1):
+        frame_id = 1 if one_rig else number
+        image = pycolmap.Image(name=f"{camera.name}/000000.png", camera_id=number, image_id=number)
+        image.frame_id = frame_id
+        found.add_image(image)
+    for frame_id in list(found.frames):
+        found.register_frame(frame_id)
+    return found
+
+
+def colmap_binary(path: Path, cameras: Sequence[Known]) -> Path:
+    folder = path / "sparse" / "0"
+    folder.mkdir(parents=True)
+    _reconstruction(cameras, one_rig=False).write_binary(str(folder))
+    return path
+
+
+def colmap_text_of_a_rig(path: Path, cameras: Sequence[Known]) -> Path:
+    _reconstruction(cameras, one_rig=True).write_text(str(path))
+    return path
+
+
+def rig_config(path: Path, cameras: Sequence[Known]) -> Path:
+    """COLMAP's rig_config.json: the first camera's axes are the rig's."""
+    entries: list[dict[str, Any]] = []
+    for number, camera in enumerate(cameras):
+        R = camera.R @ cameras[0].R.T
+        t = camera.t - R @ cameras[0].t
+        values = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2] + 0.5, camera.K[1, 2] + 0.5]
+        entry = {"image_prefix": f"rig1/{camera.name}/", "camera_model_name": "FULL_OPENCV"}
+        entry["camera_params"] = [*values, *camera.distortion, *[0] * (8 - len(camera.distortion))]
+        x, y, z, w = Rotation.from_matrix(R).as_quat()
+        entry |= (
+            {"cam_from_rig_rotation": [w, x, y, z], "cam_from_rig_translation": t.tolist()}
+            if number
+            else {"ref_sensor": True}
+        )
+        entries.append(entry)
+    (path / "rig_config.json").write_text(json.dumps([{"cameras": entries}]))
+    return path / "rig_config.json"
+
+
+class Case(NamedTuple):
+    """One format: how it is written, what the table calls it, which lenses it holds."""
+
+    write: Callable[[Path, Sequence[Known]], Path]
+    format: str
+    coefficients: int = 5
+    fisheye: bool = False
+    relative: bool = False
+    """The world is the first camera's."""
+    names: tuple[str, ...] = ("cam_0", "cam_1", "cam_2")
+    sizes: bool = True
+    """The file says how large the images are."""
+
+
+CASES = {
+    "pose2sim": Case(pose2sim, "pose2sim", coefficients=4, names=("int_cam1_img", "int_cam2_img", "int_cam3_img")),
+    "anipose": Case(anipose, "anipose"),
+    "anipose, fisheye": Case(anipose, "anipose", fisheye=True),
+    "caliscope": Case(caliscope, "caliscope"),
+    "caliscope, fisheye": Case(caliscope, "caliscope", fisheye=True),
+    "caliscope, older": Case(old_caliscope, "caliscope"),
+    "easymocap": Case(easymocap, "easymocap", names=("00", "11", "cam-x")),
+    "kalibr": Case(kalibr, "kalibr", coefficients=4, relative=True, names=("cam0", "cam1", "cam2")),
+    "kalibr, equidistant": Case(kalibr, "kalibr", fisheye=True, relative=True, names=("cam0", "cam1", "cam2")),
+    "multical": Case(multical, "multical"),
+    "multical, rational": Case(multical, "multical", coefficients=8),
+    "panoptic": Case(panoptic, "panoptic", names=("00_00", "00_01", "00_02")),
+    "transforms": Case(transforms, "transforms"),
+    "colmap, binary": Case(colmap_binary, "colmap"),
+    "colmap, fisheye": Case(colmap_binary, "colmap", fisheye=True),
+    "colmap, text of a rig": Case(colmap_text_of_a_rig, "colmap", coefficients=8),
+    "colmap's rig_config": Case(rig_config, "colmap_rig", coefficients=8, relative=True, sizes=False),
+    "cameras.json": Case(cameras_json, "folder"),
+    "cameras.json, fisheye": Case(cameras_json, "folder", fisheye=True),
+}

@@ -1,0 +1,196 @@
+"""Poses from what cameras saw of the same things: refined, found, scaled, and refused where that settles nothing."""
+
+from __future__ import annotations
+
+import zlib  # noqa: F401  (pycolmap brings a zlib of its own that must not come first)
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rigs import NOISE, arc, filmed, moved, seen_by, worst
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings.cameras.calibrating import SolvedRig, scaled_by_board
+from d2_plugin.recordings.cameras.calibrating.align import aligned, rig_width
+from d2_plugin.recordings.cameras.calibrating.bundle import project
+from d2_plugin.recordings.cameras.calibrating.features import find_features, sampson
+from d2_plugin.recordings.cameras.calibrating.refine import RefinedPoses, refine_poses
+from d2_plugin.recordings.cameras.calibrating.solve import solve_features
+from d2_plugin.recordings.cameras.calibration import rigid
+from d2_plugin.recordings.recording import Camera
+
+pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
+cv2 = pytest.importorskip("cv2", reason="opencv is in the `calibration` extra")
+
+
+class TestRefinedPoses:
+    """Better where that is proven, else as they were given."""
+
+    @pytest.mark.parametrize("seed", [0, 1])
+    def test_a_degree_and_a_hundredth_become_a_tenth(self, seed: int) -> None:
+        truth = arc()
+        given = moved(truth, 1.0, 0.01, seed)
+        refined = refine_poses(given, seen_by(truth, seed=seed))
+        assert refined.accepted, refined.reason
+        before, after = worst(given, truth), worst(refined.cameras, truth)
+        assert after[0] < 0.1 * before[0]
+        assert after[1] < 0.1 * before[1] + 5e-4
+        assert refined.pixels_before is not None
+        assert refined.pixels_after is not None
+        assert refined.pixels_after < 0.5 * refined.pixels_before
+        assert "poses refined: the error fell from" in refined.reason
+
+    def test_the_rig_as_a_whole_stays_where_it_was(self) -> None:
+        truth = arc()
+        given = moved(truth, 1.0, 0.01)
+        refined = refine_poses(given, seen_by(truth))
+        centres = [np.mean([camera.centre for camera in rig.values()], axis=0) for rig in (refined.cameras, given)]
+        np.testing.assert_allclose(*centres, atol=1e-9)
+        for name, camera in refined.cameras.items():
+            np.testing.assert_array_equal(camera.K, given[name].K)
+
+    def test_right_poses_stay(self) -> None:
+        truth = arc()
+        refined = refine_poses(truth, seen_by(truth))
+        assert not refined.accepted
+        assert refined.cameras == truth
+        assert "the poses stay" in refined.reason
+
+    def test_matches_that_are_all_wrong_change_nothing(self) -> None:
+        truth = arc()
+        given = moved(truth, 1.0, 0.01)
+        refined = refine_poses(given, seen_by(truth, wrong=1.0))
+        assert not refined.accepted
+        assert refined.cameras == given
+
+    def test_a_camera_that_shares_nothing_is_named(self) -> None:
+        truth = arc()
+        features = seen_by(truth)
+        features["c3"] = seen_by(truth, seed=9)["c3"]
+        refined = refine_poses(truth, features)
+        assert not refined.accepted
+        assert "the poses stay: camera c3 shares too few features" in refined.reason
+
+    def test_a_recording_gets_accepted_poses_and_a_note(self) -> None:
+        from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+        recording = synthetic_recording(cameras=2, held_out=1, frames=1, width=48, height=32)
+        name = next(iter(recording.cameras))
+        new = replace(recording.cameras[name], T_camera_world=np.eye(4))
+        poses = RefinedPoses({name: new}, True, "because", 2.0, 1.0, {}, {}, 9)
+        applied = poses.applied(recording)
+        assert applied.cameras[name] is new
+        assert len(applied.cameras) == len(recording.cameras)
+        assert applied.notes[-1] == "because"
+        assert replace(poses, accepted=False).applied(recording) is recording
+
+
+class TestRigsFromImagesAlone:
+    """Known intrinsics, nothing else."""
+
+    def test_four_cameras_25_degrees_apart(self) -> None:
+        truth = arc()
+        rig = solve_features(seen_by(truth), truth, tuple(truth))
+        degrees, share = worst(rig.cameras, truth)
+        assert degrees < 0.1
+        assert share < 0.003
+        assert rig_width(rig.cameras) == pytest.approx(1)
+        np.testing.assert_allclose(rig.cameras["c0"].T_camera_world, np.eye(4), atol=1e-12)
+        assert all(pixels < 3 * NOISE for pixels in rig.pixels.values())
+        assert rig.scale.startswith("arbitrary")
+        assert rig.verdicts()["c2"].startswith(f"{rig.pixels['c2']:.2f} pixels over ")
+        metres = rig.scaled("c0", "c3", 2.5)
+        assert np.linalg.norm(metres.cameras["c0"].centre - metres.cameras["c3"].centre) == pytest.approx(2.5)
+        with pytest.raises(D2Error, match="name two cameras of c0, c1, c2, c3"):
+            rig.scaled("c0", "c9", 1)
+
+    def test_a_camera_that_sees_something_else_is_refused_by_name(self) -> None:
+        truth = arc()
+        features = seen_by(truth)
+        features["c2"] = seen_by(truth, seed=5)["c2"]
+        with pytest.raises(D2Error, match="do not settle where camera c2 stands: add stills .* or video a board"):
+            solve_features(features, truth, tuple(truth))
+
+    def test_two_stills_between_connect_two_cameras_that_share_nothing(self) -> None:
+        truth = arc(4, 15.0)
+        features = seen_by(truth)
+        rng = np.random.default_rng(1)
+        for name, first in (("c0", 0), ("c3", 1)):  # every other thing is lost on either side, in turn
+            strange = rng.normal(size=features[name].descriptors[first::2].shape).astype(np.float32)
+            descriptors = features[name].descriptors.copy()
+            descriptors[first::2] = strange / np.linalg.norm(strange, axis=1, keepdims=True)
+            features[name] = replace(features[name], descriptors=descriptors)
+        outer = {name: features[name] for name in ("c0", "c3")}
+        with pytest.raises(D2Error, match="do not settle where camera c0, c3 stands"):
+            solve_features(outer, truth, ("c0", "c3"))
+        rig = solve_features(features, truth, ("c0", "c3"))
+        assert list(rig.cameras) == ["c0", "c3"]
+        assert worst(rig.cameras, {name: truth[name] for name in ("c0", "c3")})[0] < 0.3
+
+    def test_matches_that_are_all_wrong_are_refused(self) -> None:
+        truth = arc()
+        with pytest.raises(D2Error, match="add stills"):
+            solve_features(seen_by(truth, wrong=1.0), truth, tuple(truth))
+
+
+class TestBoards:
+    """Scale from a board that was filmed."""
+
+    def solved(self) -> tuple[SolvedRig, dict[str, Camera]]:
+        truth = arc(3)
+        first = np.linalg.inv(truth["c0"].T_camera_world)
+        inside = {name: replace(camera, T_camera_world=camera.T_camera_world @ first) for name, camera in truth.items()}
+        nothing = dict.fromkeys(truth, 0.0)
+        rig = SolvedRig(inside, nothing, dict.fromkeys(truth, 0), dict.fromkeys(truth, (0.0, 0.0)))
+        return rig.times(0.37, "arbitrary"), truth
+
+    def test_a_charuco_board_says_how_large_the_world_is(self) -> None:
+        rig, truth = self.solved()
+        images, board = filmed(truth, 0.25)
+        scaled = scaled_by_board(rig, images, board)
+        assert rig_width(scaled.cameras) == pytest.approx(rig_width(truth), rel=0.003)
+        assert "sides of a board's squares" in scaled.scale
+
+    def test_a_board_that_one_camera_saw_says_nothing(self) -> None:
+        rig, truth = self.solved()
+        images, board = filmed(truth, 0.25)
+        blank = [np.full((480, 640, 3), 128, np.uint8)]
+        with pytest.raises(D2Error, match="saw 0 sides of the board's squares .* show the whole board"):
+            scaled_by_board(rig, {"c0": images["c0"], "c1": blank, "c2": blank}, board)
+
+    def test_an_unknown_dictionary(self) -> None:
+        rig, truth = self.solved()
+        images, board = filmed(truth, 0.25)
+        with pytest.raises(D2Error, match="unknown marker dictionary 'DICT_9'"):
+            scaled_by_board(rig, images, replace(board, dictionary="DICT_9"))
+
+
+def test_features_lie_where_things_are_not_a_quarter_of_a_pixel_beside() -> None:
+    y, x = np.mgrid[:120, :120] + 0.5
+    centres = np.array([[30.3, 40.7], [80.25, 70.5], [90.8, 25.1], [40.4, 90.9]])
+    grey = sum(200 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 40) for cx, cy in centres)
+    image = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+    found = find_features([image]).pixels
+    for centre in centres:
+        nearest = found[np.linalg.norm(found - centre, axis=1).argmin()]
+        np.testing.assert_allclose(nearest, centre, atol=0.1)
+
+
+def test_sampsons_distance_is_zero_for_what_both_see_and_grows_by_the_pixel() -> None:
+    cameras = arc(2)
+    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
+    p, q = (project(camera, points) for camera in cameras.values())
+    assert sampson(cameras["c0"], cameras["c1"], p, q).max() < 1e-9
+    off = sampson(cameras["c0"], cameras["c1"], p, q + [0, 2.0])  # across the lines, shared by the two
+    assert 0.9 < np.median(off) < 1.6
+
+
+def test_a_rig_is_laid_over_another_by_its_rotations() -> None:
+    cameras = arc(2)  # two centres alone leave a turn about their line open
+    R = cv2.Rodrigues(np.array([0.3, -0.8, 0.5]))[0]
+    turned = {}
+    for name, camera in cameras.items():
+        T = camera.T_camera_world
+        turned[name] = replace(camera, T_camera_world=rigid(T[:3, :3] @ R, 3 * T[:3, 3] + T[:3, :3] @ [1.0, 2, 3]))
+    for name, camera in aligned(turned, cameras).items():
+        np.testing.assert_allclose(camera.T_camera_world, cameras[name].T_camera_world, atol=1e-9)

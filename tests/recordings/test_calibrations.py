@@ -1,0 +1,228 @@
+"""Calibrations of other tools: what was written from known cameras comes back, distortion included."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cv2", reason="opencv is in the `calibration` extra")
+pytest.importorskip("yaml", reason="pyyaml is in the `calibration` extra")
+import zlib  # noqa: F401  (pycolmap brings a zlib of its own that must not come first)
+
+pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
+
+from calibration_writers import CASES, Known, anipose, cameras_json, easymocap, panoptic, pose2sim, rig, transforms
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings.cameras.formats import CalibratedCamera, open_calibration, read_calibration, scaled
+from d2_plugin.recordings.cameras.formats.cameras_json import to_json
+from d2_plugin.recordings.naming import arrange
+
+POINTS = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3))
+"""In front of every camera of `rig`."""
+
+
+def in_first_camera(cameras: list[Known]) -> list[Known]:
+    """The same rig in a world that is the first camera's."""
+    R, t = cameras[0].R, cameras[0].t
+    return [camera._replace(R=camera.R @ R.T, t=camera.t - camera.R @ R.T @ t) for camera in cameras]
+
+
+def assert_same(found: CalibratedCamera, known: Known, points: np.ndarray) -> None:
+    assert (found.width, found.height) == known.size
+    np.testing.assert_allclose(found.rotation, known.R, atol=1e-6)
+    np.testing.assert_allclose(found.translation, known.t, atol=1e-6)
+    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    np.testing.assert_allclose(found.matrix - half, known.K, atol=1e-6)
+    seen = (points @ found.rotation.T + found.translation) @ found.pinhole().K.T
+    recorded = found.lens.recorded_pixels(seen[:, :2] / seen[:, 2:])
+    expected = known.project(points) + 0.5
+    assert np.ptp(expected, axis=0).min() > 200, "the points cover too little of the image to say anything"
+    np.testing.assert_allclose(recorded, expected, atol=0.01)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_known_cameras_come_back(name: str, tmp_path: Path) -> None:
+    case = CASES[name]
+    cameras = rig(case.coefficients, case.fisheye, case.names)
+    written = case.write(tmp_path, cameras)
+    sizes = None if case.sizes else {camera.name: camera.size for camera in cameras}
+    found = open_calibration(written, sizes)
+    assert found.format == case.format
+    assert not found.notes
+    assert [camera.name for camera in found.cameras] == [camera.name for camera in cameras]
+    points = POINTS
+    if case.relative:
+        points = POINTS @ cameras[0].R.T + cameras[0].t
+        cameras = in_first_camera(cameras)
+    for camera, known in zip(found.cameras, cameras, strict=True):
+        assert_same(camera, known, points)
+
+
+@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.format not in ("easymocap", "colmap")])
+def test_the_format_is_seen_from_the_content_not_the_name(name: str, tmp_path: Path) -> None:
+    case = CASES[name]
+    written = case.write(tmp_path, rig(case.coefficients, case.fisheye, case.names))
+    other = written.rename(tmp_path / "rig.txt")
+    sizes = None if case.sizes else dict.fromkeys(case.names, (1280, 720))
+    assert open_calibration(other, sizes).format == case.format
+
+
+def test_a_folder_with_one_calibration_is_enough(tmp_path: Path) -> None:
+    pose2sim(tmp_path, rig(4))
+    (tmp_path / "notes.json").write_text('{"hello": 1}')
+    assert open_calibration(tmp_path).format == "pose2sim"
+    anipose(tmp_path, rig())
+    with pytest.raises(D2Error, match=r"holds 2 calibrations \(Calib_board.toml, calibration.toml\), expected one"):
+        open_calibration(tmp_path)
+
+
+def test_recordings_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None:
+    cameras = rig()
+    path = anipose(tmp_path, cameras)
+    (found,) = read_calibration(path, {"cam_1": (640, 360)})
+    assert (found.width, found.height) == (640, 360)
+    seen = (POINTS @ found.rotation.T + found.translation) @ found.pinhole().K.T
+    half_size = found.lens.recorded_pixels(seen[:, :2] / seen[:, 2:])
+    np.testing.assert_allclose(half_size, (cameras[1].project(POINTS) + 0.5) / 2, atol=0.01)
+    with pytest.raises(D2Error, match="images of camera cam_1 are 720x1280 .* another aspect"):
+        read_calibration(path, {"cam_1": (720, 1280)})
+
+
+def test_our_own_json_says_everything(tmp_path: Path) -> None:
+    cameras = read_calibration(anipose(tmp_path, rig()))
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": to_json(cameras)}))
+    for again, known in zip(read_calibration(tmp_path / "cameras.json"), rig(), strict=True):
+        assert_same(again, known, POINTS)
+
+
+def test_millimetres_are_noted_with_the_scale_that_mends_them(tmp_path: Path) -> None:
+    cameras = [camera._replace(t=1000 * camera.t) for camera in rig()]
+    found = open_calibration(anipose(tmp_path, cameras))
+    (note,) = found.notes
+    assert "looks like millimetres (scale .001) instead of metres" in note
+    for camera, known in zip(scaled(found.cameras, 0.001), rig(), strict=True):
+        assert_same(camera, known, POINTS)
+
+
+class TestRefusals:
+    """One sentence each."""
+
+    def refused(self, path: Path, pattern: str, sizes: dict[str, tuple[int, int]] | None = None) -> None:
+        with pytest.raises(D2Error, match=pattern) as caught:
+            read_calibration(path, sizes)
+        assert "\n" not in str(caught.value)
+
+    def test_a_mirrored_rig(self, tmp_path: Path) -> None:
+        mirrored = [camera._replace(R=camera.R @ np.diag([1.0, 1, -1])) for camera in rig()]
+        self.refused(cameras_json(tmp_path, mirrored), "cam_0 .* mirrored pose .* left-handed axes; export it")
+
+    def test_a_matrix_that_is_no_rotation(self, tmp_path: Path) -> None:
+        scaled_up = [camera._replace(R=1.01 * camera.R) for camera in rig()]
+        self.refused(cameras_json(tmp_path, scaled_up), r"cam_0 .* an R that is no rotation \(orthonormal")
+
+    def test_sizes_that_nobody_names(self, tmp_path: Path) -> None:
+        easymocap(tmp_path, rig(names=("00", "01")))
+        text = (tmp_path / "intri.yml").read_text()
+        (tmp_path / "intri.yml").write_text(
+            "\n".join(line for line in text.splitlines() if line[:2] not in ("W_", "H_"))
+        )
+        self.refused(tmp_path, "names no size of the images of camera 00: give the recordings with it")
+        assert read_calibration(tmp_path, {"00": (1080, 1920)})[0].height == 1920
+
+    def test_a_recording_that_is_not_described(self, tmp_path: Path) -> None:
+        self.refused(anipose(tmp_path, rig()), "no camera for cam_7, only cam_0, cam_1, cam_2", {"cam_7": (1280, 720)})
+
+    def test_a_pickle(self, tmp_path: Path) -> None:
+        (tmp_path / "cam.pickle").write_bytes(b"\x80\x04\x95.")
+        self.refused(tmp_path / "cam.pickle", "is a pickle, which can run any program .* convert it to TOML")
+
+    def test_a_file_of_something_else(self, tmp_path: Path) -> None:
+        (tmp_path / "a.json").write_text('{"frames": 3}')
+        self.refused(
+            tmp_path / "a.json", "no calibration that can be read: expected one of folder, caliscope, pose2sim"
+        )
+        self.refused(tmp_path / "b.json", "no such calibration")
+
+    def test_yaml_that_unfolds(self, tmp_path: Path) -> None:
+        (tmp_path / "a.yaml").write_text("a: &a [1]\ncam0: *a\n")
+        self.refused(tmp_path / "a.yaml", "has YAML aliases")
+
+    def test_a_camera_that_caliscope_could_not_place(self, tmp_path: Path) -> None:
+        text = "[cameras.0]\ncam_id = 0\nsize = [4, 4]\nmatrix = [[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]\n"
+        (tmp_path / "a.toml").write_text(text)
+        self.refused(tmp_path / "a.toml", "cam_0 .* has no rotation and no translation: Caliscope could not place it")
+
+    @pytest.mark.parametrize("change", ["omni", "fov"])
+    def test_a_lens_of_kalibrs_that_cannot_be_undone(self, change: str, tmp_path: Path) -> None:
+        path = CASES["kalibr"].write(tmp_path, rig(4, names=("cam0", "cam1")))
+        text = path.read_text().replace("pinhole" if change == "omni" else "radtan", change)
+        path.write_text(text)
+        self.refused(path, f"cam0 .* model {change}, .*pinhole-equi or pinhole-radtan")
+
+
+class TestDamaged:
+    """What 2,000 mutations of each format found."""
+
+    def test_a_camera_without_its_label_is_named_by_its_images(self, tmp_path: Path) -> None:
+        path = transforms(tmp_path, rig())
+        content = json.loads(path.read_text())
+        del content["frames"][1]["camera_label"]
+        path.write_text(json.dumps(content))
+        assert sorted(camera.name for camera in read_calibration(path)) == ["cam_0", "cam_1", "cam_2"]
+
+    @pytest.mark.parametrize("name", ["", "."])
+    def test_a_image_without_a_name(self, name: str, tmp_path: Path) -> None:
+        (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
+        (tmp_path / "images.txt").write_text(f"1 1 0 0 0 0 0 0 1 {name}\n\n")
+        with pytest.raises(D2Error):
+            read_calibration(tmp_path)
+        with pytest.raises(D2Error, match="every image needs the name of its file"):
+            arrange([name], lambda group: True)
+
+    def test_a_model_of_a_thousand_letters_is_told_in_a_few(self, tmp_path: Path) -> None:
+        (tmp_path / "cameras.txt").write_text(f"1 {'P' * 9000} 64 48 50 50 32 24\n")
+        (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 cam0/0.png\n\n")
+        with pytest.raises(D2Error) as refusal:
+            read_calibration(tmp_path)
+        assert len(str(refusal.value)) < 1000
+
+
+class TestNames:
+    """Recordings find their cameras; a way that fits only some is not taken."""
+
+    @pytest.mark.parametrize(
+        ("cameras", "recordings"),
+        [
+            (("cam_0", "cam_1", "cam_2"), ("cam_2", "cam_0", "cam_1")),
+            (("00_05", "00_06", "00_07"), ("hd_00_07", "hd_00_05", "hd_00_06")),
+            (("int_cam1_img", "int_cam2_img", "int_cam10_img"), ("cam10", "cam01", "cam02")),
+            (("left", "right", "top"), ("GOPRO-Right", "GOPRO-Left", "GOPRO-Top")),
+        ],
+    )
+    def test_by_name(self, cameras: tuple[str, ...], recordings: tuple[str, ...], tmp_path: Path) -> None:
+        path = panoptic(tmp_path, [camera._replace(size=(1280, 720)) for camera in rig(names=cameras)])
+        found = open_calibration(path, dict.fromkeys(recordings, (1280, 720)))
+        assert [camera.name for camera in found.cameras] == list(recordings)
+        by_focal = {round(camera.matrix[0, 0]) - 900: camera.name for camera in found.cameras}
+        fit = {0: cameras[0], 1: cameras[1], 2: cameras[2]}
+        for number, recording in by_focal.items():
+            one, other = fit[number].lower(), recording.lower()
+            digits = [int("".join(filter(str.isdigit, name)) or -1) for name in (one, other)]
+            assert one in other or digits[0] == digits[1]
+        assert not found.notes
+
+    def test_by_order_with_a_note(self, tmp_path: Path) -> None:
+        path = anipose(tmp_path, [camera._replace(size=(1280, 720)) for camera in rig()])
+        found = open_calibration(path, dict.fromkeys(("kitchen", "attic", "cellar"), (1280, 720)))
+        assert [round(camera.matrix[0, 0]) for camera in found.cameras] == [902, 900, 901]
+        (note,) = found.notes
+        assert "attic is cam_0, cellar is cam_1, kitchen is cam_2" in note
+
+    def test_two_cameras_of_one_number_are_not_guessed(self, tmp_path: Path) -> None:
+        path = panoptic(tmp_path, rig(names=("00_01", "01_01", "02_05")))
+        with pytest.raises(D2Error, match="has no camera for cam1, cam5"):
+            read_calibration(path, {"cam1": (1280, 720), "cam5": (1280, 720)})

@@ -1,0 +1,133 @@
+"""What is looked at before work begins: calibrations that contradict the images, empty images, and memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import Recording, open_recording, select_cameras
+from d2_plugin.recordings.cameras.calibration import checked_camera
+from d2_plugin.recordings.cameras.check import check_recording
+from d2_plugin.recordings.checks import memory as memory_module
+from d2_plugin.recordings.checks.memory import available_bytes, check_memory, needed_bytes
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+
+W, H = 240, 135
+
+
+@pytest.fixture(scope="module")
+def room() -> Recording:
+    return synthetic_recording(cameras=3, held_out=0, frames=2, width=W, height=H)
+
+
+def moved(recording: Recording, name: str, **changes: object) -> Recording:
+    """The same images with another calibration of one camera."""
+    return replace(recording, cameras={**recording.cameras, name: replace(recording.cameras[name], **changes)})
+
+
+def transposed(recording: Recording, name: str) -> Recording:
+    T = recording.cameras[name].T_camera_world.copy()
+    T[:3, :3] = T[:3, :3].T
+    return moved(recording, name, T_camera_world=T)
+
+
+def notes_of(recording: Recording) -> tuple[str, ...]:
+    return check_recording(recording, list(recording.cameras), list(recording.cameras))
+
+
+def test_a_good_recording_has_nothing_to_be_noted(room: Recording) -> None:
+    assert notes_of(room) == ()
+
+
+@pytest.mark.parametrize("name", ["n3dv_sear_steak_t0", "pose2sim_single", "plaza", "studio"])
+def test_real_and_rendered_recordings_have_nothing_to_be_noted(name: str, shared_data: Callable[[str], Path]) -> None:
+    recording = open_recording(shared_data(name))
+    assert notes_of(select_cameras(recording, list(recording.cameras)[:4])) == ()
+
+
+@pytest.mark.parametrize("bad", ["cam00", "cam05"])
+def test_a_transposed_rotation_of_a_real_camera_is_named(bad: str, shared_data: Callable[[str], Path]) -> None:
+    recording = open_recording(shared_data("n3dv_sear_steak_t0"), downscale=2)
+    (note,) = notes_of(transposed(recording, bad))
+    assert "the calibration misses features that two images share" in note
+    assert note.endswith(f"check R, t and K of camera {bad}")
+
+
+def test_a_wrong_focal_length_is_named(room: Recording) -> None:
+    names = list(room.cameras)
+    K = room.cameras[names[0]].K.copy()
+    K[:2, 2] += 40  # a crop that nobody told the calibration
+    assert any("misses features" in note for note in notes_of(moved(room, names[0], K=K)))
+
+
+def test_a_camera_that_looks_away_is_named(room: Recording) -> None:
+    name = next(iter(room.cameras))
+    about = np.diag([-1.0, 1.0, -1.0, 1.0]) @ room.cameras[name].T_camera_world
+    assert f"camera {name} sees nothing that another camera sees: check its R and t" in notes_of(
+        moved(room, name, T_camera_world=about)
+    )
+
+
+def test_a_rig_far_from_the_origin_is_named(room: Recording) -> None:
+    shifted = room
+    for name, camera in room.cameras.items():
+        T = camera.T_camera_world.copy()
+        T[:3, 3] -= T[:3, :3] @ np.array([5e6, 0, 0])
+        shifted = moved(shifted, name, T_camera_world=T)
+    assert any("positions lose digits in float32" in note for note in notes_of(shifted))
+
+
+def test_images_of_one_colour_are_named(room: Recording) -> None:
+    class Dark:
+        def image(self, camera: str, frame: int) -> np.ndarray:
+            return np.full((H, W, 3), 200 * frame, np.uint8)
+
+        def depth(self, camera: str, frame: int) -> None: ...
+
+        def mono(self, camera: str, frame: int) -> None: ...
+
+    name = next(iter(room.cameras))
+    notes = notes_of(replace(room, source=Dark()))
+    assert f"camera {name} is black at frame 0: nothing can be learned from that" in notes
+    assert f"camera {name} is of one colour at frame 1: nothing can be learned from that" in notes
+
+
+def test_too_little_memory_is_said_before_work_begins(room: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    large = room
+    for name, camera in room.cameras.items():
+        large = moved(large, name, width=8000, height=4500, K=camera.K * [[8000 / W], [4500 / H], [1]])
+    names = list(room.cameras)[:2]
+    assert 7 < needed_bytes(large, names) / 2**30 < 9, "7.4 GiB were measured for two images of 8000x4500"
+    monkeypatch.setattr(memory_module, "available_bytes", lambda: 4 << 30)
+    with pytest.raises(D2Error, match=r"2 cameras of 8000x4500 pixels need about 7\.\d GiB .* use --downscale 2"):
+        check_memory(large, names)
+    check_memory(room, names)
+    monkeypatch.setattr(memory_module, "available_bytes", lambda: 1 << 20)
+    with pytest.raises(D2Error, match="a machine with more memory"):
+        check_memory(large, names)
+    monkeypatch.setattr(memory_module, "available_bytes", lambda: None)
+    check_memory(large, names)
+
+
+def test_what_is_available_is_no_more_than_the_machine_has() -> None:
+    available = available_bytes()
+    assert available is None or 0 < available < 1 << 50
+
+
+@pytest.mark.parametrize("place", [(1e9, H / 2), (W / 2, -1e6)])
+def test_a_principal_point_far_from_the_image_is_refused(room: Recording, place: tuple[float, float]) -> None:
+    camera = next(iter(room.cameras.values()))
+    K = camera.K.copy()
+    K[:2, 2] = place
+    with pytest.raises(D2Error, match=r"principal point .* degrees from the middle of the image, expected at most 80"):
+        checked_camera("a", (W, H), K, camera.T_camera_world, None, "cameras.json")
+    part = camera.K.copy()  # of an image of 40 times the width, as a crop of a large one is
+    part[:2] *= 40
+    checked_camera("a", (W, H), part, camera.T_camera_world, None, "cameras.json")

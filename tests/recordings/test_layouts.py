@@ -1,0 +1,88 @@
+"""Layouts are one table: a reader or a writer is one function or two and one row."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import LAYOUTS, Layout, Recording, open_recording
+from d2_plugin.recordings.assembly import assembled
+from d2_plugin.recordings.cameras.calibration import checked_camera, pinhole
+from d2_plugin.recordings.export.base import Export, Written
+from d2_plugin.recordings.export.export import EXPORT_FILE, WRITERS, export_recording
+from d2_plugin.recordings.files import numbered_files
+from d2_plugin.recordings.images import image_size, write_png
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+
+def is_tiny(path: Path) -> bool:
+    return (path / "focal.txt").is_file()
+
+
+def open_tiny(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Recording:
+    """One camera at the origin; focal.txt holds its focal length in pixels."""
+    images = {"only": numbered_files(path)}
+    frames = tuple(images["only"])
+    width, height = image_size(images["only"][frames[0]])
+    focal = float((path / "focal.txt").read_text())
+    K = pinhole(focal, focal, width / 2, height / 2)
+    camera = checked_camera("only", (width, height), K, np.eye(4), None, "focal.txt")
+    return assembled(path, {"only": camera}, images, frames, 30.0)
+
+
+def write_tiny(export: Export) -> Written:
+    [camera] = export.recording.cameras.values()
+    export.write_images(lambda _, frame: export.folder / f"{frame}.png")
+    (export.folder / "focal.txt").write_text(f"{camera.K[0, 0]:.17g}")
+    return export.written({camera.name: "only"})
+
+
+def test_a_reader_is_two_functions_and_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "focal.txt").write_text("20")
+    for frame in (3, 4):
+        write_png(tmp_path / f"{frame}.png", np.full((6, 8, 3), frame, np.uint8))
+    with pytest.raises(D2Error, match="is no recording"):
+        open_recording(tmp_path)
+    monkeypatch.setitem(LAYOUTS, "tiny", Layout(is_tiny, open_tiny))
+    for layout in (None, "tiny"):
+        recording = open_recording(tmp_path, layout=layout, frames=[4], downscale=2)
+        assert (recording.layout, recording.frames) == ("tiny", (4,))
+        assert recording.cameras["only"].K[0, 0] == 10
+        assert (recording.image("only", 4) == 4).all()
+    with pytest.raises(D2Error, match=r"files of another layout \(.*colmap, tiny; see"):
+        open_recording(tmp_path.parent)
+
+
+def test_an_export_is_one_function_and_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(WRITERS, "tiny", write_tiny)
+    monkeypatch.setitem(LAYOUTS, "tiny", Layout(is_tiny, open_tiny))
+    original = synthetic_recording(cameras=1, frames=2, width=16, height=12)
+    folder = export_recording(original, "tiny", tmp_path / "out")
+    described = json.loads((folder / EXPORT_FILE).read_text())
+    assert (described["cameras"], described["frames"]) == ({"train0": "only"}, {"0": 0, "1": 1})
+    back = open_recording(folder)
+    np.testing.assert_array_equal(back.cameras["only"].K, original.cameras["train0"].K)
+    np.testing.assert_array_equal(back.image("only", 1), original.image("train0", 1))
+
+
+def test_the_documentation_has_the_same_layouts_in_the_same_order() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text()
+    rows = [line for line in page.splitlines() if line.startswith("| [")]
+    assert [row.split("[")[1].split("]")[0] for row in rows] == list(LAYOUTS)
+
+
+def test_a_folder_of_several_layouts_is_read_as_the_first_of_them(tmp_path: Path) -> None:
+    for name in ("poses_bounds.npy", "cameras_parameters.txt", "intri.yml", "transforms.json"):
+        (tmp_path / name).touch()
+    assert [name for name, layout in LAYOUTS.items() if layout.recognised(tmp_path)] == [
+        "n3dv",
+        "technicolor",
+        "enerf",
+        "transforms",
+    ]
+    with pytest.raises(D2Error, match=r"cannot read .*poses_bounds\.npy|no cam\*\.mp4"):
+        open_recording(tmp_path)

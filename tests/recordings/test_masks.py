@@ -1,0 +1,242 @@
+"""Masks beside images: what is foreground, and what was recorded at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_layouts import small_recording, write_layout
+
+from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.photometric import photometric_loss, weighted_photometric_loss
+from d2_plugin.priors import construct
+from d2_plugin.priors.frame import Frame, view_digest
+from d2_plugin.protocol import Label
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.cameras.formats import CalibratedCamera, Undistortion
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.masks import MASK_FOLDERS
+from d2_plugin.runs.evaluation import evaluate
+from d2_plugin.runs.start import TrainingFrames
+
+cv2 = pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+
+W, H = 48, 32
+CAMERAS = ("cam00", "cam01")
+
+
+def write_mask(path: Path, mask: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), mask)
+
+
+def left_half(value: int = 255) -> np.ndarray:
+    mask = np.zeros((H, W), np.uint8)
+    mask[:, : W // 2] = value
+    return mask
+
+
+def recorded_folder(path: Path, masks: str = "masks", valid: bool = False) -> Path:
+    """Two cameras and two frames; camera cam00 has a mask at frame 0, and its lowest rows were not recorded."""
+    save_recording(small_recording(), path)
+    write_mask(path / masks / "cam00" / "0000.png", left_half())
+    if valid:
+        recorded = np.full((H, W), 255, np.uint8)
+        recorded[-5:] = 0
+        write_mask(path / "valid" / "cam00.png", recorded)
+    return path
+
+
+@pytest.mark.parametrize("folder", MASK_FOLDERS)
+def test_masks_are_read_where_they_lie(folder: str, tmp_path: Path) -> None:
+    recording = open_recording(recorded_folder(tmp_path / "recording", folder))
+    mask = recording.mask("cam00", 0)
+    assert mask is not None
+    np.testing.assert_array_equal(mask, left_half() / 255)
+    assert recording.mask("cam00", 1) is None
+    assert recording.mask("cam01", 0) is None
+    assert any(note == f"foreground masks of cam00 from {folder}" for note in recording.notes)
+
+
+def test_enerf_recordings_have_theirs_in_bgmtv2(tmp_path: Path) -> None:
+    path = write_layout("enerf", tmp_path / "recording")
+    write_mask(path / "bgmtv2" / "cam00" / "000001.png", left_half(128))
+    recording = open_recording(path)
+    mask = recording.mask("cam00", recording.frames[1])
+    assert mask is not None
+    assert mask[5, 10] == pytest.approx(128 / 255, abs=0.01)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_a_mask_may_have_any_number_of_channels(channels: int, tmp_path: Path) -> None:
+    path = recorded_folder(tmp_path / "recording")
+    grey = left_half()
+    if channels == 3:
+        write_mask(path / "masks" / "cam00" / "0000.png", np.repeat(grey[..., None], 3, axis=2))
+    if channels == 4:  # colours of a cut-out person, whose opacity is the mask
+        write_mask(path / "masks" / "cam00" / "0000.png", np.dstack([np.full((H, W, 3), 90, np.uint8), grey]))
+    mask = open_recording(path).mask("cam00", 0)
+    assert mask is not None
+    np.testing.assert_array_equal(mask, grey / 255)
+
+
+def test_a_recording_without_masks_has_none(tmp_path: Path) -> None:
+    recording = open_recording(save_recording(small_recording(), tmp_path / "recording"))
+    assert recording.mask("cam00", 0) is None
+    assert recording.recorded("cam00") is None
+    assert TrainingFrames(recording, CAMERAS, background_weight=0.0).weights(0) is None
+    assert view_digest(recording, "cam00", 0) == Frame.read(recording, CAMERAS, 0).hashes["cam00"]
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:
+    path = recorded_folder(tmp_path / "recording")
+    write_mask(path / "masks" / "cam00" / "0000.png", np.zeros((H, W + 1), np.uint8))
+    with pytest.raises(D2Error, match="mask of frame 0 of camera cam00 is 49x32 pixels"):
+        open_recording(path).mask("cam00", 0)
+
+
+def test_masks_are_downscaled_and_saved_with_the_images(tmp_path: Path) -> None:
+    recording = open_recording(recorded_folder(tmp_path / "recording", valid=True), downscale=2)
+    mask, recorded = recording.mask("cam00", 0), recording.recorded("cam00")
+    assert mask is not None
+    assert recorded is not None
+    assert (mask.shape, mask[:, : W // 4].min(), mask[:, W // 4 :].max()) == ((H // 2, W // 2), 1, 0)
+    assert (recorded[: H // 2 - 3].all(), recorded[-3:].any()) == (True, False)  # half a block is not whole
+    again = open_recording(save_recording(recording, tmp_path / "again"))
+    np.testing.assert_array_equal(again.mask("cam00", 0), mask)
+    np.testing.assert_array_equal(again.recorded("cam00"), recorded)
+
+
+class TestUndistortion:
+    """What a lens did not record is no image."""
+
+    CAMERA = CalibratedCamera(
+        "a", W, H, np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), "opencv", (0.3, 0, 0, 0), np.eye(3), np.zeros(3)
+    )
+
+    def test_the_valid_region_is_where_a_white_image_stays_white(self) -> None:
+        undone = Undistortion.of(self.CAMERA)
+        assert undone.valid is not None
+        white = undone.image(np.full((H, W, 3), 255, np.uint8))
+        assert (white[undone.valid] == 255).all()
+        assert (white[0, 0] == 0).all()
+        assert 0.5 < undone.valid.mean() < 0.95
+        assert (white[~undone.valid].min(axis=-1) < 255).mean() > 0.5  # not much smaller than it has to be
+
+    def test_a_pinhole_leaves_images_alone(self) -> None:
+        undone = Undistortion.of(replace(self.CAMERA, model="pinhole", distortion=()))
+        image = np.zeros((H, W, 3), np.uint8)
+        assert undone.image(image) is image
+        assert undone.valid is None
+
+    def test_opening_a_distorted_recording_says_the_same(self, tmp_path: Path) -> None:
+        import json
+
+        path = recorded_folder(tmp_path / "recording")
+        content = json.loads((path / "cameras.json").read_text())
+        content["cameras"][0] |= {"model": "opencv", "distortion": [0.3, 0, 0, 0]}
+        (path / "cameras.json").write_text(json.dumps(content))
+        recording = open_recording(path)
+        recorded, mask = recording.recorded("cam00"), recording.mask("cam00", 0)
+        assert recorded is not None
+        assert mask is not None
+        assert (recording.image("cam00", 0)[~recorded].mean(), recording.recorded("cam01")) == (
+            pytest.approx(0, abs=40),
+            None,
+        )
+        assert not np.array_equal(mask, left_half() / 255)  # it was bent with the image
+        assert mask[H // 2, W // 2 - 3] == 1
+
+
+class TestLoss:
+    """Weights in the photometric loss."""
+
+    @staticmethod
+    def images(dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor]:
+        generator = torch.Generator().manual_seed(3)
+        return tuple(torch.rand(24, 20, 3, generator=generator, dtype=dtype) for _ in range(2))  # type: ignore[return-value]
+
+    def test_weights_of_one_change_nothing(self) -> None:
+        image, target = self.images(torch.float64)
+        expected = photometric_loss(image, target)
+        torch.testing.assert_close(weighted_photometric_loss(image, target, 0.2, torch.ones(24, 20)), expected)
+
+    def test_pixels_of_no_weight_pull_nothing_and_may_hold_anything(self) -> None:
+        image, target = self.images()
+        weights = torch.ones(24, 20)
+        weights[:, 12:] = 0
+        other = torch.where(weights[..., None] > 0, target, torch.zeros(()))
+        losses, gradients = [], []
+        for shown in (target, other):
+            image = image.detach().requires_grad_()
+            loss = photometric_loss(image, shown, 0.2, weights)
+            (gradient,) = torch.autograd.grad(loss, image)
+            losses.append(loss), gradients.append(gradient)
+        assert torch.equal(losses[0], losses[1])
+        assert torch.equal(gradients[0], gradients[1])
+        assert gradients[0][:, 18:].abs().max() == 0  # beyond the reach of a window
+        assert gradients[0][:, :12].abs().min() > 0
+
+    def test_l1_is_weighted_pixel_by_pixel(self) -> None:
+        image, target = self.images()
+        weights = torch.rand(24, 20, generator=torch.Generator().manual_seed(1))
+        image.requires_grad_()
+        (gradient,) = torch.autograd.grad(photometric_loss(image, target, 0.0, weights), image)
+        torch.testing.assert_close(gradient.abs(), (weights / (24 * 20 * 3))[..., None].expand_as(gradient))
+
+    def test_gradients_are_right(self) -> None:
+        generator = torch.Generator().manual_seed(0)
+        image, target = (torch.rand(7, 6, 3, generator=generator, dtype=torch.float64) for _ in range(2))
+        weights = torch.rand(7, 6, generator=generator, dtype=torch.float64) + 0.1
+        image.requires_grad_()
+        assert torch.autograd.gradcheck(lambda x: weighted_photometric_loss(x, target, 0.2, weights), image)
+
+
+def test_training_weighs_by_masks_and_never_by_what_was_not_recorded(tmp_path: Path) -> None:
+    recording = open_recording(recorded_folder(tmp_path / "recording", valid=True))
+    frames = TrainingFrames(recording, CAMERAS, background_weight=0.25)
+    by_view = {(view.camera, view.frame): frames.weights(i) for i, view in enumerate(frames.views)}
+    first, later = by_view["cam00", 0], by_view["cam00", 1]
+    assert first is not None
+    assert later is not None
+    assert (first[0, 0], first[0, -1], first[-1, 0]) == (1, 0.25, 0)
+    assert (later[0, -1], later[-1, 0]) == (1, 0)  # no mask: all of what was recorded counts
+    assert by_view["cam01", 0] is None
+    unweighted = TrainingFrames(recording, CAMERAS).weights(0)
+    assert unweighted is not None
+    assert (unweighted[0, -1], unweighted[-1, 0]) == (1, 0)
+
+
+def test_the_score_inside_the_mask(tmp_path: Path) -> None:
+    recording = open_recording(recorded_folder(tmp_path / "recording"))
+    truth = torch.from_numpy(recording.image("cam00", 0)).float() / 255
+
+    def render(camera: str, frame: int) -> tuple[torch.Tensor, None]:
+        drawn = torch.from_numpy(recording.image(camera, frame)).float() / 255
+        drawn[:, : W // 2] = (drawn[:, : W // 2] + 0.1).clamp(0, 1)
+        return drawn, None
+
+    rows = {
+        (row["camera"], row["frame"]): row for row in evaluate(render, recording, CAMERAS, recording.frames)["per_view"]
+    }
+    error = ((truth[:, : W // 2] + 0.1).clamp(0, 1) - truth[:, : W // 2]).square().mean()
+    assert rows["cam00", 0]["psnr_mask"] == pytest.approx(-10 * torch.log10(error).item(), abs=1e-3)
+    assert rows["cam00", 1]["psnr_mask"] is None
+    assert rows["cam01", 0]["psnr_mask"] is None
+
+
+def test_a_prior_knows_nothing_of_what_was_not_recorded() -> None:
+    from d2_plugin.priors.fuse import fuse
+
+    full = np.full((H, W), 2.0, np.float32)
+    maps = fuse(full, full, tau_c=0.1)
+    assert (maps.labels == Label.VERIFIED).all()
+    recorded = left_half() > 0
+    kept = construct._within(maps, recorded)
+    assert (kept.labels[recorded] == Label.VERIFIED).all()
+    assert (kept.labels[~recorded] == Label.EMPTY).all()
+    assert (kept.depth[~recorded] == 0).all()
+    assert np.isinf(kept.sigma[~recorded]).all()

@@ -1,0 +1,234 @@
+"""COLMAP models, binary and text: cameras by name, lenses undone, what is refused and in which words."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import zlib  # noqa: F401  before pycolmap, see d2_plugin.priors.colmap.points
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stand_in_recordings import five_cameras
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.export.export import export_recording
+from d2_plugin.recordings.images import write_png
+from d2_plugin.recordings.readers.colmap_model import MODELS, ColmapCamera, find_model, read_model, read_points
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+W, H = 32, 24
+PINHOLE = "1 PINHOLE 32 24 30 31 15.5 12.25"
+
+
+def write_text(folder: Path, cameras: list[str], images: list[str], observations: str = "") -> None:
+    """A text model: lines of cameras.txt, and of images.txt without the second line of each image."""
+    folder.mkdir(parents=True)
+    (folder / "cameras.txt").write_text("# Camera list\n" + "\n".join(cameras) + "\n")
+    (folder / "images.txt").write_text("# Image list\n" + "".join(f"{image}\n{observations}\n" for image in images))
+
+
+def write_grey(path: Path, value: int = 0, size: tuple[int, int] = (W, H)) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(path, np.full((size[1], size[0], 3), value, np.uint8))
+
+
+def pose_line(identity: int, name: str, camera: int = 1, x: float = 0.0) -> str:
+    return f"{identity} 1 0 0 0 {x} 0 0 {camera} {name}"
+
+
+def two_cameras(path: Path, pattern: str = "{}_{:04d}.png") -> Path:
+    """Two cameras with three frames each, of which only the first is registered (4C4D's way)."""
+    names = ["cam01", "cam10"]
+    lines = [pose_line(i + 1, pattern.format(name, 0), x=i) for i, name in enumerate(names)]
+    write_text(path / "sparse" / "0", [PINHOLE], lines)
+    for i, name in enumerate(names):
+        for frame in range(3):
+            write_grey(path / "images" / pattern.format(name, frame), 100 * i + frame)
+    return path
+
+
+def refused(path: Path, pattern: str, **options: object) -> None:
+    with pytest.raises(D2Error, match=pattern) as caught:
+        open_recording(path, **options)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def original() -> Recording:
+    return synthetic_recording(cameras=2, held_out=1, frames=2, width=W, height=H)
+
+
+def test_an_exported_recording_reads_back(original: Recording, tmp_path: Path) -> None:
+    found = open_recording(export_recording(original, "colmap", tmp_path / "scene"))
+    assert found.layout == "colmap"
+    assert set(found.cameras) == set(original.cameras)
+    assert found.frames == original.frames
+    for name, camera in original.cameras.items():
+        np.testing.assert_allclose(found.cameras[name].K, camera.K, atol=1e-9)
+        np.testing.assert_allclose(found.cameras[name].T_camera_world, camera.T_camera_world, atol=1e-9)
+        for frame in original.frames:
+            np.testing.assert_array_equal(found.image(name, frame), original.image(name, frame))
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_models_that_colmap_itself_writes_are_read(tmp_path: Path, binary: bool) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    model, rng = pycolmap.Reconstruction(), np.random.default_rng(1)
+    names = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE")
+    expected = {}
+    for i, name in enumerate(names, start=1):
+        focal = [30.0, 31.0] if dict(MODELS)[name] in (4, 8) and name != "SIMPLE_RADIAL" else [30.0]
+        parameters = [*focal, 15.0, 12.0, *(0.01 * rng.random(4))][: dict(MODELS)[name]]
+        camera = pycolmap.Camera(model=name, width=W, height=H, camera_id=i, params=parameters)
+        model.add_camera_with_trivial_rig(camera)
+        quaternion = rng.normal(size=4)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(quaternion / np.linalg.norm(quaternion)), rng.normal(size=3))
+        image = pycolmap.Image(name=f"cam{i}/0001.png", camera_id=i, image_id=i)
+        model.add_image_with_trivial_frame(image, pose)
+        expected[i] = pose.matrix()
+        write_grey(tmp_path / "images" / f"cam{i}" / "0001.png")
+    points = rng.normal(size=(4, 3))
+    for point in points:
+        model.add_point3D(point, pycolmap.Track(), np.array([1, 2, 3], np.uint8))
+    folder = tmp_path / "sparse" / "0"
+    folder.mkdir(parents=True)
+    (model.write_binary if binary else model.write_text)(str(folder))
+
+    found = read_model(folder)
+    for i, name in enumerate(names, start=1):
+        assert found.cameras[i].model == name
+        np.testing.assert_array_equal(found.cameras[i].parameters, model.cameras[i].params)
+        np.testing.assert_allclose(found.images[i].T_camera_world[:3], expected[i], atol=1e-12)
+    sparse = read_points(folder)
+    np.testing.assert_allclose(np.sort(sparse.positions, axis=0), np.sort(points, axis=0), atol=1e-12)
+    np.testing.assert_array_equal(sparse.colors, np.tile([1, 2, 3], (4, 1)))
+    recording = open_recording(tmp_path)
+    assert list(recording.cameras) == [f"cam{i}" for i in range(1, 6)]
+    assert recording.frames == (1,)
+    assert any("distortion of cam3, cam4, cam5 is undone" in note for note in recording.notes)
+
+
+def test_undistortion_uses_colmaps_own_camera_models() -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    rays = np.random.default_rng(2).uniform(-0.4, 0.4, (20, 2))
+    for name, count in MODELS[:6] + MODELS[8:10]:
+        camera = pycolmap.Camera(model=name, width=W, height=H, camera_id=1)
+        shape = [30.0, 31.0, 15.0, 12.0] if name == "PINHOLE" or "OPENCV" in name else [30.0, 15.0, 12.0]
+        camera.params = (shape + [0.05, -0.02, 0.003, 0.004])[:count]
+        lens = ColmapCamera(name, W, H, tuple(camera.params)).lens("model")
+        ours = lens.recorded_pixels(rays * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2])
+        theirs = camera.img_from_cam(np.concatenate([rays, np.ones((20, 1))], axis=1))
+        np.testing.assert_allclose(ours, theirs, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("pattern", ["{}_{:04d}.png", "{}/{:04d}.png", "{}/images/frame_{:04d}.png"])
+def test_one_registered_frame_gives_its_pose_to_the_frames_on_disk(tmp_path: Path, pattern: str) -> None:
+    recording = open_recording(two_cameras(tmp_path, pattern))
+    assert list(recording.cameras) == ["cam01", "cam10"]
+    assert recording.frames == (0, 1, 2)
+    assert recording.cameras["cam10"].T_camera_world[0, 3] == 1
+    np.testing.assert_array_equal(recording.cameras["cam01"].K[:2, 2], [15.5, 12.25])
+    assert (recording.image("cam10", 2) == 102).all()
+    assert list(open_recording(tmp_path, cameras=["cam10"], frames=[1]).cameras) == ["cam10"]
+    smaller = open_recording(tmp_path, downscale=2)
+    assert smaller.cameras["cam01"].K[0, 0] == 15
+    assert smaller.image("cam01", 0).shape == (12, 16, 3)
+
+
+@pytest.mark.parametrize("observations", ["", "1.5 2.5 -1 3.5 4.5 7"])
+def test_the_second_line_of_an_image_may_be_empty(tmp_path: Path, observations: str) -> None:
+    lines = [pose_line(1, "a_0.png"), pose_line(2, "b_0.png", x=1.0)]
+    write_text(tmp_path / "m", [PINHOLE], lines, observations)
+    assert [image.name for image in read_model(tmp_path / "m").images.values()] == ["a_0.png", "b_0.png"]
+
+
+def test_a_still_scene_from_a_moving_camera_is_one_instant(tmp_path: Path) -> None:
+    lines = [pose_line(i, f"DSC_{i:04d}.png", x=0.3 * i) for i in range(1, 4)]
+    write_text(tmp_path / "sparse" / "0", [PINHOLE], lines)
+    for i in range(1, 6):
+        write_grey(tmp_path / "images" / f"DSC_{i:04d}.png", i)
+    recording = open_recording(tmp_path)
+    assert list(recording.cameras) == ["DSC_0001", "DSC_0002", "DSC_0003"]
+    assert recording.frames == (0,)
+    assert (recording.image("DSC_0003", 0) == 3).all()
+    assert any("camera of its own at one instant" in note for note in recording.notes)
+    assert any("2 images left out" in note for note in recording.notes)
+
+
+def test_images_smaller_than_the_model_scale_its_intrinsics(tmp_path: Path) -> None:
+    two_cameras(tmp_path)
+    for file in (tmp_path / "images").iterdir():
+        write_grey(file, size=(16, 12))
+    recording = open_recording(tmp_path)
+    np.testing.assert_allclose(recording.cameras["cam01"].K, [[15, 0, 7.75], [0, 15.5, 6.125], [0, 0, 1]])
+    for file in (tmp_path / "images").iterdir():
+        write_grey(file, size=(16, 16))
+    refused(tmp_path, "cam01 are 16x16 but .* says 32x24, another aspect")
+
+
+def test_a_distorted_camera_becomes_a_pinhole(tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    two_cameras(tmp_path)
+    (tmp_path / "sparse" / "0" / "cameras.txt").write_text("1 OPENCV 32 24 30 31 15.5 12.25 0.3 0.0 0.0 0.0\n")
+    for file in (tmp_path / "images").iterdir():
+        write_grey(file, 200)
+    recording = open_recording(tmp_path)
+    shown = recording.image("cam01", 0)
+    assert (shown[12, 15] == 200).all()
+    assert (shown[0, 0] == 0).all()  # not recorded
+    assert any(re.search(r"that were not recorded are black: up to [\d.]+% \(", note) for note in recording.notes)
+
+
+def test_models_without_undistortion_are_refused(tmp_path: Path) -> None:
+    two_cameras(tmp_path)
+    (tmp_path / "sparse" / "0" / "cameras.txt").write_text("1 FOV 32 24 30 31 15.5 12.25 0.9\n")
+    refused(tmp_path, "model FOV with 5 parameters, which cannot be undistorted here: run `colmap image_undistorter`")
+
+
+def test_cameras_without_images_are_named_and_left_out_only_when_asked(tmp_path: Path) -> None:
+    two_cameras(tmp_path)
+    for file in (tmp_path / "images").glob("cam10*"):
+        file.unlink()
+    refused(tmp_path, "camera cam10 of .*0 has no image")
+    recording = open_recording(tmp_path, intersect=True)
+    assert list(recording.cameras) == ["cam01"]
+    assert any("cam10" in note for note in recording.notes)
+    refused(tmp_path, "unknown camera 'cam1'.*did you mean", cameras=["cam1"])
+    shutil.rmtree(tmp_path / "images")
+    refused(tmp_path, "is no folder", layout="colmap")
+
+
+def test_damaged_models_are_refused_by_file(original: Recording, tmp_path: Path) -> None:
+    path = export_recording(original, "colmap", tmp_path / "scene")
+    model = path / "sparse" / "0"
+    whole = (model / "images.bin").read_bytes()
+    for data in (whole[:-3], whole[:50], b"", whole[:8] + bytes(64)):
+        (model / "images.bin").write_bytes(data)
+        refused(path, r"images\.bin is damaged or no COLMAP model")
+    (model / "images.bin").write_bytes(bytes(8))
+    refused(path, "registers no image")
+    (model / "images.bin").write_bytes(whole)
+    (model / "cameras.bin").write_bytes(bytes(8))
+    refused(path, r"uses camera 1, which .*cameras\.bin lacks")
+    (model / "images.bin").unlink()
+    assert find_model(path) is None
+    refused(path, "holds no COLMAP model", layout="colmap")
+
+
+def test_a_model_without_points_has_none(tmp_path: Path) -> None:
+    two_cameras(tmp_path)
+    assert read_points(tmp_path / "sparse" / "0").positions.shape == (0, 3)
+
+
+def test_rows_rounded_to_seven_digits_survive_a_model(tmp_path: Path) -> None:
+    real = open_recording(five_cameras(tmp_path / "source"), downscale=2)
+    found = open_recording(export_recording(real, "colmap", tmp_path / "scene"))
+    assert list(found.cameras) == list(real.cameras)
+    for name, camera in real.cameras.items():
+        np.testing.assert_allclose(found.cameras[name].K, camera.K, atol=1e-9)
+        # poses_bounds.npy keeps seven digits of its rotations, a quaternion is exactly orthonormal
+        np.testing.assert_allclose(found.cameras[name].T_camera_world, camera.T_camera_world, atol=1e-5)
+        np.testing.assert_array_equal(found.image(name, 0), real.image(name, 0))

@@ -1,0 +1,184 @@
+"""ENeRF-Outdoor's layout: OpenCV's YAML, cameras that not every file knows, distortion undone on load."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.cameras.rotations import rotation_of_vector
+from d2_plugin.recordings.images import write_png
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+cv2 = pytest.importorskip("cv2")
+
+W, H = 48, 32
+HALF_A_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+"""From OpenCV's pixels, whose centres lie at whole numbers, to this project's."""
+R_11 = (1.631797, -1.236095, 0.801056)
+T_11 = (0.327633, 1.096058, 3.260243)
+
+
+def matrix(name: str, values: np.ndarray) -> str:
+    """A matrix as EasyMocap writes it."""
+    values = np.atleast_2d(np.asarray(values, float))
+    numbers = ", ".join(f"{value:.6f}" for value in values.ravel())
+    rows, columns = values.shape
+    return f"{name}: !!opencv-matrix\n  rows: {rows}\n  cols: {columns}\n  dt: d\n  data: [{numbers}]\n"
+
+
+def yaml(path: Path, names: list[str], *entries: str) -> None:
+    listed = "".join(f'  - "{name}"\n' for name in names)
+    path.write_text(f"%YAML:1.0\n---\nnames:\n{listed}" + "".join(entries))
+
+
+def intrinsics(name: str, key: str | None = "dist", k1: float = 0.0) -> str:
+    entry = matrix(f"K_{name}", np.array([[40.1, 0, 25.06], [0, 40.3, 13.3], [0, 0, 1]]))
+    return entry + (matrix(f"{key}_{name}", np.array([[k1, 0, 0, 0, 0]])) if key else "")
+
+
+def extrinsics(name: str) -> str:
+    rotation = cv2.Rodrigues(np.array(R_11))[0]
+    vectors = matrix(f"R_{name}", np.array(R_11)[:, None]) + matrix(f"Rot_{name}", rotation)
+    return vectors + matrix(f"T_{name}", np.array(T_11)[:, None])
+
+
+def scene(path: Path, folders: tuple[str, ...] = ("00", "11"), k1: float = 0.0, key: str | None = "dist") -> Path:
+    """intri.yml knows 00 to 03 and 11, extri.yml 00 and 11; images show the camera's number plus the frame."""
+    path.mkdir(parents=True, exist_ok=True)
+    known = ["00", "01", "02", "03", "11"]
+    yaml(path / "intri.yml", known, *(intrinsics(name, key, k1) for name in known))
+    yaml(path / "extri.yml", ["00", "11"], extrinsics("00"), extrinsics("11"))
+    for folder in folders:
+        for frame in range(3):
+            file = path / "images" / folder / f"{frame:06d}.png"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_png(file, np.full((H, W, 3), 10 * int(folder) + frame, np.uint8))
+    return path
+
+
+def refused(path: Path, pattern: str, **options: object) -> None:
+    with pytest.raises(D2Error, match=pattern) as caught:
+        open_recording(path, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_real_rotation_vector_becomes_the_matrix_beside_it() -> None:
+    rotation = rotation_of_vector(np.array(R_11))
+    np.testing.assert_allclose(rotation[0], [0.287431, -0.957452, -0.025882], atol=2e-6)
+    np.testing.assert_allclose(rotation, cv2.Rodrigues(np.array(R_11))[0], atol=1e-12)
+    np.testing.assert_array_equal(rotation_of_vector(np.zeros(3)), np.eye(3))
+    tiny = rotation_of_vector(np.array([0, 0, 1e-9]))
+    np.testing.assert_allclose(tiny, [[1, -1e-9, 0], [1e-9, 1, 0], [0, 0, 1]], atol=1e-17)
+
+
+def test_cameras_are_those_with_intrinsics_pose_and_images(tmp_path: Path) -> None:
+    recording = open_recording(scene(tmp_path, folders=("00", "11", "02", "17")))
+    assert recording.layout == "enerf"
+    assert list(recording.cameras) == ["00", "11"]
+    [note] = [note for note in recording.notes if "left out" in note]
+    for told in ("01 (no extri.yml, images)", "02 (no extri.yml)", "17 (no intri.yml, extri.yml)"):
+        assert told in note
+    assert (recording.frames, recording.fps) == ((0, 1, 2), 60)
+    assert (recording.image("11", 2) == 112).all()
+
+
+def test_poses_map_world_to_camera(tmp_path: Path) -> None:
+    camera = open_recording(scene(tmp_path)).cameras["11"]
+    rotation = cv2.Rodrigues(np.array(R_11))[0]
+    np.testing.assert_allclose(camera.T_camera_world[:3, :3], rotation, atol=2e-6)
+    np.testing.assert_allclose(camera.centre, -rotation.T @ np.array(T_11), atol=1e-5)
+    # OpenCV, with which EasyMocap calibrates, has the centre of the first pixel at 0: here it is at 0.5.
+    np.testing.assert_allclose(camera.K, [[40.1, 0, 25.56], [0, 40.3, 13.8], [0, 0, 1]])
+
+
+def test_a_recording_written_by_opencv_reads_back(tmp_path: Path) -> None:
+    original = synthetic_recording(cameras=2, held_out=1, frames=2, width=W, height=H)
+    files = {
+        name: cv2.FileStorage(str(tmp_path / f"{name}.yml"), cv2.FILE_STORAGE_WRITE) for name in ("intri", "extri")
+    }
+    for name, camera in original.cameras.items():
+        files["intri"].write(f"K_{name}", camera.K)
+        files["extri"].write(f"R_{name}", cv2.Rodrigues(camera.T_camera_world[:3, :3])[0])
+        files["extri"].write(f"T_{name}", camera.T_camera_world[:3, 3])
+        for frame in original.frames:
+            file = tmp_path / "images" / name / f"{frame:06d}.png"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_png(file, original.image(name, frame))
+    for file in files.values():
+        file.release()
+    found = open_recording(tmp_path)  # without a list of names, the folders say which cameras there are
+    assert sorted(found.cameras) == sorted(original.cameras)
+    for name, camera in original.cameras.items():
+        np.testing.assert_allclose(found.cameras[name].K - HALF_A_PIXEL, camera.K, atol=1e-12)
+        np.testing.assert_allclose(found.cameras[name].T_camera_world, camera.T_camera_world, atol=1e-9)
+        np.testing.assert_array_equal(found.image(name, 1), original.image(name, 1))
+
+
+def test_the_matrix_serves_where_the_vector_is_missing(tmp_path: Path) -> None:
+    path = scene(tmp_path)
+    without_vector = (path / "extri.yml").read_text().replace("\nR_", "\nunused_")
+    expected = open_recording(path).cameras["11"].T_camera_world
+    (path / "extri.yml").write_text(without_vector)
+    np.testing.assert_allclose(open_recording(path).cameras["11"].T_camera_world, expected, atol=2e-6)
+    (path / "extri.yml").write_text(without_vector.replace("Rot_", "also_unused_"))
+    refused(path, "neither R_00 nor Rot_00")
+
+
+@pytest.mark.parametrize("key", ["dist", "D"])
+def test_distortion_is_undone_under_either_name(tmp_path: Path, key: str) -> None:
+    path = scene(tmp_path, k1=0.4, key=key)
+    recording = open_recording(path)
+    assert any("distortion of 00, 11 is undone" in note for note in recording.notes)
+    shown = recording.image("11", 0)
+    assert (shown[13, 25] == 110).all()
+    assert (shown[-1, 0] == 0).all()
+    assert not any("undone" in note for note in open_recording(scene(tmp_path, key=None)).notes)
+
+
+def test_a_image_that_is_smaller_than_its_calibration_scales_it(tmp_path: Path) -> None:
+    path = scene(tmp_path)
+    with (path / "intri.yml").open("a") as file:
+        file.write(f"W_11: {2 * W}\nH_11: {2 * H}\n")
+    cameras = open_recording(path).cameras
+    np.testing.assert_allclose(cameras["11"].K, [[20.05, 0, 12.78], [0, 20.15, 6.9], [0, 0, 1]])
+    assert cameras["00"].K[0, 0] == 40.1
+
+
+def test_declared_depth_bounds_are_read(tmp_path: Path) -> None:
+    path = scene(tmp_path)
+    with (path / "extri.yml").open("a") as file:
+        file.write("n_11: 3.5\nf_11: 9\n")
+    cameras = open_recording(path).cameras
+    assert cameras["11"].near_far == (3.5, 9.0)
+    assert cameras["00"].near_far is None
+
+
+def test_hulls_and_backgrounds_are_named_and_not_used(tmp_path: Path) -> None:
+    path = scene(tmp_path)
+    (path / "vhull").mkdir()
+    (path / "background.ply").touch()
+    assert "not used: vhull, background.ply" in open_recording(path).notes
+
+
+def test_a_camera_asked_for_must_have_everything(tmp_path: Path) -> None:
+    path = scene(tmp_path, folders=("00", "11", "02"))
+    assert list(open_recording(path, cameras=["11"], frames=[1, 2]).cameras) == ["11"]
+    refused(path, r"camera 02 of .* is missing in extri\.yml: choose among 00, 11", cameras=["02"])
+    refused(path, "unknown camera '12'", cameras=["12"])
+
+
+def test_files_that_cannot_be_are_refused(tmp_path: Path) -> None:
+    path = scene(tmp_path / "a", folders=())
+    refused(path, "no camera of .* has intrinsics in intri.yml, a pose in extri.yml and a folder")
+    path = scene(tmp_path / "b")
+    whole = (path / "extri.yml").read_text()
+    (path / "extri.yml").write_text(whole.replace("T_11: !!opencv-matrix", "T_11: hello\nother: !!opencv-matrix"))
+    refused(path, "T_11 in .* is no matrix")
+    (path / "extri.yml").write_text(whole.replace("rows: 3\n  cols: 1", "rows: 1\n  cols: 3"))
+    assert list(open_recording(path).cameras) == ["00", "11"]  # a row serves as well as a column
+    (path / "extri.yml").unlink()
+    refused(path, r"extri\.yml \(there is no such file\)")

@@ -1,0 +1,289 @@
+"""The folder layout: what is read, what is refused and in which words."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+
+@pytest.fixture(scope="module")
+def original() -> Recording:
+    return synthetic_recording(cameras=2, held_out=1, frames=2, width=32, height=24)
+
+
+@pytest.fixture(scope="module")
+def saved(original: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_recording(original, tmp_path_factory.mktemp("recordings") / "scene")
+
+
+@pytest.fixture
+def folder(saved: Path, tmp_path: Path) -> Path:
+    """A copy of the saved recording that a test may spoil."""
+    return Path(shutil.copytree(saved, tmp_path / "scene"))
+
+
+def edit_calibration(folder: Path, camera: int | None, **changes: object) -> None:
+    path = folder / "cameras.json"
+    content = json.loads(path.read_text())
+    (content if camera is None else content["cameras"][camera]).update(changes)
+    path.write_text(json.dumps(content))
+
+
+def refused(folder: Path, pattern: str, **options: object) -> None:
+    with pytest.raises(D2Error, match=pattern) as caught:
+        open_recording(folder, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_saved_recording_reads_back_bitwise(original: Recording, saved: Path) -> None:
+    found = open_recording(saved)
+    assert (found.name, found.frames, found.fps) == ("scene", original.frames, original.fps)
+    assert found.mono_kind == "relative"
+    assert found.mono_emulated
+    assert any("emulated" in note for note in found.notes)
+    for name, camera in original.cameras.items():
+        again = found.cameras[name]
+        np.testing.assert_array_equal(again.K, camera.K)
+        np.testing.assert_array_equal(again.T_camera_world, camera.T_camera_world)
+        assert (again.width, again.height, again.near_far) == (camera.width, camera.height, camera.near_far)
+        for frame in original.frames:
+            np.testing.assert_array_equal(found.image(name, frame), original.image(name, frame))
+            np.testing.assert_array_equal(found.depth(name, frame), original.depth(name, frame))
+            np.testing.assert_array_equal(found.mono(name, frame), original.mono(name, frame))
+
+
+def test_saving_overwrites_nothing(original: Recording, saved: Path) -> None:
+    with pytest.raises(D2Error, match="not empty.*nothing was written"):
+        save_recording(original, saved)
+
+
+def test_opening_reads_headers_only(folder: Path) -> None:
+    for image in (folder / "images").rglob("*.png"):
+        image.write_bytes(image.read_bytes()[:40])
+    recording = open_recording(folder)
+    with pytest.raises(D2Error, match=r"00000\.png is not a readable PNG or JPEG"):
+        recording.image("train0", 0)
+
+
+def test_maps_are_optional(folder: Path) -> None:
+    shutil.rmtree(folder / "depth")
+    shutil.rmtree(folder / "mono")
+    recording = open_recording(folder)
+    assert recording.mono_kind is None
+    assert not recording.mono_emulated
+    assert recording.depth("train0", 0) is None
+    assert recording.mono("train0", 0) is None
+
+
+def test_maps_without_a_declaration_are_relative_inverse_depth(folder: Path) -> None:
+    (folder / "mono" / "mono.json").unlink()
+    recording = open_recording(folder)
+    assert recording.mono_kind == "relative"
+    assert not recording.mono_emulated
+
+
+def test_metric_maps_are_declared_in_mono_json(folder: Path) -> None:
+    (folder / "mono" / "mono.json").write_text('{"kind": "metric"}')
+    recording = open_recording(folder)
+    assert recording.mono_kind == "metric"
+    assert not recording.mono_emulated
+    (folder / "mono" / "mono.json").write_text('{"kind": "disparity"}')
+    refused(folder, r"mono\.json says kind 'disparity'.*expected 'relative' or 'metric'")
+
+
+@pytest.mark.parametrize("declared", [None, {"kind": "relative"}])
+@pytest.mark.parametrize("said", ["inverse depth, affine-invariant (emulated, see SOURCE.txt)", "Emulated"])
+def test_maps_that_cameras_json_calls_emulated_are_emulated(folder: Path, said: str, declared: dict | None) -> None:
+    (folder / "mono" / "mono.json").unlink()
+    if declared:
+        (folder / "mono" / "mono.json").write_text(json.dumps(declared))
+    edit_calibration(folder, None, mono=said)
+    recording = open_recording(folder)
+    assert recording.mono_emulated
+    assert "monocular maps are emulated, not predicted (cameras.json says so)" in recording.notes
+
+
+def test_what_source_txt_and_cameras_json_say_in_words_is_understood(folder: Path) -> None:
+    (folder / "mono" / "mono.json").unlink()
+    edit_calibration(folder, None, mono="predicted by a network, not emulated")
+    assert not open_recording(folder).mono_emulated
+    (folder / "SOURCE.txt").write_text("images/: rendered\nmono/<camera>: EMULATED, see the paper\n")
+    assert open_recording(folder).mono_emulated
+    (folder / "mono" / "mono.json").write_text('{"emulated": false}')  # a declaration is worth more than words
+    assert not open_recording(folder).mono_emulated
+    assert not any("emulated" in note for note in open_recording(folder).notes)
+
+
+def test_depth_that_is_not_finite_counts_as_unknown(folder: Path, original: Recording) -> None:
+    depth = original.depth("train0", 0).copy()
+    depth[0, :3] = np.nan, np.inf, -1
+    np.savez(folder / "depth" / "train0" / "00000.npz", depth=depth)
+    read = open_recording(folder).depth("train0", 0)
+    np.testing.assert_array_equal(read[0, :3], 0)
+    np.testing.assert_array_equal(read[1:], depth[1:])
+
+
+def test_monocular_maps_keep_their_holes(folder: Path) -> None:
+    np.save(folder / "mono" / "train0" / "00000.npy", np.full((5, 7), np.nan, np.float16))
+    mono = open_recording(folder).mono("train0", 0)
+    assert mono.shape == (5, 7)
+    assert mono.dtype == np.float32
+    assert np.isnan(mono).all()
+
+
+def test_frames_that_not_every_camera_has_are_left_out_and_noted(folder: Path) -> None:
+    (folder / "images" / "train1" / "00001.png").unlink()
+    recording = open_recording(folder)
+    assert recording.frames == (0,)
+    assert any("1 frames left out" in note for note in recording.notes)
+
+
+def test_chosen_cameras_and_frames_come_in_the_order_asked(folder: Path) -> None:
+    recording = open_recording(folder, cameras=["test0", "train1"], frames=[1])
+    assert list(recording.cameras) == ["test0", "train1"]
+    assert recording.frames == (1,)
+
+
+def test_a_chosen_camera_is_enough_where_others_are_broken(folder: Path) -> None:
+    edit_calibration(folder, 0, name="elsewhere")
+    assert list(open_recording(folder, cameras=["train1"]).cameras) == ["train1"]
+
+
+def test_cameras_without_counterpart_are_named_and_left_out_only_when_asked(folder: Path) -> None:
+    shutil.rmtree(folder / "images" / "test0")
+    refused(folder, r"camera test0 of .*cameras\.json has no folder")
+    (folder / "images" / "extra").mkdir()
+    refused(folder, r"camera extra is not in .*cameras\.json, which has train0, train1, test0")
+    recording = open_recording(folder, intersect=True)
+    assert list(recording.cameras) == ["train0", "train1"]
+    assert any("extra" in note and "test0" in note for note in recording.notes)
+
+
+def test_missing_things_are_refused_in_one_sentence(folder: Path, tmp_path: Path) -> None:
+    refused(tmp_path / "nowhere", "no such recording")
+    refused(tmp_path, "is no recording: expected cameras.json")
+    refused(folder, "unknown camera 'train7'.*did you mean 'train", cameras=["train7"])
+    refused(folder, "frame 9 is not in scene", frames=[0, 9])
+    refused(folder, "unknown layout 'folders'.*did you mean 'folder'", layout="folders")
+    refused(folder, "empty or repeated", cameras=["train0", "train0"])
+    shutil.rmtree(folder / "images")
+    refused(folder, "has cameras.json but no folder images")
+
+
+def test_images_without_calibration_are_refused(folder: Path) -> None:
+    (folder / "cameras.json").unlink()
+    refused(folder, "has images but no cameras.json")
+
+
+def test_a_camera_without_images_is_refused(folder: Path) -> None:
+    for image in (folder / "images").rglob("*.png"):
+        image.unlink()
+    refused(folder, "no frames in")
+
+
+def test_two_files_of_one_frame_are_refused(folder: Path) -> None:
+    images = folder / "images" / "train0"
+    shutil.copy(images / "00001.png", images / "1.png")
+    refused(folder, r"00001\.png and 1\.png .* are both frame 1")
+
+
+def test_a_file_without_a_number_is_refused(folder: Path) -> None:
+    shutil.copy(folder / "images" / "train0" / "00001.png", folder / "images" / "train0" / "cover.png")
+    refused(folder, "no frame number")
+
+
+def test_the_first_image_of_every_camera_is_held_against_its_calibration(folder: Path) -> None:
+    edit_calibration(folder, 1, width=64)
+    refused(folder, r"is 32x24 pixels but cameras\.json says 64x24 for camera train1")
+
+
+def test_images_of_two_sizes_are_refused_when_read(folder: Path) -> None:
+    small = synthetic_recording(cameras=2, frames=2, width=16, height=12)
+    shutil.rmtree(folder / "images" / "train0")
+    other = save_recording(small, folder.parent / "small")
+    shutil.copytree(other / "images" / "train0", folder / "images" / "train0")
+    shutil.copy(folder / "images" / "train1" / "00000.png", folder / "images" / "train0" / "00000.png")
+    recording = open_recording(folder)
+    with pytest.raises(D2Error, match="frame 1 of camera train0 is 16x12 pixels but its calibration says 32x24"):
+        recording.image("train0", 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fx": float("nan")}, "cameras.json is not JSON .*NaN, which is not finite"),
+        ({"t": [0, float("inf"), 0]}, "cameras.json is not JSON .*Infinity, which is not finite"),
+        ({"fy": -3.0}, "focal lengths"),
+        ({"R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "no rotation"),
+        ({"R": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "no rotation"),
+        ({"R": [[1, 0], [0, 1]]}, "cannot be understood"),
+        ({"width": 0}, "at least one pixel"),
+        ({"name": "train1"}, "camera train1 twice"),
+    ],
+)
+def test_calibrations_that_cannot_be_are_refused(folder: Path, changes: dict, message: str) -> None:
+    edit_calibration(folder, 0, **changes)
+    refused(folder, message)
+
+
+def test_broken_descriptions_are_refused(folder: Path) -> None:
+    edit_calibration(folder, None, bounds={"train0": [3.0, 1.0]})
+    refused(folder, "depth bounds 3 to 1")
+    edit_calibration(folder, None, bounds={}, fps=0)
+    refused(folder, "fps 0, expected frames per second above 0")
+    path = folder / "cameras.json"
+    content = json.loads(path.read_text())
+    del content["cameras"][0]["cx"]
+    path.write_text(json.dumps(content))
+    refused(folder, "camera train0 .* has no cx")
+    path.write_text('{"cameras": []}')
+    refused(folder, "no list 'cameras'")
+    path.write_text("{")
+    refused(folder, re.escape(str(path)) + " is not JSON")
+
+
+def test_broken_maps_are_refused_by_name(folder: Path) -> None:
+    archive = folder / "depth" / "train0" / "00000.npz"
+    archive.write_bytes(archive.read_bytes()[:-100])
+    np.save(folder / "mono" / "train0" / "00000.npy", np.zeros((2, 3, 4)))
+    recording = open_recording(folder)
+    with pytest.raises(D2Error, match=r"cannot read .*00000\.npz"):
+        recording.depth("train0", 0)
+    with pytest.raises(D2Error, match=r"has shape \(2, 3, 4\), expected \[height, width\]"):
+        recording.mono("train0", 0)
+
+
+def test_true_depth_of_another_size_is_refused(folder: Path) -> None:
+    np.savez(folder / "depth" / "train0" / "00000.npz", depth=np.ones((3, 4), np.float32))
+    with pytest.raises(D2Error, match="true depth of frame 0 of camera train0 is 4x3 pixels"):
+        open_recording(folder).depth("train0", 0)
+
+
+def test_studio_owns_up_to_emulated_monocular_maps(shared_data) -> None:
+    recording = open_recording(shared_data("studio"))
+    assert list(recording.cameras) == [f"{i:02d}" for i in range(8)]
+    assert (len(recording.frames), recording.fps, recording.mono_kind) == (20, 24.0, "relative")
+    assert recording.mono_emulated
+    assert recording.depth("03", 5) is not None
+    assert recording.depth("03", 6) is None
+    # Emulated inverse depth: near pixels have large values.
+    depth, mono = recording.depth("00", 0), recording.mono("00", 0)
+    assert np.corrcoef(1 / depth[depth > 0], mono[depth > 0])[0, 1] > 0.8
+
+
+def test_a_real_recording_of_four_cameras_opens(shared_data) -> None:
+    recording = open_recording(shared_data("pose2sim_single"))
+    assert (len(recording.cameras), len(recording.frames), recording.fps) == (4, 48, 30.0)
+    assert recording.image("cam04", 47).shape == (640, 362, 3)
+    assert recording.seconds(47) == pytest.approx(47 / 30)

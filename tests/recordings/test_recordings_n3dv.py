@@ -1,0 +1,260 @@
+"""The N3DV layout: rows of poses_bounds.npy, videos and extracted frames."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stand_in_recordings import smooth_recording, write_videos
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.images import write_png
+from d2_plugin.recordings.importing.plain import SKIP_LIMIT, VideoSource
+from d2_plugin.recordings.readers.n3dv import camera_from_row
+
+ROW = np.array(
+    [-.0287202, .9990870, -.0316285, .0323124, 2028, .9944864, .0253668, -.1017517, -1.3285572, 2704,
+     -.1008565, -.0343765, -.9943069, -.2155790, 1462.0671309, 8.5598926, 19.8132412]
+)  # fmt: skip
+"""The real row of camera cam00 of sear_steak."""
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A video of 20 frames."""
+    return write_videos(smooth_recording(("00",)), tmp_path_factory.mktemp("videos")) / "cam00.mp4"
+
+
+def test_a_real_row_becomes_the_opencv_camera_it_describes() -> None:
+    camera = camera_from_row(ROW, "cam00", (1352, 1014), "poses_bounds.npy")
+    rotation = [
+        [0.9990870, 0.0253668, -0.0343765],
+        [-0.0287202, 0.9944864, -0.1008565],
+        [0.0316285, 0.1017517, 0.9943069],
+    ]
+    np.testing.assert_allclose(camera.T_camera_world[:3, :3], rotation, atol=1e-6)
+    np.testing.assert_allclose(camera.T_camera_world[:3, 3], [-0.0059926, 1.3004175, 0.3485126], atol=1e-6)
+    np.testing.assert_allclose(camera.centre, [0.0323124, -1.3285572, -0.2155790], atol=1e-6)
+    assert camera.K[0, 0] == pytest.approx(731.0335654, abs=1e-6)
+    assert camera.K[1, 1] == camera.K[0, 0]
+    np.testing.assert_array_equal(camera.K[:2, 2], [676, 507])
+    assert camera.near_far == (8.5598926, 19.8132412)
+
+
+def test_the_size_in_the_row_is_taken_where_no_image_says_another() -> None:
+    camera = camera_from_row(ROW, "cam00", None, "poses_bounds.npy")
+    assert (camera.width, camera.height, camera.K[0, 0]) == (2704, 2028, 1462.0671309)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        (0, np.nan, "not finite"),
+        (4, 0.0, "below one pixel"),
+        (14, -5.0, "focal"),
+        (0, 1.0, "no rotation"),
+        (16, 1.0, "bounds"),
+    ],
+)
+def test_rows_that_cannot_be_are_refused(place: int, value: float, message: str) -> None:
+    row = ROW.copy()
+    row[place] = value
+    with pytest.raises(D2Error, match=f"cam00.*{message}"):
+        camera_from_row(row, "cam00", None, "poses_bounds.npy")
+
+
+def test_images_of_another_aspect_are_refused() -> None:
+    with pytest.raises(D2Error, match="scaled, not cropped"):
+        camera_from_row(ROW, "cam00", (1000, 1000), "poses_bounds.npy")
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "cam{:02d}/images/{:04d}.png",
+        "cam{:02d}/{:04d}.png",
+        "images/cam{:02d}/{:04d}.png",
+        "images/cam{:02d}_{:04d}.png",
+    ],
+)
+def test_extracted_frames_are_found_in_every_usual_place(tmp_path: Path, pattern: str) -> None:
+    rows = np.stack([ROW, ROW])
+    rows[1, 3] += 1
+    np.save(tmp_path / "poses_bounds.npy", rows)
+    for i, camera in enumerate((2, 13)):  # numbers may be missing: rows belong to the sorted names
+        for frame in range(2):
+            path = tmp_path / pattern.format(camera, frame)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_png(path, np.full((6, 8, 3), 100 * i + frame, np.uint8))
+    recording = open_recording(tmp_path)
+    assert list(recording.cameras) == ["cam02", "cam13"]
+    assert recording.frames == (0, 1)
+    assert recording.fps == 30
+    assert recording.cameras["cam13"].centre[0] == pytest.approx(ROW[3] + 1)
+    assert (recording.image("cam13", 1) == 101).all()
+    assert list(open_recording(tmp_path, cameras=["cam13"]).cameras) == ["cam13"]
+
+
+def test_rows_and_cameras_must_agree_in_number(tmp_path: Path) -> None:
+    np.save(tmp_path / "poses_bounds.npy", np.stack([ROW, ROW]))
+    with pytest.raises(D2Error, match=r"no cam\*\.mp4 and no extracted frames"):
+        open_recording(tmp_path)
+    (tmp_path / "cam00").mkdir()
+    write_png(tmp_path / "cam00" / "0000.png", np.zeros((6, 8, 3), np.uint8))
+    with pytest.raises(D2Error, match="2 rows for 1 cameras"):
+        open_recording(tmp_path)
+    np.save(tmp_path / "poses_bounds.npy", ROW)
+    with pytest.raises(D2Error, match=r"expected \[cameras, 17\]"):
+        open_recording(tmp_path)
+
+
+def n3dv_scene(folder: Path, rows: int, cameras: tuple[int, ...]) -> Path:
+    """Rows whose camera stands at x = row number, and one frame of each camera."""
+    table = np.stack([ROW] * rows)
+    table[:, 3] = np.arange(rows)
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "poses_bounds.npy", table)
+    for camera in cameras:
+        (folder / f"cam{camera:02d}").mkdir()
+        write_png(folder / f"cam{camera:02d}" / "0000.png", np.zeros((6, 8, 3), np.uint8))
+    return folder
+
+
+def test_a_camera_without_images_is_left_out_only_when_asked(tmp_path: Path) -> None:
+    path = n3dv_scene(tmp_path / "scene", 3, (0, 5, 9))
+    (path / "cam05" / "0000.png").unlink()
+    with pytest.raises(D2Error, match=r"camera cam05 of .*poses_bounds\.npy has no image"):
+        open_recording(path)
+    recording = open_recording(path, intersect=True)
+    assert {name: camera.centre[0] for name, camera in recording.cameras.items()} == pytest.approx(
+        {"cam00": 0, "cam09": 2},
+        abs=1e-6,  # each keeps its own row
+    )
+    assert "left out, images missing: cam05" in recording.notes
+    with pytest.raises(D2Error, match="camera cam05 .* has no image"):
+        open_recording(path, intersect=True, cameras=["cam05"])
+
+
+def test_of_the_whole_rig_a_few_cameras_are_enough_when_asked(tmp_path: Path) -> None:
+    path = n3dv_scene(tmp_path / "scene", 21, (0, 13, 20))
+    with pytest.raises(D2Error, match="21 rows for 3 cameras"):
+        open_recording(path)
+    recording = open_recording(path, intersect=True)
+    assert {name: camera.centre[0] for name, camera in recording.cameras.items()} == pytest.approx(
+        {"cam00": 0, "cam13": 13, "cam20": 20}, abs=1e-6
+    )
+    assert any("18 of 21 cameras are not there" in note for note in recording.notes)
+
+
+def test_rows_that_no_camera_can_be_told_for_are_refused_even_when_asked(tmp_path: Path) -> None:
+    path = n3dv_scene(tmp_path / "scene", 18, (0, 13, 17))  # a scene that lacks cameras: row 13 may be cam15's
+    with pytest.raises(D2Error, match="18 rows for 3 cameras"):
+        open_recording(path, intersect=True)
+
+
+def test_the_unsynchronised_camera_of_coffee_martini_is_named(tmp_path: Path) -> None:
+    scene = tmp_path / "coffee_martini"
+    for name in ("cam00", "cam13"):
+        (scene / name).mkdir(parents=True)
+        write_png(scene / name / "0000.png", np.zeros((6, 8, 3), np.uint8))
+    np.save(scene / "poses_bounds.npy", np.stack([ROW, ROW]))
+    assert any("cam13" in note for note in open_recording(scene).notes)
+
+
+def test_a_file_that_is_no_video_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture) -> None:
+    np.save(tmp_path / "poses_bounds.npy", ROW[None])
+    (tmp_path / "cam00.mp4").write_bytes(b"not a video")
+    with pytest.raises(D2Error, match=r"cam00\.mp4 is no video in an MP4"):
+        open_recording(tmp_path)
+
+
+def test_a_recording_has_the_same_cameras_in_both_layouts(tmp_path: Path) -> None:
+    path = write_videos(recorded := smooth_recording(("00", "05")), save_recording(recorded, tmp_path / "scene"))
+    folder = open_recording(path)
+    videos = open_recording(path, layout="n3dv")
+    assert list(videos.cameras) == [f"cam{name}" for name in folder.cameras]
+    assert (videos.frames, videos.fps) == (folder.frames, folder.fps)
+    for ours, theirs in zip(folder.cameras.values(), videos.cameras.values()):
+        np.testing.assert_allclose(theirs.K, ours.K, atol=1e-9)
+        np.testing.assert_allclose(theirs.T_camera_world, ours.T_camera_world, atol=1e-6)
+        assert theirs.near_far is not None
+    for frame in (0, 7, 19):  # the images differ by the video's compression only
+        difference = folder.image("05", frame).astype(float) - videos.image("cam05", frame)
+        assert np.abs(difference).mean() < 3
+        others = [
+            np.abs(folder.image("05", f).astype(float) - videos.image("cam05", frame)).mean() for f in folder.frames
+        ]
+        assert int(np.argmin(others)) == frame
+
+
+def test_videos_give_the_same_frame_in_any_order(video: Path) -> None:
+    in_order = VideoSource({"a": video})
+    expected = [in_order.image("a", frame) for frame in range(20)]
+    jumping = VideoSource({"a": video})
+    for frame in (7, 3, 19, 0, 12, 12, 5, 6, 17):
+        np.testing.assert_array_equal(jumping.image("a", frame), expected[frame])
+
+
+def test_reading_in_order_never_seeks(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = VideoSource({"a": video})
+    source.image("a", 0)
+
+    class NoSeek:
+        def __init__(self, video) -> None:
+            self.video = video
+
+        def set(self, *_: object) -> bool:
+            raise AssertionError("a seek decodes from the last key frame")
+
+        def __getattr__(self, name: str):
+            return getattr(self.video, name)
+
+    source._decoders["a"].video = NoSeek(source._decoders["a"].video)
+    assert SKIP_LIMIT >= 4
+    for frame in (1, 2, 6, 19):
+        source.image("a", frame)
+
+
+def test_a_video_source_travels_to_another_process(video: Path) -> None:
+    source = VideoSource({"a": video})
+    first = source.image("a", 4)
+    again = pickle.loads(pickle.dumps(source))
+    np.testing.assert_array_equal(again.image("a", 4), first)
+
+
+def test_a_frame_behind_the_end_of_a_video_is_refused(video: Path) -> None:
+    source = VideoSource({"a": video})
+    with pytest.raises(D2Error, match=r"frame 400 of .*cam00\.mp4 cannot be decoded"):
+        source.image("a", 400)
+    assert source.image("a", 2).shape == (64, 96, 3)
+
+
+def test_the_real_n3dv_rows_agree_with_its_folder_layout(shared_data) -> None:
+    path = shared_data("n3dv_sear_steak_t0")
+    rows, folder = open_recording(path, layout="n3dv"), open_recording(path)
+    assert list(rows.cameras) == list(folder.cameras) == ["cam00", "cam03", "cam05", "cam08", "cam14"]
+    for name, camera in rows.cameras.items():
+        np.testing.assert_allclose(camera.K, folder.cameras[name].K, atol=1e-9)
+        np.testing.assert_allclose(camera.T_camera_world, folder.cameras[name].T_camera_world, atol=1e-12)
+        assert camera.near_far == folder.cameras[name].near_far
+    golden = camera_from_row(ROW, "cam00", (1352, 1014), "datasets.md")
+    np.testing.assert_allclose(rows.cameras["cam00"].T_camera_world, golden.T_camera_world, atol=1e-6)
+
+
+def test_checked_points_of_sear_steak_project_where_every_camera_sees_them(shared_data, tmp_path: Path) -> None:
+    path = shared_data("n3dv_sear_steak_t0")
+    shutil.copytree(path, tmp_path / "copy", ignore=shutil.ignore_patterns("cameras.json"))
+    recording = open_recording(tmp_path / "copy")  # without cameras.json the rows are the calibration
+    points = np.load(path / "sift_points.npz")["xyz"].astype(float)
+    inside = np.zeros(len(points), int)
+    for camera in recording.cameras.values():
+        z = points @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
+        homogeneous = (points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]) @ camera.K.T
+        pixels = homogeneous[:, :2] / homogeneous[:, 2:]
+        inside += (z > 0) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    assert (inside >= 2).all()  # each was triangulated from at least two of the images

@@ -1,0 +1,185 @@
+"""Fewer cameras, frames and pixels; images in and out of files."""
+
+from __future__ import annotations
+
+import struct
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.recordings import open_recording, select_cameras, select_frames
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.images import image_size, read_image, shrink_depth, shrink_image, write_png
+from d2_plugin.recordings.selection import downscale
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+cv2 = pytest.importorskip("cv2")
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**31))
+def test_a_written_png_reads_back_bitwise(
+    tmp_path_factory: pytest.TempPathFactory, height: int, width: int, seed: int
+) -> None:
+    image = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    path = tmp_path_factory.getbasetemp() / "image.png"
+    write_png(path, image)
+    assert image_size(path) == (width, height)
+    np.testing.assert_array_equal(read_image(path), image)
+
+
+@pytest.mark.parametrize("options", [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 4]])
+def test_the_size_of_a_jpeg_is_read_from_its_header(tmp_path: Path, options: list[int]) -> None:
+    path = tmp_path / "image.jpg"
+    cv2.imwrite(str(path), np.zeros((21, 34, 3), np.uint8), options)
+    assert image_size(path) == (34, 21)
+    # A comment of 300 bytes and fill bytes in front of the frame header.
+    data = path.read_bytes()
+    path.write_bytes(data[:2] + b"\xff\xfe" + struct.pack(">H", 302) + bytes(300) + b"\xff\xff" + data[2:][1:])
+    assert image_size(path) == (34, 21)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\xff\xd8", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"GIF89a", b"\xff\xd8\xff\xe0\x00\x00"]
+)
+def test_damaged_headers_are_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "broken.png"
+    path.write_bytes(content)
+    with pytest.raises(D2Error, match="not a readable PNG or JPEG"):
+        image_size(path)
+
+
+def test_a_missing_image_is_told(tmp_path: Path) -> None:
+    with pytest.raises(D2Error, match=r"cannot read .*none\.png"):
+        read_image(tmp_path / "none.png")
+
+
+def test_a_image_rotated_by_its_metadata_keeps_the_stored_pixel_order(tmp_path: Path) -> None:
+    path = tmp_path / "rotated.jpg"
+    cv2.imwrite(str(path), np.zeros((20, 30, 3), np.uint8))
+    data = path.read_bytes()
+    tiff = (
+        b"II*\x00\x08\x00\x00\x00" + struct.pack("<HHHII", 1, 0x0112, 3, 1, 6) + bytes(4)
+    )  # orientation 6: by 90 degrees
+    body = b"Exif\x00\x00" + tiff
+    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + data[2:])
+    assert read_image(path).shape == (20, 30, 3)
+
+
+def test_only_reading_needs_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The demo must run on a machine with torch and numpy alone."""
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    recording = synthetic_recording(cameras=1, frames=1, width=16, height=16)
+    save_recording(recording, tmp_path / "scene")
+    opened = open_recording(tmp_path / "scene")
+    with pytest.raises(MissingExtra, match=r"reading images needs OpenCV.*d2-4dgs\[image\]"):
+        opened.image("train0", 0)
+
+
+def test_a_written_png_is_valid_chunk_by_chunk(tmp_path: Path) -> None:
+    path = tmp_path / "image.png"
+    write_png(path, np.zeros((3, 4, 3), np.uint8))
+    data, kinds = path.read_bytes()[8:], []
+    while data:
+        length, kind = struct.unpack(">I4s", data[:8])
+        assert struct.unpack(">I", data[8 + length : 12 + length])[0] == zlib.crc32(data[4 : 8 + length])
+        kinds.append(kind)
+        data = data[12 + length :]
+    assert kinds == [b"IHDR", b"IDAT", b"IEND"]
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 5), st.integers(5, 23), st.integers(5, 23), st.integers(0, 2**31))
+def test_downscaling_a_image_is_opencvs_area_mean(factor: int, height: int, width: int, seed: int) -> None:
+    image = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    small = shrink_image(image, factor)
+    whole = image[: height // factor * factor, : width // factor * factor]
+    area = cv2.resize(whole, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+    assert small.shape == area.shape
+    assert np.abs(small.astype(int) - area).max() <= 1  # rounding of halves
+
+
+def test_downscaled_depth_never_lies_between_two_surfaces() -> None:
+    depth = np.full((8, 8), 2.0, np.float32)
+    depth[:, 3:] = 6.0  # an edge inside a block of two columns
+    small = shrink_depth(depth, 2)
+    assert set(np.unique(small)) == {2.0, 6.0}
+
+
+def test_downscaled_depth_averages_one_surface_and_ignores_unknown_pixels() -> None:
+    depth = np.array([[2.0, 2.02, 0, 0], [2.02, 2.04, 0, 3.0]], np.float32)
+    np.testing.assert_allclose(shrink_depth(depth, 2), [[2.02, 3.0]], rtol=1e-6)
+    np.testing.assert_array_equal(shrink_depth(np.zeros((4, 4), np.float32), 2), 0)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 4), st.integers(0, 2**31))
+def test_downscaled_depth_stays_within_the_known_depths_of_its_block(factor: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth = (rng.uniform(0.5, 50, (12, 12)) * (rng.random((12, 12)) < 0.6)).astype(np.float32)
+    small = shrink_depth(depth, factor)
+    for row, column in np.ndindex(small.shape):
+        block = depth[row * factor : (row + 1) * factor, column * factor : (column + 1) * factor]
+        known = block[block > 0]
+        if known.size:
+            assert known.min() * 0.9999 <= small[row, column] <= known.max() * 1.0001
+        else:
+            assert small[row, column] == 0
+
+
+def test_a_downscaled_recording_projects_points_to_the_same_place() -> None:
+    recording = synthetic_recording(cameras=1, held_out=0, frames=1, width=50, height=38)
+    small = downscale(recording, 4)
+    camera, smaller = recording.cameras["train0"], small.cameras["train0"]
+    assert (smaller.width, smaller.height) == (12, 9)
+    point = np.array([0.2, -0.1, 3.0])
+    large, little = camera.K @ point, smaller.K @ point
+    np.testing.assert_allclose(little[:2] / little[2], large[:2] / large[2] / 4)  # corners at integers: no half pixel
+    assert small.image("train0", 0).shape == (9, 12, 3)
+    assert small.depth("train0", 0).shape == (9, 12)
+    assert small.mono("train0", 0).shape == (38, 50)
+    np.testing.assert_array_equal(small.image("train0", 0), shrink_image(recording.image("train0", 0), 4))
+    assert downscale(recording, 1) is recording
+
+
+def test_true_depth_and_downscaled_depth_agree(tmp_path: Path) -> None:
+    path = save_recording(synthetic_recording(cameras=1, frames=1, width=480, height=272), tmp_path / "scene")
+    full, half = open_recording(path), open_recording(path, downscale=2)
+    large, small = full.depth("train0", 0), half.depth("train0", 0)
+    corner = large[::2, ::2]
+    smooth = (np.abs(large[1::2, 1::2] - corner) < 0.005 * corner) & (corner > 0)
+    assert smooth.mean() > 0.5
+    assert np.abs(small / corner - 1)[smooth].max() < 0.02
+
+
+@pytest.mark.parametrize("factor", [0, -2, 1.5, True, "2"])
+def test_downscaling_wants_a_whole_number(factor: object) -> None:
+    with pytest.raises(D2Error, match="no whole number of at least 1"):
+        downscale(synthetic_recording(frames=1), factor)  # type: ignore[arg-type]
+
+
+def test_downscaling_leaves_at_least_one_pixel() -> None:
+    with pytest.raises(D2Error, match="leaves no pixel of camera train0"):
+        downscale(synthetic_recording(frames=1, width=16, height=16), 17)
+
+
+def test_selections_are_checked() -> None:
+    recording = synthetic_recording(frames=3, width=16, height=16)
+    assert list(select_cameras(recording, ["test1", "train0"]).cameras) == ["test1", "train0"]
+    assert select_frames(recording, [2, 0, 2]).frames == (0, 2)
+    with pytest.raises(D2Error, match="unknown camera 'test9'"):
+        select_cameras(recording, ["test9"])
+    with pytest.raises(D2Error, match="no camera chosen"):
+        select_cameras(recording, [])
+    with pytest.raises(D2Error, match="duplicate"):
+        select_cameras(recording, ["test0", "test0"])
+    with pytest.raises(D2Error, match="no frame chosen.*0 to 2"):
+        select_frames(recording, [])
+    with pytest.raises(D2Error, match="frame 3 is not in"):
+        select_frames(recording, range(4))

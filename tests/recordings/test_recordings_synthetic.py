@@ -1,0 +1,182 @@
+"""The synthetic room: exact geometry, real-looking difficulty, the same every time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.synthetic.raycast import render_depth
+from d2_plugin.recordings.synthetic.room import (
+    CACHE_BYTES,
+    MonocularEmulation,
+    emulated_monocular,
+    furnished_room,
+    split,
+    synthetic_recording,
+)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return synthetic_recording(frames=6, width=120, height=68)
+
+
+def world_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """World point [H * W, 3] of every pixel centre at its planar depth."""
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    pixels = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3)
+    in_camera = pixels @ np.linalg.inv(camera.K).T * depth.reshape(-1, 1)
+    return (in_camera - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
+
+
+def test_training_and_held_out_cameras_are_told_by_name(recording: Recording) -> None:
+    train, test = split(recording)
+    assert train == ["train0", "train1", "train2", "train3"]
+    assert test == ["test0", "test1", "test2"]
+    centres = {name: camera.centre for name, camera in recording.cameras.items()}
+    for i, name in enumerate(test):  # each stands between two neighbours
+        assert centres[f"train{i}"][0] < centres[name][0] < centres[f"train{i + 1}"][0]
+
+
+def test_depth_says_where_another_camera_sees_the_same_surface(recording: Recording) -> None:
+    """Points from one camera's depth, seen by another: never in front of the other's depth, mostly on it."""
+    first, second = recording.cameras["train1"], recording.cameras["train2"]
+    points = world_points(first, recording.depth("train1", 2))
+    in_second = points @ second.T_camera_world[:3, :3].T + second.T_camera_world[:3, 3]
+    pixels = in_second @ second.K.T
+    u, v = (pixels[:, :2] / pixels[:, 2:]).T
+    inside = (u >= 1) & (u < second.width - 1) & (v >= 1) & (v < second.height - 1)
+    seen = recording.depth("train2", 2)[v[inside].astype(int), u[inside].astype(int)]
+    ratio = in_second[inside, 2] / seen
+    assert np.mean(np.abs(ratio - 1) < 0.02) > 0.8
+    assert np.mean(ratio < 0.97) < 0.03  # only at silhouettes, by up to a pixel
+
+
+def test_colours_of_one_surface_point_agree_between_cameras(recording: Recording) -> None:
+    first, second = recording.cameras["train1"], recording.cameras["train2"]
+    points = world_points(first, recording.depth("train1", 2))
+    in_second = points @ second.T_camera_world[:3, :3].T + second.T_camera_world[:3, 3]
+    pixels = in_second @ second.K.T
+    u, v = (pixels[:, :2] / pixels[:, 2:]).T
+    inside = (u >= 0) & (u < second.width) & (v >= 0) & (v < second.height)
+    rows, columns = v[inside].astype(int), u[inside].astype(int)
+    same = np.abs(in_second[inside, 2] / recording.depth("train2", 2)[rows, columns] - 1) < 0.01
+    here = recording.image("train1", 2).reshape(-1, 3)[inside][same].astype(float)
+    there = recording.image("train2", 2)[rows, columns][same].astype(float)
+    matched = np.abs(here - there).mean()
+    shuffled = np.abs(here - there[np.random.default_rng(0).permutation(len(there))]).mean()
+    assert matched < 0.35 * shuffled
+
+
+def test_depth_matches_the_sphere_it_is_told_to_be() -> None:
+    """The ball's depth against its equation, per pixel of a camera that looks straight at it."""
+    scene = furnished_room(seed=0, moving=True)
+    ball = next(solid for solid in scene.solids if solid.radius is not None)
+    recording = synthetic_recording(cameras=1, held_out=0, frames=1, width=120, height=68)
+    camera = recording.cameras["train0"]
+    depth = render_depth(scene, camera, 0.5).astype(float)
+    distances = np.linalg.norm(world_points(camera, depth) - ball.motion(0.5)[1], axis=1)
+    assert distances.min() > ball.radius * (1 - 1e-6)
+    on_ball = distances < ball.radius * (1 + 1e-5)
+    assert on_ball.sum() > 50
+
+
+def test_every_pixel_has_a_depth_inside_the_declared_bounds(recording: Recording) -> None:
+    for name, camera in recording.cameras.items():
+        depth = recording.depth(name, 0)
+        assert camera.near_far[0] < depth.min()
+        assert depth.max() < camera.near_far[1]
+
+
+def test_things_move_unless_they_are_told_to_stand_still(recording: Recording) -> None:
+    moved = (np.abs(recording.image("train0", 0).astype(int) - recording.image("train0", 5)).max(-1) > 20).mean()
+    assert 0.01 < moved < 0.3
+    still = synthetic_recording(frames=3, width=64, height=36, moving=False)
+    np.testing.assert_array_equal(still.image("train0", 0), still.image("train0", 2))
+
+
+def test_images_are_textured_but_for_the_plaster(recording: Recording) -> None:
+    image, camera = recording.image("train1", 0).astype(float), recording.cameras["train1"]
+    gradient = np.abs(np.diff(image, axis=1)).mean(-1)
+    points = world_points(camera, recording.depth("train1", 0)).reshape(camera.height, camera.width, 3)
+    left_wall, bricks = points[:, :-1, 0] < -2.59, points[:, :-1, 1] > 1.99
+    assert left_wall.sum() > 100
+    assert np.median(gradient[left_wall]) < 0.3 * np.median(gradient[bricks])
+
+
+def test_the_same_arguments_give_the_same_recording(recording: Recording) -> None:
+    again = synthetic_recording(frames=6, width=120, height=68)
+    np.testing.assert_array_equal(again.image("test1", 3), recording.image("test1", 3))
+    np.testing.assert_array_equal(again.mono("test1", 3), recording.mono("test1", 3))
+    other = synthetic_recording(frames=6, width=120, height=68, seed=1)
+    assert (other.image("test1", 3) != recording.image("test1", 3)).mean() > 0.2
+
+
+def test_the_global_random_state_is_left_alone() -> None:
+    before = np.random.get_state()[1].copy()
+    synthetic_recording(frames=1, width=16, height=16).mono("train0", 0)
+    np.testing.assert_array_equal(np.random.get_state()[1], before)
+
+
+def test_monocular_maps_are_emulated_and_say_so(recording: Recording) -> None:
+    assert recording.mono_emulated
+    assert recording.mono_kind == "relative"
+    assert any("emulated" in note for note in recording.notes)
+
+
+def test_emulated_maps_are_affine_in_inverse_depth_up_to_a_local_bias(recording: Recording) -> None:
+    for frame in range(3):
+        inverse, mono = 1 / recording.depth("train2", frame).ravel(), recording.mono("train2", frame).ravel()
+        slope, offset = np.polyfit(mono, inverse, 1)
+        assert slope > 0
+        error = np.abs(slope * mono + offset - inverse) / inverse
+        assert 0.01 < np.median(error) < 0.15
+    scales = [
+        np.ptp(recording.mono("train2", frame)) / np.ptp(1 / recording.depth("train2", frame)) for frame in range(6)
+    ]
+    assert max(scales) > 1.3 * min(scales)  # every frame has its own scale
+
+
+def test_an_emulation_without_errors_is_exact_inverse_depth() -> None:
+    exact = MonocularEmulation(edge_blur=0, fixed_bias=0, frame_bias=0, scale=(3, 3), shift=(0.5, 0.5))
+    recording = synthetic_recording(cameras=1, held_out=0, frames=1, width=32, height=24, emulation=exact)
+    np.testing.assert_allclose(recording.mono("train0", 0), 3 / recording.depth("train0", 0) + 0.5, rtol=1e-5)
+
+
+def test_the_emulation_blurs_depth_edges() -> None:
+    depth = np.full((9, 30), 1.0, np.float32)
+    depth[:, 15:] = 4.0
+    mono = emulated_monocular(depth, np.zeros((9, 30)), 1.0, 0.0, 2.0)
+    assert 0.3 < mono[4, 14] < 0.95
+    assert mono[4, 0] == pytest.approx(1)
+    assert mono[4, -1] == pytest.approx(0.25)
+
+
+def test_a_returned_image_is_the_callers_own(recording: Recording) -> None:
+    before = recording.image("train0", 0).copy()
+    recording.image("train0", 0)[:] = 0
+    np.testing.assert_array_equal(recording.image("train0", 0), before)
+
+
+def test_the_cache_stays_small() -> None:
+    recording = synthetic_recording(cameras=1, held_out=0, frames=3, width=32, height=24)
+    source = recording.source
+    source._cache["image", "big", 0] = np.zeros(CACHE_BYTES, np.uint8)
+    for frame in recording.frames:
+        recording.image("train0", frame)
+    assert ("image", "big", 0) not in source._cache
+    assert sum(array.nbytes for array in source._cache.values()) <= CACHE_BYTES
+
+
+@pytest.mark.parametrize("wrong", [{"cameras": 0}, {"frames": 0}, {"width": 4}, {"fps": 0.0}, {"held_out": -1}])
+def test_impossible_recordings_are_refused(wrong: dict) -> None:
+    with pytest.raises(D2Error, match="is not possible"):
+        synthetic_recording(**wrong)
+
+
+def test_one_camera_and_one_frame_are_a_recording() -> None:
+    recording = synthetic_recording(cameras=1, frames=1, width=16, height=16)
+    assert list(recording.cameras) == ["train0"]
+    assert recording.image("train0", 0).shape == (16, 16, 3)

@@ -1,0 +1,164 @@
+"""The Technicolor layout: both releases, off-centre principal points, known damage, what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
+from d2_plugin.recordings.images import write_png
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+W, H = 32, 16
+HEADER = "f cu cv ar sk qw qx qy qz tx ty tz\n"
+INTRINSICS = "30.5 17.25 6.5 1.02 0"
+POSE = "0.6 0 0.8 0 0.1 -0.2 0.3"
+
+
+def rig(path: Path, cameras: int = 3, frames: tuple[int, ...] = (151, 152), **options: str) -> Path:
+    """A recording of several cameras whose images show 10 * camera + number of the frame in order."""
+    scene, tag = options.get("scene", "Birthday"), options.get("tag", "_undist")
+    line = options.get("line", f"{INTRINSICS} {POSE}")
+    path.mkdir(parents=True, exist_ok=True)
+    (path / "cameras_parameters.txt").write_text(HEADER + f"{line}\n" * cameras + "\n")
+    for camera in range(cameras):
+        for i, frame in enumerate(frames):
+            write_png(
+                path / f"{scene}{tag}_{frame:05d}_{camera:02d}.png", np.full((H, W, 3), 10 * camera + i, np.uint8)
+            )
+    return path
+
+
+def refused(path: Path, pattern: str, **options: object) -> None:
+    with pytest.raises(D2Error, match=pattern) as caught:
+        open_recording(path, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_last_two_numbers_of_a_name_are_frame_and_camera(tmp_path: Path) -> None:
+    recording = open_recording(rig(tmp_path / "Birthday"))
+    assert recording.layout == "technicolor"
+    assert list(recording.cameras) == ["00", "01", "02"]
+    assert (recording.frames, recording.fps) == ((151, 152), 30)
+    assert (recording.image("02", 152) == 21).all()
+
+
+def test_the_principal_point_is_not_the_centre_and_fy_is_scaled(tmp_path: Path) -> None:
+    recording = open_recording(rig(tmp_path / "Birthday"))
+    camera = recording.cameras["01"]
+    np.testing.assert_allclose(camera.K, [[30.5, 0, 17.25], [0, 1.02 * 30.5, 6.5], [0, 0, 1]], atol=1e-12)
+    # A quaternion (.6, 0, .8, 0) turns by 2 atan(.8 / .6) about y; the pose maps world to camera.
+    cosine, sine = 0.6**2 - 0.8**2, 2 * 0.6 * 0.8
+    rotation = [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]
+    np.testing.assert_allclose(camera.T_camera_world[:3, :3], rotation, atol=1e-12)
+    np.testing.assert_array_equal(camera.T_camera_world[:3, 3], [0.1, -0.2, 0.3])
+    assert camera.near_far == (1.75, 10.0)
+    half = open_recording(tmp_path / "Birthday", downscale=2).cameras["01"]
+    np.testing.assert_allclose(half.K[:2, 2], [8.625, 3.25])
+
+
+def test_images_of_a_camera_without_calibration_are_left_out_only_when_asked(tmp_path: Path) -> None:
+    path = rig(tmp_path / "Train", scene="Train")
+    shutil.copy(next(path.glob("*_00.png")), path / "Train_undist_00151_07.png")
+    with pytest.raises(D2Error, match=r"camera 07 has images but is not in .*cameras_parameters\.txt, which has 00"):
+        open_recording(path)
+    recording = open_recording(path, intersect=True)
+    assert "07" not in recording.cameras
+    assert "left out, calibration missing: 07" in recording.notes
+    assert list(open_recording(path, cameras=["01"]).cameras) == ["01"]
+
+
+def test_the_distorted_release_is_undistorted_on_load(tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    path = rig(tmp_path / "Train", scene="Train", tag="", line=f"{INTRINSICS} 0.4 0.05 {POSE}")
+    for file in path.glob("*.png"):
+        write_png(file, np.full((H, W, 3), 200, np.uint8))
+    recording = open_recording(path)
+    np.testing.assert_array_equal(recording.cameras["00"].T_camera_world[:3, 3], [0.1, -0.2, 0.3])
+    assert any("distortion of 00, 01, 02 is undone" in note for note in recording.notes)
+    shown = recording.image("00", 151)
+    assert (shown[6, 17] == 200).all()
+    assert (shown[0, 0] == 0).all()
+
+
+def test_images_that_are_undistorted_already_are_left_alone(tmp_path: Path) -> None:
+    recording = open_recording(rig(tmp_path / "Train", scene="Train", line=f"{INTRINSICS} 0.4 0.05 {POSE}"))
+    assert (recording.image("01", 151) == 10).all()
+    assert not any("undone" in note for note in recording.notes)
+
+
+def test_known_damaged_images_are_replaced_and_named(tmp_path: Path) -> None:
+    recording = open_recording(rig(tmp_path / "any_name", cameras=10, frames=(172, 173, 174)))
+    assert (recording.image("09", 173) == 90).all()  # frame 172's
+    assert (recording.image("08", 173) == 81).all()
+    assert any("frame 173 of camera 09 is known to be damaged: frame 172 stands in" in n for n in recording.notes)
+    alone = open_recording(rig(tmp_path / "without", cameras=10, frames=(173, 174)))
+    assert alone.frames == (174,)
+    assert any("damaged and left out" in note for note in alone.notes)
+    other = open_recording(rig(tmp_path / "other", cameras=10, frames=(172, 173), scene="Painter"))
+    assert not other.notes
+
+
+def test_a_recording_written_in_the_layout_reads_back(tmp_path: Path) -> None:
+    original = synthetic_recording(cameras=2, held_out=1, frames=2, width=W, height=H)
+    lines = []
+    for number, camera in enumerate(original.cameras.values()):
+        K, T = camera.K, camera.T_camera_world
+        numbers = [K[0, 0], K[0, 2], K[1, 2], K[1, 1] / K[0, 0], 0.0, *quaternion_of_rotation(T[:3, :3]), *T[:3, 3]]
+        lines.append(" ".join(f"{value:.17g}" for value in numbers))
+        for frame in original.frames:
+            write_png(tmp_path / f"scene_undist_{frame:05d}_{number:02d}.png", original.image(camera.name, frame))
+    (tmp_path / "cameras_parameters.txt").write_text(HEADER + "\n".join(lines))
+    found = open_recording(tmp_path)
+    for ours, theirs in zip(original.cameras.values(), found.cameras.values(), strict=True):
+        np.testing.assert_allclose(theirs.K, ours.K, atol=1e-12)
+        np.testing.assert_allclose(theirs.T_camera_world, ours.T_camera_world, atol=1e-12)
+        np.testing.assert_array_equal(found.image(theirs.name, 1), original.image(ours.name, 1))
+
+
+def test_fields_may_be_separated_by_several_spaces(tmp_path: Path) -> None:
+    recording = open_recording(rig(tmp_path / "a", line=f"  {INTRINSICS}   {POSE.replace(' ', '  ')} "))
+    assert recording.cameras["00"].K[0, 0] == 30.5
+
+
+def test_cameras_without_images_are_named_and_left_out_only_when_asked(tmp_path: Path) -> None:
+    path = rig(tmp_path / "a")
+    for file in path.glob("*_02.png"):
+        file.unlink()
+    refused(path, "camera 02 of .* has no image")
+    recording = open_recording(path, intersect=True)
+    assert list(recording.cameras) == ["00", "01"]
+    assert any("02" in note for note in recording.notes)
+    assert list(open_recording(path, cameras=["01"]).cameras) == ["01"]
+    refused(path, "unknown camera '1'", cameras=["1"])
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (f"{INTRINSICS} 0.1 {POSE}", "line 2 of .* has 13 numbers, expected 12 .* or 14"),
+        (f"{INTRINSICS} a b {POSE}", "cannot read"),
+        (f"{INTRINSICS} 0 0 0 0 0 0 0", "length zero"),
+        ("-3 1 1 1 0 1 0 0 0 0 0 0", "focal lengths"),
+    ],
+)
+def test_lines_that_cannot_be_are_refused(tmp_path: Path, line: str, message: str) -> None:
+    refused(rig(tmp_path / "a", line=line), message)
+
+
+def test_folders_that_cannot_be_are_refused(tmp_path: Path) -> None:
+    path = rig(tmp_path / "a", frames=())
+    refused(path, "no images in .*: expected names like Birthday_undist")
+    rig(path)
+    write_png(path / "Birthday_00151_00.png", np.zeros((H, W, 3), np.uint8))
+    refused(path, "are both frame 151 of camera 00")
+    (path / "Birthday_00151_00.png").unlink()
+    write_png(path / "Train_undist_00151_00.png", np.zeros((H, W, 3), np.uint8))
+    refused(path, "several scenes .birthday, train.")
+    (path / "cameras_parameters.txt").write_text(HEADER)
+    refused(path, "describes no camera")

@@ -1,0 +1,197 @@
+"""transforms.json: NeRF axes, times, intrinsics beside each image, splits, transparent images."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stand_in_recordings import five_cameras
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.export.export import export_recording
+from d2_plugin.recordings.images import read_image, write_png
+from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+W, H = 32, 24
+Frames = list[dict]
+
+
+def image(path: Path, value: int = 0) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(path, np.full((H, W, 3), value, np.uint8))
+
+
+def entry(name: str, x: float = 0.0, **more: object) -> dict:
+    """An image of a camera at (x, 0, 0) that looks along -z of the world, as Blender's do."""
+    matrix = np.eye(4)
+    matrix[0, 3] = x
+    return {"file_path": name, "transform_matrix": matrix.tolist(), **more}
+
+
+def write(path: Path, frames: Frames, file: str = "transforms.json", images: bool = True, **top: object) -> Path:
+    if images:
+        for i, frame in enumerate(frames):
+            name = frame["file_path"]
+            image(path / (name if name.endswith(".png") else f"{name}.png"), i)
+    (path / file).write_text(json.dumps({"camera_angle_x": 1.0, **top, "frames": frames}))
+    return path
+
+
+def two_by_two(**more: object) -> Frames:
+    return [
+        entry(f"images/cam{c:02d}_{f:04d}", x=c, time=f / 30, **more) for c in (0, 7) for f in (0, 1)
+    ]  # fmt: skip
+
+
+def refused(path: Path, pattern: str, **options: object) -> None:
+    with pytest.raises(D2Error, match=pattern) as caught:
+        open_recording(path, **options)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def original() -> Recording:
+    return synthetic_recording(cameras=2, held_out=1, frames=3, width=W, height=H)
+
+
+@pytest.mark.parametrize("held_out", [(), ("test0",)])
+def test_an_exported_recording_reads_back(original: Recording, tmp_path: Path, held_out: tuple[str, ...]) -> None:
+    found = open_recording(export_recording(original, "transforms", tmp_path / "scene", test_cameras=held_out))
+    assert found.layout == "transforms"
+    assert (set(found.cameras), found.frames, found.fps) == (set(original.cameras), original.frames, original.fps)
+    for name, camera in original.cameras.items():
+        np.testing.assert_allclose(found.cameras[name].K, camera.K, atol=1e-9)
+        np.testing.assert_allclose(found.cameras[name].T_camera_world, camera.T_camera_world, atol=1e-12)
+        for frame in original.frames:
+            np.testing.assert_array_equal(found.image(name, frame), original.image(name, frame))
+    assert any("transforms_test.json lists test0" in note for note in found.notes) == bool(held_out)
+
+
+def test_opengl_axes_become_opencv_axes(tmp_path: Path) -> None:
+    camera = open_recording(write(tmp_path, two_by_two())).cameras["cam07"]
+    np.testing.assert_array_equal(camera.T_camera_world[:3, :3], np.diag([1, -1, -1]))
+    np.testing.assert_array_equal(camera.centre, [7, 0, 0])
+    ahead = camera.T_camera_world @ [7, 0, -2, 1]  # in front of a Blender camera is towards -z
+    np.testing.assert_array_equal(ahead[:3], [0, 0, 2])
+
+
+def test_the_angle_of_view_is_the_focal_length(tmp_path: Path) -> None:
+    recording = open_recording(write(tmp_path, two_by_two()))
+    K = recording.cameras["cam00"].K
+    assert 2 * math.atan(W / 2 / K[0, 0]) == pytest.approx(1.0)
+    assert (K[0, 0], K[0, 2], K[1, 2]) == (K[1, 1], W / 2, H / 2)
+    assert (recording.frames, recording.fps) == ((0, 1), pytest.approx(30))
+
+
+def test_intrinsics_beside_a_image_win_and_scale_with_it(tmp_path: Path) -> None:
+    frames = two_by_two()
+    for frame in frames[:2]:
+        frame.update(fl_x=100.0, fl_y=110.0, cx=33.0, cy=20.0, w=2 * W, h=2 * H)
+    recording = open_recording(write(tmp_path, frames))
+    np.testing.assert_allclose(recording.cameras["cam00"].K, [[50, 0, 16.5], [0, 55, 10], [0, 0, 1]])
+    assert recording.cameras["cam07"].K[0, 0] == pytest.approx(W / 2 / math.tan(0.5))
+
+
+def test_distortion_beside_a_image_is_undone(tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    frames = two_by_two(fl_x=30.0, k1=0.3)
+    recording = open_recording(write(tmp_path, frames))
+    assert any("distortion of cam00, cam07 is undone" in note for note in recording.notes)
+    assert (recording.image("cam07", 1)[0, 0] == 0).all()
+    assert (recording.image("cam07", 1)[12, 16] == 3).all()
+    fisheye = two_by_two(fl_x=30.0, camera_model="OPENCV_FISHEYE")
+    assert any("undone" in note for note in open_recording(write(tmp_path, fisheye)).notes)
+    refused(write(tmp_path, two_by_two(fl_x=30.0, k4=0.1)), "6 distortion coefficients")
+
+
+def test_frames_are_counted_by_time_where_names_do_not_run_with_it(tmp_path: Path) -> None:
+    # Two splits, each numbered from 0: the same numbers mean other times.
+    write(tmp_path, [entry(f"train/a_{i}", time=t) for i, t in enumerate((0.0, 0.5))], "transforms_train.json")
+    write(tmp_path, [entry(f"test/b_{i}", x=1, time=t) for i, t in enumerate((0.5, 1.0))], "transforms_test.json")
+    recording = open_recording(tmp_path)
+    assert list(recording.cameras) == ["test", "train"]
+    assert recording.frames == (1,)  # time 0.5 is the only one that both cameras have
+    assert recording.fps == 2
+    assert (recording.image("train", 1) == 1).all()
+    assert (recording.image("test", 1) == 0).all()
+
+
+def test_folders_of_splits_are_no_cameras(tmp_path: Path) -> None:
+    names = ("train/cam01", "train/cam02", "test/cam00")
+    frames = [entry(f"{name}_{f:04d}", x=i, time=f / 30) for i, name in enumerate(names) for f in range(2)]
+    recording = open_recording(write(tmp_path, frames))
+    assert list(recording.cameras) == ["cam00", "cam01", "cam02"]
+    assert recording.frames == (0, 1)
+    assert recording.cameras["cam00"].centre[0] == 2
+
+
+def test_a_static_scene_is_one_instant_with_a_camera_per_image(tmp_path: Path) -> None:
+    recording = open_recording(write(tmp_path, [entry(f"./train/r_{i}", x=i) for i in range(3)]))
+    assert list(recording.cameras) == ["r_0", "r_1", "r_2"]
+    assert recording.frames == (0,)
+    assert (recording.image("r_2", 0) == 2).all()
+
+
+def test_a_camera_that_moves_over_time_is_refused(tmp_path: Path) -> None:
+    frames = [entry(f"./train/r_{i:03d}", x=i, time=i / 2) for i in range(3)]
+    refused(write(tmp_path, frames), "3 images .* at 3 times by cameras that move")
+
+
+def test_a_transparent_image_is_laid_over_black(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    rgba = np.zeros((2, 2, 4), np.uint8)
+    rgba[..., :3], rgba[..., 3] = (10, 100, 200), [[255, 128], [0, 51]]  # blue, green, red, opacity
+    cv2.imwrite(str(tmp_path / "a.png"), rgba)
+    expected = [[[200, 100, 10], [100, 50, 5]], [[0, 0, 0], [40, 20, 2]]]
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), expected)
+    cv2.imwrite(str(tmp_path / "b.png"), rgba.astype(np.uint16) * 257)
+    np.testing.assert_array_equal(read_image(tmp_path / "b.png"), expected)
+
+
+def test_missing_images_are_named_and_left_out_only_when_asked(tmp_path: Path) -> None:
+    write(tmp_path, two_by_two())
+    (tmp_path / "images" / "cam07_0001.png").unlink()
+    refused(tmp_path, r"cam07_0001\.png is listed in .*transforms\.json but is not there \(1 of 4")
+    recording = open_recording(tmp_path, intersect=True)
+    assert recording.frames == (0,)
+    assert any("1 listed images" in note for note in recording.notes)
+    refused(tmp_path, "unknown camera 'cam1'", cameras=["cam1"], intersect=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"transform_matrix": [[1, 0], [0, 1]]}, "cannot be understood"),
+        ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "not finite"),
+        ({"transform_matrix": (2 * np.eye(4)).tolist()}, "no rotation"),
+        ({"time": None}, "cannot be understood"),
+        ({"fl_x": "long"}, "fl_x of camera a .* must be a number, got 'long'"),
+        ({"fl_x": -3}, "focal lengths"),
+    ],
+)
+def test_entries_that_cannot_be_are_refused(tmp_path: Path, changes: dict, message: str) -> None:
+    refused(write(tmp_path, [entry("a_0", time=0.0) | changes]), message)
+
+
+def test_files_that_cannot_be_are_refused(tmp_path: Path) -> None:
+    write(tmp_path, [], frames_="none")
+    refused(tmp_path, "that lists images")
+    (tmp_path / "transforms.json").write_text('{"camera_angle_x": 1}')
+    refused(tmp_path, "has no list 'frames'")
+    refused(write(tmp_path, [{"transform_matrix": []}], images=False), "has no 'file_path'")
+    refused(write(tmp_path, [entry("a_0", time=0.0), entry("a_1")]), "some images .* have a time")
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [entry("a_0")]}))
+    refused(tmp_path, "neither fl_x nor camera_angle_x")
+
+
+def test_rows_rounded_to_seven_digits_survive_the_layout(tmp_path: Path) -> None:
+    real = open_recording(five_cameras(tmp_path / "source"), downscale=2)
+    found = open_recording(export_recording(real, "transforms", tmp_path / "scene", test_cameras=["cam00"]))
+    for name, camera in real.cameras.items():
+        np.testing.assert_allclose(found.cameras[name].K, camera.K, atol=1e-9)
+        np.testing.assert_allclose(found.cameras[name].T_camera_world, camera.T_camera_world, atol=1e-5)

@@ -1,0 +1,236 @@
+"""Rigs whose lenses are not known, or whose cameras share a board alone; features in better places; d2 import."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded import Filmed, Shooting, video
+from rigs import arc, cv2, filmed, seen_by, worst
+
+from d2_plugin.commands.cli import main
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import Recording, open_recording, select_cameras
+from d2_plugin.recordings.cameras.calibrating import Board, scaled_by_board, solve_rig
+from d2_plugin.recordings.cameras.calibrating.align import rig_width
+from d2_plugin.recordings.cameras.calibrating.bundle import Tracks
+from d2_plugin.recordings.cameras.calibrating.features import find_features, of_a_still_camera
+from d2_plugin.recordings.cameras.calibrating.sharpen import sharpened
+from d2_plugin.recordings.cameras.calibrating.solve import solve_features
+from d2_plugin.recordings.cameras.calibration import pinhole
+from d2_plugin.recordings.cameras.formats import read_calibration
+from d2_plugin.recordings.recording import Camera
+
+NEIGHBOURS = ("02", "03", "04", "05")
+
+
+def blind(cameras: dict[str, Camera]) -> dict[str, Camera]:
+    """The cameras with a focal length that is far off."""
+    return {
+        name: replace(camera, K=pinhole(300, 300, camera.width / 2, camera.height / 2))
+        for name, camera in cameras.items()
+    }
+
+
+class TestFocalLengths:
+    """Not known beforehand."""
+
+    @pytest.mark.parametrize("focal", ["shared", "each"])
+    def test_are_found_with_the_poses(self, focal: str) -> None:
+        truth = {
+            name: replace(camera, K=pinhole(600, 600, camera.width / 2, camera.height / 2))
+            for name, camera in arc().items()
+        }
+        rig = solve_features(seen_by(truth), blind(truth), tuple(truth), focal=focal)
+        for name, camera in rig.cameras.items():
+            assert camera.K[0, 0] == pytest.approx(600, rel=0.01)
+            assert abs(np.log(camera.K[0, 0] / 600)) < max(2 * rig.focals[name], 0.004)
+        assert len({camera.K[0, 0] for camera in rig.cameras.values()}) == (1 if focal == "shared" else 4)
+        assert worst(rig.cameras, truth)[0] < 0.3
+        assert "focal length 60" in rig.verdicts()["c0"] or "focal length 59" in rig.verdicts()["c0"]
+
+    def test_that_the_images_do_not_tell_are_refused(self) -> None:
+        truth = arc(3, 4.0)  # hardly any angle: focal length and depth change places
+        with pytest.raises(D2Error, match=r"two halves of the images disagree about|do not settle"):
+            solve_features(seen_by(truth, things=60), blind(truth), tuple(truth), focal="each")
+
+
+def held(rig: dict[str, Camera], square: float, moments: int) -> tuple[dict[str, list[np.ndarray]], Board]:
+    """Images of a board at some places, in front of grey."""
+    rng = np.random.default_rng(0)
+    found: dict[str, list[np.ndarray]] = {name: [] for name in rig}
+    for _ in range(moments):
+        turn = np.eye(4)
+        turn[:3, :3] = cv2.Rodrigues(rng.uniform(-0.5, 0.5, 3))[0]
+        turn[:3, 3] = rng.uniform(-0.35, 0.35, 3)
+        moved = {name: replace(camera, T_camera_world=camera.T_camera_world @ turn) for name, camera in rig.items()}
+        images, board = filmed(moved, square)
+        for name, taken in images.items():
+            found[name] += taken
+    return found, board
+
+
+class TestBoards:
+    """Corners are matches, however little else two cameras share."""
+
+    def test_a_board_alone_settles_cameras_forty_degrees_apart(self) -> None:
+        truth = arc(3, 40.0)
+        images, board = held(truth, 0.2, 6)
+        rig = solve_rig(images, truth, board=board)
+        degrees, share = worst(rig.cameras, truth)
+        assert degrees < 0.1
+        assert share < 0.003
+        scaled = scaled_by_board(rig, images, board)
+        assert rig_width(scaled.cameras) == pytest.approx(rig_width(truth), rel=0.005)
+
+    def test_half_of_a_charuco_board_is_enough_for_the_scale_and_half_of_a_plain_one_is_not(self) -> None:
+        truth = arc(3)
+        images, board = filmed(truth, 0.25)
+        half = {name: [taken[0].copy()] for name, taken in images.items()}
+        for taken in half.values():
+            taken[0][:, 320:] = 128
+        rig = self.solved(truth)
+        assert rig_width(scaled_by_board(rig, half, board).cameras) == pytest.approx(rig_width(truth), rel=0.01)
+        with pytest.raises(D2Error, match="saw 0 sides of the board's squares .* show the whole board"):
+            scaled_by_board(rig, half, replace(board, marker=None))
+
+    @staticmethod
+    def solved(truth: dict[str, Camera]):
+        return solve_features(seen_by(truth), truth, tuple(truth))
+
+    @pytest.mark.parametrize(
+        "text",
+        ["", "charuco", "charuco:7x5:0.04", "charuco:7x5:0.03:0.04", "charuco:2x5:0.04:0.03", "checkerboard:9x6:-1"]
+        + ["checkerboard:9:0.1", "checkerboard:9x6:0.1:0.05", "chess:9x6:0.1", "charuco:7x5:nan:0.03"],
+    )
+    def test_words_that_are_no_board(self, text: str) -> None:
+        with pytest.raises(D2Error, match="expected charuco:COLUMNSxROWS:SQUARE:MARKER"):
+            Board.parsed(text)
+
+    def test_words_that_are_one(self) -> None:
+        assert Board.parsed("charuco:7x5:0.04:0.03") == Board(7, 5, 0.04, 0.03)
+        assert Board.parsed("charuco:7x5:0.04:0.03:DICT_5X5_50") == Board(7, 5, 0.04, 0.03, "DICT_5X5_50")
+        assert Board.parsed("checkerboard:9x6:0.025") == Board(9, 6, 0.025)
+
+
+class TestPlaces:
+    """Of features."""
+
+    def test_features_are_moved_to_where_their_surroundings_are(self) -> None:
+        rng = np.random.default_rng(0)
+        noise = cv2.GaussianBlur(rng.uniform(0, 255, (240, 320)).astype(np.float32), (0, 0), 2.5)
+        grey = np.clip((noise - noise.mean()) * 8 + 128, 0, 255).astype(np.uint8)
+        warp = np.array([[1.05, 0.08, -9.3], [-0.05, 0.96, 6.7]])  # what a slanted surface does to an image
+        other = np.clip(0.8 * cv2.warpAffine(grey, warp, (320, 240), flags=cv2.INTER_CUBIC) + 10, 0, 255)
+        one, two = (find_features([np.repeat(p.astype(np.uint8)[..., None], 3, 2)]) for p in (grey, other))
+        inside = np.all((one.pixels > 40) & (one.pixels < (280, 200)), axis=1)
+        expected = (one.pixels - 0.5) @ warp[:, :2].T + warp[:, 2] + 0.5
+        rows = np.flatnonzero(inside)[:150]
+        two = replace(two, pixels=expected[rows] + rng.normal(0, 0.4, (len(rows), 2)), shapes=one.shapes[rows])
+        two = replace(two, moments=np.zeros(len(rows), int))
+        tracks = Tracks(("a", "b"), np.stack([rows, np.arange(len(rows))], axis=1))
+        camera = Camera("a", 320, 240, pinhole(300, 300, 160, 120), np.eye(4))
+        better, kept = sharpened({"a": one, "b": two}, tracks, {"a": camera, "b": camera})
+        assert len(kept.seen) > 0.9 * len(rows)
+        off = better["b"].pixels[kept.seen[:, 1]] - expected[kept.seen[:, 0]]
+        assert np.median(np.linalg.norm(off, axis=1)) < 0.06  # of half a pixel; OpenCV warps by 32nds of a pixel
+        assert np.array_equal(better["a"].pixels, one.pixels)
+
+    def test_what_stands_still_is_one_witness(self) -> None:
+        rng = np.random.default_rng(0)
+        wall = np.repeat(
+            cv2.GaussianBlur(rng.uniform(0, 255, (120, 160)).astype(np.float32), (0, 0), 2)[..., None], 3, 2
+        )
+        taken = []
+        for moment in range(5):
+            image = wall.copy()
+            image[40:60, 20 * moment : 20 * moment + 20] = rng.uniform(0, 255, (20, 20, 1))
+            taken.append(np.clip((image - 128) * 3 + 128, 0, 255).astype(np.uint8))
+        found = of_a_still_camera(taken)
+        assert np.mean(found.moments == 0) > 0.5
+        moving = found.pixels[found.moments > 0]
+        assert np.all((moving[:, 1] > 30) & (moving[:, 1] < 70))
+
+
+@pytest.fixture(scope="module")
+def large(shared_data: Callable[[str], Path]) -> Recording:
+    return open_recording(shared_data("plaza_large"))
+
+
+@pytest.fixture(scope="module")
+def near(large: Recording, tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+    pytest.importorskip("av")
+    chosen = select_cameras(large, NEIGHBOURS)
+    return video(chosen, tmp_path_factory.mktemp("near"), {name: Shooting() for name in NEIGHBOURS})
+
+
+@pytest.mark.slow
+def test_videos_become_a_recording_without_a_calibration(
+    near: Filmed, large: Recording, tmp_path: Path, capsys
+) -> None:
+    truth = {name: large.cameras[name] for name in NEIGHBOURS}
+    apart = float(np.linalg.norm(truth["02"].centre - truth["05"].centre))
+    words = ["import", str(near.videos), "--output", str(tmp_path / "c"), "--offsets", "none", "--exposure", "false"]
+    words += ["--scale", "0.25", "--distance", f"02,05,{apart}", "--intrinsics", str(near.calibration)]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "camera 03: 0." in said
+    assert f"scale: from the distance {apart:g} of 02 and 05" in said
+    found = {camera.name: camera.pinhole() for camera in read_calibration(tmp_path / "c" / "calibration.json")}
+    degrees, share = worst(found, truth)
+    assert degrees < 0.1
+    assert share < 0.005
+    assert rig_width(found) == pytest.approx(rig_width(truth), rel=0.005)
+    told = json.loads((tmp_path / "c" / "calibration.json").read_text())
+    assert {"verdict", "reprojection_error", "points", "doubt_degrees"} <= told["cameras"][0].keys()
+    assert "note  poses were found from the videos; the scale of the world is from the distance" in said
+    assert open_recording(tmp_path / "c").frames == (0, 1)
+    before = (tmp_path / "c" / "calibration.json").read_bytes()
+    assert main(words) == 0  # the same import is read, not solved again
+    assert "camera 03: 0." not in capsys.readouterr().out
+    assert (tmp_path / "c" / "calibration.json").read_bytes() == before
+
+
+def test_cameras_too_far_apart_are_refused_and_nothing_is_left(large: Recording, tmp_path: Path, capsys) -> None:
+    pytest.importorskip("av")
+    far = ("00", "03", "06")
+    take = video(select_cameras(large, far), tmp_path / "far", {name: Shooting() for name in far})
+    words = ["import", str(take.videos), "--output", str(tmp_path / "c"), "--offsets", "none"]
+    assert main([*words, "--intrinsics", str(take.calibration)]) == 2
+    said = capsys.readouterr().err
+    assert "where camera 0" in said
+    assert "add stills on the way between the cameras (at most 20 degrees apart)" in said
+    assert not (tmp_path / "c").exists()
+
+
+BAD_WORDS = [
+    (["--calibration", "CALIBRATION", "--focal", "700"], r"--calibration and --focal are both given"),
+    (["--unit", "mm"], r"--unit says what a calibration is in, and none is given"),
+    (["--focal", "wide"], r"--focal says 'wide', expected shared, each, a number of pixels"),
+    (["--focal", "02=700"], r"--focal says nothing of camera 03, 04, 05: add NAME=PIXELS"),
+    (["--focal", "09=700"], r"--focal names camera '09', have 02, 03, 04, 05"),
+    (["--focal", "700", "--intrinsics", "CALIBRATION"], r"--intrinsics and --focal both say how the lenses are"),
+    (["--distance", "02,05"], r"--distance says '02,05', expected CAMERA,CAMERA,METRES"),
+    (["--distance", "02,02,1"], r"--distance says '02,02,1', expected"),
+    (["--distance", "02,05,0"], r"--distance says '02,05,0', expected"),
+    (["--board", "a4"], r"--board says 'a4', expected charuco"),
+    (["--stills", "FOLDER"], r"--stills .* is no folder with images"),
+]
+
+
+@pytest.mark.parametrize(("words", "says"), BAD_WORDS)
+def test_words_that_say_nothing(near: Filmed, tmp_path: Path, capsys, words: list[str], says: str) -> None:
+    import re
+
+    (tmp_path / "empty").mkdir()
+    places = {"CALIBRATION": str(near.calibration), "FOLDER": str(tmp_path / "empty")}
+    given = [places.get(word, word) for word in words]
+    command = ["import", str(near.videos), "--output", str(tmp_path / "c"), "--offsets", "none"]
+    assert main([*command, *given]) == 2
+    said = capsys.readouterr().err
+    assert re.search(says, said), said
+    assert not (tmp_path / "c").exists()

@@ -1,0 +1,296 @@
+"""What people give by mistake: one sentence that says what to do, and nothing is written over."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from recorded import Filmed, Shooting, video
+from videos import write_video
+
+from d2_plugin.commands.cli import main
+from d2_plugin.recordings import Recording, open_recording, select_cameras
+from d2_plugin.recordings.selection import select_frames
+
+pytest.importorskip("av")
+pytest.importorskip("cv2")
+
+NAMES = ("02", "03", "04")
+
+
+@pytest.fixture(scope="module")
+def studio(shared_data: Callable[[str], Path]) -> Recording:
+    return select_cameras(open_recording(shared_data("studio")), NAMES)
+
+
+@pytest.fixture(scope="module")
+def filmed(studio: Recording, tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+    short = select_frames(studio, studio.frames[:10])
+    return video(short, tmp_path_factory.mktemp("good"), {name: Shooting() for name in NAMES}, sound=True)
+
+
+@pytest.fixture
+def given(filmed: Filmed, tmp_path: Path) -> Filmed:
+    """A copy that a test may spoil."""
+    shutil.copytree(filmed.folder, tmp_path / "given")
+    return Filmed(tmp_path / "given", tmp_path / "given" / "cameras.json")
+
+
+def change(given: Filmed, edit: Callable[[dict[str, Any]], None]) -> None:
+    """Spoil the calibration."""
+    table = json.loads(given.calibration.read_text())
+    edit({camera["name"]: camera for camera in table["cameras"]} | {"all": table})
+    given.calibration.write_text(json.dumps(table))
+
+
+def no_frames(given: Filmed) -> None:
+    write_video(given.videos / "03.mp4", [np.zeros((48, 64, 3), np.uint8)], [0.0])
+    path = given.videos / "03.mp4"
+    data = path.read_bytes()
+    place = data.index(b"stsz")
+    path.write_bytes(data[: place + 12] + b"\0\0\0\0" + data[place + 16 :])  # the table of samples holds none
+
+
+def damaged(given: Filmed) -> None:
+    path = given.videos / "03.mp4"
+    data = bytearray(path.read_bytes())
+    start = data.index(b"mdat") + 4
+    data[start : start + (len(data) - start) * 3 // 4] = bytes((len(data) - start) * 3 // 4)
+    path.write_bytes(data)
+
+
+def cut_off(given: Filmed) -> None:
+    path = given.videos / "03.mp4"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def only_sound(given: Filmed) -> None:
+    import av
+
+    with av.open(str(given.videos / "03.mp4"), "w") as container:
+        track = container.add_stream("aac", rate=48_000)
+        frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+        frame.sample_rate = 48_000
+        container.mux(track.encode(frame) + track.encode())
+
+
+def swap(given: Filmed) -> None:
+    one, other = given.videos / "02.mp4", given.videos / "04.mp4"
+    one.rename(given.videos / "x.mp4")
+    other.rename(one)
+    (given.videos / "x.mp4").rename(other)
+
+
+def millimetres(given: Filmed) -> None:
+    def edit(cameras: dict[str, Any]) -> None:
+        for name in NAMES:
+            cameras[name]["t"] = [1000 * value for value in cameras[name]["t"]]
+
+    change(given, edit)
+
+
+def mirrored(given: Filmed) -> None:
+    change(given, lambda c: c["03"].update(R=[[-x for x in c["03"]["R"][0]], *c["03"]["R"][1:]]))
+
+
+def turned_away(given: Filmed) -> None:
+    """A pose that is another camera's."""
+    change(given, lambda c: c["03"].update(R=(np.diag([-1, 1, -1]) @ c["03"]["R"]).tolist()))
+
+
+def wrong_focal(given: Filmed) -> None:
+    change(given, lambda c: [c[name].update(fx=3 * c[name]["fx"], fy=3 * c[name]["fy"]) for name in ("03",)])
+
+
+def left_handed(given: Filmed) -> None:
+    """All poses as a tool with left-handed axes writes them."""
+    flip = np.diag([1.0, 1.0, -1.0])
+    change(given, lambda c: [c[name].update(R=(np.array(c[name]["R"]) @ flip).tolist()) for name in NAMES])
+
+
+def of_another_rig(given: Filmed) -> None:
+    """A calibration of cameras with the same names and sizes, which stood wider apart."""
+
+    def edit(cameras: dict[str, Any]) -> None:
+        for angle, name in zip((-0.35, 0.0, 0.35), NAMES):
+            cosine, sine = np.cos(angle), np.sin(angle)
+            R = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+            cameras[name].update(R=R.tolist(), t=[0.1, 0.05, 4.0])
+
+    change(given, edit)
+
+
+def no_number(given: Filmed) -> None:
+    change(given, lambda c: c["03"].update(t=[float("nan"), 0, 0]))
+
+
+def other_aspect(given: Filmed) -> None:
+    change(given, lambda c: c["03"].update(width=2 * c["03"]["width"]))
+
+
+def one_place(given: Filmed) -> None:
+    change(given, lambda c: [c[name].update(R=np.eye(3).tolist(), t=[0, 0, 0]) for name in NAMES])
+
+
+def missing_camera(given: Filmed) -> None:
+    change(given, lambda c: c["all"]["cameras"].remove(c["03"]))
+
+
+def called_alike(given: Filmed) -> None:
+    (given.videos / "more").mkdir()
+    shutil.copy(given.videos / "03.mp4", given.videos / "03.mov")
+
+
+def nothing(given: Filmed) -> None:
+    """The words alone are wrong."""
+
+
+def no_videos(given: Filmed) -> None:
+    for path in given.videos.iterdir():
+        path.unlink()
+
+
+def text(given: Filmed) -> None:
+    (given.videos / "03.mp4").write_text("not a video\n" * 1000)
+
+
+def empty(given: Filmed) -> None:
+    (given.videos / "03.mp4").write_bytes(b"")
+
+
+def garbage(given: Filmed) -> None:
+    given.calibration.write_text("{]")
+
+
+def no_calibration(given: Filmed) -> None:
+    given.calibration.unlink()
+
+
+CASES: list[tuple[Callable[[Filmed], None], list[str], str]] = [
+    (no_frames, [], r"has no frame|no frame of video"),
+    (damaged, [], r"can(not)? be decoded.*(repair|replace) the"),
+    (cut_off, [], r"cannot read video .*03\.mp4.*replace the file or leave its camera out"),
+    (text, [], r"03\.mp4.*replace the file or leave its camera out"),
+    (empty, [], r"03\.mp4.*replace the file or leave its camera out"),
+    (only_sound, [], r"03\.mp4 holds audio and no image: give a video"),
+    (no_videos, [], r"holds no video: give videos, or a folder"),
+    (called_alike, [], r"are both called 03: name each video like its camera"),
+    (swap, [], r"cameras 02 and 04 are swapped: exchange"),
+    (turned_away, ["--offsets", "none"], r"03"),
+    (wrong_focal, [], r"does not fit the videos: .*03"),
+    (mirrored, [], r"camera 03 .*mirrored.*right-handed"),
+    (left_handed, [], r"camera 02 .*mirrored.*right-handed"),
+    (of_another_rig, [], r"does not fit the videos: "),
+    (no_number, [], r"(NaN|not finite)"),
+    (other_aspect, [], r"another aspect"),
+    (millimetres, [], r"up to \d+ apart, which is no metres: say what it is with --unit mm"),
+    (one_place, [], r"puts all cameras at one place: give a calibration with their poses|does not fit"),
+    (missing_camera, [], r"no camera for 03"),
+    (garbage, [], r"not JSON|no calibration that can be read"),
+    (no_calibration, [], r"no such calibration|there is no such file|is not there"),
+    (nothing, ["--offsets", "07=3"], r"--offsets names camera '07', have 02, 03, 04"),
+    (nothing, ["--offsets", "03=soon"], r"--offsets says '03=soon', expected NAME=FRAMES"),
+    (nothing, ["--offsets", "03=900"], r"camera 0\d stopped .* seconds before camera 03 began"),
+    (nothing, ["--offsets", "timecode"], r"nothing in the timecode links"),
+    (nothing, ["--times", "40,50"], r"--times asks for 40 to 50 seconds"),
+    (nothing, ["--frames", "500"], r"--frames asks for 500"),
+    (nothing, ["--crop", "9000x10+0+0"], r"lies outside of camera 02, which has"),
+    (nothing, ["--crop", "all of it"], r"--crop says 'all of it', expected WIDTHxHEIGHT\+LEFT\+TOP"),
+    (nothing, ["--crop", "09=10x10+0+0"], r"--crop names camera '09', have 02, 03, 04"),
+    (nothing, ["--scale", "0.001"], r"--scale 0.001 leaves less than 8 pixels"),
+    (nothing, ["--scale", "0"], r"scale"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "words", "says"), CASES, ids=lambda one: getattr(one, "__name__", None))
+def test_one_sentence_and_nothing_written_over(
+    given: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable, words: list[str], says: str
+) -> None:
+    spoil(given)
+    before = {path: path.read_bytes() for path in given.folder.rglob("*") if path.is_file()}
+    folder = tmp_path / "recording"
+    command = ["import", str(given.videos), "--calibration", str(given.calibration), "--output", str(folder)]
+    code = main([*command, "--exposure", "false", *words])
+    said = capsys.readouterr().err
+    sentences = [line for line in said.splitlines() if line.startswith("d2: ")]
+    assert code == 2, said
+    assert len(sentences) == 1
+    assert "fault of d2-4dgs" not in said
+    import re
+
+    assert re.search(says, sentences[0]), sentences[0]
+    assert {path: path.read_bytes() for path in given.folder.rglob("*") if path.is_file()} == before
+    assert not (folder / "cameras.json").exists()
+
+
+def test_another_import_and_another_folder_are_not_written_over(
+    given: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "recording"
+    command = ["import", str(given.videos), "--calibration", str(given.calibration), "--output", str(folder)]
+    command += ["--exposure", "false", "--scale", "0.3", "--offsets", "none"]
+    assert main([*command, "--frames", "0:1"]) == 0
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert main([*command, "--frames", "0:2"]) == 2
+    assert "holds another import, made with other frames: give another --output" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("mine")
+    assert main([*command[:5], str(tmp_path / "mine"), "--frames", "0:1"][:6]) == 2
+    assert "is not empty and holds no import" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_one_video_of_another_event(studio: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The same room, another take: sound of its own, and things that move at other times."""
+    take = video(studio, tmp_path / "one", {name: Shooting() for name in NAMES}, sound=True, sounds={"04": 99})
+    words = ["import", str(take.videos), "--calibration", str(take.calibration), "--output", str(tmp_path / "c")]
+    assert main([*words, "--offsets", "sound"]) == 2
+    said = capsys.readouterr().err
+    assert "nothing in the sound links 04 with 02, 03: leave the camera out, give the offsets" in said
+
+
+def test_timecode_against_sound(studio: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shots = {name: Shooting(timecode="01:00:00:00") for name in NAMES}
+    take = video(studio, tmp_path / "one", {**shots, "04": Shooting(timecode="01:00:00:09")}, sound=True)
+    words = ["import", str(take.videos), "--calibration", str(take.calibration), "--output", str(tmp_path / "c")]
+    assert main(words) == 2
+    assert "sound and timecode contradict each other" in capsys.readouterr().err
+
+
+def test_a_folder_of_videos_is_no_recording_yet(
+    given: Filmed, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    words = ["train", str(given.videos), "--train-cameras", "all", "--output", str(tmp_path / "run")]
+    assert main(words) == 2
+    assert "holds videos and no calibration that goes with them: give it with --calibration" in capsys.readouterr().err
+
+
+def test_a_video_that_moved_since_it_was_imported(given: Filmed, tmp_path: Path, capsys) -> None:
+    folder = tmp_path / "lazy"
+    words = ["import", str(given.videos), "--calibration", str(given.calibration), "--output", str(folder)]
+    assert main([*words, "--exposure", "false", "--offsets", "none", "--images", "videos"]) == 0
+    (given.videos / "03.mp4").rename(tmp_path / "elsewhere.mp4")
+    assert main(["doctor", str(folder)]) == 2
+    assert "the video of camera 03 is not at" in capsys.readouterr().err
+    short = select_frames(replace(open_recording(folder, cameras=["02"]), frames=(0, 1)), (0, 1))
+    assert len(short.frames) == 2
+
+
+def test_a_calibration_folder_is_not_searched_without_end(
+    given: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("d2_plugin.recordings.importing.claimed.MOST_FILES", 5)
+    (tmp_path / "home").mkdir()
+    for number in range(6):
+        (tmp_path / "home" / f"{number}.txt").write_text("")
+    words = ["import", str(given.videos), "--calibration", str(tmp_path / "home"), "--output", str(tmp_path / "out")]
+    assert main(words) == 2
+    assert "home holds more than 5 files, which is no calibration" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,175 @@
+"""From videos to a recording: offsets, gains, turns and dropped frames are undone, and a stopped import goes on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded import Filmed, Shooting, video
+
+from d2_plugin.commands.cli import main
+from d2_plugin.durable import read_table
+from d2_plugin.recordings import Recording, open_recording, select_cameras
+from d2_plugin.recordings.cameras.formats import CalibratedCamera
+from d2_plugin.recordings.checks.lacking import lacking_text
+from d2_plugin.recordings.importing.claimed import KIND
+from d2_plugin.recordings.importing.importing import import_videos
+from d2_plugin.recordings.importing.settings import ImportSettings
+from d2_plugin.recordings.importing.source import Cut, valid_pixels
+from d2_plugin.recordings.selection import select_frames
+
+pytest.importorskip("av")
+pytest.importorskip("cv2")
+
+NAMES = ("01", "02", "03", "04")
+FPS = 24.0
+SHOOTINGS = {
+    "01": Shooting(),
+    "02": Shooting(-7.5 / FPS, gain=(1.12, 1.1, 1.08), turn=90, dropped=(4, 11)),
+    "03": Shooting(4 / FPS, gain=(0.87, 0.9, 0.93)),
+    "04": Shooting(12 / FPS, turn=180),
+}
+"""By sound: a camera that started first, turned and left out frames; one that is darker; one that started last."""
+
+
+@pytest.fixture(scope="module")
+def plaza(shared_data: Callable[[str], Path]) -> Recording:
+    return select_cameras(open_recording(shared_data("plaza")), NAMES)
+
+
+@pytest.fixture(scope="module")
+def filmed(plaza: Recording, tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+    return video(plaza, tmp_path_factory.mktemp("filmed"), SHOOTINGS, sound=True)
+
+
+@pytest.fixture(scope="module")
+def imported(filmed: Filmed) -> Path:
+    folder = filmed.folder / "recording"
+    import_videos(settings_of(filmed, folder))
+    return folder
+
+
+def settings_of(filmed: Filmed, folder: Path, **more: object) -> ImportSettings:
+    return ImportSettings(videos=(filmed.videos,), calibration=filmed.calibration, output=folder, **more)
+
+
+def test_offsets_by_sound_are_within_a_tenth_of_a_frame(imported: Path) -> None:
+    clocks = read_table(imported / "import" / "clocks.json", KIND)
+    for name, shot in SHOOTINGS.items():
+        assert clocks[name]["method"] == "sound"
+        assert abs(clocks[name]["seconds"] - shot.offset) * FPS < 0.1
+        assert 0 <= clocks[name]["error"] * FPS < 0.1
+
+
+def test_each_frame_is_the_right_one_of_each_camera(imported: Path, plaza: Recording) -> None:
+    recording = open_recording(imported)
+    first = 12  # the camera that started last
+    assert len(recording.frames) >= 10
+    for name in ("01", "03", "04"):
+        gain = np.array(SHOOTINGS[name].gain)
+        for frame in (recording.frames[0], recording.frames[-1]):
+            error = [
+                np.abs(
+                    recording.image(name, frame) / gain - plaza.image(name, plaza.frames[min(first + frame + off, 23)])
+                ).mean()
+                for off in (-1, 0, 1)
+            ]
+            assert int(np.argmin(error)) == 1 or first + frame + 1 > 23
+            assert error[1] < 3
+
+
+def test_gains_are_within_one_percent_of_what_was_applied(filmed: Filmed, imported: Path, plaza: Recording) -> None:
+    from d2_plugin.recordings.importing.exposure import measured_exposures
+
+    own = measured_exposures(plaza, NAMES)  # plaza's cameras differ by up to three percent themselves
+    found = open_recording(imported).exposures
+    applied = np.log([np.array(SHOOTINGS[name].gain) for name in NAMES])
+    measured = np.log([np.array(found[name].gain) / own[name].gain for name in NAMES])
+    assert np.abs(measured - (applied - applied.mean(0))).max() < 0.01
+
+
+def test_a_stopped_import_goes_on_and_a_finished_one_is_read(filmed: Filmed, imported: Path, monkeypatch) -> None:
+    clocks, images = imported / "import" / "clocks.json", sorted((imported / "images").rglob("*.png"))
+    before = {path: path.read_bytes() for path in (clocks, imported / "cameras.json", *images)}
+    times = {path: path.stat().st_mtime_ns for path in images}
+    (imported / "cameras.json").unlink()
+    images[3].unlink()
+    monkeypatch.setattr("d2_plugin.recordings.importing.clocks.read_sound", lambda path: pytest.fail("found again"))
+    import_videos(settings_of(filmed, imported))
+    assert {path: path.read_bytes() for path in before} == before
+    assert [path for path in images if path.stat().st_mtime_ns != times[path]] == [images[3]]
+
+
+def test_images_that_stay_in_the_videos_are_the_same(filmed: Filmed, imported: Path, tmp_path: Path) -> None:
+    given = tuple(f"{n}={c['seconds'] * FPS}" for n, c in read_table(imported / "import" / "clocks.json", KIND).items())
+    import_videos(settings_of(filmed, tmp_path / "lazy", images="videos", offsets=given, exposure=False))
+    lazy, written = open_recording(tmp_path / "lazy"), open_recording(imported)
+    assert lazy.layout == "videos"
+    assert not list((tmp_path / "lazy").rglob("*.png"))
+    assert lazy.frames == written.frames
+    for name in NAMES:
+        for frame in (written.frames[3], written.frames[0]):
+            assert (lazy.image(name, frame) == written.image(name, frame)).all()
+    some = select_frames(select_cameras(lazy, ["03"]), written.frames[:2])
+    assert some.seconds(written.frames[1], "03") == pytest.approx(written.seconds(written.frames[1], "03"), abs=1e-4)
+
+
+def test_crop_and_scale_move_the_camera_with_the_image(filmed: Filmed, imported: Path, tmp_path: Path) -> None:
+    options = {"crop": ("160x120+80+30",), "scale": 0.5, "frames": (2, 4), "exposure": False, "offsets": ("none",)}
+    import_videos(settings_of(filmed, tmp_path / "part", **options))
+    part = open_recording(tmp_path / "part")
+    whole = open_recording(imported).cameras["01"]
+    camera = part.cameras["01"]
+    assert (camera.width, camera.height) == (80, 60)
+    assert part.frames == (2, 4)
+    K = whole.K
+    expected = [K[0, 0] / 2, K[1, 1] / 2, (K[0, 2] - 80) / 2, (K[1, 2] - 30) / 2]
+    assert [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]] == pytest.approx(expected)
+
+
+def test_margins_of_undistorted_images_are_not_valid() -> None:
+    K = np.array([[90.0, 0, 50], [0, 90, 40], [0, 0, 1]])
+    camera = CalibratedCamera("a", 100, 80, K, "opencv", (0.3, 0, 0, 0, 0), np.eye(3), np.zeros(3))
+    valid = valid_pixels(camera, Cut(0, 0, 100, 80, 0.5))
+    assert valid.shape == (40, 50)
+    assert valid[20, 25]
+    assert not valid[0, 0]
+
+
+def test_motion_alone_is_within_half_a_frame(plaza: Recording, tmp_path: Path) -> None:
+    shootings = {name: replace(SHOOTINGS[name], offset=frames / FPS) for name, frames in zip(NAMES, (0, 3, -5, 6))}
+    videos = video(plaza, tmp_path, shootings)
+    found = import_videos(settings_of(videos, tmp_path / "recording", exposure=False, images="videos"))
+    for name, shot in shootings.items():
+        assert found.clocks[name].method == "motion"
+        assert abs(found.clocks[name].seconds - shot.offset) * FPS < 0.5
+
+
+def test_the_commands(filmed: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["import", str(filmed.videos), "--calibration", str(filmed.calibration), "--output", str(tmp_path / "c")]
+    assert main([*words, "--scale", "0.5", "--times", "0,0.2", "--offsets", "sound", "--exposure", "false"]) == 0
+    said = capsys.readouterr().out
+    assert "start in frames, by sound: 01 +0.00, 02 -7.5" in said
+    assert "4 cameras, 5 frames at 24 per second, 160x90 pixels" in said
+    assert main(["doctor", str(tmp_path / "c")]) == 0
+    said = capsys.readouterr().out
+    assert "lacks  mono" in said
+    assert "has  cameras     4, 19 to 20 degrees" in said
+
+
+def test_doctor_says_what_is_there_and_what_is_not(imported: Path, plaza: Recording) -> None:
+    said = lacking_text(open_recording(imported))
+    assert "clock       cameras exposed up to 0.0" in said
+    assert "exposure    measured; 0" in said
+    assert "relative maps, emulated" in lacking_text(plaza)
+
+
+def test_the_table_of_a_recording_reads_back(imported: Path) -> None:
+    told = json.loads((imported / "cameras.json").read_text())
+    recording = open_recording(imported)
+    assert set(told["exposures"]) == set(NAMES)
+    assert recording.exposures["02"].gain == tuple(told["exposures"]["02"]["gain"])

@@ -1,0 +1,166 @@
+"""When cameras started: timecode, sound, motion, each alone, and what happens where they contradict each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded import SOUND_RATE, graded, room_sound
+
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import Recording, open_recording
+from d2_plugin.recordings.importing.clocks import Evidence, _solved, common_clock, given_clock
+from d2_plugin.recordings.importing.files import Turn, VideoFile
+from d2_plugin.recordings.importing.motion import offsets_from_motion
+from d2_plugin.recordings.importing.profiles import Watched
+from d2_plugin.recordings.importing.sound import RATE, Sound, lag_between
+from d2_plugin.recordings.importing.timecode import shortest, timecode_seconds
+
+cv2 = pytest.importorskip("cv2")
+
+
+@pytest.mark.parametrize(
+    ("text", "rate", "seconds"),
+    [
+        ("00:00:10:12", 24.0, 10.5),
+        ("01:00:00:00", 25.0, 3600.0),
+        ("00:01:00;02", 30000 / 1001, 1800 * 1001 / 30000),  # numbers 0 and 1 of the minute do not exist
+        ("00:10:00;00", 30000 / 1001, 17982 * 1001 / 30000),
+        ("01:00:00;00", 60000 / 1001, 215784 * 1001 / 60000),
+    ],
+)
+def test_timecode_counts_frames_as_smpte_12m_does(text: str, rate: float, seconds: float) -> None:
+    assert timecode_seconds(text, rate) == pytest.approx(seconds, abs=1e-9)
+
+
+@pytest.mark.parametrize("text", ["", "noon", "00:61:00:00", "00:00:00:30", "1:2:3"])
+def test_what_is_no_timecode_counts_for_nothing(text: str) -> None:
+    assert timecode_seconds(text, 30.0) is None
+
+
+def test_midnight_is_no_day_apart() -> None:
+    assert shortest(86_399.5) == pytest.approx(-0.5)
+
+
+def heard(sound: np.ndarray, seed: int, loudness: float) -> Sound:
+    """What a microphone of its own makes of a sound."""
+    noise = np.random.default_rng(seed).normal(0, 0.005, len(sound))
+    whole = loudness * sound + noise
+    step = SOUND_RATE // RATE
+    return Sound(whole[: len(whole) // step * step].reshape(-1, step).mean(1).astype(np.float32), 0.0)
+
+
+@pytest.mark.parametrize("frames", [-7.5, -0.3, 0.0, 4.25, 12.0])
+def test_sound_finds_the_offset_within_a_tenth_of_a_frame(frames: float) -> None:
+    room, begin = room_sound(4.0), 0.5
+    offset = frames / 30
+    one = heard(room[round(begin * SOUND_RATE) :], 1, 0.8)
+    other = heard(room[round((begin + offset) * SOUND_RATE) :], 2, 0.2)
+    lag = lag_between(one, other)
+    assert lag is not None
+    assert abs(lag.seconds - offset) * 30 < 0.1
+    assert abs(lag.seconds - offset) < 5 * lag.error
+
+
+def test_sounds_of_other_events_say_nothing() -> None:
+    found = [lag_between(heard(room_sound(3.0, i), i, 1.0), heard(room_sound(3.0, 50 + i), 9, 1.0)) for i in range(6)]
+    assert found == [None] * 6
+
+
+def watched(recording: Recording, names: list[str], offsets: dict[str, float], rng: np.random.Generator) -> dict:
+    """What cameras that begin some frames later saw, with gains and frames that they dropped."""
+    found = {}
+    for name in names:
+        camera, first = recording.cameras[name], round(max(offsets[name], 0))
+        places = np.arange(first, len(recording.frames) + min(round(offsets[name]), 0))
+        places = places[rng.random(len(places)) > 0.08]
+        gain = tuple(rng.uniform(0.85, 1.15, 3))
+        images = [graded(recording.image(name, recording.frames[i]), gain) for i in places]
+        small = [
+            cv2.resize(cv2.cvtColor(p, cv2.COLOR_RGB2GRAY), (160, 90), interpolation=cv2.INTER_AREA) for p in images
+        ]
+        shrunk = np.diag([160 / camera.width, 90 / camera.height, 1.0]) @ camera.K
+        of_small = replace(camera, width=160, height=90, K=shrunk)
+        found[name] = Watched(of_small, np.stack(small), (places - offsets[name]) / recording.fps)
+    return found
+
+
+CASES = [
+    ("plaza", ["00", "02", "05", "07"], [0, 4, -5, 3]),
+    ("plaza", ["01", "02", "03", "04"], [0, -7, 5, 2]),
+    ("studio", ["00", "02", "05", "07"], [0, 5, -3, 2]),
+    ("studio", ["03", "04"], [0, -3]),
+]
+
+
+@pytest.mark.parametrize(("scene", "names", "frames"), CASES)
+def test_motion_finds_the_offset_within_half_a_frame(
+    shared_data: Callable[[str], Path], scene: str, names: list[str], frames: list[int]
+) -> None:
+    recording = open_recording(shared_data(scene))
+    offsets = dict(zip(names, map(float, frames), strict=True))
+    seen = offsets_from_motion(watched(recording, names, offsets, np.random.default_rng(0)), search=1.0)
+    for name in names:
+        assert not seen[name].doubt
+        assert abs(seen[name].seconds * recording.fps - offsets[name]) < 0.5
+
+
+def test_motion_of_another_event_is_doubted(shared_data: Callable[[str], Path]) -> None:
+    recording = open_recording(shared_data("plaza"))
+    names = ["01", "02", "03", "04"]
+    videos = watched(recording, names, dict.fromkeys(names, 0.0), np.random.default_rng(0))
+    rng = np.random.default_rng(1)
+    still = videos["03"].images[:1].repeat(len(videos["03"].images), 0)
+    walks = [np.roll(rng.integers(0, 255, (90, 12)), 3 * i, 0) for i in range(len(still))]
+    other = np.stack([np.concatenate([p[:, :140], w[:, :12], p[:, 152:]], 1) for p, w in zip(still, walks)])
+    videos["03"] = videos["03"]._replace(images=other.astype(np.uint8))
+    seen = offsets_from_motion(videos, search=1.0)
+    assert seen["03"].doubt
+
+
+def a_video(rate: int, timecode: str | None) -> VideoFile:
+    return VideoFile(Path("a.mp4"), (64, 48), Turn(0), np.arange(10), Fraction(1, rate), timecode)
+
+
+def never() -> dict:
+    pytest.fail("all videos would be decoded although they have timecode")
+
+
+def test_timecode_needs_no_look_at_images() -> None:
+    videos = {"a": a_video(25, "10:00:00:00"), "b": a_video(25, "09:59:59:20"), "c": a_video(25, "10:00:01:00")}
+    clocks = common_clock(videos, "auto", never)
+    assert [clocks[name].seconds for name in videos] == pytest.approx([0.0, -0.2, 1.0], abs=1e-9)
+    assert 0 < clocks["b"].error < 0.04
+    assert clocks["b"].method == "timecode"
+
+
+def evidence(**pairs: float) -> list[Evidence]:
+    return [Evidence(pair[0], pair[1], seconds, 0.002, "sound") for pair, seconds in pairs.items()]
+
+
+def test_pairs_are_weighed_and_agree() -> None:
+    clocks = _solved("abc", evidence(ab=0.100, bc=0.202, ac=0.300), 0.04)
+    assert clocks["c"].seconds - clocks["b"].seconds == pytest.approx(0.2013, abs=1e-3)
+    assert clocks["c"].error < 0.002
+
+
+def test_a_camera_of_another_event_is_named() -> None:
+    pairs = evidence(ab=0.1, ac=0.2, bc=0.1, ad=0.5, bd=2.0, cd=-1.0)
+    with pytest.raises(D2Error, match=r"without camera d all agree .*--offsets"):
+        _solved("abcd", pairs, 0.04)
+
+
+def test_a_loop_that_does_not_close_is_refused() -> None:
+    with pytest.raises(D2Error, match=r"the sound contradicts itself by .* frames between"):
+        _solved("abc", evidence(ab=0.1, bc=0.1, ac=0.5), 0.04)
+
+
+def test_given_offsets_are_in_frames_of_each_camera() -> None:
+    videos = {"a": a_video(25, None), "b": a_video(50, None)}
+    clocks = given_clock(videos, ("b=-7.5",))
+    assert clocks["a"].seconds == 0
+    assert clocks["b"].seconds == pytest.approx(-0.15)

@@ -1,0 +1,81 @@
+"""Small recordings that tests write themselves, in the form of the recordings that are not part of the project."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from d2_plugin.recordings import Recording
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.export.n3dv import llff_row
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+LLFF_DIGITS = 7
+"""Decimals of the rotations in poses_bounds.npy of the data set: orthonormal up to rounding."""
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """Soft colours and a bright spot that moves by three pixels per frame: a video loses little of them."""
+
+    width: int
+    height: int
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        """RGB uint8 [H, W, 3]; the colours tell cameras apart, the spot tells frames apart."""
+        y, x = np.mgrid[: self.height, : self.width] / self.height
+        number = sum(camera.encode()) % 7
+        soft = np.stack([80 + 50 * x, 90 + 40 * y, np.full_like(x, 60 + 10 * number)], axis=-1)
+        spot = np.exp(-((x * self.height - 12 - 3 * frame) ** 2 + (y * self.height - self.height / 2) ** 2) / 72)
+        return np.rint(soft + 90 * spot[..., None]).astype(np.uint8)
+
+    def depth(self, camera: str, frame: int) -> None:
+        """No true depth."""
+
+    def mono(self, camera: str, frame: int) -> None:
+        """No monocular maps."""
+
+
+def smooth_recording(names: tuple[str, ...], frames: int = 20, width: int = 96, height: int = 64) -> Recording:
+    """Cameras on an arc that declare near and far, named `names`, whose images are `Smooth`."""
+    rig = synthetic_recording(len(names), 0, frames, width, height, fps=24.0)
+    cameras = {
+        name: replace(camera, name=name, near_far=(1.5, 9.0))
+        for name, camera in zip(names, rig.cameras.values(), strict=True)
+    }
+    return replace(rig, cameras=cameras, source=Smooth(width, height), mono_kind=None, mono_emulated=False)
+
+
+def write_videos(recording: Recording, folder: Path) -> Path:
+    """The recording as N3DV has it: camXX.mp4 (cam before each name) and poses_bounds.npy."""
+    cv2 = pytest.importorskip("cv2")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, camera in recording.cameras.items():
+        code = cv2.VideoWriter_fourcc(*"mp4v")
+        video = cv2.VideoWriter(str(folder / f"cam{name}.mp4"), code, recording.fps, (camera.width, camera.height))
+        if not video.isOpened():
+            pytest.skip("this OpenCV writes no MPEG-4 video")
+        for frame in recording.frames:
+            video.write(recording.image(name, frame)[..., ::-1])
+        video.release()
+    return write_rows(recording, folder)
+
+
+def write_rows(recording: Recording, folder: Path, digits: int | None = None) -> Path:
+    """poses_bounds.npy of cameras that declare near and far, rounded to `digits` where given."""
+    rows = np.stack([llff_row(camera, camera.near_far or (1.0, 10.0)) for camera in recording.cameras.values()])
+    np.save(folder / "poses_bounds.npy", rows if digits is None else rows.round(digits))
+    return folder
+
+
+def five_cameras(folder: Path) -> Path:
+    """A folder recording of one instant with N3DV's names, its rotations rounded as the data set's are."""
+    recording = smooth_recording(("cam00", "cam03", "cam05", "cam08", "cam14"), frames=1, width=32, height=24)
+    rounded = {
+        name: replace(camera, T_camera_world=camera.T_camera_world.round(LLFF_DIGITS))
+        for name, camera in recording.cameras.items()
+    }
+    return write_rows(recording, save_recording(replace(recording, cameras=rounded), folder), LLFF_DIGITS)
