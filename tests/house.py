@@ -101,20 +101,6 @@ def unknown_rooms(house: House, rooms: Mapping[str, str], ground: str) -> list[s
     return sorted({room(name) for name in house.files} - set(rooms) - set(ground.split()))
 
 
-def crowded_folders(house: House, most: int) -> list[str]:
-    """Folders with more than `most` modules, `__init__` not counted."""
-    counts: dict[Path, int] = {}
-    for path in house.files.values():
-        counts[path.parent] = counts.get(path.parent, 0) + (path.name != "__init__.py")
-    return [f"{folder} has {count} modules, at most {most}" for folder, count in counts.items() if count > most]
-
-
-def long_modules(house: House, most: int) -> list[str]:
-    """Modules of more than `most` lines."""
-    counts = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in house.files.values()}
-    return [f"{path} has {count} lines, at most {most}" for path, count in counts.items() if count > most]
-
-
 def unpackaged(root: Path, setup: configparser.ConfigParser) -> list[str]:
     """What setup.cfg's `packages` and `package_data` say and the tree does not, and the other way round."""
     places = dict(re.split(r"\s*=\s*", line) for line in setup["options"]["package_dir"].split("\n") if line.strip())

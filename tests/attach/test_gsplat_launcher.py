@@ -155,7 +155,7 @@ def test_hooks_insert_remove_and_pull_on_depth() -> None:
 @pytest.mark.usefixtures("checkout")
 def test_the_export_that_the_parser_reads_renames_the_cameras(tmp_path: Path, monkeypatch) -> None:
     """As a run of the real script showed: its images are called cam05 where the prior says 01."""
-    from d2_plugin.priors.disk import exported
+    from d2_plugin.store import exported
 
     read: list[Path] = []
     monkeypatch.setattr(exported, "export_read", lambda prior, source: read.append(source))

@@ -12,7 +12,7 @@ from d2_plugin.rasterizer import native
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export import folder as folder_layout
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.study import demo
+from d2_plugin.viewing import demo
 from d2_plugin.viewing.export.page import read_page
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")

@@ -98,7 +98,7 @@ class TestValues:
             (["--no-images"], "no_images", True),
             (["--no-images", "false"], "no_images", False),
             (["--no_images"], "no_images", True),
-            (["--no-pic"], "no_images", True),
+            (["--no-ima"], "no_images", True),
             (["--steps", "1", "--steps", "2"], "steps", 2),
         ],
     )

@@ -106,7 +106,9 @@ class Gaussians(nn.Module):
         """Copies of small Gaussians at the end, then one prune of what is faint."""
         info = self._densification_info
         chosen = info[1] >= grad_threshold * info[0].clamp_min(1.0)
-        self._swap(lambda _, p: torch.cat([p, p[chosen]]), lambda _, m: torch.cat([m, torch.zeros_like(m[chosen])]))
+        self._swap(
+            lambda _, p: torch.cat([p, p[chosen]]), lambda _, m: torch.cat([m, torch.zeros_like(m[chosen])])
+        )
         self._densification_info = None
         self.prune(self._opacities.flatten() < math.log(min_opacity / (1 - min_opacity)))
 

@@ -110,5 +110,5 @@ def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, 
                     gaussians.reset_opacity()
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
-                gaussians.optimizer.zero_grad(set_to_none=True)
+                gaussians.optimizer.zero_grad(set_to_none = True)
     return SimpleNamespace(**locals())

@@ -134,7 +134,7 @@ def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, 
             loss = l1_loss(render_pkg["render"], viewpoint_cam.original_image)
             loss.backward()
             gaussians.cache_gradient()
-            gaussians.optimizer.zero_grad(set_to_none=True)  #
+            gaussians.optimizer.zero_grad(set_to_none = True)#
         gaussians.set_batch_gradient(opt.batch_size)
         with torch.no_grad():
             if iteration < opt.densify_until_iter:
@@ -149,5 +149,5 @@ def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, 
                 gaussians._omega.grad *= gaussians.omegamask
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
-                gaussians.optimizer.zero_grad(set_to_none=True)
+                gaussians.optimizer.zero_grad(set_to_none = True)
     return SimpleNamespace(**locals())

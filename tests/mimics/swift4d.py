@@ -166,7 +166,7 @@ def scene_reconstruction(gaussians, scene, stage, opt, checkpoint, stop, args=No
                     gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005, scene.cameras_extent, None)
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
-                gaussians.optimizer.zero_grad(set_to_none=True)
+                gaussians.optimizer.zero_grad(set_to_none = True)
                 gaussians.hash_optimizer.step()
-                gaussians.hash_optimizer.zero_grad(set_to_none=True)
+                gaussians.hash_optimizer.zero_grad(set_to_none = True)
     return SimpleNamespace(**locals())

@@ -64,7 +64,7 @@ def test_what_a_trainer_imports_keeps_to_python_3_9() -> None:
     pytest.importorskip("vermin", reason="needs vermin")
     files = trainer_files()
     names = {Path(file).relative_to(Path(files[0]).parent).as_posix() for file in files if "d2_plugin" in file}
-    assert {"plugin.py", "protocol.py", "settings.py", "priors/store.py", "attach/launch.py"} <= names
+    assert {"plugin.py", "protocol.py", "settings.py", "store/store.py", "attach/launch.py"} <= names
     judged = vermin(*files)
     assert judged.returncode == 0, judged.stdout + judged.stderr
 

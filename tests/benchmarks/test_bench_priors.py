@@ -103,7 +103,7 @@ def test_what_cannot_be_compared_is_refused_in_a_sentence(folder: Path, tmp_path
     shutil.rmtree(blind / "depth")
     with pytest.raises(D2Error, match=r"^blind has no true depth, .*: name recordings that have one$"):
         cases(PriorsBench((str(blind),)))
-    with pytest.raises(D2Error, match="den has no true depth at frame 1: choose from frames 0, 2 by --frames"):
+    with pytest.raises(D2Error, match="den has no true depth at frame 1: choose --frames from frames 0, 2"):
         cases(PriorsBench((str(folder),), frames=(1,)))
     with pytest.raises(D2Error, match="unknown camera 'train9'"):
         cases(PriorsBench((str(folder),), train_cameras=("train9",)))
