@@ -1,4 +1,5 @@
-"""`d2 bench priors`: declared against true error of the depth prior, on every recording that has true depth.
+"""`python -m benchmarks priors`: declared against true error of the depth prior, on every recording that has true
+depth.
 
 The prior is built with the default settings, as `d2 priors` does, and every finite sigma is held against the error that
 the pixel has. A normal error lies within sigma at 68 % and within 2 sigma at 95 % of the pixels; 60 to 80 % and at
@@ -24,8 +25,7 @@ from d2_plugin.priors.calibration import NORMAL_SHARE, Calibration, frames_with_
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs.command_line import command_line
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, make_row
+from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
 from d2_plugin.runs.start import triangulated_points
 from d2_plugin.settings import AtATime, Count, Positional, Range, Settings
 from d2_plugin.store.store import PriorStore
@@ -40,7 +40,7 @@ FAR = "far"
 
 @dataclass(frozen=True)
 class PriorsBench(Settings):
-    """Settings of `d2 bench priors`."""
+    """Settings of `python -m benchmarks priors`."""
 
     recordings: Annotated[tuple[str, ...], Positional()] = ()
     """Folders of recordings with true depth; the rendered rig of four cameras if none is named."""
@@ -82,7 +82,7 @@ def run(settings: PriorsBench) -> str:
 def _command(settings: PriorsBench) -> str:
     """As it is typed: recordings stand apart, the values of a flag are joined by commas."""
     joined = {name: ",".join(map(str, getattr(settings, name))) for name in ("rigs", "train_cameras", "frames")}
-    return command_line("bench priors", settings, False, **joined)
+    return command_line("bench priors", settings, **joined)
 
 
 def cases(settings: PriorsBench) -> list[Case]:

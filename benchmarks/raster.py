@@ -1,4 +1,4 @@
-"""`d2 bench raster`: time against error of the rasterizer, beside its peers, on scenes of known size."""
+"""`python -m benchmarks raster`: time against error of the rasterizer, beside its peers, on scenes of known size."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import torch
 
+from benchmarks.growth import power
 from benchmarks.raster_measure import (
     THRESHOLDS,
     Case,
@@ -23,17 +24,11 @@ from benchmarks.raster_measure import (
     timed,
     with_thresholds,
 )
-from d2_plugin.durable import make_folder
+from benchmarks.work_precision import means_table
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.checks.memory import BYTES_PER_PIXEL, check_bytes
-from d2_plugin.runs.command_line import command_line
-from d2_plugin.runs.growth import power
 from d2_plugin.runs.markup import Table, markdown
-from d2_plugin.runs.provenance import provenance
-from d2_plugin.runs.report.precision import raster_plot
-from d2_plugin.runs.report.svg import figure
-from d2_plugin.runs.report.work_precision import colors_of, growth
-from d2_plugin.runs.rows import Row, append_rows, make_row
+from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
 from d2_plugin.settings import AtATime, Count, NotNegative, Settings
 
 logger = logging.getLogger(__name__)
@@ -45,7 +40,7 @@ PASSES = ("forward", "forward+backward", "survey")
 
 @dataclass(frozen=True)
 class RasterBench(Settings):
-    """Settings of `d2 bench raster`."""
+    """Settings of `python -m benchmarks raster`."""
 
     scenes: tuple[str, ...] = ("synth:10000", "synth:50000", "synth:200000")
     """What is drawn: synth:N for N synthetic Gaussians, or garden."""
@@ -63,72 +58,29 @@ class RasterBench(Settings):
     """Most Gaussians for which the error is measured; with more of them the truth in float64 takes minutes."""
     no_memory: bool = False
     """Leave out peak memory, which takes a new process for every row on the CPU."""
-    output: Path = Path("bench-raster")
-    """Folder of the results."""
+    output: Path = Path("runs.jsonl")
+    """File that the rows are added to."""
 
 
 def run(settings: RasterBench) -> str:
-    """Measure; the table, and where rows, table and plot lie."""
+    """Measure and add the rows; the tables, and where the rows lie.
+
+    One row per implementation, scene and size, and one per setting of the thresholds where errors are measured.
+    """
     if settings.threads:
         torch.set_num_threads(settings.threads)
-    rows = bench_raster(
-        settings.output,
-        scenes=settings.scenes,
-        sizes=settings.sizes,
-        garden=settings.garden,
-        device=settings.device,
-        seconds=settings.seconds,
-        error_limit=settings.error_limit,
-        memory=not settings.no_memory,
-        command=command_line("bench raster", settings),
-    )
-    return f"{table(rows)}\nraster.jsonl (rows), raster.md (this table) and raster.svg (plot) are in {settings.output}"
-
-
-def bench_raster(
-    output: Path,
-    *,
-    scenes: Sequence[str] = RasterBench.scenes,
-    sizes: Sequence[str] = RasterBench.sizes,
-    garden: Path | None = None,
-    device: str = "cpu",
-    seconds: float = RasterBench.seconds,
-    error_limit: int = RasterBench.error_limit,
-    memory: bool = True,
-    command: str = "",
-) -> list[Row]:
-    """Measure and write `raster.jsonl`, `raster.md` and `raster.svg` into `output`.
-
-    Args:
-        output: folder, created where absent; its three files are replaced.
-        scenes: `synth:N` and `garden`.
-        sizes: images as WIDTHxHEIGHT in pixels.
-        garden: gsplat's test_garden.npz; with it `garden` is measured too.
-        device: what torch calls it.
-        seconds: about how long each pass is repeated.
-        error_limit: most Gaussians for which the error is measured; the truth in float64 takes minutes beyond.
-        memory: whether peak memory is measured; on the CPU that takes a new process for every row.
-        command: how this was started, for the captions.
-
-    Returns:
-        One row per implementation, scene and size; the file also has one per setting of the thresholds, where errors
-        are measured.
-    """
-    make_folder(output)
-    names = [*scenes, *(["garden"] if garden and "garden" not in scenes else [])]
-    cases = [Case(name, *parse_size(size), garden) for name in names for size in sizes]
-    rows = []
-    (output / "raster.jsonl").unlink(missing_ok=True)
+    names = [*settings.scenes, *(["garden"] if settings.garden and "garden" not in settings.scenes else [])]
+    cases = [Case(name, *parse_size(size), settings.garden) for name in names for size in settings.sizes]
+    begin_rows(settings.output)
+    command, rows = command_line("bench raster", settings), list[Row]()
     for case in cases:
-        measured = _measure(case, torch.device(device), seconds, error_limit, memory, command)
-        append_rows(output / "raster.jsonl", measured)
+        measured = _measure(case, settings, command)
         if measured[0]["errors"]:
-            found = _measure_thresholds(case, torch.device(device), seconds, command)
-            append_rows(output / "raster.jsonl", found)
+            measured += _measure_thresholds(case, torch.device(settings.device), settings.seconds, command)
+        append_rows(settings.output, measured)
         rows += measured
-    (output / "raster.md").write_text(table(rows))
-    (output / "raster.svg").write_text(plot(rows))
-    return rows
+    shown = [part for title, table in tables(rows) for part in (title, markdown(table))]
+    return "\n\n".join([CAPTION, *shown, f"rows are in {settings.output}"])
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -141,16 +93,14 @@ def parse_size(text: str) -> tuple[int, int]:
     return width, height
 
 
-def _measure(
-    case: Case, device: torch.device, seconds: float, error_limit: int, memory: bool, command: str
-) -> list[Row]:
-    scene = case.load()
+def _measure(case: Case, settings: RasterBench, command: str) -> list[Row]:
+    scene, device = case.load(), torch.device(settings.device)
     gaussians = len(scene.means)
-    truth = exact(scene) if gaussians <= error_limit else None
+    truth = exact(scene) if gaussians <= settings.error_limit else None
     rows = []
     for name, render in implementations(device, gaussians).items():
         passes = passes_of(render, scene, device)
-        times = timed(passes, device, seconds)
+        times = timed(passes, device, settings.seconds)
         errors = error_of(render, scene, device, truth) if truth else None
         rows.append(
             make_row(
@@ -165,7 +115,7 @@ def _measure(
                 gaussians=gaussians,
                 passes=times,
                 errors=errors,
-                peak_mb=peak_memory(case, name, device) if memory else None,
+                peak_mb=None if settings.no_memory else peak_memory(case, name, device),
             )
         )
         logger.info("%s, %s at %dx%d is measured", name, *case[:3])
@@ -191,22 +141,26 @@ def _measure_thresholds(case: Case, device: torch.device, seconds: float, comman
     ]
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Markdown: times, memory and errors per case, then how time grows with Gaussians and with pixels."""
+CAPTION = (
+    "Median wall time and half the interquartile range in ms; CPU ms is the CPU time of one forward+backward over "
+    "all threads; peak MB is what one forward+backward takes beyond its inputs. Error against float64: absolute "
+    "for color (0..1), relative L2 for gradients; pixels apart are the share where a threshold was decided "
+    "differently, gradients are without them. The thresholds (contributions below alpha are left out, a pixel is "
+    "finished at a transmittance T) are compared with an image that has next to none."
+)
+
+
+def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
+    """Times, memory and errors per case, how time grows with Gaussians and pixels, and what thresholds cost."""
+    plain, swept = ([row for row in rows if ("thresholds" in row) == wanted] for wanted in (False, True))
     header = ("implementation", "scene", "size", *(f"{kind} ms" for kind in PASSES), "CPU ms", "peak MB")
     header += ("color p99.9", "color max", "pixels apart", "worst gradient")
-    parts = [_caption(rows), markdown(Table(header, tuple(map(_cells, rows))))]
-    grown = [f"- {name}: {law}" for name, law in _growth(rows)]
-    return "\n\n".join([*parts, "Forward+backward grows as:", "\n".join(grown)]) + "\n"
-
-
-def _caption(rows: Sequence[Row]) -> str:
-    return (
-        "Median wall time and half the interquartile range in ms; CPU ms is the CPU time of one forward+backward over "
-        "all threads; peak MB is what one forward+backward takes beyond its inputs. Error against float64: absolute "
-        "for color (0..1), relative L2 for gradients; pixels apart are the share where a threshold was decided "
-        f"differently, gradients are without them. {provenance(rows[0])}"
-    )
+    made = [("Every scene and size", Table(header, tuple(map(_cells, plain))))]
+    if grown := tuple(_growth(plain)):
+        made.append(("Forward+backward grows as", Table(("what", "power"), grown)))
+    if swept:
+        made.append(("Thresholds, mean over scenes and sizes", means_table(swept, "color p99.9", "ms", 1e3)))
+    return made
 
 
 def _cells(row: Row) -> tuple[str, ...]:
@@ -250,10 +204,3 @@ def _grouped(rows: Sequence[Row], key: Callable[[Row], Key]) -> list[tuple[Key, 
 
 def _milliseconds(row: Row) -> float:
     return row["passes"]["forward+backward"]["median_ms"]
-
-
-def plot(rows: Sequence[Row]) -> str:
-    """SVG: error against time where errors were measured, and time against the number of Gaussians."""
-    lines, colors = _by_gaussians(rows), colors_of(rows)
-    panels = (raster_plot(rows), growth("Growth", "Gaussians", "forward+backward, ms", lines, len(colors)))
-    return figure(panels, "Rasterizer: error against time, and time against Gaussians", columns=2, size=(480, 340))

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from benchmarks.memory import in_fresh_process, peak_resident
 from benchmarks.raster_scenes import Scene, load_scene
 from d2_plugin.rasterizer import DepthPrior, RasterSettings, Render, Splats, rasterize, reference, survey
-from d2_plugin.runs.memory import in_fresh_process, peak_resident
 
 SETTINGS = RasterSettings()
 GRADIENTS = ("means", "covariances", "opacities", "colors")

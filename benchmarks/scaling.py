@@ -1,4 +1,4 @@
-"""`d2 bench scaling`: how the time of priors and the memory of training grow with the number of frames.
+"""`python -m benchmarks scaling`: how the time of priors and the memory of training grow with the number of frames.
 
 The recording is synthetic, written to disk and read back frame by frame as others are. Priors and training run
 in processes of their own. Training keeps decoded images up to a bound (320 MiB) and re-reads the others.
@@ -13,22 +13,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+from benchmarks.growth import power
+from benchmarks.memory import in_fresh_process
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import split, synthetic_recording
-from d2_plugin.runs.command_line import command_line
-from d2_plugin.runs.growth import exponent, power
-from d2_plugin.runs.memory import in_fresh_process
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, make_row
+from d2_plugin.runs.markup import Table, markdown
+from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.settings import Range, Settings
 
-PARTS, MEASURES = ("priors", "training"), ("seconds", "peak_mb")
-
 
 @dataclass(frozen=True)
 class ScalingBench(Settings):
-    """Settings of `d2 bench scaling`."""
+    """Settings of `python -m benchmarks scaling`."""
 
     frames: tuple[Annotated[int, Range(1)], ...] = (5, 20, 80)
     """Lengths of the recording, frames."""
@@ -46,7 +44,7 @@ def run(settings: ScalingBench) -> str:
     command = command_line("bench scaling", settings)
     rows = bench_scaling(settings.frames, settings.width, settings.iterations, command)
     append_rows(settings.output, rows)
-    return f"{summary(rows)}\nrows are in {settings.output}; `d2 report {settings.output}` shows them"
+    return f"{markdown(table(rows))}\nrows are in {settings.output}; `d2 report {settings.output}` shows them"
 
 
 def bench_scaling(
@@ -87,22 +85,12 @@ def _training(settings: RunSettings, folder: Path) -> dict[str, Any]:
     return {"seconds": run.seconds["train"]}
 
 
-def summary(rows: Sequence[Row]) -> str:
+def table(rows: Sequence[Row]) -> Table:
     """One line per part and cost: its value for each length, and the power of the number of frames it grows as."""
-    lines = []
-    for part in PARTS:
-        for measure in MEASURES:
-            places = _places(rows, part, measure)
-            law = power(places, "frames")
-            found = ", ".join(f"{frames:g}: {value:.1f}" for frames, value in places)
-            lines.append(f"{part:9} {measure:8} {found}" + (f"  grows as {law}" if law else ""))
-    return "\n".join(lines)
-
-
-def growth(rows: Sequence[Row], part: str, measure: str) -> float | None:
-    """Exponent p of `measure` ("seconds", "peak_mb") ~ frames^p; None with fewer than two lengths."""
-    return exponent(_places(rows, part, measure))
-
-
-def _places(rows: Sequence[Row], part: str, measure: str) -> list[tuple[float, float]]:
-    return [(row["frames"], row[measure]) for row in rows if row["method"] == part and row[measure]]
+    lengths, lines = sorted({row["frames"] for row in rows}), []
+    for part in ("priors", "training"):
+        for measure, title in (("seconds", "seconds"), ("peak_mb", "peak MB")):
+            places = [(row["frames"], row[measure]) for row in rows if row["method"] == part and row[measure]]
+            values = (f"{dict(places)[length]:.1f}" if length in dict(places) else "-" for length in lengths)
+            lines.append((part, title, *values, power(places, "frames") or "-"))
+    return Table(("part", "of", *(f"{length:g} frames" for length in lengths), "grows as"), tuple(lines))

@@ -1,9 +1,10 @@
-"""`d2 bench stereo`: error against run time of geometric depth, every matcher and setting behind the same filter."""
+"""`python -m benchmarks stereo`: error against run time of geometric depth, every matcher and setting behind the
+same filter."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,27 +13,20 @@ import torch
 
 from benchmarks.stereo_measure import Method, measure, methods
 from benchmarks.stereo_rigs import ARCS, MIDDLEBURY, load_rigs
-from d2_plugin.durable import make_folder
 from d2_plugin.errors import unknown_name
-from d2_plugin.runs.command_line import command_line
 from d2_plugin.runs.markup import Table, markdown
-from d2_plugin.runs.provenance import provenance
-from d2_plugin.runs.report.svg import figure
-from d2_plugin.runs.report.work_precision import work_precision
-from d2_plugin.runs.rows import Row, append_rows, make_row
+from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
 from d2_plugin.settings import AtATime, Range, Settings
 
 logger = logging.getLogger(__name__)
 
 RENDERED = tuple(f"synthetic{views}" for views in ARCS)
 FROM_DISK = ("studio", *MIDDLEBURY)
-DRAWN_SHARE = 1e-4
-"""Smallest share of wrong depths in the plot, whose axis is logarithmic."""
 
 
 @dataclass(frozen=True)
 class StereoBench(Settings):
-    """Settings of `d2 bench stereo`."""
+    """Settings of `python -m benchmarks stereo`."""
 
     rigs: tuple[str, ...] = ()
     """Rendered: synthetic2, synthetic3, synthetic4. From --data: studio, art, laundry, motorcycle, teddy. All that are
@@ -53,72 +47,26 @@ class StereoBench(Settings):
     """CPU threads."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where PatchMatch runs. Times are CPU seconds either way; rows of a GPU also have wall seconds."""
-    output: Path = Path("bench-stereo")
-    """Folder of the results."""
+    output: Path = Path("runs.jsonl")
+    """File that the rows are added to."""
 
 
 def run(settings: StereoBench) -> str:
-    """Measure; the table, and where rows, table and plot lie."""
+    """Measure and add the rows, one per method and rig; the tables, and where the rows lie."""
     _set_threads(settings.threads)
-    rows = bench_stereo(
-        settings.output,
-        rigs=settings.rigs or (*RENDERED, *(FROM_DISK if settings.data else ())),
-        makers=settings.makers,
-        defaults_only=settings.defaults_only,
-        data=settings.data,
-        width=settings.width,
-        widen=settings.widen,
-        repeats=settings.repeats,
-        device=settings.device,
-        command=command_line("bench stereo", settings),
-    )
-    return f"{table(rows)}\nstereo.jsonl (rows), stereo.md (this table) and stereo.svg (plot) are in {settings.output}"
-
-
-def bench_stereo(
-    output: Path,
-    *,
-    rigs: Sequence[str] = RENDERED,
-    makers: Sequence[str] = (),
-    defaults_only: bool = False,
-    data: Path | None = None,
-    width: int = 320,
-    widen: float = 1.0,
-    repeats: int = 1,
-    device: Literal["cpu", "cuda"] = "cpu",
-    command: str = "",
-) -> list[Row]:
-    """Measure and write `stereo.jsonl`, `stereo.md` and `stereo.svg` into `output`.
-
-    Args:
-        output: folder, created where absent; its three files are replaced.
-        rigs: names of `load_rigs`.
-        makers: `patchmatch`, `sweep`, `sgbm`, and `colmap` where it runs; all where empty.
-        defaults_only: leave out what is varied about a matcher.
-        data: folder with the recordings `studio` and `middlebury`.
-        width: of rendered images, pixels.
-        widen: how many times too wide the depth range is at both ends.
-        repeats: of every matching; times are medians.
-        device: where PatchMatch runs.
-        command: how this was started, for the captions.
-
-    Returns:
-        One row per method and rig.
-    """
-    chosen = [_on(method, device) for method in _chosen(makers, defaults_only)]
-    loaded = [load_rigs(name, data, width) for name in rigs]
-    make_folder(output)
+    begin_rows(settings.output)
+    chosen = [_on(method, settings.device) for method in _chosen(settings.makers, settings.defaults_only)]
+    names = settings.rigs or (*RENDERED, *(FROM_DISK if settings.data else ()))
+    about = {name: getattr(settings, name) for name in ("device", "widen", "repeats")}
+    about["command"] = command_line("bench stereo", settings)
     rows: list[Row] = []
-    (output / "stereo.jsonl").unlink(missing_ok=True)
-    for group in loaded:
+    for group in [load_rigs(name, settings.data, settings.width) for name in names]:
         for method in chosen:
-            row = measure(method, group, widen, repeats)
-            rows.append(_row(row, device=device, widen=widen, repeats=repeats, command=command))
-            append_rows(output / "stereo.jsonl", rows[-1:])
-            logger.info("%s (%s) on %s is measured", method.name, method.setting, row["rig"])
-    (output / "stereo.md").write_text(table(rows))
-    (output / "stereo.svg").write_text(plot(rows))
-    return rows
+            rows.append(_row(measure(method, group, settings.widen, settings.repeats), **about))
+            append_rows(settings.output, rows[-1:])
+            logger.info("%s (%s) on %s is measured", method.name, method.setting, rows[-1]["rig"])
+    shown = [part for title, table in tables(rows) for part in (title, markdown(table))]
+    return "\n\n".join([CAPTION, *shown, f"rows are in {settings.output}"])
 
 
 def _on(method: Method, device: Literal["cpu", "cuda"]) -> Method:
@@ -148,20 +96,24 @@ def _chosen(makers: Sequence[str], defaults_only: bool) -> list[Method]:
     ]
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Markdown: the mean over rigs per method and setting, then every rig."""
-    caption = (
-        "Completeness: share of the pixels that another view sees which have a depth after the filter. F: harmonic "
-        "mean of the share of depths within 1 % of the truth and the share of co-visible pixels with such a depth. "
-        f"Time is of matching alone, per view. {provenance(rows[0])}"
-    )
+CAPTION = (
+    "Completeness: share of the pixels that another view sees which have a depth after the filter. F: harmonic "
+    "mean of the share of depths within 1 % of the truth and the share of co-visible pixels with such a depth. "
+    "Time is of matching alone, per view. A rig on which a method failed counts with completeness and F of 0."
+)
+
+
+def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
+    """The mean over rigs per method and setting, then every rig."""
     header = ("matcher", "setting", "completeness", "F at 1 %", "median error", "off > 5 %", "CPU s", "CPU µs/pixel")
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["method"], row["setting"]), []).append(row)
     over_rigs = Table(header, tuple((*key, *_numbers(_mean(group))) for key, group in groups.items()))
-    each = Table(("rig", "views", "size", *header), tuple(map(_cells, rows)))
-    return "\n\n".join([caption, "Mean over rigs", markdown(over_rigs), "Every rig", markdown(each)]) + "\n"
+    return [
+        ("Mean over rigs", over_rigs),
+        ("Every rig", Table(("rig", "views", "size", *header), tuple(map(_cells, rows)))),
+    ]
 
 
 def _cells(row: Row) -> tuple[str, ...]:
@@ -187,28 +139,6 @@ def _numbers(row: Row) -> list[str]:
     forms = {"completeness": "{:.3f}", "f1": "{:.3f}", "median": "{:.5f}", "wrong": "{:.2%}", "cpu": "{:.2f}"}
     forms["microseconds_per_pixel"] = "{:.1f}"
     return ["-" if row[name] is None else form.format(row[name]) for name, form in forms.items()]
-
-
-def plot(rows: Sequence[Row]) -> str:
-    """SVG: 1 - F, 1 - completeness and the share of wrong depths against CPU time per view; lower left is better.
-
-    Means over the rigs are geometric; a share of 0 is drawn as 0.01 %.
-    """
-    errors = {
-        "1 - F at 1 %": lambda row: row["error"],
-        "1 - completeness": lambda row: max(1 - row["completeness"], DRAWN_SHARE),
-        "share off by more than 5 %": lambda row: None if row["wrong"] is None else max(row["wrong"], DRAWN_SHARE),
-    }
-    panels = [
-        work_precision([_with_error(row, error) for row in rows], title, title, "CPU seconds per view")
-        for title, error in errors.items()
-    ]
-    return figure(panels, "Stereo: errors against CPU time", columns=3, size=(380, 340))
-
-
-def _with_error(row: Row, error: Callable[[Row], float | None]) -> Row:
-    """The row with another of its figures as its error."""
-    return row if row["failed"] else {**row, "error": error(row)}
 
 
 def _set_threads(count: int) -> None:

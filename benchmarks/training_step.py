@@ -1,4 +1,4 @@
-"""`d2 bench training-step`: what one optimizer step costs beside the rasterizer's own forward and backward.
+"""`python -m benchmarks training-step`: what one optimizer step costs beside the rasterizer's own forward and backward.
 
 Everything is synthetic and made here: N Gaussians of the native backbone, all of them seen, four cameras, images and
 depth.
@@ -16,14 +16,13 @@ from typing import Annotated, Any, NamedTuple
 
 import torch
 
+from benchmarks.memory import in_fresh_process
 from benchmarks.raster import parse_size
 from benchmarks.raster_measure import timed
 from benchmarks.training_step_scene import RASTER, StepScene, look_at_all, works_of
 from d2_plugin.errors import D2Error
-from d2_plugin.runs.command_line import command_line
 from d2_plugin.runs.markup import Table, markdown
-from d2_plugin.runs.memory import in_fresh_process
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, make_row
+from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
 from d2_plugin.settings import AtATime, Range, Settings
 
 BARE, GUIDED = "step", "step with D2"
@@ -31,7 +30,7 @@ BARE, GUIDED = "step", "step with D2"
 
 @dataclass(frozen=True)
 class TrainingStepBench(Settings):
-    """Settings of `d2 bench training-step`."""
+    """Settings of `python -m benchmarks training-step`."""
 
     gaussians: tuple[Annotated[int, Range(1, 10_000_000)], ...] = (4000,)
     """How many Gaussians the model has."""
@@ -75,7 +74,8 @@ def run(settings: TrainingStepBench) -> str:
     command = command_line("bench training-step", settings)
     rows = [row for case in cases for row in measure(case, settings.seconds, not settings.no_memory, command)]
     append_rows(settings.output, rows)
-    return f"{table(rows)}\n\nrows are in {settings.output}"
+    told = f"{markdown(table(rows))}\n\nD2's share of a step: {share(rows):.1%}"
+    return f"{told}\n\nrows are in {settings.output}"
 
 
 def measure(case: StepCase, seconds: float, memory: bool = True, command: str = "") -> list[Row]:
@@ -103,7 +103,7 @@ def measure(case: StepCase, seconds: float, memory: bool = True, command: str = 
 
 def _steps(case: StepCase, name: str) -> float:
     """Peak memory, MB, of making the scene, looking at all its images, and three of the works."""
-    from d2_plugin.runs.memory import peak_resident
+    from benchmarks.memory import peak_resident
 
     works_of(StepCase(100, 64, 48, 1).scene())[name]()  # libraries and thread stacks are not the step's memory
 
@@ -117,8 +117,8 @@ def _steps(case: StepCase, name: str) -> float:
     return peak_resident(work).peak_mb
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Markdown: one line per work, and D2's share of a step."""
+def table(rows: Sequence[Row]) -> Table:
+    """One line per work."""
     header = ("case", "work", "CPU ms", "wall ms", "CPU over the rasterizer's", "peak MB")
     cells = tuple(
         (
@@ -130,7 +130,7 @@ def table(rows: Sequence[Row]) -> str:
         )
         for row in rows
     )
-    return f"{markdown(Table(header, cells))}\n\nD2's share of a step: {share(rows):.1%}"
+    return Table(header, cells)
 
 
 def share(rows: Sequence[Row]) -> float:

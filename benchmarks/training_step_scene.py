@@ -1,4 +1,5 @@
-"""What `d2 bench training-step` trains: synthetic Gaussians, images that cost nothing to make, and a depth prior."""
+"""What `python -m benchmarks training-step` trains: synthetic Gaussians, images that cost nothing to make, and a
+depth prior."""
 
 from __future__ import annotations
 

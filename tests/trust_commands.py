@@ -29,7 +29,7 @@ COUNT, FAIL_ONCE, FAIL_FROM, KILL_BEFORE_RENAME, KILL_AFTER_RENAME = range(5)
 PRELOADED = [
     *("torch", "torch._dynamo", "torch.onnx", "sympy", "cv2", "pycolmap"),
     *("d2_plugin.commands.cli", "d2_plugin.runs.run", "d2_plugin.runs.evaluation", "d2_plugin.priors.build"),
-    *("d2_plugin.backbones.yang4d", "d2_plugin.adapters.yang4d", "d2_plugin.runs.recording_export"),
+    *("d2_plugin.backbones.yang4d", "d2_plugin.adapters.yang4d", "d2_plugin.commands.export_recording"),
     *("d2_plugin.runs.report.report", "d2_plugin.viewing.export.export", "d2_plugin.recordings.importing.importing"),
     *("av", "trust_commands"),
 ]

@@ -1,4 +1,4 @@
-"""`d2 bench gpu`: everything that a GPU has to show, one step after another, in less than 25 minutes.
+"""`python -m benchmarks gpu`: everything that a GPU has to show, one step after another, in less than 25 minutes.
 
 Each step has a time limit of its own and leaves its output and a row as soon as it ends, so that a machine lent for
 half an hour loses nothing. A step that cannot run here says why in one sentence; what needs no device runs without one.
@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -23,9 +23,8 @@ import torch
 from benchmarks.gpu.static import ARCHITECTURES, static_analysis
 from d2_plugin.durable import make_folder
 from d2_plugin.errors import D2Error
-from d2_plugin.runs.command_line import command_line
 from d2_plugin.runs.markup import Table, markdown
-from d2_plugin.runs.rows import Row, append_rows, make_row
+from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.settings import Range, Settings
 
 logger = logging.getLogger(__name__)
@@ -36,7 +35,7 @@ LONGEST = 25 * 60
 
 @dataclass(frozen=True)
 class GpuBench(Settings):
-    """Settings of `d2 bench gpu`."""
+    """Settings of `python -m benchmarks gpu`."""
 
     steps: tuple[str, ...] = ()
     """Names of the steps to run; all if not given."""
@@ -91,6 +90,10 @@ def _d2(*words: str) -> list[str]:
     return [str(Path(sys.executable).with_name("d2")), *words]
 
 
+def _part(*words: str) -> list[str]:
+    return [sys.executable, "-m", "benchmarks", *words]
+
+
 def _sanitizer(tool: str) -> Step:
     # Small scenes: a sanitizer slows a kernel down a hundred times.
     chosen = ["-m", "cuda", "tests/rasterizer/test_rasterizer_cuda.py", "-k", "1x1 or 15x33 or empty or survey"]
@@ -102,7 +105,7 @@ def _sanitizer(tool: str) -> Step:
 def _raster(settings: GpuBench) -> list[str]:
     sizes = ("--sizes", "640x360", "1920x1080", "--scenes", "synth:50000", "synth:200000", "synth:1000000")
     kind = ("--device", "cuda", "--seconds", "2", "--error-limit", "60000")
-    return _d2("bench", "raster", *kind, *sizes, "--output", str(settings.output / "raster"))
+    return _part("raster", *kind, *sizes, "--output", str(settings.output / "raster.jsonl"))
 
 
 def _train(device: str) -> Callable[[GpuBench], list[str]]:
@@ -127,14 +130,14 @@ def _profile(settings: GpuBench) -> list[str]:
     kernels = "regex:d2_(render|backward|survey)$"
     options = ["--set", "basic", "-k", kernels, "-c", "6", "-f", "-o", str(settings.output / "profile")]
     work = ("--device", "cuda", "--scenes", "synth:200000", "--sizes", "1920x1080", "--seconds", "0.1", "--no-memory")
-    raster = _d2("bench", "raster", *work, "--error-limit", "1", "--output", str(settings.output / "profiled"))
+    raster = _part("raster", *work, "--error-limit", "1", "--output", str(settings.output / "profiled.jsonl"))
     return ["ncu", *options, *raster]
 
 
 def _stereo(device: str) -> Callable[[GpuBench], list[str]]:
     def words(settings: GpuBench) -> list[str]:
         kind = ("--makers", "patchmatch", "--defaults-only", "--rigs", "synthetic4", "--width", "640")
-        return _d2("bench", "stereo", *kind, "--device", device, "--output", str(settings.output / f"stereo-{device}"))
+        return _part("stereo", *kind, "--device", device, "--output", str(settings.output / f"stereo-{device}.jsonl"))
 
     return words
 
@@ -170,7 +173,8 @@ def run(settings: GpuBench) -> str:
         append_rows(settings.output / "gpu.jsonl", done)
         logger.info("%s: %s", name, done[0]["failed"] or "done")
         rows += done
-    return f"{table(rows)}\n\ngpu.jsonl (rows) and the output of each step are in {settings.output}"
+    shown = "\n\n".join(markdown(table) for _, table in tables(rows))
+    return f"{shown}\n\ngpu.jsonl (rows) and the output of each step are in {settings.output}"
 
 
 def _run_step(name: str, settings: GpuBench, command: str) -> list[Row]:
@@ -219,19 +223,21 @@ def _resolved(settings: GpuBench) -> GpuBench:
     return replace(settings, output=settings.output.resolve(), recording=recording)
 
 
-def table(rows: list[Row]) -> str:
-    """Markdown: what became of each step, and what the compiler says of each kernel."""
+def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
+    """What became of each step, and what the compiler says of each kernel."""
     steps = [row for row in rows if row["method"] == "step"]
-    lines = tuple((row["case"], f"{row['seconds']:.1f}", row["failed"] or "done") for row in steps)
-    parts = [markdown(Table(("step", "s", "outcome"), lines))]
-    kernels = [row for row in rows if row["method"] == "d2"]
+    lines = tuple((row["case"], row["device"], f"{row['seconds']:.1f}", row["failed"] or "done") for row in steps)
     facts = ("registers", "spill_bytes", "shared_bytes", "instructions", "fragment_instructions")
-    cells = tuple((row["case"], row["setting"], *(_plain(row[fact]) for fact in facts)) for row in kernels)
-    if cells:
-        head = ("static analysis", "for", "registers", "bytes spilled", "bytes shared", "instructions", "a fragment")
-        named = tuple((cell[0].removeprefix("static analysis of "), *cell[1:]) for cell in cells)
-        parts.append(markdown(Table(head, named)))
-    return "\n\n".join(parts)
+    cells = tuple(
+        (row["case"].rpartition(" ")[2], row["setting"], *(_plain(row[fact]) for fact in facts))
+        for row in rows
+        if row["method"] == "d2"
+    )
+    head = ("kernel", "for", "registers", "bytes spilled", "bytes shared", "instructions", "for a fragment")
+    return [
+        ("Steps", Table(("step", "device", "s", "result"), lines)),
+        *([("Static analysis", Table(head, cells))] if cells else []),
+    ]
 
 
 def _plain(value: int | None) -> str:

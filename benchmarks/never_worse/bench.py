@@ -1,4 +1,5 @@
-"""`d2 bench never-worse`: is D² with wrong monocular maps worse than the backbone alone, or than stereo alone?
+"""`python -m benchmarks never-worse`: is D² with wrong monocular maps worse than the backbone alone, or than stereo
+alone?
 
 Each recording is written with the cameras that train, and those that score where not all others do:
 PATH@00+02+05+07@01+03+04+06. All runs of one recording start from the same points and see the same images; the prior of
@@ -20,18 +21,15 @@ from benchmarks.never_worse.maps import SPOILED, spoiled_recording
 from benchmarks.never_worse.section import BACKBONE, STEREO, never_worse_text
 from d2_plugin.errors import D2Error
 from d2_plugin.progress import progress_bar
-from d2_plugin.runs.ablation.job import Job
 from d2_plugin.runs.ablation.presets import PRESETS, Preset
-from d2_plugin.runs.command_line import command_line
 from d2_plugin.runs.prior.build import build_priors_for
-from d2_plugin.runs.rows import Row, append_rows, read_rows
+from d2_plugin.runs.rows import Row, append_rows, command_line, read_rows
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings, check, prior_settings
-from d2_plugin.runs.shared import Shared, share
+from d2_plugin.runs.shared import Job, Shared, share
 from d2_plugin.runs.start import TimedPoints
-from d2_plugin.runs.training.cases import Case, case_of
-from d2_plugin.runs.training.measured import Work
-from d2_plugin.runs.training.spread import Line, follow, workers
+from d2_plugin.runs.training.bench import Case, case_of
+from d2_plugin.runs.training.measured import Line, Work, follow, workers
 from d2_plugin.settings import AtLeastOne, Count, Positional, Range, Seed, Settings
 
 Maps = Literal["own", "noise", "smooth", "constant", "other", "network"]
@@ -39,7 +37,7 @@ Maps = Literal["own", "noise", "smooth", "constant", "other", "network"]
 
 @dataclass(frozen=True)
 class NeverWorseBench(Settings):
-    """Settings of `d2 bench never-worse`."""
+    """Settings of `python -m benchmarks never-worse`."""
 
     recordings: Annotated[tuple[str, ...], Positional()] = ()
     """Recordings with their cameras, as PATH@TRAIN+TRAIN or PATH@TRAIN+TRAIN@SCORE+SCORE."""
@@ -69,7 +67,7 @@ class NeverWorseBench(Settings):
 def run(settings: NeverWorseBench) -> str:
     """Measure what is missing; the table, and where the rows lie."""
     if not settings.recordings:
-        raise D2Error("d2 bench never-worse needs a recording with its cameras: write PATH@00+02+05+07")
+        raise D2Error("the benchmark never-worse needs a recording with its cameras: write PATH@00+02+05+07")
     path = settings.output / "never-worse.jsonl"
     known = {(row["case"], row["method"], row["fingerprint"]) for row in _rows(path)}
     works = [work for text in settings.recordings for work in _works(settings, text)]
@@ -141,7 +139,7 @@ class _Template:
     def __init__(self, settings: NeverWorseBench, case: str, shared: Shared) -> None:
         self.settings, self.case, self.shared = settings, case, shared
         listed = {name: ",".join(map(str, getattr(settings, name) or ())) for name in ("maps", "seeds", "frames")}
-        self.command = command_line("bench never-worse", settings, False, **listed)
+        self.command = command_line("bench never-worse", settings, **listed)
 
     def works(self, method: str, base: RunSettings, preset: Preset) -> Iterator[Work]:
         """The seeds of one method, its prior built where it needs one."""
@@ -151,8 +149,8 @@ class _Template:
         about = {"prior": self._build(used, store) if preset.hooks else None, "frames": base.frames}
         for seed in self.settings.seeds:
             folder = self.shared.folder / "runs" / name / f"{base.iterations}steps" / f"seed{seed}"
-            job = Job(preset.name, base.backbone, seed, replace(used, seed=seed), folder)
-            yield Work(job, self.shared, self.case, method, self.command, "steps", about, "never_worse")
+            job = Job(preset.name, replace(used, seed=seed), folder)
+            yield Work(job, self.shared.points, self.case, method, self.command, "steps", about, "never_worse")
 
     def _build(self, settings: RunSettings, store: Path) -> str:
         """The prior of one method, with the geometric depth of the full one; what it became, in a line."""
@@ -160,4 +158,4 @@ class _Template:
             shutil.copytree(self.shared.priors, store, ignore=shutil.ignore_patterns("priors", "matches", "mono"))
         points = TimedPoints.load(self.shared.points).positions
         settings = check(settings)
-        return build_priors_for(settings, Scene.open(settings), points, store).headline()
+        return build_priors_for(Scene.open(settings), points, store).headline()

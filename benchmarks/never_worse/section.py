@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from statistics import mean
 
 from d2_plugin.runs.markup import Table, markdown
-from d2_plugin.runs.report.scores import psnr, score, scored
-from d2_plugin.runs.report.sections import Section, cases_of, sources_of
+from d2_plugin.runs.report.page import Section, cases_of, sources_of
 from d2_plugin.runs.rows import Row
 from d2_plugin.runs.verdict import margin, seeds_in_words
 
@@ -20,7 +19,6 @@ HEADER = ("recording", "monocular maps", "seeds", "PSNR", "over the backbone", "
 
 def never_worse(rows: Sequence[Row]) -> Section:
     """One table: every kind of map against the backbone alone and against stereo alone."""
-    found = table(scored(rows))
     return Section(
         "never_worse",
         "Never worse than without",
@@ -28,19 +26,19 @@ def never_worse(rows: Sequence[Row]) -> Section:
         "pixel, `smooth` random blobs, `constant` one value, `other` the map of another frame (of another camera "
         "where there is one frame), `network` a small network that runs on phones. `stereo alone` uses no monocular "
         f"map. Not worse is at most {ALLOWED} dB below the backbone alone; what is stands out.",
-        tables=(("Held-out scores by monocular maps", found),) if found.rows else (),
+        tables=(("Held-out scores by monocular maps", table(rows)),),
         sources=sources_of(rows),
-        headlines=tuple(_headline(case, mine) for case, mine in cases_of(scored(rows)).items()),
     )
 
 
 def never_worse_text(rows: Sequence[Row]) -> str:
     """The table, for a terminal."""
-    return markdown(table(scored(rows)), padded=True)
+    return markdown(table(rows), padded=True)
 
 
 def table(rows: Sequence[Row]) -> Table:
     """A row per recording and method, in the order of measurement; what is not worse than the backbone stands out."""
+    rows = [row for row in rows if row.get("scores")]
     cells: list[tuple[str, ...]] = []
     fine: list[tuple[int, int]] = []
     for case, mine in cases_of(rows).items():
@@ -54,9 +52,14 @@ def table(rows: Sequence[Row]) -> Table:
     return Table(HEADER, tuple(cells), frozenset(fine))
 
 
+def psnr(row: Row) -> float:
+    """The held-out PSNR of a run, dB."""
+    return row["scores"]["psnr"]
+
+
 def _others(runs: Sequence[Row]) -> list[str]:
     """Means of the other scores; a dash where they were not measured."""
-    found = [[score(row, key) for row in runs] for key in ("ssim1", "depth_absrel")]
+    found = [[row["scores"].get(key) for row in runs] for key in ("ssim1", "depth_absrel")]
     return ["-" if None in values else f"{mean(v for v in values if v is not None):.4f}" for values in found]
 
 
@@ -78,14 +81,3 @@ def _worse(methods: dict[str, list[Row]], runs: Sequence[Row]) -> bool:
     """Whether the mean lies below that of the backbone by more than is allowed."""
     reference = methods.get(BACKBONE)
     return reference is not None and mean(map(psnr, runs)) < mean(map(psnr, reference)) - ALLOWED
-
-
-def _headline(case: str, rows: Sequence[Row]) -> str:
-    methods = _by_method(rows)
-    guided = {name: runs for name, runs in methods.items() if name not in (BACKBONE, STEREO)}
-    if not guided or BACKBONE not in methods:
-        return ""
-    worse = [name for name, runs in guided.items() if _worse(methods, runs)]
-    if worse:
-        return f"{case}: worse than the backbone alone with {', '.join(worse)}"
-    return f"{case}: not worse than the backbone alone with any of {', '.join(guided)}"

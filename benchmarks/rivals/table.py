@@ -1,9 +1,15 @@
-"""The one list of rivals: name, title, source of its depth, and how it is made from its settings."""
+"""`python -m benchmarks rivals`: the training bench with what users would pick instead of D², at equal time or steps.
+
+Each rival is the published formula with its published weight, on the same backbone, points and depth inputs as D². All
+else is as `d2 bench training` has it.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,10 +19,13 @@ from benchmarks.rivals.patch_norm import PatchNorm, PatchNormConfig
 from benchmarks.rivals.pearson import Pearson, PearsonConfig
 from benchmarks.rivals.scale_shift import ScaleShift, ScaleShiftConfig
 from benchmarks.rivals.sparse_points import SparsePointDepth, SparsePointsConfig
-from d2_plugin.errors import unknown_name
 from d2_plugin.hooks import Hook
+from d2_plugin.priors.monocular.network import MonocularModel
+from d2_plugin.runs.ablation.presets import PRESETS, TABLES, Preset
 from d2_plugin.runs.scene import Scene
+from d2_plugin.runs.settings import RunSettings, check
 from d2_plugin.runs.start import TimedPoints
+from d2_plugin.runs.training import bench
 
 Needs = Literal["points", "mono", "stereo"]
 
@@ -70,14 +79,46 @@ class RivalGuidance:
         return {} if hook is None else {self.name: hook(self.config, Inputs(scene, points, priors))}
 
 
-def rival(name: str | None, iterations: int) -> RivalGuidance | None:
-    """The rival of that name with its published settings, for a run of so many steps; None for None.
-
-    Raises:
-        D2Error: an unknown name.
-    """
-    if name is None:
-        return None
-    if name not in RIVALS:
-        raise unknown_name("rival", name, RIVALS)
+def guidance(name: str, iterations: int) -> RivalGuidance:
+    """The rival of that name with its published settings, for a run of so many steps."""
     return RivalGuidance(name, RIVALS[name].config(iterations))
+
+
+def prior_seconds(needs: Needs, settings: RunSettings, full: float | None) -> float | None:
+    """CPU seconds of what a rival needs: nothing, monocular maps alone, or the full prior's, which `full` is."""
+    if needs == "mono":
+        return monocular_seconds(settings)
+    return 0.0 if needs == "points" else full
+
+
+def monocular_seconds(settings: RunSettings) -> float:
+    """CPU time of the monocular maps alone: 0 for maps on disk, else one prediction, times as many as there are."""
+    scene = Scene.open(check(settings))
+    chosen = scene.priors
+    if not chosen.mono_onnx or chosen.mono_kind is None:
+        return 0.0
+    model = MonocularModel(chosen.mono_onnx, chosen.mono_kind, chosen.mono_preprocessing, chosen.mono_threads)
+    image = scene.recording.image(scene.train_cameras[0], scene.recording.frames[0])
+    start = time.process_time()
+    model.predict(image)
+    return (time.process_time() - start) * len(scene.train_cameras) * len(scene.recording.frames)
+
+
+RIVAL_PRESETS = {
+    name: Preset(name, rival.title, (), {}, partial(guidance, name), partial(prior_seconds, rival.needs))
+    for name, rival in RIVALS.items()
+}
+
+
+@dataclass(frozen=True)
+class RivalsBench(bench.TrainingBench):
+    """Settings of `python -m benchmarks rivals`."""
+
+    methods: tuple[str, ...] = ("rivals",)
+    """Rows or tables of `d2 ablate`, and rivals; `rivals` stands for the backbone, all of them and D²."""
+
+
+def run(settings: RivalsBench) -> str:
+    """Measure what is missing; where the rows lie."""
+    tables = TABLES | {"rivals": ("backbone", *RIVALS, "full")}
+    return bench.run(settings, PRESETS | RIVAL_PRESETS, tables, "bench rivals")

@@ -1,4 +1,5 @@
-"""`d2 stability`: parameters swept to where numbers end, in float32 and float64, with the error of every point.
+"""`python -m benchmarks stability`: parameters swept to where numbers end, in float32 and float64, with the error of
+every point.
 
 A point is `ok` where its error is below the sweep's limit, a `gap` where it is above and finite, and a `failure` where
 something is not finite or is refused. Nothing is clamped in silence: each sweep names what is guarded, and how.
@@ -16,10 +17,11 @@ import torch
 from benchmarks.stability.definition import Sweep
 from benchmarks.stability.gaussians import gaussian_sweeps
 from benchmarks.stability.priors import prior_sweeps
+from benchmarks.work_precision import shown
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.progress import progress_bar
-from d2_plugin.runs.command_line import command_line
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, make_row
+from d2_plugin.runs.markup import Table, markdown
+from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
 from d2_plugin.settings import Settings
 
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
@@ -30,7 +32,7 @@ SWEEPS: dict[str, Sweep] = {sweep.name: sweep for sweep in (*gaussian_sweeps(), 
 
 @dataclass(frozen=True)
 class StabilitySettings(Settings):
-    """Settings of `d2 stability`."""
+    """Settings of `python -m benchmarks stability`."""
 
     sweeps: tuple[str, ...] = ()
     """Names of sweeps; all if not given. An unknown name shows the list."""
@@ -39,11 +41,12 @@ class StabilitySettings(Settings):
 
 
 def run(settings: StabilitySettings) -> str:
-    """Sweep and add the rows; a line per sweep, and where the rows lie."""
+    """Sweep and add the rows; the tables, and where the rows lie."""
     begin_rows(settings.output)
-    rows = run_sweeps(settings.sweeps, command_line("stability", settings))
+    rows = run_sweeps(settings.sweeps, command_line("bench stability", settings))
     append_rows(settings.output, rows)
-    return f"{summary(rows)}\nrows are in {settings.output}; `d2 report {settings.output}` shows them"
+    told = "\n\n".join(markdown(table) for _, table in tables(rows))
+    return f"{told}\n\nrows are in {settings.output}; `d2 report {settings.output}` shows them"
 
 
 def measure(sweep: Sweep, value: float, precision: str, command: str = "") -> Row:
@@ -95,14 +98,25 @@ def run_sweeps(names: Sequence[str] = (), command: str = "") -> list[Row]:
     return rows
 
 
-def summary(rows: Sequence[Row]) -> str:
-    """One line per sweep and precision: how many points are ok, which are not, and the largest error."""
-    lines = []
+def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
+    """Each sweep in each precision, what is guarded and how, and the points that are not ok."""
+    header = ("sweep", "precision", "parameter", "points", "ok", "largest error", "limit")
+    sweeps = []
     for case, method in dict.fromkeys((row["case"], row["method"]) for row in rows):
         mine = [row for row in rows if (row["case"], row["method"]) == (case, method)]
-        lost = [f"{row['verdict']} at {row['setting']}" for row in mine if row["verdict"] != "ok"]
-        worst = max((row["error"] for row in mine if row["error"] is not None), default=float("nan"))
-        shown = ", ".join([*lost[:4], *([f"and {len(lost) - 4} more"] if len(lost) > 4 else [])])
-        ok = f"{len(mine) - len(lost):2}/{len(mine)} ok, worst {worst:.1e}"
-        lines.append(f"{case:18} {method}  {ok}  {shown}".rstrip())
-    return "\n".join(lines)
+        values = [row["value"] for row in mine]
+        worst = max((row["error"] for row in mine if row["error"] is not None), default=None)
+        span = f"{mine[0]['parameter']}: {min(values):g} .. {max(values):g}"
+        ok = sum(row["verdict"] == "ok" for row in mine)
+        sweeps.append((case, method, span, str(len(mine)), str(ok), shown(worst), shown(mine[0]["limit"])))
+    guards = tuple(dict.fromkeys((row["case"], row["measures"], row["guard"]) for row in rows))
+    beyond = tuple(
+        (row["case"], row["method"], f"{row['value']:g}", row["verdict"], shown(row["error"]), row["failed"] or "")
+        for row in rows
+        if row["verdict"] != "ok"
+    )
+    return [
+        ("Sweeps", Table(header, tuple(sweeps))),
+        ("Guards", Table(("sweep", "the error is", "what is guarded, and how"), guards)),
+        *([("Not ok", Table(("sweep", "precision", "at", "verdict", "error", "why"), beyond))] if beyond else []),
+    ]

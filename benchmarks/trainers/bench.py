@@ -1,4 +1,4 @@
-"""`d2 bench trainers FOLDER`: the official trainers, unedited: bare, with D2 without hooks, and with all.
+"""`python -m benchmarks trainers FOLDER`: the official trainers, unedited: bare, with D2 without hooks, and with all.
 
 FOLDER holds one checkout per repository, named as its repository is. Each runs its own script for some hundred
 iterations on recordings that `d2 export-recording` wrote in its layout, and is judged by its own report of held-out
@@ -20,8 +20,8 @@ from benchmarks.trainers.trials import TRIALS
 from d2_plugin.durable import append
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import json_text, read_text
-from d2_plugin.runs.command_line import command_line
 from d2_plugin.runs.provenance import circumstances
+from d2_plugin.runs.rows import command_line
 from d2_plugin.settings import Positional, Range, Seed, Settings
 
 log = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TrainersBench(Settings):
-    """Settings of `d2 bench trainers`."""
+    """Settings of `python -m benchmarks trainers`."""
 
     checkouts: Annotated[Path | None, Positional()] = None
     """Folder with one checkout per repository; if left out, nothing runs and the tables are made of the rows."""

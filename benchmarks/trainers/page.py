@@ -1,4 +1,4 @@
-"""The tables of docs/results/attach.md, from the rows of `d2 bench trainers`."""
+"""The tables of docs/results/attach.md, from the rows of `python -m benchmarks trainers`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def read_rows(path: Path) -> list[Row]:
     """The rows of a file; of the same run done twice the later one counts."""
     if not path.is_file():
         return []
-    lines = read_text(path, "run `d2 bench trainers`").splitlines()
+    lines = read_text(path, "run `python -m benchmarks trainers`").splitlines()
     rows = [parse_json(line, f"{path}, line {i}", "run it again") for i, line in enumerate(lines, start=1) if line]
     latest = {tuple(row[name] for name in _SAME): row for row in rows}
     return list(latest.values())

@@ -21,7 +21,7 @@ class AblationOptions(ConfigFile):
     output: Path
     """Folder of runs, shared priors and tables."""
     rows: tuple[str, ...] = ("ablation", "pruning")
-    """Tables (ablation, pruning, main, rivals) or presets, joined by commas; an unknown name shows the list."""
+    """Tables (ablation, pruning, main) or presets, joined by commas; an unknown name shows the list."""
     backbones: tuple[str, ...] = ("yang4d",)
     """Names joined by commas."""
     seeds: tuple[Seed, ...] = (0, 1, 2)
@@ -45,7 +45,7 @@ def run(given: Given) -> str:
     options = given.make(AblationOptions)
     presets = rows_named(options.rows)
     work = ablate.jobs(run_settings(given), presets, options.backbones, options.seeds, options.output)
-    text = ablate.write(ablate.run_jobs(work, options.jobs), presets, options.output, _command_line())
+    text = ablate.write(ablate.run_jobs(work, options.jobs, options.output), presets, options.output, _command_line())
     return f"{text}\ntables and runs.jsonl in {options.output}"
 
 

@@ -10,29 +10,46 @@ from types import ModuleType
 
 from d2_plugin import __version__
 from d2_plugin.commands.arguments.boundary import DEBUG, guarded
-from d2_plugin.commands.arguments.form import HELP
+from d2_plugin.commands.arguments.form import HELP, ModuleCommand
 from d2_plugin.commands.arguments.help import entry, help_text
 from d2_plugin.errors import D2Error, unknown_name
 
-COMMANDS = {
-    "demo": "demo",
+COMMANDS: dict[str, str | ModuleCommand] = {
+    "demo": ModuleCommand(
+        *("d2_plugin.viewing.demo", "Demo"),
+        "A synthetic recording, trained by the backbone alone and with D2: a table, an image and a player.",
+    ),
     "import": "import_",
     "plan": "plan",
     "priors": "priors",
     "train": "train",
     "eval": "eval",
-    "render": "render",
-    "view": "view",
+    "render": ModuleCommand(
+        *("d2_plugin.viewing.videos.render", "RenderSettings"),
+        "A video of a run: its held-out cameras, or a camera that moves; depth, errors, several runs together.",
+    ),
+    "view": ModuleCommand(
+        *("d2_plugin.viewing.live.show", "ViewSettings"),
+        "A page in the browser that shows a run, a recording or a depth prior, in space and time.",
+    ),
     "compare": "compare",
     "ablate": "ablate",
     "bench": "bench",
-    "stability": "stability",
-    "report": "report",
-    "export": "export",
-    "export-recording": "export_recording",
+    "report": ModuleCommand(
+        "d2_plugin.runs.report.report", "ReportSettings", "One page of everything measured: plots, tables, images."
+    ),
+    "export": ModuleCommand(
+        *("d2_plugin.viewing.export.export", "Export"),
+        "Write a trained run as a web page that plays it, or as files that other viewers open.",
+    ),
+    "export-recording": ModuleCommand(
+        *("d2_plugin.commands.export_recording", "RecordingExport"),
+        "Write a recording in the input layout of another 4D Gaussian Splatting repository.",
+    ),
     "doctor": "doctor",
 }
-"""Name -> module beside this file: its docstring is the help, its `form(words)` what it takes."""
+"""Name -> what serves it: a module beside this file, whose docstring is the help and whose `form(words)` says what it
+takes; or any module with settings and `run`."""
 
 NEEDED = (3, 11)
 """The Python of the commands; a trainer's process, which imports none of them, may be older."""
@@ -62,20 +79,25 @@ def _answer(words: list[str]) -> str | None:
     if words[0] not in COMMANDS:
         raise unknown_name("command", words[0], COMMANDS)
     rest = words[1:]
-    form = _module(words[0]).form(rest)
+    command = COMMANDS[words[0]]
+    form = command.form(f"d2 {words[0]}") if isinstance(command, ModuleCommand) else _module(command).form(rest)
     return help_text(form, rest) if any(word in HELP for word in rest) else form.run(form.parse(rest))
 
 
 def _overview() -> str:
-    lines = [entry(name, (_module(name).__doc__ or "").partition("\n")[0]) for name in COMMANDS]
+    lines = [entry(name, _about(command)) for name, command in COMMANDS.items()]
     head = "Dual-source depth priors for 4D Gaussian Splatting from two to four cameras."
     foot = "`d2 COMMAND --help` says what a command takes; `d2 --version` prints the version."
     debug = f"Every command takes {DEBUG}: an error then shows where it arose."
     return "\n".join(["usage: d2 COMMAND ...", "", head, "", *lines, "", foot, debug])
 
 
-def _module(command: str) -> ModuleType:
-    return importlib.import_module(f"d2_plugin.commands.{COMMANDS[command]}")
+def _about(command: str | ModuleCommand) -> str:
+    return command.help if isinstance(command, ModuleCommand) else (_module(command).__doc__ or "").partition("\n")[0]
+
+
+def _module(name: str) -> ModuleType:
+    return importlib.import_module(f"d2_plugin.commands.{name}")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,62 @@
-"""Write a recording in the input layout of another 4D Gaussian Splatting repository."""
+"""`d2 export-recording`: a recording in the input layout of another repository, with points to start from."""
 
 from __future__ import annotations
 
-from d2_plugin.commands.arguments.form import Form
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from d2_plugin.recordings import Recording, open_recording, select_cameras
+from d2_plugin.recordings.export.export import export_recording
+from d2_plugin.recordings.export.ply import PointCloud
+from d2_plugin.runs.start import MIN_POINTS, initial_points, scene_extent, triangulated_points
+from d2_plugin.settings import Count, Positional, Range, Seed, Settings
 
 
-def form(words: list[str]) -> Form:
-    """What `d2 export-recording` takes."""
-    from d2_plugin.runs.recording_export import RecordingExport, run
+@dataclass(frozen=True)
+class RecordingExport(Settings):
+    """Which recording is written, in which layout and where."""
 
-    return Form.of("d2 export-recording", __doc__, RecordingExport, run)
+    recording: Annotated[Path, Positional()]
+    """Folder of the recording, in any layout that d2 reads."""
+    format: Literal["transforms", "n3dv", "multipleview", "colmap", "colmap_frames", "gsplat"]
+    """Layout to write; docs/attach says which repository reads which."""
+    output: Path
+    """Folder that does not exist or is empty."""
+    train_cameras: tuple[str, ...] = ()
+    """Names of the cameras to train with, joined by commas; if left out, all that are not held out."""
+    test_cameras: tuple[str, ...] = ()
+    """Names of the cameras that are held out, joined by commas."""
+    frames: tuple[Count, ...] | None = None
+    """first:last or first:last:step, the last one included; if left out, all frames."""
+    downscale: Annotated[int, Range(1)] = 1
+    """Make images this many times smaller along each side."""
+    points: Count = MIN_POINTS
+    """Least number of initial points; 0 writes none."""
+    seed: Seed = 0
+    """Seed of the random points among them."""
+
+
+def run(settings: RecordingExport) -> str:
+    """Write the recording; returns what was written and where."""
+    recording = open_recording(settings.recording, frames=settings.frames, downscale=settings.downscale)
+    held_out = settings.test_cameras
+    train = settings.train_cameras or tuple(name for name in recording.cameras if name not in held_out)
+    recording = select_cameras(recording, [*train, *(name for name in held_out if name not in train)])
+    cloud = start_cloud(recording, train, settings.points, settings.seed) if settings.points > 0 else None
+    export_recording(recording, settings.format, settings.output, test_cameras=held_out, cloud=cloud)
+    points = "no" if cloud is None else len(cloud.positions)
+    written = f"{len(recording.cameras)} cameras, {len(recording.frames)} frames, {points} initial points"
+    return f"{written} in {settings.output} ({settings.format})"
+
+
+def start_cloud(recording: Recording, cameras: Sequence[str], minimum: int = MIN_POINTS, seed: int = 0) -> PointCloud:
+    """Points triangulated from the training cameras, filled up to `minimum` with random ones that the cameras see.
+
+    The same start as `d2 train` has, so that another repository can be compared with the bundled backbones.
+    """
+    sparse = triangulated_points(recording, cameras)
+    extent = scene_extent(recording, cameras, sparse.positions)
+    start = initial_points(recording, cameras, sparse, extent, seed, minimum)
+    return PointCloud(start.positions, start.colors, start.times)

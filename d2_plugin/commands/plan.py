@@ -3,32 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from d2_plugin.commands.arguments.form import Form, Given
-from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
-from d2_plugin.commands.arguments.study_form import study_form
-from d2_plugin.errors import D2Error
+from d2_plugin.commands.arguments.recording import recording_form, run_settings, say, say_notes, say_plan
 
 if TYPE_CHECKING:
     from d2_plugin.recordings import Recording
 
 
-@dataclass(frozen=True)
-class PlanOptions(ConfigFile):
-    """How the plan is made."""
-
-    verify: bool = False
-    """Measure what each decision saves and costs; `d2 plan --verify --help` says what that takes."""
-
-
 def form(words: list[str]) -> Form:
-    """What `d2 plan` takes; with --verify, what the measurement takes."""
-    if "--verify" in words:
-        words.remove("--verify")
-        return study_form("d2 plan --verify", "d2_plugin.runs.plan_verify", "PlanVerification")
-    return recording_form("d2 plan", __doc__, run, (), PlanOptions, ("priors", "plan"))
+    """What `d2 plan` takes."""
+    return recording_form("d2 plan", __doc__, run, tables=("priors", "plan"))
 
 
 def run(given: Given) -> None:
@@ -36,8 +22,6 @@ def run(given: Given) -> None:
     from d2_plugin.runs.scene import Scene
     from d2_plugin.runs.settings import check
 
-    if given.values["verify"]:
-        raise D2Error("--verify is a switch: write it in full and without a value")
     scene = Scene.open(check(run_settings(given)))
     say(f"recording  {described(scene.recording)}")
     say_notes(scene.recording.notes)

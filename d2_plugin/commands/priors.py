@@ -53,7 +53,7 @@ def run(given: Given) -> str:
     say_notes(scene.recording.notes)
     say_plan(scene.plan)
     points = triangulated_points(scene.recording, scene.train_cameras).positions
-    summary = build_priors_for(settings, scene, points, options.output, shard=shard, cluster=cluster)
+    summary = build_priors_for(scene, points, options.output, shard=shard, cluster=cluster)
     say(str(summary), summary.headline())
     folder = summary.folder or options.output
     if folder != options.output:

@@ -7,14 +7,11 @@ import platform
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from d2_plugin import __version__
-
-if TYPE_CHECKING:
-    from d2_plugin.runs.run import Run
 
 
 def circumstances(device: torch.device | str = "cpu") -> dict[str, str | int | None]:
@@ -56,30 +53,3 @@ def commit() -> str | None:
 
 def _git(*words: str) -> str:
     return subprocess.run(["git", *words], cwd=Path(__file__).parent, capture_output=True, text=True, check=True).stdout
-
-
-def about(run: Run, trainer: Any) -> dict[str, Any]:
-    """What metrics.json says beside the scores: the run, its cost, and the machine."""
-    scene = run.scene
-    return {
-        "gaussians": len(trainer.model),
-        "iterations": trainer.step,
-        "seconds": {name: round(value, 3) for name, value in run.seconds.items()},
-        "cpu_seconds": {name: round(value, 3) for name, value in run.cpu_seconds.items()},
-        "train_cameras": list(scene.train_cameras),
-        "test_cameras": list(scene.test_cameras),
-        "protocol": run.settings.protocol,
-        "backbone": run.settings.backbone,
-        "hooks": list(run.settings.hooks),
-        "guidance": None if run.guidance is None else dict(run.guidance.identity()),
-        "retired": run.retired,
-        "background": getattr(trainer.model, "background", None) is not None,
-        "appearance": getattr(trainer.model, "appearance", None) is not None,
-        "clocks": None if getattr(trainer.model, "clocks", None) is None else trainer.model.clocks.in_frames(),
-        "prior": run.prior,
-        "plan": scene.plan.as_dict(),
-        "recording": scene.recording.name,
-        "mono_emulated": scene.recording.mono_emulated,
-        "notes": list(scene.recording.notes),
-        "made": circumstances(),
-    }

@@ -8,7 +8,8 @@ stands beside these under names of its own; `d2 report` makes tables and plots o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,28 +17,15 @@ from typing import Any
 import torch
 
 from d2_plugin.durable import append
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error
 from d2_plugin.reading import field, json_text, opened, parse_json, read_text
 from d2_plugin.runs.provenance import circumstances
+from d2_plugin.settings import Settings, declared
 
 Row = dict[str, Any]
 
-KINDS = {
-    "alignment": "relative objective gap F / F* - 1 of the fit",
-    "stereo": "1 - F at 1 % of geometric depth",
-    "priors": "distance of the share of errors within sigma from 68.3 %; of far pixels, the false share",
-    "raster": "99.9th percentile of the colour's deviation from float64, 0..1",
-    "training": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
-    "quality": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
-    "never_worse": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
-    "ablation": "root mean square error of held-out colour, 0..1 (10^(-PSNR/20))",
-    "stability": "as each case defines it",
-    "plan": "loss of what is left out, as each decision defines it",
-    "scaling": "none",
-    "gpu": "none",
-    "step": "none",
-}
-"""What `error` is for each kind of row."""
+TRY = "try"
+"""`target` of a training that only looked for the number of steps of a time: such a row is in no table."""
 
 MEASURED = ("kind", "case", "method", "setting", "error", "seconds", "failed")
 REQUIRED = (*MEASURED, "device", "threads", "version", "commit", "torch", "command")
@@ -66,7 +54,7 @@ def make_row(
     """One measurement with its circumstances.
 
     Args:
-        kind: one of `KINDS`.
+        kind: what was measured: training, quality, ablation, or a benchmark of the checkout.
         case: scene, rig, recording or sweep that was measured.
         method, setting: what was measured, and what was varied about it.
         error: lower is better; None where it was not measured. Not finite is a failure and is recorded as one.
@@ -76,13 +64,17 @@ def make_row(
         device: what torch calls it.
         details: whatever else the kind knows, as JSON can hold it.
     """
-    if kind not in KINDS:
-        raise unknown_name("kind of row", kind, KINDS)
     if error is not None and not math.isfinite(error):
         error, failed = None, failed or f"the error is {error}"
     row: Row = {"kind": kind, "case": case, "method": method, "setting": setting}
     row |= {"error": error, "seconds": seconds, "failed": failed}
     return row | details | circumstances(device) | {"command": command}
+
+
+def rms_error(scores: Mapping[str, float | None]) -> float | None:
+    """The root mean square error of colour, 0..1, that a PSNR stands for: 10^(-PSNR / 20)."""
+    psnr = scores.get("psnr")
+    return None if psnr is None else 10 ** (-psnr / 20)
 
 
 def told_apart(rows: Sequence[Row]) -> list[Row]:
@@ -160,8 +152,6 @@ def _checked(line: str, where: str) -> Row:
         raise D2Error(f"{where} has no {', '.join(missing)}: measure it again, its form is not that of this version")
     for name, kind in FORM.items():
         field(row, name, kind, where, "measure it again, its form is not that of this version")
-    if row["kind"] not in KINDS:
-        raise unknown_name(f"kind of row ({where})", row["kind"], KINDS)
     return row
 
 
@@ -172,3 +162,36 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def command_line(command: str, settings: Settings, **written: str) -> str:
+    """`d2 COMMAND` with every setting that is not the default; folders of this machine are left out.
+
+    Args:
+        command: its words after `d2`.
+        settings: what was given.
+        written: flags whose text is not simply that of the value.
+    """
+    words = ["d2", *command.split()]
+    kind: Any = type(settings)
+    for setting in declared(kind):
+        value = getattr(settings, setting.name)
+        if value == setting.default:
+            continue
+        texts = [written[setting.name]] if setting.name in written else _texts(value)
+        words += texts if setting.positional else [f"--{setting.name.replace('_', '-')}", *texts]
+    return shlex.join(words)
+
+
+def _texts(value: Any) -> list[str]:
+    if isinstance(value, bool):
+        return []
+    if isinstance(value, tuple):
+        return [text for item in value for text in _texts(item)]
+    return [_without_folders(value)]
+
+
+def _without_folders(value: Any) -> str:
+    """An absolute path as its last part: the rest says nothing about the measurement."""
+    text = str(value)
+    return Path(text).name if text.startswith("/") else text

@@ -18,7 +18,7 @@ from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.prior.alongside import OPEN_BY, PriorAlongside, alongside
 from d2_plugin.runs.prior.build import build_priors_for, refuse_unusable
-from d2_plugin.runs.provenance import about
+from d2_plugin.runs.provenance import circumstances
 from d2_plugin.runs.saved.checkpoint import fitting, load_checkpoint, save_checkpoint
 from d2_plugin.runs.saved.claim import claim
 from d2_plugin.runs.saved.finite import Watch, watched, what_diverged
@@ -85,7 +85,7 @@ class Run:
         with self._writing(), self._timed("priors"):
             points = self._points()
             if priors and self.uses_prior:
-                self._take(build_priors_for(self.settings, self.scene, points.positions, self._store), told)
+                self._take(build_priors_for(self.scene, points.positions, self._store), told)
         return points
 
     def _take(self, summary: PriorSummary, told: Callable[[PriorSummary], None] | None) -> None:
@@ -141,7 +141,7 @@ class Run:
             with self._timed("eval"):
                 shown = self.folder / "images" if images else None
                 scores = evaluate_scene(trainer.model, self.scene, self.settings.device, shown)
-            metrics = scores | about(self, trainer)
+            metrics = scores | _about(self, trainer)
             write_tables(metrics, self.folder)
             write_table(self.folder / "metrics.json", metrics, METRICS)
         return metrics
@@ -284,3 +284,30 @@ class Run:
         finally:
             self.seconds[name] += time.monotonic() - start
             self.cpu_seconds[name] += time.process_time() - cpu
+
+
+def _about(run: Run, trainer: Any) -> dict[str, Any]:
+    """What metrics.json says beside the scores: the run, its cost, and the machine."""
+    scene = run.scene
+    return {
+        "gaussians": len(trainer.model),
+        "iterations": trainer.step,
+        "seconds": {name: round(value, 3) for name, value in run.seconds.items()},
+        "cpu_seconds": {name: round(value, 3) for name, value in run.cpu_seconds.items()},
+        "train_cameras": list(scene.train_cameras),
+        "test_cameras": list(scene.test_cameras),
+        "protocol": run.settings.protocol,
+        "backbone": run.settings.backbone,
+        "hooks": list(run.settings.hooks),
+        "guidance": None if run.guidance is None else dict(run.guidance.identity()),
+        "retired": run.retired,
+        "background": getattr(trainer.model, "background", None) is not None,
+        "appearance": getattr(trainer.model, "appearance", None) is not None,
+        "clocks": None if getattr(trainer.model, "clocks", None) is None else trainer.model.clocks.in_frames(),
+        "prior": run.prior,
+        "plan": scene.plan.as_dict(),
+        "recording": scene.recording.name,
+        "mono_emulated": scene.recording.mono_emulated,
+        "notes": list(scene.recording.notes),
+        "made": circumstances(),
+    }

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks import Hook
+from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.cameras.check import check_recording
 from d2_plugin.recordings.checks.masked import check_background_weight
@@ -28,6 +29,13 @@ class Scene:
     train_cameras: tuple[str, ...]
     test_cameras: tuple[str, ...]
     plan: ScenePlan
+    priors: PriorSettings
+    """Of the prior builder, before the plan."""
+
+    @property
+    def prior_settings(self) -> PriorSettings:
+        """Of the prior builder, with what the plan leaves out."""
+        return self.plan.obeyed_by(self.priors)
 
     @classmethod
     def open(cls, settings: RunSettings) -> Scene:
@@ -47,8 +55,9 @@ class Scene:
         recording = replace(
             recording, notes=(*recording.notes, *check_recording(recording, (*train, *test), scored=test))
         )
-        plan = plan_scene(recording, train, _mono_source(recording, settings), prior_settings(settings))
-        return cls(recording, train, test, plan.override(**settings.overrides.get("plan", {})))
+        priors = prior_settings(settings)
+        plan = plan_scene(recording, train, _mono_source(recording, settings), priors)
+        return cls(recording, train, test, plan.override(**settings.overrides.get("plan", {})), priors)
 
     def with_points(self, points: TimedPoints, settings: RunSettings) -> Scene:
         """The same scene with what triangulated points decide: whether the cameras' exposures differ."""

@@ -1,38 +1,70 @@
-"""What the runs of one comparison share: starting points and the full depth prior, made once."""
+"""What the runs of one comparison share: starting points and depth priors, each made once; and one such run."""
 
 from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from d2_plugin.durable import Kind, make_folder, read_table, write_table
 from d2_plugin.runs.prior.build import build_priors_for
-from d2_plugin.runs.scene import Scene
+from d2_plugin.runs.run import Run
+from d2_plugin.runs.scene import Guidance, Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, prior_settings
 from d2_plugin.runs.start import TimedPoints, triangulated_points
 
-SHARED = Kind("time of a shared prior", 1, "delete it")
-"""shared.json."""
+COST = Kind("time that something shared took", 1, "delete it")
+"""NAME.seconds.json, beside what it is about."""
 
-FULL = "dual"
-"""The variant of the prior that decides."""
+Metrics = Mapping[str, Any]
+"""What metrics.json of a run holds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """One run of a comparison."""
+
+    preset: str
+    settings: RunSettings
+    folder: Path
+    guidance: Guidance | None = None
+    """What guides it in place of D2's hooks."""
+
+    @property
+    def uses_prior(self) -> bool:
+        """Whether hooks or another guidance read a depth prior."""
+        return bool(self.settings.hooks) or self.guidance is not None
+
+    def run(self) -> Run:
+        """The run in its folder; refuses a folder of other settings, with one sentence."""
+        return Run(self.settings, self.folder, self.guidance)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What something shared took to make; None where a build was cut off, since its parts were not timed together."""
+
+    seconds: float | None
+    """Wall time."""
+    cpu_seconds: float | None
+    """CPU time of the process that made it; None as well where a cluster did."""
+
+    @classmethod
+    def of(cls, made: Path) -> Cost:
+        """As recorded beside `made`; of nothing where there is no record."""
+        record = _record(made)
+        return cls(**read_table(record, COST)) if record.is_file() else cls(None, None)
 
 
 @dataclass(frozen=True)
 class Shared:
-    """What lies in the folder of a comparison, and what it cost."""
+    """The points, and the prior of one variant, in the folder of a comparison."""
 
     folder: Path
-    seconds: float | None
-    """Wall time of points and full prior; None where a build was cut off, since its parts were not timed together."""
-    cpu_seconds: float | None
-    """The same in CPU time of the process that built it."""
+    variant: str
 
     @property
     def points(self) -> Path:
@@ -41,57 +73,60 @@ class Shared:
 
     @property
     def priors(self) -> Path:
-        """Folder of the full prior."""
-        return self.folder / "priors" / FULL
+        """Folder of the prior."""
+        return self.folder / "priors" / self.variant
 
-    def give_points(self, run: Path) -> None:
-        """The points into the folder of a run, which must exist."""
-        if not (run / "points.npz").is_file():
-            shutil.copyfile(self.points, run / "points.npz")
+    @property
+    def cost(self) -> Cost:
+        """Of points and prior together."""
+        parts = Cost.of(self.points), Cost.of(self.priors)
+        wall, cpu = ([getattr(part, name) for part in parts] for name in ("seconds", "cpu_seconds"))
+        return Cost(None if None in wall else sum(wall), None if None in cpu else sum(cpu))
+
+
+def give_points(points: Path, run: Path) -> None:
+    """The shared points into the folder of a run, which must exist."""
+    if not (run / "points.npz").is_file():
+        shutil.copyfile(points, run / "points.npz")
+
+
+def share_points(settings: RunSettings, folder: Path) -> Path:
+    """Triangulate where `folder` has no points.npz yet; returns its path."""
+    points = folder / "points.npz"
+    if not _record(points).is_file():
+        scene = Scene.open(check(settings))
+        _timed(points, lambda: triangulated_points(scene.recording, scene.train_cameras).save(points))
+    return points
 
 
 def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None = None) -> Shared:
-    """Make what is missing in `folder`: points.npz, priors/dual and shared.json.
+    """Make what is missing in `folder`: points.npz and priors/VARIANT.
 
     Args:
-        settings: of any run of the comparison; its tables for the prior hold, its variant does not.
+        settings: of any run of the comparison that uses this variant of the prior.
         folder: of the comparison, absolute.
-        cluster: what builds the frames in place of this process, as for `build_priors_for`; no CPU time is known then.
+        cluster: what builds the frames in place of this process, as for `build_priors_for`.
     """
-    path = folder / "shared.json"
-    if path.is_file():
-        return Shared(folder, **read_table(path, SHARED))
-    full = check(replace(settings, hooks=HOOK_NAMES, overrides=_with(settings.overrides, "priors", variant=FULL)))
-    start, cpu = time.monotonic(), time.process_time()
-    scene = Scene.open(full)
-    points = make_folder(folder) / "points.npz"
-    if not points.is_file():
-        triangulated_points(scene.recording, scene.train_cameras).save(points)
-    store = folder / "priors" / FULL
-    whole = not (store / "store.json").is_file()
-    build_priors_for(full, scene, TimedPoints.load(points).positions, store, cluster=cluster)
-    used = time.process_time() - cpu if cluster is None else None
-    took = (time.monotonic() - start, used) if whole else (None, None)
-    shared = Shared(folder, *took)
-    write_table(path, {"seconds": took[0], "cpu_seconds": took[1]}, SHARED)
+    shared = Shared(folder, prior_settings(settings).variant)
+    points = share_points(settings, folder)
+    if not _record(shared.priors).is_file():
+        scene = Scene.open(check(replace(settings, hooks=HOOK_NAMES)))
+        positions = TimedPoints.load(points).positions
+        build = lambda: build_priors_for(scene, positions, shared.priors, cluster=cluster)  # noqa: E731
+        _timed(shared.priors, build, here=cluster is None)
     return shared
 
 
-def monocular_seconds(settings: RunSettings) -> float:
-    """CPU time of the monocular maps alone: 0 for maps on disk, else one prediction, times as many as there are."""
-    chosen = prior_settings(settings)
-    if not chosen.mono_onnx or chosen.mono_kind is None:
-        return 0.0
-    from d2_plugin.priors.monocular.network import MonocularModel
-
-    scene = Scene.open(check(settings))
-    model = MonocularModel(chosen.mono_onnx, chosen.mono_kind, chosen.mono_preprocessing, chosen.mono_threads)
-    image = scene.recording.image(scene.train_cameras[0], scene.recording.frames[0])
-    start = time.process_time()
-    model.predict(np.asarray(image))
-    return (time.process_time() - start) * len(scene.train_cameras) * len(scene.recording.frames)
+def _record(made: Path) -> Path:
+    return Path(f"{made}.seconds.json")
 
 
-def _with(tables: Any, name: str, **values: Any) -> dict[str, Any]:
-    """The tables with values over one of them."""
-    return {**tables, name: {**tables.get(name, {}), **values}}
+def _timed(made: Path, make: Callable[[], Any], here: bool = True) -> None:
+    """Make it, and record beside it what that took, where nothing of it was there before."""
+    make_folder(made.parent)
+    whole = not made.exists()
+    start, cpu = time.monotonic(), time.process_time()
+    make()
+    wall, used = time.monotonic() - start, time.process_time() - cpu
+    cost = {"seconds": wall if whole else None, "cpu_seconds": used if whole and here else None}
+    write_table(_record(made), cost, COST)

@@ -6,9 +6,12 @@ It takes at least three seeds, and more than two standard errors.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import mean, variance
+
+from d2_plugin.runs.markup import Table
+from d2_plugin.runs.tables import STUDY_COLUMNS, Column
 
 LEAST_SEEDS = 3
 """Two seeds agree by chance in far too many experiments, and one has no spread at all."""
@@ -87,3 +90,35 @@ def margin(ours: Sequence[float], theirs: Sequence[float], larger_is_better: boo
     if seeds > 1:
         error = math.sqrt(variance(ours) / len(ours) + variance(theirs) / len(theirs))
     return Margin(sign * (mean(ours) - mean(theirs)), error, seeds)
+
+
+Scores = Mapping[str, Sequence[Mapping[str, float | None]]]
+"""Name of a variant -> the scores of its runs, one per seed, by the keys of metrics.json."""
+
+EXPLANATION = (
+    "Margin of the means with its standard error, metric by metric; positive is better. A verdict needs at least three "
+    "seeds and a margin beyond two standard errors."
+)
+
+
+def verdicts_table(scores: Scores, ours: str, others: Sequence[str], title: str) -> Table:
+    """Whether one variant is better than others: a row for each that was run, a column for each metric measured."""
+    columns = [column for column in STUDY_COLUMNS if _values(scores, ours, column)]
+    rows = tuple(
+        (other, *(_verdict(scores, ours, other, column) for column in columns))
+        for other in others
+        if any(_values(scores, other, column) for column in columns)
+    )
+    return Table((title, *(column.title for column in columns)), rows)
+
+
+def _verdict(scores: Scores, ours: str, other: str, column: Column) -> str:
+    theirs = _values(scores, other, column)
+    if not theirs:
+        return "-"
+    measured = margin(_values(scores, ours, column), theirs, column.larger_is_better)
+    return f"{measured.verdict} ({measured.text(2 if column.unit else 4, column.unit)})"
+
+
+def _values(scores: Scores, name: str, column: Column) -> list[float]:
+    return [value for run in scores.get(name, ()) if (value := run.get(column.key)) is not None]

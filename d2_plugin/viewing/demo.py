@@ -92,6 +92,6 @@ def _compare(folders: dict[str, Path], camera: str, image: Path) -> None:
         panels = read_image(found[len(found) // 2])
         title = np.full((14, panels.shape[1], 3), BACKGROUND, np.uint8)
         letters = text(name)
-        title[4 : 4 + len(letters), 2 : 2 + letters.shape[1]] = letters
+        title[2 : 2 + len(letters), 2 : 2 + letters.shape[1]] = letters
         rows += [title, panels]
     write_png(image, np.concatenate(rows))

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from benchmarks.growth import exponent
 from benchmarks.raster import RasterBench, bench_raster, parse_size, run
 from benchmarks.raster_measure import THRESHOLDS, Case, peak_memory, threshold_errors
 from benchmarks.raster_scenes import load_scene
 from d2_plugin.errors import D2Error
 from d2_plugin.rasterizer import RasterSettings, reference
-from d2_plugin.runs.growth import exponent
 
 
 def test_synthetic_gaussians_have_the_radius_and_the_frustum_they_are_described_with():

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from benchmarks import scaling as bench_scaling
+from benchmarks.memory import Measured, in_fresh_process
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs import memory, plan_verify
-from d2_plugin.runs.memory import Measured, in_fresh_process
 from d2_plugin.runs.plan_verify import LEFT_OUT, USED, PlanVerification, questions, table, verify
 from d2_plugin.runs.rows import Row, make_row
 from d2_plugin.runs.scene import Scene

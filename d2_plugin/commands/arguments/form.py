@@ -7,6 +7,8 @@ Flags, types, ranges, defaults and help are those of the dataclasses (`d2_plugin
 from __future__ import annotations
 
 import difflib
+import importlib
+import inspect
 import re
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -176,6 +178,20 @@ class Form:
         if left:
             raise D2Error(f"{self.command} has no place for '{left[0]}': `{self.command} --help` says what it takes")
         return values
+
+
+class ModuleCommand(NamedTuple):
+    """A command that a module serves: a class of settings and `run(settings) -> str`. Imported when it is asked for."""
+
+    module: str
+    settings: str
+    """Name of the class of settings in that module."""
+    help: str
+
+    def form(self, command: str) -> Form:
+        """What it takes; the docstring of its module is the text above the help."""
+        module = importlib.import_module(self.module)
+        return Form.of(command, inspect.cleandoc(module.__doc__ or ""), getattr(module, self.settings), module.run)
 
 
 def said(setting: Declared) -> str:

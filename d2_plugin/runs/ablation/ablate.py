@@ -1,4 +1,4 @@
-"""`d2 ablate`: the paper's ablation tables, and rivals, on any recording: each row over several seeds."""
+"""`d2 ablate`: the paper's ablation tables on any recording: each row over several seeds."""
 
 from __future__ import annotations
 
@@ -7,28 +7,21 @@ from concurrent.futures import as_completed
 from dataclasses import replace
 from pathlib import Path
 
-from d2_plugin import durable
-from d2_plugin.durable import Kind, read_table, write_table, write_text
+from d2_plugin.durable import write_text
 from d2_plugin.progress import be_silent, progress_bar
-from d2_plugin.runs.ablation.job import Job, Metrics
 from d2_plugin.runs.ablation.presets import Preset
 from d2_plugin.runs.ablation.tables import report
-from d2_plugin.runs.rows import Row, as_line, make_row
+from d2_plugin.runs.rows import Row, as_line, make_row, rms_error
 from d2_plugin.runs.saved.kinds import read_metrics
 from d2_plugin.runs.settings import RunSettings, prior_settings
-from d2_plugin.runs.shared import share
+from d2_plugin.runs.shared import Cost, Job, Metrics, give_points, share, share_points
 from d2_plugin.runs.workers import worker_pool
-
-PRIOR_SECONDS = Kind("time of a prior", 1, "delete it")
-"""PRIORS.seconds.json, beside each prior that runs share."""
 
 
 def jobs(
     base: RunSettings, presets: Sequence[Preset], backbones: Sequence[str], seeds: Sequence[int], output: Path
 ) -> list[Job]:
-    """Every run, preset by preset; runs with the same prior settings share one prior under `output`/priors.
-
-    Where any row uses a prior, points and full prior are made here, and all rows get the background that it asks for.
+    """Every run, preset by preset; runs with the same variant of the prior share one under `output`/priors.
 
     Args:
         base: gives recording, cameras, iterations and the user's own tables; hooks, backbone and seed are set here.
@@ -36,8 +29,6 @@ def jobs(
         output: folder of the ablation.
     """
     output, made = output.absolute(), []
-    if any(preset.hooks or preset.rival for preset in presets):
-        share(base, output)
     for backbone in backbones:
         for preset in presets:
             for seed in seeds:
@@ -45,22 +36,25 @@ def jobs(
                     base, backbone=backbone, hooks=preset.hooks, seed=seed, overrides=preset.merged(base.overrides)
                 )
                 settings = replace(settings, priors=str(output / "priors" / prior_settings(settings).variant))
-                folder = output / backbone / preset.name / f"seed{seed}"
-                made.append(Job(preset.name, backbone, seed, settings, folder, preset.rival))
+                made.append(Job(preset.name, settings, output / backbone / preset.name / f"seed{seed}"))
     return made
 
 
-def run_jobs(work: Sequence[Job], workers: int) -> dict[Job, Metrics]:
+def run_jobs(work: Sequence[Job], workers: int, output: Path) -> dict[Job, Metrics]:
     """Train and score what is not finished, `workers` runs at a time with one thread each; the metrics of all.
 
-    Priors and starting points are made once, before the runs that share them start.
+    Priors and starting points are made once under `output`, before the runs that share them start.
     """
-    results = {job: found for job in work if (found := _finished(job)) is not None}
+    results = {job: metrics for job in work if (metrics := _finished(job)) is not None}
     missing = [job for job in work if job not in results]
     with progress_bar("ablate", len(work)) as bar:
         bar.update(len(results))
-        if missing:
-            _share(missing)
+        for job in missing:
+            job.run()  # takes its folder
+            points = share_points(job.settings, output.absolute())
+            if job.uses_prior:
+                share(job.settings, output.absolute())
+            give_points(points, job.folder)
         with worker_pool(max(workers, 1), _prepare_worker) as pool:
             started = {pool.submit(_run, job): job for job in missing}
             for future in as_completed(started):
@@ -70,7 +64,7 @@ def run_jobs(work: Sequence[Job], workers: int) -> dict[Job, Metrics]:
                 except BaseException:
                     pool.shutdown(wait=False, cancel_futures=True)  # else all other runs would still be trained
                     raise
-                bar.update(len(results), f"{job.backbone} {job.preset} seed {job.seed}")
+                bar.update(len(results), f"{job.settings.backbone} {job.preset} seed {job.settings.seed}")
     return {job: results[job] for job in work}
 
 
@@ -84,41 +78,6 @@ def _finished(job: Job) -> Metrics | None:
     return metrics if metrics["iterations"] == job.settings.iterations else None
 
 
-def _share(work: Sequence[Job]) -> None:
-    """Points for every run, and the other priors, each built once: runs side by side never build the same twice."""
-    built: set[str | None] = set()
-    output = Path(str(work[0].settings.priors)).parents[1]
-    shared = share(work[0].settings, output) if (output / "shared.json").is_file() else None
-    points = output / "points.npz" if shared is not None else None
-    for job in work:
-        run = job.run()
-        if points is None:
-            run.prepare(priors=False)
-            points = run.folder / "points.npz"
-        elif not (run.folder / "points.npz").is_file():
-            durable.write(run.folder / "points.npz", points.read_bytes())
-        if run.uses_prior and job.settings.priors not in built:
-            run.prepare()
-            built.add(job.settings.priors)
-            measured = _prior_seconds_file(job.settings)
-            if not measured.exists():  # a build that was cut off and continues would time its second part alone
-                whole = shared is not None and Path(str(job.settings.priors)) == shared.priors
-                seconds = shared.seconds if shared and whole else run.seconds["priors"]
-                write_table(measured, {"seconds": seconds}, PRIOR_SECONDS)
-
-
-def _prior_seconds_file(settings: RunSettings) -> Path:
-    return Path(f"{settings.priors}.seconds.json")
-
-
-def _prior_seconds(job: Job) -> float | None:
-    """How long the prior of a run took, which others share; 0 without one, None where it was not measured."""
-    if not job.settings.hooks and job.rival is None:
-        return 0.0
-    measured = _prior_seconds_file(job.settings)
-    return read_table(measured, PRIOR_SECONDS)["seconds"] if measured.exists() else None
-
-
 def _prepare_worker() -> None:
     import torch
 
@@ -129,7 +88,7 @@ def _prepare_worker() -> None:
 def _run(job: Job) -> Metrics:
     run = job.run()
     run.train()
-    return run.evaluate(images=job.seed == 0)
+    return run.evaluate(images=job.settings.seed == 0)
 
 
 def write(results: Mapping[Job, Metrics], presets: Sequence[Preset], output: Path, command: str) -> str:
@@ -144,21 +103,21 @@ def write(results: Mapping[Job, Metrics], presets: Sequence[Preset], output: Pat
 
 def _row(job: Job, metrics: Metrics, command: str) -> Row:
     scores = metrics["test"] or {}
-    psnr = scores.get("psnr")
     protocol, frames = job.settings.protocol, job.settings.frames
     further = (f", {len(frames)} frames" if frames else "") + (f", {protocol}" if protocol else "")
     return make_row(
         "ablation",
-        f"{metrics['recording']}, {len(metrics['train_cameras'])} cameras{further}",
-        f"{job.backbone} {job.preset}",
-        f"seed {job.seed}",
-        error=None if psnr is None else 10 ** (-psnr / 20),
+        f"{metrics['recording']}, {len(metrics['train_cameras'])} views{further}",
+        f"{job.settings.backbone} {job.preset}",
+        f"seed {job.settings.seed}",
+        error=rms_error(scores),
         seconds=metrics["seconds"]["train"],
         command=command,
         scores=scores,
         gaussians=metrics["gaussians"],
         iterations=metrics["iterations"],
-        prior_seconds=_prior_seconds(job),
+        seed=job.settings.seed,
+        prior_seconds=Cost.of(Path(str(job.settings.priors))).seconds if job.uses_prior else 0.0,
         cameras=list(metrics["train_cameras"]),
         protocol=protocol,
     )

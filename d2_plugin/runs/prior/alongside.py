@@ -132,7 +132,7 @@ def _build(telling: Connection, settings: RunSettings, points: np.ndarray, folde
     end_with_parent()
     be_silent()
     try:
-        summary = build_priors_for(settings, Scene.open(settings), points, folder, told=telling.send)
+        summary = build_priors_for(Scene.open(settings), points, folder, on_image=telling.send)
     except D2Error as refusal:
         telling.send(str(refusal))
     else:

@@ -13,31 +13,29 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSummary, build_priors
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.scene import Scene
-from d2_plugin.runs.settings import RunSettings, prior_settings
 
 
 def build_priors_for(
-    settings: RunSettings,
     scene: Scene,
     points: np.ndarray,
     folder: Path,
     *,
     shard: tuple[int, int] | None = None,
     cluster: Mapping[str, Any] | None = None,
-    told: Callable[[int], None] | None = None,
+    on_image: Callable[[int], None] | None = None,
 ) -> PriorSummary:
     """Build what is missing of the depth prior in `folder`; `points` [P, 3] bound the depths that are searched.
 
     `shard` (index from 0, count) builds one part, so that any scheduler can run the parts beside each other. `cluster`
-    (`scheduler` or `workers`) hands the frames to dask.distributed instead. `told` is called with the number of
+    (`scheduler` or `workers`) hands the frames to dask.distributed instead. `on_image` is called with the number of
     images that are done: all cameras of one frame after the other, the frames in order.
     """
     with progress_bar("priors", len(scene.recording.frames) * len(scene.train_cameras)) as bar:
 
         def report(done: int, total: int, note: str = "") -> None:
             bar.update(done, note)
-            if told is not None:
-                told(done)
+            if on_image is not None:
+                on_image(done)
 
         if cluster is None:
             build = partial(build_priors, shard=shard)
@@ -46,7 +44,7 @@ def build_priors_for(
 
             build = partial(build_priors_on_cluster, **cluster)
         return build(
-            *(scene.recording, scene.train_cameras, folder, scene.plan.obeyed_by(prior_settings(settings))),
+            *(scene.recording, scene.train_cameras, folder, scene.prior_settings),
             sparse_points=points,
             progress=report,
         )

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from html import escape
 from typing import NamedTuple
 
 from d2_plugin.runs import markup
 from d2_plugin.runs.markup import Table
-from d2_plugin.runs.report.sections import Section
+from d2_plugin.runs.provenance import provenance
 from d2_plugin.runs.report.svg import style
+from d2_plugin.runs.rows import Row
 
-TITLE = "D²-4DGS: error against run time"
+TITLE = "D²-4DGS: quality against run time"
 
 CSS = """
 :root{color-scheme:light dark;--page:#f6f5f2;--card:#fcfcfb;--ink:#1b1b1a;--soft:#5c5b57;--line:#e0dfda;--mark:#e7f0fb}
@@ -21,8 +23,6 @@ CSS = """
 body{margin:0;background:var(--page);color:var(--ink);font:16px/1.55 system-ui,sans-serif}
 header,main,footer{max-width:1160px;margin:0 auto;padding:0 20px}
 header{padding-top:44px}h1{font-size:2rem;line-height:1.2;margin:0 0 .4em}
-dl{display:grid;grid-template-columns:max-content 1fr;gap:4px 18px;margin:0 0 1.2em}
-dt{color:var(--soft)}dd{grid-column:2;margin:0}
 h2{font-size:1.35rem;margin:0 0 .3em}h3{font-size:1rem;margin:1.6em 0 .5em}
 p{max-width:72ch}.soft,figcaption,footer{color:var(--soft);font-size:.875rem}
 nav{position:sticky;top:0;background:var(--page);border-bottom:1px solid var(--line);z-index:1}
@@ -44,6 +44,39 @@ footer{padding:10px 20px 50px}
 """
 
 
+@dataclass(frozen=True)
+class Section:
+    """One part of the report; `figures` are SVG by name, `tables` come with a title."""
+
+    name: str
+    title: str
+    text: str
+    figures: dict[str, str] = field(default_factory=dict)
+    tables: tuple[tuple[str, Table], ...] = ()
+    sources: tuple[str, ...] = ()
+
+
+def sources_of(rows: Sequence[Row]) -> tuple[str, ...]:
+    """One sentence per machine, commit and command that the rows come from."""
+    return tuple(dict.fromkeys(_source(row) for row in rows))
+
+
+def _source(row: Row) -> str:
+    if row["device"] is None:
+        return f"`{row['command']}`, which recorded neither machine nor commit."
+    return provenance(row)
+
+
+def cases_of(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """The rows by case, in order of appearance."""
+    return {case: [row for row in rows if row["case"] == case] for case in dict.fromkeys(row["case"] for row in rows)}
+
+
+def distinct(rows: Sequence[Row], name: str) -> list[float]:
+    """The values of a field, ascending, each once."""
+    return sorted({row[name] for row in rows})
+
+
 class Image(NamedTuple):
     """An image of a run as a data URI, with what it shows."""
 
@@ -61,21 +94,11 @@ def html(sections: Sequence[Section], images: Sequence[Image], lead: str) -> str
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f"<title>{TITLE}</title><style>{CSS}{style()}</style></head>\n"
-        f"<body><header><h1>{TITLE}</h1><p>{escape(lead)}</p>{_glance(sections)}</header>\n"
+        f"<body><header><h1>{TITLE}</h1><p>{escape(lead)}</p></header>\n"
         f'<nav aria-label="Sections"><ul>{links}</ul></nav>\n<main>{body}</main>\n'
         "<footer><p>Made by <code>d2 report</code> from the rows that the commands above wrote; nothing is typed in. "
         "Marks carry their numbers as tooltips.</p></footer></body></html>\n"
     )
-
-
-def _glance(sections: Sequence[Section]) -> str:
-    """What the sections found, in a line or a few each."""
-    items = "".join(
-        f"<dt>{escape(_short(section))}</dt>" + "".join(f"<dd>{escape(line)}</dd>" for line in section.headlines)
-        for section in sections
-        if any(section.headlines)
-    )
-    return f"<dl>{items}</dl>" if items else ""
 
 
 def _short(section: Section) -> str:
@@ -86,12 +109,9 @@ def _short(section: Section) -> str:
 def _section(section: Section) -> str:
     figures = "".join(f"<figure>{_inline(svg)}</figure>" for svg in section.figures.values())
     tables = "".join(f"<h3>{escape(title)}</h3>{_table(table)}" for title, table in section.tables)
-    folded = "".join(
-        f"<details><summary>{escape(title)}</summary>{_table(table)}</details>" for title, table in section.details
-    )
     return (
         f'<section id="{section.name}"><h2>{escape(section.title)}</h2><p>{escape(section.text)}</p>'
-        f"{figures}{tables}{folded}{_sources(section)}</section>\n"
+        f"{figures}{tables}{_sources(section)}</section>\n"
     )
 
 
@@ -149,8 +169,7 @@ def _gallery(images: Sequence[Image]) -> str:
 
 def markdown(sections: Sequence[Section], lead: str) -> str:
     """The same without images; the plots are the files `NAME.svg` beside it."""
-    glance = [f"- {_short(section)}: {line}" for section in sections for line in section.headlines if line]
-    parts = [f"# {TITLE}", lead, *(["\n".join(glance)] if glance else [])]
+    parts = [f"# {TITLE}", lead]
     for section in sections:
         parts += [f"## {section.title}", section.text]
         parts += [f"![{section.title}]({name}.svg)" for name in section.figures]

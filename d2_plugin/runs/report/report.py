@@ -2,42 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from benchmarks.never_worse.section import never_worse
 from d2_plugin.durable import make_folder, remove_leftovers, write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.reading import parsing
-from d2_plugin.runs.report.ablation import ablation
-from d2_plugin.runs.report.limits import gpu, plan, scaling, stability, step
-from d2_plugin.runs.report.page import Image, html, markdown
-from d2_plugin.runs.report.precision import alignment, raster, stereo
-from d2_plugin.runs.report.priors import priors
-from d2_plugin.runs.report.quality import quality
-from d2_plugin.runs.report.sections import Section
-from d2_plugin.runs.report.training import training
-from d2_plugin.runs.report.versions import versions
+from d2_plugin.runs.report.page import Image, Section, html, markdown
+from d2_plugin.runs.report.quality import ablation, quality, training
+from d2_plugin.runs.report.run_folders import image_of, method_of, training_rows
 from d2_plugin.runs.rows import Row, read_rows, told_apart
-from d2_plugin.runs.tables import read_metrics
-from d2_plugin.runs.training_rows import image_of, method_of, training_rows
+from d2_plugin.runs.saved.kinds import read_metrics
 from d2_plugin.settings import Positional, Settings
 
-BUILDERS: dict[str, Callable[[Sequence[Row]], Section]] = {
-    build.__name__: build
-    for build in (
-        *(training, quality, never_worse, ablation),
-        *(alignment, stereo, priors, raster, step, gpu, stability, plan, scaling),
-    )
-}
-"""The function that makes a section from the rows of a kind, in the order of the page."""
+Builder = Callable[[Sequence[Row]], Section]
+"""Makes a section from the rows of one kind."""
+
+BUILDERS: dict[str, Builder] = {"quality": quality, "training": training, "ablation": ablation}
+"""By the kind of row, in the order of the page."""
 
 LEAD = (
     "Every figure here was measured by a command of this package and is shown with the machine, the commit and the "
-    "command that made it. Errors are on the vertical axis, run time on the horizontal one."
+    "command that made it."
 )
 
 
@@ -53,34 +42,42 @@ class ReportSettings(Settings):
     """Leave the images of the runs out of the page."""
 
 
-def run(settings: ReportSettings) -> str:
+def run(settings: ReportSettings, builders: Mapping[str, Builder] = BUILDERS) -> str:
     """Make the report; how many rows it holds, and which files it is."""
     rows, images = collect(settings.sources)
-    page, markdown_file, *plots = make_report(rows, settings.output, () if settings.no_images else images)
+    images = [] if settings.no_images else images
+    page, markdown_file, *plots = make_report(rows, settings.output, images, builders)
     return f"{len(rows)} rows; open {page}, or read {markdown_file} with its {len(plots)} plots"
 
 
-def make_report(rows: Sequence[Row], output: Path, images: Sequence[Image] = ()) -> list[Path]:
+def make_report(
+    rows: Sequence[Row], output: Path, images: Sequence[Image] = (), builders: Mapping[str, Builder] = BUILDERS
+) -> list[Path]:
     """Write report.html, report.md and one SVG per plot into `output`.
 
     Args:
         rows: of any kinds, see `d2_plugin.runs.rows`.
         output: folder, created where absent; files of the same names are replaced.
         images: for the page; the Markdown has none.
+        builders: what makes a section of each kind of row.
 
     Returns:
         The files that were written.
 
     Raises:
-        D2Error: there is no row.
+        D2Error: there is no row, or one that no builder knows.
     """
     if not rows:
         raise D2Error("there is nothing to report: give a runs.jsonl with rows in it, or the folder of a finished run")
     rows = told_apart(rows)
-    by_kind = {kind: [row for row in rows if row["kind"] == kind] for kind in BUILDERS}
-    sections = [_built(kind, mine) for kind, mine in by_kind.items() if mine]
-    compared = versions(rows)
-    sections += [] if compared is None else [compared]
+    for row in rows:
+        if row["kind"] not in builders:
+            raise D2Error(
+                f"rows of kind '{row['kind']}' are drawn from a checkout alone: `python -m benchmarks report` there, "
+                f"or give rows of {', '.join(builders)}"
+            )
+    by_kind = {kind: [row for row in rows if row["kind"] == kind] for kind in builders}
+    sections = [_built(kind, builders[kind], mine) for kind, mine in by_kind.items() if mine]
     texts = {"report.html": html(sections, images, LEAD), "report.md": markdown(sections, LEAD)}
     texts |= {f"{name}.svg": svg for section in sections for name, svg in section.figures.items()}
     with only_writer(make_folder(output)):
@@ -90,10 +87,10 @@ def make_report(rows: Sequence[Row], output: Path, images: Sequence[Image] = ())
     return [output / name for name in texts]
 
 
-def _built(kind: str, rows: Sequence[Row]) -> Section:
+def _built(kind: str, build: Builder, rows: Sequence[Row]) -> Section:
     """The section of one kind of row; each reads what else its rows hold, which only it knows."""
     with parsing(f"the rows of kind {kind}", "measure them again, their form is not that of this version"):
-        return BUILDERS[kind](rows)
+        return build(rows)
 
 
 def collect(sources: Sequence[Path]) -> tuple[list[Row], list[Image]]:

@@ -1,6 +1,6 @@
-"""Plots as SVG, the only plot engine of this package.
+"""Plots as SVG: axes with round ticks, series of marks and lines in them, and how they are drawn.
 
-It is used instead of a plotting library because the report needs what matplotlib's SVG does not give: text stays text,
+Own code instead of a plotting library, because the report needs what matplotlib's SVG does not give: text stays text,
 every mark carries its numbers as a tooltip, colours follow the reader's light or dark setting through one style sheet
 that a page states once, and a file of a few kilobytes changes in a diff where a number changed. Series differ by shape
 as well as by colour.
@@ -8,10 +8,103 @@ as well as by colour.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
+from typing import NamedTuple
 
-from d2_plugin.runs.report.plots import Plot, Series
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+EDGE = 0.06
+"""Room between the outermost marks and the frame, as a share of the axis."""
+
+
+class Point(NamedTuple):
+    """One mark: its place, what the tooltip says, and a label beside it where there is room."""
+
+    x: float
+    y: float
+    note: str = ""
+    label: str = ""
+    faded: bool = False
+
+
+@dataclass(frozen=True)
+class Series:
+    """Marks of one colour and shape; `line` joins some points, `hollow` marks are figures from elsewhere."""
+
+    name: str
+    points: tuple[Point, ...]
+    line: tuple[tuple[float, float], ...] = ()
+    color: int = 0
+    hollow: bool = False
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A range of values with a label that names the unit."""
+
+    label: str
+    low: float
+    high: float
+    log: bool = False
+
+    @classmethod
+    def around(cls, label: str, values: Iterable[float], log: bool = False) -> Axis:
+        """The range of `values` with some room at both ends; a decade around a single one."""
+        known = [value for value in values if math.isfinite(value) and (value > 0 or not log)] or [1.0]
+        low, high = (math.log10(min(known)), math.log10(max(known))) if log else (min(known), max(known))
+        if high - low < 1e-9 * max(abs(high), 1e-12) or (log and high - low < 0.3):
+            room = 0.5 if log else max(0.1 * abs(high), 1e-6)
+        else:
+            room = EDGE * (high - low)
+        ends = (low - room, high + room)
+        return cls(label, *((10 ** ends[0], 10 ** ends[1]) if log else ends), log)
+
+    def place(self, value: float) -> float:
+        """0 at `low`, 1 at `high`."""
+        if self.log:
+            return math.log(max(value, 1e-300) / self.low) / math.log(self.high / self.low)
+        return (value - self.low) / (self.high - self.low)
+
+    def ticks(self, most: int = 7) -> list[tuple[float, str]]:
+        """Round values within the range, with their text."""
+        values = self._decades(most) if self.log else self._steps(most)
+        return [(value, number(value)) for value in values if self.low <= value <= self.high]
+
+    def _decades(self, most: int) -> list[float]:
+        first, last = math.ceil(math.log10(self.low) - 1e-9), math.floor(math.log10(self.high) + 1e-9)
+        if last - first >= 2:
+            return [10.0**power for power in range(first, last + 1, math.ceil((last - first + 1) / most))]
+        factors = (1, 2, 5) if self.high / self.low > 3 else (1, 1.5, 2, 3, 4, 5, 6, 7, 8, 9)
+        return [factor * 10.0**power for power in range(first - 1, last + 1) for factor in factors]
+
+    def _steps(self, most: int) -> list[float]:
+        raw = (self.high - self.low) / most
+        unit = 10 ** math.floor(math.log10(raw))
+        step = next(factor * unit for factor in (1, 2, 5, 10) if factor * unit >= raw)
+        return [step * i for i in range(math.ceil(self.low / step), math.floor(self.high / step) + 1)]
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Axes with series in them."""
+
+    title: str
+    x: Axis
+    y: Axis
+    series: tuple[Series, ...]
+
+
+def number(value: float) -> str:
+    """A short text: plain where that is short, powers of ten otherwise."""
+    if value == 0 or 1e-3 <= abs(value) < 1e5:
+        return f"{value:.6g}"
+    power = math.floor(math.log10(abs(value)) + 1e-9)
+    mantissa = value / 10.0**power
+    front = "" if abs(mantissa - 1) < 1e-6 else f"{mantissa:.3g}·"
+    return f"{front}10{str(power).translate(SUPERSCRIPTS)}"
+
 
 LIGHT = ("#2a78d6", "#eb6834", "#149a69", "#b07c00", "#d0589a", "#4a3aa7", "#e34948", "#008300")
 DARK = ("#5598e7", "#e0713f", "#2db584", "#d09a1d", "#d55181", "#9085e9", "#e66767", "#4aa84a")
@@ -22,8 +115,6 @@ LETTER = 6.4
 """Mean width of a letter at 12 px, px."""
 LABELLED = 320
 """In plots narrower than this marks have tooltips but no labels, px."""
-NAMED_ROW = 24
-"""Height of one name on an axis that lists names, px."""
 
 
 def style() -> str:
@@ -48,7 +139,7 @@ def style() -> str:
 def figure(plots: Sequence[Plot], description: str, columns: int = 1, size: tuple[int, int] = (720, 380)) -> str:
     """All plots on a grid under one legend, as one SVG; `description` is what a screen reader says.
 
-    `size` is that of one plot, px; one that lists names takes its height from them. Plots without a mark are left out.
+    `size` is that of one plot, px. Plots without a mark are left out.
     """
     plots = [plot for plot in plots if any(series.points for series in plot.series)]
     if not plots:
@@ -58,15 +149,9 @@ def figure(plots: Sequence[Plot], description: str, columns: int = 1, size: tupl
     parts = [legend]
     for first in range(0, len(plots), columns):
         row = plots[first : first + columns]
-        height = max(_height(plot, size[1]) for plot in row)
-        parts += [_plot(plot, place * size[0], top, (size[0], height)) for place, plot in enumerate(row)]
-        top += height
+        parts += [_plot(plot, place * size[0], top, size) for place, plot in enumerate(row)]
+        top += size[1]
     return document("".join(parts), columns * size[0], top, description)
-
-
-def _height(plot: Plot, height: int) -> int:
-    """A plot that lists names is as high as it has names."""
-    return MARGIN_TOP + MARGIN_BOTTOM + NAMED_ROW * len(plot.y.names) if plot.y.names else height
 
 
 def document(body: str, width: float, height: float, description: str) -> str:
@@ -125,8 +210,7 @@ def _dashes(series: Series) -> str:
 
 
 def _plot(plot: Plot, left: float, top: float, size: tuple[int, int]) -> str:
-    names = LETTER * max((len(name) for name in plot.y.names), default=0)
-    x0, x1 = left + max(MARGIN_LEFT, names + 28), left + size[0] - MARGIN_RIGHT
+    x0, x1 = left + MARGIN_LEFT, left + size[0] - MARGIN_RIGHT
     y0, y1 = top + size[1] - MARGIN_BOTTOM, top + MARGIN_TOP
     at = lambda x, y: (x0 + (x1 - x0) * plot.x.place(x), y0 + (y1 - y0) * plot.y.place(y))  # noqa: E731
     parts = [text(x0, top + 20, plot.title, "ink title")]
@@ -176,30 +260,3 @@ def _label(x: float, y: float, words: str, taken: list[tuple[float, float, float
             taken.append(place)
             return text(x, y + shift, words, "soft small")
     return ""
-
-
-def bars(
-    rows: Sequence[tuple[str, Sequence[float]]], parts: Sequence[str], unit: str, description: str, width: int = 720
-) -> str:
-    """Stacked horizontal bars: one row per label, one segment per part, the sum at the end."""
-    legend, top = _legend([(name, _swatch(index)) for index, name in enumerate(parts)], width)
-    left = 24 + LETTER * max(len(label) for label, _ in rows)
-    most = max(max(sum(values) for _, values in rows), 1e-12)
-    scale = (width - left - 90) / most
-    body = []
-    for index, (label, values) in enumerate(rows):
-        y, x = top + 8 + 30 * index, left
-        body.append(text(left - 10, y + 15, label, "ink", "end"))
-        for part, value in enumerate(values):
-            long = max(value * scale - 2, 0.5)  # a gap of two pixels keeps neighbours apart
-            tip = f"<title>{escape(f'{label}, {parts[part]}: {value:.4g} {unit}')}</title>"
-            box = f'x="{x:.1f}" y="{y:.1f}" width="{long:.1f}" height="20" rx="2"'
-            body.append(f'<rect class="{_color(part)} edge" {box}>{tip}</rect>')
-            x += value * scale
-        body.append(text(x + 6, y + 15, f"{sum(values):.3g} {unit}", "soft"))
-    return document(legend + "".join(body), width, top + 18 + 30 * len(rows), description)
-
-
-def _swatch(color: int) -> Callable[[float, float], str]:
-    """A piece of a bar, for the legend."""
-    return lambda x, y: f'<rect class="{_color(color)} edge" x="{x - 6:.1f}" y="{y - 5:.1f}" width="12" height="10"/>'

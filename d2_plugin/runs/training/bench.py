@@ -1,4 +1,4 @@
-"""`d2 bench training`: backbone, rivals and D² at the same CPU time, on any number of recordings and seeds.
+"""`d2 bench training`: D², stereo alone and the backbone at the same CPU time, on any number of recordings and seeds.
 
 Each recording is written with the cameras that train, and those that score where not all others do:
 PATH@00+02+05+07@01+03+04+06. Every run of one recording has the same starting points, depth inputs and settings,
@@ -10,25 +10,21 @@ finish, and the same command continues where it was stopped. `d2 report` draws t
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, NamedTuple
 
-from benchmarks.rivals.table import RIVALS
 from d2_plugin.errors import D2Error
 from d2_plugin.progress import progress_bar
 from d2_plugin.reading import read_toml
-from d2_plugin.runs.ablation.job import Job
-from d2_plugin.runs.ablation.presets import Preset, rows_named
-from d2_plugin.runs.command_line import command_line
-from d2_plugin.runs.rows import Row, append_rows, read_rows
+from d2_plugin.recordings.presets import resolve_cameras, split_name
+from d2_plugin.runs.ablation.presets import PRESETS, TABLES, Preset, rows_named
+from d2_plugin.runs.rows import TRY, Row, append_rows, command_line, read_rows
 from d2_plugin.runs.settings import RunSettings
-from d2_plugin.runs.shared import Shared, monocular_seconds, share
+from d2_plugin.runs.shared import Job, Shared, share, share_points
 from d2_plugin.runs.training.budget import TRIES, Timed, fits, nearest, next_steps
-from d2_plugin.runs.training.cases import Case, case_of
-from d2_plugin.runs.training.measured import TRY, Work
-from d2_plugin.runs.training.spread import Line, follow, workers
+from d2_plugin.runs.training.measured import Line, Work, follow, workers
 from d2_plugin.settings import AtATime, AtLeastOne, Count, Positional, Positive, Range, Seed, Settings
 
 
@@ -38,8 +34,8 @@ class TrainingBench(Settings):
 
     recordings: Annotated[tuple[str, ...], Positional()] = ()
     """Recordings with their cameras, as PATH@TRAIN+TRAIN or PATH@TRAIN+TRAIN@SCORE+SCORE."""
-    methods: tuple[str, ...] = ("rivals",)
-    """Rows or tables of `d2 ablate`; `rivals` stands for the backbone, all rivals and D²."""
+    methods: tuple[str, ...] = ("backbone", "mvs_only", "full")
+    """Rows or tables of `d2 ablate`."""
     seconds: tuple[Positive, ...] = ()
     """CPU seconds of training to compare at; 10, 30 and 100 if neither these nor steps are given."""
     steps: tuple[Annotated[int, Range(1, unit="steps")], ...] = ()
@@ -68,14 +64,27 @@ class TrainingBench(Settings):
     """Folder of priors, runs and training.jsonl."""
 
 
-def run(settings: TrainingBench) -> str:
-    """Measure what is missing; where the rows lie."""
+def run(
+    settings: TrainingBench,
+    presets: Mapping[str, Preset] = PRESETS,
+    tables: Mapping[str, Sequence[str]] = TABLES,
+    name: str = "bench training",
+) -> str:
+    """Measure what is missing; where the rows lie.
+
+    Args:
+        settings: what is compared, and on what.
+        presets, tables: methods by name, and tables of such names, that `settings.methods` may hold.
+        name: of the command, as rows have it.
+    """
     if not settings.recordings:
-        raise D2Error("d2 bench training needs a recording with its cameras: write PATH@00+02+05+07")
+        raise D2Error(f"{name} needs a recording with its cameras: write PATH@00+02+05+07")
     path = settings.output / "training.jsonl"
     known = read_rows([path]) if path.is_file() else []
-    lines = [line for text in settings.recordings for line in _lines(settings, text, known)]
-    with progress_bar("bench training", len(lines) * len(settings.seeds) * len(_targets(settings))) as bar:
+    chosen = rows_named(settings.methods, presets, tables)
+    command = command_line(name, settings, **_joined(settings))
+    lines = [line for text in settings.recordings for line in _lines(settings, text, chosen, known, command)]
+    with progress_bar(name, len(lines) * len(settings.seeds) * len(_targets(settings))) as bar:
         done: list[Row] = []
 
         def write(row: Row) -> None:
@@ -88,6 +97,39 @@ def run(settings: TrainingBench) -> str:
     return f"rows are in {path}; `d2 report {path}` draws them"
 
 
+class Case(NamedTuple):
+    """One recording with its cameras."""
+
+    name: str
+    """As rows have it: the recording, how many cameras train, and the size where it is not the recording's own."""
+    slug: str
+    """Name of its folder."""
+    settings: RunSettings
+
+
+def case_of(text: str, base: RunSettings) -> Case:
+    """The case that a text names; `base` gives all but recording and cameras.
+
+    Raises:
+        D2Error: no cameras, or more than two groups of them.
+    """
+    path, *groups = text.split("@")
+    if not path or not 1 <= len(groups) <= 2:
+        raise D2Error(
+            f"'{text}' names no cameras to train with: write PATH@00+02+05+07, or PATH@00+02@01+03 to say as well "
+            "which ones score"
+        )
+    named = [tuple(name for name in group.split("+") if name) for group in groups]
+    train, test, _ = resolve_cameras(path, named[0], named[1] if len(named) > 1 else None)
+    protocol = split_name(named[0])
+    settings = replace(base, recording=path, train_cameras=train, test_cameras=test, protocol=protocol)
+    title = Path(path).resolve().name
+    size = f", 1/{base.downscale} size" if base.downscale > 1 else ""
+    slug = "_".join([title, *train]) + (f"_small{base.downscale}" if base.downscale > 1 else "")
+    name = f"{title}, {len(train)} views{size}" + (f", {protocol}" if protocol else "")
+    return Case(name, slug + (f"_{protocol.replace(':', '_')}" if protocol else ""), settings)
+
+
 Target = tuple[Literal["seconds", "steps"], float]
 
 
@@ -97,24 +139,27 @@ def _targets(settings: TrainingBench) -> list[Target]:
     return [*(("steps", float(n)) for n in sorted(settings.steps)), *(("seconds", s) for s in sorted(seconds))]
 
 
-def _lines(settings: TrainingBench, text: str, known: Sequence[Row]) -> Iterator[Line]:
-    """One line per method of a case; points and prior are made here, before anything is measured."""
+def _lines(
+    settings: TrainingBench, text: str, presets: Sequence[Preset], known: Sequence[Row], command: str
+) -> Iterator[Line]:
+    """One line per method of a case; points and priors are made here, before anything is measured."""
     shown = ("backbone", "frames", "downscale", "mono_onnx", "mono_kind")
-    base = RunSettings("", (), **{n: getattr(settings, n) for n in shown}, overrides=_tables(settings.config))
-    case, presets = case_of(text, base), rows_named(settings.methods)
-    for preset in presets:
-        if "variant" in preset.overrides.get("priors", {}):
-            raise D2Error(f"'{preset.name}' has a prior of its own, and here all methods share one: use `d2 ablate`")
+    tables = {} if settings.config is None else read_toml(settings.config, "write TOML tables, or leave out --config")
+    base = RunSettings("", (), **{n: getattr(settings, n) for n in shown}, overrides=tables)
+    case = case_of(text, base)
     folder = settings.output.absolute() / case.slug
     cluster = None if settings.scheduler is None else {"scheduler": settings.scheduler}
-    shared = share(case.settings, folder, cluster)
     for preset in presets:
-        yield _line(settings, case, shared, preset, known)
+        share_points(case.settings, folder)
+        used = replace(case.settings, overrides=preset.merged(case.settings.overrides))
+        needed = preset.hooks or preset.guidance is not None
+        shared = share(used, folder, cluster) if needed else Shared(folder, "none")
+        yield _line(_Template(settings, case, shared, preset, command), known)
 
 
-def _line(settings: TrainingBench, case: Case, shared: Shared, preset: Preset, known: Sequence[Row]) -> Line:
+def _line(template: _Template, known: Sequence[Row]) -> Line:
     """All targets of one method: the length of a run is tried with the first seed, then the other seeds follow."""
-    template = _Template(settings, case, shared, preset)
+    settings, case = template.settings, template.case
     found = {(row["fingerprint"], row["target"]): row for row in known if row["kind"] == "quality"}
     tried: list[Timed] = [
         (row["iterations"], row["seconds"])
@@ -154,49 +199,42 @@ def _settled(found: dict[tuple[str, str], Row], template: _Template, target: str
 
 
 def _same(row: Row, case: Case) -> bool:
-    """Whether a row is of that case; one without cameras is of an earlier version, which did not say them."""
-    cameras = list(case.settings.train_cameras)
-    return row["case"] == case.name and row.get("cameras", cameras) == cameras
+    return row["case"] == case.name and row["cameras"] == list(case.settings.train_cameras)
 
 
 class _Template:
     """Makes the runs of one method on one case."""
 
-    def __init__(self, settings: TrainingBench, case: Case, shared: Shared, preset: Preset) -> None:
-        self.settings, self.case, self.shared, self.preset = settings, case, shared, preset
+    def __init__(self, settings: TrainingBench, case: Case, shared: Shared, preset: Preset, command: str) -> None:
+        self.settings, self.case, self.shared, self.preset, self.command = settings, case, shared, preset, command
         self.method = f"{settings.backbone} {preset.name}" + (f", {settings.label}" if settings.label else "")
-        self.command = command_line("bench training", settings, False, **_joined(settings))
         self.prior_seconds = _prior_seconds(preset, case, shared)
 
     def work(self, steps: int, seed: int, target: str) -> Work:
         """One run of so many steps."""
-        base = self.case.settings
-        run = replace(base, hooks=self.preset.hooks, seed=seed, iterations=steps, priors=str(self.shared.priors))
-        run = replace(run, overrides=self.preset.merged(base.overrides))
-        name = self.preset.name + (f"_{self.settings.label}".replace(" ", "_") if self.settings.label else "")
-        folder = self.shared.folder / "runs" / self.settings.backbone / name / f"{steps}steps" / f"seed{seed}"
-        job = Job(self.preset.name, base.backbone, seed, run, folder, self.preset.rival)
+        base, preset, shared = self.case.settings, self.preset, self.shared
+        run = replace(base, hooks=preset.hooks, seed=seed, iterations=steps, overrides=preset.merged(base.overrides))
+        guidance = None if preset.guidance is None else preset.guidance(steps)
+        if run.hooks or guidance is not None:
+            run = replace(run, priors=str(shared.priors))
+        name = preset.name + (f"_{self.settings.label}".replace(" ", "_") if self.settings.label else "")
+        folder = shared.folder / "runs" / self.settings.backbone / name / f"{steps}steps" / f"seed{seed}"
+        job = Job(preset.name, run, folder, guidance)
         about = {"prior_seconds": self.prior_seconds, "protocol": base.protocol}
-        return Work(job, self.shared, self.case.name, self.method, self.command, target, about)
-
-
-def _tables(path: Path | None) -> dict[str, Any]:
-    """The tables of a --config file; none where there is no file."""
-    if path is None:
-        return {}
-    return read_toml(path, "write TOML tables, or leave out --config")
+        return Work(job, shared.points, self.case.name, self.method, self.command, target, about)
 
 
 def _prior_seconds(preset: Preset, case: Case, shared: Shared) -> float | None:
-    """CPU seconds of what a method needs beforehand: nothing, monocular maps, or the full prior."""
-    needs = "stereo" if preset.hooks else "points" if preset.rival is None else RIVALS[preset.rival].needs
-    if needs == "mono":
-        return monocular_seconds(case.settings)
-    return 0.0 if needs == "points" else shared.cpu_seconds if shared.cpu_seconds is not None else shared.seconds
+    """CPU seconds of what a method needs beforehand; wall seconds where a cluster built it."""
+    cost = shared.cost
+    built = cost.seconds if cost.cpu_seconds is None else cost.cpu_seconds
+    if preset.guidance is not None:
+        return preset.prior_seconds(case.settings, built)
+    return built if preset.hooks else 0.0
 
 
-def _joined(settings: TrainingBench) -> dict[str, Any]:
-    """The values of a flag are joined by commas, where recordings stand apart."""
+def _joined(settings: TrainingBench) -> dict[str, str]:
+    """The values of a flag, joined by commas, where recordings stand apart."""
     many = {name: getattr(settings, name) or () for name in ("methods", "seconds", "steps", "seeds", "frames")}
     return {name: ",".join(_plain(value) for value in values) for name, values in many.items()}
 

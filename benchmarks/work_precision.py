@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from d2_plugin.runs.markup import Table
-from d2_plugin.runs.report.plots import Axis, Plot, Point, Series, number
+from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, number
 from d2_plugin.runs.rows import Row
 
 SMALLEST = 1e-16
@@ -120,19 +120,6 @@ def _point(mark: Drawn, unit: float, on_front: bool, error_label: str, seconds_l
     note += f"; failed on {mean.failures} of {mean.cases}" if mean.failures else ""
     label = mean.setting if on_front and mean.setting != "default" else ""
     return Point(mark.seconds * unit, max(mark.error, SMALLEST), note, label, faded=not on_front)
-
-
-def growth(
-    title: str, size: str, cost: str, lines: Mapping[str, Sequence[tuple[float, float]]], first_color: int = 0
-) -> Plot:
-    """How a cost grows with a size: one line of (size, cost) per name, both axes logarithmic."""
-    series = []
-    for color, (name, line) in enumerate(lines.items(), start=first_color):
-        points = tuple(Point(*place, f"{name}, {place[0]:g} {size}: {place[1]:.4g} {cost}") for place in line)
-        series.append(Series(name, points, tuple(line), color))
-    values = [place for line in lines.values() for place in line]
-    x, y = Axis.around(size, [x for x, _ in values], log=True), Axis.around(cost, [y for _, y in values], log=True)
-    return Plot(title, x, y, tuple(series))
 
 
 def means_table(rows: Sequence[Row], error_name: str, seconds_name: str, unit: float = 1) -> Table:

@@ -1,4 +1,4 @@
-"""Run folders of `d2 train` as rows of the study: held-out score, time with that of the prior, Gaussians."""
+"""Run folders of `d2 train` as rows of the report: held-out score, time with that of the prior, Gaussians."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import Any
 
 from d2_plugin.errors import MissingExtra
 from d2_plugin.recordings.images import opencv, read_image, shrink_image
-from d2_plugin.runs.provenance import circumstances
-from d2_plugin.runs.rows import Row, make_row
+from d2_plugin.runs.rows import Row, make_row, rms_error
 from d2_plugin.runs.saved.kinds import read_metrics, read_run
 from d2_plugin.runs.settings import HOOK_NAMES
 
@@ -23,7 +22,7 @@ def training_rows(folders: Sequence[Path]) -> list[Row]:
     """One row per run folder: seconds of training, those of the prior beside them, held-out scores.
 
     The error is the root mean square error of colour that the PSNR stands for. Device, versions and commit are those
-    that the run recorded, None where it recorded none.
+    that the run recorded.
 
     Raises:
         D2Error: a folder without metrics.json.
@@ -36,13 +35,12 @@ def _row(folder: Path) -> Row:
     settings = read_run(folder) if (folder / "run.json").is_file() else {}
     scores = metrics.get("test") or {}
     seconds = metrics["seconds"]
-    made = metrics.get("made")
-    found = make_row(
+    row = make_row(
         "training",
         case_of(metrics, settings),
         method_of(metrics) + (", own settings" if settings.get("overrides") else ""),
         f"{metrics['iterations']} steps" + (f", seed {settings['seed']}" if "seed" in settings else ""),
-        error=10 ** (-scores["psnr"] / 20) if scores.get("psnr") is not None else None,
+        error=rms_error(scores),
         seconds=seconds["train"],
         failed=None if scores.get("psnr") is not None else "no camera was held out",
         command=command_of(metrics, settings, folder.name),
@@ -58,7 +56,7 @@ def _row(folder: Path) -> Row:
         mono_emulated=metrics.get("mono_emulated", False),
         scores=scores,
     )
-    return found | (made or dict.fromkeys(circumstances()))
+    return row | metrics["made"]
 
 
 def command_of(metrics: dict[str, Any], settings: dict[str, Any], output: str) -> str:

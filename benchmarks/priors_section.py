@@ -6,9 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from d2_plugin.priors.calibration import DECLARED, shown
 from d2_plugin.runs.markup import Table
-from d2_plugin.runs.report.plots import Axis, Plot, Point, Series
-from d2_plugin.runs.report.sections import Section, cases_of, sources_of
-from d2_plugin.runs.report.svg import figure
+from d2_plugin.runs.report.page import Section, cases_of, sources_of
+from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure
 from d2_plugin.runs.rows import Row
 
 LABELS = tuple(map(shown, DECLARED))
@@ -25,12 +24,11 @@ FAINT = 0.05
 
 def priors(rows: Sequence[Row]) -> Section:
     """Declared against true error: one diagram per recording, one line per label, on the same axes."""
-    latest = _latest(rows)
-    curves = [row for row in latest if row.get("curve")]
+    curves = [row for row in rows if row.get("curve")]
     ends = _ends(value for row in curves for point in row["curve"] for value in point[:2])
     plots = [_diagram(case, mine, ends) for case, mine in cases_of(curves).items()]
-    emulated = any(row.get("mono_emulated") for row in latest)
-    tables = [("Errors within the declared sigma", _calibration_table(latest)), ("Far pixels", _far_table(latest))]
+    emulated = any(row.get("mono_emulated") for row in rows)
+    tables = [("Errors within the declared sigma", _calibration_table(rows)), ("Far pixels", _far_table(rows))]
     return Section(
         "priors",
         "Priors: declared against true error",
@@ -43,16 +41,8 @@ def priors(rows: Sequence[Row]) -> Section:
         + (" Monocular depth of some recordings is emulated, not predicted." if emulated else ""),
         {"priors": figure(plots, "Reliability: true error against declared sigma", columns=3, size=(340, 330))},
         tuple((title, table) for title, table in tables if table.rows),
-        sources=sources_of(latest),
-        headlines=tuple(filter(None, [_headline(latest)])),
+        sources=sources_of(rows),
     )
-
-
-def _latest(rows: Sequence[Row]) -> list[Row]:
-    """The last measurement of each recording."""
-    last = {row["case"]: (row["commit"], row["command"]) for row in rows}
-    mine = [row for row in rows if (row["commit"], row["command"]) == last[row["case"]]]
-    return list({(row["case"], row["method"]): row for row in mine}.values())
 
 
 def _ends(values: Iterable[float]) -> tuple[float, float]:
@@ -105,17 +95,6 @@ def _far_table(rows: Sequence[Row]) -> Table:
     header = ("recording", "far, of pixels without true depth", "far, of the others")
     found = [row for row in rows if row.get("false_far") is not None]
     return Table(header, tuple((row["case"], _percent(row, "sky_found"), _percent(row, "false_far")) for row in found))
-
-
-def _headline(rows: Sequence[Row]) -> str:
-    """How many labels meet the goal, and which do not."""
-    counted = [row for row in rows if row.get("within") is not None and row["share"] >= COUNTED]
-    missed = [row for row in counted if not (_in_goal(row) and row["within_two"] >= GOAL_TWO)]
-    if not counted:
-        return ""
-    others = [f"{case} ({', '.join(row['method'] for row in mine)})" for case, mine in cases_of(missed).items()]
-    met = f"{_goal()} for {len(counted) - len(missed)} of {len(counted)} labels"
-    return f"{met}; not for {'; '.join(others)}" if others else met
 
 
 def _whole(share: float) -> str:
