@@ -28,28 +28,16 @@ def markdown(table: Table, padded: bool = False) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def latex(table: Table, columns: str | None = None) -> str:
-    """The table in the form of the paper's (booktabs); what stands out is bold.
+def latex(table: Table) -> str:
+    """The table in the form of the paper's (booktabs): the first column to the left, the others centred.
 
-    Args:
-        table: its cells are LaTeX already, see `escaped`; signs that LaTeX lacks are replaced here.
-        columns: their alignment; the first to the left and the others centred where None.
+    Its cells are LaTeX already; signs that LaTeX lacks are replaced here.
     """
-    rows = [
-        [rf"\textbf{{{c}}}" if (i, k) in table.best else c for k, c in enumerate(r)] for i, r in enumerate(table.rows)
-    ]
-    head, *body = (" & ".join(line) + r" \\" for line in (table.header, *rows))
-    begin = rf"\begin{{tabular}}{{{columns or 'l' + 'c' * (len(table.header) - 1)}}}"
+    head, *body = (" & ".join(line) + r" \\" for line in (table.header, *table.rows))
+    begin = rf"\begin{{tabular}}{{l{'c' * (len(table.header) - 1)}}}"
     text = "\n".join([begin, r"\toprule", head, r"\midrule", *body, r"\bottomrule", r"\end{tabular}"])
     for sign, written in _LATEX.items():
         text = text.replace(sign, written)
-    return text
-
-
-def escaped(text: str) -> str:
-    """A text that LaTeX prints as it is."""
-    for symbol in "&%$#_{}":
-        text = text.replace(symbol, "\\" + symbol)
     return text
 
 

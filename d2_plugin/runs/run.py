@@ -130,11 +130,10 @@ class Run:
     def evaluate(self, images: bool = True) -> dict[str, Any]:
         """Score every held-out camera at every frame; returns the metrics.
 
-        Writes metrics.json (per view, per frame, per camera, mean), the same as tables in metrics.md and metrics.tex,
-        and images/.
+        Writes metrics.json (per view, per frame, per camera, mean), the same as tables in metrics.md, and images/.
         """
         from d2_plugin.runs.evaluation import evaluate_scene
-        from d2_plugin.runs.tables import write_tables
+        from d2_plugin.runs.tables import view_tables
 
         with self._writing():
             trainer = self.trained()
@@ -142,7 +141,7 @@ class Run:
                 shown = self.folder / "images" if images else None
                 scores = evaluate_scene(trainer.model, self.scene, self.settings.device, shown)
             metrics = scores | _about(self, trainer)
-            write_tables(metrics, self.folder)
+            write_text(self.folder / "metrics.md", view_tables(metrics))
             write_table(self.folder / "metrics.json", metrics, METRICS)
         return metrics
 
@@ -234,8 +233,8 @@ class Run:
                 state["d2"] = None
             trainer.load_state_dict(state)
             self.seconds = {name: max(value, self.seconds[name]) for name, value in state["seconds"].items()}
-            before = state.get("cpu_seconds", {})  # 0.1.0 kept none
-            self.cpu_seconds = {name: max(value, before.get(name, 0.0)) for name, value in self.cpu_seconds.items()}
+            kept = state["cpu_seconds"]
+            self.cpu_seconds = {name: max(value, kept[name]) for name, value in self.cpu_seconds.items()}
             self.prior = self.prior or state["prior"]
         wrong = what_diverged(trainer.model)
         if wrong:

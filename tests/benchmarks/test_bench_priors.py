@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from benchmarks.priors import Case, PriorsBench, cases, rows_of, run
-from d2_plugin.commands.bench import form
+from benchmarks.priors_section import COUNTED, DIAGONAL, priors
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.calibration import NORMAL_SHARE, Calibration, frames_with_truth, reliability_curve
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs.report.priors import COUNTED, DIAGONAL, priors
 from d2_plugin.runs.report.report import make_report
 from d2_plugin.runs.rows import Row, make_row, read_rows
 
@@ -120,14 +119,6 @@ def test_frames_with_truth_are_those_of_any_of_the_cameras(folder: Path) -> None
     assert frames_with_truth(long, ["train0"], most=9) == list(range(9))
 
 
-def test_its_flags_are_lists_joined_by_commas() -> None:
-    words = ["room", "den", "--rigs", "synthetic3", "--train-cameras", "a,b", "--frames", "0,8", "--output", "o"]
-    values = form(["priors"]).parse(words).values
-    assert values["recordings"] == ("room", "den")
-    assert values["train_cameras"] == ("a", "b")
-    assert values["frames"] == (0, 8)
-
-
 # ---------------------------------------------------------------- the report
 
 
@@ -142,7 +133,7 @@ def marks(svg: str) -> list[ET.Element]:
 
 def test_the_diagram_has_a_mark_per_bin_and_the_diagonal(measured: tuple[str, list[Row]], tmp_path: Path) -> None:
     _, rows = measured
-    make_report(rows, tmp_path)
+    make_report(rows, tmp_path, builders={"priors": priors})
     svg, text = (tmp_path / "priors.svg").read_text(), (tmp_path / "report.md").read_text()
     assert len(marks(svg)) == sum(len(row["curve"]) for row in rows[:-1]) > 0
     assert DIAGONAL in svg
@@ -151,12 +142,9 @@ def test_the_diagram_has_a_mark_per_bin_and_the_diagonal(measured: tuple[str, li
     assert "emulated, not predicted" in text
 
 
-def test_rare_labels_and_small_bins_are_faded_and_the_last_measurement_counts() -> None:
+def test_rare_labels_and_small_bins_are_faded() -> None:
     curve = [[0.01, 0.02, 900], [0.02, 0.03, 30]]
-    old = label_row("room", "mono only", 0.5, 0.2, curve) | {"commit": "before"}
     rows = [
-        old,
-        label_row("room", "verified", 0.5, 0.2, curve),
         label_row("room", "verified", 0.5, 0.7, curve),
         label_row("room", "agreed", COUNTED / 2, 0.9, curve),
     ]
@@ -167,14 +155,6 @@ def test_rare_labels_and_small_bins_are_faded_and_the_last_measurement_counts() 
     table = section.tables[0][1]
     assert [row[1] for row in table.rows] == ["verified", "agreed"]
     assert table.best == {(0, 3), (0, 4), (1, 4)}
-
-
-def test_the_headline_counts_the_labels_that_meet_the_goal_and_names_the_others() -> None:
-    shares = {"verified": 0.7, "agreed": 0.85, "mono only": 0.59}
-    rows = [label_row("room", label, 0.3, within, []) for label, within in shares.items()]
-    (headline,) = priors(rows).headlines
-    assert "for 1 of 3 labels; not for room (agreed, mono only)" in headline
-    assert "not for" not in priors(rows[:1]).headlines[0]
 
 
 def test_a_recording_without_any_label_has_a_row_and_no_curve() -> None:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import math
 from pathlib import Path
 
 import pytest
 import torch
 
-from benchmarks.growth import exponent
-from benchmarks.raster import RasterBench, bench_raster, parse_size, run
+from benchmarks.raster import RasterBench, parse_size, run
 from benchmarks.raster_measure import THRESHOLDS, Case, peak_memory, threshold_errors
 from benchmarks.raster_scenes import load_scene
 from d2_plugin.errors import D2Error
 from d2_plugin.rasterizer import RasterSettings, reference
+from d2_plugin.runs.rows import read_rows
 
 
 def test_synthetic_gaussians_have_the_radius_and_the_frustum_they_are_described_with():
@@ -58,41 +56,6 @@ def test_a_size_that_is_none_is_told(text):
         parse_size(text)
 
 
-def test_scaling_exponent_is_the_slope_in_logarithms():
-    assert exponent([(n, 3 * n**1.5) for n in (10, 100, 1000)]) == pytest.approx(1.5)
-    assert exponent([(10, 1.0), (10, 2.0)]) is None
-
-
-def test_bench_writes_rows_table_and_plot(tmp_path):
-    told = run(
-        RasterBench(scenes=("synth:30", "synth:60"), sizes=("24x16",), seconds=0, no_memory=True, output=tmp_path)
-    )
-    every = [json.loads(line) for line in (tmp_path / "raster.jsonl").read_text().splitlines()]
-    rows = [row for row in every if "thresholds" not in row]
-    assert [(row["method"], row["gaussians"]) for row in rows] == [
-        *(("d2", 30), ("torch reference", 30)),
-        *(("d2", 60), ("torch reference", 60)),
-    ]
-    for row in rows:
-        assert row["kind"] == "raster"
-        assert row["error"] == row["errors"]["color"]["p99.9"]
-        assert row["passes"]["forward"]["repeats"] >= 3
-        assert 0 < row["passes"]["forward+backward"]["min_ms"] <= row["passes"]["forward+backward"]["median_ms"]
-        assert 0 < row["errors"]["color"]["max"] < 1e-3
-        assert 0 < row["errors"]["grad covariances"]["relative_l2"] < 1e-3
-        assert row["command"] == (
-            "d2 bench raster --scenes synth:30 synth:60 --sizes 24x16 --seconds 0.0 --no-memory "
-            f"--output {tmp_path.name}"
-        )
-        assert not math.isnan(row["passes"]["forward"]["cpu_ms"])
-    table = (tmp_path / "raster.md").read_text()
-    assert "| d2 | synth:60 | 24x16 |" in table
-    assert "N^" in table
-    assert table in told
-    assert told.endswith(f"are in {tmp_path}")
-    assert (tmp_path / "raster.svg").stat().st_size > 1000
-
-
 def test_lower_thresholds_are_nearer_to_the_image_without_any(tmp_path):
     found = threshold_errors(load_scene("synth:400", 64, 36), torch.device("cpu"))
     assert list(found) == list(THRESHOLDS)
@@ -101,17 +64,33 @@ def test_lower_thresholds_are_nearer_to_the_image_without_any(tmp_path):
     assert found["alpha 1e-5, T 1e-6"] < 1e-4 < found["alpha 1/64, T 1e-4"]
 
 
-def test_beyond_the_limit_the_error_is_left_out_not_guessed(tmp_path):
-    small = {"scenes": ["synth:20"], "sizes": ["16x16"], "seconds": 0}
-    (row, _) = bench_raster(tmp_path, **small, error_limit=10, memory=False)
-    assert row["error"] is None
-    assert row["errors"] is None
-    assert "| - | - | - | - | - |" in (tmp_path / "raster.md").read_text()
-
-
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peak memory is measured on Linux")
 def test_peak_memory_is_that_of_the_call_not_of_the_process():
     case = Case("synth:30000", 320, 180, None)
     peak = peak_memory(case, "d2", torch.device("cpu"))
     records = 30_000 * 64 / 1e6
     assert records < peak < 40 * records
+
+
+def test_bench_adds_rows_and_prints_their_tables(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    told = run(RasterBench(("synth:30", "synth:60"), ("24x16",), seconds=0, no_memory=True, output=path))
+    rows = [row for row in read_rows([path]) if "thresholds" not in row]
+    assert [(row["method"], row["gaussians"]) for row in rows] == [
+        *(("d2", 30), ("torch reference", 30)),
+        *(("d2", 60), ("torch reference", 60)),
+    ]
+    for row in rows:
+        assert row["error"] == row["errors"]["color"]["p99.9"]
+        assert row["passes"]["forward"]["repeats"] >= 3
+        assert 0 < row["errors"]["color"]["max"] < 1e-3
+        assert 0 < row["errors"]["grad covariances"]["relative_l2"] < 1e-3
+    assert "| d2 | synth:60 | 24x16 |" in told
+    assert "N^" in told
+
+
+def test_beyond_the_limit_the_error_is_left_out_not_guessed(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    told = run(RasterBench(("synth:20",), ("16x16",), seconds=0, error_limit=10, no_memory=True, output=path))
+    assert {(row["error"], row["errors"]) for row in read_rows([path])} == {(None, None)}
+    assert "| - | - | - | - | - |" in told

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from benchmarks.sgbm import sgbm
-from benchmarks.stereo import StereoBench, bench_stereo, run, table
+from benchmarks.stereo import StereoBench, run, tables
 from benchmarks.stereo_measure import Method, measure, methods, score
 from benchmarks.stereo_rigs import Rig, load_rigs, textured_rig
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.filtering.filter import filter_depths
 from d2_plugin.priors.stereo.geometric_depth import gray
+from d2_plugin.runs.rows import read_rows
 
 pytest.importorskip("cv2")
 
@@ -74,36 +74,28 @@ def test_a_method_that_fails_on_a_rig_says_why_and_counts_as_nothing(rig: Rig) -
     row = measure(broken, [rig])
     assert row["failed"] == "disparities span more than the image"
     working = {**measure(methods()[-1], [rig]), "method": "broken"}
-    circumstances = {"device": "cpu", "threads": 1, "torch": "2", "commit": "abc", "version": "1", "command": "x"}
-    lines = table([{**row, **circumstances}, {**working, **circumstances}]).splitlines()
-    assert any(line.startswith("| synthetic2 | 2 | 192x108 | broken | default | failed |") for line in lines)
-    mean = next(line for line in lines if line.startswith("| broken | default |"))
-    assert mean.split("|")[3].strip() == f"{working['completeness'] / 2:.3f}"
-
-
-def test_bench_writes_rows_table_and_plot(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.stereo._set_threads", lambda count: None)
-    settings = StereoBench(
-        rigs=("synthetic2",), width=96, makers=("sweep", "sgbm"), defaults_only=True, output=tmp_path
-    )
-    told = run(settings)
-    assert "| sweep | default |" in told, "what a command made is printed"
-    assert told.endswith(f"are in {tmp_path}")
-    rows = [json.loads(line) for line in (tmp_path / "stereo.jsonl").read_text().splitlines()]
-    assert [(row["method"], row["rig"], row["width"]) for row in rows] == [
-        ("sweep", "synthetic2", 96),
-        ("sgbm", "synthetic2", 96),
-    ]
-    assert all(row["kind"] == "stereo" and row["error"] == 1 - row["f1"] for row in rows)
-    assert all(row["cpu"] > 0 and row["command"].startswith("d2 bench stereo --rigs") for row in rows)
-    assert "| synthetic2 | 2 | 96x54 | sweep | default |" in (tmp_path / "stereo.md").read_text()
-    assert (tmp_path / "stereo.svg").stat().st_size > 1000
+    (_, means), (_, every) = tables([row, working])
+    assert every.rows[0][:6] == ("synthetic2", "2", "192x108", "broken", "default", "failed")
+    assert means.rows[0][:3] == ("broken", "default", f"{working['completeness'] / 2:.3f}")
 
 
 def test_an_unknown_rig_or_maker_is_told(tmp_path) -> None:
     with pytest.raises(D2Error, match="unknown rig 'studi'.*did you mean 'studio'"):
         load_rigs("studi", None)
     with pytest.raises(D2Error, match="unknown stereo matcher 'patchmach'.*did you mean 'patchmatch'"):
-        bench_stereo(tmp_path, rigs=["synthetic2"], makers=["patchmach"])
+        run(StereoBench(rigs=("synthetic2",), makers=("patchmach",), output=tmp_path / "rows.jsonl"))
     with pytest.raises(D2Error, match="no such recording"):
         load_rigs("studio", tmp_path)
+
+
+def test_bench_adds_rows_and_prints_their_tables(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("benchmarks.stereo._set_threads", lambda count: None)
+    path = tmp_path / "rows.jsonl"
+    told = run(StereoBench(rigs=("synthetic2",), width=96, makers=("sweep", "sgbm"), defaults_only=True, output=path))
+    assert "| synthetic2 | 2 | 96x54 | sweep | default |" in told
+    rows = read_rows([path])
+    assert [(row["method"], row["rig"], row["width"]) for row in rows] == [
+        ("sweep", "synthetic2", 96),
+        ("sgbm", "synthetic2", 96),
+    ]
+    assert all(row["kind"] == "stereo" and row["error"] == 1 - row["f1"] and row["cpu"] > 0 for row in rows)

@@ -1,4 +1,4 @@
-"""The table of benchmarks: each entry leads to its settings and to what runs them."""
+"""What holds for every part of `python -m benchmarks`: settings, help, where rows go, and the page of them all."""
 
 from __future__ import annotations
 
@@ -7,54 +7,133 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from benchmarks import BENCHMARKS
-from d2_plugin.commands.cli import main
+from benchmarks import memory, scaling, training_step
+from benchmarks.__main__ import PARTS, main
+from benchmarks.growth import exponent
+from benchmarks.memory import in_fresh_process
+from benchmarks.report import EVERY
+from benchmarks.work_precision import means, pareto_front, work_precision
 from d2_plugin.errors import D2Error
-from d2_plugin.runs.rows import begin_rows
+from d2_plugin.runs.report.report import make_report
+from d2_plugin.runs.rows import Row, make_row, read_rows
 from d2_plugin.settings import Settings, declared
 
+RUNS = Path(__file__).parents[1] / "data" / "runs.jsonl"
+LINUX = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peak memory is measured on Linux")
 
-@pytest.mark.parametrize("name", BENCHMARKS)
-def test_each_benchmark_has_settings_with_help_and_something_that_runs_them(name: str) -> None:
-    module = importlib.import_module(BENCHMARKS[name].module)
-    settings = getattr(module, BENCHMARKS[name].settings)
+
+@pytest.mark.parametrize("name", PARTS)
+def test_each_part_has_settings_with_help_and_something_that_runs_them(name: str) -> None:
+    module = importlib.import_module(PARTS[name].module)
+    settings = getattr(module, PARTS[name].settings)
     assert issubclass(settings, Settings)
     assert all(setting.help for setting in declared(settings))
-    assert settings().output != Path()
     assert callable(module.run)
 
 
-@pytest.mark.parametrize("words", [["stability"], ["bench", "training-step"], ["bench", "scaling"]])
+def test_parts_are_found_from_any_folder_and_a_mistake_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for words, says in ((["bench", "sterio"], "did you mean 'stereo'?"), (["bench", "raster", "--size", "1"], "64")):
+        done = subprocess.run(
+            [sys.executable, "-c", "import sys; from d2_plugin.commands.cli import main; sys.exit(main(sys.argv[1:]))"]
+            + words,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert (done.returncode, len(done.stderr.splitlines())) == (2, 1), done.stderr
+        assert says in done.stderr or "WIDTHxHEIGHT" in done.stderr
+
+
+@pytest.mark.parametrize("part", ["align", "raster", "scaling", "stability", "stereo", "training-step"])
 def test_a_place_for_rows_that_cannot_be_is_said_before_anything_is_measured(
-    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    part: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torch.set_num_threads", lambda count: None)
+    monkeypatch.setattr("benchmarks.stereo._set_threads", lambda count: None)
     (tmp_path / "thesis.tex").write_text("mine")
     for name, says in (("thesis.tex", "is no file of rows"), ("thesis.tex/x.jsonl", "cannot"), (".", "is a folder")):
-        assert main([*words, "--output", str(tmp_path / name)]) == 2
+        assert main([part, "--output", str(tmp_path / name)]) == 2
         assert says in capsys.readouterr().err
     assert (tmp_path / "thesis.tex").read_text() == "mine"
 
 
-def test_rows_can_begin_where_nothing_is(tmp_path: Path) -> None:
-    begin_rows(tmp_path / "new" / "runs.jsonl")
-    assert not list((tmp_path / "new").iterdir())
-    (tmp_path / "runs.jsonl").write_text('{"kind": "step"}\n')
-    begin_rows(tmp_path / "runs.jsonl")
-    assert (tmp_path / "runs.jsonl").read_text() == '{"kind": "step"}\n'
-
-
-def test_the_table_is_read_without_importing_torch() -> None:
-    code = "import sys, benchmarks; print('torch' in sys.modules)"
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "False"
-
-
 def test_a_step_too_small_to_be_measured_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    from benchmarks import training_step
-
     monkeypatch.setattr(training_step, "timed", lambda *_: {training_step.RASTER: {"cpu_ms": 0.0}})
     with pytest.raises(D2Error, match="took no CPU time that can be measured: give more --gaussians"):
         training_step.measure(training_step.StepCase(5, 16, 16, 1), 0.0, memory=False)
+
+
+# ---------------------------------------------------------------- the page
+
+
+@pytest.mark.parametrize("kind", EVERY)
+def test_each_kind_becomes_a_section_also_where_nothing_has_a_result(kind: str, tmp_path: Path) -> None:
+    rows = [row for row in read_rows([RUNS]) if row["kind"] == kind]
+    assert rows, "the committed rows hold every kind"
+    lost = [row | {"error": None, "failed": "refused", "verdict": "failure", "scores": {}} for row in rows[:2]]
+    lost = [row | {"depth_error": None, "peak_mb": None} for row in lost]
+    for name, some in (("whole", rows), ("lost", lost)):
+        page, text, *plots = make_report(some, tmp_path / name, builders=EVERY)
+        assert f'<section id="{kind}">' in page.read_text()
+        assert all(f"]({plot.name})" in text.read_text() for plot in plots)
+
+
+def measured(method: str, setting: str, error: float | None, seconds: float | None, failed: str | None = None) -> Row:
+    return make_row("stereo", "rig", method, setting, error=error, seconds=seconds, failed=failed)
+
+
+@given(st.lists(st.tuples(st.floats(0, 1e9), st.floats(0, 1e9)), max_size=30))
+def test_every_point_off_the_front_is_beaten_by_one_on_it_and_none_of_the_front_is(points: list) -> None:
+    front = [points[i] for i in pareto_front(points)]
+    assert all(any(x <= p[0] and y <= p[1] for x, y in front) for p in points)
+    assert not any(a != b and a[0] <= b[0] and a[1] <= b[1] for a in front for b in front)
+
+
+def test_means_over_cases_are_geometric_and_failures_keep_a_setting_off_the_front() -> None:
+    rows = [measured("a", "x", 0.01, 1.0), measured("a", "x", 0.04, 4.0), measured("b", "y", 0.5, 9.0)]
+    rows += [measured("c", "z", 1e-9, 1e-9), measured("c", "z", None, None, "gave up")]
+    first, _, third = means(rows)
+    assert (first.error, first.seconds) == pytest.approx((0.02, 2.0))
+    assert (third.cases, third.failures) == (2, 1)
+    plot = work_precision(rows, "title", "error", "seconds")
+    assert {series.name: series.points[0].faded for series in plot.series} == {"a": False, "b": True, "c": True}
+
+
+# ---------------------------------------------------------------- growth and memory
+
+
+def test_growth_is_the_slope_in_logarithms() -> None:
+    assert exponent([(n, 3 * n**1.5) for n in (10, 100, 1000)]) == pytest.approx(1.5)
+    assert exponent([(10, 1.0), (10, 2.0)]) is None
+
+
+def test_scaling_adds_rows_of_time_and_memory_per_length(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(scaling, "in_fresh_process", lambda work, *given: memory.Measured(work(*given), 1.0))
+    path = tmp_path / "runs.jsonl"
+    told = scaling.run(scaling.ScalingBench(frames=(1, 2), width=96, iterations=2, output=path))
+    rows = read_rows([path])
+    assert [(row["method"], row["frames"]) for row in rows] == [(p, n) for n in (1, 2) for p in ("priors", "training")]
+    assert all(row["seconds"] > 0 for row in rows)
+    assert "frames^" in told
+    assert rows[0]["command"] == "d2 bench scaling --frames 1 2 --width 96 --iterations 2 --output runs.jsonl"
+
+
+def fill(megabytes: int) -> float:
+    return float(np.ones(megabytes * 125_000).sum())
+
+
+@LINUX
+def test_memory_is_that_of_the_work_not_of_what_was_there_before() -> None:
+    before = np.ones(20_000_000)  # 160 MB that stay
+    result, peak = in_fresh_process(fill, 100)
+    assert result == 100 * 125_000
+    assert 95 < peak < 130
+    assert before[0] == 1

@@ -9,13 +9,12 @@ import pytest
 
 from benchmarks.never_worse.bench import NeverWorseBench, run
 from benchmarks.never_worse.maps import SPOILED, Spoiled, spoiled_recording
-from benchmarks.never_worse.section import BACKBONE, STEREO, never_worse, table
+from benchmarks.never_worse.section import BACKBONE, STEREO, table
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs.report.page import markdown
 from d2_plugin.runs.rows import Row, make_row, read_rows
 
 pytest.importorskip("cv2")
@@ -82,15 +81,6 @@ def test_what_is_below_the_backbone_is_named_and_what_is_not_stands_out() -> Non
     column = found.header.index("over the backbone")
     assert [cells[column] for cells in found.rows] == ["-", "+1.00 dB", "+2.00 dB", "-0.05 dB", "-0.15 dB"]
     assert found.best == {(2, column), (3, column)}, "a tenth of a decibel is allowed"
-    section = never_worse(rows)
-    assert section.headlines == ("room: worse than the backbone alone with constant",)
-    assert "19.85" in markdown([section], "")
-    assert never_worse(rows[:4]).headlines == ("room: not worse than the backbone alone with any of own, noise",)
-
-
-def test_nothing_is_claimed_of_what_was_not_run() -> None:
-    assert never_worse([row(BACKBONE, 20.0), row(STEREO, 21.0)]).headlines == ("",)
-    assert never_worse([row("own", 20.0)]).headlines == ("",)
 
 
 def test_a_seed_that_was_repeated_counts_once() -> None:

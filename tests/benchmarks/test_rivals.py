@@ -21,13 +21,14 @@ from benchmarks.rivals.patch_norm import patch_norm_loss
 from benchmarks.rivals.pearson import PearsonConfig, pearson_correlation, pearson_depth_loss
 from benchmarks.rivals.scale_shift import fitted_scale_and_shift, scale_shift_loss
 from benchmarks.rivals.sparse_points import Seen, at_pixels, sparse_point_loss
-from benchmarks.rivals.table import RIVALS, rival
+from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, guidance
 from d2_plugin import D2Config, D2Hooks
-from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.runs.ablation import ablate
+from d2_plugin.runs.ablation.presets import PRESETS, rows_named
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved.kinds import read_run
 from d2_plugin.runs.settings import RunSettings
@@ -245,11 +246,6 @@ def test_back_projected_points_project_onto_their_pixels_with_their_colours() ->
     np.testing.assert_allclose(points.colors, room.image(name, 0)[row, column] / 255)
 
 
-def test_an_unknown_rival_is_answered_with_the_nearest() -> None:
-    with pytest.raises(D2Error, match="pearson"):
-        rival("pearsn", 100)
-
-
 def tensors_in(state: object) -> list[Tensor]:
     """All tensors of a nested state, in its order."""
     if isinstance(state, Tensor):
@@ -269,9 +265,15 @@ def ablation(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
     pytest.importorskip("cv2", reason="opencv is in the `image` extra")
     output = tmp_path_factory.mktemp("ablation") / "out"
-    command = ["ablate", str(room), "--train-cameras", "train0,train1,train2", "--rows", "rivals", "--seeds", "0"]
-    assert main([*command, "--iterations", "24", "--jobs", "1", "--output", str(output)]) == 0
+    base = RunSettings(str(room), ("train0", "train1", "train2"), iterations=24)
+    presets = rows_named(["backbone", *RIVALS, "full"], PRESETS | RIVAL_PRESETS)
+    work = ablate.jobs(base, presets, ["yang4d"], [0], output)
+    ablate.write(ablate.run_jobs(work, 1, output), presets, output, "")
     return output
+
+
+def folder_of(output: Path, method: str) -> Path:
+    return output / "yang4d" / method / "seed0"
 
 
 class TestOnARecording:
@@ -280,7 +282,7 @@ class TestOnARecording:
         assert {row["method"].removeprefix("yang4d ") for row in rows} == {"backbone", *RIVALS, "full"}
         assert [path.name for path in (ablation / "priors").iterdir() if path.is_dir()] == ["dual"]
         for name in RIVALS:
-            metrics = json.loads((ablation / "yang4d" / name / "seed0" / "metrics.json").read_text())
+            metrics = json.loads((folder_of(ablation, name) / "metrics.json").read_text())
             assert metrics["guidance"]["name"] == name
             assert metrics["cpu_seconds"]["train"] > 0
 
@@ -289,17 +291,17 @@ class TestOnARecording:
         assert len({metrics["test"]["psnr"] for metrics in scores.values()}) == len(scores)
 
     def test_a_dense_start_adds_stereo_points_to_the_triangulated_ones(self, ablation: Path) -> None:
-        run = Run.load(ablation / "yang4d" / "dense_start" / "seed0")
+        run = Run.load(folder_of(ablation, "dense_start"))
         points = run.prepare(priors=False)
-        started = rival("dense_start", 24).start(run.scene, points, ablation / "priors" / "dual")
+        started = guidance("dense_start", 24).start(run.scene, points, run.priors)
         assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of six images rounds
         np.testing.assert_array_equal(started.positions[: len(points)], points.positions)
         assert set(started.times) == {0.0, run.scene.recording.seconds(1)}
 
     def test_the_store_is_opened_once_for_all_maps(self, ablation: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """A rival is charged for its own work: opening the store costs more than a step."""
-        run, opened = Run.load(ablation / "yang4d" / "pearson" / "seed0"), []
-        inputs = Inputs(run.scene, run.prepare(priors=False), ablation / "priors" / "dual")
+        run, opened = Run.load(folder_of(ablation, "pearson")), []
+        inputs = Inputs(run.scene, run.prepare(priors=False), run.priors)
         open_store = PriorStore.open
         monkeypatch.setattr(PriorStore, "open", lambda path: opened.append(path) or open_store(path))
         views = [
@@ -310,16 +312,16 @@ class TestOnARecording:
 
     def test_a_resumed_rival_is_bitwise_the_uninterrupted_one(self, ablation: Path, tmp_path: Path) -> None:
         """patch_norm draws at random: its draws come from the run's own generator, which is saved."""
-        whole = ablation / "yang4d" / "patch_norm" / "seed0"
+        whole = folder_of(ablation, "patch_norm")
         stored = read_run(whole)
-        guidance = rival(stored.pop("guidance")["name"], 24)
+        rival = guidance(stored.pop("guidance")["name"], 24)
         settings = RunSettings.from_table(stored, "run.json")
-        run = Run(settings, tmp_path / "cut", guidance)
+        run = Run(settings, tmp_path / "cut", rival)
         (tmp_path / "cut" / "points.npz").write_bytes((whole / "points.npz").read_bytes())
         trainer = run._trainer(run.prepare())
         trainer.run(10)
         run._save(trainer)
-        again = Run(settings, tmp_path / "cut", guidance)
+        again = Run(settings, tmp_path / "cut", rival)
         again.train()
         ours, theirs = (torch.load(f / "checkpoint.pt", weights_only=True) for f in (tmp_path / "cut", whole))
         mine, others = tensors_in(ours["model"]), tensors_in(theirs["model"])
@@ -327,20 +329,20 @@ class TestOnARecording:
         assert all(torch.equal(a, b) for a, b in zip(mine, others, strict=True))
 
     def test_a_rivals_run_can_be_scored_but_not_trained_by_others(self, ablation: Path) -> None:
-        run = Run.load(ablation / "yang4d" / "pearson" / "seed0")
+        run = Run.load(folder_of(ablation, "pearson"))
         assert run.evaluate(images=False)["guidance"]["name"] == "pearson"
         with pytest.raises(D2Error, match="guided by 'pearson'"):
             run._trainer(run.prepare(priors=False))
 
     def test_another_rival_does_not_take_the_folder(self, ablation: Path) -> None:
-        folder = ablation / "yang4d" / "pearson" / "seed0"
+        folder = folder_of(ablation, "pearson")
         settings = Run.load(folder).settings
         with pytest.raises(D2Error, match="other settings of guidance"):
-            Run(settings, folder, rival("scale_shift", 24))
+            Run(settings, folder, guidance("scale_shift", 24))
         with pytest.raises(D2Error, match="other settings of guidance"):
             Run(settings, folder)
         with pytest.raises(D2Error, match="other settings of guidance"):
-            Run(settings, folder, replace(rival("pearson", 24), config=PearsonConfig(weight=0.5)))
+            Run(settings, folder, replace(guidance("pearson", 24), config=PearsonConfig(weight=0.5)))
 
 
 class TestHooksAsObjects:
@@ -362,7 +364,6 @@ class TestHooksAsObjects:
             D2Hooks(D2Config(), make_adapter(make_model()), TinyStore(), {"prune": self.Constant(HookConfig())})
 
     def test_training_does_not_import_what_it_is_compared_with(self) -> None:
-        code = (
-            "import sys, d2_plugin.runs.run, d2_plugin.commands.train; print([m for m in sys.modules if '.study' in m])"
-        )
+        asks = "import sys, d2_plugin.runs.training.bench, d2_plugin.commands.train; "
+        code = asks + "print([name for name in sys.modules if name.startswith('benchmarks')])"
         assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from benchmarks.stability.gaussians import difference, largest, random_rotation, random_scene
-from benchmarks.stability.sweep import PRECISIONS, SWEEPS, StabilitySettings, measure, run, run_sweeps, summary
+from benchmarks.stability.sweep import PRECISIONS, SWEEPS, StabilitySettings, measure, run, run_sweeps, tables
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.rows import Row
 
@@ -53,7 +53,7 @@ def test_nothing_fails_and_only_what_float32_cannot_hold_is_a_gap(rows: list[Row
 def test_what_float32_cannot_hold_is_told_rather_than_clamped(rows: list[Row]) -> None:
     far = [row for row in rows if (row["case"], row["method"], row["value"]) == ("world offset", "float32", 1e6)]
     assert [row["verdict"] for row in far] == ["gap"]
-    assert "gap at 1e+06" in summary(rows)
+    assert any(row[:4] == ("world offset", "float32", "1e+06", "gap") for row in tables(rows)[2][1].rows)
 
 
 def test_a_point_that_is_refused_or_not_finite_is_a_failure_and_one_above_its_limit_a_gap() -> None:
@@ -91,8 +91,8 @@ def test_the_command_appends_rows_and_prints_a_line_per_sweep(tmp_path: Path) ->
     assert first == told
     found = [json.loads(line) for line in output.read_text().splitlines()]
     assert len(found) == 2 * 2 * len(SWEEPS["epsilon"].values)
-    assert found[0]["command"].startswith("d2 stability --sweeps epsilon")
-    assert "epsilon            float32   8/8 ok" in told
+    assert found[0]["command"].startswith("d2 bench stability --sweeps epsilon")
+    assert "| epsilon | float32 | smoothing over median depth: 1e-08 .. 0.1 | 8 | 8 |" in told
     assert str(output) in told
 
 

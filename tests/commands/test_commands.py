@@ -1,4 +1,4 @@
-"""Every `d2` command as a person meets it: its help, its flags, old ones included, and tables given by flags."""
+"""Every `d2` command as a person meets it: its help, its flags, and tables given by flags."""
 
 from __future__ import annotations
 
@@ -12,18 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import BENCHMARKS
 from d2_plugin.commands import cli
-from d2_plugin.commands.arguments.form import Form, Given
-from d2_plugin.commands.arguments.recording import all_tables
+from d2_plugin.commands.arguments.form import Form, Given, ModuleCommand
 from d2_plugin.commands.cli import COMMANDS, main
 from d2_plugin.config import DensifyConfig
-from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
-from d2_plugin.runs.settings import OVERRIDABLE, TABLES, hook_config, prior_settings
-from d2_plugin.settings import declared
+from d2_plugin.runs.settings import hook_config, prior_settings
 
 CAMERAS = ["--train-cameras", "train0,train1,train2"]
 
@@ -36,7 +32,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def form_of(command: str, words: list[str]) -> Form:
-    return cli._module(command).form(words)
+    known = COMMANDS[command]
+    return known.form(command) if isinstance(known, ModuleCommand) else cli._module(known).form(words)
 
 
 def parsed(command: str, *words: str) -> Given:
@@ -62,7 +59,7 @@ class TestHelp:
             [line] = [line for line in lines if line.startswith(f"  {name} ")]
             assert len(line.split()) > 5
 
-    @pytest.mark.parametrize("command", ["demo", "plan", "priors", "train", "eval", "compare", "ablate", "doctor"])
+    @pytest.mark.parametrize("command", [name for name in COMMANDS if name != "bench"])
     def test_every_command_explains_each_of_its_settings(
         self, command: str, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -85,29 +82,19 @@ class TestHelp:
         assert main(["train", "--help-all", "--backbone", "deform"]) == 0
         assert "--backbone.mlp." in capsys.readouterr().out
 
-    def test_bench_names_its_parts(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(["bench", "--help"]) == 0
-        told = capsys.readouterr().out
-        assert all(f"{name:13} {benchmark.help}" in told for name, benchmark in BENCHMARKS.items())
-        assert main(["bench"]) == 2
-        assert "have align, gpu, never-worse, priors, raster, scaling, stereo" in capsys.readouterr().err
-        assert main(["bench", "sterio"]) == 2
-        assert "did you mean 'stereo'?" in capsys.readouterr().err
+    def test_bench_measures_runs_everywhere_and_other_parts_in_a_checkout(
+        self, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        assert main(["bench", "training", "--help"]) == 0
+        assert "d2 bench training" in capsys.readouterr().out
+        assert main(["bench", "raster", "--help"]) == 0, "this is a checkout"
+        assert "python -m benchmarks raster" in capsys.readouterr().out
+        monkeypatch.setattr("d2_plugin.__file__", str(tmp_path / "site-packages" / "d2_plugin" / "__init__.py"))
+        assert main(["bench", "raster"]) == 2
+        assert "'raster' is measured from a checkout alone" in capsys.readouterr().err
 
 
 class TestTables:
-    def test_every_table_of_a_configuration_file_can_be_given_by_flags(self) -> None:
-        assert set(all_tables("yang4d")) == set(TABLES) | {"import"}
-        assert {setting.name for setting in declared(all_tables("yang4d")["plan"].kind)} == set(OVERRIDABLE)
-
-    def test_every_setting_of_the_prior_has_a_flag(self) -> None:
-        sections = form_of("train", []).sections([])
-        stereo = {setting.name for setting in sections["priors.stereo"].settings}
-        assert stereo == {setting.name for setting in declared(StereoSettings)}
-        assert {s.name for s in sections["priors"].settings} | {"stereo", "align"} == {
-            setting.name for setting in declared(PriorSettings)
-        }
-
     def test_flags_stand_over_the_file_and_the_file_over_the_defaults(self, recording: Path, tmp_path: Path) -> None:
         config = tmp_path / "d2.toml"
         config.write_text(
@@ -150,51 +137,10 @@ class TestTables:
         assert "unknown flag --backbone.sh-time-degree" in capsys.readouterr().err
 
 
-OLD = {
-    "train": "room --train-cameras a,b --test-cameras c --frames 0:8:2 --downscale 2 --mono-onnx n.onnx "
-    "--mono-kind relative --config c.toml --backbone deform --iterations 7 --hooks prior,densify --output o "
-    "--priors p --seed 3 --device cuda --export-ply",
-    "eval": "folder --no-images",
-    "compare": "one two three",
-    "ablate": "room --train-cameras a,b --test-cameras c --frames 0:8 --downscale 2 --mono-onnx n --mono-kind metric "
-    "--config c.toml --rows main --backbones yang4d,deform --seeds 0,1 --iterations 5 --jobs 99 --output o",
-    "priors": "room --train-cameras a,b --frames 0:8 --downscale 2 --mono-onnx n --mono-kind metric --config c.toml "
-    "--output o --shard 1/2 --workers 2 --scheduler tcp://a:1",
-    "plan": "room --train-cameras preset:4 --frames 0:8 --downscale 2 --mono-onnx n --mono-kind metric --config c.toml",
-    "demo": "--output o --iterations 5",
-    "doctor": "",
-    "export-recording": "room --format colmap --output o --train-cameras a --test-cameras b --frames 0:1 --downscale 2 "
-    "--points 0 --seed 1",
-    "bench align": "--output o --anchors 10 20 --outliers 0 .2 --methods a b --seeds 1 --seconds .1 --threads 1",
-    "bench gpu": "--output o --steps static shim --repository r --recording c --train-cameras a --iterations 5",
-    "bench raster": "--output o --scenes synth:30 garden --sizes 64x36 --garden g.npz --device cuda --seconds 1 "
-    "--threads 1 --error-limit 5 --no-memory",
-    "bench scaling": "--output o --frames 5 20 --width 64 --iterations 5",
-    "bench stereo": "--output o --rigs pair --data d --makers sweep --defaults-only --width 64 --widen 2 --repeats 2 "
-    "--threads 2",
-    "stability": "--output o --sweeps epsilon",
-    "report": "runs.jsonl folder --output o --no-images",
-    "plan --verify": "room --train-cameras a,b --frames 0:8 --downscale 2 --mono-onnx n --mono-kind metric "
-    "--iterations 5 --prior-frames 2 --seeds 0,1 --output o",
-}
-"""All flags of each command before they came from the declared settings."""
-
-
-@pytest.mark.parametrize("command", OLD)
-def test_old_flags_keep_working(command: str) -> None:
-    name, *rest = command.split()
-    words = [*rest, *OLD[command].split()]
-    form = form_of(name, words)
-    given = form.parse(words)
-    flags = [word.lstrip("-").replace("-", "_") for word in words if word.startswith("--")]
-    defaults = {setting.name: setting.default for setting in form.settings}
-    for flag in flags:
-        assert given.values[flag] != defaults[flag], flag
-
-
 class TestFlagsOfARun:
     def test_values_are_those_that_were_written(self) -> None:
-        values = parsed("train", *OLD["train"].split()).values
+        words = "room --train-cameras a,b --frames 0:8:2 --hooks prior,densify --output o --export-ply"
+        values = parsed("train", *words.split()).values
         assert values["train_cameras"] == ("a", "b")
         assert values["frames"] == (0, 2, 4, 6, 8)
         assert values["hooks"] == ("prior", "densify")

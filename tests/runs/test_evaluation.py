@@ -177,15 +177,6 @@ def test_missing_depth_is_drawn_black(recording: Recording, tmp_path: Path) -> N
     assert (depth[:, 10:].max(axis=-1) > 0).all()
 
 
-def test_letters_can_be_told_apart() -> None:
-    shapes = {drawing.text(chr(code)).tobytes() for code in range(32, 127)}
-    assert len(shapes) == 95
-    assert drawing.text("ab", 2).shape == (16, 24, 3)
-    np.testing.assert_array_equal(drawing.text("é"), drawing.text("?"))
-    bar = drawing.text("|")[..., 0] == drawing.INK
-    assert bar.any(axis=0).tolist() == [False, False, True, False, False, False]
-
-
 def test_colour_scales_run_from_dark_to_bright() -> None:
     for name in ("viridis", "inferno"):
         brightness = drawing.color_scale(name).astype(float) @ [0.299, 0.587, 0.114]

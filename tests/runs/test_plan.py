@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.export.ply import PointCloud
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.overlap import measure_overlap, measure_texture
-from d2_plugin.runs.plan import changed_share, plan_scene, plan_text
+from d2_plugin.runs.plan import changed_share, plan_scene
 from d2_plugin.runs.run import build_priors_for
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings
@@ -234,7 +233,7 @@ def test_no_stereo_reaches_the_priors(moving, tmp_path: Path, monkeypatch: pytes
     settings = RunSettings(str(path), ("train0", "train1"))
     scene = Scene.open(settings)
     assert [scene.plan.uses(name) for name in ("stereo", "monocular", "verification")] == [False, True, False]
-    summary = build_priors_for(settings, scene, np.zeros((0, 3)), tmp_path / "priors")
+    summary = build_priors_for(scene, np.zeros((0, 3)), tmp_path / "priors")
     assert any("nothing matched" in note for note in summary.notes)
     prior = PriorStore.open(tmp_path / "priors").prior("train0", 0)
     assert set(np.unique(prior.labels)) <= {Label.MONO, Label.EMPTY}
@@ -246,21 +245,6 @@ def test_stereo_changes_no_setting_of_the_priors(moving) -> None:
     settings = PriorSettings(tau_c=0.2)
     assert plan.obeyed_by(settings) is settings
     assert plan.override(stereo=False).obeyed_by(settings).stereo == StereoSettings(matcher=NO_MATCHER)
-
-
-def test_the_text_of_a_plan_says_what_the_recording_is(moving, tmp_path: Path) -> None:
-    recording = open_recording(save_recording(moving, tmp_path / "scene"))
-    train = ["train0", "train1"]
-    lines = plan_text(recording, train, plan_scene(recording, train, "maps")).splitlines()
-    assert lines[:4] == [
-        "   layout  folder",
-        "  cameras  5 (train0 train1 train2 test0 test1); training on train0 train1",
-        "   frames  4 (0 to 3) at 12 per second",
-        " images  96x54 pixels",
-    ]
-    assert lines[4] == "     note  monocular maps are emulated, not predicted"
-    assert lines[5].startswith("      use  temporal     motion: up to")
-    assert json.dumps(plan_scene(recording, train, "maps").as_dict())
 
 
 def test_a_recording_of_one_instant_on_disk_has_no_temporal_dimension(moving, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Tables of scores: every view, frame and camera, and LaTeX rows in the form of the paper's."""
+"""Tables of scores: every view, frame and camera."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings.selection import select_cameras
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.evaluation import evaluate
-from d2_plugin.runs.tables import latex_table, metrics_table, read_metrics, view_tables, write_tables
+from d2_plugin.runs.saved.kinds import read_metrics
+from d2_plugin.runs.tables import metrics_table, view_tables
 
 NAMES = ["test0", "test1"]
 
@@ -67,31 +68,6 @@ def test_a_missing_score_is_a_dash_and_an_unmeasured_column_is_left_out() -> Non
     assert second[head.index("flicker")] == "0.0200"
     assert second[-3:] == ["6", "0.0", "1.2"]
     assert len({len(line) for line in table.splitlines()}) == 1
-
-
-def test_latex_rows_have_the_form_of_the_papers_tables() -> None:
-    runs = {
-        "backbone_alone": run(psnr=20.0, ssim1=0.7, ssim2=0.8, lpips=0.2),
-        "D²-4DGS": run(psnr=21.46683, ssim1=0.8011, ssim2=0.79, lpips=0.1968),
-        "unfinished": {"test": None},
-    }
-    lines = latex_table(runs).splitlines()
-    assert lines[0] == r"\begin{tabular}{lcccc}"
-    assert lines[2] == r"Method & PSNR$\uparrow$ & SSIM$_1\uparrow$ & SSIM$_2\uparrow$ & LPIPS$\downarrow$ \\"
-    assert lines[4] == r"backbone\_alone & 20.0000 & 0.7000 & \textbf{0.8000} & 0.2000 \\"
-    assert lines[5] == r"D$^2$-4DGS & \textbf{21.4668} & \textbf{0.8011} & 0.7900 & \textbf{0.1968} \\"
-    assert lines[6] == r"unfinished & -- & -- & -- & -- \\"
-    assert lines[-1] == r"\end{tabular}"
-    assert r"\textbf" not in latex_table({"alone": run(psnr=20.0)})
-
-
-def test_evaluation_leaves_both_tables_in_the_run_folder(metrics: dict[str, Any], tmp_path: Path) -> None:
-    write_tables(metrics, tmp_path)
-    assert (tmp_path / "metrics.md").read_text() == view_tables(metrics)
-    latex = (tmp_path / "metrics.tex").read_text()
-    assert f"yang4d prune & {metrics['test']['psnr']:.4f}" in latex
-    with pytest.raises(D2Error, match="has no metrics.json: finish `d2 train`"):
-        read_metrics(tmp_path)
 
 
 @pytest.mark.parametrize("content", [b"", b'{"test": {"psnr": 2', b"[1, 2]", b"\xff\xfe"])

@@ -13,18 +13,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
-from d2_plugin.runs.ablation.job import Job
 from d2_plugin.runs.ablation.presets import PRESETS
-from d2_plugin.runs.rows import Row, make_row
+from d2_plugin.runs.rows import TRY, Row, make_row
+from d2_plugin.runs.scene import Remembered
 from d2_plugin.runs.settings import RunSettings
-from d2_plugin.runs.shared import Shared
-from d2_plugin.runs.training.bench import TrainingBench, _line, _targets
+from d2_plugin.runs.shared import Job, Shared
+from d2_plugin.runs.training.bench import Case, TrainingBench, _line, _targets, _Template, case_of
 from d2_plugin.runs.training.budget import PILOT, TOLERANCE, fits, nearest, next_steps
-from d2_plugin.runs.training.cases import Case, case_of
-from d2_plugin.runs.training.measured import TRY, Work, fingerprint
-from d2_plugin.runs.training.spread import follow
+from d2_plugin.runs.training.measured import Work, fingerprint, follow
 
 SETTINGS = RunSettings("room", ("a", "b"))
 
@@ -73,7 +70,13 @@ class TestCases:
 def pretend(work: Work, seconds_per_step: float = 0.05) -> Row:
     """A row as if the run had taken so long."""
     settings = work.job.settings
-    about = {"target": work.target, "iterations": settings.iterations, "seed": settings.seed, "gaussians": 10}
+    about = {
+        "cameras": list(settings.train_cameras),
+        "target": work.target,
+        "iterations": settings.iterations,
+        "seed": settings.seed,
+        "gaussians": 10,
+    }
     psnr = 20 + math.log(settings.iterations) + 0.01 * settings.seed + (1 if "full" in work.method else 0)
     scores = {"psnr": psnr, "ssim1": 0.8, "depth_absrel": 0.1}
     return make_row(
@@ -97,8 +100,8 @@ def now(work: Work) -> Future[Row]:
 def bench(known: Sequence[Row], methods: Sequence[str] = ("backbone", "full"), **more: Any) -> list[Row]:
     """The rows that one call writes, given what lies there already."""
     settings = TrainingBench(("room@a+b",), **more)
-    case, shared = Case("room, 2 views", "room", SETTINGS), Shared(Path("/out/room"), 3.0, 3.0)
-    lines = [_line(settings, case, shared, PRESETS[name], known) for name in methods]
+    case, shared = Case("room, 2 views", "room", SETTINGS), Shared(Path("/out/room"), "dual")
+    lines = [_line(_Template(settings, case, shared, PRESETS[name], "d2"), known) for name in methods]
     rows: list[Row] = []
     follow(lines, now, rows.append)
     return rows
@@ -126,17 +129,13 @@ class TestPlan:
         assert [row["iterations"] for row in rows if row["method"] == "yang4d backbone"] == [20, 70]
 
     def test_other_settings_are_other_runs_wherever_the_files_lie(self) -> None:
-        def job(settings: RunSettings, rival: str | None = None) -> str:
-            return fingerprint(Job("full", "yang4d", 0, settings, Path("x"), rival))
+        def job(settings: RunSettings, **guidance: object) -> str:
+            return fingerprint(Job("full", settings, Path("x"), Remembered(guidance) if guidance else None))
 
         elsewhere = replace(SETTINGS, recording="/elsewhere/room", priors="/elsewhere/dual")
         assert job(elsewhere) == job(replace(SETTINGS, recording="room", priors="dual"))
         others = [replace(SETTINGS, seed=1), replace(SETTINGS, iterations=5), replace(SETTINGS, downscale=2)]
-        assert len({job(SETTINGS), *map(job, others), job(SETTINGS, "pearson"), job(SETTINGS, "patch_norm")}) == 6
-
-    def test_a_preset_with_a_prior_of_its_own_is_refused(self, tmp_path: Path) -> None:
-        command = ["bench", "training", "room@a", "--methods", "mono_only", "--output", str(tmp_path / "o")]
-        assert main(command) == 2
+        assert len({job(SETTINGS), *map(job, others), job(SETTINGS, name="a"), job(SETTINGS, name="a", weight=2)}) == 6
 
     def test_an_error_of_a_worker_ends_the_whole(self) -> None:
         def broken(work: Work) -> Future[Row]:
@@ -144,12 +143,7 @@ class TestPlan:
             future.set_exception(MemoryError("gone"))
             return future
 
-        line = _line(
-            TrainingBench(("room@a",), steps=(5,)),
-            Case("room", "room", SETTINGS),
-            Shared(Path("/out"), None, None),
-            PRESETS["backbone"],
-            [],
-        )
+        settings, case = TrainingBench(("room@a",), steps=(5,)), Case("room", "room", SETTINGS)
+        line = _line(_Template(settings, case, Shared(Path("/out"), "dual"), PRESETS["backbone"], "d2"), [])
         with pytest.raises(MemoryError):
             follow([line], broken, lambda row: None)

@@ -36,7 +36,9 @@ def jobs(
                     base, backbone=backbone, hooks=preset.hooks, seed=seed, overrides=preset.merged(base.overrides)
                 )
                 settings = replace(settings, priors=str(output / "priors" / prior_settings(settings).variant))
-                made.append(Job(preset.name, settings, output / backbone / preset.name / f"seed{seed}"))
+                guidance = None if preset.guidance is None else preset.guidance(settings.iterations)
+                folder = output / backbone / preset.name / f"seed{seed}"
+                made.append(Job(preset.name, settings, folder, guidance))
     return made
 
 

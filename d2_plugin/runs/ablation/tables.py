@@ -26,12 +26,16 @@ def table(
     `published` holds the paper's PSNR by preset: it stands in a column of its own, labelled as the paper's.
     """
     header = ["variant", "seeds", *(column.title for column in STUDY_COLUMNS), "Gaussians", "train s"]
-    lines = [[PRESETS[name].title, *_cells(_of(results, backbone, name), as_latex)] for name in rows]
+    lines = [[_title(name), *_cells(_of(results, backbone, name), as_latex)] for name in rows]
     if published:
         header.append(f"{MARK} paper's PSNR")
         lines = [[*line, f"{published[name]:.2f}" if name in published else "-"] for line, name in zip(lines, rows)]
     made = Table(tuple(header), tuple(map(tuple, lines)))
     return latex(made) if as_latex else markdown(made)
+
+
+def _title(name: str) -> str:
+    return PRESETS[name].title if name in PRESETS else name
 
 
 def _of(results: Mapping[Job, Metrics], backbone: str, preset: str) -> list[Metrics]:
@@ -55,8 +59,8 @@ def _cell(value: Estimate | None, form: str, as_latex: bool) -> str:
 def order_table(results: Mapping[Job, Metrics], backbone: str) -> Table:
     """Whether the full method is better than each other row that was run, metric by metric."""
     scores = {
-        preset.title: [run["test"] for run in _of(results, backbone, name) if run["test"]]
-        for name, preset in PRESETS.items()
+        _title(name): [run["test"] for run in _of(results, backbone, name) if run["test"]]
+        for name in dict.fromkeys(job.preset for job in results)
     }
     full = PRESETS["full"].title
     return verdicts_table(scores, full, [name for name in scores if name != full], f"{full} is better than")
