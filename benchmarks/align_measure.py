@@ -2,22 +2,19 @@
 
 Each problem has anchors like a real one: depths of a room, a monocular value that is their line up to a few per cent
 of noise, and wrong geometric depths, which are those of other places in the room. Least squares, Huber's weights,
-RANSAC and the median rule of Inria's `make_depth_scale.py` are what other code bases align with; L-BFGS is a general
-solver for our problem.
+RANSAC and the median rule of Inria's `make_depth_scale.py` are what other code bases align with.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from statistics import median
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.monocular.affine import charbonnier, fit_affine
@@ -109,24 +106,20 @@ class AlignMethod:
 
 
 def methods() -> list[AlignMethod]:
-    """Ours at several tolerances, and the others; L-BFGS only where scipy is installed."""
+    """Ours at several tolerances, and the others."""
     found = [
         AlignMethod("certified", f"{residual}, gap {tolerance:g}", residual, _certified(residual, tolerance))
         for residual in ("relative", "absolute")
         for tolerance in (1e-2, 1e-6, 1e-10)
     ]
     found.append(AlignMethod("align()", "as the priors use it", "relative", _as_used))
-    found.append(AlignMethod("align()", "leverage guard", "relative", partial(_as_used, leverage_guard=True)))
     found += [
         AlignMethod("Huber IRLS", f"{count} iterations", "relative", partial(_huber, iterations=count))
         for count in (5, 50)
     ]
     found += [AlignMethod("RANSAC", f"{count} pairs", "relative", partial(_ransac, pairs=count)) for count in (50, 500)]
     found.append(AlignMethod("least squares", "closed form", "relative", _least_squares))
-    found.append(AlignMethod("least squares", "torch.linalg.lstsq", "relative", _torch_least_squares))
     found.append(AlignMethod("median and MAD", "make_depth_scale.py", "relative", _median_and_mad))
-    if importlib.util.find_spec("scipy"):
-        found.append(AlignMethod("L-BFGS (scipy)", "its defaults", "relative", _lbfgs))
     return found
 
 
@@ -140,9 +133,9 @@ def _certified(residual: str, tolerance: float) -> Callable[[AlignProblem], Line
     return fit
 
 
-def _as_used(problem: AlignProblem, leverage_guard: bool = AlignSettings.leverage_guard) -> Line:
+def _as_used(problem: AlignProblem) -> Line:
     """Everything that building a prior does: selection, subsampling, fit, certificate, acceptance."""
-    settings = AlignSettings(leverage_guard=leverage_guard)
+    settings = AlignSettings()
     found = align(problem.mono[None], problem.geometric[None], kind=problem.kind, settings=settings)
     if not found.accepted:
         raise D2Error(found.status.value)
@@ -160,13 +153,6 @@ def _weighted(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> Line:
 def _least_squares(problem: AlignProblem) -> Line:
     target = problem.target
     return _weighted(problem.mono, target, target**-2)
-
-
-def _torch_least_squares(problem: AlignProblem) -> Line:
-    target = problem.target
-    matrix = np.stack([problem.mono / target, 1 / target], axis=1)
-    solution = torch.linalg.lstsq(torch.from_numpy(matrix), torch.ones(len(target), 1, dtype=torch.float64)).solution
-    return float(solution[0, 0]), float(solution[1, 0])
 
 
 def _huber(problem: AlignProblem, iterations: int) -> Line:
@@ -201,26 +187,6 @@ def _median_and_mad(problem: AlignProblem) -> Line:
     median_x, median_y = np.median(x), np.median(y)
     scale = float(np.abs(y - median_y).mean() / np.abs(x - median_x).mean())
     return scale, float(median_y - scale * median_x)
-
-
-def _lbfgs(problem: AlignProblem) -> Line:
-    """The certified solver's own problem, relative residual, given to a general solver with the bound scale >= 0."""
-    from scipy.optimize import minimize
-
-    x, y = problem.mono, problem.target
-    weights, epsilon = weights_and_epsilon(y, "relative")
-    centre, spread = float(np.median(x)), float(np.abs(x - np.median(x)).mean())
-    unit, scaled = float(np.abs(y - np.median(y)).mean()), (x - centre) / spread
-
-    def objective(parameters: np.ndarray) -> tuple[float, np.ndarray]:
-        residual = weights * (unit * (parameters[0] * scaled + parameters[1]) - y)
-        slope = unit * weights * residual / np.hypot(residual, epsilon)
-        return charbonnier(residual, epsilon).sum(), np.array([slope @ scaled, slope.sum()])
-
-    start = np.array([1.0, np.median(y) / unit])
-    found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=[(0, None), (None, None)])
-    scale = float(found.x[0]) * unit / spread
-    return scale, float(found.x[1]) * unit - scale * centre
 
 
 class AlignScore(NamedTuple):
@@ -262,8 +228,3 @@ def optimum(problem: AlignProblem, residual: str) -> float:
     weights, epsilon = weights_and_epsilon(target, residual)
     found = fit_affine(problem.mono, target, weights, epsilon=epsilon, tolerance=EXACT)
     return problem.objective((found.scale, found.shift), residual) * (1 - found.gap)
-
-
-def without_noise(problem: AlignProblem) -> AlignProblem:
-    """The same anchors, all of them right: every method must find `TRUE_LINE`."""
-    return replace(problem, mono=problem.clean_mono, geometric=problem.truth)

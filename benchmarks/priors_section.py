@@ -14,12 +14,6 @@ LABELS = tuple(map(shown, DECLARED))
 """Labels whose sigma is drawn; each has its colour in all plots."""
 DIAGONAL = "declared = true"
 DIAGONAL_COLOR = 5
-GOAL, GOAL_TWO = (0.6, 0.8), 0.9
-"""Share of the errors within sigma, from and to, and least share within 2 sigma."""
-COUNTED = 0.01
-"""The goal is set for labels that this share of the pixels carry; the others are faded."""
-FAINT = 0.05
-"""A mark that holds a smaller share of its label's pixels is faded."""
 
 
 def priors(rows: Sequence[Row]) -> Section:
@@ -34,10 +28,9 @@ def priors(rows: Sequence[Row]) -> Section:
         "Priors: declared against true error",
         "Sigma is the relative standard deviation that the prior declares for the depth of a pixel. A mark holds the "
         "pixels of one label whose sigma is alike; 68 % of their true errors |log(D / true)| are smaller than its "
-        f"height. It is faded where it holds less than {_whole(FAINT)} of that label's pixels. On the dashed diagonal "
-        "the prior is as wrong as it says; above, it is overconfident, and below, too cautious. Goal, for every label "
-        f"that {_whole(COUNTED)} of the pixels carry: {_goal()}; what meets it stands out in the table. A pixel "
-        "without a true depth is sky, or nobody measured it."
+        "height. On the dashed diagonal the prior is as wrong as it says; above, it is overconfident, and below, too "
+        "cautious. A normal error lies within sigma at 68 % and within 2 sigma at 95 % of the pixels. A pixel without "
+        "a true depth is sky, or nobody measured it."
         + (" Monocular depth of some recordings is emulated, not predicted." if emulated else ""),
         {"priors": figure(plots, "Reliability: true error against declared sigma", columns=3, size=(340, 330))},
         tuple((title, table) for title, table in tables if table.rows),
@@ -63,13 +56,9 @@ def _diagram(case: str, rows: Sequence[Row], ends: tuple[float, float]) -> Plot:
 
 
 def _points(row: Row) -> tuple[Point, ...]:
-    least = FAINT * sum(pixels for *_, pixels in row["curve"])
+    note = f"{row['method']}, {row['case']}"
     return tuple(
-        Point(
-            *(sigma, error),
-            f"{row['method']}, {row['case']}: sigma {sigma:.2%}, error {error:.2%}, {pixels} pixels",
-            faded=row["share"] < COUNTED or pixels < least,
-        )
+        Point(sigma, error, f"{note}: sigma {sigma:.2%}, error {error:.2%}, {pixels} pixels")
         for sigma, error, pixels in row["curve"]
     )
 
@@ -81,13 +70,7 @@ def _calibration_table(rows: Sequence[Row]) -> Table:
     cells = tuple(
         (row["case"], row["method"], *(_percent(row, name) for name in shares), _seconds(row)) for row in held
     )
-    met = {(place, 3) for place, row in enumerate(held) if _in_goal(row)}
-    met |= {(place, 4) for place, row in enumerate(held) if row["within_two"] >= GOAL_TWO}
-    return Table((*header, "s per image"), cells, frozenset(met))
-
-
-def _in_goal(row: Row) -> bool:
-    return GOAL[0] <= row["within"] <= GOAL[1]
+    return Table((*header, "s per image"), cells)
 
 
 def _far_table(rows: Sequence[Row]) -> Table:
@@ -97,21 +80,12 @@ def _far_table(rows: Sequence[Row]) -> Table:
     return Table(header, tuple((row["case"], _percent(row, "sky_found"), _percent(row, "false_far")) for row in found))
 
 
-def _whole(share: float) -> str:
-    return f"{100 * share:.0f} %"
-
-
-def _goal() -> str:
-    low, high = GOAL
-    return f"{100 * low:.0f} to {_whole(high)} of the errors within sigma, at least {_whole(GOAL_TWO)} within 2 sigma"
-
-
 def _percent(row: Mapping[str, float | None], name: str) -> str:
     """Two digits behind the point where it is small; a dash where it was not measured."""
     value = row.get(name)
     if value is None:
         return "-"
-    return f"{value:.2%}" if "median" in name or value < COUNTED else f"{value:.1%}"
+    return f"{value:.2%}" if "median" in name or value < 0.01 else f"{value:.1%}"
 
 
 def _seconds(row: Row) -> str:

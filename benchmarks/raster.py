@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 
-from benchmarks.growth import power
 from benchmarks.raster_measure import (
-    THRESHOLDS,
     Case,
     error_of,
     exact,
     implementations,
     passes_of,
     peak_memory,
-    threshold_errors,
     timed,
-    with_thresholds,
 )
-from benchmarks.work_precision import means_table
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.checks.memory import BYTES_PER_PIXEL, check_bytes
 from d2_plugin.runs.markup import Table, markdown
@@ -32,8 +26,6 @@ from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make
 from d2_plugin.settings import AtATime, Count, NotNegative, Settings
 
 logger = logging.getLogger(__name__)
-
-Key = TypeVar("Key")
 
 PASSES = ("forward", "forward+backward", "survey")
 
@@ -63,10 +55,7 @@ class RasterBench(Settings):
 
 
 def run(settings: RasterBench) -> str:
-    """Measure and add the rows; the tables, and where the rows lie.
-
-    One row per implementation, scene and size, and one per setting of the thresholds where errors are measured.
-    """
+    """Measure and add the rows, one per implementation, scene and size; the table, and where the rows lie."""
     if settings.threads:
         torch.set_num_threads(settings.threads)
     names = [*settings.scenes, *(["garden"] if settings.garden and "garden" not in settings.scenes else [])]
@@ -75,12 +64,9 @@ def run(settings: RasterBench) -> str:
     command, rows = command_line("bench raster", settings), list[Row]()
     for case in cases:
         measured = _measure(case, settings, command)
-        if measured[0]["errors"]:
-            measured += _measure_thresholds(case, torch.device(settings.device), settings.seconds, command)
         append_rows(settings.output, measured)
         rows += measured
-    shown = [part for title, table in tables(rows) for part in (title, markdown(table))]
-    return "\n\n".join([CAPTION, *shown, f"rows are in {settings.output}"])
+    return "\n\n".join([CAPTION, markdown(table(rows)), f"rows are in {settings.output}"])
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -122,45 +108,19 @@ def _measure(case: Case, settings: RasterBench, command: str) -> list[Row]:
     return rows
 
 
-def _measure_thresholds(case: Case, device: torch.device, seconds: float, command: str) -> list[Row]:
-    """What the thresholds of splatting cost in error and save in time, one row each, for `d2 report`."""
-    scene, where = case.load(), f"{case.scene} at {case.width}x{case.height}"
-    works = {name: passes_of(with_thresholds(name), scene, device)["forward+backward"] for name in THRESHOLDS}
-    times, errors = timed(works, device, seconds), threshold_errors(scene, device)
-    logger.info("thresholds on %s are measured", where)
-    return [
-        make_row(
-            *("raster", where, "d2", name),
-            error=error,
-            seconds=times[name]["median_ms"] / 1e3,
-            command=command,
-            device=device,
-            thresholds=name,
-        )
-        for name, error in errors.items()
-    ]
-
-
 CAPTION = (
     "Median wall time and half the interquartile range in ms; CPU ms is the CPU time of one forward+backward over "
     "all threads; peak MB is what one forward+backward takes beyond its inputs. Error against float64: absolute "
     "for color (0..1), relative L2 for gradients; pixels apart are the share where a threshold was decided "
-    "differently, gradients are without them. The thresholds (contributions below alpha are left out, a pixel is "
-    "finished at a transmittance T) are compared with an image that has next to none."
+    "differently, gradients are without them."
 )
 
 
-def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
-    """Times, memory and errors per case, how time grows with Gaussians and pixels, and what thresholds cost."""
-    plain, swept = ([row for row in rows if ("thresholds" in row) == wanted] for wanted in (False, True))
+def table(rows: Sequence[Row]) -> Table:
+    """Times, memory and errors per case."""
     header = ("implementation", "scene", "size", *(f"{kind} ms" for kind in PASSES), "CPU ms", "peak MB")
     header += ("color p99.9", "color max", "pixels apart", "worst gradient")
-    made = [("Every scene and size", Table(header, tuple(map(_cells, plain))))]
-    if grown := tuple(_growth(plain)):
-        made.append(("Forward+backward grows as", Table(("what", "power"), grown)))
-    if swept:
-        made.append(("Thresholds, mean over scenes and sizes", means_table(swept, "color p99.9", "ms", 1e3)))
-    return made
+    return Table(header, tuple(map(_cells, rows)))
 
 
 def _cells(row: Row) -> tuple[str, ...]:
@@ -180,27 +140,3 @@ def _error_cells(errors: Mapping[str, Mapping[str, float]] | None) -> tuple[str,
     worst = max(value["relative_l2"] for name, value in errors.items() if name.startswith("grad"))
     color = errors["color"]
     return tuple(f"{value:.1e}" for value in (color["p99.9"], color["max"], errors["pixels"]["apart"], worst))
-
-
-def _growth(rows: Sequence[Row]) -> list[tuple[str, str]]:
-    """What grows, and as which power of the number of Gaussians or of pixels."""
-    laws = [(name, power(line, "N")) for name, line in _by_gaussians(rows).items()]
-    for (name, scene), group in _grouped(rows, lambda row: (row["method"], row["scene"])):
-        line = [(row["width"] * row["height"], _milliseconds(row)) for row in group]
-        laws.append((f"{name}, {scene}", power(line, "pixels")))
-    return [(name, law) for name, law in laws if law is not None]
-
-
-def _by_gaussians(rows: Sequence[Row]) -> Mapping[str, list[tuple[float, float]]]:
-    """Milliseconds over the number of synthetic Gaussians, per implementation and image size."""
-    synthetic = [row for row in rows if row["scene"] != "garden"]
-    groups = _grouped(synthetic, lambda row: f"{row['method']} at {row['width']}x{row['height']}")
-    return {name: sorted((row["gaussians"], _milliseconds(row)) for row in group) for name, group in groups}
-
-
-def _grouped(rows: Sequence[Row], key: Callable[[Row], Key]) -> list[tuple[Key, list[Row]]]:
-    return [(value, [row for row in rows if key(row) == value]) for value in dict.fromkeys(map(key, rows))]
-
-
-def _milliseconds(row: Row) -> float:
-    return row["passes"]["forward+backward"]["median_ms"]

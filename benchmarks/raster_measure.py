@@ -25,21 +25,6 @@ REFERENCE_LIMIT = 12_000
 """Most Gaussians for which the torch path is timed as a peer; with more of them it takes seconds per call."""
 
 
-NEARLY_NO_THRESHOLDS = RasterSettings(alpha_min=1e-7, transmittance_min=1e-9)
-"""What images with thresholds are compared with, in float64."""
-
-THRESHOLDS = {
-    "alpha 1/255, T 1e-4 (default)": SETTINGS,
-    "alpha 1/255, T 1e-2": RasterSettings(transmittance_min=1e-2),
-    "alpha 1/255, T 1e-3": RasterSettings(transmittance_min=1e-3),
-    "alpha 1/64, T 1e-4": RasterSettings(alpha_min=1 / 64),
-    "alpha 1e-3, T 1e-4": RasterSettings(alpha_min=1e-3),
-    "alpha 1e-4, T 1e-5": RasterSettings(alpha_min=1e-4, transmittance_min=1e-5),
-    "alpha 1e-5, T 1e-6": RasterSettings(alpha_min=1e-5, transmittance_min=1e-6),
-}
-"""Which contributions are left out, and when a pixel is finished."""
-
-
 class Case(NamedTuple):
     """A scene at an image size."""
 
@@ -218,22 +203,6 @@ def error_of(render: RenderScene, scene: Scene, device: torch.device, truth: Tru
         errors[f"grad {name}"] = {**_quantiles(deviation.abs() / scale), "relative_l2": relative.item()}
     errors["pixels"] = {"apart": apart.double().mean().item()}
     return errors
-
-
-def threshold_errors(scene: Scene, device: torch.device) -> dict[str, float]:
-    """For each of `THRESHOLDS` the 99.9th percentile of the colour's deviation from an image that has nearly none."""
-    exact_splats = scene.to(torch.float64).splats()
-    leaves = leaves_of(scene, device, torch.float32)
-    splats, colors = splats_of(leaves), leaves[3]
-    with torch.no_grad():
-        truth = reference.rasterize(exact_splats, scene.colors.double(), scene.view, NEARLY_NO_THRESHOLDS).color
-        found = {name: rasterize(splats, colors, scene.view, kind).color for name, kind in THRESHOLDS.items()}
-    return {name: _quantiles((color.cpu().double() - truth).abs())["p99.9"] for name, color in found.items()}
-
-
-def with_thresholds(name: str) -> RenderScene:
-    """This package's rasterizer with one of `THRESHOLDS`."""
-    return lambda splats, colors, scene: rasterize(splats, colors, scene.view, THRESHOLDS[name])
 
 
 def _quantiles(deviation: Tensor) -> dict[str, float]:

@@ -9,20 +9,26 @@ from collections.abc import Sequence
 
 from benchmarks import align, raster, scaling, stereo, training_step
 from benchmarks.gpu import proof
-from benchmarks.never_worse.section import never_worse
+from benchmarks.never_worse import bench as never_worse_bench
 from benchmarks.priors_section import priors
 from benchmarks.stability import sweep
-from benchmarks.work_precision import colors_of, shown, work_precision
+from benchmarks.work_precision import colors_of, work_precision
 from d2_plugin.runs.report import report
-from d2_plugin.runs.report.page import Section, cases_of, sources_of
+from d2_plugin.runs.report.page import Section, sources_of
 from d2_plugin.runs.report.report import BUILDERS, ReportSettings
-from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure
+from d2_plugin.runs.report.svg import figure
 from d2_plugin.runs.rows import Row
 
 __all__ = ["ReportSettings", "run"]
 
 PLOTTED_ANCHORS = 20_000
 """Number of anchors that is plotted, or the nearest one that was measured."""
+
+
+def never_worse(rows: Sequence[Row]) -> Section:
+    """D² with wrong monocular maps beside stereo alone and the backbone alone."""
+    tables = [("Scores", never_worse_bench.table(rows))]
+    return _section("never_worse", "Never worse than without", never_worse_bench.CAPTION, rows, {}, tables)
 
 
 def alignment(rows: Sequence[Row]) -> Section:
@@ -53,31 +59,11 @@ def stereo_depth(rows: Sequence[Row]) -> Section:
 
 
 def rasterizer(rows: Sequence[Row]) -> Section:
-    """Deviation from float64 against milliseconds, and what the thresholds of splatting cost."""
-    plain, swept = ([row for row in rows if ("thresholds" in row) == wanted] for wanted in (False, True))
-    figures = {"raster": figure([_raster_plot(plain)], "Rasterizer error against time")}
-    if swept:
-        labels = ("colour error, p99.9", "forward + backward, ms")
-        plots = [work_precision(mine, case, *labels, 1e3) for case, mine in cases_of(swept).items()]
-        figures["raster-thresholds"] = figure(plots, "Cost of the thresholds of splatting", columns=2, size=(480, 320))
-    return _section("raster", "Rasterizer: time and precision", raster.CAPTION, rows, figures, raster.tables(rows))
-
-
-def _raster_plot(rows: Sequence[Row]) -> Plot:
-    """One mark per scene and size; scenes are not compared, so none is faded."""
-    drawn = [row for row in rows if row["error"] and row["seconds"]]
-    points = {name: tuple(_raster_point(row) for row in drawn if row["method"] == name) for name in colors_of(drawn)}
-    every = [point for mine in points.values() for point in mine]
-    x = Axis.around("forward + backward, ms", [point.x for point in every], log=True)
-    y = Axis.around("colour error against float64, p99.9", [point.y for point in every], log=True)
-    series = (Series(name, mine, color=color) for color, (name, mine) in enumerate(points.items()))
-    return Plot("Every scene and size", x, y, tuple(series))
-
-
-def _raster_point(row: Row) -> Point:
-    milliseconds = 1e3 * row["seconds"]
-    note = f"{row['method']}, {row['case']}: error {shown(row['error'])} in {milliseconds:.3g} ms"
-    return Point(milliseconds, row["error"], note, row["case"])
+    """Deviation from float64 against milliseconds."""
+    plot = work_precision(rows, "Mean over scenes and sizes", "colour error, p99.9", "forward + backward, ms", 1e3)
+    drawn = {"raster": figure([plot], "Rasterizer error against time")}
+    tables = [("Every scene and size", raster.table(rows))]
+    return _section("raster", "Rasterizer: time and precision", raster.CAPTION, rows, drawn, tables)
 
 
 def step(rows: Sequence[Row]) -> Section:

@@ -6,6 +6,7 @@ in processes of their own. Training keeps decoded images up to a bound (320 MiB)
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
 from collections.abc import Sequence
@@ -13,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from benchmarks.growth import power
 from benchmarks.memory import in_fresh_process
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import split, synthetic_recording
@@ -91,6 +91,17 @@ def table(rows: Sequence[Row]) -> Table:
     for part in ("priors", "training"):
         for measure, title in (("seconds", "seconds"), ("peak_mb", "peak MB")):
             places = [(row["frames"], row[measure]) for row in rows if row["method"] == part and row[measure]]
+            grown = exponent(places)
             values = (f"{dict(places)[length]:.1f}" if length in dict(places) else "-" for length in lengths)
-            lines.append((part, title, *values, power(places, "frames") or "-"))
+            lines.append((part, title, *values, "-" if grown is None else f"frames^{round(grown, 2) + 0.0:.2f}"))
     return Table(("part", "of", *(f"{length:g} frames" for length in lengths), "grows as"), tuple(lines))
+
+
+def exponent(points: Sequence[tuple[float, float]]) -> float | None:
+    """Slope p of cost ~ size^p by least squares in logarithms, from (size, cost); None with fewer than two sizes."""
+    if len({size for size, _ in points}) < 2:
+        return None
+    logs = [(math.log(size), math.log(value)) for size, value in points]
+    mean_x, mean_y = (sum(values) / len(logs) for values in zip(*logs))
+    spread = sum((x - mean_x) ** 2 for x, _ in logs)
+    return sum((x - mean_x) * (y - mean_y) for x, y in logs) / spread

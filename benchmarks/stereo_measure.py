@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.sgbm import sgbm
 from benchmarks.stereo_rigs import Rig
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.colmap.mvs import why_not_usable
@@ -54,13 +53,12 @@ class Method:
 def methods() -> list[Method]:
     """Every matcher that runs here and what is varied about it; the first row of each is its default."""
     default = StereoSettings()
-    rows = [
+    return [
         Method(name, setting, MATCHERS[name], replace(default, **changes))
         for name, variants in VARIANTS.items()
         if name != "colmap" or not why_not_usable()
         for setting, changes in variants.items()
     ]
-    return [*rows, Method("sgbm", "default", sgbm, default)]
 
 
 class Run(NamedTuple):

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from d2_plugin.runs.markup import Table
 from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, number
 from d2_plugin.runs.rows import Row
 
@@ -120,22 +119,6 @@ def _point(mark: Drawn, unit: float, on_front: bool, error_label: str, seconds_l
     note += f"; failed on {mean.failures} of {mean.cases}" if mean.failures else ""
     label = mean.setting if on_front and mean.setting != "default" else ""
     return Point(mark.seconds * unit, max(mark.error, SMALLEST), note, label, faded=not on_front)
-
-
-def means_table(rows: Sequence[Row], error_name: str, seconds_name: str, unit: float = 1) -> Table:
-    """Method, setting, error (geometric mean and worst case), time, failures; settings on the front stand out."""
-    header = ("method", "setting", error_name, "worst case", seconds_name, "cases", "failed")
-    found = means(rows)
-    front = {mark.mean for mark in _front(drawn(found))}
-    cells = tuple(
-        (
-            *(mean.method, mean.setting, shown(mean.error), shown(mean.worst)),
-            *(shown(mean.seconds and mean.seconds * unit), str(mean.cases), str(mean.failures or "-")),
-        )
-        for mean in found
-    )
-    best = frozenset((row, column) for row, mean in enumerate(found) if mean in front for column in (2, 4))
-    return Table(header, cells, best)
 
 
 def shown(value: float | None) -> str:

@@ -227,18 +227,14 @@ def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
     """What became of each step, and what the compiler says of each kernel."""
     steps = [row for row in rows if row["method"] == "step"]
     lines = tuple((row["case"], row["device"], f"{row['seconds']:.1f}", row["failed"] or "done") for row in steps)
-    facts = ("registers", "spill_bytes", "shared_bytes", "instructions", "fragment_instructions")
+    facts = ("registers", "spill_bytes", "shared_bytes", "instructions")
     cells = tuple(
-        (row["case"].rpartition(" ")[2], row["setting"], *(_plain(row[fact]) for fact in facts))
+        (row["case"].rpartition(" ")[2], row["setting"], *(str(row[fact]) for fact in facts))
         for row in rows
         if row["method"] == "d2"
     )
-    head = ("kernel", "for", "registers", "bytes spilled", "bytes shared", "instructions", "for a fragment")
+    head = ("kernel", "for", "registers", "bytes spilled", "bytes shared", "instructions")
     return [
         ("Steps", Table(("step", "device", "s", "result"), lines)),
         *([("Static analysis", Table(head, cells))] if cells else []),
     ]
-
-
-def _plain(value: int | None) -> str:
-    return "-" if value is None else str(value)

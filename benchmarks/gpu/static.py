@@ -1,8 +1,7 @@
 """What the GPU kernels take, told by the compiler: no device is needed, and nothing here is a time on one.
 
 nvcc compiles the sources for an architecture; ptxas says registers, spills and shared memory of each kernel, and the
-binary says how many instructions it has, with nvdisasm also how many for one fragment. Rows of this are called "static
-analysis" and never more.
+binary says how many instructions it has. Rows of this are called "static analysis" and never more.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.gpu.loops import fragment_instructions, nvdisasm
 from d2_plugin.compiler.nvrtc import Program
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.stereo.gpu import call as patchmatch
@@ -44,8 +42,7 @@ PROGRAMS = (
 
 
 def static_analysis(nvcc: str, architecture: str, command: str = "") -> list[Row]:
-    """One row per kernel: registers, bytes spilled, bytes of shared memory, instructions, those for one fragment (None
-    where the kernel has none, or there is no nvdisasm).
+    """One row per kernel: registers, bytes spilled, bytes of shared memory, instructions.
 
     Args:
         nvcc: the compiler's path.
@@ -77,12 +74,8 @@ def _kernels(nvcc: str, program: Program, flags: Sequence[str]) -> dict[str, dic
         if result.returncode:
             said = result.stderr[:4000]
             raise D2Error(f"nvcc refused {program.source.name} ({flags[0]}); please report what it said:\n{said}")
-        counts, disassembler = instructions(cubin.read_bytes()), nvdisasm()
-        fragments = {} if disassembler is None else fragment_instructions(disassembler, cubin)
-    return {
-        name: {**found, "instructions": counts[name], "fragment_instructions": fragments.get(name)}
-        for name, found in resources(result.stderr).items()
-    }
+        counts = instructions(cubin.read_bytes())
+    return {name: {**facts, "instructions": counts[name]} for name, facts in resources(result.stderr).items()}
 
 
 def resources(told: str) -> dict[str, dict[str, Any]]:

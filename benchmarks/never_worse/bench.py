@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from benchmarks.never_worse.maps import SPOILED, spoiled_recording
-from benchmarks.never_worse.section import BACKBONE, STEREO, never_worse_text
 from d2_plugin.errors import D2Error
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.ablation.presets import PRESETS, Preset
+from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.prior.build import build_priors_for
+from d2_plugin.runs.report.quality import groups_of, scores_table
 from d2_plugin.runs.rows import Row, append_rows, command_line, read_rows
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings, check, prior_settings
@@ -31,6 +32,15 @@ from d2_plugin.runs.start import TimedPoints
 from d2_plugin.runs.training.bench import Case, case_of
 from d2_plugin.runs.training.measured import Line, Work, follow, workers
 from d2_plugin.settings import AtLeastOne, Count, Positional, Range, Seed, Settings
+
+BACKBONE, STEREO = "backbone alone", "stereo alone"
+"""Methods that use no monocular map."""
+
+CAPTION = (
+    "Held-out scores where the monocular maps are not what they should be: `noise` is a random value at every pixel, "
+    "`smooth` random blobs, `constant` one value, `other` the map of another frame (of another camera where there is "
+    "one frame), `network` a small network that runs on phones. `stereo alone` uses no monocular map."
+)
 
 Maps = Literal["own", "noise", "smooth", "constant", "other", "network"]
 
@@ -81,11 +91,16 @@ def run(settings: NeverWorseBench) -> str:
 
         with workers(settings.jobs, None) as submit:
             follow([_all_of(missing)] if missing else [], submit, write)
-    return f"{never_worse_text(_rows(path))}\n\nrows are in {path}; `d2 report {path}` draws them"
+    return f"{markdown(table(_rows(path)))}\n\nrows are in {path}; `d2 report {path}` draws them"
 
 
 def _rows(path: Path) -> list[Row]:
     return read_rows([path]) if path.is_file() else []
+
+
+def table(rows: Sequence[Row]) -> Table:
+    """The scores of each recording, by what the monocular maps were."""
+    return scores_table(groups_of([{**row, "method": f"yang4d {row['method']}"} for row in rows]))
 
 
 def _all_of(works: Sequence[Work]) -> Line:
@@ -150,7 +165,16 @@ class _Template:
         for seed in self.settings.seeds:
             folder = self.shared.folder / "runs" / name / f"{base.iterations}steps" / f"seed{seed}"
             job = Job(preset.name, replace(used, seed=seed), folder)
-            yield Work(job, self.shared.points, self.case, method, self.command, "steps", about, "never_worse")
+            yield Work(
+                job,
+                self.shared.points,
+                self.case,
+                method,
+                self.command,
+                f"{base.iterations} steps",
+                about,
+                "never_worse",
+            )
 
     def _build(self, settings: RunSettings, store: Path) -> str:
         """The prior of one method, with the geometric depth of the full one; what it became, in a line."""

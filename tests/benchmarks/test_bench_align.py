@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,6 @@ from benchmarks.align_measure import (
     methods,
     optimum,
     weights_and_epsilon,
-    without_noise,
 )
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import AlignSettings
@@ -28,7 +28,8 @@ SMALL = {"anchors": (60, 300), "outliers": (0.0, 0.4), "seeds": 1, "seconds": 0.
 @pytest.mark.parametrize("kind", ["relative", "metric"])
 @pytest.mark.parametrize("method", methods(), ids=lambda method: f"{method.name}, {method.setting}")
 def test_every_method_finds_the_line_when_nothing_is_wrong(method: AlignMethod, kind: str) -> None:
-    problem = without_noise(align_problem(kind, 2000, 0.0))
+    noisy = align_problem(kind, 2000, 0.0)
+    problem = replace(noisy, mono=noisy.clean_mono, geometric=noisy.truth)
     line = method.fit(problem)
     np.testing.assert_allclose(line, TRUE_LINE, rtol=2e-3, atol=2e-4)
     assert problem.depth_error(line).max() < 5e-3
@@ -44,17 +45,6 @@ def test_no_line_beats_the_optimum_that_gaps_are_measured_from() -> None:
         for _ in range(200):
             line = np.array(TRUE_LINE) * (1 + rng.normal(0, 0.05, 2))
             assert problem.objective(tuple(line), residual) >= best
-
-
-def test_both_least_squares_are_one_and_a_general_solver_agrees_with_the_certified_one() -> None:
-    problem = align_problem("metric", 3000, 0.3)
-    fits = {(method.name, method.setting): method.fit(problem) for method in methods()}
-    np.testing.assert_allclose(
-        fits["least squares", "closed form"], fits["least squares", "torch.linalg.lstsq"], rtol=1e-9
-    )
-    if ("L-BFGS (scipy)", "its defaults") in fits:
-        certified = fits["certified", "relative, gap 1e-10"]
-        np.testing.assert_allclose(fits["L-BFGS (scipy)", "its defaults"], certified, rtol=1e-4)
 
 
 def test_a_tighter_gap_is_closer_to_the_optimum_and_is_kept() -> None:

@@ -10,7 +10,6 @@ import torch
 
 from benchmarks.gpu import proof as gpu
 from benchmarks.gpu import static as gpu_static
-from benchmarks.gpu.loops import smallest_loops
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.rows import read_rows
 
@@ -43,10 +42,6 @@ NVDISASM = """
         /*0000*/                   IADD3 R1, R1, 0x1, RZ ;
         /*0010*/                   BRA `(.L_x_5) ;
 """
-
-
-def test_instructions_for_a_fragment_are_those_of_the_smallest_loop_with_an_exponential() -> None:
-    assert smallest_loops(NVDISASM) == {"d2_render": 5}
 
 
 def test_all_steps_together_end_in_time() -> None:

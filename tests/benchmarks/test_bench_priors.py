@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from benchmarks.priors import Case, PriorsBench, cases, rows_of, run
-from benchmarks.priors_section import COUNTED, DIAGONAL, priors
+from benchmarks.priors_section import DIAGONAL, priors
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.calibration import NORMAL_SHARE, Calibration, frames_with_truth, reliability_curve
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.report.report import make_report
-from d2_plugin.runs.rows import Row, make_row, read_rows
+from d2_plugin.runs.rows import Row, read_rows
 
 pytest.importorskip("cv2")
 
@@ -122,11 +122,6 @@ def test_frames_with_truth_are_those_of_any_of_the_cameras(folder: Path) -> None
 # ---------------------------------------------------------------- the report
 
 
-def label_row(case: str, label: str, share: float, within: float, curve: list) -> Row:
-    more = {"within_two": 0.95, "median_sigma": 0.02, "median_error": 0.01}
-    return make_row("priors", case, label, error=0.0, seconds=1.0, share=share, within=within, curve=curve, **more)
-
-
 def marks(svg: str) -> list[ET.Element]:
     return [e for e in ET.fromstring(svg).iter() if len(e) and e[0].tag.endswith("title") and "pixels" in e[0].text]
 
@@ -140,21 +135,6 @@ def test_the_diagram_has_a_mark_per_bin_and_the_diagonal(measured: tuple[str, li
     assert "true error, 68 % quantile" in svg
     assert "| synthetic4, 4 views | mono only |" in text
     assert "emulated, not predicted" in text
-
-
-def test_rare_labels_and_small_bins_are_faded() -> None:
-    curve = [[0.01, 0.02, 900], [0.02, 0.03, 30]]
-    rows = [
-        label_row("room", "verified", 0.5, 0.7, curve),
-        label_row("room", "agreed", COUNTED / 2, 0.9, curve),
-    ]
-    section = priors(rows)
-    faded = [mark for mark in marks(section.figures["priors"]) if "faded" in mark.get("class", "")]
-    assert len(marks(section.figures["priors"])) == 4
-    assert len(faded) == 3
-    table = section.tables[0][1]
-    assert [row[1] for row in table.rows] == ["verified", "agreed"]
-    assert table.best == {(0, 3), (0, 4), (1, 4)}
 
 
 def test_a_recording_without_any_label_has_a_row_and_no_curve() -> None:

@@ -7,14 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.sgbm import sgbm
 from benchmarks.stereo import StereoBench, run, tables
 from benchmarks.stereo_measure import Method, measure, methods, score
 from benchmarks.stereo_rigs import Rig, load_rigs, textured_rig
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo.filtering.filter import filter_depths
-from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.runs.rows import read_rows
 
 pytest.importorskip("cv2")
@@ -55,15 +52,6 @@ def test_covisibility_without_the_other_truth_is_nearly_that_with_it(rig: Rig) -
     alone = replace(rig, truths=[rig.truths[0], None])
     assert (alone.covisible[0] == rig.covisible[0]).mean() > 0.97
     assert not alone.covisible[1].any()
-
-
-def test_the_outsider_is_right_about_most_of_what_the_filter_leaves_it(rig: Rig) -> None:
-    grays, settings = [gray(image) for image in rig.images], StereoSettings()
-    maps = sgbm(grays, rig.cameras, rig.depth_range, settings)
-    results = filter_depths(grays, rig.cameras, *map(list, zip(*maps)), settings)
-    found = score([result.depth for result in results], rig.truths, rig.covisible)
-    assert found.completeness > 0.15
-    assert found.wrong < 0.02
 
 
 def test_a_method_that_fails_on_a_rig_says_why_and_counts_as_nothing(rig: Rig) -> None:

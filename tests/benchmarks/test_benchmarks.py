@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from benchmarks import memory, scaling, training_step
 from benchmarks.__main__ import PARTS, main
-from benchmarks.growth import exponent
 from benchmarks.memory import in_fresh_process
 from benchmarks.report import EVERY
 from benchmarks.work_precision import means, pareto_front, work_precision
@@ -111,8 +110,8 @@ def test_means_over_cases_are_geometric_and_failures_keep_a_setting_off_the_fron
 
 
 def test_growth_is_the_slope_in_logarithms() -> None:
-    assert exponent([(n, 3 * n**1.5) for n in (10, 100, 1000)]) == pytest.approx(1.5)
-    assert exponent([(10, 1.0), (10, 2.0)]) is None
+    assert scaling.exponent([(n, 3 * n**1.5) for n in (10, 100, 1000)]) == pytest.approx(1.5)
+    assert scaling.exponent([(10, 1.0), (10, 2.0)]) is None
 
 
 def test_scaling_adds_rows_of_time_and_memory_per_length(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
