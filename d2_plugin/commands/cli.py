@@ -57,8 +57,8 @@ NEEDED = (3, 11)
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; an error is one sentence on stderr and exit code 2, Ctrl-C exit code 130."""
-    # Read when torch is first imported, further down. OpenMP threads that spin at each barrier cost a training step
-    # on a busy machine 130 to 210 ms instead of 20 (two threads, 25,000 Gaussians, 240x135).
+    # Read when torch is first imported, further down: OpenMP threads that spin at each barrier make a training step
+    # on a busy machine several times slower.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     words = list(sys.argv[1:] if arguments is None else arguments)
     plain = [word for word in words if word != DEBUG]

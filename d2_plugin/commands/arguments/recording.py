@@ -75,11 +75,10 @@ def recording_form(
 
 
 def all_tables(backbone: str) -> dict[str, Group]:
-    """Every table of settings of a run, with the class that declares it."""
+    """The tables of settings of a run that may be given by flags, with the class that declares each."""
     from d2_plugin import registry
     from d2_plugin.config import D2Config
     from d2_plugin.priors.settings import PriorSettings
-    from d2_plugin.recordings.importing.settings import ImportChoices
     from d2_plugin.runs.settings import PlanChoices
 
     hooks = {s.name: kind for s in declared(D2Config) for kind in (s.kind, *get_args(s.kind)) if is_dataclass(kind)}
@@ -88,9 +87,8 @@ def all_tables(backbone: str) -> dict[str, Group]:
         **{name: Group(kind) for name, kind in hooks.items() if isinstance(kind, type)},
         "d2": Group(D2Config, (*hooks, "exported", "iterations")),  # for other trainers
         "priors": Group(PriorSettings),
-        "backbone": Group(type(module.settings_from({}))),
+        "backbone": Group(type(module.settings_from({})), ("raster",)),  # constants of splatting: in a file alone
         "plan": Group(PlanChoices),
-        "import": Group(ImportChoices),
     }
 
 
