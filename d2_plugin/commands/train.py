@@ -26,7 +26,7 @@ OF_THE_RUN = (
     *("test_cameras", "backbone", "iterations", "hooks", "priors", "priors_in_step", "accept_empty_prior"),
     *("background_weight", "seed", "device"),
 )
-TABLES = ("densify", "prune", "depth_loss", "d2", "priors", "backbone", "plan")
+TABLES = ("densify", "prune", "depth_loss", "d2", "priors", "backbone", "plan", "import")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +36,8 @@ class TrainOptions(ConfigFile):
     output: Path
     """Folder of the run; an unfinished run in it is continued."""
     calibration: Path | None = None
-    """Of the cameras where RECORDING is a folder of videos: they are imported first, into OUTPUT-recording, by the table
-    [import] of --config."""
+    """Of the cameras where RECORDING is a folder of videos: they are imported first, into OUTPUT-recording. With it
+    there is a table of settings more, `import`."""
     view: bool = False
     """Watch it train on a page in the browser."""
     export_ply: bool = False

@@ -26,7 +26,7 @@ FLAGS = """
 --d2.finite-every -1 | --d2.finite-every 1.5 | --plan.temporal maybe | --seed -1 | --seed 99999999999999999999999
 --frames 0:3000000000 | --frames x | --frames 3:1 | --iterations 0 | --iterations 1e400 | --iterations nan
 --downscale 0 | --downscale 1e9 | --hooks all,none | --hooks densfy | --device tpu | --backbone ../x
---priors.stereo.depth-range 1,2,3 | --backbone.raster.near -1 | --config /dev/null | --config /nope
+--priors.stereo.depth-range 1,2,3 | --backbone.densify.every -1 | --config /dev/null | --config /nope
 --train-cameras a,b | --train-cameras train0,train0 | --test-cameras train0 | --mono-onnx /nope | --mono-kind purple
 --output /proc/x/y | --output /dev/null/x
 """

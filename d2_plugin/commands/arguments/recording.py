@@ -60,7 +60,7 @@ def recording_form(
         run: what it does.
         more: settings of a run that it takes beside those in `RECORDING`.
         options: the dataclass of the command's own settings; they replace settings of a run with the same name.
-        tables: which tables of settings may be given by dotted flags.
+        tables: which tables of settings may be given by dotted flags; that of the import beside --calibration alone.
     """
     from d2_plugin.runs.settings import RunSettings
 
@@ -69,7 +69,8 @@ def recording_form(
     taken = [of_run[name] for name in (*RECORDING, *more) if name not in {setting.name for setting in own}]
 
     def groups(typed: Mapping[str, str]) -> dict[str, Group]:
-        return {name: group for name, group in all_tables(_backbone(typed)).items() if name in tables}
+        known = all_tables(_backbone(typed))
+        return {name: known[name] for name in tables if name != "import" or "calibration" in typed}
 
     return Form(command, about or "", (*taken, *own), run, groups, {"hooks": hook_names})
 
@@ -79,6 +80,7 @@ def all_tables(backbone: str) -> dict[str, Group]:
     from d2_plugin import registry
     from d2_plugin.config import D2Config
     from d2_plugin.priors.settings import PriorSettings
+    from d2_plugin.recordings.importing.settings import ImportChoices
     from d2_plugin.runs.settings import PlanChoices
 
     hooks = {s.name: kind for s in declared(D2Config) for kind in (s.kind, *get_args(s.kind)) if is_dataclass(kind)}
@@ -89,6 +91,7 @@ def all_tables(backbone: str) -> dict[str, Group]:
         "priors": Group(PriorSettings),
         "backbone": Group(type(module.settings_from({})), ("raster",)),  # constants of splatting: in a file alone
         "plan": Group(PlanChoices),
+        "import": Group(ImportChoices),
     }
 
 
