@@ -14,13 +14,12 @@ import pytest
 import torch
 from mimics.workplace import furnish
 
-from benchmarks.trainers import inside, prepare, trial_run
+from benchmarks.trainers import inside, prepare
 from benchmarks.trainers.bench import TrainersBench, run
 from benchmarks.trainers.page import read_rows, replaced, table
 from benchmarks.trainers.prepare import Prepared, Source
 from benchmarks.trainers.trials import TRIALS, Job, Trial, gsplat_stats, reported, scored_after
 from d2_plugin import D2Error
-from d2_plugin.attach.recipes import RECIPES
 
 TESTS = Path(__file__).parents[1]
 
@@ -97,10 +96,6 @@ def test_a_model_that_is_a_module_is_counted_and_told_apart() -> None:
 
 
 class TestTrials:
-    def test_every_recipe_of_the_launcher_has_a_trial(self) -> None:
-        assert set(TRIALS) == set(RECIPES)
-        assert all(RECIPES[name].script == trial.script for name, trial in TRIALS.items())
-
     @pytest.mark.parametrize("name", TRIALS)
     def test_its_script_is_told_data_length_and_place(self, name: str, tmp_path: Path) -> None:
         asked = job(tmp_path)
@@ -198,10 +193,6 @@ def test_mistakes_are_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "4C4D").mkdir()
     with pytest.raises(D2Error, match="no recording to train on"):
         run(TrainersBench(tmp_path, only=("4c4d",)))
-
-
-def test_a_checkout_is_known_by_its_commit(tmp_path: Path) -> None:
-    assert trial_run.commit_of(tmp_path) is None
 
 
 def test_a_script_that_sets_its_own_seed_gets_another(monkeypatch: pytest.MonkeyPatch) -> None:

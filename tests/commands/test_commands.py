@@ -147,25 +147,6 @@ class TestFlagsOfARun:
         assert values["export_ply"] is True
         assert parsed("train", "room", *CAMERAS, "--output", "o", "--hooks", "none").values["hooks"] == ()
 
-    @pytest.mark.parametrize(
-        ("words", "message"),
-        [
-            (["--mono-kind", "metrical"], "did you mean 'metric'"),
-            (["--frames", "0-8"], "first:last"),
-            (["--iterations", "many"], "--iterations must be a whole number"),
-            (["--densify.budget-per-view", "many"], "--densify.budget-per-view must be a whole number"),
-            (["--budget-per-view", "5"], "did you mean --densify.budget-per-view?"),
-            (["--iteratoins", "5"], "did you mean --iterations?"),
-        ],
-    )
-    def test_a_mistake_is_one_sentence(
-        self, words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        assert main(["train", "nowhere", *CAMERAS, "--output", str(tmp_path / "x"), *words]) == 2
-        said = capsys.readouterr().err
-        assert message in said
-        assert len(said.splitlines()) == 1
-
     def test_what_is_needed_is_asked_for(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["train", "room"]) == 2
         assert "d2 train needs --train-cameras and --output" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""`d2 demo` goes on where it was cut off, and its clock runs for training alone."""
+"""`d2 demo` goes on where it was cut off."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from pathlib import Path
 import pytest
 
 from d2_plugin.commands.cli import main
-from d2_plugin.gaussians import native_slice, native_ssim
-from d2_plugin.rasterizer import native
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export import folder as folder_layout
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -54,19 +52,3 @@ def test_a_demo_cut_off_while_it_writes_its_recording_goes_on(
     assert read_page(tmp_path / "demo" / "player.html").header["name"] == "recording"
     assert len(open_recording(tmp_path / "demo" / "recording").frames) == 2
     assert not list((tmp_path / "demo").glob("*unfinished*"))
-
-
-def test_kernels_are_compiled_before_the_clock_of_the_first_run_starts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[str] = []
-    for module, name in ((native, "available"), (native_slice, "library"), (native_ssim, "library")):
-        monkeypatch.setattr(module, name, lambda said=module.__name__: asked.append(said))
-
-    def first_run(run: object) -> None:
-        raise Stopped
-
-    monkeypatch.setattr(demo.Run, "train", first_run)
-    with pytest.raises(Stopped):
-        main(["demo", "--output", str(tmp_path), "--iterations", "4"])
-    assert {name.rsplit(".", 1)[1] for name in asked} == {"native", "native_slice", "native_ssim"}

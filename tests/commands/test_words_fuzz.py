@@ -24,7 +24,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def random_words(rng: random.Random, recording: Path, output: Path) -> list[str]:
     """A command line that a person might have meant, with a few words replaced."""
-    command = rng.choice([name for name in COMMANDS if name not in ("demo", "bench", "stability", "doctor", "ablate")])
+    command = rng.choice([name for name in COMMANDS if name not in ("demo", "bench", "doctor", "ablate")])
     words = [command, str(recording), "--train-cameras", "cam00,cam01", "--output", str(output), "--iterations", "1"]
     flags = ("seed", "frames", "downscale", "hooks", "config", "mono-onnx", "mono-kind", "test-cameras", "shard")
     tables = ("densify.cell", "prune.tau-p", "priors.stereo.min-angle", "plan.temporal", "backbone.sh-degree")
@@ -93,25 +93,24 @@ def fuzz_configurations(
             expect_an_answer(words, capsys, f"configuration {seed} {number}")
 
 
+ROUNDS = [(FEW, 0), pytest.param(MANY, 1, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize(("count", "seed"), ROUNDS)
 def test_command_lines_at_random(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    recording: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    count: int,
+    seed: int,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    fuzz_words(FEW, 0, recording, tmp_path, capsys)
+    fuzz_words(count, seed, recording, tmp_path, capsys)
 
 
-def test_configurations_at_random(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fuzz_configurations(FEW, 0, recording, tmp_path, capsys)
-
-
-@pytest.mark.slow
-def test_two_thousand_command_lines(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("count", "seed"), ROUNDS)
+def test_configurations_at_random(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], count: int, seed: int
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    fuzz_words(MANY, 1, recording, tmp_path, capsys)
-
-
-@pytest.mark.slow
-def test_two_thousand_configurations(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fuzz_configurations(MANY, 1, recording, tmp_path, capsys)
+    fuzz_configurations(count, seed, recording, tmp_path, capsys)

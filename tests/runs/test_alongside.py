@@ -6,7 +6,6 @@ import math
 import multiprocessing
 import os
 import signal
-import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -157,20 +156,6 @@ class TestTheProcess:
         os.kill(building._process.pid, signal.SIGKILL)
         with pytest.raises(D2Error, match=r"ended with code -9: the same command goes on where it stopped"):
             building.finish()
-
-    def test_is_not_held_up_by_a_training_that_has_enough_frames(self) -> None:
-        building = object.__new__(PriorAlongside)
-        building._told, telling = multiprocessing.Pipe(duplex=False)
-        building.cameras, building.frames, building.iterations = 1, range(20_000), 1000
-        building._summary, building._images = None, 0
-        teller = threading.Thread(target=lambda: [telling.send(count + 1) for count in range(20_000)], daemon=True)
-        teller.start()
-        for _ in range(1000):
-            building.opened(1)
-            teller.join(0.01)
-            if not teller.is_alive():
-                break
-        assert not teller.is_alive()
 
     def test_tells_what_the_build_refuses(self, room: Path, tmp_path: Path) -> None:
         (tmp_path / "priors").mkdir()

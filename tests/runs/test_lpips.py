@@ -10,7 +10,6 @@ import torch
 from torch import nn
 
 from d2_plugin.errors import D2Error
-from d2_plugin.runs import lpips
 from d2_plugin.runs.lpips import Lpips, find_lpips
 
 CONVOLUTIONS = {
@@ -62,50 +61,33 @@ def test_equal_images_have_no_distance_and_the_order_does_not_matter(alex) -> No
     assert distance(a, b) > distance(a, (0.9 * a + 0.1 * b)) > 0
 
 
-def test_the_distance_is_the_published_formula_on_images_in_0_to_1(alex) -> None:
-    distance, weights = alex
-    a, b = torch.rand(2, 66, 66, 3, generator=torch.Generator().manual_seed(2))
-    shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
-    x = torch.stack([((image - shift) / scale).permute(2, 0, 1) for image in (a, b)])
-    total, relu, pool = 0.0, nn.functional.relu, nn.functional.max_pool2d
-    for i, (number, stride, padding) in enumerate([(0, 4, 2), (3, 1, 2), (6, 1, 1), (8, 1, 1), (10, 1, 1)]):
-        x = pool(x, 3, 2) if i in (1, 2) else x
-        weight, bias = weights[f"features.{number}.weight"], weights[f"features.{number}.bias"]
-        x = relu(nn.functional.conv2d(x, weight, bias, stride=stride, padding=padding))
-        unit = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
-        total += nn.functional.conv2d((unit[:1] - unit[1:]) ** 2, weights[f"lin{i}.model.1.weight"]).mean().item()
-    assert distance(a, b) == pytest.approx(total, rel=1e-5)
-    assert "alex" in distance.variant
-
-
-def test_the_distance_on_vgg_is_the_published_formula_too(tmp_path: Path) -> None:
-    weights = write_weights(tmp_path, "vgg")
-    distance = find_lpips("vgg", tmp_path)
-    assert distance is not None
-    assert "vgg" in distance.variant
-    a, b = torch.rand(2, 64, 64, 3, generator=torch.Generator().manual_seed(3))
-    shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
-    x = torch.stack([((image - shift) / scale).permute(2, 0, 1) for image in (a, b)])
-    total = 0.0
-    for i, block in enumerate([(0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28)]):
-        x = nn.functional.max_pool2d(x, 2) if i else x
-        for number in block:
-            weight, bias = weights[f"features.{number}.weight"], weights[f"features.{number}.bias"]
-            x = nn.functional.conv2d(x, weight, bias, padding=1).relu()
-        unit = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
-        total += nn.functional.conv2d((unit[:1] - unit[1:]) ** 2, weights[f"lin{i}.model.1.weight"]).mean().item()
-    assert distance(a, b) == pytest.approx(total, rel=1e-5)
+BLOCKS = {
+    "alex": [[(0, 4, 2)], [(3, 1, 2)], [(6, 1, 1)], [(8, 1, 1)], [(10, 1, 1)]],
+    "vgg": [[(n, 1, 1) for n in block] for block in ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))],
+}
+"""Layer, stride and padding of each convolution, by the depth at which features are compared."""
+POOLED = {"alex": {1: 3, 2: 3}, "vgg": dict.fromkeys(range(1, 5), 2)}
+"""Window of the pooling before a block."""
 
 
 @pytest.mark.parametrize("net", ["alex", "vgg"])
-def test_layers_are_numbered_as_torchvision_does(net: str) -> None:
-    with torch.device("meta"):
-        layers = lpips._alexnet() if net == "alex" else lpips._vgg16()
-    shapes = {f"{number}.weight": (*shape, shape[2]) for number, shape in CONVOLUTIONS[net].items()}
-    assert {name: tuple(value.shape) for name, value in layers.state_dict().items() if "weight" in name} == shapes
-    taps = lpips._TAPS[net]
-    assert all(isinstance(layers[tap], nn.ReLU) for tap in taps)
-    assert tuple(layers[tap - 1].out_channels for tap in taps) == CHANNELS[net]
+def test_the_distance_is_the_published_formula_on_images_in_0_to_1(tmp_path: Path, net: str) -> None:
+    weights = write_weights(tmp_path, net)
+    distance = find_lpips(net, tmp_path)
+    assert distance is not None
+    assert net in distance.variant
+    a, b = torch.rand(2, 66, 66, 3, generator=torch.Generator().manual_seed(2))
+    shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+    x = torch.stack([((image - shift) / scale).permute(2, 0, 1) for image in (a, b)])
+    total = 0.0
+    for i, block in enumerate(BLOCKS[net]):
+        x = nn.functional.max_pool2d(x, POOLED[net][i], 2) if i in POOLED[net] else x
+        for number, stride, padding in block:
+            weight, bias = weights[f"features.{number}.weight"], weights[f"features.{number}.bias"]
+            x = nn.functional.conv2d(x, weight, bias, stride=stride, padding=padding).relu()
+        unit = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
+        total += nn.functional.conv2d((unit[:1] - unit[1:]) ** 2, weights[f"lin{i}.model.1.weight"]).mean().item()
+    assert distance(a, b) == pytest.approx(total, rel=1e-5)
 
 
 def test_without_weights_it_is_not_available_and_says_so_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -12,7 +12,6 @@ import pytest
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo import match
-from d2_plugin.priors.stereo.settings import NO_MATCHER
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import Camera, Recording, open_recording, select_frames
 from d2_plugin.recordings.cameras.calibration import pinhole, rigid
@@ -240,39 +239,24 @@ def test_no_stereo_reaches_the_priors(moving, tmp_path: Path, monkeypatch: pytes
     assert prior.support.numpy().mean() > 0.8
 
 
-def test_stereo_changes_no_setting_of_the_priors(moving) -> None:
-    plan = plan_scene(moving, ["train0", "train1"], "maps")
-    settings = PriorSettings(tau_c=0.2)
-    assert plan.obeyed_by(settings) is settings
-    assert plan.override(stereo=False).obeyed_by(settings).stereo == StereoSettings(matcher=NO_MATCHER)
-
-
 def test_a_recording_of_one_instant_on_disk_has_no_temporal_dimension(moving, tmp_path: Path) -> None:
     path = save_recording(select_frames(moving, [2]), tmp_path / "scene")
     assert not plan_scene(open_recording(path), ["train0", "train1"], None).uses("temporal")
 
 
-def test_the_real_one_instant_recording_has_no_temporal_dimension(shared_data) -> None:
-    recording = open_recording(shared_data("n3dv_sear_steak_t0"))
-    assert not plan_scene(recording, ["cam03", "cam05"], None).uses("temporal")
-
-
-def test_the_real_moving_recording_has_one(shared_data) -> None:
-    recording = open_recording(shared_data("pose2sim_single"), frames=[0, 20, 40])
-    assert plan_scene(recording, ["cam01", "cam02"], None).uses("temporal")
-
-
 @pytest.mark.parametrize(
-    ("name", "cameras"),
+    ("name", "cameras", "frames", "moves"),
     [
-        ("studio", "00 02 05 07"),
-        ("plaza", "00 02 05 07"),
-        ("plaza", "02 05"),
-        ("n3dv_sear_steak_t0", "cam03 cam05 cam08 cam14"),
-        ("pose2sim_single", "cam01 cam02 cam03 cam04"),
+        ("studio", "00 02 05 07", None, True),
+        ("plaza", "02 05", None, True),
+        ("n3dv_sear_steak_t0", "cam03 cam05 cam08 cam14", None, False),
+        ("pose2sim_single", "cam01 cam02 cam03 cam04", [0, 20, 40], True),
     ],
 )
-def test_the_real_recordings_keep_stereo(shared_data, name: str, cameras: str) -> None:
-    plan = plan_scene(open_recording(shared_data(name)), cameras.split(), None)
+def test_real_recordings_keep_stereo_and_time_where_something_moves(
+    shared_data, name: str, cameras: str, frames: list[int] | None, moves: bool
+) -> None:
+    plan = plan_scene(open_recording(shared_data(name), frames=frames), cameras.split(), None)
     assert plan.uses("stereo")
+    assert plan.uses("temporal") == moves
     assert "textured" in plan.as_dict()["stereo"]["reason"]
