@@ -135,5 +135,5 @@ def _depth_error(rows: Sequence[Row]) -> str:
     """Mean over the cases that the method took on, and how many it refused."""
     errors = [row["depth_error"] for row in rows if not row["failed"]]
     refused = len(rows) - len(errors)
-    told = f"{mean(errors):.4f}" if errors else "-"
-    return f"{told} ({refused} of {len(rows)} refused)" if refused else told
+    text = f"{mean(errors):.4f}" if errors else "-"
+    return f"{text} ({refused} of {len(rows)} refused)" if refused else text

@@ -70,13 +70,13 @@ def run(settings: PriorsBench) -> str:
     """Measure and add the rows; a table per recording, and where the rows lie."""
     begin_rows(settings.output)
     torch.set_num_threads(settings.threads)
-    command, told = _command(settings), []
+    command, shown_text = _command(settings), []
     for case in cases(settings):
         found, seconds = measure(case)
         append_rows(settings.output, rows_of(case, found, seconds, command))
-        told.append(f"{case.name}, {seconds:.2f} s per image, {found}")
+        shown_text.append(f"{case.name}, {seconds:.2f} s per image, {found}")
         logger.info("the prior of %s is measured", case.name)
-    return "\n\n".join([*told, f"rows are in {settings.output}; `d2 report {settings.output}` draws them"])
+    return "\n\n".join([*shown_text, f"rows are in {settings.output}; `d2 report {settings.output}` draws them"])
 
 
 def _command(settings: PriorsBench) -> str:

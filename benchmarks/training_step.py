@@ -74,8 +74,8 @@ def run(settings: TrainingStepBench) -> str:
     command = command_line("bench training-step", settings)
     rows = [row for case in cases for row in measure(case, settings.seconds, not settings.no_memory, command)]
     append_rows(settings.output, rows)
-    told = f"{markdown(table(rows))}\n\nD2's share of a step: {share(rows):.1%}"
-    return f"{told}\n\nrows are in {settings.output}"
+    text = f"{markdown(table(rows))}\n\nD2's share of a step: {share(rows):.1%}"
+    return f"{text}\n\nrows are in {settings.output}"
 
 
 def measure(case: StepCase, seconds: float, memory: bool = True, command: str = "") -> list[Row]:

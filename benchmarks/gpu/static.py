@@ -1,4 +1,4 @@
-"""What the GPU kernels take, told by the compiler: no device is needed, and nothing here is a time on one.
+"""What the GPU kernels take, as the compiler says: no device is needed, and nothing here is a time on one.
 
 nvcc compiles the sources for an architecture; ptxas says registers, spills and shared memory of each kernel, and the
 binary says how many instructions it has. Rows of this are called "static analysis" and never more.
@@ -78,10 +78,10 @@ def _kernels(nvcc: str, program: Program, flags: Sequence[str]) -> dict[str, dic
     return {name: {**facts, "instructions": counts[name]} for name, facts in resources(result.stderr).items()}
 
 
-def resources(told: str) -> dict[str, dict[str, Any]]:
+def resources(printed: str) -> dict[str, dict[str, Any]]:
     """What `ptxas -v` says of each kernel: registers per thread, bytes spilled and stacked, bytes of shared memory."""
     found = {}
-    for match in ENTRY.finditer(told):
+    for match in ENTRY.finditer(printed):
         shared = re.search(r"(\d+) bytes smem", match["rest"])
         found[match["kernel"]] = {
             "registers": int(match["registers"]),

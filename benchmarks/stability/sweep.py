@@ -45,8 +45,8 @@ def run(settings: StabilitySettings) -> str:
     begin_rows(settings.output)
     rows = run_sweeps(settings.sweeps, command_line("bench stability", settings))
     append_rows(settings.output, rows)
-    told = "\n\n".join(markdown(table) for _, table in tables(rows))
-    return f"{told}\n\nrows are in {settings.output}; `d2 report {settings.output}` shows them"
+    text = "\n\n".join(markdown(table) for _, table in tables(rows))
+    return f"{text}\n\nrows are in {settings.output}; `d2 report {settings.output}` shows them"
 
 
 def measure(sweep: Sweep, value: float, precision: str, command: str = "") -> Row:

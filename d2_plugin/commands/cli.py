@@ -70,8 +70,8 @@ def _answer(words: list[str]) -> str | None:
     if words[:1] == ["--version"]:
         return f"d2-4dgs {__version__}"
     if sys.version_info[:2] < NEEDED:
-        needed, found = (".".join(map(str, version)) for version in (NEEDED, sys.version_info[:2]))
-        raise D2Error(f"the commands need Python {needed} or later, this is {found}: run them in another environment")
+        needed, running = (".".join(map(str, version)) for version in (NEEDED, sys.version_info[:2]))
+        raise D2Error(f"the commands need Python {needed} or later, this is {running}: run them in another environment")
     if not words:
         raise D2Error(f"no command is given: have {', '.join(COMMANDS)}; `d2 --help` says what each does")
     if words[0] in HELP:

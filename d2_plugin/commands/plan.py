@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from d2_plugin.commands.arguments.form import Form, Given
-from d2_plugin.commands.arguments.recording import recording_form, run_settings, say, say_notes, say_plan
+from d2_plugin.commands.arguments.recording import recording_form, run_settings, show, show_notes, show_plan
 
 if TYPE_CHECKING:
     from d2_plugin.recordings import Recording
@@ -23,9 +23,9 @@ def run(given: Given) -> None:
     from d2_plugin.runs.settings import check
 
     scene = Scene.open(check(run_settings(given)))
-    say(f"recording  {described(scene.recording)}")
-    say_notes(scene.recording.notes)
-    say_plan(scene.plan)
+    show(f"recording  {described(scene.recording)}")
+    show_notes(scene.recording.notes)
+    show_plan(scene.plan)
 
 
 def described(recording: Recording) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin.commands.arguments.form import Form, Given
-from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, say, say_notes, say_plan
+from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, show, show_notes, show_plan
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import AtATime
 
@@ -50,21 +50,21 @@ def run(given: Given) -> str:
     shard, cluster = part_of(options.shard), cluster_of(options)
     settings = check(run_settings(given))
     scene = Scene.open(settings)
-    say_notes(scene.recording.notes)
-    say_plan(scene.plan)
+    show_notes(scene.recording.notes)
+    show_plan(scene.plan)
     points = triangulated_points(scene.recording, scene.train_cameras).positions
     summary = build_priors_for(scene, points, options.output, shard=shard, cluster=cluster)
-    say(str(summary), summary.headline())
+    show(str(summary), summary.headline())
     folder = summary.folder or options.output
     if folder != options.output:
-        say_notes([f"{options.output} holds the priors of other cameras, which stay; those of these are in {folder}"])
+        show_notes([f"{options.output} holds the priors of other cameras, which stay; those of these are in {folder}"])
     if shard is not None:
         return f"part {options.shard} of the prior is in {folder}"
     store, sheet = PriorStore.open(folder), folder / "contact_sheet.png"
     frames = frames_with_truth(scene.recording, scene.train_cameras, HELD_FRAMES)
     calibration = held_against_truth(store, scene.recording, frames)
     if calibration is not None:
-        say(str(calibration))
+        show(str(calibration))
     try:
         with in_turn(options.output):
             contact_sheet(store, scene.recording, sheet)

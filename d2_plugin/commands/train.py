@@ -11,9 +11,9 @@ from d2_plugin.commands.arguments.recording import (
     ConfigFile,
     recording_form,
     run_settings,
-    say,
-    say_notes,
-    say_plan,
+    show,
+    show_notes,
+    show_plan,
     table_of_config,
 )
 from d2_plugin.errors import D2Error
@@ -57,16 +57,16 @@ def run(given: Given) -> str:
     options = given.make(TrainOptions)
     given = _imported(given, options)
     run = Run(run_settings(given), options.output)
-    say_notes(run.scene.recording.notes)
-    say_plan(run.scene.plan)
+    show_notes(run.scene.recording.notes)
+    show_plan(run.scene.plan)
     live = _live(run) if options.view else None
-    run.train(told=lambda summary: say(str(summary)), watch=None if live is None else live.watch)
-    say_notes([f"{name} retired at step {step}: it changed next to nothing" for name, step in run.retired.items()])
+    run.train(on_prior=lambda summary: show(str(summary)), watch=None if live is None else live.watch)
+    show_notes([f"{name} retired at step {step}: it changed next to nothing" for name, step in run.retired.items()])
     metrics = run.evaluate()
     if metrics["background"]:
-        say("background: the prior found sky, so directions have a colour of their own at infinity")
+        show("background: the prior found sky, so directions have a colour of their own at infinity")
     if options.export_ply:
-        say(f"{len(run.export_ply())} PLY files in {options.output / 'ply'}")
+        show(f"{len(run.export_ply())} PLY files in {options.output / 'ply'}")
     if live is not None:
         live.stay()
     table = metrics_table({options.output.name: metrics})
@@ -86,7 +86,7 @@ def _imported(given: Given, options: TrainOptions) -> Given:
     chosen = ImportChoices.from_dict(table_of_config(given, "import"), "import")
     folder = options.output.with_name(f"{options.output.name}-recording")
     settings = ImportSettings(videos=(videos,), calibration=options.calibration, output=folder, **vars(chosen))
-    import_videos(settings, told=say)
+    import_videos(settings, told=show)
     return replace(given, values={**given.values, "recording": str(folder)})
 
 

@@ -82,6 +82,11 @@ def evaluate(
 ) -> dict[str, Any]:
     """Compare renders with the recording's images, one view at a time.
 
+    With any renderer of your own:
+
+        scores = evaluate(my_render, open_recording("studio"), ["01", "03"], range(20))
+        scores["test"]["psnr"]
+
     Args:
         render: draws one view; colours are clamped to 0..1 here.
         recording: the truth.

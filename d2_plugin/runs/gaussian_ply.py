@@ -81,8 +81,10 @@ def write_ply(
     added = [rest.transpose(1, 2).flatten(1), *(values.detach().double().cpu()[:, None] for values in more.values())]
     finite = torch.isfinite(torch.cat([means, covariances, colors, opacities[:, None], *added], dim=1)).all(dim=1)
     kept = finite & (opacities >= ALPHA_MIN)
-    found = scales_and_rotations(covariances[kept]) if shapes is None else (shapes[0][kept], shapes[1][kept])
-    scales, quaternions = found
+    if shapes is None:
+        scales, quaternions = scales_and_rotations(covariances[kept])
+    else:
+        scales, quaternions = shapes[0][kept], shapes[1][kept]
     columns = [
         means[kept],
         torch.zeros_like(means[kept]),  # normals, which readers expect and ignore

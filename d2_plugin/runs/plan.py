@@ -136,13 +136,13 @@ def _geometric(
     recording: Recording, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None
 ) -> tuple[Decision, ...]:
     """Sensor and stereo: depth on disk, from a sensor or COLMAP, is used first."""
-    found = find_depth_on_disk(recording, cameras, settings.stereo)
-    if found is not None and found.name == SensorDepth.name:
+    source = find_depth_on_disk(recording, cameras, settings.stereo)
+    if source is not None and source.name == SensorDepth.name:
         reason = "a sensor measured the depth: nothing is matched"
         instead = 'the sensor is taken first: choose a matcher, such as stereo.matcher = "patchmatch" in [priors]'
-        return Decision("sensor", True, found.about), Decision("stereo", False, reason, instead)
-    if found is not None:
-        return (Decision("stereo", True, found.about),)
+        return Decision("sensor", True, source.about), Decision("stereo", False, reason, instead)
+    if source is not None:
+        return (Decision("stereo", True, source.about),)
     stereo = _stereo(recording, cameras, settings, points)
     folder = settings.stereo.folder or "depth"
     if recording.path is None or not (recording.path / folder / "depth.json").is_file():
@@ -184,13 +184,15 @@ def appearance_decision(
         return Decision("appearance", False, "one training camera", "it takes a second training camera")
     if set(cameras) <= recording.exposures.keys():
         return _measured_at_import(recording, cameras)
-    found = relative_exposures(recording, cameras, positions, times)
-    if found is None:
+    exposures = relative_exposures(recording, cameras, positions, times)
+    if exposures is None:
         return Decision("appearance", False, f"exposures not known: a camera shares fewer than {FEWEST} points")
-    gain, error = found.largest
+    gain, error = exposures.largest
     differ = gain > DIFFERENT_GAIN and gain > 3 * error
     agree = "differ" if differ else "agree"
-    figures = f"gains off the mean by {gain:.1%} at most (standard error {error:.1%}, {found.points} points or more)"
+    figures = (
+        f"gains off the mean by {gain:.1%} at most (standard error {error:.1%}, {exposures.points} points or more)"
+    )
     return Decision("appearance", differ, f"the cameras' exposures {agree}: {figures}")
 
 

@@ -45,10 +45,10 @@ def cpu_name() -> str:
 def commit() -> str | None:
     """The commit of the checkout when first asked, with + where files differ; None for an installed package."""
     try:
-        found, changed = _git("rev-parse", "--short", "HEAD"), _git("status", "--porcelain", "--", "..")
+        revision, changed = _git("rev-parse", "--short", "HEAD"), _git("status", "--porcelain", "--", "..")
     except (OSError, subprocess.CalledProcessError):
         return None
-    return found.strip() + ("+" if changed else "")
+    return revision.strip() + ("+" if changed else "")
 
 
 def _git(*words: str) -> str:

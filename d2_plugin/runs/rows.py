@@ -77,7 +77,7 @@ def rms_error(scores: Mapping[str, float | None]) -> float | None:
     return None if psnr is None else 10 ** (-psnr / 20)
 
 
-def told_apart(rows: Sequence[Row]) -> list[Row]:
+def named_by_cameras(rows: Sequence[Row]) -> list[Row]:
     """The rows, with the cameras behind the case where some of one case trained with other ones: their means are not
     to be mixed. Rows that do not say their `cameras` stay as they are."""
     cameras: dict[tuple[str, str], set[str]] = {}
@@ -85,11 +85,11 @@ def told_apart(rows: Sequence[Row]) -> list[Row]:
         if row.get("cameras"):
             cameras.setdefault((row["kind"], row["case"]), set()).add(" ".join(row["cameras"]))
 
-    def told(row: Row) -> Row:
+    def named(row: Row) -> Row:
         several = row.get("cameras") and len(cameras[row["kind"], row["case"]]) > 1
         return {**row, "case": f"{row['case']}, {' '.join(row['cameras'])}"} if several else row
 
-    return [told(row) for row in rows]
+    return [named(row) for row in rows]
 
 
 def append_rows(path: Path, rows: Iterable[Row]) -> None:

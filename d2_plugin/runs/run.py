@@ -42,7 +42,23 @@ CHECKPOINTS = 10
 
 
 class Run:
-    """A run folder: run.json (settings), points.npz, priors/, checkpoint.pt, metrics.json, images/."""
+    """A run folder: run.json (settings), points.npz, priors/, checkpoint.pt, metrics.json, images/.
+
+    A run is trained, scored and opened again:
+
+        run = Run(RunSettings("studio", ("00", "02", "05", "07"), iterations=3000), Path("runs/full"))
+        run.train()
+        psnr = run.evaluate()["test"]["psnr"]
+        model = Run.load(Path("runs/full")).trained().model
+
+    Args:
+        settings: what is trained, on what, for how long.
+        folder: absent, empty, or that of this very run, which is continued.
+        guidance: what guides the run in place of D2's hooks.
+
+    Raises:
+        D2Error: impossible settings, a recording that cannot be read, or a folder that holds something else.
+    """
 
     @checked_arguments
     def __init__(self, settings: RunSettings, folder: Path, guidance: Guidance | None = None) -> None:
@@ -74,10 +90,10 @@ class Run:
         """Whether anything that guides this run needs the depth prior."""
         return self.guidance is not None or any(name in self.settings.hooks for name in HOOK_NAMES[1:])
 
-    def prepare(self, priors: bool = True, told: Callable[[PriorSummary], None] | None = None) -> TimedPoints:
+    def prepare(self, priors: bool = True, on_prior: Callable[[PriorSummary], None] | None = None) -> TimedPoints:
         """Triangulate the sparse points and build the depth prior where they are missing; returns the points.
 
-        `told` is called with what the prior became.
+        `on_prior` is called with what the prior became.
 
         Raises:
             D2Error: no view has a usable prior, and the settings do not allow that.
@@ -85,17 +101,17 @@ class Run:
         with self._writing(), self._timed("priors"):
             points = self._points()
             if priors and self.uses_prior:
-                self._take(build_priors_for(self.scene, points.positions, self._store), told)
+                self._take(build_priors_for(self.scene, points.positions, self._store), on_prior)
         return points
 
-    def _take(self, summary: PriorSummary, told: Callable[[PriorSummary], None] | None) -> None:
+    def _take(self, summary: PriorSummary, on_prior: Callable[[PriorSummary], None] | None) -> None:
         """Tell and keep what the prior became; refuse one that is of no use."""
-        if told is not None:
-            told(summary)
+        if on_prior is not None:
+            on_prior(summary)
         refuse_unusable(summary, self.settings.accept_empty_prior)
         self.prior = summary.as_dict()
 
-    def train(self, told: Callable[[PriorSummary], None] | None = None, watch: Watch | None = None) -> None:
+    def train(self, on_prior: Callable[[PriorSummary], None] | None = None, watch: Watch | None = None) -> None:
         """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one.
 
         `watch` gets the trainer and returns what is called with step and loss after every step.
@@ -105,7 +121,7 @@ class Run:
             Diverged: the loss or a parameter is no finite number any more.
         """
         with self._writing(), self._beside():
-            trainer = self._trainer(self.prepare(self._building is None, told))
+            trainer = self._trainer(self.prepare(self._building is None, on_prior))
             self._restore(trainer)
             watching = watch(trainer) if watch else lambda step, loss: None
             iterations = self.settings.iterations
@@ -122,9 +138,9 @@ class Run:
                     with self._timed("train"), watched(trainer, self._checkpoint) as finite:
                         trainer.run(until, finite(on_step))
                     if trainer.step >= OPEN_BY * iterations:
-                        self._finish_prior(told)
+                        self._finish_prior(on_prior)
                     self._save(trainer)
-                self._finish_prior(told)
+                self._finish_prior(on_prior)
             self.retired = {} if trainer.d2 is None else dict(trainer.d2.retired)
 
     def evaluate(self, images: bool = True) -> dict[str, Any]:
@@ -267,10 +283,10 @@ class Run:
             finally:
                 self._building = None
 
-    def _finish_prior(self, told: Callable[[PriorSummary], None] | None) -> None:
+    def _finish_prior(self, on_prior: Callable[[PriorSummary], None] | None) -> None:
         """Take what the prior that is built beside became."""
         if self._building is not None:
-            self._take(self._building.finish(), told)
+            self._take(self._building.finish(), on_prior)
             self.seconds["priors"] += self._building.seconds
             self.cpu_seconds["priors"] += self._building.cpu_seconds
             self._building = None

@@ -81,17 +81,17 @@ class Guidance(Protocol):
 
 @dataclass(frozen=True)
 class Remembered:
-    """The guidance of a run that lies in a folder: it can be scored and looked at, and only its maker trains it on."""
+    """The guidance of a run that was read from its folder: enough to score and view it, not to train it further."""
 
-    found: Mapping[str, Any]
+    table: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        if not isinstance(self.found, Mapping) or not isinstance(self.found.get("name"), str):
-            raise D2Error(f"the run is guided by {shown(self.found)}, which has no name: {RUN.remedy}")
+        if not isinstance(self.table, Mapping) or not isinstance(self.table.get("name"), str):
+            raise D2Error(f"the run is guided by {shown(self.table)}, which has no name: {RUN.remedy}")
 
     def identity(self) -> Mapping[str, Any]:
         """As run.json has it."""
-        return self.found
+        return self.table
 
     def start(self, scene: Scene, points: TimedPoints, priors: Path) -> TimedPoints:
         """The triangulated points; a checkpoint takes their place."""
@@ -99,7 +99,7 @@ class Remembered:
 
     def hooks(self, scene: Scene, points: TimedPoints, priors: Path) -> Mapping[str, Hook]:
         """Refused: what the hooks are is known by name only."""
-        raise D2Error(f"this run is guided by '{self.found['name']}': continue it with the command that began it")
+        raise D2Error(f"this run is guided by '{self.table['name']}': continue it with the command that began it")
 
 
 def _split(recording: Recording, settings: RunSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:

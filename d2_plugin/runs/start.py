@@ -62,9 +62,9 @@ class TimedPoints:
         if not problem:
             try:
                 with np.load(path, allow_pickle=False) as stored:
-                    found = stored["format"].tolist() if "format" in stored else None
+                    form = stored["format"].tolist() if "format" in stored else None
                     points = cls(stored["positions"], stored["colors"], stored["times"])
-                problem = points.problem() if found == POINTS_FORMAT else f"format {found}, expected {POINTS_FORMAT}"
+                problem = points.problem() if form == POINTS_FORMAT else f"format {form}, expected {POINTS_FORMAT}"
             except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, zipfile.BadZipFile) as failure:
                 problem = str(failure)
         if problem:
@@ -250,9 +250,9 @@ def triangulated_points(recording: Recording, cameras: Sequence[str], instants: 
     """
     chosen = np.unique(np.linspace(0, len(recording.frames) - 1, instants).round().astype(int))
     try:
-        found = triangulate_frames(recording, cameras, [recording.frames[i] for i in chosen])
+        triangulated = triangulate_frames(recording, cameras, [recording.frames[i] for i in chosen])
     except MissingExtra as error:
         warnings.warn(f"{error}; Gaussians start from random points instead", stacklevel=2)
         return TimedPoints(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0))
-    times = np.array([recording.seconds(int(frame)) for frame in found.frames], dtype=float)
-    return TimedPoints(found.positions, found.colors, times)
+    times = np.array([recording.seconds(int(frame)) for frame in triangulated.frames], dtype=float)
+    return TimedPoints(triangulated.positions, triangulated.colors, times)

@@ -19,7 +19,7 @@ from d2_plugin.runs.report.quality import groups_of, scores_table
 from d2_plugin.runs.report.report import BUILDERS, ReportSettings, collect, make_report, run
 from d2_plugin.runs.report.run_folders import training_rows
 from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure, number
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, make_row, read_rows, told_apart
+from d2_plugin.runs.rows import Row, append_rows, begin_rows, make_row, named_by_cameras, read_rows
 from d2_plugin.runs.saved.kinds import METRICS, RUN
 
 RUNS = Path(__file__).parents[1] / "data" / "runs.jsonl"
@@ -203,10 +203,10 @@ def test_other_cameras_of_one_recording_are_another_case() -> None:
         more = {} if cameras is None else {"cameras": cameras}
         return {"kind": kind, "case": "plaza, 2 views", **more}
 
-    pairs = told_apart([row(["00", "07"]), row(["01", "03"]), row(None), row(["01", "03"], "training")])
+    pairs = named_by_cameras([row(["00", "07"]), row(["01", "03"]), row(None), row(["01", "03"], "training")])
     names = ["plaza, 2 views, 00 07", "plaza, 2 views, 01 03", "plaza, 2 views", "plaza, 2 views"]
     assert [each["case"] for each in pairs] == names
-    assert [each["case"] for each in told_apart([row(["00", "07"]), row(["00", "07"])])] == ["plaza, 2 views"] * 2
+    assert [each["case"] for each in named_by_cameras([row(["00", "07"]), row(["00", "07"])])] == ["plaza, 2 views"] * 2
 
 
 # ---------------------------------------------------------------- run folders

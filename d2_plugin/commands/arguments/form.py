@@ -87,7 +87,7 @@ class Form:
             if name in by_name:
                 values[name] = self._read(by_name[name], texts)
         values |= self._placed(places)
-        missing = [said(setting) for setting in self.settings if setting.name not in values]
+        missing = [typed_as(setting) for setting in self.settings if setting.name not in values]
         if missing:
             raise D2Error(f"{self.command} needs {' and '.join(missing)}: `{self.command} --help` says what that is")
         return Given(values, self._tables({name: texts for name, texts in given.items() if "." in name}, words))
@@ -95,8 +95,8 @@ class Form:
     def sections(self, words: Sequence[str]) -> dict[str, Section]:
         """All tables of a command line by their dotted names, those inside others too."""
         groups = self.groups(_typed(words))
-        found = [s for name, group in groups.items() for s in _sections(name, group.kind, group.without)]
-        return {section.name: section for section in found}
+        sections = [s for name, group in groups.items() for s in _sections(name, group.kind, group.without)]
+        return {section.name: section for section in sections}
 
     def _split(self, words: Sequence[str]) -> tuple[list[str], dict[str, list[str]]]:
         """Words taken by their place, and the words of each flag by the name of its setting."""
@@ -165,7 +165,7 @@ class Form:
     def _read(self, setting: Declared, texts: Sequence[str]) -> Any:
         if setting.name in self.readers:
             return self.readers[setting.name](",".join(texts))
-        return read(setting, texts, said(setting))
+        return read(setting, texts, typed_as(setting))
 
     def _placed(self, words: Sequence[str]) -> dict[str, Any]:
         """The settings that are taken by their place, in the order of their declaration."""
@@ -194,7 +194,7 @@ class ModuleCommand(NamedTuple):
         return Form.of(command, inspect.cleandoc(module.__doc__ or ""), getattr(module, self.settings), module.run)
 
 
-def said(setting: Declared) -> str:
+def typed_as(setting: Declared) -> str:
     """How a person names a setting: by its flag, or in capitals where it is taken by its place."""
     return setting.name.upper() if setting.positional else flag_of(setting.name)
 
@@ -221,12 +221,12 @@ def _is_flag(word: str) -> bool:
 
 def _typed(words: Sequence[str]) -> dict[str, str]:
     """The word behind each flag by the flag's name, read without knowing the flags."""
-    found = {}
+    values = {}
     for word, following in zip(words, [*words[1:], ""]):
         if _is_flag(word):
             flag, attached, value = word.partition("=")
-            found[flag.lstrip("-").replace("-", "_")] = value if attached else following
-    return found
+            values[flag.lstrip("-").replace("-", "_")] = value if attached else following
+    return values
 
 
 def _as_toml(value: Any) -> Any:

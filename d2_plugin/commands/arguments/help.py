@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Collection, Sequence
 from dataclasses import MISSING, replace
 
-from d2_plugin.commands.arguments.form import HELP, Form, Section, said
+from d2_plugin.commands.arguments.form import HELP, Form, Section, typed_as
 from d2_plugin.commands.arguments.text import bare, flag_of, item_kind, limits, placeholder, shown
 from d2_plugin.errors import unknown_name
 from d2_plugin.settings import Declared, Range
@@ -76,15 +76,15 @@ def _table(section: Section) -> str:
 def _typed(setting: Declared) -> str:
     """A setting as it is typed."""
     if setting.positional:
-        return said(setting) + (" ..." if item_kind(setting.kind) is not None else "")
-    return said(setting) if bare(setting.kind) is bool else f"{said(setting)} {placeholder(setting.kind)}"
+        return typed_as(setting) + (" ..." if item_kind(setting.kind) is not None else "")
+    return typed_as(setting) if bare(setting.kind) is bool else f"{typed_as(setting)} {placeholder(setting.kind)}"
 
 
 def _explained(setting: Declared) -> str:
     """The docstring, then range, unit and default."""
     facts = [_bounds(limits(setting)), "needed" if setting.default is MISSING else _default(setting)]
-    said = "; ".join(fact for fact in facts if fact)
-    return f"{setting.help} ({said})".strip() if said else setting.help
+    facts_text = "; ".join(fact for fact in facts if fact)
+    return f"{setting.help} ({facts_text})".strip() if facts_text else setting.help
 
 
 def _bounds(where: Range) -> str:

@@ -103,7 +103,7 @@ def run_settings(given: Given, **more: Any) -> RunSettings:
     train, test, notes = resolve_cameras(
         given.values["recording"], given.values["train_cameras"], given.values.get("test_cameras")
     )
-    say_notes(notes)
+    show_notes(notes)
     overrides = _over(read_toml(given.values["config"]), given.tables)
     overrides.pop("import", None)  # of the recording, not of the run
     more["protocol"] = split_name(given.values["train_cameras"])
@@ -113,8 +113,8 @@ def run_settings(given: Given, **more: Any) -> RunSettings:
 def table_of_config(given: Given, name: str) -> dict[str, Any]:
     """One table of settings: that of the --config file with the flags over it."""
     both = _over(read_toml(given.values["config"]), given.tables)
-    found = both.get(name, {})
-    return found if isinstance(found, dict) else {name: found}
+    table = both.get(name, {})
+    return table if isinstance(table, dict) else {name: table}
 
 
 def hook_names(text: str) -> tuple[str, ...]:
@@ -144,20 +144,20 @@ def read_toml(path: Path | None) -> dict[str, Any]:
         raise D2Error(f"no configuration at {shown_path(path)}: write one, or leave out --config") from None
 
 
-def say(*lines: str) -> None:
+def show(*lines: str) -> None:
     """Print at once, before long work starts."""
     sys.stdout.write("".join(f"{line}\n" for line in lines))
     sys.stdout.flush()
 
 
-def say_notes(notes: Sequence[str]) -> None:
+def show_notes(notes: Sequence[str]) -> None:
     """What is worth knowing about a recording or a choice."""
-    say(*(f"     note  {note}" for note in notes))
+    show(*(f"     note  {note}" for note in notes))
 
 
-def say_plan(plan: ScenePlan) -> None:
+def show_plan(plan: ScenePlan) -> None:
     """Each decision with its measurement."""
-    say(*(f"{'use' if one.use else 'leave out':>9}  {one.name:12} {one.reason}" for one in plan.decisions))
+    show(*(f"{'use' if one.use else 'leave out':>9}  {one.name:12} {one.reason}" for one in plan.decisions))
 
 
 def _spelled(setting: Declared) -> Declared:

@@ -20,8 +20,8 @@ def flag_of(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def read(setting: Declared, texts: Sequence[str], said: str) -> Any:
-    """The value that `texts` stand for, checked against the declaration; `said` is the flag, for the error.
+def read(setting: Declared, texts: Sequence[str], flag: str) -> Any:
+    """The value that `texts` stand for, checked against the declaration; `flag` is the flag, for the error.
 
     `none` is None where that is allowed. Lists are joined by commas; those of whole numbers may hold `first:last` and
     `first:last:step`, the last one included.
@@ -33,10 +33,10 @@ def read(setting: Declared, texts: Sequence[str], said: str) -> Any:
         return None
     item = item_kind(setting.kind)
     if item is None:
-        return checked(setting.kind, setting.range, _plain(setting.kind, texts[-1]), said)
+        return checked(setting.kind, setting.range, _plain(setting.kind, texts[-1]), flag)
     pieces = [piece.strip() for text in texts for piece in text.split(",") if piece.strip()]
-    value = _numbers(pieces, said) if item is int else tuple(_plain(item, piece) for piece in pieces)
-    return checked(setting.kind, setting.range, value, said)
+    value = _numbers(pieces, flag) if item is int else tuple(_plain(item, piece) for piece in pieces)
+    return checked(setting.kind, setting.range, value, flag)
 
 
 def options(kind: Any) -> list[Any]:
@@ -64,8 +64,8 @@ def item_kind(kind: Any) -> Any:
 def limits(setting: Declared) -> Range:
     """The range of a setting, or that of the values it may hold."""
     inner = [setting.kind, *get_args(setting.kind), *get_args(bare(setting.kind))]
-    found = [extra for kind in inner for extra in get_args(kind) if isinstance(extra, Range)]
-    return setting.range if setting.range != Range() or not found else found[0]
+    ranges = [extra for kind in inner for extra in get_args(kind) if isinstance(extra, Range)]
+    return setting.range if setting.range != Range() or not ranges else ranges[0]
 
 
 def placeholder(kind: Any) -> str:
@@ -102,18 +102,18 @@ def _plain(kind: Any, text: str) -> Any:
     return text
 
 
-def _numbers(pieces: Sequence[str], said: str) -> tuple[int, ...]:
-    found: list[int] = []
+def _numbers(pieces: Sequence[str], flag: str) -> tuple[int, ...]:
+    values: list[int] = []
     for piece in pieces:
         try:
             first, *last = (int(part) for part in piece.split(":"))
             numbers = range(first, last[0] + 1, *last[1:]) if last else [first]
-            if not 0 < len(numbers) <= MOST_NUMBERS - len(found):
+            if not 0 < len(numbers) <= MOST_NUMBERS - len(values):
                 raise ValueError(piece)
-            found += numbers
+            values += numbers
         except (ValueError, TypeError, OverflowError):
             raise D2Error(
-                f"{said} is '{piece[:80]}': give whole numbers joined by commas, or first:last or first:last:step, "
+                f"{flag} is '{piece[:80]}': give whole numbers joined by commas, or first:last or first:last:step, "
                 f"{MOST_NUMBERS} numbers at most"
             ) from None
-    return tuple(found)
+    return tuple(values)

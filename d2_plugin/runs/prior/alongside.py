@@ -61,15 +61,15 @@ class PriorAlongside:
         self._summary: PriorSummary | None = None
         self._images, self._start = 0, time.monotonic()
         context = multiprocessing.get_context("spawn")
-        self._told, telling = context.Pipe(duplex=False)
-        self._process = context.Process(target=_build, args=(telling, settings, points, folder), daemon=True)
+        self._progress, sender = context.Pipe(duplex=False)
+        self._process = context.Process(target=_build, args=(sender, settings, points, folder), daemon=True)
         self._process.start()
-        telling.close()  # the other process has it: its end is the end of the pipe
+        sender.close()  # the other process has it: its end is the end of the pipe
 
     def opened(self, step: int) -> int:
         """How many views, frame by frame, are trained on at a step; returns once their prior is there."""
-        while self._summary is None and self._told.poll():  # who tells must not wait for us
-            self._hear()
+        while self._summary is None and self._progress.poll():  # the sender must not wait for this process
+            self._receive()
         count = frames_open(step, self.iterations, len(self.frames))
         self.wait(count)
         return count * self.cameras
@@ -78,16 +78,16 @@ class PriorAlongside:
         """Return once the prior of a frame is there."""
         self.wait(self.frames.index(frame) + 1)
 
-    def wait(self, frames: int, told: Callable[[int], None] | None = None) -> None:
-        """Return once the prior of so many frames is there; `told` is called with the images that are done.
+    def wait(self, frames: int, on_images: Callable[[int], None] | None = None) -> None:
+        """Return once the prior of so many frames is there; `on_images` is called with those that are done.
 
         Raises:
             D2Error: what the build refuses, or its process was killed.
         """
         while self._images < frames * self.cameras and self._summary is None:
-            self._hear()
-            if told is not None:
-                told(min(self._images, frames * self.cameras))
+            self._receive()
+            if on_images is not None:
+                on_images(min(self._images, frames * self.cameras))
 
     @property
     def share(self) -> float:
@@ -101,7 +101,7 @@ class PriorAlongside:
             D2Error: what the build refuses, or its process was killed.
         """
         while self._summary is None:
-            self._hear()
+            self._receive()
         return self._summary
 
     def end(self) -> None:
@@ -109,34 +109,34 @@ class PriorAlongside:
         self._process.terminate()
         self._process.join()
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         try:
-            told = self._told.recv()
+            message = self._progress.recv()
         except EOFError:
             self._process.join()
             raise D2Error(
                 f"the process that builds the prior ended with code {self._process.exitcode}: the same command goes "
                 "on where it stopped, and without --priors-in-step it builds the prior first"
             ) from None
-        if isinstance(told, int):
-            self._images = told
-        elif isinstance(told, str):
-            raise D2Error(told)
+        if isinstance(message, int):
+            self._images = message
+        elif isinstance(message, str):
+            raise D2Error(message)
         else:
-            self._summary, self.cpu_seconds = told
+            self._summary, self.cpu_seconds = message
             self.seconds = time.monotonic() - self._start
 
 
-def _build(telling: Connection, settings: RunSettings, points: np.ndarray, folder: Path) -> None:
-    """What the process does: tells how many images are done, at last what the prior became or why it did not."""
+def _build(sender: Connection, settings: RunSettings, points: np.ndarray, folder: Path) -> None:
+    """The work of the process: it sends how many images are done, at last the summary or why there is none."""
     end_with_parent()
     be_silent()
     try:
-        summary = build_priors_for(Scene.open(settings), points, folder, on_image=telling.send)
+        summary = build_priors_for(Scene.open(settings), points, folder, on_image=sender.send)
     except D2Error as refusal:
-        telling.send(str(refusal))
+        sender.send(str(refusal))
     else:
-        telling.send((summary, time.process_time()))
+        sender.send((summary, time.process_time()))
 
 
 @contextmanager

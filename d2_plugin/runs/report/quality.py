@@ -186,7 +186,7 @@ def _text(values: Sequence[float | None], form: str) -> str:
 
 def _best(groups: Sequence[Group], column: Column) -> list[int]:
     """Index of the group with the best mean, for each recording and length that has two groups or more."""
-    found = []
+    best = []
     for key in dict.fromkeys((group.case, group.length) for group in groups):
         means = {
             place: mean(values)
@@ -194,8 +194,8 @@ def _best(groups: Sequence[Group], column: Column) -> list[int]:
             if (group.case, group.length) == key and (values := group.scores(column))
         }
         if len(means) > 1:
-            found.append((max if column.larger_is_better else min)(means, key=means.__getitem__))
-    return found
+            best.append((max if column.larger_is_better else min)(means, key=means.__getitem__))
+    return best
 
 
 def _order(groups: Sequence[Group]) -> Table:

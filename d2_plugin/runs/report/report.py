@@ -14,7 +14,7 @@ from d2_plugin.reading import parsing
 from d2_plugin.runs.report.page import Image, Section, html, markdown
 from d2_plugin.runs.report.quality import ablation, quality, training
 from d2_plugin.runs.report.run_folders import image_of, method_of, training_rows
-from d2_plugin.runs.rows import Row, read_rows, told_apart
+from d2_plugin.runs.rows import Row, named_by_cameras, read_rows
 from d2_plugin.runs.saved.kinds import read_metrics
 from d2_plugin.settings import Positional, Settings
 
@@ -69,7 +69,7 @@ def make_report(
     """
     if not rows:
         raise D2Error("there is nothing to report: give a runs.jsonl with rows in it, or the folder of a finished run")
-    rows = told_apart(rows)
+    rows = named_by_cameras(rows)
     for row in rows:
         if row["kind"] not in builders:
             raise D2Error(
@@ -111,12 +111,12 @@ def collect(sources: Sequence[Path]) -> tuple[list[Row], list[Image]]:
 
 
 def _runs(folder: Path) -> list[Path]:
-    found = sorted(path.parent for path in folder.rglob("metrics.json"))
-    if not found:
+    folders = sorted(path.parent for path in folder.rglob("metrics.json"))
+    if not folders:
         raise D2Error(f"no finished run lies in {folder}: expected metrics.json, as `d2 train` writes it")
-    return found
+    return folders
 
 
 def _image(folder: Path, recording: str, method: str) -> Image | None:
-    found = image_of(folder)
-    return None if found is None else Image(f"{recording}, {method}: {found[0]} of run {folder.name}", found[1])
+    image = image_of(folder)
+    return None if image is None else Image(f"{recording}, {method}: {image[0]} of run {folder.name}", image[1])

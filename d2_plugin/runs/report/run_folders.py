@@ -103,10 +103,10 @@ def image_of(folder: Path) -> tuple[str, str] | None:
 
     As a JPEG of at most `IMAGE_WIDTH` pixels where OpenCV is installed, else the file as it is.
     """
-    found = sorted((folder / "images").glob("*.png"))
-    if not found:
+    images = sorted((folder / "images").glob("*.png"))
+    if not images:
         return None
-    path = found[len(found) // 2]
+    path = images[len(images) // 2]
     try:
         cv2 = opencv("making images smaller")
     except MissingExtra:

@@ -43,10 +43,10 @@ def load_checkpoint(path: Path, device: str) -> dict[str, Any] | None:
         raise Damaged(f"the checkpoint {path} is damaged ({problem}): {_REMEDY}")
     with fitting(path):
         state = torch.load(path, map_location=device, weights_only=True)
-    found = state.get("format") if isinstance(state, dict) else None
-    if found != FORMAT:
+    form = state.get("format") if isinstance(state, dict) else None
+    if form != FORMAT:
         raise OtherFormat(
-            f"the checkpoint {path} has format {found} but this version reads format {FORMAT}: continue it with the "
+            f"the checkpoint {path} has format {form} but this version reads format {FORMAT}: continue it with the "
             "d2-4dgs that wrote it, or remove the file to train from the start"
         )
     return state

@@ -32,9 +32,9 @@ def claim(folder: Path, identity: Mapping[str, Any]) -> None:
 def _refuse_another(folder: Path, identity: Mapping[str, Any]) -> None:
     table = read_run(folder)
     guidance = table.pop("guidance", None)
-    found = RunSettings.from_table(table, str(folder / "run.json")).as_table()
-    found |= {} if guidance is None else {"guidance": guidance}
-    changed = sorted(k for k in identity.keys() | found.keys() if identity.get(k) != found.get(k))
+    kept = RunSettings.from_table(table, str(folder / "run.json")).as_table()
+    kept |= {} if guidance is None else {"guidance": guidance}
+    changed = sorted(k for k in identity.keys() | kept.keys() if identity.get(k) != kept.get(k))
     if changed:
         raise D2Error(
             f"{folder} holds another run, made with other settings of {', '.join(changed)}: "

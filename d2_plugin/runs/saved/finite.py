@@ -52,7 +52,7 @@ def watched(trainer: Any, checkpoint: Path) -> Iterator[Callable[[OnStep], OnSte
         return Diverged(f"training diverged at step {step} ({wrong}): {kept}; {advice}") if wrong else None
 
     def watch(on_step: OnStep) -> OnStep:
-        def told(step: int, loss: float) -> None:
+        def checked_step(step: int, loss: float) -> None:
             total = getattr(trainer, "loss", None)
             if not all_finite(trainer.model, torch.as_tensor(loss) if total is None else total):
                 error = diverged(step, loss)
@@ -60,7 +60,7 @@ def watched(trainer: Any, checkpoint: Path) -> Iterator[Callable[[OnStep], OnSte
                     raise error
             on_step(step, loss)
 
-        return told
+        return checked_step
 
     try:
         yield watch

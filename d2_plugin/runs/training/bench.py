@@ -160,20 +160,20 @@ def _lines(
 def _line(template: _Template, known: Sequence[Row]) -> Line:
     """All targets of one method: the length of a run is tried with the first seed, then the other seeds follow."""
     settings, case = template.settings, template.case
-    found = {(row["fingerprint"], row["target"]): row for row in known if row["kind"] == "quality"}
+    by_run = {(row["fingerprint"], row["target"]): row for row in known if row["kind"] == "quality"}
     tried: list[Timed] = [
         (row["iterations"], row["seconds"])
-        for row in found.values()
+        for row in by_run.values()
         if _same(row, case) and row["method"] == template.method and row["seconds"]
     ]
 
     def missing(works: Sequence[Work]) -> list[Work]:
-        return [work for work in works if work.key not in found]
+        return [work for work in works if work.key not in by_run]
 
     for kind, size in _targets(settings):
         target, steps = (f"{size:g} s", 0) if kind == "seconds" else (f"{size:g} steps", round(size))
         if not steps:
-            steps = _settled(found, template, target) or 0
+            steps = _settled(by_run, template, target) or 0
             for _ in range(TRIES if not steps else 0):
                 length = next_steps(size, tried)
                 if any(length == n for n, _ in tried):
@@ -191,10 +191,10 @@ def _line(template: _Template, known: Sequence[Row]) -> Line:
         tried += [(row["iterations"], row["seconds"]) for row in rows if row["seconds"]]
 
 
-def _settled(found: dict[tuple[str, str], Row], template: _Template, target: str) -> int | None:
+def _settled(by_run: dict[tuple[str, str], Row], template: _Template, target: str) -> int | None:
     """The number of steps that an earlier call chose for this time."""
     mine = template.method, target
-    same = (row for row in found.values() if _same(row, template.case) and (row["method"], row["target"]) == mine)
+    same = (row for row in by_run.values() if _same(row, template.case) and (row["method"], row["target"]) == mine)
     return next((row["iterations"] for row in same), None)
 
 

@@ -25,7 +25,7 @@ def next_steps(target: float, tried: Sequence[Timed]) -> int:
     lengths: dict[int, list[float]] = {}
     for steps, seconds in tried:
         lengths.setdefault(steps, []).append(max(seconds, 1e-3))
-    means = [(steps, sum(found) / len(found)) for steps, found in lengths.items()]
+    means = [(steps, sum(seconds_of) / len(seconds_of)) for steps, seconds_of in lengths.items()]
     (steps, seconds), *others = sorted(means, key=lambda timed: abs(math.log(timed[1] / target)))
     power = _power((steps, seconds), others[0]) if others else GROWTH
     return max(round(steps * (target / seconds) ** (1 / power)), 1)

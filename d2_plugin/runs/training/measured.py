@@ -140,8 +140,8 @@ def follow(lines: Sequence[Line], submit: Submit, on_row: Callable[[Row], None])
         row: Row = future.result()
         on_row(row)
         open_work[line][place] = row
-        if all(found is not None for found in open_work[line]):
-            resume(line, [found for found in open_work[line] if found is not None])
+        if all(row_of_work is not None for row_of_work in open_work[line]):
+            resume(line, [row_of_work for row_of_work in open_work[line] if row_of_work is not None])
 
 
 @contextmanager
