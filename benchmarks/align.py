@@ -121,14 +121,13 @@ def _cells(
     errors = [_depth_error([row for row in group if row["outliers"] == share]) for share in shares]
     worked = [row for row in group if not row["failed"]]
     gap = f"{max(row['error'] for row in worked):.0e}" if worked else "-"
-    times = [_milliseconds(worked, count) for count in counts]
-    return (*key, *errors, gap, *("-" if time is None else f"{time:.2f}" for time in times))
+    return (*key, *errors, gap, *(_milliseconds(worked, count) for count in counts))
 
 
-def _milliseconds(rows: Sequence[Row], anchors: int) -> float | None:
-    """Median time of a fit of so many anchors, None where there was none."""
+def _milliseconds(rows: Sequence[Row], anchors: int) -> str:
+    """Median time of a fit of so many anchors."""
     times = [1000 * row["seconds"] for row in rows if row["anchors"] == anchors]
-    return median(times) if times else None
+    return f"{median(times):.2f}" if times else "-"
 
 
 def _depth_error(rows: Sequence[Row]) -> str:

@@ -3,7 +3,7 @@ depth.
 
 The prior is built with the default settings, as `d2 priors` does, and every finite sigma is held against the error that
 the pixel has. A normal error lies within sigma at 68 % and within 2 sigma at 95 % of the pixels; 60 to 80 % and at
-least 90 % count as calibrated. `d2 report` draws the reliability diagram of the rows.
+least 90 % count as calibrated. `python -m benchmarks report` draws the reliability diagram of the rows.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def run(settings: PriorsBench) -> str:
         append_rows(settings.output, rows_of(case, found, seconds, command))
         shown_text.append(f"{case.name}, {seconds:.2f} s per image, {found}")
         logger.info("the prior of %s is measured", case.name)
-    return "\n\n".join([*shown_text, f"rows are in {settings.output}; `d2 report {settings.output}` draws them"])
+    return "\n\n".join([*shown_text, f"rows are in {settings.output}; `python -m benchmarks report` draws them"])
 
 
 def _command(settings: PriorsBench) -> str:
@@ -125,8 +125,7 @@ def _case(recording: Recording, settings: PriorsBench) -> Case:
 
 
 def _listed(frames: Sequence[int]) -> str:
-    shown_frames = ", ".join(map(str, frames[:8])) + (" and more" if len(frames) > 8 else "")
-    return f"frame{'s' if len(frames) > 1 else ''} {shown_frames}"
+    return f"frame{'s' if len(frames) > 1 else ''} {', '.join(map(str, frames[:8]))}"
 
 
 def measure(case: Case) -> tuple[Calibration, float]:

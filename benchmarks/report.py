@@ -100,9 +100,7 @@ def growth(rows: Sequence[Row]) -> Section:
     return _section("scaling", title, text, rows, {}, [("Measured", scaling.table(rows))])
 
 
-def _section(
-    name: str, title: str, text: str, rows: Sequence[Row], figures: dict[str, str], tables: Sequence[tuple]
-) -> Section:
+def _section(name: str, title: str, text: str, rows: Sequence[Row], figures: dict[str, str], tables: list) -> Section:
     return Section(name, title, text, figures, tuple(tables), sources_of(rows))
 
 

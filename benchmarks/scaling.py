@@ -6,13 +6,14 @@ in processes of their own. Training keeps decoded images up to a bound (320 MiB)
 
 from __future__ import annotations
 
-import math
 import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
+
+import numpy as np
 
 from benchmarks.memory import in_fresh_process
 from d2_plugin.recordings.export.folder import save_recording
@@ -39,38 +40,26 @@ class ScalingBench(Settings):
 
 
 def run(settings: ScalingBench) -> str:
-    """Measure and add the rows; how each cost grows, and where the rows lie."""
-    begin_rows(settings.output)
-    command = command_line("bench scaling", settings)
-    rows = bench_scaling(settings.frames, settings.width, settings.iterations, command)
-    append_rows(settings.output, rows)
-    return f"{markdown(table(rows))}\nrows are in {settings.output}; `d2 report {settings.output}` shows them"
+    """Measure and add the rows, of priors and of training with all hooks for each length; the table, and their place.
 
-
-def bench_scaling(
-    frames: Sequence[int] = ScalingBench.frames, width: int = 160, iterations: int = 150, command: str = ""
-) -> list[Row]:
-    """Two rows per number of frames: building priors (time and memory), and training with all hooks.
-
-    Args:
-        frames: lengths of the recording, at two training cameras and one held out.
-        width: of the images (16:9), pixels.
-        iterations: optimizer steps of each training.
-        command: how this was started.
+    Two cameras train and one is held out.
     """
-    rows = []
+    begin_rows(settings.output)
+    width, iterations, rows = settings.width, settings.iterations, []
+    command = command_line("bench scaling", settings)
     with tempfile.TemporaryDirectory() as folder:
-        for count in frames:
+        for count in settings.frames:
             place = Path(folder) / str(count)
             recording = synthetic_recording(2, frames=count, width=width, height=width * 9 // 16, arc_degrees=20)
             save_recording(recording, place / "recording")
-            settings = RunSettings(str(place / "recording"), tuple(split(recording)[0]), iterations=iterations)
+            chosen = RunSettings(str(place / "recording"), tuple(split(recording)[0]), iterations=iterations)
             for part, work in (("priors", _priors), ("training", _training)):
-                result, peak = in_fresh_process(work, settings, place / "run")
+                result, peak = in_fresh_process(work, chosen, place / "run")
                 about = {"frames": count, "peak_mb": peak, "width": width, "iterations": iterations, **result}
                 case = f"synthetic, {count} frames"
                 rows.append(make_row("scaling", case, part, f"{count} frames", error=None, command=command, **about))
-    return rows
+    append_rows(settings.output, rows)
+    return f"{markdown(table(rows))}\nrows are in {settings.output}"
 
 
 def _priors(settings: RunSettings, folder: Path) -> dict[str, Any]:
@@ -101,7 +90,5 @@ def exponent(points: Sequence[tuple[float, float]]) -> float | None:
     """Slope p of cost ~ size^p by least squares in logarithms, from (size, cost); None with fewer than two sizes."""
     if len({size for size, _ in points}) < 2:
         return None
-    logs = [(math.log(size), math.log(value)) for size, value in points]
-    mean_x, mean_y = (sum(values) / len(logs) for values in zip(*logs))
-    spread = sum((x - mean_x) ** 2 for x, _ in logs)
-    return sum((x - mean_x) * (y - mean_y) for x, y in logs) / spread
+    sizes, costs = np.log(points).T
+    return float(np.polyfit(sizes, costs, 1)[0])

@@ -39,8 +39,6 @@ class StereoBench(Settings):
     """Leave out what is varied about a matcher."""
     width: Annotated[int, Range(32, unit="pixels")] = 320
     """Width of rendered images, which are 16:9, pixels."""
-    widen: Annotated[float, Range(1)] = 1.0
-    """Make the depth range too wide by this factor at both ends."""
     repeats: Annotated[int, Range(1)] = 1
     """Matchings per row; times are medians, CPU seconds."""
     threads: AtATime = 1
@@ -55,22 +53,21 @@ def run(settings: StereoBench) -> str:
     """Measure and add the rows, one per method and rig; the tables, and where the rows lie."""
     _set_threads(settings.threads)
     begin_rows(settings.output)
-    chosen = [_on(method, settings.device) for method in _chosen(settings.makers, settings.defaults_only)]
+    chosen = [
+        replace(method, settings=replace(method.settings, patchmatch_device=settings.device))
+        for method in _chosen(settings.makers, settings.defaults_only)
+    ]
     names = settings.rigs or (*RENDERED, *(FROM_DISK if settings.data else ()))
-    about = {name: getattr(settings, name) for name in ("device", "widen", "repeats")}
+    about = {name: getattr(settings, name) for name in ("device", "repeats")}
     about["command"] = command_line("bench stereo", settings)
     rows: list[Row] = []
     for group in [load_rigs(name, settings.data, settings.width) for name in names]:
         for method in chosen:
-            rows.append(_row(measure(method, group, settings.widen, settings.repeats), **about))
+            rows.append(_row(measure(method, group, repeats=settings.repeats), **about))
             append_rows(settings.output, rows[-1:])
             logger.info("%s (%s) on %s is measured", method.name, method.setting, rows[-1]["rig"])
     shown = [part for title, table in tables(rows) for part in (title, markdown(table))]
     return "\n\n".join([CAPTION, *shown, f"rows are in {settings.output}"])
-
-
-def _on(method: Method, device: Literal["cpu", "cuda"]) -> Method:
-    return replace(method, settings=replace(method.settings, patchmatch_device=device))
 
 
 def _row(found: dict[str, Any], **more: Any) -> Row:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, NamedTuple
 
 import torch
 
-from benchmarks.memory import in_fresh_process
+from benchmarks.memory import in_fresh_process, peak_resident
 from benchmarks.raster import parse_size
 from benchmarks.raster_measure import timed
 from benchmarks.training_step_scene import RASTER, StepScene, look_at_all, works_of
@@ -103,8 +103,6 @@ def measure(case: StepCase, seconds: float, memory: bool = True, command: str = 
 
 def _steps(case: StepCase, name: str) -> float:
     """Peak memory, MB, of making the scene, looking at all its images, and three of the works."""
-    from benchmarks.memory import peak_resident
-
     works_of(StepCase(100, 64, 48, 1).scene())[name]()  # libraries and thread stacks are not the step's memory
 
     def work() -> None:

@@ -39,11 +39,6 @@ class Drawn(NamedTuple):
     error: float
 
 
-def drawn(found: Sequence[Mean]) -> list[Drawn]:
-    """The means that can be plotted."""
-    return [Drawn(mean, mean.seconds, mean.error) for mean in found if mean.error is not None and mean.seconds]
-
-
 def means(rows: Sequence[Row]) -> list[Mean]:
     """One `Mean` per (method, setting), in order of appearance."""
     groups: dict[tuple[str, str], list[Row]] = {}
@@ -93,7 +88,7 @@ def work_precision(
 
     A setting that failed on some case is faded and never on the front: a mean over the easy cases is no result.
     """
-    marks = drawn(means(rows))
+    marks = [Drawn(m, m.seconds, m.error) for m in means(rows) if m.error is not None and m.seconds]
     front = {mark.mean for mark in _front(marks)}
     series = []
     for name, color in (colors or colors_of(rows)).items():

@@ -14,6 +14,7 @@ from fuzzing import bounded_memory, expect_result_or_sentence, mutate_file
 from small_layouts import small_recording
 from tiny_onnx import mean_network
 
+from benchmarks.report import EVERY
 from d2_plugin.arrays import map_array, read_array
 from d2_plugin.config import D2Config, for_iterations
 from d2_plugin.priors.colmap.dense_arrays import read_dense_array, write_dense_array
@@ -61,7 +62,7 @@ def write_sensor(path: Path) -> None:
 
 def report(path: Path) -> object:
     rows, images = collect([path])
-    return make_report(rows, path.parent / "report", images)
+    return make_report(rows, path.parent / "report", images, EVERY)
 
 
 def some_rows() -> list[str]:

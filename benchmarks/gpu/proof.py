@@ -167,12 +167,11 @@ def run(settings: GpuBench) -> str:
         raise D2Error(f"unknown step '{unknown[0]}': have {', '.join(STEPS)}")
     make_folder(settings.output)
     command = command_line("bench gpu", settings)
-    rows = []
+    rows = list[Row]()
     for name in settings.steps or STEPS:
-        done = _run_step(name, settings, command)
+        rows += (done := _run_step(name, settings, command))
         append_rows(settings.output / "gpu.jsonl", done)
         logger.info("%s: %s", name, done[0]["failed"] or "done")
-        rows += done
     shown = "\n\n".join(markdown(table) for _, table in tables(rows))
     return f"{shown}\n\ngpu.jsonl (rows) and the output of each step are in {settings.output}"
 

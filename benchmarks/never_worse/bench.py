@@ -4,7 +4,7 @@ alone?
 Each recording is written with the cameras that train, and those that score where not all others do:
 PATH@00+02+05+07@01+03+04+06. All runs of one recording start from the same points and see the same images; the prior of
 each is built anew from its own maps, with the same geometric depth. Rows are written as runs finish, and the same
-command continues where it was stopped. `d2 report` draws them.
+command continues where it was stopped. `python -m benchmarks report` draws them.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def run(settings: NeverWorseBench) -> str:
 
         with workers(settings.jobs, None) as submit:
             follow([_all_of(missing)] if missing else [], submit, write)
-    return f"{markdown(table(_rows(path)))}\n\nrows are in {path}; `d2 report {path}` draws them"
+    return f"{markdown(table(_rows(path)))}\n\nrows are in {path}; `python -m benchmarks report` draws them"
 
 
 def _rows(path: Path) -> list[Row]:

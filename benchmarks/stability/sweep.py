@@ -46,7 +46,7 @@ def run(settings: StabilitySettings) -> str:
     rows = run_sweeps(settings.sweeps, command_line("bench stability", settings))
     append_rows(settings.output, rows)
     text = "\n\n".join(markdown(table) for _, table in tables(rows))
-    return f"{text}\n\nrows are in {settings.output}; `d2 report {settings.output}` shows them"
+    return f"{text}\n\nrows are in {settings.output}; `python -m benchmarks report` draws them"
 
 
 def measure(sweep: Sweep, value: float, precision: str, command: str = "") -> Row:

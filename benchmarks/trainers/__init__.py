@@ -1,4 +1,1 @@
-"""The official trainers themselves: each repository's own script, bare, with D2 attached without hooks, and with all.
-
-`trials` says of each repository what its script needs, `inside` runs in the script's process, `bench` compares.
-"""
+"""The official trainers themselves: each repository's own script, bare, with D2 without hooks, and with all."""
