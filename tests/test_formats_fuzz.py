@@ -20,7 +20,8 @@ from d2_plugin.priors.colmap.dense_arrays import read_dense_array, write_dense_a
 from d2_plugin.priors.depth_on_disk import SensorDepth
 from d2_plugin.priors.monocular.network import MonocularModel
 from d2_plugin.reading import read_json
-from d2_plugin.recordings.export.export import EXPORT_FILE, export_recording
+from d2_plugin.recordings.export.export import export_recording
+from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.recordings.images import image_size, read_image, write_png
 from d2_plugin.recordings.importing.plain import VideoSource, video_header
 from d2_plugin.recordings.recording import Camera
