@@ -20,7 +20,7 @@ import torch
 from benchmarks.stereo_rigs import ARCS
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.calibration import NORMAL_SHARE, Calibration, frames_with_truth, held_against_truth, shown
+from d2_plugin.priors.declared_error import NORMAL_SHARE, Calibration, frames_with_truth, held_against_truth, shown
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording

@@ -12,7 +12,15 @@ from d2_plugin.priors.settings import Variant
 from d2_plugin.protocol import Label
 from d2_plugin.store.maps import FusedPrior, empty_prior
 
-__all__ = ["VARIANTS", "FusedPrior", "cross_source_discrepancy", "empty_prior", "fuse", "hanging_pixels", "verified_region"]
+__all__ = [
+    "VARIANTS",
+    "FusedPrior",
+    "cross_source_discrepancy",
+    "empty_prior",
+    "fuse",
+    "hanging_pixels",
+    "verified_region",
+]
 
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
 

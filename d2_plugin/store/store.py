@@ -46,6 +46,7 @@ STORE = Kind("prior store", FORMAT, "build the priors anew in another folder")
 OTHERS = "cameras"
 """Folder of a store that holds the stores of other sets of cameras."""
 
+
 class PriorStore:
     """Priors of one recording, by camera and frame; safe for many readers, and for writers of different frames."""
 

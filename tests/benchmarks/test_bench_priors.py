@@ -12,7 +12,7 @@ import pytest
 from benchmarks.priors import Case, PriorsBench, cases, rows_of, run
 from d2_plugin.commands.bench import form
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.calibration import NORMAL_SHARE, Calibration, frames_with_truth, reliability_curve
+from d2_plugin.priors.declared_error import NORMAL_SHARE, Calibration, frames_with_truth, reliability_curve
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.report.priors import COUNTED, DIAGONAL, priors

@@ -19,7 +19,7 @@ from d2_plugin.priors.build import PriorSettings, PriorSummary, build_priors
 from d2_plugin.priors.construct import NO_MAP, SCALE_UNKNOWN
 from d2_plugin.priors.monocular.align import align
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo import match
+from d2_plugin.priors.stereo import matched_depth
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording, Source
 from d2_plugin.recordings.synthetic.room import synthetic_recording

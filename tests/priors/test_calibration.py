@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.calibration import Calibration, held_against_truth, truth_rounding
+from d2_plugin.priors.declared_error import Calibration, held_against_truth, truth_rounding
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.summary import PriorSummary

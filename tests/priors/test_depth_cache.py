@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from d2_plugin.priors.frame import Frame
-from d2_plugin.priors.stereo.cache import DepthCache, StoredDepth
+from d2_plugin.priors.geometric_source import DepthCache, StoredDepth
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.store.files import write_entry

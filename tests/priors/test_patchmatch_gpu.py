@@ -21,7 +21,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.geometric_depth import choose_matcher, gray
 from d2_plugin.priors.stereo.gpu import kernel as gpu
-from d2_plugin.priors.stereo.gpu.call import PROGRAM, Call, flags_for
+from d2_plugin.priors.stereo.patchmatch_cuda import PROGRAM, Call, flags_for
 from d2_plugin.priors.stereo.patchmatch import patchmatch
 from d2_plugin.priors.stereo.pyramid import NO_MATCH
 from d2_plugin.priors.stereo.source_views import choose_sources

@@ -16,7 +16,7 @@ from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.geometric_depth import geometric_depth
-from d2_plugin.priors.stereo.match import MatchedDepth
+from d2_plugin.priors.stereo.matched_depth import MatchedDepth
 from d2_plugin.priors.stereo.reuse import MEMORY_DTYPE, MatchMemory, changed, covering_boxes
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording

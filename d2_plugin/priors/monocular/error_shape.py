@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.monocular.native.order import median
+from d2_plugin.priors.monocular.order import median
 
 FLOOR, DISTANCE, GAP, EDGE, WIDE_EDGE, BEYOND = 0.051, 1.19, 0.79, 2.76, 0.16, 0.086
 """f0 and fd (of d itself) to fr; fitted once to the true errors of studio, plaza and a rendered room together."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from d2_plugin.priors.monocular.align import unjudged_line
-from d2_plugin.priors.monocular.native.order import median, quantile
+from d2_plugin.priors.monocular.order import median, quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
 

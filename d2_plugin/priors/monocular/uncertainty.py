@@ -27,12 +27,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d2_plugin.priors.disk.confidence import divided
 from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.maps_on_disk import divided
 from d2_plugin.priors.monocular.correct import corrected_depth, corrected_without
 from d2_plugin.priors.monocular.error_shape import ErrorShape
 from d2_plugin.priors.monocular.extrapolation import extrapolation_error
-from d2_plugin.priors.monocular.native.order import median, quantile
+from d2_plugin.priors.monocular.order import median, quantile
 from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from d2_plugin.priors.calibration import DECLARED, shown
+from d2_plugin.priors.declared_error import DECLARED, shown
 from d2_plugin.runs.markup import Table
 from d2_plugin.runs.report.plots import Axis, Plot, Point, Series
 from d2_plugin.runs.report.sections import Section, cases_of, sources_of
