@@ -116,7 +116,6 @@ def methods() -> list[AlignMethod]:
         for tolerance in (1e-2, 1e-6, 1e-10)
     ]
     found.append(AlignMethod("align()", "as the priors use it", "relative", _as_used))
-    found.append(AlignMethod("align()", "leverage guard", "relative", partial(_as_used, leverage_guard=True)))
     found += [
         AlignMethod("Huber IRLS", f"{count} iterations", "relative", partial(_huber, iterations=count))
         for count in (5, 50)
@@ -140,10 +139,9 @@ def _certified(residual: str, tolerance: float) -> Callable[[AlignProblem], Line
     return fit
 
 
-def _as_used(problem: AlignProblem, leverage_guard: bool = AlignSettings.leverage_guard) -> Line:
+def _as_used(problem: AlignProblem) -> Line:
     """Everything that building a prior does: selection, subsampling, fit, certificate, acceptance."""
-    settings = AlignSettings(leverage_guard=leverage_guard)
-    found = align(problem.mono[None], problem.geometric[None], kind=problem.kind, settings=settings)
+    found = align(problem.mono[None], problem.geometric[None], kind=problem.kind, settings=AlignSettings())
     if not found.accepted:
         raise D2Error(found.status.value)
     return found.scale, found.shift

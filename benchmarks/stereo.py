@@ -40,7 +40,7 @@ class StereoBench(Settings):
     data: Path | None = None
     """Folder with the recordings studio/ and middlebury/."""
     makers: tuple[str, ...] = ()
-    """Matchers, of patchmatch, sweep, sgbm and colmap (which needs CUDA); all that run here if not given."""
+    """Matchers, of patchmatch, sgbm and colmap (which needs CUDA); all that run here if not given."""
     defaults_only: bool = False
     """Leave out what is varied about a matcher."""
     width: Annotated[int, Range(32, unit="pixels")] = 320
@@ -93,7 +93,7 @@ def bench_stereo(
     Args:
         output: folder, created where absent; its three files are replaced.
         rigs: names of `load_rigs`.
-        makers: `patchmatch`, `sweep`, `sgbm`, and `colmap` where it runs; all where empty.
+        makers: `patchmatch`, `sgbm`, and `colmap` where it runs; all where empty.
         defaults_only: leave out what is varied about a matcher.
         data: folder with the recordings `studio` and `middlebury`.
         width: of rendered images, pixels.

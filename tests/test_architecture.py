@@ -36,7 +36,7 @@ ROOMS = {
     "rasterizer": "ground",
     "gaussians": "ground rasterizer",
     "recordings": "ground",
-    "store": "ground (priors) (recordings)",
+    "store": "ground",
     "priors": "ground recordings store",
     "hooks": "ground rasterizer",
     "config": "ground hooks",

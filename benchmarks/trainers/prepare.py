@@ -9,8 +9,8 @@ from pathlib import Path
 
 from benchmarks.trainers.trials import HELD_OUT, TRAINED, Trial
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings import open_recording
 from d2_plugin.protocol import EXPORT_FILE
+from d2_plugin.recordings import open_recording
 from d2_plugin.runs.recording_export import RecordingExport
 from d2_plugin.runs.recording_export import run as export
 

@@ -262,7 +262,7 @@ def _refuse_without_kernels() -> None:
         cross_view.library()
     except NoCompiler as error:
         raise D2Error(
-            f"priors are built by compiled kernels, which a platform wheel brings along; here {error}"
+            f"priors are built by compiled kernels, which a platform wheel brings and a checkout compiles; {error}"
         ) from None
 
 

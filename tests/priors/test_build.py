@@ -28,7 +28,7 @@ from d2_plugin.store.store import PriorStore
 pytest.importorskip("cv2")
 
 NAMES = ["train0", "train1", "train2"]
-SETTINGS = PriorSettings(stereo=StereoSettings(matcher="sweep"))
+SETTINGS = PriorSettings(stereo=StereoSettings(matcher="patchmatch"))
 
 
 @dataclass
@@ -86,7 +86,7 @@ def no_stereo(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: object) -> None:
         raise AssertionError("stereo was computed again")
 
-    monkeypatch.setattr(match, "geometric_depth", refuse)
+    monkeypatch.setattr(matched_depth, "geometric_depth", refuse)
 
 
 def errors_of(recording: Recording, store: PriorStore, *labels: Label) -> np.ndarray:
@@ -150,13 +150,13 @@ def test_a_frame_is_matched_within_its_own_timestamp(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     matched = []
-    original = match.geometric_depth
+    original = matched_depth.geometric_depth
 
     def watch(images: list, *rest: object) -> list:
         matched.append(images)
         return original(images, *rest)
 
-    monkeypatch.setattr(match, "geometric_depth", watch)
+    monkeypatch.setattr(matched_depth, "geometric_depth", watch)
     build_priors(recording, NAMES[:2], tmp_path, SETTINGS)
     for frame, images in zip(recording.frames, matched, strict=True):
         for camera, image in zip(NAMES, images):
@@ -236,7 +236,7 @@ def test_a_kill_in_the_middle_loses_only_the_frame_in_work(plain: Recording, bui
         "def progress(done, total, note):\n"
         "    print(done, flush=True)\n"
         "    time.sleep(60 if done == 4 else 0)\n"
-        "settings = PriorSettings(stereo=StereoSettings(matcher='sweep'))\n"
+        "settings = PriorSettings(stereo=StereoSettings(matcher='patchmatch'))\n"
         f"build_priors(recording, {NAMES}, sys.argv[1], settings, progress=progress)"
     )
     process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True)

@@ -9,11 +9,11 @@ from typing import Any
 
 from benchmarks.rivals.table import rival
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.frame import hash_of
 from d2_plugin.runs.ablation.job import Job
 from d2_plugin.runs.rows import Row, make_row
 from d2_plugin.runs.saved.kinds import read_metrics
 from d2_plugin.runs.shared import Shared
+from d2_plugin.store.files import hash_of
 
 TRY = "try"
 """Target of a run that looks for the number of steps of a budget: drawn, and in no table."""
