@@ -127,7 +127,7 @@ def held_against_truth(
                 pairs.append(np.stack([error, np.hypot(sigma[mask], rounding[mask])]))
     if not views:
         return None
-    by_label = {label: _label_errors(*np.concatenate(pairs, axis=1), pixels) for label, pairs in collected.items()}
+    by_label = {label: _label_errors(np.concatenate(pairs, axis=1), pixels) for label, pairs in collected.items()}
     return DeclaredErrors(
         views,
         {label: errors for label, errors in by_label.items() if errors.pixels},
@@ -175,8 +175,9 @@ def reliability_curve(error: np.ndarray, sigma: np.ndarray) -> tuple[CurvePoint,
     )
 
 
-def _label_errors(error: np.ndarray, sigma: np.ndarray, pixels: int) -> LabelErrors:
-    """Of errors and sigmas [K] of one label, out of so many `pixels` in all."""
+def _label_errors(pairs: np.ndarray, pixels: int) -> LabelErrors:
+    """Of errors and sigmas [2, K] of one label, out of so many `pixels` in all."""
+    error, sigma = pairs
     if not error.size:
         unknown = float("nan")
         return LabelErrors(0, 0.0, unknown, unknown, unknown, unknown)
