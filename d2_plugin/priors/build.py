@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -79,10 +79,9 @@ def build_priors(
     total, done = len(frames) * len(names), 0
     with store.building(output):
         for number in frames:
-            built = _build_frame(sources, store, number)
-            for name in names:
+            for name, built in _build_frame(sources, store, number):
                 record = store.record(name, number) or {}
-                summary.add(name, number, record, name in built)
+                summary.add(name, number, record, built)
                 done += 1
                 if progress is not None:
                     share = f"{record['shares']['verified']:.0%} verified"
@@ -90,19 +89,19 @@ def build_priors(
     return summary
 
 
-def _build_frame(sources: _Sources, store: PriorStore, number: int) -> list[str]:
-    """Construct and store what is missing of one frame; returns the cameras that were."""
+def _build_frame(sources: _Sources, store: PriorStore, number: int) -> Iterator[tuple[str, bool]]:
+    """Construct and store what is missing of one frame: (camera, whether it was built now), one after the other."""
     frame = Frame.read(sources.recording, list(sources.cameras), number)
     keys = sources.keys(frame)
     missing = [name for name in keys if not store.is_current(name, number, keys[name])]
-    if missing:
-        # Cameras that are compared need the maps of all others.
-        needed = list(sources.cameras) if sources.compared else missing
-        priors = construct(sources.views(frame, needed), sources.cameras, sources.settings, sources.kind)
-        for name in missing:
+    # Cameras that are compared need the maps of all others.
+    needed = list(sources.cameras) if missing and sources.compared else missing
+    priors = construct(sources.views(frame, needed), sources.cameras, sources.settings, sources.kind) if missing else {}
+    for name in keys:
+        if name in missing:
             record = {**sources.described(name, frame), **priors[name].record(), "key": keys[name]}
             store.write(name, number, priors[name].maps, record)
-    return missing
+        yield name, name in missing
 
 
 @dataclass(frozen=True, eq=False)

@@ -133,7 +133,7 @@ def test_the_record_tells_everything_that_decided(built: tuple) -> None:
     record = PriorStore.open(built[0]).record("train0", 1)
     assert record["alignment"]["status"] == "ok"
     assert record["alignment"]["gap"] <= 1e-9
-    assert record["settings"]["stereo"]["matcher"] == "sweep"
+    assert record["settings"]["stereo"]["matcher"] == "patchmatch"
     assert record["settings"]["tau_c"] == SETTINGS.tau_c
     assert record["stereo"]["survivors"]["kept"] > 0
     assert "emulated" in record["monocular"]

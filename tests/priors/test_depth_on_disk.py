@@ -170,9 +170,7 @@ def test_a_map_that_is_no_depth_is_named(recording: Recording) -> None:
 
 
 @pytest.mark.parametrize("noise", [0, 0.01])
-def test_pixels_between_two_surfaces_are_dropped_and_plain_walls_are_kept(
-    noise: float, tmp_path: Path
-) -> None:
+def test_pixels_between_two_surfaces_are_dropped_and_plain_walls_are_kept(noise: float, tmp_path: Path) -> None:
     """A sensor mixes both depths of an edge; a wall without texture is what it is there for."""
     room = synthetic_recording(cameras=1, held_out=0, frames=1, width=320, height=180)
     (camera,) = room.cameras.values()

@@ -75,7 +75,7 @@ class TestStereoFilter:
         """Cameras side by side before a wall three units away, noisy and with holes."""
         random, shape = np.random.default_rng(seed), (height, width)
         places = [unit * np.array([0.5 * i, *random.normal(0, 0.1, 2)]) for i in range(count)]
-        cameras = [camera(place, random.normal(0, 0.1), width, height, (0.5, 0.5)) for place in places]
+        cameras = [camera(place, random.normal(0, 0.05), width, height, (0.5, 0.5)) for place in places]
         depths = [unit * 3 * np.exp(random.normal(0, noise, shape)) for _ in range(count)]
         depths = [np.where(random.random(shape) < 0.9, depth, 0).astype(np.float32) for depth in depths]
         return [random.integers(100, 130, shape).astype(np.uint8) for _ in range(count)], cameras, depths

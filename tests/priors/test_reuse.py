@@ -15,7 +15,7 @@ from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.geometric_depth import geometric_depth
 from d2_plugin.priors.stereo.matched_depth import MatchedDepth
-from d2_plugin.priors.stereo.reuse import MEMORY_DTYPE, RADIUS, MatchMemory, changed
+from d2_plugin.priors.stereo.reuse import RADIUS, MatchMemory, changed
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -72,19 +72,6 @@ def test_the_memory_takes_in_what_was_matched_and_keeps_the_rest() -> None:
     assert memory.matched_share == pytest.approx(mask.mean())
 
 
-def test_a_saved_memory_comes_back_under_its_key_only_and_only_intact(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    memory = MatchMemory([rng.integers(0, 255, (5, 5)).astype(np.uint8).astype(MEMORY_DTYPE) for _ in range(2)])
-    memory.save(tmp_path, "key")
-    loaded = MatchMemory.load(tmp_path, "key", 2)
-    for view, expected in zip(loaded.views, memory.views, strict=True):
-        np.testing.assert_array_equal(view, expected)
-    assert MatchMemory.load(tmp_path, "other", 2) is None
-    assert MatchMemory.load(tmp_path, "key", 3) is None
-    (tmp_path / "1.npy").write_bytes(b"half a file")
-    assert MatchMemory.load(tmp_path, "key", 2) is None
-
-
 def test_a_scene_that_stands_still_is_matched_once() -> None:
     still = synthetic_recording(cameras=2, held_out=0, frames=2, width=128, height=72, arc_degrees=10, moving=False)
     memory, results = MatchMemory(), []
@@ -135,19 +122,6 @@ def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(
 
     with pytest.raises(Stopped):
         build_priors(recording, NAMES, tmp_path, SETTINGS, progress=stop)
-    build_priors(recording, NAMES, tmp_path, SETTINGS)
-    assert priors_of(tmp_path) == priors_of(built)
-
-
-def test_without_its_saved_memory_a_block_is_matched_again_to_the_same_store(
-    recording: Recording, built: Path, tmp_path: Path
-) -> None:
-    build_priors(recording, NAMES, tmp_path, SETTINGS)
-    memory = list((tmp_path / "cache" / "matches").rglob("*.npy"))
-    assert memory
-    for file in [*memory, *(tmp_path / "cache" / "stereo").rglob("*2.npy")]:
-        file.unlink()
-    (tmp_path / "priors" / "train1" / "00002.npy").unlink()
     build_priors(recording, NAMES, tmp_path, SETTINGS)
     assert priors_of(tmp_path) == priors_of(built)
 

@@ -28,8 +28,7 @@ class MatchedDepth(GeometricSource):
         cameras: the cameras that are matched.
         bounds: depth range that is searched.
         settings: matching, filtering, carrying over.
-        cache: folder below which depth is kept, and the matches of unfinished blocks, with which a build that was
-            killed goes on.
+        cache: folder below which depth is kept.
         frames: all frame numbers of the build, ascending.
         read: reads the images of one frame.
     """
@@ -48,9 +47,8 @@ class MatchedDepth(GeometricSource):
             settings = replace(settings, reuse_static=False)
         super().__init__(cameras, bounds, settings, matcher, cache / "stereo")
         self.depth_range = bounds[:2]
-        self.matches, self.read = cache / "matches", read
-        self.blocks = frame_blocks(frames, settings)
-        self._before = {after: before for block in self.blocks for before, after in pairwise(block)}
+        self.read = read
+        self._before = {after: before for block in frame_blocks(frames, settings) for before, after in pairwise(block)}
         self._memory, self._remembered = MatchMemory(), ""
 
     def _inputs(self, frame: Frame) -> str:
@@ -63,32 +61,18 @@ class MatchedDepth(GeometricSource):
         return self._keys[before]
 
     def _computed(self, frame: Frame) -> list[GeometricDepth]:
-        """D^g per camera at one frame, after making sure that the memory is that of the frame before it."""
+        """D^g per camera at one frame. A build that goes on within a block matches the frames before it again."""
         key, before = self.key(frame), self._before.get(frame.number)
         if before is None:
             self._memory = MatchMemory()
         elif self._remembered != self._keys[before]:
-            self._remember(before)
+            self._computed(self.read(before))
         images = [frame.images[camera.name] for camera in self.cameras]
         memory = self._memory if self.settings.reuse_static else None
         results = geometric_depth(images, self.cameras, self.depth_range, self.settings, self.matcher, memory)
         self._remembered = key
-        if frame.number in self._before.values():
-            self._memory.save(self._saved(frame.number), key)
         matched_share = 1.0 if memory is None else round(memory.matched_share, 6)
         return [replace(result, record=result.record | {"matched_share": matched_share}) for result in results]
-
-    def _remember(self, number: int) -> None:
-        """Make the memory that of this frame: as it was saved, or by matching again from the start of the block."""
-        saved = MatchMemory.load(self._saved(number), self._keys[number], len(self.cameras))
-        if saved is None:
-            self._computed(self.read(number))
-        else:
-            self._memory = saved
-
-    def _saved(self, number: int) -> Path:
-        """Where the memory of a frame's block is kept."""
-        return self.matches / f"{next(block[0] for block in self.blocks if number in block):05d}"
 
 
 def frame_blocks(frames: Sequence[int], settings: StereoSettings) -> list[tuple[int, ...]]:

@@ -10,13 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.extras import opencv
-from d2_plugin.store.files import Entry, read_record, write_entry
 
 SMOOTHING = 3  # side of the box over which a change is averaged, pixels: noise cancels, moving things do not
 MEMORY_DTYPE = np.dtype([("gray", "u1"), ("depth", "<f4"), ("cost", "<f4")])
@@ -56,27 +53,6 @@ class MatchMemory:
             view["gray"][mask], view["depth"][mask], view["cost"][mask] = gray[mask], depth[mask], cost[mask]
         self.matched_share = float(np.mean([mask.mean() for mask in wanted]))
         return [(view["depth"].copy(), view["cost"].copy()) for view in self.views]
-
-    def save(self, folder: Path, key: str) -> None:
-        """Keep the memory on disk, so that a build that is killed goes on with the same matches."""
-        for index, view in enumerate(self.views):
-            record = {"key": key, "matched_share": self.matched_share}
-            write_entry(folder / f"{index}.npy", view, record, synced=False)
-
-    @classmethod
-    def load(cls, folder: Path, key: str, count: int) -> MatchMemory | None:
-        """The memory of `count` views that was saved under `key`, or None where there is no intact one."""
-        views = []
-        for index in range(count):
-            path = folder / f"{index}.npy"
-            try:
-                entry = Entry(path, read_record(path))
-                if entry.record.get("key") != key:
-                    return None
-                views.append(np.array(entry.array(MEMORY_DTYPE)))
-            except (FileNotFoundError, D2Error):
-                return None
-        return cls(views)
 
 
 def changed(gray: np.ndarray, before: np.ndarray) -> np.ndarray:
