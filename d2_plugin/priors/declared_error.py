@@ -100,7 +100,7 @@ def held_against_truth(
 ) -> DeclaredErrors | None:
     """Compare D* with the true depth of the recording, None where it has none.
 
-    Pixels at which nothing tells sigma, so that it is infinite, promise nothing and are left out. Where the truth
+    Pixels of an infinite sigma declare nothing and are left out. Where the truth
     itself is rounded, what rounding may do to it is added to sigma (see `truth_rounding`).
 
     Args:

@@ -43,7 +43,7 @@ def describe_camera(camera: Camera) -> dict[str, Any]:
 
 
 def describe_recording(recording: Recording) -> dict[str, Any]:
-    """What a store says of its recording: the name for people, the calibrations of all its cameras."""
+    """What a store records of its recording: its name and the calibrations of all its cameras."""
     cameras = {name: describe_camera(camera) for name, camera in recording.cameras.items()}
     return {"recording": recording.name, "calibrations": cameras}
 

@@ -65,12 +65,12 @@ def relative_pose(reference: Camera, source: Camera) -> np.ndarray:
 
 
 def view_pair(reference: Camera, source: Camera) -> ViewPair:
-    """The homography parts A and k from `reference` to `source`; arrays that nobody may write to."""
+    """The homography parts A and k from `reference` to `source`; read-only arrays."""
     return _view_pair(_Known(reference), _Known(source))
 
 
 class _Known:
-    """A camera that is told from others by its numbers alone, as they are now."""
+    """A camera as a key: equal where intrinsics and pose are, as they are now."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
@@ -85,7 +85,7 @@ class _Known:
 
 @functools.lru_cache(maxsize=1024)
 def _view_pair(ours: _Known, theirs: _Known) -> ViewPair:
-    """See `view_pair`; the same pairs are asked for at every frame, by matching, filter and evidence."""
+    """See `view_pair`; the same pairs are needed at every frame, by matching, filter and evidence."""
     reference, source = ours.camera, theirs.camera
     T = relative_pose(reference, source)
     K_s, K_r = index_intrinsics(source), index_intrinsics(reference)

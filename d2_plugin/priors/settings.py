@@ -22,7 +22,7 @@ Variant = Literal["dual", "mono", "mvs", "dual_unaligned", "dual_unverified"]
 verified, since the paper runs "identical densification, pruning, and RGB-D optimization" on each row.
 `mvs`: geometric depth alone, every pixel of it counts as verified; no monocular map is used at all.
 `dual_unaligned`: as `dual`, but with a = 1, b = 0. A relative map has no scale, so nearly all of it contradicts D^g.
-`dual_unverified`: aligned, but every geometric depth counts as verified, whatever the monocular map says.
+`dual_unverified`: aligned, but every geometric depth counts as verified, whatever the monocular map has.
 """
 
 Preprocessing = Literal["auto", "depth_anything_v2", "unit"]

@@ -22,7 +22,7 @@ REMEDY = "give the folder that `d2 export-recording` wrote"
 
 
 class RenamedStore:
-    """The priors of the source recording, asked for by the names of its export."""
+    """The priors of the source recording under the names of its export."""
 
     def __init__(self, store: Any, cameras: dict[str, str], frames: dict[int, int]) -> None:
         """`cameras` and `frames` map those of the export to those of the source."""

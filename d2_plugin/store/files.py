@@ -124,7 +124,7 @@ class EntryFolder:
 def write_entry(path: Path, array: np.ndarray, record: dict[str, Any], synced: bool = True) -> dict[str, Any]:
     """Array first, record second, each written whole: a record vouches for the array beside it.
 
-    What is not `synced` may be damaged after a power cut, which its checksums tell: for what is made again then.
+    What is not `synced` may be damaged after a power cut, which its checksums show: for what can be made again.
 
     Returns:
         The record as it was written.

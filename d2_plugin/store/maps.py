@@ -64,7 +64,7 @@ class FusedPrior:
     """All maps per pixel of D* of one view, as numpy arrays: what the construction fills and the store writes.
 
     `depth` [H, W] float32 is planar z, 0 where empty; `labels` [H, W] uint8 holds `Label`; `sigma` [H, W] float32 is
-    the relative standard deviation of the depth, infinite where nothing tells it; `colors` [H, W, 3] uint8 is the
+    the relative standard deviation of the depth, infinite where it is unknown; `colors` [H, W, 3] uint8 is the
     image that it was made for, None until the construction adds it.
     """
 
@@ -105,8 +105,8 @@ def check_maps(prior: FusedPrior, what: str) -> None:
     if depth.ndim != 2 or depth.shape != labels.shape:
         raise D2Error(f"{what} has depth {depth.shape} and labels {labels.shape}: both must be [H, W] of one size")
     if prior.colors is None or prior.colors.shape != (*depth.shape, 3):
-        found = "none" if prior.colors is None else str(prior.colors.shape)
-        raise D2Error(f"{what} is {depth.shape} and its colours {found}: build the prior at the image's size")
+        colors = "none" if prior.colors is None else str(prior.colors.shape)
+        raise D2Error(f"{what} is {depth.shape} and its colours {colors}: build the prior at the image's size")
     bad = ~np.isfinite(depth) | (depth < 0)
     if bad.any():
         raise D2Error(f"{what} has {int(bad.sum())} depths that are NaN, infinite or negative: use 0 for unknown depth")

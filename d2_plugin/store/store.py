@@ -80,11 +80,11 @@ class PriorStore:
     def create(
         cls, path: Path | str, cameras: Sequence[str], frames: Sequence[int], about: dict[str, Any]
     ) -> PriorStore:
-        """Open the store at `path` for building, or begin one; `about` says which recording it belongs to.
+        """Open the store at `path` for building, or begin one; `about` describes its recording.
 
         Frames that were built for the same cameras before stay part of the store, and so does the order of its
         cameras. Other cameras of the same recording get a store of their own in it, see `located`. Where nothing has
-        to be added nothing is written: a finished store may lie where nobody can write.
+        to be added nothing is written: a finished store may lie on a read-only disk.
 
         Raises:
             D2Error: the folder holds something else, or the priors of another recording.
@@ -94,15 +94,15 @@ class PriorStore:
         if root.exists() and not root.is_dir():
             raise D2Error(f"{root} is a file, and the priors need a folder: choose another output folder")
         with in_turn(make_folder(root)):
-            found = cls._found(root, about)
+            existing = cls._existing(root, about)
             place = cls.place(root, cameras)
             if place != root:
-                found = cls._found(make_folder(place), about)
-            if found is None:
+                existing = cls._existing(make_folder(place), about)
+            if existing is None:
                 store = cls(place, cameras, frames, about)
             else:
-                store = cls(place, found.cameras, sorted({*found.frames, *frames}), found.about)
-            if found is None or store.frames != found.frames:
+                store = cls(place, existing.cameras, sorted({*existing.frames, *frames}), existing.about)
+            if existing is None or store.frames != existing.frames:
                 described = {"cameras": store.cameras, "frames": store.frames, "about": store.about}
                 write_table(place / "store.json", described, STORE)
         return store
@@ -122,14 +122,14 @@ class PriorStore:
         return place if (place / "store.json").is_file() else Path(path)
 
     @classmethod
-    def _found(cls, path: Path, about: dict[str, Any]) -> PriorStore | None:
+    def _existing(cls, path: Path, about: dict[str, Any]) -> PriorStore | None:
         """The store at `path` as it stands, None where nothing is there; another recording's is refused."""
         if (path / "store.json").is_file():
-            found = cls.described(path)
-            reason = other_recording(found.about, about)
+            store = cls.described(path)
+            reason = other_recording(store.about, about)
             if reason is not None:
-                raise not_of(path, found.about, about, reason)
-            return found
+                raise not_of(path, store.about, about, reason)
+            return store
         if path.exists() and not all(is_leftover(inside) for inside in path.iterdir()):
             raise D2Error(f"{path} is not empty and holds no prior store: choose another output folder")
         return None
@@ -194,7 +194,7 @@ class PriorStore:
     def building(self, root: Path) -> Iterator[None]:
         """Write priors beside other processes that do; `root` is the folder that `create` was given.
 
-        Whoever finds nobody else there removes what killed builds left, and what is damaged.
+        The first of them removes what killed builds left, and what is damaged.
         """
 
         def tidy() -> None:
@@ -229,14 +229,14 @@ def _joined(cameras: Sequence[str]) -> str:
 _REBUILD = "run `d2 priors` again with the same output folder, which rebuilds what is damaged"
 
 
-def other_recording(found: dict[str, Any], given: dict[str, Any]) -> str | None:
+def other_recording(stored: dict[str, Any], given: dict[str, Any]) -> str | None:
     """Why two descriptions (`describe_recording`) are of different recordings; None if of one.
 
     The name decides only where one of them holds no calibration.
     """
-    ours, theirs = given.get("calibrations"), found.get("calibrations")
+    ours, theirs = given.get("calibrations"), stored.get("calibrations")
     if not ours or not theirs:
-        return None if found == given else ""
+        return None if stored == given else ""
     shared = sorted(ours.keys() & theirs.keys())
     if not shared:
         return "they have no camera in common"
@@ -244,11 +244,11 @@ def other_recording(found: dict[str, Any], given: dict[str, Any]) -> str | None:
     return f"camera {moved[0]} has another size, lens or pose" if moved else None
 
 
-def not_of(path: Path, found: dict[str, Any], given: dict[str, Any], reason: str) -> D2Error:
+def not_of(path: Path, stored: dict[str, Any], given: dict[str, Any], reason: str) -> D2Error:
     """The error for a store that belongs to another recording."""
     why = f" ({reason})" if reason else ""
     return D2Error(
-        f"{path} holds the priors of {found.get('recording')}, not of {given.get('recording')}{why}: "
+        f"{path} holds the priors of {stored.get('recording')}, not of {given.get('recording')}{why}: "
         "choose another output folder"
     )
 

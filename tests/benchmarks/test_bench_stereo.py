@@ -84,19 +84,19 @@ def test_a_method_that_fails_on_a_rig_says_why_and_counts_as_nothing(rig: Rig) -
 def test_bench_writes_rows_table_and_plot(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("benchmarks.stereo._set_threads", lambda count: None)
     settings = StereoBench(
-        rigs=("synthetic2",), width=96, makers=("sweep", "sgbm"), defaults_only=True, output=tmp_path
+        rigs=("synthetic2",), width=96, makers=("patchmatch", "sgbm"), defaults_only=True, output=tmp_path
     )
     told = run(settings)
-    assert "| sweep | default |" in told, "what a command made is printed"
+    assert "| patchmatch | default |" in told, "what a command made is printed"
     assert told.endswith(f"are in {tmp_path}")
     rows = [json.loads(line) for line in (tmp_path / "stereo.jsonl").read_text().splitlines()]
     assert [(row["method"], row["rig"], row["width"]) for row in rows] == [
-        ("sweep", "synthetic2", 96),
+        ("patchmatch", "synthetic2", 96),
         ("sgbm", "synthetic2", 96),
     ]
     assert all(row["kind"] == "stereo" and row["error"] == 1 - row["f1"] for row in rows)
     assert all(row["cpu"] > 0 and row["command"].startswith("d2 bench stereo --rigs") for row in rows)
-    assert "| synthetic2 | 2 | 96x54 | sweep | default |" in (tmp_path / "stereo.md").read_text()
+    assert "| synthetic2 | 2 | 96x54 | patchmatch | default |" in (tmp_path / "stereo.md").read_text()
     assert (tmp_path / "stereo.svg").stat().st_size > 1000
 
 

@@ -1,9 +1,9 @@
-"""Slopes of maps whose anchors cannot tell them, from what two cameras' maps must share; an addition to the paper.
+"""Slopes of maps whose anchors leave them open, from what two cameras' maps must share; an addition to the paper.
 
 Where cameras stand far apart stereo may know one tree and nothing else. Such anchors fix the depth at one value of the
 map and leave the slope of its line open: drawn on to the rest of the image it may be wrong by any factor. But the
 ground and the walls that two maps show are one surface, and with the wrong slopes they part. So the slopes are those
-with which most pixels of one map, seen by the other camera, lie where its map says:
+with which most pixels of one map, seen by the other camera, lie where its map has them:
 
     maximise over the slopes   sum of exp(-r^2 / 2 s^2),   r = log(depth of the pixel there / the other map's),
 
@@ -27,9 +27,9 @@ from d2_plugin.priors.monocular.order import quantile
 from d2_plugin.recordings.recording import Camera, MonoKind
 
 SPAN = 0.15
-"""Anchors whose values span a smaller share of the map's cannot tell its slope."""
+"""Anchors whose values span a smaller share of the map's leave its slope open."""
 RANGE, MOST = (0.02, 0.98), (0.1, 0.9)
-"""Quantiles between which a map's values span, and those of anchors: a handful on a passer-by cannot tell a slope."""
+"""Quantiles between which a map's values span, and those of anchors: a handful on a passer-by leave a slope open."""
 SLOPES = np.geomspace(0.03, 3, 28)
 """What is tried, in units of the slope with which the smallest values of the map lie infinitely far (of an inverse
 map), or that of a line through the origin (of a depth map)."""
@@ -38,7 +38,7 @@ FINER = 9
 LEAST_REACH = 0.05
 """Anchors nearer than this to the smallest values of an inverse map, as a share of its span, count as so far off."""
 SAMPLES = 5000
-"""Pixels of each map that are asked."""
+"""Pixels of each map that are compared."""
 SPREAD = 0.07
 """s: how far two maps that belong to their images differ, in log depth."""
 MATCHED = 0.35
@@ -63,7 +63,7 @@ class Shown(NamedTuple):
 
 
 def aligned_across(views: Mapping[str, Shown], kind: MonoKind) -> dict[str, Alignment]:
-    """The alignments of the views whose anchors cannot tell a slope, by name; without those whose slope stays unknown.
+    """The alignments of the views whose anchors leave the slope open, by name; without those whose slope stays unknown.
 
     Where there are such views, the others come too, with their own lines and how far their maps part from these.
 

@@ -2,8 +2,6 @@
 
 The paper fits a D^m + b to D^g. A relative model (Depth Anything V2) however returns affine-invariant *inverse* depth,
 so its map is fitted to 1 / D^g. A metric model is fitted to D^g as the paper writes it.
-
-Measured: see docs/evidence.md.
 """
 
 from __future__ import annotations
@@ -133,7 +131,7 @@ def align(mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: 
 def unjudged_line(
     mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: AlignSettings
 ) -> tuple[float, float]:
-    """Scale and shift that `align` finds, without the tests that tell whether they may be used; NaN without a line."""
+    """Scale and shift of `align` without the tests of whether they may be used; NaN without a line."""
     _check(mono, geometric, kind)
     fitted = _fitted(mono, geometric, kind, settings)
     line = fitted if isinstance(fitted, Alignment) else fitted.fit
@@ -160,7 +158,7 @@ def aligned_depth(mono: np.ndarray, alignment: Alignment, z_far: float) -> np.nd
 def aligned_inverse(mono: np.ndarray, alignment: Alignment) -> np.ndarray:
     """Aligned inverse depth float64 [H, W], also where it is no depth: 0 and below is infinitely far, NaN is unknown.
 
-    The zero of a saturated ReLU says "farther than I can tell" and is taken at its word.
+    The zero of a saturated ReLU means "farther than can be predicted" and is taken as infinitely far.
     """
     value = alignment.scale * mono.astype(np.float64) + alignment.shift
     if alignment.kind == "metric":
@@ -170,7 +168,7 @@ def aligned_inverse(mono: np.ndarray, alignment: Alignment) -> np.ndarray:
 
 
 def inverse_at_least(mono: np.ndarray, alignment: Alignment) -> float:
-    """What no number of `aligned_inverse` lies below, from the ends of the map [H, W]; NaN where that tells nothing."""
+    """What no number of `aligned_inverse` lies below, from the ends of the map [H, W]; NaN where that gives none."""
     low, high = float(np.fmin.reduce(mono, axis=None)), float(np.fmax.reduce(mono, axis=None))
     ends = [low, high, 0.0] if low <= 0 <= high else [low, high]
     return float(np.fmin.reduce(aligned_inverse(np.array(ends), alignment)))
@@ -179,7 +177,7 @@ def inverse_at_least(mono: np.ndarray, alignment: Alignment) -> float:
 def predicted(mono: np.ndarray) -> np.ndarray:
     """Pixels at which the network said something, bool: finite, and not the zero of a saturated ReLU.
 
-    Depth Anything V2 ends in a ReLU. Its exact zeros say "farther than I can tell", which is no value to fit a line to.
+    Depth Anything V2 ends in a ReLU. Its exact zeros mean "farther than can be predicted", which is no value to fit.
     """
     return np.isfinite(mono) & (mono != 0)
 

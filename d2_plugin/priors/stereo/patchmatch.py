@@ -42,7 +42,7 @@ def patchmatch(
         cameras: at least two, in the same order.
         depth_range: near and far in world units; ten times too wide does no harm.
         settings: `patchmatch_device`, `patchmatch_sources`, `min_angle`, `max_angle` and `seed` are used.
-        wanted: bool [H, W] per camera, pixels whose depth is asked for; all where None. Others may have no depth.
+        wanted: bool [H, W] per camera, pixels to match; all where None. Others may have no depth.
 
     Returns:
         Per camera: planar depth float32 [H, W] (0 where nothing matches) and 1 - NCC float32 [H, W] in 0..2. A view

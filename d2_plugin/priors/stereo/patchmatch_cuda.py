@@ -56,7 +56,7 @@ class Launcher(Protocol):
 
 
 def flags_for(sources: int) -> tuple[str, ...]:
-    """What NVRTC, or nvcc, is told to compile the kernels for so many sources of a view."""
+    """Flags of NVRTC, or nvcc, to compile the kernels for so many sources of a view."""
     return (*FLAGS, f"-DD2_MAX_SOURCES={sources}", f"-DD2_CALL_SIZE={ctypes.sizeof(Call)}")
 
 

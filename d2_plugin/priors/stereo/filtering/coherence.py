@@ -16,7 +16,7 @@ RADIUS = 9
 """Half the side of the square window, pixels, a multiple of `STRIDE`."""
 CONTRAST = 0.05
 """Standard deviation of the weight over grey values, in 0..1: neighbours that differ by more have little say."""
-STRIDE = 3  # pixels between the neighbours that are asked
+STRIDE = 3  # pixels between the neighbours that are compared
 SLOPE_REACH = 2  # pixels between the ends of a difference: shorter ones amplify noise, longer ones cross edges
 
 

@@ -68,7 +68,7 @@ def _add_source(
     source: Camera,
     settings: StereoSettings,
 ) -> None:
-    """Add what one source says of `depth` [H, W] to the sums."""
+    """Add the confirmation of `depth` [H, W] by one source to the sums."""
     rays = np.linalg.inv(index_intrinsics(reference))
     pair, back = view_pair(reference, source), view_pair(source, reference)
     low, high = np.deg2rad(settings.min_angle), np.deg2rad(settings.max_angle)

@@ -73,7 +73,7 @@ def filter_depths(
     known = [_finite(depth) for depth in depths]
     matched = [depth * (cost < COST_MAX) for depth, cost in zip(known, costs)]
     textured = [depth * texture_mask(gray) for gray, depth in zip(grays, matched)]
-    # The unfiltered map is asked: a neighbour that matched badly may still tell where the surface runs.
+    # Neighbours in the unfiltered map: one that matched badly may still tell where the surface runs.
     coherent = [surface_coherence(gray, depth) for gray, depth in zip(grays, known)]
     candidates = [z * (share >= COHERENCE_MIN) for share, z in zip(coherent, textured)]
     results = []

@@ -1,4 +1,4 @@
-"""How precise a geometric depth is: matching precision through the parallax, and what neighbours and sources say.
+"""How precise a geometric depth is: matching precision through the parallax, neighbours and confirming sources.
 
 A match that is off by e pixels puts the depth off by e / P, where P is the parallax: by how many pixels the match moves
 in the confirming sources when the depth changes by its own size. The match itself is as sharp as the image is: grey
@@ -23,7 +23,7 @@ from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.stereo.filtering import kernel
 
 MATCHING = 0.00293
-"""Error of the best match, pixels: next to nothing, what it is worth is told by the gradient."""
+"""Error of the best match, pixels: next to nothing; the gradient decides."""
 GRAY_NOISE = 1.3e-3
 """Error of the grey values (0..1) that a match compares: noise, exposure, resampling."""
 PER_INCOHERENCE = 2.83
