@@ -114,7 +114,7 @@ def check_maps(prior: FusedPrior, what: str) -> None:
         raise D2Error(f"{what} has label {int(labels.max())}: labels are 0 to {int(max(Label))}")
     if prior.sigma.shape != depth.shape or not (prior.sigma >= 0).all():
         raise D2Error(f"{what} has a sigma that is no map [H, W] of numbers >= 0: use infinity where nothing is known")
-    supported = np.isin(labels, (Label.MONO, Label.VERIFIED, Label.AGREED, Label.FAR))
+    supported = (labels != Label.EMPTY) & (labels != Label.CONFLICT)
     if not np.array_equal(supported, depth > 0):
         known = "mono-only, verified, agreed and far"
         raise D2Error(f"{what} has labels that contradict its depth: exactly {known} pixels have a depth")

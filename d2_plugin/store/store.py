@@ -31,7 +31,6 @@ import torch
 
 from d2_plugin.durable import Kind, is_leftover, make_folder, read_table, remove_leftovers, write_table
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.locks import in_turn, one_of_many
 from d2_plugin.protocol import CameraRecord, DepthPrior
 from d2_plugin.store.files import Entry, EntryFolder, hash_of
 from d2_plugin.store.maps import PRIOR_DTYPE, SIGMA, DepthRange, FusedPrior, check_maps, encode_sigma
@@ -90,6 +89,8 @@ class PriorStore:
             D2Error: the folder holds something else, or the priors of another recording.
             CannotWrite: the disk is full, broken or not ours.
         """
+        from d2_plugin.locks import in_turn  # who reads needs none
+
         root = Path(path)
         if root.exists() and not root.is_dir():
             raise D2Error(f"{root} is a file, and the priors need a folder: choose another output folder")
@@ -196,6 +197,8 @@ class PriorStore:
 
         The first of them removes what killed builds left, and what is damaged.
         """
+
+        from d2_plugin.locks import in_turn, one_of_many
 
         def tidy() -> None:
             with in_turn(root):

@@ -374,18 +374,6 @@ def test_the_papers_preset_is_the_papers_equations_and_nothing_else(plain: Recor
     assert accepted
 
 
-def test_the_papers_plain_construction_is_a_preset_and_less_exact(
-    plain: Recording, built: tuple, tmp_path: Path
-) -> None:
-    summary = build_priors(plain, NAMES, tmp_path, PriorSettings.paper(stereo=SETTINGS.stereo))
-    conflict, less = (np.mean([share["conflict"] for share in s.shares.values()]) for s in (summary, built[1]))
-    assert conflict > less
-    plain_error, corrected = (
-        np.median(errors_of(plain, PriorStore.open(path), Label.MONO, Label.AGREED)) for path in (tmp_path, built[0])
-    )
-    assert corrected < 0.9 * plain_error
-
-
 def test_a_network_is_asked_once_per_image(plain: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("onnxruntime")
     from d2_plugin.priors.monocular.network import MonocularModel

@@ -4,7 +4,7 @@ COLMAP would estimate the geometry of every pair of images anew to tell good mat
 known here, so a match is kept when it lies on its epipolar line: no random sampling, and pairs with a handful of
 matches still count.
 
-Features are COLMAP's SIFT: OpenCV's takes a third of its time but finds fewer points in pairs that see little in common.
+Features are those of COLMAP's SIFT; OpenCV's takes less time but serves cameras that see little in common worse.
 """
 
 from __future__ import annotations

@@ -8,7 +8,6 @@ disagrees with the many around it is outvoted there, so verification by the corr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from types import ModuleType
 
 import numpy as np
@@ -71,34 +70,31 @@ def _smooth_fields(bend: np.ndarray, known: np.ndarray) -> np.ndarray:
     for scale in SCALES:
         sigma = max(scale * width / cell, 0.5)
         blurs.append((_blur_matrix(cv2, rows, sigma), _blur_matrix(cv2, columns, sigma)))
+    count = _block_sum(known, cell)
+    mean = _block_sum(np.where(known, bend, np.float32(0)), cell) / np.maximum(count, 1)
+    share, cells = count / np.float32(cell**2), np.zeros_like(mean)
+    for down, across in blurs:
+        cells += _robust_average(down, across, mean - cells, share)
     fields = np.empty(known.shape, np.float32)
-    for which, out in zip(known, fields):
-        field = _cell_field(np.where(which, bend, np.float32(0)), which, cell, blurs)
+    for field, out in zip(cells, fields):
         enlarged = cv2.resize(field, (columns * cell, rows * cell), interpolation=cv2.INTER_LINEAR)
         out[:] = enlarged[:height, :width]
     return fields
 
 
-_Blur = tuple[np.ndarray, np.ndarray]
-"""Blur of a column of cells and of a row of cells."""
-
-
-def _cell_field(bend: np.ndarray, known: np.ndarray, cell: int, blurs: Sequence[_Blur]) -> np.ndarray:
-    """Correction of log depth in each cell [rows, columns] from its values [H, W] at the known pixels, 0 elsewhere."""
-    count = _block_sum(known.astype(np.float32), cell)
-    mean = _block_sum(bend, cell) / np.maximum(count, 1)
-    share = count / cell**2
-    field = np.zeros_like(mean)
-    for down, across in blurs:
-        field = field + _robust_average(down, across, mean - field, share)
-    return field
-
-
 def _robust_average(down: np.ndarray, across: np.ndarray, values: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Gaussian average weighted by how much of a cell is known, then by agreement with that average."""
+    """Gaussian averages [n, rows, columns] weighted by how much of a cell is known, then by agreement with the average.
+
+    Args:
+        down, across: blur of a column and of a row of cells.
+        values: of the cells [n, rows, columns].
+        share: how much of each cell is known, 0..1.
+    """
 
     def average(weight: np.ndarray) -> np.ndarray:
-        total, weights = down @ np.stack([weight * values, weight]) @ across.T
+        # One product for each map: larger ones BLAS would split over threads, which wait long on a busy machine.
+        blurred = down @ np.concatenate([weight * values, weight]) @ across.T
+        total, weights = blurred[: len(values)], blurred[len(values) :]
         return total / (weights + np.float32(PRIOR))
 
     weight = share
@@ -129,8 +125,9 @@ _BLURS: dict[tuple[int, float], np.ndarray] = {}
 
 
 def _block_sum(values: np.ndarray, cell: int) -> np.ndarray:
-    """Sum over cells of `cell` pixels a side; those at the lower and right rim may be cut."""
-    height, width = (-(-size // cell) * cell for size in values.shape)
-    padded = np.zeros((height, width), np.float32)
-    padded[: values.shape[0], : values.shape[1]] = values
-    return padded.reshape(height // cell, cell, width // cell, cell).sum(axis=(1, 3))
+    """Sums [n, rows, columns] over cells of `cell` pixels a side; those at the lower and right rim may be cut."""
+    count, height, width = values.shape
+    rows, columns = -(-height // cell), -(-width // cell)
+    padded = np.zeros((count, rows * cell, columns * cell), np.float32)
+    padded[:, :height, :width] = values
+    return padded.reshape(count, rows, cell, columns, cell).sum(axis=(2, 4))
