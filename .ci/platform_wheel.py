@@ -54,14 +54,13 @@ def libraries() -> list[Library]:
     from d2_plugin.gaussians import native_adam, native_image, native_slice, native_ssim
     from d2_plugin.hooks import native_depth_loss
     from d2_plugin.priors.cross_view import kernel as cross_view
-    from d2_plugin.priors.monocular.native import library as monocular
     from d2_plugin.priors.stereo.filtering import kernel as filtering
     from d2_plugin.priors.stereo.patchmatch_kernel import PatchMatchKernel
     from d2_plugin.priors.stereo.settings import StereoSettings
     from d2_plugin.rasterizer import native
 
     gaussians = native, native_slice, native_ssim, native_image, native_adam, native_depth_loss
-    modules = *gaussians, filtering, monocular, cross_view, absolute
+    modules = *gaussians, filtering, cross_view, absolute
     loads = [*(module.library for module in modules), lambda: PatchMatchKernel([], (1.0, 2.0), StereoSettings())]
     for load in loads:
         with contextlib.suppress(Noted):

@@ -135,8 +135,7 @@ def _certified(residual: str, tolerance: float) -> Callable[[AlignProblem], Line
 
 def _as_used(problem: AlignProblem) -> Line:
     """Everything that building a prior does: selection, subsampling, fit, certificate, acceptance."""
-    settings = AlignSettings()
-    found = align(problem.mono[None], problem.geometric[None], kind=problem.kind, settings=settings)
+    found = align(problem.mono[None], problem.geometric[None], kind=problem.kind, settings=AlignSettings())
     if not found.accepted:
         raise D2Error(found.status.value)
     return found.scale, found.shift

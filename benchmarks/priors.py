@@ -21,7 +21,13 @@ import torch
 from benchmarks.stereo_rigs import ARCS
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.calibration import NORMAL_SHARE, Calibration, frames_with_truth, held_against_truth, shown
+from d2_plugin.priors.declared_error import (
+    NORMAL_SHARE,
+    DeclaredErrors,
+    frames_with_truth,
+    held_against_truth,
+    label_name,
+)
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -128,7 +134,7 @@ def _listed(frames: Sequence[int]) -> str:
     return f"frame{'s' if len(frames) > 1 else ''} {', '.join(map(str, frames[:8]))}"
 
 
-def measure(case: Case) -> tuple[Calibration, float]:
+def measure(case: Case) -> tuple[DeclaredErrors, float]:
     """How the prior that the defaults make compares with the truth, and the seconds that it takes per image."""
     points = triangulated_points(case.recording, case.cameras).positions
     with tempfile.TemporaryDirectory() as folder:
@@ -141,7 +147,7 @@ def measure(case: Case) -> tuple[Calibration, float]:
     return found, seconds / (len(case.cameras) * len(case.recording.frames))
 
 
-def rows_of(case: Case, found: Calibration, seconds: float, command: str = "") -> list[Row]:
+def rows_of(case: Case, found: DeclaredErrors, seconds: float, command: str = "") -> list[Row]:
     """A row per label that a pixel carries, and one about far pixels."""
     about: dict[str, Any] = {
         "command": command,
@@ -153,7 +159,7 @@ def rows_of(case: Case, found: Calibration, seconds: float, command: str = "") -
     }
     rows = [
         make_row(
-            *("priors", case.name, shown(label)),
+            *("priors", case.name, label_name(label)),
             error=abs(held.within - NORMAL_SHARE),
             share=held.share,
             within=held.within,

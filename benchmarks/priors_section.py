@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from d2_plugin.priors.calibration import DECLARED, shown
+from d2_plugin.priors.declared_error import DECLARED, label_name
 from d2_plugin.runs.markup import Table
 from d2_plugin.runs.report.page import Section, cases_of, sources_of
 from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure
 from d2_plugin.runs.rows import Row
 
-LABELS = tuple(map(shown, DECLARED))
+LABELS = tuple(map(label_name, DECLARED))
 """Labels whose sigma is drawn; each has its colour in all plots."""
 DIAGONAL = "declared = true"
 DIAGONAL_COLOR = 5

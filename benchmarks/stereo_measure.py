@@ -18,23 +18,7 @@ from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_dept
 from d2_plugin.priors.stereo.geometric_depth import MATCHERS, Matcher, gray
 
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
-    "patchmatch": {
-        "default": {},
-        "dense: 1 geometric round": {"patchmatch_geometric_rounds": 1},
-        "2 sweeps at full size": {"patchmatch_rounds": (4, 2, 2, 2)},
-        "8 sweeps, one scale": {"patchmatch_rounds": (8,)},
-        "4 sweeps, one scale": {"patchmatch_rounds": (4,)},
-        "2 scales": {"patchmatch_rounds": (4, 1)},
-        "3 scales": {"patchmatch_rounds": (4, 2, 1)},
-        "fewer sweeps": {"patchmatch_rounds": (2, 1, 1, 1)},
-        "half size only": {"patchmatch_rounds": (4, 2, 1, 0)},
-        "no consensus": {"patchmatch_consensus_passes": 0},
-    },
-    "sweep": {
-        "default": {},
-        "planes half a pixel apart": {"sweep_step": 0.5},
-        "planes 2 pixels apart": {"sweep_step": 2},
-    },
+    "patchmatch": {"default": {}, "2 sources": {"patchmatch_sources": 2}},
     "colmap": {"default": {}, "photometric pass alone": {"colmap_geometric": False}},
 }
 """What is varied about each matcher of this package: its settings that are not the default."""

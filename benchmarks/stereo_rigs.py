@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from d2_plugin.errors import unknown_name
-from d2_plugin.priors.geometry import pixel_grid, view_pair
-from d2_plugin.priors.stereo.filtering.confirm import sample_nearest
+from d2_plugin.priors.geometry import Projection, pixel_grid, view_pair
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic import materials
@@ -66,9 +65,21 @@ def _covisible(rig: Rig, index: int) -> np.ndarray:
         surface = rig.truths[other]
         if surface is None:
             surface = _nearest_surface(at.x, at.y, np.where(truth > 0, at.z, 0), source)
-        there = sample_nearest(surface, at)
+        there = _nearest_depth(surface, at)
         seen |= (truth > 0) & (np.abs(there - at.z) < OCCLUSION * at.z)
     return seen
+
+
+def _nearest_depth(depth: np.ndarray, at: Projection) -> np.ndarray:
+    """`depth` at the nearest pixel of `at`, 0 outside of the image or behind the camera.
+
+    Nearest on purpose: a value interpolated across an occlusion edge belongs to no surface.
+    """
+    height, width = depth.shape
+    inside = (at.z > 0) & (at.x > -0.5) & (at.y > -0.5) & (at.x < width - 0.5) & (at.y < height - 0.5)
+    column = np.rint(np.where(inside, at.x, 0)).astype(np.int32)
+    row = np.rint(np.where(inside, at.y, 0)).astype(np.int32)
+    return np.where(inside, depth[row, column], 0)
 
 
 def _nearest_surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, source: Camera) -> np.ndarray:

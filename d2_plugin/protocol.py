@@ -17,6 +17,9 @@ from torch import Tensor
 
 from d2_plugin.settings import Range, Settings, Share
 
+EXPORT_FILE = "export.json"
+"""Beside exported images: which camera and frame of the source recording each camera and frame of the export is."""
+
 
 class Label(IntEnum):
     """What is known about one pixel of a depth prior (paper, section "Dual-source Depth Consistency Prior")."""

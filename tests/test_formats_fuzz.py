@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from colmap_maps import write_dense_array
 from fuzzing import bounded_memory, expect_result_or_sentence, mutate_file
 from small_layouts import small_recording
 from tiny_onnx import mean_network
@@ -17,11 +18,12 @@ from tiny_onnx import mean_network
 from benchmarks.report import EVERY
 from d2_plugin.arrays import map_array, read_array
 from d2_plugin.config import D2Config, for_iterations
-from d2_plugin.priors.colmap.dense_arrays import read_dense_array, write_dense_array
+from d2_plugin.priors.colmap.dense_arrays import read_dense_array
 from d2_plugin.priors.depth_on_disk import SensorDepth
 from d2_plugin.priors.monocular.network import MonocularModel
+from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.reading import read_json
-from d2_plugin.recordings.export.export import EXPORT_FILE, export_recording
+from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.images import image_size, read_image, write_png
 from d2_plugin.recordings.importing.plain import VideoSource, video_header
 from d2_plugin.recordings.recording import Camera

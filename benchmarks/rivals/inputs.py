@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from d2_plugin.hooks import Context, Hook, HookConfig
+from d2_plugin.priors.geometric_source import stored_depth
 from d2_plugin.priors.monocular.network import upsample
-from d2_plugin.priors.stereo.cache import stored_depth
 from d2_plugin.protocol import View
 from d2_plugin.rasterizer import Splats, rasterize
 from d2_plugin.runs.scene import Scene

@@ -11,8 +11,8 @@ from benchmarks.trainers.trials import HELD_OUT, TRAINED, Trial
 from d2_plugin.commands.export_recording import RecordingExport
 from d2_plugin.commands.export_recording import run as export
 from d2_plugin.errors import D2Error
+from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.export.export import EXPORT_FILE
 
 
 @dataclass(frozen=True)

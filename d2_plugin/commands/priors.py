@@ -38,7 +38,7 @@ def run(given: Given) -> str:
     """Build what is missing; returns a summary of the frames."""
     from d2_plugin.durable import CannotWrite
     from d2_plugin.locks import in_turn
-    from d2_plugin.priors.calibration import frames_with_truth, held_against_truth
+    from d2_plugin.priors.declared_error import frames_with_truth, held_against_truth
     from d2_plugin.priors.sheet import contact_sheet
     from d2_plugin.runs.prior.build import build_priors_for
     from d2_plugin.runs.scene import Scene

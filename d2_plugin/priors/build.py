@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from d2_plugin.compiler import NoCompiler
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.priors.construct import CONSTRUCTION_VERSION, Construction
-from d2_plugin.priors.depth_on_disk import FilteredDepthOnDisk, find_depth_on_disk
-from d2_plugin.priors.disk.confidence import OF_DEPTH, OF_MONO, ConfidenceMaps
-from d2_plugin.priors.frame import Frame, describe_camera, describe_recording, digest, hash_of, not_of, view_digest
-from d2_plugin.priors.monocular.maps import mono_source
+from d2_plugin.priors.construct import CONSTRUCTION_VERSION, ViewSources, compares_cameras, construct
+from d2_plugin.priors.cross_view import kernel as cross_view
+from d2_plugin.priors.depth_on_disk import DepthOnDisk, find_depth_on_disk
+from d2_plugin.priors.frame import Frame, describe_camera, describe_recording, digest, view_digest
+from d2_plugin.priors.geometric_source import GeometricSource
+from d2_plugin.priors.maps_on_disk import OF_DEPTH, OF_MONO, ConfidenceMaps
+from d2_plugin.priors.monocular.maps import MonoSource, mono_source
 from d2_plugin.priors.settings import PriorSettings, Variant
-from d2_plugin.priors.stereo.cache import DepthCache, GeometricSource
 from d2_plugin.priors.stereo.depth_range import DepthBounds, depth_bounds
-from d2_plugin.priors.stereo.match import MatchedDepth, frame_blocks
+from d2_plugin.priors.stereo.filtering import kernel as filtering
+from d2_plugin.priors.stereo.matched_depth import MatchedDepth, frame_blocks
 from d2_plugin.priors.stereo.settings import NO_MATCHER
 from d2_plugin.priors.summary import PriorSummary
-from d2_plugin.recordings.recording import Recording
-from d2_plugin.store.store import PriorStore
+from d2_plugin.recordings.recording import Camera, MonoKind, Recording
+from d2_plugin.store.files import hash_of
+from d2_plugin.store.store import PriorStore, not_of
 
 __all__ = ["PriorSettings", "PriorSummary", "build_priors"]
 
@@ -61,147 +65,204 @@ def build_priors(
 
     Raises:
         D2Error: unknown cameras, no depth source at all, a folder that holds something else or the priors of another
-            recording, or a disk that is full, broken or not ours.
+            recording, no compiler for the kernels, or a disk that is full, broken or not ours.
     """
+    output, names = Path(output), list(cameras)
+    _check(recording, names)
+    _refuse_without_kernels()
     frames = _shard(recording.frames, settings, shard)
-    builder = _Builder(recording, list(cameras), Path(output), settings, sparse_points)
-    summary = PriorSummary(notes=builder.notes, folder=builder.store.path)
-    total, done = len(frames) * len(builder.names), 0
-    with builder.store.building(Path(output)):
+    _refuse_other_images(recording, names, output)
+    names = _ordered(names, output)
+    sources = _Sources.find(recording, names, output, settings, sparse_points)
+    store = PriorStore.create(output, names, recording.frames, describe_recording(recording))
+    summary = PriorSummary(notes=sources.notes, folder=store.path)
+    total, done = len(frames) * len(names), 0
+    with store.building(output):
         for number in frames:
-            for camera, record, built in builder.build(number):
-                summary.add(camera, number, record, built)
+            for name, built in _build_frame(sources, store, number):
+                record = store.record(name, number) or {}
+                summary.add(name, number, record, built)
                 done += 1
                 if progress is not None:
                     share = f"{record['shares']['verified']:.0%} verified"
-                    progress(done, total, f"camera {camera}, frame {number}: {share}")
+                    progress(done, total, f"camera {name}, frame {number}: {share}")
     return summary
 
 
-class _Builder:
-    """The sources, the construction and the store of one build."""
+def _build_frame(sources: _Sources, store: PriorStore, number: int) -> Iterator[tuple[str, bool]]:
+    """Construct and store what is missing of one frame: (camera, whether it was built now), one after the other."""
+    frame = Frame.read(sources.recording, list(sources.cameras), number)
+    keys = sources.keys(frame)
+    missing = [name for name in keys if not store.is_current(name, number, keys[name])]
+    # Cameras that are compared need the maps of all others.
+    needed = list(sources.cameras) if missing and sources.compared else missing
+    priors = construct(sources.views(frame, needed), sources.cameras, sources.settings, sources.kind) if missing else {}
+    for name in keys:
+        if name in missing:
+            record = {**sources.described(name, frame), **priors[name].record(), "key": keys[name]}
+            store.write(name, number, priors[name].maps, record)
+        yield name, name in missing
 
-    def __init__(
-        self, recording: Recording, names: list[str], output: Path, settings: PriorSettings, points: np.ndarray | None
-    ) -> None:
-        _check(recording, names)
-        _refuse_other_images(recording, names, output)
-        self.recording, self.names, self.settings = recording, _ordered(names, output), settings
-        self.notes: list[str] = []
-        self._block_keys: dict[int, str] = {}
-        self.cameras = {name: recording.cameras[name] for name in self.names}
-        self.bounds: DepthBounds | None = None
+
+@dataclass(frozen=True, eq=False)
+class _Sources:
+    """What the priors of a recording are made of."""
+
+    recording: Recording
+    cameras: Mapping[str, Camera]
+    wanted: PriorSettings
+    """As the user gave them."""
+    settings: PriorSettings
+    """The same with the variant that the sources allow."""
+    mono: MonoSource | None
+    geometric: GeometricSource | None
+    bounds: DepthBounds | None
+    """The depths that are searched; None where nothing bounds them."""
+    confidence: ConfidenceMaps
+    """Of the monocular maps."""
+    notes: list[str]
+    """For the user: which sources were taken, and what is left out for lack of one."""
+
+    @classmethod
+    def find(
+        cls, recording: Recording, names: list[str], output: Path, settings: PriorSettings, points: np.ndarray | None
+    ) -> _Sources:
+        """The sources that recording and settings name; `points` [N, 3] bound the depths that are searched."""
         maps = output / "cache" / "mono"  # one for all sets of cameras: a map depends on its own image alone
-        self.mono = None if settings.variant == "mvs" else mono_source(recording, settings, maps)
-        cache = PriorStore.place(output, self.names) / "cache"
-        self.source = self._geometric_source(points, cache / "matches")
-        possible = replace(settings, variant=self._variant())
-        self.confidence = ConfidenceMaps.beside(recording.path if settings.uncertainty else None, OF_MONO, self.names)
-        self.store = PriorStore.create(output, self.names, recording.frames, describe_recording(recording))
-        geometric = None if self.source is None else DepthCache(self.source, cache / "stereo")
-        self.construction = Construction(self.cameras, self.mono, geometric, possible, self.confidence, self.block)
-
-    def _geometric_source(self, points: np.ndarray | None, matches: Path) -> GeometricSource | None:
-        """Depth on disk where there is any, else matching, or None where nothing is matched; sets the depth range."""
-        stereo, cameras = self.settings.stereo, list(self.cameras.values())
-        found = find_depth_on_disk(self.recording, self.names, stereo)
-        if found is not None:
-            self.notes.append(f"geometric depth: {found.about}")
-            self.bounds = _chosen_bounds(self.settings)
-            confidence = ConfidenceMaps.beside(self.recording.path, OF_DEPTH, self.names)
-            return FilteredDepthOnDisk(found, cameras, self.bounds, stereo, confidence)
-        if len(cameras) == 1 or stereo.matcher == NO_MATCHER:
-            return None
-        self.bounds = _chosen_bounds(self.settings) or _rounded(depth_bounds(cameras, points, stereo.max_angle))
-        return MatchedDepth(cameras, self.bounds, stereo, matches, self.recording.frames, self.read)
-
-    def _variant(self) -> Variant:
-        """The variant that the sources at hand allow; what is left out is noted."""
-        wanted = self.settings.variant
-        if self.source is not None and self.mono is not None:
-            return wanted
-        if self.source is not None:
-            if wanted != "mvs":
-                self.notes.append("no monocular depth: geometric depth counts as verified without a second source")
-            return "mvs"
-        if self.mono is None:
-            raise D2Error(
-                f"{self.recording.name} has no depth source ({self._lacking}): give a metric monocular network, or "
-                "cameras that see the same"
-            )
-        self.notes.append(
-            f"{self._lacking}: no geometric depth, so nothing is verified and nothing can prune or supervise"
+        mono = None if settings.variant == "mvs" else mono_source(recording, settings, maps)
+        cache = PriorStore.place(output, names) / "cache"
+        notes: list[str] = []
+        geometric, bounds = _geometric_source(recording, names, settings, points, cache, notes)
+        variant = _variant(settings.variant, recording, names, mono, geometric, notes)
+        return cls(
+            recording=recording,
+            cameras={name: recording.cameras[name] for name in names},
+            wanted=settings,
+            settings=replace(settings, variant=variant),
+            mono=mono,
+            geometric=geometric,
+            bounds=bounds,
+            confidence=ConfidenceMaps.beside(recording.path if settings.uncertainty else None, OF_MONO, names),
+            notes=notes,
         )
-        return wanted
 
     @property
-    def _lacking(self) -> str:
-        """Why there is no geometric depth."""
-        return "one camera" if len(self.names) == 1 else "nothing matched"
+    def kind(self) -> MonoKind | None:
+        """What the monocular maps are; None where there are none."""
+        return None if self.mono is None else self.mono.kind
 
-    def read(self, number: int) -> Frame:
-        """The images of one frame."""
-        return Frame.read(self.recording, self.names, number)
+    @property
+    def compared(self) -> bool:
+        """Whether the prior of one camera depends on those of the others."""
+        return compares_cameras(self.settings, len(self.cameras), self.geometric is not None)
 
-    def block(self, number: int) -> list[Frame]:
-        """The images of all frames that are built in order with this one."""
-        blocks = frame_blocks(self.recording.frames, self.settings.stereo)
-        return [self.read(frame) for frame in next(block for block in blocks if number in block)]
+    def views(self, frame: Frame, names: Sequence[str]) -> dict[str, ViewSources]:
+        """Both depths of the views of one frame."""
+        depths = {} if self.geometric is None else self.geometric.depths(frame)
+        return {
+            name: ViewSources(
+                frame.images[name],
+                depths.get(name),
+                None if self.mono is None else self.mono.map(name, frame),
+                self.confidence.of(self.cameras[name], frame.number),
+                frame.recorded.get(name),
+            )
+            for name in names
+        }
 
-    def build(self, number: int) -> Iterator[tuple[str, dict[str, Any], bool]]:
-        """(camera, record, whether it was built now) for every camera of one frame."""
-        frame = self.read(number)
-        keys = self._keys(frame)
-        missing = [name for name in self.names if not self.store.is_current(name, number, keys[name])]
-        priors = self.construction.priors(frame, missing) if missing else {}
-        for name in self.names:
-            if name in missing:
-                record = {**self._described(name, frame), **priors[name].record(), "key": keys[name]}
-                self.store.write(name, number, priors[name].maps, record)
-            yield name, self.store.record(name, number) or {}, name in missing
-
-    def _described(self, name: str, frame: Frame) -> dict[str, Any]:
+    def described(self, name: str, frame: Frame) -> dict[str, Any]:
         """What is recorded about a view besides how its prior was constructed."""
         return {
-            "variant": self.construction.settings.variant,
+            "variant": self.settings.variant,
             "monocular": None if self.mono is None else self.mono.about,
             "bounds": None if self.bounds is None else list(self.bounds),
-            "settings": asdict(self.settings),
+            "settings": asdict(self.wanted),
             "camera": describe_camera(self.cameras[name]),
             "image": frame.hashes[name],
         }
 
-    def _mono_key(self, name: str, frame: Frame) -> str:
-        """Hash of a monocular map and of what it says of itself."""
-        sure = self.confidence.of(self.cameras[name], frame.number)
-        key = "none" if self.mono is None else self.mono.key(name, frame)
-        return key if sure is None else hash_of(key, digest(sure))
-
-    def _keys(self, frame: Frame) -> dict[str, str]:
+    def keys(self, frame: Frame) -> dict[str, str]:
         """Per camera, the hash of everything that its prior depends on."""
-        settings = self.construction.settings
-        geometric = None if self.source is None else self.source.key(frame)
-        maps = {} if self.mono is None else {name: self._mono_key(name, frame) for name in self.names}
+        settings = self.settings
+        maps = {} if self.mono is None else {name: self._mono_key(name, frame) for name in self.cameras}
         common = (
             CONSTRUCTION_VERSION,
             settings.variant,
             [settings.uncertainty, settings.conflict_sigmas, settings.most_vetoed, settings.tau_c],
-            [settings.z_far_factor, settings.hanging_limit, settings.far, settings.mono_along],
+            [settings.hanging_limit, settings.far, settings.mono_along],
             asdict(settings.align),
-            geometric,
-            [settings.agreement, *maps.values()] if self.construction.agrees else None,
+            None if self.geometric is None else self.geometric.key(frame),
+            [settings.agreement, *maps.values()] if self.compared else None,
         )
-        block = self._block_key(frame.number) if settings.align.together else None
-        return {name: hash_of(*common, block, maps.get(name)) for name in self.names}
+        return {name: hash_of(*common, maps.get(name)) for name in self.cameras}
 
-    def _block_key(self, number: int) -> str:
-        """Hash of what the alignments of a block depend on, which those of each of its frames do."""
-        if number not in self._block_keys:
-            frames = self.block(number)
-            stereo = [None if self.source is None else self.source.key(frame) for frame in frames]
-            maps = [self._mono_key(name, frame) for frame in frames for name in self.names]
-            self._block_keys |= dict.fromkeys((frame.number for frame in frames), hash_of(stereo, maps))
-        return self._block_keys[number]
+    def _mono_key(self, name: str, frame: Frame) -> str:
+        """Hash of a monocular map and of its confidence."""
+        confidence = self.confidence.of(self.cameras[name], frame.number)
+        key = "none" if self.mono is None else self.mono.key(name, frame)
+        return key if confidence is None else hash_of(key, digest(confidence))
+
+
+def _geometric_source(
+    recording: Recording,
+    names: list[str],
+    settings: PriorSettings,
+    points: np.ndarray | None,
+    cache: Path,
+    notes: list[str],
+) -> tuple[GeometricSource | None, DepthBounds | None]:
+    """Depth on disk where there is any, else matching, or None where nothing is matched; and the depth range."""
+    stereo, cameras = settings.stereo, [recording.cameras[name] for name in names]
+    maps = find_depth_on_disk(recording, names, stereo)
+    if maps is not None:
+        notes.append(f"geometric depth: {maps.about}")
+        chosen = _chosen_bounds(settings)
+        confidence = ConfidenceMaps.beside(recording.path, OF_DEPTH, names)
+        return DepthOnDisk(maps, cameras, chosen, stereo, cache, confidence), chosen
+    if len(cameras) == 1 or stereo.matcher == NO_MATCHER:
+        return None, None
+    bounds = _chosen_bounds(settings) or _rounded(depth_bounds(cameras, points, stereo.max_angle))
+
+    def read(number: int) -> Frame:
+        return Frame.read(recording, names, number)
+
+    return MatchedDepth(cameras, bounds, stereo, cache, recording.frames, read), bounds
+
+
+def _variant(
+    wanted: Variant,
+    recording: Recording,
+    names: list[str],
+    mono: MonoSource | None,
+    geometric: GeometricSource | None,
+    notes: list[str],
+) -> Variant:
+    """The variant that the sources at hand allow; what is left out is noted."""
+    if geometric is not None and mono is not None:
+        return wanted
+    if geometric is not None:
+        if wanted != "mvs":
+            notes.append("no monocular depth: geometric depth counts as verified without a second source")
+        return "mvs"
+    lacking = "one camera" if len(names) == 1 else "nothing matched"
+    if mono is None:
+        raise D2Error(
+            f"{recording.name} has no depth source ({lacking}): give a metric monocular network, or cameras that see "
+            "the same"
+        )
+    notes.append(f"{lacking}: no geometric depth, so nothing is verified and nothing can prune or supervise")
+    return wanted
+
+
+def _refuse_without_kernels() -> None:
+    """Load the kernels before anything is computed."""
+    try:
+        filtering.library()
+        cross_view.library()
+    except NoCompiler as error:
+        raise D2Error(
+            f"priors are built by compiled kernels, which a platform wheel brings and a checkout compiles; {error}"
+        ) from None
 
 
 def _ordered(names: list[str], output: Path) -> list[str]:

@@ -19,7 +19,7 @@ import numpy as np
 from d2_plugin.errors import D2Error, missing_extra
 from d2_plugin.priors.build import Progress, build_priors
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.priors.stereo.match import frame_blocks
+from d2_plugin.priors.stereo.matched_depth import frame_blocks
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.recordings.recording import Recording
 

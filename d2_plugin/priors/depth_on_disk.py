@@ -3,7 +3,7 @@
 Sensor maps lie beside the images as depth/CAMERA/FRAME.npy or .png, with depth/depth.json: {"scale": world units per
 stored number}, or {"unit": "m" | "cm" | "mm"} where the calibration is in metres. They hold planar depth, or with
 {"along": "ray"} distances from the camera's centre. 0, NaN and infinity are no depth. Confidence maps may lie beside
-them (`d2_plugin.priors.disk.confidence`). True depth for evaluation (depth/CAMERA/FRAME.npz) is never read here.
+them (`maps_on_disk.ConfidenceMaps`). True depth for evaluation (depth/CAMERA/FRAME.npz) is never read here.
 Workspaces are read by `d2_plugin.priors.colmap.workspace`.
 """
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -19,9 +19,9 @@ import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.colmap.workspace import WorkspaceDepth
-from d2_plugin.priors.disk.confidence import ConfidenceMaps, divided
-from d2_plugin.priors.disk.stored import SUFFIXES, at_image_size, planar, stored_numbers
-from d2_plugin.priors.frame import Frame, describe_camera, digest, hash_of
+from d2_plugin.priors.frame import Frame, digest
+from d2_plugin.priors.geometric_source import GeometricSource
+from d2_plugin.priors.maps_on_disk import SUFFIXES, ConfidenceMaps, at_image_size, divided, planar, stored_numbers
 from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths, remove_speckles
 from d2_plugin.priors.stereo.geometric_depth import gray
@@ -30,8 +30,6 @@ from d2_plugin.reading import read_json
 from d2_plugin.recordings.files import FrameFiles, numbered_files
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.values import shown
-
-FILTER_VERSION = 3  # raise it when the filter changes what it returns, so that caches are not trusted
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """Metres per unit."""
@@ -48,8 +46,8 @@ SAME_SURFACE = 0.03
 """Neighbours of a sensor's depth agree within this share of it."""
 
 
-class DepthOnDisk(Protocol):
-    """A folder of depth maps; `name` is what the setting `matcher` calls it."""
+class DepthMaps(Protocol):
+    """A folder of depth maps; `name` is what the setting `matcher` calls it, `about` describes it to a person."""
 
     name: ClassVar[str]
     about: str
@@ -75,7 +73,7 @@ class SensorDepth:
         self.about = f"sensor depth of {', '.join(self.files) or 'no camera'} in {folder.name}/"
 
     def depth(self, camera: Camera, frame: int) -> np.ndarray | None:
-        """The map of one camera at one frame (see `DepthOnDisk`)."""
+        """The map of one camera at one frame (see `DepthMaps`)."""
         path = self.files.get(camera.name, {}).get(frame)
         if path is None:
             return None
@@ -86,7 +84,7 @@ class SensorDepth:
         return planar(depth, camera) if self.along_ray else depth
 
 
-def find_depth_on_disk(recording: Recording, cameras: Sequence[str], settings: StereoSettings) -> DepthOnDisk | None:
+def find_depth_on_disk(recording: Recording, cameras: Sequence[str], settings: StereoSettings) -> DepthMaps | None:
     """The depth on disk that settings and recording name, or None where geometric depth is to be matched.
 
     Of its own accord (`auto`) no camera is left without depth: sensors are taken where every camera has one.
@@ -107,69 +105,57 @@ def find_depth_on_disk(recording: Recording, cameras: Sequence[str], settings: S
         if settings.matcher == SensorDepth.name:
             raise D2Error(f"matcher = sensor but {folder} has no depth.json: write it beside CAMERA/FRAME.png or .npy")
     calibrations = [recording.cameras[name] for name in cameras]
-    found = WorkspaceDepth.find(root, settings, calibrations, recording.frames)
-    if found is None and settings.matcher == WorkspaceDepth.name:
+    workspace = WorkspaceDepth.find(root, settings, calibrations, recording.frames)
+    if workspace is None and settings.matcher == WorkspaceDepth.name:
         where = settings.folder or "colmap/FRAME, colmap or dense"
         raise D2Error(
             f"matcher = workspace but {root} has no COLMAP workspace with stereo/depth_maps at {where}: say where "
             "it is with stereo.folder"
         )
-    return found
+    return workspace
 
 
-class FilteredDepthOnDisk:
-    """Filtered geometric depth from maps on disk; a `GeometricSource` of the cache.
+class DepthOnDisk(GeometricSource):
+    """Filtered geometric depth from maps on disk.
 
     COLMAP's maps go through the filter of all matchers, with a cost of 0. A sensor measures where nothing can be
-    matched, often with one camera alone: its maps are asked for neighbours at their depth, not for texture and not for
-    a second view.
+    matched, often with one camera alone: its maps are compared with their neighbours, not judged by texture or by a
+    second view.
 
     Args:
-        found: the maps.
+        maps: where they are read.
         cameras: whose maps are read.
         bounds: what lies outside of them is dropped; nothing where None.
         settings: of the filter.
-        confidence: what the maps say of themselves; nothing where None.
+        cache: folder below which filtered depth is kept.
+        confidence: that of the maps themselves; 1 everywhere where None.
     """
-
-    matched_share = 1.0  # nothing is carried over
 
     def __init__(
         self,
-        found: DepthOnDisk,
+        maps: DepthMaps,
         cameras: Sequence[Camera],
         bounds: DepthBounds | None,
         settings: StereoSettings,
+        cache: Path,
         confidence: ConfidenceMaps | None = None,
     ) -> None:
-        self.confidence = ConfidenceMaps(Path(), ()) if confidence is None else confidence
-        self.found, self.cameras, self.bounds = found, list(cameras), bounds
-        self.matcher, self.settings = found.name, replace(settings, reuse_static=False)
-        self._keys: dict[int, str] = {}
+        super().__init__(cameras, bounds, settings, maps.name, cache / "stereo")
+        self.maps, self.confidence = maps, ConfidenceMaps(Path(), ()) if confidence is None else confidence
         self._last: tuple[int | None, list[np.ndarray]] = None, []
 
-    def key(self, frame: Frame) -> str:
-        """Hash of maps, images, cameras, range and settings."""
-        if frame.number not in self._keys:
-            self._keys[frame.number] = hash_of(
-                FILTER_VERSION,
-                self.matcher,
-                asdict(self.settings),
-                None if self.bounds is None else list(self.bounds[:2]),
-                [describe_camera(camera) for camera in self.cameras],
-                [frame.hashes[camera.name] for camera in self.cameras],
-                [digest(depth) for depth in self._maps(frame.number)],
-                [None if sure is None else digest(sure) for sure in self._confidences(frame.number)],
-            )
-        return self._keys[frame.number]
+    def _inputs(self, frame: Frame) -> list[list[str | None]]:
+        """Hashes of the maps and of their confidence."""
+        confidences = [None if map_ is None else digest(map_) for map_ in self._confidences(frame.number)]
+        return [[digest(depth) for depth in self._read(frame.number)], confidences]
 
-    def depths(self, frame: Frame) -> list[GeometricDepth]:
+    def _computed(self, frame: Frame) -> list[GeometricDepth]:
         """D^g per camera at one frame."""
         confidences = self._confidences(frame.number)
-        sure = [True if values is None else values > 0 for values in confidences]
-        maps = [np.where(where, depth, np.float32(0)) for where, depth in zip(sure, self._maps(frame.number))]
-        found = self._filtered(frame, maps)
-        return [replace(depth, sigma=divided(depth.sigma, c)) for depth, c in zip(found, confidences)]
+        known = [True if values is None else values > 0 for values in confidences]
+        maps = [np.where(where, depth, np.float32(0)) for where, depth in zip(known, self._read(frame.number))]
+        filtered = self._filtered(frame, maps)
+        return [replace(depth, sigma=divided(depth.sigma, c)) for depth, c in zip(filtered, confidences)]
 
     def _filtered(self, frame: Frame, maps: list[np.ndarray]) -> list[GeometricDepth]:
         if self.matcher == SensorDepth.name:
@@ -181,11 +167,11 @@ class FilteredDepthOnDisk:
     def _confidences(self, number: int) -> list[np.ndarray | None]:
         return [self.confidence.of(camera, number) for camera in self.cameras]
 
-    def _maps(self, number: int) -> list[np.ndarray]:
+    def _read(self, number: int) -> list[np.ndarray]:
         """The maps of one frame, float32 [H, W] per camera, 0 where unknown or out of range; the last are kept."""
         if self._last[0] != number:
             near, far = (0.0, np.inf) if self.bounds is None else self.bounds[:2]
-            read = [(camera, self.found.depth(camera, number)) for camera in self.cameras]
+            read = [(camera, self.maps.depth(camera, number)) for camera in self.cameras]
             whole = [np.zeros((c.height, c.width), np.float32) if depth is None else depth for c, depth in read]
             self._last = number, [np.where((d >= near) & (d <= far), d, np.float32(0)) for d in whole]
         return self._last[1]
@@ -194,7 +180,7 @@ class FilteredDepthOnDisk:
 def filter_sensor(depth: np.ndarray, settings: StereoSettings) -> GeometricDepth:
     """A sensor's map without the pixels that fly between two surfaces and without specks."""
     settled = np.where(flying_pixels(depth), 0, depth)
-    final = remove_speckles(settled, settings.speckle_size, settings.relative_depth_max)
+    final = remove_speckles(settled)
     survivors = {
         "pixels": depth.size,
         "measured": int(np.count_nonzero(depth)),
@@ -202,15 +188,14 @@ def filter_sensor(depth: np.ndarray, settings: StereoSettings) -> GeometricDepth
         "kept": int(np.count_nonzero(final)),
     }
     sigma = np.where(final > 0, np.float32(settings.sensor_sigma), np.float32(np.inf))
-    return GeometricDepth(final, np.zeros(depth.shape, np.float32), np.zeros(depth.shape, np.uint8), survivors, sigma)
+    return GeometricDepth(final, sigma, {"survivors": survivors})
 
 
 def flying_pixels(depth: np.ndarray) -> np.ndarray:
     """Pixels [H, W] bool of a sensor's map that lie between two surfaces: at an edge sensors mix both depths.
 
     They are those whose 5x5 neighbours mostly lie elsewhere, by more than 3 %. The coherence test of matched depth is
-    made for less noise. Measured on a rendered room of 640x360 with 1 % of noise, depth mixed over 3 (5) pixels: of the
-    depths off by more than 5 %, .1 (1.4) % stay, of those within 3 %, 99.5 %, where the coherence test keeps 45 %.
+    made for less noise.
     """
     height, width = depth.shape
     padded = np.pad(depth, NEIGHBOURS)

@@ -1,4 +1,4 @@
-"""Optional packages of the priors, imported when first needed; the error for a missing one says what to install."""
+"""Optional packages of the priors, imported when first needed; the error for a missing one names what to install."""
 
 from __future__ import annotations
 

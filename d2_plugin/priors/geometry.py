@@ -65,12 +65,12 @@ def relative_pose(reference: Camera, source: Camera) -> np.ndarray:
 
 
 def view_pair(reference: Camera, source: Camera) -> ViewPair:
-    """The homography parts A and k from `reference` to `source`; arrays that nobody may write to."""
+    """The homography parts A and k from `reference` to `source`; read-only arrays."""
     return _view_pair(_Known(reference), _Known(source))
 
 
 class _Known:
-    """A camera that is told from others by its numbers alone, as they are now."""
+    """A camera as a key: equal where intrinsics and pose are, as they are now."""
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
@@ -85,7 +85,7 @@ class _Known:
 
 @functools.lru_cache(maxsize=1024)
 def _view_pair(ours: _Known, theirs: _Known) -> ViewPair:
-    """See `view_pair`; the same pairs are asked for at every frame, by matching, filter and evidence."""
+    """See `view_pair`; the same pairs are needed at every frame, by matching, filter and evidence."""
     reference, source = ours.camera, theirs.camera
     T = relative_pose(reference, source)
     K_s, K_r = index_intrinsics(source), index_intrinsics(reference)
@@ -131,61 +131,10 @@ def angle_of_rays(points: np.ndarray, pair: ViewPair) -> np.ndarray:
     return np.arctan2(cross, x * u + y * v + z * w)
 
 
-def interpolated_surface(depth: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A depth map [H, W] between its pixels: (where four neighbours are one surface, depth there), shaped like x and y.
-
-    Bilinear in inverse depth, which is linear over a plane. x and y are array indices, NaN-free.
-    """
-    height, width = depth.shape
-    if min(height, width) < 2:
-        return np.zeros(x.shape, bool), np.ones(x.shape)
-    inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-    left = np.clip(np.floor(np.where(inside, x, 0)), 0, width - 2).astype(np.int64)
-    top = np.clip(np.floor(np.where(inside, y, 0)), 0, height - 2).astype(np.int64)
-    right, down = np.where(inside, x, 0) - left, np.where(inside, y, 0) - top
-    first, flat = top * width + left, np.ascontiguousarray(depth).ravel()
-    corners = [flat[first + offset] for offset in (0, 1, width, width + 1)]
-    nearest, farthest = np.minimum.reduce(corners), np.maximum.reduce(corners)
-    known = inside & (nearest > 0) & (farthest < CONTINUOUS * nearest)
-    inverse = [1 / np.where(known, corner, 1).astype(np.float64) for corner in corners]
-    upper, lower = (inverse[i] * (1 - right) + inverse[i + 1] * right for i in (0, 2))
-    return known, 1 / (upper * (1 - down) + lower * down)
-
-
 def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
     """The same camera with an image of another size; with centres at i + 0.5 the intrinsics only scale."""
     K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     return replace(camera, width=width, height=height, K=K)
-
-
-def cropped_camera(camera: Camera, rows: slice, columns: slice) -> Camera:
-    """The camera whose image is that part of this one's."""
-    K = np.array(camera.K, dtype=np.float64)
-    K[:2, 2] -= columns.start, rows.start
-    return replace(camera, width=columns.stop - columns.start, height=rows.stop - rows.start, K=K)
-
-
-def inverse_depth_planes(
-    reference: Camera, sources: Sequence[Camera], depth_range: tuple[float, float], step: float
-) -> np.ndarray:
-    """Inverse depths [D] float64, ascending, between which a projection moves by `step` source pixels on average.
-
-    The average is over the pixels that lie inside a source image, and over the sources. Spacing by the fastest of them
-    takes four times as many planes at wide angles for the same result. A range that is ten times too wide adds planes
-    only where pixels are really seen twice; where there is no overlap at all the spacing stays coarse.
-    """
-    fine = np.linspace(1 / depth_range[1], 1 / depth_range[0], 2049)
-    u, v = np.meshgrid(np.linspace(0, reference.width - 1, 9), np.linspace(0, reference.height - 1, 9))
-    speed = np.zeros(len(fine) - 1)
-    for source in sources:
-        at = view_pair(reference, source).project(u.ravel()[None, :], v.ravel()[None, :], 1 / fine[:, None])
-        inside = (at.z > 0) & (at.x > -1) & (at.y > -1) & (at.x < source.width) & (at.y < source.height)
-        inside = inside[1:] | inside[:-1]
-        moved = np.minimum(np.hypot(np.diff(at.x, axis=0), np.diff(at.y, axis=0)), source.width)
-        speed += (moved * inside).sum(axis=1) / np.maximum(inside.sum(axis=1), 1) / len(sources)
-    travel = np.concatenate([[0.0], np.cumsum(np.maximum(speed, 1e-6))])
-    count = max(3, int(np.ceil(travel[-1] / step)) + 1)
-    return np.interp(np.linspace(0, travel[-1], count), travel, fine)
 
 
 def check_depth_range(depth_range: tuple[float, float]) -> tuple[float, float]:

@@ -22,7 +22,7 @@ Variant = Literal["dual", "mono", "mvs", "dual_unaligned", "dual_unverified"]
 verified, since the paper runs "identical densification, pruning, and RGB-D optimization" on each row.
 `mvs`: geometric depth alone, every pixel of it counts as verified; no monocular map is used at all.
 `dual_unaligned`: as `dual`, but with a = 1, b = 0. A relative map has no scale, so nearly all of it contradicts D^g.
-`dual_unverified`: aligned, but every geometric depth counts as verified, whatever the monocular map says.
+`dual_unverified`: aligned, but every geometric depth counts as verified, whatever the monocular map has.
 """
 
 Preprocessing = Literal["auto", "depth_anything_v2", "unit"]
@@ -47,25 +47,18 @@ class PriorSettings(Settings):
     """Standard deviations of their difference above which the two sources conflict (with `uncertainty`)."""
     most_vetoed: Share = 0.01
     """Where a map contradicts more than this share of a view's geometric depths, the map is wrong, and all of them stay
-    (`dual` with `uncertainty`): .1 to 1 % of filtered stereo are off by over 5 %. 1 lets every map veto. Measured: maps
-    that belong to their images contradict 0 to .6 % (studio, plaza, a room; two to four views), PyDNet 1.7 to 2.8 %,
-    and of those 85 to 99 % are right, people who walk above all. Studio with PyDNet, 5 frames, 500 steps, three seeds:
-    26.7 dB (of what moves 20.5) where it may veto, 28.0 (23.6) where not; plaza, one seed, 19.0 and 19.1."""
+    (`dual` with `uncertainty`); 1 lets every map veto."""
     tau_c: NotNegative = 0.1
     """A geometric depth is verified when aligned monocular depth differs by less than this share of it (without
-    `uncertainty`). Measured on studio at .05, .1, .15: verified 33.2, 33.8, 34.1 % of the pixels, of which .1, .4, .7 %
-    are off by over 5 %."""
-    z_far_factor: Positive = 3.0
-    """Aligned monocular depth beyond this multiple of the 99.5 percentile of the anchors is left empty."""
+    `uncertainty`)."""
     hanging_limit: NotNegative = 0.08
     """Mono-only pixels are left empty where monocular depth spans more than this share within 1 % of the image's
     width: they hang between two surfaces. 0 keeps them, as the paper does."""
     agreement: NotNegative = 0.02
     """Two cameras' monocular depths agree within this share (`dual` alone). 0 leaves the other cameras out, as in the
-    paper: they neither confirm nor contradict a mono-only pixel. Measured: see `d2_plugin.priors.evidence`."""
+    paper: they neither confirm nor contradict a mono-only pixel (`d2_plugin.priors.evidence`)."""
     far: bool = True
-    """Find sky and what lies beyond any parallax (`dual` alone); off, as in the paper, such pixels are like all others.
-    Measured on plaza: 92 % of the sky, and nothing else; no pixel of studio, sear_steak or a rendered room."""
+    """Find sky and what lies beyond any parallax (`dual` alone); off, as in the paper, they are like all others."""
     depth_range: tuple[Positive, Positive] | None = None
     """Near and far of the stereo search, world units; by default from sparse points, the data set, or the baselines."""
     mono_onnx: str | None = None
@@ -93,7 +86,7 @@ class PriorSettings(Settings):
     def paper(cls, **changes: Any) -> PriorSettings:
         """The paper's construction and nothing else: absolute residuals, one scale and shift, blurred edges kept,
         each camera for itself, depth read at pixels."""
-        align = AlignSettings(residual="absolute", epsilon=0.01, local_scales=(), across=False)
+        align = AlignSettings(residual="absolute", epsilon=0.01, local_correction=False, across=False)
         changes["stereo"] = replace(changes.get("stereo", StereoSettings()), between_pixels=False)
         return cls(uncertainty=False, hanging_limit=0.0, agreement=0.0, far=False, align=align, **changes)
 

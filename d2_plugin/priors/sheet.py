@@ -28,7 +28,7 @@ LABEL_COLORS = {
 SURE, UNSURE = 0.001, 0.5
 """Sigma at the dark and at the bright end of its colours, which are logarithmic; an infinite sigma is grey."""
 UNKNOWN = (120, 120, 120)
-"""RGB of a pixel with a depth of which nothing tells how wrong it may be."""
+"""RGB of a pixel whose depth has an infinite sigma."""
 TITLES = (
     "image",
     "D*: near red, far blue, none black",

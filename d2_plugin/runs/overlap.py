@@ -79,21 +79,21 @@ def measure_overlap(
     return Overlap(tuple(shares), tuple(angles), known)
 
 
-def measure_texture(recording: Recording, cameras: Sequence[str], settings: StereoSettings) -> tuple[float, ...]:
+def measure_texture(recording: Recording, cameras: Sequence[str]) -> tuple[float, ...]:
     """Share of each camera's images with enough texture to match, by the test of the stereo filter, 0..1.
 
     The first and the last frame are looked at, made smaller: a window then covers more of the scene, so the share is
     rather too high than too low.
     """
     frames = sorted({recording.frames[0], recording.frames[-1]})
-    return tuple(float(np.mean([_textured(recording.image(name, f), settings) for f in frames])) for name in cameras)
+    return tuple(float(np.mean([_textured(recording.image(name, f)) for f in frames])) for name in cameras)
 
 
-def _textured(image: np.ndarray, settings: StereoSettings) -> float:
+def _textured(image: np.ndarray) -> float:
     height, width = image.shape[:2]
     factor = math.ceil(math.sqrt(height * width / TEXTURE_PIXELS))
     small = shrink_image(image, factor) if factor > 1 else image
-    return float(texture_mask(gray(small), settings).mean())
+    return float(texture_mask(gray(small)).mean())
 
 
 def _depths(

@@ -163,7 +163,7 @@ def _stereo(
         return Decision("stereo", False, "all training cameras stand at one point", "it takes cameras that stand apart")
     points = _own_points(recording) if points is None else points
     seen = measure_overlap(calibrations, settings.stereo, depth_range=settings.depth_range, points=points)
-    texture = measure_texture(recording, cameras, settings.stereo)
+    texture = measure_texture(recording, cameras)
     overlap, textured = max(seen.shares) > MIN_OVERLAP, max(texture) > MIN_TEXTURE
     lacking = "" if overlap and textured else f"no {'texture' if overlap else 'overlap'}: "
     figures = f"{len(cameras)} training cameras, {_in_words(seen)}, {np.mean(texture):.0%} textured"

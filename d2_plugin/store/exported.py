@@ -1,7 +1,7 @@
-"""A prior store under the names that an export gave to cameras and frames (see d2_plugin.recordings.export.export).
+"""A prior store under the names that an export of its recording gave to cameras and frames.
 
-The export says so in `export.json` beside the images. Who trains from an export says where it lies (`exported` in the
-configuration), or it is found above the image's own path.
+`export.json` beside the exported images holds both names. The configuration gives its folder (`exported`), or it is
+looked for above the path of a training image.
 """
 
 from __future__ import annotations
@@ -11,20 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin.errors import unknown_name
-from d2_plugin.priors.frame import other_recording
-from d2_plugin.protocol import DepthPrior
+from d2_plugin.protocol import EXPORT_FILE, DepthPrior
 from d2_plugin.reading import field, parsing, read_json
-from d2_plugin.recordings.export.export import EXPORT_FILE
-from d2_plugin.store.store import PriorStore
+from d2_plugin.store.store import PriorStore, other_recording
 from d2_plugin.values import fitting
 
 log = logging.getLogger(__name__)
 
-GIVE = "give the folder that `d2 export-recording` wrote"
+REMEDY = "give the folder that `d2 export-recording` wrote"
 
 
 class RenamedStore:
-    """The priors of the source recording, asked for by the names of its export."""
+    """The priors of the source recording under the names of its export."""
 
     def __init__(self, store: Any, cameras: dict[str, str], frames: dict[int, int]) -> None:
         """`cameras` and `frames` map those of the export to those of the source."""
@@ -34,11 +32,11 @@ class RenamedStore:
     def of_export(cls, store: Any, folder: Path) -> RenamedStore:
         """The priors under the names of an exported folder; names that the source uses itself are kept."""
         path = folder / EXPORT_FILE
-        described = read_json(path, GIVE)
-        names = field(described, "cameras", dict, str(path), GIVE)
-        numbers = field(described, "frames", dict, str(path), GIVE)
+        described = read_json(path, REMEDY)
+        names = field(described, "cameras", dict, str(path), REMEDY)
+        numbers = field(described, "frames", dict, str(path), REMEDY)
         cameras = {fitting(str, exported, f"a camera in {path}"): source for source, exported in names.items()}
-        with parsing(f"the frames in {path}", GIVE):
+        with parsing(f"the frames in {path}", REMEDY):
             frames = {int(exported): int(source) for source, exported in numbers.items()}
         return cls(store, cameras, frames)
 
@@ -50,19 +48,19 @@ class RenamedStore:
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None:
         """D* of one view, or None where there is none; a camera that the export does not have is refused."""
-        return self._asked("prior", camera, frame)
+        return self._of_source("prior", camera, frame)
 
     def camera(self, camera: str, frame: int) -> Any:
         """The camera that one prior was built for, or None where the store does not say."""
-        return self._asked("camera", camera, frame)
+        return self._of_source("camera", camera, frame)
 
-    def _asked(self, what: str, camera: str, frame: int) -> Any:
+    def _of_source(self, what: str, camera: str, frame: int) -> Any:
         if camera not in self.sources:
             raise unknown_name("camera of the export", camera, self.sources)
         if frame not in self.frames or camera not in self.cameras:
             return None  # a camera of the recording that the prior was not built for is trained without one
-        ask = getattr(self.store, what, None)
-        return None if ask is None else ask(self.sources[camera], self.frames[frame])
+        method = getattr(self.store, what, None)
+        return None if method is None else method(self.sources[camera], self.frames[frame])
 
 
 def opened(prior: str, exported: str | None) -> Any:
@@ -100,7 +98,7 @@ def is_source_of(store: Any, folder: Path) -> bool:
     Both say the calibrations of their cameras under their own names; where the export kept all names, the name of the
     recording decides.
     """
-    about, described = getattr(store, "about", None) or {}, read_json(folder / EXPORT_FILE, GIVE)
+    about, described = getattr(store, "about", None) or {}, read_json(folder / EXPORT_FILE, REMEDY)
     source = {"calibrations": described.get("calibrations"), "recording": described.get("source")}
     if not source["calibrations"] or not about.get("calibrations") or other_recording(about, source) is not None:
         return False

@@ -5,7 +5,9 @@ The record is sealed (`d2_plugin.durable`) and holds the checksum of the array: 
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 import logging
 import tokenize
 import zlib
@@ -58,8 +60,8 @@ class Entry:
 
     def checksum_problem(self) -> str:
         """Empty where the bytes match the record's checksum."""
-        found = checksum(_mapped(self.path))
-        return "" if found == self.record.get("checksum") else "its checksum differs from the one recorded"
+        intact = checksum(_mapped(self.path)) == self.record.get("checksum")
+        return "" if intact else "its checksum differs from the one recorded"
 
 
 class EntryFolder:
@@ -122,7 +124,7 @@ class EntryFolder:
 def write_entry(path: Path, array: np.ndarray, record: dict[str, Any], synced: bool = True) -> dict[str, Any]:
     """Array first, record second, each written whole: a record vouches for the array beside it.
 
-    What is not `synced` may be damaged after a power cut, which its checksums tell: for what is made again then.
+    What is not `synced` may be damaged after a power cut, which its checksums show: for what can be made again.
 
     Returns:
         The record as it was written.
@@ -155,6 +157,11 @@ def _mapped(path: Path) -> np.ndarray:
     """The array of an .npy file, memory-mapped; unlike `np.load` it takes the file for nothing else."""
     refuse_no_file(path)
     return np.lib.format.open_memmap(path, mode="r")
+
+
+def hash_of(*parts: Any) -> str:
+    """Hash of plain values, in an order that does not depend on dictionaries."""
+    return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def checksum(array: np.ndarray) -> int:

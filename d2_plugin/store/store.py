@@ -23,7 +23,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +31,9 @@ import torch
 
 from d2_plugin.durable import Kind, is_leftover, make_folder, read_table, remove_leftovers, write_table
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.locks import in_turn, one_of_many
-from d2_plugin.priors.frame import hash_of, not_of, other_recording
-from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.protocol import CameraRecord, DepthPrior, Label
-from d2_plugin.store.files import Entry, EntryFolder
+from d2_plugin.protocol import CameraRecord, DepthPrior
+from d2_plugin.store.files import Entry, EntryFolder, hash_of
+from d2_plugin.store.maps import PRIOR_DTYPE, SIGMA, DepthRange, FusedPrior, check_maps, encode_sigma
 from d2_plugin.values import checked_arguments
 
 FORMAT = 4
@@ -47,52 +44,6 @@ STORE = Kind("prior store", FORMAT, "build the priors anew in another folder")
 
 OTHERS = "cameras"
 """Folder of a store that holds the stores of other sets of cameras."""
-
-PRIOR_DTYPE = np.dtype([("depth", "<u2"), ("label", "u1"), ("sigma", "u1"), ("color", "u1", (3,))])
-"""The maps of a `FusedPrior` as they are stored, pixel by pixel."""
-
-CODES = 65534  # depth codes 1..65535; 0 is empty
-
-
-@dataclass(frozen=True)
-class DepthRange:
-    """The depths that codes 1 and 65535 stand for."""
-
-    near: float
-    far: float
-
-    @classmethod
-    def of(cls, depth: np.ndarray) -> DepthRange:
-        """Smallest and largest depth of a map; 1, 1 where it has none."""
-        known = depth[depth > 0]
-        return cls(float(known.min()), float(known.max())) if known.size else cls(1.0, 1.0)
-
-    def encode(self, depth: np.ndarray) -> np.ndarray:
-        """Depth float [H, W] (0 = empty) to codes uint16."""
-        known = depth > 0
-        ratio = max(np.log(self.far / self.near), np.finfo(np.float64).tiny)
-        position = np.log(np.where(known, depth, self.near).astype(np.float64) / self.near) / ratio
-        return np.where(known, 1 + np.rint(position * CODES), 0).astype(np.uint16)
-
-    def decode(self, codes: np.ndarray) -> np.ndarray:
-        """Codes uint16 to depth float32, 0 where empty; through a table, since a million exponentials are slow."""
-        table = np.exp(np.linspace(np.log(self.near), np.log(self.far), CODES + 1))
-        return np.concatenate([[0.0], table]).astype(np.float32)[codes]
-
-
-SIGMA = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 254), [np.inf]]).astype(np.float32)
-"""The relative standard deviations that the codes 0 to 255 stand for; 0 is the paper's certainty."""
-
-
-def encode_sigma(sigma: np.ndarray) -> np.ndarray:
-    """Relative standard deviation float [H, W] to codes uint8: the nearest there is, infinite above 1.
-
-    Only an exact 0 stays 0; what is smaller than the smallest step becomes that step.
-    """
-    steps = np.log(SIGMA[254] / SIGMA[1])
-    position = 1 + np.log(np.clip(sigma, SIGMA[1], 1) / SIGMA[1]) * (253 / steps)
-    codes = np.where(sigma <= 1, np.rint(np.minimum(position, 254)), 255)
-    return np.where(sigma == 0, 0, codes).astype(np.uint8)
 
 
 class PriorStore:
@@ -128,29 +79,31 @@ class PriorStore:
     def create(
         cls, path: Path | str, cameras: Sequence[str], frames: Sequence[int], about: dict[str, Any]
     ) -> PriorStore:
-        """Open the store at `path` for building, or begin one; `about` says which recording it belongs to.
+        """Open the store at `path` for building, or begin one; `about` describes its recording.
 
         Frames that were built for the same cameras before stay part of the store, and so does the order of its
         cameras. Other cameras of the same recording get a store of their own in it, see `located`. Where nothing has
-        to be added nothing is written: a finished store may lie where nobody can write.
+        to be added nothing is written: a finished store may lie on a read-only disk.
 
         Raises:
             D2Error: the folder holds something else, or the priors of another recording.
             CannotWrite: the disk is full, broken or not ours.
         """
+        from d2_plugin.locks import in_turn  # who reads needs none
+
         root = Path(path)
         if root.exists() and not root.is_dir():
             raise D2Error(f"{root} is a file, and the priors need a folder: choose another output folder")
         with in_turn(make_folder(root)):
-            found = cls._found(root, about)
+            existing = cls._existing(root, about)
             place = cls.place(root, cameras)
             if place != root:
-                found = cls._found(make_folder(place), about)
-            if found is None:
+                existing = cls._existing(make_folder(place), about)
+            if existing is None:
                 store = cls(place, cameras, frames, about)
             else:
-                store = cls(place, found.cameras, sorted({*found.frames, *frames}), found.about)
-            if found is None or store.frames != found.frames:
+                store = cls(place, existing.cameras, sorted({*existing.frames, *frames}), existing.about)
+            if existing is None or store.frames != existing.frames:
                 described = {"cameras": store.cameras, "frames": store.frames, "about": store.about}
                 write_table(place / "store.json", described, STORE)
         return store
@@ -170,14 +123,14 @@ class PriorStore:
         return place if (place / "store.json").is_file() else Path(path)
 
     @classmethod
-    def _found(cls, path: Path, about: dict[str, Any]) -> PriorStore | None:
+    def _existing(cls, path: Path, about: dict[str, Any]) -> PriorStore | None:
         """The store at `path` as it stands, None where nothing is there; another recording's is refused."""
         if (path / "store.json").is_file():
-            found = cls.described(path)
-            reason = other_recording(found.about, about)
+            store = cls.described(path)
+            reason = other_recording(store.about, about)
             if reason is not None:
-                raise not_of(path, found.about, about, reason)
-            return found
+                raise not_of(path, store.about, about, reason)
+            return store
         if path.exists() and not all(is_leftover(inside) for inside in path.iterdir()):
             raise D2Error(f"{path} is not empty and holds no prior store: choose another output folder")
         return None
@@ -231,7 +184,7 @@ class PriorStore:
             D2Error: no colours or those of another size, depth that is not finite or negative, sigma that is NaN or
                 negative, or labels that contradict the depth.
         """
-        _check(prior, f"the prior of camera {camera}, frame {frame}")
+        check_maps(prior, f"the prior of camera {camera}, frame {frame}")
         depth_range = DepthRange.of(prior.depth)
         codes = np.empty(prior.depth.shape, PRIOR_DTYPE)
         codes["depth"], codes["label"], codes["color"] = depth_range.encode(prior.depth), prior.labels, prior.colors
@@ -242,8 +195,10 @@ class PriorStore:
     def building(self, root: Path) -> Iterator[None]:
         """Write priors beside other processes that do; `root` is the folder that `create` was given.
 
-        Whoever finds nobody else there removes what killed builds left, and what is damaged.
+        The first of them removes what killed builds left, and what is damaged.
         """
+
+        from d2_plugin.locks import in_turn, one_of_many
 
         def tidy() -> None:
             with in_turn(root):
@@ -277,21 +232,32 @@ def _joined(cameras: Sequence[str]) -> str:
 _REBUILD = "run `d2 priors` again with the same output folder, which rebuilds what is damaged"
 
 
-def _check(prior: FusedPrior, what: str) -> None:
-    depth, labels = prior.depth, prior.labels
-    if depth.ndim != 2 or depth.shape != labels.shape:
-        raise D2Error(f"{what} has depth {depth.shape} and labels {labels.shape}: both must be [H, W] of one size")
-    if prior.colors is None or prior.colors.shape != (*depth.shape, 3):
-        found = "none" if prior.colors is None else str(prior.colors.shape)
-        raise D2Error(f"{what} is {depth.shape} and its colours {found}: build the prior at the image's size")
-    bad = ~np.isfinite(depth) | (depth < 0)
-    if bad.any():
-        raise D2Error(f"{what} has {int(bad.sum())} depths that are NaN, infinite or negative: use 0 for unknown depth")
-    if labels.max(initial=0) > max(Label):
-        raise D2Error(f"{what} has label {int(labels.max())}: labels are 0 to {int(max(Label))}")
-    if prior.sigma.shape != depth.shape or not (prior.sigma >= 0).all():
-        raise D2Error(f"{what} has a sigma that is no map [H, W] of numbers >= 0: use infinity where nothing is known")
-    supported = np.isin(labels, (Label.MONO, Label.VERIFIED, Label.AGREED, Label.FAR))
-    if not np.array_equal(supported, depth > 0):
-        known = "mono-only, verified, agreed and far"
-        raise D2Error(f"{what} has labels that contradict its depth: exactly {known} pixels have a depth")
+def other_recording(stored: dict[str, Any], given: dict[str, Any]) -> str | None:
+    """Why two descriptions (`describe_recording`) are of different recordings; None if of one.
+
+    The name decides only where one of them holds no calibration.
+    """
+    ours, theirs = given.get("calibrations"), stored.get("calibrations")
+    if not ours or not theirs:
+        return None if stored == given else ""
+    shared = sorted(ours.keys() & theirs.keys())
+    if not shared:
+        return "they have no camera in common"
+    moved = [name for name in shared if not _same_camera(ours[name], theirs[name])]
+    return f"camera {moved[0]} has another size, lens or pose" if moved else None
+
+
+def not_of(path: Path, stored: dict[str, Any], given: dict[str, Any], reason: str) -> D2Error:
+    """The error for a store that belongs to another recording."""
+    why = f" ({reason})" if reason else ""
+    return D2Error(
+        f"{path} holds the priors of {stored.get('recording')}, not of {given.get('recording')}{why}: "
+        "choose another output folder"
+    )
+
+
+def _same_camera(ours: dict[str, Any], theirs: dict[str, Any]) -> bool:
+    """Whether two calibrations are one, up to the last digits, which differ from machine to machine."""
+    if ours["size"] != theirs["size"]:
+        return False
+    return all(np.allclose(ours[key], theirs[key], rtol=1e-6, atol=1e-9) for key in ("K", "T_camera_world"))

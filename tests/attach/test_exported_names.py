@@ -16,7 +16,8 @@ from d2_plugin.adapters.inria import InriaAdapter, RenderedCamera
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.frame import describe_recording
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.recordings.export.export import EXPORT_FILE, export_recording
+from d2_plugin.protocol import EXPORT_FILE
+from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.export.ply import PointCloud
 from d2_plugin.store.exported import export_read, opened, renamed_by
 from d2_plugin.store.store import PriorStore

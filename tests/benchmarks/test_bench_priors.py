@@ -12,7 +12,7 @@ import pytest
 from benchmarks.priors import Case, PriorsBench, cases, rows_of, run
 from benchmarks.priors_section import DIAGONAL, priors
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.calibration import NORMAL_SHARE, Calibration, frames_with_truth, reliability_curve
+from d2_plugin.priors.declared_error import NORMAL_SHARE, DeclaredErrors, frames_with_truth, reliability_curve
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.report.report import make_report
@@ -139,7 +139,7 @@ def test_the_diagram_has_a_mark_per_bin_and_the_diagonal(measured: tuple[str, li
 
 def test_a_recording_without_any_label_has_a_row_and_no_curve() -> None:
     recording = synthetic_recording(1, held_out=0, frames=1, width=32, height=18)
-    rows = rows_of(Case("sky, 1 views", recording, ("train0",)), Calibration(1, {}, 0.9, 0.01), 1.0)
+    rows = rows_of(Case("sky, 1 views", recording, ("train0",)), DeclaredErrors(1, {}, 0.9, 0.01), 1.0)
     assert [(row["method"], row["error"]) for row in rows] == [("far", 0.01)]
     section = priors(rows)
     assert "nothing was measured" in section.figures["priors"]

@@ -11,8 +11,8 @@ import torch
 from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_views
 
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import Points
+from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import PriorStore
 
 HOOKS = replace(

@@ -76,7 +76,7 @@ def error(room: Recording, name: str, view: Shown, scale: float, shift: float, k
 def test_the_slopes_are_found_that_one_patch_of_depth_leaves_open(room: Recording, kind: MonoKind) -> None:
     views = shown(room, kind)
     assert all(is_open(view) for view in views.values())
-    found = aligned_across(views, kind, ALIGN)
+    found = aligned_across(views, kind)
     assert set(found) == set(views)
     before = [error(room, name, view, *line(view.alignment), kind) for name, view in views.items()]
     after = [error(room, name, views[name], *line(alignment), kind) for name, alignment in found.items()]
@@ -100,8 +100,8 @@ def test_neither_the_unit_of_the_world_nor_that_of_a_map_matters(world: float, s
     def other(name: str, mono: np.ndarray) -> np.ndarray:
         return (mono + shift) * 10**scale
 
-    plain = aligned_across(shown(room), "relative", ALIGN)
-    scaled = aligned_across(shown(room, turned=other, unit=10**world), "relative", ALIGN)
+    plain = aligned_across(shown(room), "relative")
+    scaled = aligned_across(shown(room, turned=other, unit=10**world), "relative")
     assert set(plain) == set(scaled)
     for name, view in shown(room, turned=other).items():
         depth = 1 / (scaled[name].scale * view.mono.astype(np.float64) + scaled[name].shift) / 10**world
@@ -117,9 +117,9 @@ def test_maps_with_spread_anchors_keep_their_lines_and_help_the_others(room: Rec
         spread[name] = view._replace(
             geometric=depth, alignment=align(view.mono, depth, kind="relative", settings=ALIGN)
         )
-    assert aligned_across(spread, "relative", ALIGN) == {}, "nothing is open"
+    assert aligned_across(spread, "relative") == {}, "nothing is open"
     one = next(iter(views))
-    found = aligned_across({**spread, one: views[one]}, "relative", ALIGN)
+    found = aligned_across({**spread, one: views[one]}, "relative")
     assert error(room, one, views[one], *line(found[one])) < 0.03
     for name in set(spread) - {one}:
         assert found[name].status is AlignStatus.OK
@@ -142,20 +142,20 @@ def test_maps_that_show_no_common_surface_are_told_nothing(
     room: Recording, wrong: Callable[[str, np.ndarray], np.ndarray]
 ) -> None:
     views = shown(room, turned=wrong)
-    assert not [view for view in aligned_across(views, "relative", ALIGN).values() if view.status is AlignStatus.ACROSS]
+    assert not [view for view in aligned_across(views, "relative").values() if view.status is AlignStatus.ACROSS]
 
 
 def test_one_wrong_map_is_left_out_and_the_others_are_told(room: Recording) -> None:
     last = list(room.cameras)[-1]
     views = shown(room, turned=lambda name, mono: mono[::-1, ::-1] if name == last else mono)
-    found = aligned_across(views, "relative", ALIGN)
+    found = aligned_across(views, "relative")
     assert set(found) == set(views) - {last}
     assert max(error(room, name, views[name], *line(found[name])) for name in found) < 0.05
 
 
 class TestStiff:
     def test_one_camera_alone_is_told_nothing(self, room: Recording) -> None:
-        assert aligned_across(shown(room, names=tuple(room.cameras)[:1]), "relative", ALIGN) == {}
+        assert aligned_across(shown(room, names=tuple(room.cameras)[:1]), "relative") == {}
 
     def test_a_map_without_anchors_is_left_out(self, room: Recording) -> None:
         views = shown(room)
@@ -164,7 +164,7 @@ class TestStiff:
         bare = views[first]._replace(
             geometric=empty, alignment=align(views[first].mono, empty, kind="relative", settings=ALIGN)
         )
-        found = aligned_across(views | {first: bare}, "relative", ALIGN)
+        found = aligned_across(views | {first: bare}, "relative")
         assert set(found) == set(views) - {first}
 
     @pytest.mark.parametrize("value", [np.nan, 0.0])
@@ -173,7 +173,7 @@ class TestStiff:
             holes = np.indices(mono.shape).sum(0) % 2 == 0
             return np.where(holes, value, mono)
 
-        found = aligned_across(shown(room, turned=half), "relative", ALIGN)
+        found = aligned_across(shown(room, turned=half), "relative")
         assert max(error(room, name, shown(room)[name], *line(found[name])) for name in found) < 0.03
 
     def test_a_constant_map_is_not_open_and_anchors_of_one_depth_are(self, room: Recording) -> None:
@@ -191,7 +191,7 @@ class TestStiff:
         back = np.array(view.camera.T_camera_world)
         back[[0, 2]] *= -1  # about its own vertical axis
         away = Camera(name, view.camera.width, view.camera.height, view.camera.K, back)
-        assert aligned_across(views | {name: view._replace(camera=away)}, "relative", ALIGN) == {}
+        assert aligned_across(views | {name: view._replace(camera=away)}, "relative") == {}
 
 
 def test_two_cameras_far_apart_outdoors(shared_data: Callable[[str], Path], tmp_path: Path) -> None:

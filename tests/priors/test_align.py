@@ -5,9 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.align_measure import align_problem
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.monocular.align import Alignment, AlignStatus, align, aligned_depth, not_aligned, rank_correlation
+from d2_plugin.priors.monocular import align as module
+from d2_plugin.priors.monocular.align import (
+    Alignment,
+    AlignStatus,
+    align,
+    aligned_depth,
+    aligned_inverse,
+    inverse_at_least,
+    not_aligned,
+    rank_correlation,
+    unjudged_line,
+)
 from d2_plugin.priors.settings import AlignSettings
 
 SHAPE = (90, 120)
@@ -74,14 +84,14 @@ def test_zeros_of_a_saturated_network_are_neither_fitted_nor_given_a_depth() -> 
     np.testing.assert_array_equal(aligned_depth(mono, alignment, 100.0) > 0, mono > 0)
 
 
-def test_subsampling_changes_the_aligned_depth_by_less_than_a_thousandth() -> None:
+def test_subsampling_changes_the_aligned_depth_by_less_than_a_thousandth(monkeypatch: pytest.MonkeyPatch) -> None:
     depth = np.tile(depths(), (4, 4))
     rng = np.random.default_rng(3)
     mono = (1 / depth - 0.05) / 0.3 * (1 + rng.normal(0, 0.02, depth.shape))
-    maps = [
-        aligned_depth(mono, align(mono, depth, kind="relative", settings=AlignSettings(max_anchors=n)), 100.0)
-        for n in (10**6, 20_000)
-    ]
+    maps = []
+    for most in (10**6, 20_000):
+        monkeypatch.setattr(module, "MAX_ANCHORS", most)
+        maps.append(aligned_depth(mono, align(mono, depth, kind="relative", settings=AlignSettings()), 100.0))
     assert np.abs(maps[1] / maps[0] - 1).max() < 1e-3
 
 
@@ -122,40 +132,6 @@ def test_the_rank_correlation_is_spearmans() -> None:
     assert rank_correlation(x, np.ones(500)) == 0
 
 
-def test_the_leverage_guard_saves_a_fit_that_every_convex_one_loses() -> None:
-    depth = depths()
-    mono = (depth - 0.5) / 2
-    geometric = depth.copy()
-    far = mono > np.quantile(mono, 0.6)
-    geometric[far] = np.random.default_rng(4).uniform(0.3, 0.6, int(far.sum()))
-    plain, guarded = (
-        align(mono, geometric, kind="metric", settings=AlignSettings(leverage_guard=guard, wrong_kind_correlation=-1.0))
-        for guard in (False, True)
-    )
-    assert plain.status is AlignStatus.BOUNDARY
-    assert guarded.status is AlignStatus.OK
-    assert guarded.scale == pytest.approx(2, rel=0.01)
-
-
-@pytest.mark.parametrize("wrong", [0.2, 0.4, 0.6])
-@pytest.mark.parametrize("kind", ["relative", "metric"])
-def test_with_the_leverage_guard_most_anchors_may_be_wrong(kind: str, wrong: float) -> None:
-    problem = align_problem(kind, 20_000, wrong)
-    found = align(problem.mono[None], problem.geometric[None], kind=kind, settings=AlignSettings(leverage_guard=True))
-    assert found.accepted
-    assert found.gap <= 1e-9
-    assert np.median(problem.depth_error((found.scale, found.shift))) < 0.004
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_leverage_guard_finds_no_line_where_there_is_none(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    unrelated, depth = rng.uniform(0, 1, (2, 50, 80))
-    found = align(unrelated, 2 + 6 * depth, kind="metric", settings=AlignSettings(leverage_guard=True))
-    assert not found.accepted
-    assert found.t < AlignSettings().min_t
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [({"kind": "depth"}, "unknown monocular kind 'depth'"), ({"geometric": np.ones((3, 3))}, "resize the map")],
@@ -166,3 +142,29 @@ def test_mistakes_are_told_in_one_sentence(change: dict, message: str) -> None:
         align(**(arguments | change))
     with pytest.raises(D2Error, match="did you mean 'absolute'"):
         align(np.ones(SHAPE), np.ones(SHAPE), kind="metric", settings=AlignSettings(residual="absolut"))
+
+
+@pytest.mark.parametrize("anchors", [0, 1, 49, 50, 3000])
+@pytest.mark.parametrize("kind", ["relative", "metric"])
+@pytest.mark.parametrize("depths", ["many", "one", "unrelated"])
+def test_the_unjudged_line_is_that_of_the_alignment(anchors: int, kind: str, depths: str) -> None:
+    random = np.random.default_rng(anchors)
+    geometric = np.zeros(6000)
+    geometric[:anchors] = 4 if depths == "one" else random.uniform(1, 9, anchors)
+    truth = random.uniform(1, 9, 6000) if depths == "unrelated" else np.where(geometric > 0, geometric, 5)
+    mono = (1 / truth if kind == "relative" else truth) * random.uniform(0.9, 1.1, 6000)
+    views = mono.reshape(60, 100), geometric.reshape(60, 100)
+    alignment = align(*views, kind=kind, settings=AlignSettings())
+    line = unjudged_line(*views, kind=kind, settings=AlignSettings())
+    np.testing.assert_equal(line, (alignment.scale, alignment.shift))
+
+
+@pytest.mark.parametrize("kind", ["relative", "metric"])
+@pytest.mark.parametrize("seed", range(20))
+def test_no_aligned_inverse_lies_below_the_bound_that_spares_the_map(kind: str, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    mono = random.normal(random.normal(), 1, (9, 9)).astype(np.float32) * (random.random((9, 9)) < random.random() * 2)
+    mono[0, :2] = np.nan, np.inf
+    alignment = Alignment(AlignStatus.OK, kind, scale=random.uniform(0.1, 2), shift=random.normal())
+    bound, inverse = inverse_at_least(mono, alignment), aligned_inverse(mono, alignment)
+    assert np.isnan(bound) or not (inverse < bound - 1e-12 * abs(bound)).any()

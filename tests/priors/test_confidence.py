@@ -11,9 +11,8 @@ import pytest
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.disk.confidence import ConfidenceMaps, divided
-from d2_plugin.priors.disk.stored import planar
 from d2_plugin.priors.geometry import back_project
+from d2_plugin.priors.maps_on_disk import ConfidenceMaps, divided, planar
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording

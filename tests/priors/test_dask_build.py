@@ -24,7 +24,7 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 pytest.importorskip("cv2")
 
 NAMES = ["train0", "train1"]
-SETTINGS = PriorSettings(stereo=StereoSettings(matcher="sweep", reuse_block=2))
+SETTINGS = PriorSettings(stereo=StereoSettings(matcher="patchmatch", reuse_block=2))
 needs_dask = pytest.mark.skipif(
     importlib.util.find_spec("distributed") is None, reason="dask.distributed is not installed"
 )

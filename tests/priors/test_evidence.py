@@ -1,4 +1,4 @@
-"""What other cameras say about a mono-only depth: surfaces are taken, maps that meet agree, the rest stays as it is."""
+"""Mono-only depth compared with other cameras: surfaces are taken, maps that meet agree, the rest stays as it is."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.cross_view.ask import BESIDE, LIKE, NEAR, WITHIN
+from d2_plugin.priors.cross_view.kernel import BESIDE, LIKE, NEAR, WITHIN
 from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, with_evidence
 from d2_plugin.priors.fuse import FusedPrior, empty_prior
 from d2_plugin.priors.settings import PriorSettings
@@ -48,7 +48,7 @@ def prior_of(depth: np.ndarray | float, label: Label = Label.MONO, sigma: float 
 
 
 def left_of(left: FusedPrior, right: FusedPrior) -> FusedPrior:
-    """The left view after the right one was asked."""
+    """The left view compared with the right one."""
     return with_evidence({"left": left, "right": right}, CAMERAS, TOLERANCE)["left"]
 
 
@@ -74,8 +74,8 @@ def test_maps_that_put_a_wall_at_one_place_agree_where_both_cameras_see_it() -> 
 
 
 def test_maps_that_differ_by_more_than_the_tolerance_do_not_and_both_are_less_sure() -> None:
-    asked = with_evidence({"left": prior_of(WALL), "right": prior_of(WALL * 1.03)}, CAMERAS, TOLERANCE)
-    for prior in asked.values():
+    compared = with_evidence({"left": prior_of(WALL), "right": prior_of(WALL * 1.03)}, CAMERAS, TOLERANCE)
+    for prior in compared.values():
         assert share(prior, Label.MONO) == 1
         np.testing.assert_allclose(np.unique(prior.sigma), [SIGMA, ALONE * SIGMA], rtol=1e-6)
 
@@ -83,15 +83,15 @@ def test_maps_that_differ_by_more_than_the_tolerance_do_not_and_both_are_less_su
 @pytest.mark.parametrize("factor", [0.96, 0.99, 1.0, 1.02, 1.05])
 def test_a_surface_that_another_camera_verified_is_taken_along_the_ray(factor: float) -> None:
     truth, theirs = slanted(CAMERAS["left"]), slanted(CAMERAS["right"])
-    asked = left_of(prior_of(truth * factor), prior_of(theirs, Label.VERIFIED, 0.001))
-    met = asked.labels == Label.VERIFIED
+    compared = left_of(prior_of(truth * factor), prior_of(theirs, Label.VERIFIED, 0.001))
+    met = compared.labels == Label.VERIFIED
     assert met[2:-2, 8:-2].all(), "the right camera sees all but the columns at the left"
     assert not met[:, 0].any()
-    np.testing.assert_allclose(asked.depth[met], truth[met], rtol=1e-3)
+    np.testing.assert_allclose(compared.depth[met], truth[met], rtol=1e-3)
     expected = np.hypot(0.001, BESIDE * np.abs(np.log(factor)))
-    np.testing.assert_allclose(asked.sigma[met], expected, rtol=0.05, atol=2e-4)
+    np.testing.assert_allclose(compared.sigma[met], expected, rtol=0.05, atol=2e-4)
     beside = ~met
-    np.testing.assert_array_equal(asked.depth[beside], (truth * factor).astype(np.float32)[beside])
+    np.testing.assert_array_equal(compared.depth[beside], (truth * factor).astype(np.float32)[beside])
 
 
 @pytest.mark.parametrize(
@@ -107,15 +107,15 @@ def test_a_surface_that_another_camera_verified_is_taken_along_the_ray(factor: f
 )
 def test_a_surface_farther_than_sigma_or_than_near_is_another_surface(sigma: float, away: float, taken: bool) -> None:
     truth, theirs = slanted(CAMERAS["left"]), slanted(CAMERAS["right"])
-    asked = left_of(prior_of(truth * np.exp(away), sigma=sigma), prior_of(theirs, Label.VERIFIED, 0.001))
-    assert (share(asked, Label.VERIFIED) > 0.5) == taken
-    assert (share(asked, Label.VERIFIED) == 0) != taken
+    compared = left_of(prior_of(truth * np.exp(away), sigma=sigma), prior_of(theirs, Label.VERIFIED, 0.001))
+    assert (share(compared, Label.VERIFIED) > 0.5) == taken
+    assert (share(compared, Label.VERIFIED) == 0) != taken
 
 
 def test_what_nothing_is_known_of_stays_unknown_however_well_two_maps_agree() -> None:
-    asked = left_of(prior_of(WALL, sigma=np.inf), prior_of(WALL, sigma=np.inf))
-    assert share(asked, Label.AGREED) > 0.5
-    assert np.isinf(asked.sigma).all()
+    compared = left_of(prior_of(WALL, sigma=np.inf), prior_of(WALL, sigma=np.inf))
+    assert share(compared, Label.AGREED) > 0.5
+    assert np.isinf(compared.sigma).all()
 
 
 def test_only_mono_only_pixels_ever_change() -> None:
@@ -125,26 +125,26 @@ def test_only_mono_only_pixels_ever_change() -> None:
     depth = np.where(known, WALL, 0).astype(np.float32)
     prior = FusedPrior(depth, labels, np.where(known, SIGMA, np.inf).astype(np.float32))
     for theirs in (prior_of(WALL), prior_of(WALL * 1.01, Label.VERIFIED, 0.001)):
-        asked = left_of(prior, theirs)
+        compared = left_of(prior, theirs)
         other = labels != Label.MONO
-        for map_, before in ((asked.depth, depth), (asked.labels, labels), (asked.sigma, prior.sigma)):
+        for map_, before in ((compared.depth, depth), (compared.labels, labels), (compared.sigma, prior.sigma)):
             np.testing.assert_array_equal(map_[other], before[other])
-        changed = asked.labels != labels
+        changed = compared.labels != labels
         assert changed.any()
         assert (labels[changed] == Label.MONO).all()
-        assert np.isin(asked.labels[changed], (Label.AGREED, Label.VERIFIED)).all()
+        assert np.isin(compared.labels[changed], (Label.AGREED, Label.VERIFIED)).all()
     np.testing.assert_array_equal(prior.labels, labels)
 
 
 @pytest.mark.parametrize("label", [Label.FAR, Label.AGREED, Label.EMPTY, Label.CONFLICT])
 def test_far_and_empty_pixels_have_no_say_and_agreed_ones_do(label: Label) -> None:
     theirs = prior_of(WALL if label in (Label.FAR, Label.AGREED) else 0.0, label)
-    asked = left_of(prior_of(WALL), theirs)
+    compared = left_of(prior_of(WALL), theirs)
     if label == Label.AGREED:
-        assert share(asked, Label.AGREED) > 0.5
+        assert share(compared, Label.AGREED) > 0.5
     else:
-        assert share(asked, Label.MONO) == 1
-        np.testing.assert_array_equal(asked.sigma, np.float32(SIGMA))
+        assert share(compared, Label.MONO) == 1
+        np.testing.assert_array_equal(compared.sigma, np.float32(SIGMA))
 
 
 def test_points_behind_another_camera_or_off_its_image_are_not_looked_up() -> None:
@@ -152,9 +152,9 @@ def test_points_behind_another_camera_or_off_its_image_are_not_looked_up() -> No
     turned.T_camera_world[:3, :3] = np.diag([-1.0, 1, -1])  # looks away
     for there in (turned, camera(1e6), camera(-1e6)):
         for theirs in (prior_of(WALL), prior_of(WALL, Label.VERIFIED, 0.001)):
-            asked = with_evidence({"left": prior_of(WALL), "away": theirs}, {"left": camera(0), "away": there}, 0.02)
-            assert share(asked["left"], Label.MONO) == 1
-            np.testing.assert_array_equal(asked["left"].sigma, np.float32(SIGMA))
+            compared = with_evidence({"left": prior_of(WALL), "away": theirs}, {"left": camera(0), "away": there}, 0.02)
+            assert share(compared["left"], Label.MONO) == 1
+            np.testing.assert_array_equal(compared["left"].sigma, np.float32(SIGMA))
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 5), (5, 1), (2, 2)])
@@ -166,34 +166,34 @@ def test_images_of_a_pixel_or_a_row_are_possible(height: int, width: int) -> Non
     agreed = with_evidence({"left": mono, "right": mono}, rig, TOLERANCE)["left"]
     assert share(agreed, Label.AGREED) == 1
     verified = FusedPrior(full, np.full(full.shape, 2, np.uint8), sigma)
-    asked = with_evidence({"left": mono, "right": verified}, rig, TOLERANCE)["left"]
-    assert np.isfinite(asked.depth).all()
-    assert not np.isnan(asked.sigma).any()
+    compared = with_evidence({"left": mono, "right": verified}, rig, TOLERANCE)["left"]
+    assert np.isfinite(compared.depth).all()
+    assert not np.isnan(compared.sigma).any()
 
 
-def test_a_view_without_depth_neither_asks_nor_answers() -> None:
+def test_a_view_without_depth_changes_nothing_and_stays_as_it_is() -> None:
     nothing = empty_prior((HEIGHT, WIDTH))
-    asked = with_evidence({"left": prior_of(WALL), "right": nothing}, CAMERAS, TOLERANCE)
-    np.testing.assert_array_equal(asked["left"].labels, Label.MONO)
-    np.testing.assert_array_equal(asked["left"].sigma, np.float32(SIGMA))
-    for map_, before in zip((asked["right"].depth, asked["right"].labels), (nothing.depth, nothing.labels)):
+    compared = with_evidence({"left": prior_of(WALL), "right": nothing}, CAMERAS, TOLERANCE)
+    np.testing.assert_array_equal(compared["left"].labels, Label.MONO)
+    np.testing.assert_array_equal(compared["left"].sigma, np.float32(SIGMA))
+    for map_, before in zip((compared["right"].depth, compared["right"].labels), (nothing.depth, nothing.labels)):
         np.testing.assert_array_equal(map_, before)
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1e6])
 def test_the_unit_of_the_world_does_not_matter(unit: float) -> None:
     truth, theirs = slanted(CAMERAS["left"]), slanted(CAMERAS["right"])
-    asked = left_of(prior_of(truth * 1.02), prior_of(theirs, Label.VERIFIED, 0.001))
+    compared = left_of(prior_of(truth * 1.02), prior_of(theirs, Label.VERIFIED, 0.001))
     scaled_cameras = {"left": camera(0.0), "right": camera(0.5 * unit)}
     scaled = with_evidence(
         {"left": prior_of(truth * 1.02 * unit), "right": prior_of(theirs * unit, Label.VERIFIED, 0.001)},
         scaled_cameras,
         TOLERANCE,
     )["left"]
-    same = scaled.labels == asked.labels
+    same = scaled.labels == compared.labels
     assert same.mean() > 0.97, "but for points that rounding moves across the rim of the image"
-    np.testing.assert_allclose(scaled.depth[same] / unit, asked.depth[same], rtol=1e-5)
-    np.testing.assert_allclose(scaled.sigma[same], asked.sigma[same], rtol=1e-3)
+    np.testing.assert_allclose(scaled.depth[same] / unit, compared.depth[same], rtol=1e-5)
+    np.testing.assert_allclose(scaled.sigma[same], compared.sigma[same], rtol=1e-3)
 
 
 def test_trusted_is_verified_and_agreed_and_far_is_neither_trusted_nor_supported() -> None:
@@ -204,7 +204,7 @@ def test_trusted_is_verified_and_agreed_and_far_is_neither_trusted_nor_supported
     assert prior.far.tolist() == [[False, False, False, False, False, True]]
 
 
-def test_the_builder_asks_other_cameras_for_the_dual_prior_alone(tmp_path: Path) -> None:
+def test_cameras_are_compared_for_the_dual_prior_alone(tmp_path: Path) -> None:
     pytest.importorskip("cv2", reason="opencv is in the `image` extra")
     recording = synthetic_recording(cameras=3, held_out=0, frames=1, width=160, height=90)
     names = list(recording.cameras)
@@ -229,9 +229,9 @@ def test_a_surface_of_another_colour_is_not_the_thing_that_the_ray_sees() -> Non
     pytest.importorskip("cv2")
     ours, theirs = prior_of(WALL * 1.01), prior_of(WALL, Label.VERIFIED, 0.001)
     for apart, taken in ((0, True), (0.9, True), (1.1, False)):
-        asked = left_of(painted(ours, 100), painted(theirs, 100 + int(apart * LIKE * 255)))
-        assert (share(asked, Label.VERIFIED) > 0.5) is taken
-        assert taken or (asked.depth == ours.depth).all()
+        compared = left_of(painted(ours, 100), painted(theirs, 100 + int(apart * LIKE * 255)))
+        assert (share(compared, Label.VERIFIED) > 0.5) is taken
+        assert taken or (compared.depth == ours.depth).all()
     assert share(left_of(ours, theirs), Label.VERIFIED) > 0.5, "without images nothing speaks against it"
 
 
@@ -246,8 +246,8 @@ def test_a_colour_is_compared_in_the_exposure_of_the_other_camera(mine: int, see
     greys = (100, mine), (120, seen)
     colors = [np.tile(np.where(half[:, None], left, right), (HEIGHT, 1, 3)) for left, right in greys]
     ours, theirs = (replace(p, colors=c.astype(np.uint8)) for p, c in zip((ours, verified), colors, strict=True))
-    asked = left_of(ours, theirs)
-    right = asked.labels[:, 3 * WIDTH // 4 :]
+    compared = left_of(ours, theirs)
+    right = compared.labels[:, 3 * WIDTH // 4 :]
     assert bool(np.mean(right == Label.VERIFIED) > 0.3) is taken
 
 
@@ -261,7 +261,7 @@ def test_maps_agree_only_about_places_of_one_colour() -> None:
 
 def test_agreement_takes_back_what_a_heavy_tail_added() -> None:
     maps = {name: prior_of(WALL) for name in ("left", "right")}
-    asked = with_evidence(maps, CAMERAS, TOLERANCE, {"left": 2.0, "right": float("nan")})
+    compared = with_evidence(maps, CAMERAS, TOLERANCE, {"left": 2.0, "right": float("nan")})
     for name, tail in (("left", 2.0), ("right", 1.0)):
-        sigma = asked[name].sigma[asked[name].labels == Label.AGREED]
+        sigma = compared[name].sigma[compared[name].labels == Label.AGREED]
         np.testing.assert_allclose(sigma, np.hypot(AGREED * SIGMA / tail, AT_BEST), rtol=1e-6)

@@ -1,4 +1,4 @@
-"""The final filter: true depth passes where it is seen twice, wrong depth does not."""
+"""The filter of stereo depth: true depth passes where it is seen twice, wrong depth does not."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from d2_plugin.priors.geometry import viewing_rays
 from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.stereo.filtering.coherence import surface_coherence
 from d2_plugin.priors.stereo.filtering.confirm import confirm
-from d2_plugin.priors.stereo.filtering.filter import filter_depths, remove_speckles, texture_mask
+from d2_plugin.priors.stereo.filtering.filter import COST_MAX, filter_depths, remove_speckles, texture_mask
 from d2_plugin.priors.stereo.geometric_depth import gray
-from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
@@ -36,10 +40,11 @@ def test_true_depth_survives_where_another_view_sees_it(recording: Recording) ->
     grays, cameras, depths, costs = views(recording)
     results = filter_depths(grays, cameras, depths, costs, SETTINGS)
     for result, depth in zip(results, depths):
-        assert result.valid.mean() > 0.5
-        np.testing.assert_array_equal(result.depth[result.valid], depth[result.valid])
-        assert list(result.survivors.values()) == sorted(result.survivors.values(), reverse=True)
-        assert result.survivors["kept"] == result.valid.sum()
+        assert (result.depth > 0).mean() > 0.5
+        np.testing.assert_array_equal(result.depth[(result.depth > 0)], depth[(result.depth > 0)])
+        survivors = result.record["survivors"]
+        assert list(survivors.values()) == sorted(survivors.values(), reverse=True)
+        assert survivors["kept"] == np.count_nonzero(result.depth)
 
 
 def test_depth_that_is_wrong_in_one_view_is_dropped_there(recording: Recording) -> None:
@@ -48,8 +53,8 @@ def test_depth_that_is_wrong_in_one_view_is_dropped_there(recording: Recording) 
     wrong[20:60, 40:90] = True
     depths[1] = np.where(wrong, depths[1] * 1.15, depths[1]).astype(np.float32)
     result = filter_depths(grays, cameras, depths, costs, SETTINGS)[1]
-    assert result.valid[wrong].mean() < 0.02
-    assert result.valid[~wrong].mean() > 0.4
+    assert (result.depth > 0)[wrong].mean() < 0.02
+    assert (result.depth > 0)[~wrong].mean() > 0.4
 
 
 def test_random_depth_leaves_nearly_nothing(recording: Recording) -> None:
@@ -57,16 +62,17 @@ def test_random_depth_leaves_nearly_nothing(recording: Recording) -> None:
     rng = np.random.default_rng(0)
     noise = [rng.uniform(2, 8, depth.shape).astype(np.float32) for depth in depths]
     for result in filter_depths(grays, cameras, noise, costs, SETTINGS):
-        assert result.valid.mean() < 0.001
+        assert (result.depth > 0).mean() < 0.001
 
 
 def test_bad_matches_are_dropped(recording: Recording) -> None:
     grays, cameras, depths, costs = views(recording)
-    costs[0] = np.full_like(costs[0], SETTINGS.cost_max + 0.01)
+    costs[0] = np.full_like(costs[0], COST_MAX + 0.01)
     results = filter_depths(grays, cameras, depths, costs, SETTINGS)
-    assert not results[0].valid.any()
+    assert not results[0].depth.any()
     # A depth that did not match is not there, so it cannot confirm another view either.
-    assert results[1].confirmations.max() == 1
+    strict = filter_depths(grays, cameras, depths, costs, replace(SETTINGS, min_sources=2))
+    assert not strict[1].depth.any()
 
 
 def test_nan_and_negative_depths_are_no_depths(recording: Recording) -> None:
@@ -74,8 +80,8 @@ def test_nan_and_negative_depths_are_no_depths(recording: Recording) -> None:
     depths[0] = depths[0].copy()
     depths[0][:30], depths[0][30:50], depths[0][50:60] = np.nan, -1, np.inf
     result = filter_depths(grays, cameras, depths, costs, SETTINGS)[0]
-    assert not result.valid[:60].any()
-    assert result.valid[60:].any()
+    assert not (result.depth > 0)[:60].any()
+    assert (result.depth > 0)[60:].any()
     assert np.isfinite(result.depth).all()
 
 
@@ -83,7 +89,7 @@ def test_cameras_with_one_centre_confirm_nothing(recording: Recording) -> None:
     grays, cameras, depths, costs = views(recording)
     same = [cameras[0]] * 3
     for result in filter_depths([grays[0]] * 3, same, [depths[0]] * 3, costs, SETTINGS):
-        assert not result.valid.any()
+        assert not (result.depth > 0).any()
 
 
 def test_views_that_meet_at_too_wide_an_angle_do_not_confirm_each_other(recording: Recording) -> None:
@@ -91,9 +97,9 @@ def test_views_that_meet_at_too_wide_an_angle_do_not_confirm_each_other(recordin
     outer = [0, 2]  # 30 degrees apart
     kept = {}
     for limit in (60, 15):
-        settings = replace(SETTINGS, max_angle=limit)
+        chosen = replace(SETTINGS, max_angle=limit)
         parts = [[values[i] for i in outer] for values in (grays, cameras, depths, costs)]
-        kept[limit] = filter_depths(*parts, settings)[0].valid.mean()
+        kept[limit] = filter_depths(*parts, chosen)[0].depth.astype(bool).mean()
     assert kept[60] > 0.3 > 10 * kept[15]
 
 
@@ -101,8 +107,8 @@ def test_more_confirmations_can_be_asked_for(recording: Recording) -> None:
     grays, cameras, depths, costs = views(recording)
     kept = []
     for needed in (1, 2, 3):
-        settings = replace(SETTINGS, min_sources=needed)
-        kept.append(filter_depths(grays, cameras, depths, costs, settings)[1].valid.mean())
+        chosen = replace(SETTINGS, min_sources=needed)
+        kept.append(filter_depths(grays, cameras, depths, costs, chosen)[1].depth.astype(bool).mean())
     assert kept[0] > kept[1] > 0
     assert kept[2] == kept[1]  # there are only two other views
     count = confirm(1, cameras, depths, SETTINGS).sources
@@ -112,7 +118,7 @@ def test_more_confirmations_can_be_asked_for(recording: Recording) -> None:
 def test_texture_is_the_spread_of_grey_values_in_a_window() -> None:
     image = np.full((40, 80), 120, np.uint8)
     image[:, 40:] = np.random.default_rng(0).integers(0, 255, (40, 40))
-    mask = texture_mask(image, StereoSettings(texture_window=11, texture_min=0.02))
+    mask = texture_mask(image)
     assert not mask[:, :34].any()
     assert mask[:, 46:].all()
 
@@ -122,7 +128,92 @@ def test_small_pieces_are_speckles_and_depth_steps_cut_pieces() -> None:
     depth[5:25, 5:25] = np.linspace(2, 2.2, 20)[None]  # 400 pixels of one slanted surface
     depth[30:34, 30:34] = 3.0  # 16 pixels
     depth[10:14, 25:29] = 4.0  # 16 pixels that touch the surface but lie far behind it
-    out = remove_speckles(depth, 50, 0.01)
-    np.testing.assert_array_equal(out > 0, (depth > 0) & (depth < 2.5))
-    np.testing.assert_array_equal(remove_speckles(depth, 1, 0.01), depth)
-    assert not remove_speckles(np.zeros((5, 5)), 50, 0.01).any()
+    np.testing.assert_array_equal(remove_speckles(depth) > 0, (depth > 0) & (depth < 2.5))
+    assert not remove_speckles(np.zeros((5, 5))).any()
+
+
+SHAPE = (40, 60)
+
+
+def plane(slope_x: float, slope_y: float, inverse: float = 0.25) -> np.ndarray:
+    """Depth of a plane: inverse depth is linear over the image."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    return (1 / (inverse + slope_x * (u - 30) + slope_y * (v - 20))).astype(np.float32)
+
+
+def coherence(depth: np.ndarray, gray: np.ndarray | None = None) -> np.ndarray:
+    flat = np.full(SHAPE, 128, np.uint8)
+    return surface_coherence(flat if gray is None else gray, depth)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(-0.003, 0.003), st.floats(-0.003, 0.003), st.floats(1e-3, 1e3))
+def test_a_slanted_plane_of_any_scale_is_coherent(slope_x: float, slope_y: float, scale: float) -> None:
+    inner = coherence(plane(slope_x, slope_y) * np.float32(scale))[10:-10, 10:-10]
+    assert inner.min() > 0.99
+
+
+def test_random_depths_are_not_coherent() -> None:
+    depth = np.random.default_rng(0).uniform(2, 8, SHAPE).astype(np.float32)
+    assert coherence(depth).max() < 0.3
+
+
+def test_a_wrong_piece_of_a_plane_is_not_coherent_and_leaves_its_surroundings_alone() -> None:
+    depth = plane(0.001, 0.0)
+    depth[18:22, 28:32] *= 1.1
+    share = coherence(depth)
+    assert share[18:22, 28:32].max() < 0.5
+    assert share[18:22, 38:52].min() > 0.9
+
+
+def test_a_depth_edge_along_an_edge_of_the_image_stays_coherent() -> None:
+    depth, gray = plane(0.0, 0.0), np.full(SHAPE, 80, np.uint8)
+    depth[:, 30:], gray[:, 30:] = 8.0, 200
+    assert coherence(depth, gray)[10:-10, 28].min() > 0.9
+    assert coherence(depth)[10:-10, 29].max() < 0.7  # without the image's help the far side counts against it
+
+
+def test_where_there_is_no_depth_there_is_no_coherence() -> None:
+    depth = plane(0.0, 0.0)
+    depth[10:30, 20:40] = 0
+    share = coherence(depth)
+    assert np.isfinite(share).all()
+    assert share[10:30, 20:40].max() == 0
+
+
+WIDTH, HEIGHT, FOCAL, BASELINE = 96, 64, 90.0, 0.5
+
+
+def camera(name: str, x: float) -> Camera:
+    """One of two that look along z from the same height."""
+    T = np.eye(4)
+    T[0, 3] = -x
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, 8.0], [0, 0, 1]])
+    return Camera(name=name, width=WIDTH, height=HEIGHT, K=K, T_camera_world=T)
+
+
+def ground(view: Camera, slope: float) -> np.ndarray:
+    """Planar depth of a ground that rises to the right: y = 1 + slope x in the world; 0 above the horizon."""
+    rays = viewing_rays(view, np.float64)
+    left = -view.T_camera_world[0, 3]
+    falls = rays[..., 1] - slope * rays[..., 0]
+    depth = (1 + slope * left) / np.where(falls > 0.02, falls, np.inf)
+    return depth.astype(np.float32)
+
+
+def sources(slope: float, between: bool) -> tuple[np.ndarray, np.ndarray]:
+    """(how many sources confirm each exact depth of the left camera, that depth)."""
+    cameras = [camera("left", 0.0), camera("right", BASELINE)]
+    depths = [ground(view, slope) for view in cameras]
+    return confirm(0, cameras, depths, StereoSettings(between_pixels=between, min_angle=0.1)).sources, depths[0]
+
+
+def test_a_ground_at_a_grazing_angle_is_confirmed_between_pixels_and_not_at_them() -> None:
+    confirmed_share = {}
+    for between in (False, True):
+        confirmed, depth = sources(1.0, between)
+        grazing = (depth > 2) & (depth < 8)
+        grazing[:, :30] = False  # leaves the other image
+        confirmed_share[between] = float((confirmed[grazing] > 0).mean())
+    assert confirmed_share[True] > 0.9
+    assert confirmed_share[False] < 0.7

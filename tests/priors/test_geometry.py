@@ -12,7 +12,6 @@ from d2_plugin.priors.geometry import (
     back_project,
     check_depth_range,
     check_views,
-    inverse_depth_planes,
     pixel_grid,
     scaled_camera,
     triangulation_angle,
@@ -97,23 +96,6 @@ def test_the_angle_is_that_of_the_triangle_and_zero_for_one_centre() -> None:
     assert angle[24, 30] == pytest.approx(np.arctan2(0.5, 4.0), rel=1e-3)
     same = triangulation_angle(reference, view_pair(reference, camera("c", 0.0, 0.3)), depth)
     assert same.max() < 1e-6
-
-
-def test_planes_stand_a_step_apart_for_a_stereo_pair() -> None:
-    left, right = camera(), camera("b", 0.5)
-    planes = inverse_depth_planes(left, [right], (2.0, 20.0), 0.5)
-    assert (planes[0], planes[-1]) == pytest.approx((1 / 20, 1 / 2))
-    disparity = 60.0 * 0.5 * planes
-    assert np.diff(disparity).max() <= 0.5 + 1e-9
-    assert len(planes) == pytest.approx(60 * 0.5 * (1 / 2 - 1 / 20) / 0.5, abs=3)
-
-
-def test_a_range_ten_times_too_wide_keeps_the_spacing_where_the_views_overlap() -> None:
-    left, right = camera(), camera("b", 0.5)
-    narrow, wide = (inverse_depth_planes(left, [right], bounds, 0.5) for bounds in ((2.0, 20.0), (0.2, 200.0)))
-    inside = wide[(wide > 1 / 20) & (wide < 1 / 2)]
-    assert len(inside) == pytest.approx(len(narrow), rel=0.1)
-    assert len(wide) < 64 / 0.5 * 2  # never more planes than the image is wide
 
 
 @pytest.mark.parametrize("bounds", [(5.0, 1.0), (0.0, 1.0), (-1.0, 1.0), (1.0, 1.0), (1.0, np.inf), (np.nan, 2.0)])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d2_plugin.priors.monocular.native.order import median, quantile
+from d2_plugin.priors.monocular.order import median, quantile
 
 
 @given(

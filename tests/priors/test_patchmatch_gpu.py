@@ -19,10 +19,10 @@ from benchmarks.stereo_rigs import Rig, textured_rig
 from d2_plugin.compiler import NoCompiler, load_library, nvrtc
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo.geometric_depth import choose_matcher, gray
-from d2_plugin.priors.stereo.gpu import kernel as gpu
-from d2_plugin.priors.stereo.gpu.call import PROGRAM, Call, flags_for
+from d2_plugin.priors.stereo import patchmatch_cuda as gpu
+from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.patchmatch import patchmatch
+from d2_plugin.priors.stereo.patchmatch_cuda import PROGRAM, Call, flags_for
 from d2_plugin.priors.stereo.pyramid import NO_MATCH
 from d2_plugin.priors.stereo.source_views import choose_sources
 from d2_plugin.recordings.recording import Camera
@@ -105,13 +105,12 @@ def test_the_gpu_returns_the_bits_of_the_cpu(backend: None, rig: Rig, views: int
     assert_same(on_gpu, on_cpu)
 
 
-def test_wanted_pixels_and_geometric_rounds_as_well(backend: None, rig: Rig) -> None:
+def test_wanted_pixels_alone_as_well(backend: None, rig: Rig) -> None:
     wanted = [np.zeros(image.shape, bool) for image in grays(rig)]
     for mask in wanted:
         mask[5:31, 10:40] = True
-    dense = replace(SETTINGS, patchmatch_geometric_rounds=1)
     found, expected = (
-        patchmatch(grays(rig), rig.cameras, rig.depth_range, replace(dense, patchmatch_device=device), wanted)
+        patchmatch(grays(rig), rig.cameras, rig.depth_range, replace(SETTINGS, patchmatch_device=device), wanted)
         for device in ("cuda", "cpu")
     )
     assert_same(found, expected)
@@ -135,7 +134,7 @@ def test_many_sources_and_scattered_pixels(backend: None, rig: Rig) -> None:
         camera, pose = rig.cameras[number % 3], rig.cameras[number % 3].T_camera_world.copy()
         pose[0, 3] += 0.02 * number
         cameras.append(replace(camera, name=str(number), T_camera_world=pose))
-    settings = replace(SETTINGS, patchmatch_sources=7, max_angle=170.0, min_angle=1e-4, patchmatch_geometric_rounds=1)
+    settings = replace(SETTINGS, patchmatch_sources=7, max_angle=170.0, min_angle=1e-4)
     wanted = [np.random.default_rng(number).random(image.shape) < 0.1 for number, image in enumerate(images)]
     for mask in wanted:
         mask[0], mask[:, -1] = True, True
@@ -182,13 +181,6 @@ def test_a_missing_gpu_is_one_sentence(rig: Rig, monkeypatch: pytest.MonkeyPatch
         patchmatch(grays(rig), rig.cameras, rig.depth_range, asked)
     assert "\n" not in str(error.value)
     gpu.why_not_usable.cache_clear()
-
-
-def test_a_gpu_matches_where_there_is_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CXX", "/nowhere/c++")
-    assert choose_matcher("auto") == "sweep"
-    monkeypatch.setattr(gpu, "why_not_usable", lambda: None)
-    assert choose_matcher("auto") == "patchmatch"
 
 
 @pytest.mark.parametrize("capability", [80, 90, 120])

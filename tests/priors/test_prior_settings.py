@@ -15,26 +15,21 @@ from d2_plugin.settings import declared
 
 def test_settings_come_from_tables_and_unknown_names_are_refused() -> None:
     settings = PriorSettings.from_dict(
-        {"tau_c": 0.2, "depth_range": [1, 9], "stereo": {"matcher": "sweep"}, "align": {"local_scales": []}}
+        {"tau_c": 0.2, "depth_range": [1, 9], "stereo": {"matcher": "colmap"}, "align": {"across": False}}
     )
-    assert (settings.tau_c, settings.depth_range, settings.stereo.matcher) == (0.2, (1, 9), "sweep")
-    assert settings.align.local_scales == ()
+    assert (settings.tau_c, settings.depth_range, settings.stereo.matcher) == (0.2, (1, 9), "colmap")
+    assert not settings.align.across
     with pytest.raises(D2Error, match="unknown setting of priors.stereo 'matchers': .* did you mean 'matcher'"):
-        PriorSettings.from_dict({"stereo": {"matchers": "sweep"}})
+        PriorSettings.from_dict({"stereo": {"matchers": "colmap"}})
     with pytest.raises(D2Error, match="unknown setting of priors 'tauc': .* did you mean 'tau_c'"):
         PriorSettings.from_dict({"tauc": 0.2})
     with pytest.raises(D2Error, match="priors.tau_c must be a number, got 'small'"):
         PriorSettings.from_dict({"tau_c": "small"})
-    with pytest.raises(D2Error, match="priors.stereo.speckle_size must be a whole number, got True"):
-        PriorSettings.from_dict({"stereo": {"speckle_size": True}})
+    with pytest.raises(D2Error, match="priors.stereo.min_sources must be a whole number, got True"):
+        PriorSettings.from_dict({"stereo": {"min_sources": True}})
     with pytest.raises(D2Error, match="stereo must be a table"):
-        PriorSettings.from_dict({"stereo": "sweep"})
+        PriorSettings.from_dict({"stereo": "colmap"})
     assert PriorSettings.from_dict({"tau_c": 1}).tau_c == 1
-
-
-def test_the_old_name_of_the_matcher_is_answered_with_the_new_one() -> None:
-    with pytest.raises(D2Error, match=r"maker in \[priors.stereo\] is now called matcher: write matcher = 'sweep'"):
-        PriorSettings.from_dict({"stereo": {"maker": "sweep"}})
 
 
 @pytest.mark.parametrize(
@@ -52,20 +47,14 @@ def test_the_old_name_of_the_matcher_is_answered_with_the_new_one() -> None:
         ({"mono_threads": -1}, "mono_threads must be at least 0 threads, got -1"),
         ({"stereo": {"matcher": "patch-match"}}, "unknown priors.stereo.matcher .* did you mean 'patchmatch'"),
         ({"stereo": {"max_pixels": -5}}, "max_pixels must be at least 1 pixels, got -5"),
-        ({"stereo": {"texture_window": 0}}, "texture_window must be at least 1 pixels, got 0"),
-        ({"stereo": {"speckle_size": -1}}, "speckle_size must be at least 0 pixels, got -1"),
-        ({"stereo": {"patchmatch_rounds": [4, -1]}}, r"patchmatch_rounds\[1\] must be at least 0, got -1"),
-        ({"stereo": {"patchmatch_rounds": []}}, "patchmatch_rounds needs at least one level"),
+        ({"stereo": {"colmap_minutes": 0}}, "colmap_minutes must be above 0 minutes, got 0"),
         ({"stereo": {"patchmatch_sources": 33}}, "patchmatch_sources must be at least 1 and at most 32, got 33"),
-        ({"stereo": {"cost_max": 2.5}}, "cost_max must be at least 0 and at most 2, got 2.5"),
         ({"stereo": {"max_angle": 200}}, "max_angle must be at least 0 and at most 180 degrees, got 200"),
         ({"stereo": {"min_angle": 60.0}}, "min_angle must be below max_angle, got 60 and 60 degrees"),
         ({"stereo": {"seed": -1}}, "seed must be at least 0"),
         ({"align": {"residual": "absolut"}}, "unknown priors.align.residual 'absolut': .* did you mean 'absolute'"),
         ({"align": {"epsilon": 0.0}}, "epsilon must be above 0, got 0.0"),
         ({"align": {"min_inliers": 1.5}}, "min_inliers must be at least 0 and at most 1, got 1.5"),
-        ({"align": {"min_correlation": -2}}, "min_correlation must be at least -1 and at most 1, got -2"),
-        ({"align": {"local_scales": [0.1, 0]}}, r"local_scales\[1\] must be above 0, got 0"),
     ],
 )
 def test_a_value_that_cannot_be_meant_is_refused_in_one_sentence(table: dict[str, Any], message: str) -> None:
@@ -77,10 +66,10 @@ def test_a_value_that_cannot_be_meant_is_refused_in_one_sentence(table: dict[str
 def test_python_meets_the_same_checks() -> None:
     with pytest.raises(D2Error, match="PriorSettings.tau_c must be at least 0, got nan"):
         replace(PriorSettings(), tau_c=float("nan"))
-    with pytest.raises(D2Error, match="AlignSettings.max_anchors must be at least 1"):
-        AlignSettings(max_anchors=0)
-    with pytest.raises(D2Error, match="StereoSettings.sweep_step must be above 0 pixels"):
-        StereoSettings(sweep_step=-1.0)
+    with pytest.raises(D2Error, match="AlignSettings.epsilon must be above 0"):
+        AlignSettings(epsilon=0.0)
+    with pytest.raises(D2Error, match="StereoSettings.colmap_minutes must be above 0 minutes"):
+        StereoSettings(colmap_minutes=-1.0)
 
 
 @pytest.mark.parametrize("kind", [PriorSettings, StereoSettings, AlignSettings])

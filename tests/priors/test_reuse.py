@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, build_priors
@@ -16,8 +14,8 @@ from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.geometric_depth import geometric_depth
-from d2_plugin.priors.stereo.match import MatchedDepth
-from d2_plugin.priors.stereo.reuse import MEMORY_DTYPE, MatchMemory, changed, covering_boxes
+from d2_plugin.priors.stereo.matched_depth import MatchedDepth
+from d2_plugin.priors.stereo.reuse import RADIUS, MatchMemory, changed
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -25,7 +23,7 @@ from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")
 
-STEREO = StereoSettings(matcher="sweep", reuse_block=3)
+STEREO = StereoSettings(matcher="patchmatch", reuse_block=3)
 SETTINGS = PriorSettings(stereo=STEREO)
 NAMES = ["train0", "train1"]
 
@@ -50,29 +48,12 @@ def test_a_change_is_what_outlasts_noise_and_its_neighbourhood_changes_with_it()
     rng = np.random.default_rng(0)
     before = np.full((60, 80), 100, np.uint8)
     noisy = np.clip(before + rng.normal(0, 2, before.shape), 0, 255).astype(np.uint8)
-    assert changed(noisy, before, STEREO).mean() < 0.02
+    assert changed(noisy, before).mean() < 0.02
     moved = noisy.copy()
     moved[30:34, 40:44] += 40
-    mask = changed(moved, before, STEREO)
-    assert mask[30 - STEREO.reuse_radius : 34 + STEREO.reuse_radius, 40 - STEREO.reuse_radius : 44].all()
+    mask = changed(moved, before)
+    assert mask[30 - RADIUS : 34 + RADIUS, 40 - RADIUS : 44].all()
     assert not mask[:15].any()
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(0, 10**6), st.integers(0, 6), st.integers(0, 12))
-def test_boxes_cover_every_wanted_pixel_with_its_margin(seed: int, margin: int, count: int) -> None:
-    rng = np.random.default_rng(seed)
-    mask = np.zeros((40, 50), bool)
-    mask[rng.integers(0, 40, count), rng.integers(0, 50, count)] = True
-    covered = np.zeros_like(mask)
-    for rows, columns in covering_boxes(mask, margin):
-        assert 0 <= rows.start < rows.stop <= 40
-        assert 0 <= columns.start < columns.stop <= 50
-        covered[rows, columns] = True
-    for row, column in np.argwhere(mask):
-        window = covered[max(row - margin, 0) : row + margin + 1, max(column - margin, 0) : column + margin + 1]
-        assert window.all()
-    assert covered.any() == mask.any()
 
 
 def test_the_memory_takes_in_what_was_matched_and_keeps_the_rest() -> None:
@@ -80,7 +61,7 @@ def test_the_memory_takes_in_what_was_matched_and_keeps_the_rest() -> None:
     grays = [rng.integers(0, 255, (6, 7)).astype(np.uint8)]
     first = [(rng.random((6, 7)).astype(np.float32), rng.random((6, 7)).astype(np.float32))]
     memory = MatchMemory()
-    assert memory.wanted(grays, STEREO) is None
+    assert memory.wanted(grays) is None
     memory.merge(grays, first, None)
     assert memory.matched_share == 1
     mask = rng.random((6, 7)) < 0.3
@@ -89,19 +70,6 @@ def test_the_memory_takes_in_what_was_matched_and_keeps_the_rest() -> None:
     np.testing.assert_array_equal(depth, np.where(mask, second[0][0], first[0][0]))
     np.testing.assert_array_equal(cost, np.where(mask, second[0][1], first[0][1]))
     assert memory.matched_share == pytest.approx(mask.mean())
-
-
-def test_a_saved_memory_comes_back_under_its_key_only_and_only_intact(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    memory = MatchMemory([rng.integers(0, 255, (5, 5)).astype(np.uint8).astype(MEMORY_DTYPE) for _ in range(2)])
-    memory.save(tmp_path, "key")
-    loaded = MatchMemory.load(tmp_path, "key", 2)
-    for view, expected in zip(loaded.views, memory.views, strict=True):
-        np.testing.assert_array_equal(view, expected)
-    assert MatchMemory.load(tmp_path, "other", 2) is None
-    assert MatchMemory.load(tmp_path, "key", 3) is None
-    (tmp_path / "1.npy").write_bytes(b"half a file")
-    assert MatchMemory.load(tmp_path, "key", 2) is None
 
 
 def test_a_scene_that_stands_still_is_matched_once() -> None:
@@ -158,19 +126,6 @@ def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(
     assert priors_of(tmp_path) == priors_of(built)
 
 
-def test_without_its_saved_memory_a_block_is_matched_again_to_the_same_store(
-    recording: Recording, built: Path, tmp_path: Path
-) -> None:
-    build_priors(recording, NAMES, tmp_path, SETTINGS)
-    memory = list((tmp_path / "cache" / "matches").rglob("*.npy"))
-    assert memory
-    for file in [*memory, *(tmp_path / "cache" / "stereo").rglob("*2.npy")]:
-        file.unlink()
-    (tmp_path / "priors" / "train1" / "00002.npy").unlink()
-    build_priors(recording, NAMES, tmp_path, SETTINGS)
-    assert priors_of(tmp_path) == priors_of(built)
-
-
 def test_shards_built_in_any_order_join_to_the_same_store(recording: Recording, built: Path, tmp_path: Path) -> None:
     parts = [build_priors(recording, NAMES, tmp_path, SETTINGS, shard=(index, 2)) for index in (1, 0)]
     assert [part.built for part in parts] == [4, 6]
@@ -182,22 +137,6 @@ def test_shards_built_in_any_order_join_to_the_same_store(recording: Recording, 
 def test_a_shard_that_does_not_exist_is_refused(recording: Recording, tmp_path: Path, shard: tuple[int, int]) -> None:
     with pytest.raises(D2Error, match="does not exist"):
         build_priors(recording, NAMES, tmp_path, SETTINGS, shard=shard)
-
-
-def test_the_sweep_matches_only_boxes_around_what_is_wanted(
-    recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    images, cameras = [recording.image(name, 0) for name in NAMES], list(recording.cameras.values())
-    grays = [image.mean(axis=-1).astype(np.uint8) for image in images]
-    from d2_plugin.priors.stereo.sweep import sweep
-
-    whole = sweep(grays, cameras, (2, 9), STEREO)
-    mask = np.zeros((72, 128), bool)
-    mask[20:40, 50:80] = True
-    part = sweep(grays, cameras, (2, 9), STEREO, [mask, np.zeros_like(mask)])
-    np.testing.assert_allclose(part[0][0][mask], whole[0][0][mask], rtol=1e-4)
-    assert (part[0][0] > 0).mean() < 0.3
-    assert not part[1][0].any()
 
 
 def test_a_source_is_asked_in_order_even_from_the_middle_of_a_block(recording: Recording, tmp_path: Path) -> None:

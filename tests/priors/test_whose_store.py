@@ -21,7 +21,7 @@ from d2_plugin.store.store import PriorStore
 pytest.importorskip("cv2")
 
 NAMES = ["train0", "train1", "train2"]
-SETTINGS = PriorSettings(stereo=StereoSettings(matcher="sweep"))
+SETTINGS = PriorSettings(stereo=StereoSettings(matcher="patchmatch"))
 
 
 def room(**changes: object) -> Recording:

@@ -92,7 +92,7 @@ BEYOND = """
 import ctypes
 import numpy as np
 from test_patchmatch_gpu import shim_library
-from d2_plugin.priors.stereo.gpu.call import Call
+from d2_plugin.priors.stereo.patchmatch_cuda import Call
 from d2_plugin.priors.stereo.patchmatch_kernel import Task
 
 gray, planes = np.zeros((8, 8), np.uint8), np.ones((8, 8, 3), np.float32)

@@ -32,7 +32,7 @@ LOADED = """
 import importlib, pkgutil, sys
 import d2_plugin
 from d2_plugin import D2Config, D2Hooks, registry
-import d2_plugin.attach.launch, d2_plugin.store.store
+import d2_plugin.attach.launch, d2_plugin.store.exported
 for room in ("hooks", "gaussians", "rasterizer", "adapters", "compat", "attach"):
     package = importlib.import_module("d2_plugin." + room)
     for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):

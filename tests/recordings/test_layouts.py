@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from d2_plugin.errors import D2Error
+from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.recordings import LAYOUTS, Layout, Recording, open_recording
 from d2_plugin.recordings.assembly import assembled
 from d2_plugin.recordings.cameras.calibration import checked_camera, pinhole
 from d2_plugin.recordings.export.base import Export, Written
-from d2_plugin.recordings.export.export import EXPORT_FILE, WRITERS, export_recording
+from d2_plugin.recordings.export.export import WRITERS, export_recording
 from d2_plugin.recordings.files import numbered_files
 from d2_plugin.recordings.images import image_size, write_png
 from d2_plugin.recordings.synthetic.room import synthetic_recording

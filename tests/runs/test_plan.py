@@ -11,7 +11,8 @@ import pytest
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
-from d2_plugin.priors.stereo import match
+from d2_plugin.priors.stereo import matched_depth
+from d2_plugin.priors.stereo.settings import NO_MATCHER
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import Camera, Recording, open_recording, select_frames
 from d2_plugin.recordings.cameras.calibration import pinhole, rigid
@@ -161,7 +162,7 @@ class Plain:
 
 def test_images_without_texture_have_no_stereo_and_the_reason_says_so(moving) -> None:
     plain = replace(moving, source=Plain(moving.source))
-    assert measure_texture(plain, ["train0"], StereoSettings()) == (0,)
+    assert measure_texture(plain, ["train0"]) == (0,)
     plan = plan_scene(plain, ["train0", "train1"], "maps")
     assert not plan.uses("stereo")
     assert plan.as_dict()["stereo"]["reason"].startswith("no texture: 2 training cameras")
@@ -171,7 +172,7 @@ def test_images_without_texture_have_no_stereo_and_the_reason_says_so(moving) ->
 def test_the_reason_for_stereo_has_the_figures(moving) -> None:
     cameras = (camera("a", near_far=AT_TWO), camera("b", 0.5, near_far=AT_TWO))
     reason = plan_scene(rig(moving, *cameras), ["train0", "train1"], "maps").as_dict()["stereo"]["reason"]
-    texture = np.mean(measure_texture(moving, ["train0", "train1"], StereoSettings()))
+    texture = np.mean(measure_texture(moving, ["train0", "train1"]))
     expected = f"2 training cameras, 75% of each image seen by another, 13 degrees apart, {texture:.0%} textured"
     assert reason == expected.replace("13 degrees", f"{reason.split(', ')[2].split(' ')[0]} degrees")
     assert texture > 0.5
@@ -217,7 +218,7 @@ def test_a_sensor_beside_one_of_two_cameras_leaves_stereo(moving, tmp_path: Path
     plan = plan_scene(recording, ["train0", "train1"], None)
     assert [plan.uses(name) for name in ("sensor", "stereo")] == [False, True]
     assert "does not serve every training camera" in plan.as_dict()["sensor"]["reason"]
-    settings = PriorSettings(stereo=StereoSettings(matcher="sweep"))
+    settings = PriorSettings(stereo=StereoSettings(matcher="patchmatch"))
     assert plan_scene(recording, ["train0", "train1"], None, settings).uses("stereo")
 
 
@@ -228,7 +229,7 @@ def test_no_stereo_reaches_the_priors(moving, tmp_path: Path, monkeypatch: pytes
     for name in ("train0", "train1"):
         for frame in (0, 1):
             np.save(path / "mono" / name / f"{frame:05d}.npy", moving.depth(name, frame))
-    monkeypatch.setattr(match, "geometric_depth", lambda *_: pytest.fail("something was matched"))
+    monkeypatch.setattr(matched_depth, "geometric_depth", lambda *_: pytest.fail("something was matched"))
     settings = RunSettings(str(path), ("train0", "train1"))
     scene = Scene.open(settings)
     assert [scene.plan.uses(name) for name in ("stereo", "monocular", "verification")] == [False, True, False]

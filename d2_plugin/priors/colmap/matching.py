@@ -8,6 +8,11 @@ import numpy as np
 
 from d2_plugin.recordings.recording import Camera
 
+MAX_RATIO = 0.8
+"""Largest angle to the best match over the angle to the second best (Lowe's ratio test)."""
+MAX_ANGLE = 0.7
+"""Largest angle between matching descriptors, radians."""
+
 
 class Features(NamedTuple):
     """Feature points of one image."""
@@ -20,8 +25,6 @@ def epipolar_matches(
     first: Features,
     second: Features,
     fundamental: np.ndarray,
-    max_ratio: float,
-    max_angle: float,
     max_error: float,
 ) -> np.ndarray:
     """Pairs of feature indices [M, 2] that are each other's nearest, unambiguous, and fit the known geometry.
@@ -29,14 +32,12 @@ def epipolar_matches(
     Args:
         first, second: features of the two images.
         fundamental: F [3, 3], see `fundamental_matrix`.
-        max_ratio: largest angle to the best match over the angle to the second best.
-        max_angle: largest angle between matching descriptors, radians.
         max_error: largest `sampson_distance`, pixels.
     """
     if min(len(first.pixels), len(second.pixels)) < 2:
         return np.zeros((0, 2), np.int64)
-    forward = _nearest(first.descriptors, second.descriptors, max_ratio, max_angle)
-    backward = _nearest(second.descriptors, first.descriptors, max_ratio, max_angle)
+    forward = _nearest(first.descriptors, second.descriptors)
+    backward = _nearest(second.descriptors, first.descriptors)
     here = np.flatnonzero(forward >= 0)
     here = here[backward[forward[here]] == here]
     matches = np.stack([here, forward[here]], axis=1)
@@ -44,9 +45,7 @@ def epipolar_matches(
     return matches[error <= max_error]
 
 
-def _nearest(
-    queries: np.ndarray, candidates: np.ndarray, max_ratio: float, max_angle: float, block: int = 1024
-) -> np.ndarray:
+def _nearest(queries: np.ndarray, candidates: np.ndarray, block: int = 1024) -> np.ndarray:
     """Index of the candidate nearest to each query [Q], -1 where it is too far or a second one is as near."""
     nearest = np.full(len(queries), -1)
     for start in range(0, len(queries), block):
@@ -55,7 +54,7 @@ def _nearest(
         angle = np.arccos(np.clip(similarity[rows, best], -1, 1))
         similarity[rows, best] = -np.inf
         second = np.arccos(np.clip(similarity.max(axis=1), -1, 1))
-        clear = (angle <= max_angle) & (angle <= max_ratio * second)
+        clear = (angle <= MAX_ANGLE) & (angle <= MAX_RATIO * second)
         nearest[start : start + block] = np.where(clear, best, -1)
     return nearest
 

@@ -4,15 +4,12 @@ COLMAP would estimate the geometry of every pair of images anew to tell good mat
 known here, so a match is kept when it lies on its epipolar line: no random sampling, and pairs with a handful of
 matches still count.
 
-OpenCV's SIFT takes a third of the CPU time of COLMAP's, which is here. With four scales in an octave and as many
-points D2 was the same (studio, plaza, sear_steak, 300 and 1000 steps, three seeds: +.06 +- .05 dB), but the backbone
-alone lost .6 +- .4 dB on six pairs of plaza's cameras, which see two dozen points.
+Features are those of COLMAP's SIFT; OpenCV's takes less time but serves cameras that see little in common worse.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 import os
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +26,6 @@ from d2_plugin.errors import D2Error
 from d2_plugin.extras import import_pycolmap
 from d2_plugin.priors.colmap.matching import Features, epipolar_matches, fundamental_matrix, same_spot
 from d2_plugin.recordings.recording import Camera, Recording
-from d2_plugin.settings import Angle, Positive, Range, Settings, Share
 
 LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of red, green and blue in the grey image that features are found in (ITU-R BT.601)."""
@@ -37,27 +33,16 @@ LUMA = np.array([0.299, 0.587, 0.114])
 DESCRIPTOR_LENGTH = 128
 """Numbers in a SIFT descriptor."""
 
-PixelError = Annotated[float, Range(0, unit="pixels", open_low=True)]
-
-
-@dataclass(frozen=True)
-class TriangulationSettings(Settings):
-    """What counts as a feature, a match and a point."""
-
-    peak_threshold: Positive = 0.0033
-    """SIFT contrast threshold; half of COLMAP's, since the epipolar test is strict."""
-    max_features: Annotated[int, Range(1)] = 8192
-    """Strongest features kept per image."""
-    max_ratio: Share = 0.8
-    """Angle to the best match over angle to the second best (Lowe's ratio test)."""
-    max_angle: Annotated[float, Range(0, math.pi, unit="radians")] = 0.7
-    """Largest angle between matching descriptors."""
-    epipolar_error: PixelError = 1.0
-    """Largest Sampson distance of a match from the known epipolar geometry."""
-    reprojection_error: PixelError = 2.0
-    """Largest reprojection error of a point."""
-    min_angle: Angle = 0.5
-    """Smallest angle between two rays that meet in a point."""
+PEAK_THRESHOLD = 0.0033
+"""SIFT contrast threshold; half of COLMAP's, since the epipolar test is strict."""
+MAX_FEATURES = 8192
+"""Strongest features kept per image."""
+EPIPOLAR_ERROR = 1.0
+"""Largest Sampson distance of a match from the known epipolar geometry, pixels."""
+REPROJECTION_ERROR = 2.0
+"""Largest reprojection error of a point, pixels."""
+MIN_ANGLE = 0.5
+"""Smallest angle between two rays that meet in a point, degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,19 +84,18 @@ class SparsePoints:
     def load(cls, path: Path) -> SparsePoints:
         """Read what `save` wrote."""
         remedy = "delete the file and build again"
-        found = cls(*(read_array(path, remedy, key=field.name) for field in fields(cls)))
-        count = len(found.positions) if found.positions.ndim == 2 else -1
-        shapes = [getattr(found, field.name).shape for field in fields(cls)]
+        points = cls(*(read_array(path, remedy, key=field.name) for field in fields(cls)))
+        count = len(points.positions) if points.positions.ndim == 2 else -1
+        shapes = [getattr(points, field.name).shape for field in fields(cls)]
         if shapes != [(count, 3), (count, 3), (count,), (count,), (count,)]:
             raise D2Error(f"{path} has points of shapes {shapes}, expected (N, 3) twice and (N,) else: {remedy}")
-        return found
+        return points
 
 
 def triangulate(
     images: Sequence[np.ndarray],
     cameras: Sequence[Camera],
     frame: int = 0,
-    settings: TriangulationSettings | None = None,
 ) -> SparsePoints:
     """Surface points seen by at least two of `cameras` at one instant.
 
@@ -119,7 +103,6 @@ def triangulate(
         images: RGB uint8 [H, W, 3], one per camera.
         cameras: their calibrations.
         frame: what to note as the points' frame.
-        settings: thresholds; the defaults where None.
 
     Returns:
         The points, in an order that does not depend on threads; none for a single camera, cameras that stand on one
@@ -130,14 +113,13 @@ def triangulate(
     """
     if len(images) != len(cameras):
         raise D2Error(f"{len(images)} images for {len(cameras)} cameras: give one image per camera")
-    settings = settings or TriangulationSettings()
     pycolmap = import_pycolmap("triangulating sparse points", "stereo")
     with _quiet(pycolmap), tempfile.TemporaryDirectory(prefix="d2_sparse_") as folder:
-        features = [_extract(pycolmap, image, settings) for image in images]
-        pairs = _matched_pairs(features, cameras, settings)
+        features = [_extract(pycolmap, image) for image in images]
+        pairs = _matched_pairs(features, cameras)
         if not pairs:
             return SparsePoints.empty()
-        model = _triangulated(pycolmap, Path(folder), cameras, features, pairs, settings)
+        model = _triangulated(pycolmap, Path(folder), cameras, features, pairs)
         return _collected(model, images, frame)
 
 
@@ -145,14 +127,13 @@ def triangulate_frames(
     recording: Recording,
     cameras: Sequence[str],
     frames: Iterable[int],
-    settings: TriangulationSettings | None = None,
 ) -> SparsePoints:
     """`triangulate` for each of `frames` of a recording, joined; images are read one instant at a time."""
     calibrations = [recording.cameras[name] for name in cameras]
     parts = []
     for frame in frames:
         images = [recording.image(name, frame) for name in cameras]
-        parts.append(triangulate(images, calibrations, frame, settings))
+        parts.append(triangulate(images, calibrations, frame))
     return SparsePoints.joined(parts)
 
 
@@ -167,12 +148,12 @@ def _quiet(pycolmap: ModuleType) -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
-def _extract(pycolmap: ModuleType, image: np.ndarray, settings: TriangulationSettings) -> Features:
+def _extract(pycolmap: ModuleType, image: np.ndarray) -> Features:
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
     options.num_threads = os.cpu_count() or 1
-    options.sift.peak_threshold = settings.peak_threshold
-    options.sift.max_num_features = settings.max_features
+    options.sift.peak_threshold = PEAK_THRESHOLD
+    options.sift.max_num_features = MAX_FEATURES
     extractor = pycolmap.FeatureExtractor.create(options, device=pycolmap.Device.cpu)
     gray = np.rint(image @ LUMA).astype(np.uint8)
     keypoints, descriptors = extractor.extract_from_uint8_array(gray)
@@ -181,22 +162,13 @@ def _extract(pycolmap: ModuleType, image: np.ndarray, settings: TriangulationSet
     return Features(pixels, vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
 
 
-def _matched_pairs(
-    features: Sequence[Features], cameras: Sequence[Camera], settings: TriangulationSettings
-) -> dict[tuple[int, int], np.ndarray]:
+def _matched_pairs(features: Sequence[Features], cameras: Sequence[Camera]) -> dict[tuple[int, int], np.ndarray]:
     """Matches [M, 2] of every pair of images that has any."""
     pairs = {}
     for i, j in itertools.combinations(range(len(cameras)), 2):
         if not same_spot(cameras[i], cameras[j]):
             fundamental = fundamental_matrix(cameras[i], cameras[j])
-            pairs[i, j] = epipolar_matches(
-                features[i],
-                features[j],
-                fundamental,
-                settings.max_ratio,
-                settings.max_angle,
-                settings.epipolar_error,
-            )
+            pairs[i, j] = epipolar_matches(features[i], features[j], fundamental, EPIPOLAR_ERROR)
     return {pair: matches for pair, matches in pairs.items() if len(matches)}
 
 
@@ -206,7 +178,6 @@ def _triangulated(
     cameras: Sequence[Camera],
     features: Sequence[Features],
     pairs: dict[tuple[int, int], np.ndarray],
-    settings: TriangulationSettings,
 ) -> Any:
     """The pycolmap.Reconstruction with points; image i has the id i + 1."""
     model = _posed_model(pycolmap, cameras)
@@ -216,8 +187,8 @@ def _triangulated(
     options.min_num_matches = 1
     options.random_seed = options.triangulation.random_seed = 0
     options.triangulation.ignore_two_view_tracks = False  # the default leaves a pair of cameras without a single point
-    options.triangulation.min_angle = options.mapper.filter_min_tri_angle = settings.min_angle
-    options.mapper.filter_max_reproj_error = settings.reprojection_error
+    options.triangulation.min_angle = options.mapper.filter_min_tri_angle = MIN_ANGLE
+    options.mapper.filter_max_reproj_error = REPROJECTION_ERROR
     (folder / "model").mkdir()
     return pycolmap.triangulate_points(model, folder / "database.db", folder, folder / "model", options=options)
 

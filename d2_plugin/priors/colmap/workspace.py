@@ -74,12 +74,12 @@ class WorkspaceDepth:
     ) -> WorkspaceDepth | None:
         """The first place below `root` that has depth maps, or None.
 
-        Where it was not asked for, it must serve the first frame and the last.
+        Where the settings do not name it, it must serve the first frame and the last.
         """
         for place in [settings.folder] if settings.folder else PLACES:
             source = cls(root, place, settings, cameras, frames)
-            asked = settings.matcher == cls.name and any(source.has_maps(frame) for frame in frames)
-            if asked or all(source.serves(frame) for frame in (frames[0], frames[-1])):
+            chosen = settings.matcher == cls.name and any(source.has_maps(frame) for frame in frames)
+            if chosen or all(source.serves(frame) for frame in (frames[0], frames[-1])):
                 return source
         return None
 
@@ -135,11 +135,11 @@ class WorkspaceDepth:
 
     def _compare_poses(self, folder: Path, frame: int) -> None:
         """The scale of a workspace's world, once its cameras are known to be ours."""
-        found = {camera.name: self._image(camera.name, frame) for camera in self.cameras}
-        poses = {name: image.T_camera_world for name, image in found.items() if image is not None}
+        images = {camera.name: self._image(camera.name, frame) for camera in self.cameras}
+        poses = {name: image.T_camera_world for name, image in images.items() if image is not None}
         if not poses:
             raise D2Error(
-                f"the workspace {folder} has no image of {', '.join(found)} at frame {frame}: name images "
+                f"the workspace {folder} has no image of {', '.join(images)} at frame {frame}: name images "
                 "CAMERA/FRAME.png, or CAMERA.png where the folder is of one frame, or set matcher = patchmatch"
             )
         self._scale = scale_of_world([camera for camera in self.cameras if camera.name in poses], poses, folder)
@@ -153,8 +153,8 @@ class WorkspaceDepth:
 
     def _image(self, camera: str, frame: int) -> ColmapImage | None:
         """The image of one camera and frame, or of one camera where the workspace is of one instant."""
-        found = self._images.get((camera, frame))
-        return self._images.get((camera, None)) if found is None and self.one_instant else found
+        image = self._images.get((camera, frame))
+        return self._images.get((camera, None)) if image is None and self.one_instant else image
 
     def _map(self, folder: Path, name: str) -> Path | None:
         paths = (folder / "stereo" / "depth_maps" / f"{name}.{kind}.bin" for kind in self.kinds)
@@ -177,7 +177,7 @@ def _by_camera_and_frame(
 
     CAMERA/FRAME.png, CAMERA_FRAME.png (with letters before the number, if any) and CAMERA.png are understood.
     """
-    found: dict[tuple[str, int | None], ColmapImage] = {}
+    ours: dict[tuple[str, int | None], ColmapImage] = {}
     strangers = []
     patterns = {camera: re.compile(rf"{re.escape(camera)}(?:[/_]\D*(\d+))?") for camera in cameras}
     for image in model.images.values():
@@ -186,8 +186,8 @@ def _by_camera_and_frame(
         if not matches:
             strangers.append(image.name)
         for camera, match in matches.items():
-            found[camera, None if match[1] is None else int(match[1])] = image
-    return found, sorted(strangers)
+            ours[camera, None if match[1] is None else int(match[1])] = image
+    return ours, sorted(strangers)
 
 
 def seen_by(camera: Camera, depth: np.ndarray, K: np.ndarray) -> np.ndarray:

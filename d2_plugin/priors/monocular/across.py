@@ -1,18 +1,14 @@
-"""Slopes of maps whose anchors cannot tell them, from what two cameras' maps must share; an addition to the paper.
+"""Slopes of maps whose anchors leave them open, from what two cameras' maps must share; an addition to the paper.
 
 Where cameras stand far apart stereo may know one tree and nothing else. Such anchors fix the depth at one value of the
 map and leave the slope of its line open: drawn on to the rest of the image it may be wrong by any factor. But the
 ground and the walls that two maps show are one surface, and with the wrong slopes they part. So the slopes are those
-with which most pixels of one map, seen by the other camera, lie where its map says:
+with which most pixels of one map, seen by the other camera, lie where its map has them:
 
     maximise over the slopes   sum of exp(-r^2 / 2 s^2),   r = log(depth of the pixel there / the other map's),
 
 over even samples of every two maps, both ways. Each line passes through the medians of its anchors, so there is one
 unknown a map. The sum has other maxima, so slopes are tried on a grid, two maps at a time where none is known.
-
-Measured at six frames of plaza, two cameras 64 degrees apart, whose stereo knew 1.7 % of the pixels, nearly all of them
-far: median error of one camera's maps 1.4 to 1.8 at five of them and .11 at one, all maps of the other refused; with
-this .06 to .10 for both.
 """
 
 from __future__ import annotations
@@ -26,15 +22,14 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.priors.geometry import view_pair
-from d2_plugin.priors.monocular.align import Alignment, AlignStatus, predicted
-from d2_plugin.priors.monocular.native.order import quantile
-from d2_plugin.priors.monocular.settings import AlignSettings
+from d2_plugin.priors.monocular.align import INLIER_ERROR, SEED, Alignment, AlignStatus, predicted
+from d2_plugin.priors.monocular.order import quantile
 from d2_plugin.recordings.recording import Camera, MonoKind
 
 SPAN = 0.15
-"""Anchors whose values span a smaller share of the map's cannot tell its slope."""
+"""Anchors whose values span a smaller share of the map's leave its slope open."""
 RANGE, MOST = (0.02, 0.98), (0.1, 0.9)
-"""Quantiles between which a map's values span, and those of anchors: a handful on a passer-by cannot tell a slope."""
+"""Quantiles between which a map's values span, and those of anchors: a handful on a passer-by leave a slope open."""
 SLOPES = np.geomspace(0.03, 3, 28)
 """What is tried, in units of the slope with which the smallest values of the map lie infinitely far (of an inverse
 map), or that of a line through the origin (of a depth map)."""
@@ -43,7 +38,7 @@ FINER = 9
 LEAST_REACH = 0.05
 """Anchors nearer than this to the smallest values of an inverse map, as a share of its span, count as so far off."""
 SAMPLES = 5000
-"""Pixels of each map that are asked."""
+"""Pixels of each map that are compared."""
 SPREAD = 0.07
 """s: how far two maps that belong to their images differ, in log depth."""
 MATCHED = 0.35
@@ -67,32 +62,35 @@ class Shown(NamedTuple):
     """What these two alone give."""
 
 
-def aligned_across(views: Mapping[str, Shown], kind: MonoKind, settings: AlignSettings) -> dict[str, Alignment]:
-    """The alignments of the views whose anchors cannot tell a slope, by name; without those that nothing tells.
+def aligned_across(views: Mapping[str, Shown], kind: MonoKind) -> dict[str, Alignment]:
+    """The alignments of the views whose anchors leave the slope open, by name; without those whose slope stays unknown.
 
     Where there are such views, the others come too, with their own lines and how far their maps part from these.
 
     Args:
         views: synchronized views. Those with well spread anchors keep their lines and help the others.
         kind: what the maps are.
-        settings: of the alignment.
     """
     wanted = [name for name, view in views.items() if is_open(view)]
     if not wanted:
         return {}
     maps = {
-        name: _Map.of(view, kind, name in wanted, settings.seed)
+        name: _Map.of(view, kind, name in wanted)
         for name, view in views.items()
         if name in wanted or view.alignment.accepted
     }
     while wanted and len(maps) > 1:
         lines = _fitted(maps, wanted)
-        told = {name: _told(name, maps, lines) for name in maps}
-        worst = min(wanted, key=lambda name: told[name].matched)
-        if told[worst].matched >= MATCHED:
-            sure = [name for name in maps if told[name].matched >= MATCHED]
-            found = {name: replace(views[name].alignment, across=told[name].spread) for name in sure}
-            return found | {name: _through(found[name], views[name], lines[name], kind, settings) for name in wanted}
+        fits = {name: _agreement(name, maps, lines) for name in maps}
+        worst = min(wanted, key=lambda name: fits[name].matched)
+        if fits[worst].matched >= MATCHED:
+            alignments = {
+                name: replace(views[name].alignment, across=fit.spread)
+                for name, fit in fits.items()
+                if fit.matched >= MATCHED
+            }
+            shared = {name: _through(alignments[name], views[name], lines[name], kind) for name in wanted}
+            return alignments | shared
         wanted.remove(worst)
         del maps[worst]
     return {}
@@ -138,16 +136,16 @@ class _Map:
     known: _Line
 
     @classmethod
-    def of(cls, view: Shown, kind: MonoKind, unknown: bool, seed: int) -> _Map:
-        told, inverse = predicted(view.mono), kind == "relative"
-        anchors = told & (view.geometric > 0)
+    def of(cls, view: Shown, kind: MonoKind, unknown: bool) -> _Map:
+        known, inverse = predicted(view.mono), kind == "relative"
+        anchors = known & (view.geometric > 0)
         target = view.geometric[anchors].astype(np.float64)
         x, y = (float(np.median(v)) if v.size else 0.0 for v in (view.mono[anchors], 1 / target if inverse else target))
-        rows, columns = np.nonzero(told)
-        chosen = np.random.default_rng(seed).integers(0, len(rows), SAMPLES)
+        rows, columns = np.nonzero(known)
+        chosen = np.random.default_rng(SEED).integers(0, len(rows), SAMPLES)
         reach = x
         if inverse:
-            low, high = np.quantile(view.mono[told], RANGE)
+            low, high = np.quantile(view.mono[known], RANGE)
             reach = max(x - low, LEAST_REACH * (high - low))
         unit = y / reach if unknown and reach > 0 else 0.0
         line = _Line(view.alignment.scale, view.alignment.shift)
@@ -168,7 +166,7 @@ class _Map:
 
 def _fitted(maps: Mapping[str, _Map], wanted: Sequence[str]) -> dict[str, _Line]:
     """The lines of all maps: those of `wanted` one after another, the surest first, then each once more and finer."""
-    lines = {name: found.known for name, found in maps.items() if name not in wanted}
+    lines = {name: map_.known for name, map_ in maps.items() if name not in wanted}
     slopes: dict[str, float] = {}
     if not lines:
         slopes = _first_two(maps, wanted)
@@ -188,7 +186,7 @@ def _fitted(maps: Mapping[str, _Map], wanted: Sequence[str]) -> dict[str, _Line]
 
 
 def _first_two(maps: Mapping[str, _Map], wanted: Sequence[str]) -> dict[str, float]:
-    """The slopes of the two maps that tell each other most."""
+    """The slopes of the two maps that fit each other best."""
     best, slopes = -1.0, {}
     for one, other in combinations(wanted, 2):
         tried = [[maps[name].line(slope) for slope in SLOPES] for name in (one, other)]
@@ -209,16 +207,16 @@ def _scores(name: str, slopes: np.ndarray, maps: Mapping[str, _Map], lines: Mapp
     return total
 
 
-class _Told(NamedTuple):
-    """What a map and the others, as far as they see each other, say of their lines."""
+class _Agreement(NamedTuple):
+    """How well a map fits the others where they overlap."""
 
     matched: float
     """Mean of exp(-r^2 / 2 s^2); 0 where they see too little of each other."""
     spread: float
-    """Standard deviation of either map, as the median size of r tells, to which both add."""
+    """Standard deviation of either map: the median of |r|, to which both add, over that of a normal error."""
 
 
-def _told(name: str, maps: Mapping[str, _Map], lines: Mapping[str, _Line]) -> _Told:
+def _agreement(name: str, maps: Mapping[str, _Map], lines: Mapping[str, _Line]) -> _Agreement:
     apart = np.concatenate(
         [
             _apart(maps[one], maps[two], lines[one], [lines[two]])[0]
@@ -228,9 +226,9 @@ def _told(name: str, maps: Mapping[str, _Map], lines: Mapping[str, _Line]) -> _T
         ]
     )
     if len(apart) < SEEN * SAMPLES:
-        return _Told(0.0, np.inf)
+        return _Agreement(0.0, np.inf)
     spread = float(np.median(np.nan_to_num(np.abs(apart), nan=np.inf))) / NormalDist().inv_cdf(0.75) / np.sqrt(2)
-    return _Told(float(_match(apart).mean()), spread)
+    return _Agreement(float(_match(apart).mean()), spread)
 
 
 def _matches(ours: _Map, theirs: _Map, our_lines: Sequence[_Line], their_lines: Sequence[_Line]) -> np.ndarray:
@@ -250,11 +248,11 @@ def _apart(ours: _Map, theirs: _Map, line: _Line, their_lines: Sequence[_Line]) 
     at = pair.project(columns, rows, np.nan_to_num(depth, nan=-1.0))
     inside = (depth > 0) & (at.z > 0) & (at.x > -0.5) & (at.x < width - 0.5) & (at.y > -0.5) & (at.y < height - 0.5)
     there = theirs.values[np.rint(at.y[inside]).astype(np.int64), np.rint(at.x[inside]).astype(np.int64)]
-    told = predicted(there)
-    return np.log(at.z[inside][told] / theirs.depth(there[told].astype(np.float64), their_lines))
+    known = predicted(there)
+    return np.log(at.z[inside][known] / theirs.depth(there[known].astype(np.float64), their_lines))
 
 
-def _through(alignment: Alignment, view: Shown, line: _Line, kind: MonoKind, settings: AlignSettings) -> Alignment:
+def _through(alignment: Alignment, view: Shown, line: _Line, kind: MonoKind) -> Alignment:
     """The view's own fit with another line."""
     anchors = predicted(view.mono) & (view.geometric > 0)
     turned = line.scale * view.mono[anchors].astype(np.float64) + line.shift
@@ -264,5 +262,5 @@ def _through(alignment: Alignment, view: Shown, line: _Line, kind: MonoKind, set
         status=AlignStatus.ACROSS,
         scale=line.scale,
         shift=line.shift,
-        inliers=float(np.mean(np.abs(depth / view.geometric[anchors] - 1) < settings.inlier_error)),
+        inliers=float(np.mean(np.abs(depth / view.geometric[anchors] - 1) < INLIER_ERROR)),
     )

@@ -16,13 +16,13 @@ and u = rho'(r), projected onto the equalities, makes this bound tight at the op
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.priors.monocular.native.order import median
-from d2_plugin.priors.monocular.native.points import Points, Sums, dot
+from d2_plugin.priors.monocular.order import median
 
 BLENDS = (0.0, 0.01, 0.1, 0.5, 1.0)
 """Shares of IRLS curvature tried in turn; at 1 the model majorises F, so a step of it always descends."""
@@ -144,6 +144,40 @@ class _Units:
         return cls(x_centre, max(x_spread, tiny), y_centre, y_spread, weight, weights / weight)
 
 
+Step = tuple[float, float]
+"""Along a and along b."""
+Normal = tuple[float, float, float]
+"""A 2x2 matrix sum c (p, q)(p, q)^T as its entries aa, ab, bb."""
+
+
+class Sums(NamedTuple):
+    """What one pass over the points gives at some a and b, with r the residual and u = rho'(r)."""
+
+    value: float
+    """sum rho(r)."""
+    slope: Step
+    """Its gradient."""
+    irls: Normal
+    """c = 1 / sqrt(r^2 + eps^2)."""
+    newton: Normal
+    """c = rho''(r)."""
+    room: Normal
+    """c = 1 - u^2."""
+    spread: Normal
+    """c = u^2."""
+
+
+class Dual(NamedTuple):
+    """Of u that was moved by its room times a step and divided by `shrink`."""
+
+    largest: float
+    """Its largest size before the division."""
+    product: float
+    """Sum of it times t."""
+    conjugate: float
+    """sum (1 - sqrt(1 - u^2))."""
+
+
 class _State(NamedTuple):
     a: float
     b: float
@@ -153,10 +187,63 @@ class _State(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem(Points):
-    """min over a >= scale_min, b of sum rho(a p + b q - t): the same problem in normalised units."""
+class _Problem:
+    """min over a >= scale_min, b of sum rho(a p + b q - t): the same problem in normalised units.
 
+    `p`, `q`, `t` are float64 [n].
+    """
+
+    p: np.ndarray
+    q: np.ndarray
+    t: np.ndarray
+    epsilon: float
     scale_min: float
+
+    def residual(self, a: float, b: float) -> np.ndarray:
+        return a * self.p + b * self.q - self.t
+
+    def root(self, r: np.ndarray) -> np.ndarray:
+        """sqrt(r^2 + eps^2); in normalised units |r| <= n, so that the squares need no care."""
+        return np.sqrt(r * r + self.epsilon * self.epsilon)
+
+    def sums(self, a: float, b: float) -> Sums:
+        """All that a step from (a, b) needs."""
+        r = self.residual(a, b)
+        inverse_root = 1 / self.root(r)
+        u, sharp = r * inverse_root, self.epsilon * inverse_root
+        curvatures = inverse_root, inverse_root * sharp**2, 1 - u * u, u * u
+        slope = dot(self.p, u), dot(self.q, u)
+        return Sums(dot(r, u / (1 + sharp)), slope, *(self.normal(curvature) for curvature in curvatures))
+
+    def duals(self, a: float, b: float, steps: tuple[Step, Step], shrink: tuple[float, float]) -> tuple[Dual, Dual]:
+        """What u at (a, b) gives when it is moved.
+
+        Args:
+            a, b: where u is.
+            steps: in units of p and of q; the first is times 1 - u^2, the second times 1.
+            shrink: what the result is divided by.
+        """
+        r = self.residual(a, b)
+        u = r * (1 / self.root(r))
+
+        def moved(room: np.ndarray, step: Step, by: float) -> Dual:
+            given = u - room * (step[0] * self.p + step[1] * self.q)
+            feasible = given / by
+            square = np.minimum(feasible * feasible, 1.0)
+            conjugate = float((square / (1 + np.sqrt(1 - square))).sum())
+            return Dual(float(np.abs(given).max()), dot(feasible, self.t), conjugate)
+
+        return moved(1 - u * u, steps[0], shrink[0]), moved(np.ones_like(u), steps[1], shrink[1])
+
+    def normal(self, curvature: np.ndarray) -> Normal:
+        """The matrix of `curvature` [n]."""
+        cp = curvature * self.p
+        return dot(cp, self.p), dot(cp, self.q), dot(curvature * self.q, self.q)
+
+    @functools.cached_property
+    def plain(self) -> Normal:
+        """c = 1."""
+        return dot(self.p, self.p), dot(self.p, self.q), dot(self.q, self.q)
 
     def median_shift(self) -> float:
         return median(self.t / self.q)
@@ -265,3 +352,8 @@ def _solve_2x2(h_aa: float, h_ab: float, h_bb: float, g_a: float, g_b: float) ->
     if not determinant > SINGULAR * h_aa * h_bb:
         return None
     return (h_bb * g_a - h_ab * g_b) / determinant, (h_aa * g_b - h_ab * g_a) / determinant
+
+
+def dot(a: np.ndarray, b: np.ndarray) -> float:
+    """Inner product on one core: BLAS splits vectors of this length over threads that wait for each other."""
+    return float(np.einsum("i,i->", a, b))

@@ -2,9 +2,6 @@
 
 The paper fits a D^m + b to D^g. A relative model (Depth Anything V2) however returns affine-invariant *inverse* depth,
 so its map is fitted to 1 / D^g. A metric model is fitted to D^g as the paper writes it.
-
-Measured: the median error of an aligned relative map is .257 where it was fitted to depth, .0085 where it was fitted to
-inverse depth.
 """
 
 from __future__ import annotations
@@ -17,14 +14,29 @@ import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.monocular.affine import AffineFit, fit_affine
-from d2_plugin.priors.monocular.leverage import near_best_line
-from d2_plugin.priors.monocular.native import library, pixels
-from d2_plugin.priors.monocular.native.order import median, quantile
+from d2_plugin.priors.monocular.order import median, quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
 
 KINDS: tuple[MonoKind, ...] = get_args(MonoKind)
-RANKED = 4000  # anchors whose ranks are compared: its standard error is .016, and sorting stays below a millisecond
+RANKED = 4000
+"""Anchors whose ranks are compared: the standard error is .016, and sorting stays below a millisecond."""
+MAX_ANCHORS = 20_000
+"""More anchors than this are subsampled."""
+MIN_SPREAD = 1e-3
+"""Geometric depths whose 5..95 percentile range is below this share of their median are refused."""
+MAX_GAP = 1e-8
+"""Relative duality gap above which a fit is refused."""
+MIN_T = 10.0
+"""Scale over its standard error below which a fit needs `MIN_CORRELATION`."""
+MIN_CORRELATION = 0.5
+"""Rank correlation that speaks for a scale whose standard error does not."""
+WRONG_KIND = -0.3
+"""Rank correlation of the map with what it is declared to be, below which the declared kind is contradicted."""
+INLIER_ERROR = 0.1
+"""Relative discrepancy e below which an anchor counts as an inlier of the fit."""
+SEED = 0
+"""Of the subsampling of anchors."""
 
 
 class AlignStatus(StrEnum):
@@ -49,9 +61,8 @@ class Alignment:
     """a, b of the paper for one frame and view, with the certificate and the evidence for accepting it.
 
     `domain` of a and b follows `kind`: relative maps give inverse depth a m + b, metric ones depth a m + b.
-    `gap` bounds (F - F*) / F; `inliers` is the share of all anchors with discrepancy e below `inlier_error`; `t` is the
-    scale over its standard error (with the leverage guard, see `leverage`); `rank_correlation` that of the map with
-    1 / D^g (relative) or D^g (metric).
+    `gap` bounds (F - F*) / F; `inliers` is the share of all anchors with discrepancy e below `INLIER_ERROR`; `t` is the
+    scale over its standard error; `rank_correlation` that of the map with 1 / D^g (relative) or D^g (metric).
     """
 
     status: AlignStatus
@@ -67,7 +78,7 @@ class Alignment:
     t: float = 0.0
     rank_correlation: float = 0.0
     across: float = float("nan")
-    """Relative standard deviation of the map as other cameras' maps tell it, where they were asked (`across`)."""
+    """Relative standard deviation of the map from its difference to other cameras' maps (`across`); else NaN."""
 
     @property
     def accepted(self) -> bool:
@@ -87,31 +98,32 @@ def align(mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: 
         mono: D^m float [H, W]: inverse depth up to scale and shift (`relative`), or depth (`metric`).
         geometric: D^g float [H, W], planar depth, 0 or NaN where unknown.
         kind: what `mono` is.
-        settings: residual, smoothing and acceptance rules.
+        settings: residual, smoothing and when a fit is refused.
 
     Raises:
         D2Error: maps of two sizes, or an unknown kind.
     """
     _check(mono, geometric, kind)
-    found = _fitted(mono, geometric, kind, settings)
-    if isinstance(found, Alignment):
-        return found
-    x, depth, target, fit = found.x, found.depth, found.target, found.fit
+    fitted = _fitted(mono, geometric, kind, settings)
+    if isinstance(fitted, Alignment):
+        return fitted
+    x, depth, target, fit = fitted.x, fitted.depth, fitted.target, fitted.fit
+    t = fit.scale / max(fit.scale_error, np.finfo(float).tiny)
     error = np.abs(_depth(x, fit.scale, fit.shift, kind, np.inf) - depth) / depth
-    inliers = float((error < settings.inlier_error).mean())
+    inliers = float((error < INLIER_ERROR).mean())
     correlation = rank_correlation(x[:: max(1, x.size // RANKED)], target[:: max(1, x.size // RANKED)])
     return Alignment(
-        status=_judge(fit, correlation, found.t, inliers, settings),
+        status=_judge(fit, correlation, t, inliers, settings),
         kind=kind,
         scale=fit.scale,
         shift=fit.shift,
-        anchors=found.anchors,
+        anchors=fitted.anchors,
         gap=fit.gap,
         iterations=fit.iterations,
         objective=fit.objective,
-        epsilon=found.epsilon,
+        epsilon=fitted.epsilon,
         inliers=inliers,
-        t=float(min(found.t, 1e12)),
+        t=float(min(t, 1e12)),
         rank_correlation=correlation,
     )
 
@@ -119,10 +131,11 @@ def align(mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: 
 def unjudged_line(
     mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: AlignSettings
 ) -> tuple[float, float]:
-    """Scale and shift that `align` finds, without the tests that tell whether they may be used; NaN without a line."""
+    """Scale and shift of `align` without the tests of whether they may be used; NaN without a line."""
     _check(mono, geometric, kind)
-    found = _fitted(mono, geometric, kind, settings)
-    return (found.scale, found.shift) if isinstance(found, Alignment) else (found.fit.scale, found.fit.shift)
+    fitted = _fitted(mono, geometric, kind, settings)
+    line = fitted if isinstance(fitted, Alignment) else fitted.fit
+    return line.scale, line.shift
 
 
 def not_aligned(kind: MonoKind) -> Alignment:
@@ -139,20 +152,14 @@ def aligned_depth(mono: np.ndarray, alignment: Alignment, z_far: float) -> np.nd
     """
     if not alignment.accepted:
         return np.zeros(mono.shape, np.float32)
-    line = alignment.scale, alignment.shift
-    if library.library() is not None and mono.dtype == np.float32:
-        relative = alignment.kind == "relative"
-        return pixels.aligned_depth(mono, *line, _nearest(z_far) if relative else z_far, relative)
-    return _depth(mono.astype(np.float64), *line, alignment.kind, z_far).astype(np.float32)
+    return _depth(mono.astype(np.float64), alignment.scale, alignment.shift, alignment.kind, z_far).astype(np.float32)
 
 
 def aligned_inverse(mono: np.ndarray, alignment: Alignment) -> np.ndarray:
     """Aligned inverse depth float64 [H, W], also where it is no depth: 0 and below is infinitely far, NaN is unknown.
 
-    The zero of a saturated ReLU says "farther than I can tell" and is taken at its word.
+    The zero of a saturated ReLU means "farther than can be predicted" and is taken as infinitely far.
     """
-    if library.library() is not None and mono.dtype == np.float32:
-        return pixels.aligned_inverse(mono, alignment.scale, alignment.shift, alignment.kind == "relative")
     value = alignment.scale * mono.astype(np.float64) + alignment.shift
     if alignment.kind == "metric":
         with np.errstate(divide="ignore"):
@@ -161,7 +168,7 @@ def aligned_inverse(mono: np.ndarray, alignment: Alignment) -> np.ndarray:
 
 
 def inverse_at_least(mono: np.ndarray, alignment: Alignment) -> float:
-    """What no number of `aligned_inverse` lies below, from the ends of the map [H, W]; NaN where that tells nothing."""
+    """What no number of `aligned_inverse` lies below, from the ends of the map [H, W]; NaN where that gives none."""
     low, high = float(np.fmin.reduce(mono, axis=None)), float(np.fmax.reduce(mono, axis=None))
     ends = [low, high, 0.0] if low <= 0 <= high else [low, high]
     return float(np.fmin.reduce(aligned_inverse(np.array(ends), alignment)))
@@ -170,7 +177,7 @@ def inverse_at_least(mono: np.ndarray, alignment: Alignment) -> float:
 def predicted(mono: np.ndarray) -> np.ndarray:
     """Pixels at which the network said something, bool: finite, and not the zero of a saturated ReLU.
 
-    Depth Anything V2 ends in a ReLU. Its exact zeros say "farther than I can tell", which is no value to fit a line to.
+    Depth Anything V2 ends in a ReLU. Its exact zeros mean "farther than can be predicted", which is no value to fit.
     """
     return np.isfinite(mono) & (mono != 0)
 
@@ -211,7 +218,6 @@ class _Fitted(NamedTuple):
     target: np.ndarray
     fit: AffineFit
     epsilon: float
-    t: float
 
 
 def _fitted(mono: np.ndarray, geometric: np.ndarray, kind: MonoKind, settings: AlignSettings) -> _Fitted | Alignment:
@@ -222,28 +228,21 @@ def _fitted(mono: np.ndarray, geometric: np.ndarray, kind: MonoKind, settings: A
         return Alignment(AlignStatus.EMPTY, kind)
     if count < settings.min_anchors:
         return Alignment(AlignStatus.TOO_FEW, kind, anchors=count)
-    rows = anchors[_subsample(count, settings.max_anchors, settings.seed)]
+    rows = anchors[_subsample(count)]
     x, depth = (values.ravel()[rows].astype(np.float64) for values in (mono, geometric))
     if _central_range(x) <= 1e-6 * np.abs(x).max():
         return Alignment(AlignStatus.FLAT, kind, anchors=count)
-    if _central_range(depth) <= settings.min_spread * median(depth):
+    if _central_range(depth) <= MIN_SPREAD * median(depth):
         return Alignment(AlignStatus.ONE_DEPTH, kind, anchors=count)
     target = 1 / depth if kind == "relative" else depth
     return _Fitted(count, x, depth, target, *_fit(x, target, settings))
 
 
-def _fit(x: np.ndarray, target: np.ndarray, settings: AlignSettings) -> tuple[AffineFit, float, float]:
-    """The line, the smoothing it was fitted with, and how sure it is that there is one."""
+def _fit(x: np.ndarray, target: np.ndarray, settings: AlignSettings) -> tuple[AffineFit, float]:
+    """The line, and the smoothing it was fitted with."""
     relative = settings.residual == "relative"
-    selection = None
-    if settings.leverage_guard:
-        weights = 1 / target if relative else np.ones_like(target)
-        selection = near_best_line(x, target, weights, settings.min_inliers, settings.seed)
-        x, target = x[selection.keep], target[selection.keep]
     epsilon = settings.epsilon if relative else settings.epsilon * float(np.median(target))
-    fit = fit_affine(x, target, 1 / target if relative else None, epsilon=epsilon)
-    t = fit.scale / max(fit.scale_error, np.finfo(float).tiny) if selection is None else selection.t
-    return fit, epsilon, t
+    return fit_affine(x, target, 1 / target if relative else None, epsilon=epsilon), epsilon
 
 
 def _nearest(z_far: float) -> float:
@@ -252,25 +251,25 @@ def _nearest(z_far: float) -> float:
 
 
 def _judge(fit: AffineFit, correlation: float, t: float, inliers: float, settings: AlignSettings) -> AlignStatus:
-    if correlation < settings.wrong_kind_correlation:
+    if correlation < WRONG_KIND:
         return AlignStatus.WRONG_KIND
     if fit.flat or fit.boundary:
         return AlignStatus.FLAT if fit.flat else AlignStatus.BOUNDARY
-    if not fit.gap <= settings.max_gap:
+    if not fit.gap <= MAX_GAP:
         return AlignStatus.NOT_CERTIFIED
-    if t < settings.min_t and correlation < settings.min_correlation:
+    if t < MIN_T and correlation < MIN_CORRELATION:
         return AlignStatus.UNSTABLE
     if inliers < settings.min_inliers:
         return AlignStatus.FEW_INLIERS
     return AlignStatus.OK
 
 
-def _subsample(count: int, limit: int, seed: int) -> np.ndarray | slice:
-    """One row from each of `limit` equal strata: even over the image, without the aliasing of a fixed stride."""
-    if count <= limit:
+def _subsample(count: int) -> np.ndarray | slice:
+    """One row from each of `MAX_ANCHORS` equal strata: even over the image, without the aliasing of a fixed stride."""
+    if count <= MAX_ANCHORS:
         return slice(None)
-    jitter = np.random.default_rng(seed).random(limit)
-    return np.minimum(((np.arange(limit) + jitter) * (count / limit)).astype(np.int64), count - 1)
+    jitter = np.random.default_rng(SEED).random(MAX_ANCHORS)
+    return np.minimum(((np.arange(MAX_ANCHORS) + jitter) * (count / MAX_ANCHORS)).astype(np.int64), count - 1)
 
 
 def _central_range(values: np.ndarray) -> float:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.monocular.native.order import median
+from d2_plugin.priors.monocular.order import median
 
 FLOOR, DISTANCE, GAP, EDGE, WIDE_EDGE, BEYOND = 0.051, 1.19, 0.79, 2.76, 0.16, 0.086
 """f0 and fd (of d itself) to fr; fitted once to the true errors of studio, plaza and a rendered room together."""
@@ -20,12 +20,12 @@ EVER = 1e3
 
 @dataclass(frozen=True, eq=False)
 class ErrorShape:
-    """Squares of the terms of the shape [H, W] float32, or of its pixels that were asked for [n]."""
+    """Squares of the terms of the shape [H, W] float32, or of some of its pixels [n]."""
 
     distance: np.ndarray
     gap: np.ndarray
     own: tuple[np.ndarray, ...]
-    """Those that do not ask how far the next anchor is: edges, and what lies beyond the median anchor."""
+    """Those that do not depend on the next anchor: edges, and what lies beyond the median anchor."""
     next_distance: np.ndarray
     """What `distance` is, [1], where the pixel's own anchor was left out."""
 
@@ -36,10 +36,10 @@ class ErrorShape:
         Args:
             depth: the corrected map [H, W].
             anchors: D^g [H, W], 0 where there is none.
-            at: flat indices [n] of the pixels that are asked for; all where None.
+            at: flat indices [n] of some pixels; all where None.
         """
 
-        def asked(values: np.ndarray) -> np.ndarray:
+        def chosen(values: np.ndarray) -> np.ndarray:
             return values if at is None else values.ravel()[at]
 
         cv2: Any = opencv("the uncertainty of monocular depth")
@@ -52,17 +52,17 @@ class ErrorShape:
         )
         by_label = np.zeros(int(label.max()) + 1, np.float32)
         by_label[label[known]] = log_anchors
-        gap = np.abs(asked(log_depth) - by_label[asked(label)])
-        beyond = np.maximum(asked(log_depth) - np.float32(median(log_anchors)), 0)
+        gap = np.abs(chosen(log_depth) - by_label[chosen(label)])
+        beyond = np.maximum(chosen(log_depth) - np.float32(median(log_anchors)), 0)
         nowhere_above = np.where(predicted, log_depth, np.float32(-EVER))
         nowhere_below = np.where(predicted, log_depth, np.float32(EVER))
         edge, wide_edge = (
-            _span(*(asked(far) for far in _farthest(cv2, nowhere_above, nowhere_below, share * width)))
+            _span(*(chosen(far) for far in _farthest(cv2, nowhere_above, nowhere_below, share * width)))
             for share in (0.005, 0.02)
         )
         own = (EDGE * np.minimum(edge, 0.7)) ** 2, (WIDE_EDGE * np.minimum(wide_edge, 1)) ** 2, (BEYOND * beyond) ** 2
         next_distance = np.full(1, NEXT * width, np.float32)
-        squares = (DISTANCE**2 * np.minimum(far / width, 0.3) for far in (asked(distance), next_distance))
+        squares = (DISTANCE**2 * np.minimum(far / width, 0.3) for far in (chosen(distance), next_distance))
         return cls(next(squares), (GAP * np.minimum(gap, 0.6)) ** 2, own, next(squares))
 
     def usual(self) -> np.ndarray:

@@ -1,9 +1,9 @@
-"""What a map says beyond the depths that its anchors have: how far the line that aligns it may be off there.
+"""How far the line that aligns a map may be off beyond the depths that its anchors have.
 
 A pair of cameras measures what is near, and the line that its anchors give is drawn on to what is far. Left-out
 regions do not show what that may cost: they lie within the range of depths that the others have. So the line is fitted
-without the nearest and without the farthest third of the anchors, and where those two leave the line of all of them
-says how sure it is.
+without the nearest and without the farthest third of the anchors: how far those two part from the line of all of them
+is its error.
 """
 
 from __future__ import annotations
@@ -11,14 +11,12 @@ from __future__ import annotations
 import numpy as np
 
 from d2_plugin.priors.monocular.align import unjudged_line
-from d2_plugin.priors.monocular.native.order import median, quantile
+from d2_plugin.priors.monocular.order import median, quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
 
 THIRD = 1 / 3
-"""Share of the anchors that are left out, the nearest or the farthest. Measured on plaza with the cameras 03 and 04, of
-whose monocular pixels a third lie beyond the anchors: 53 and 70 % of the errors within sigma and 2 sigma without this,
-62 and 87 % with it and with `EVIDENCE` (1000 before) of `uncertainty`; where anchors span the scene nothing changes."""
+"""Share of the anchors that are left out, the nearest or the farthest."""
 RANGE = (0.02, 0.98)
 """Quantiles of the anchors' depths between which a map does not extrapolate."""
 

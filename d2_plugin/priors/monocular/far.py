@@ -1,6 +1,6 @@
 """Sky and whatever else lies beyond any parallax; an addition to the paper.
 
-No one thing tells a sky. Four together do: the monocular map puts it beyond the farthest depth that stereo measured,
+A sky is where four things come together: the monocular map puts it beyond the farthest depth that stereo measured,
 near the smallest value it has in the image; no stereo depth lies in it; the image is smooth there; and it reaches
 the rim. From pixels where the first holds clearly, the region grows to the outline that blurred maps give to it, as far
 as the colour is that of the sky beside it.
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.monocular.native.order import quantile
+from d2_plugin.priors.monocular.order import quantile
 
 CLEARLY = 0.4
 """Inverse depth, in units of that of the farthest anchors, below which a pixel is clearly beyond."""

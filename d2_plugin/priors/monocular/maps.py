@@ -8,11 +8,11 @@ from typing import Protocol
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.frame import Frame, digest, hash_of
+from d2_plugin.priors.frame import Frame, digest
 from d2_plugin.priors.monocular.network import MonocularModel, upsample
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings.recording import MonoKind, Recording
-from d2_plugin.store.files import EntryFolder
+from d2_plugin.store.files import EntryFolder, hash_of
 
 MONO_VERSION = 1  # raise it when prediction changes what it returns, so that caches are not trusted
 

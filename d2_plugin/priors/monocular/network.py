@@ -36,7 +36,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class NetworkInput:
-    """What the session says about its image input; `height` or `width` is None where the size is free."""
+    """The image input of a session; `height` or `width` is None where the size is free."""
 
     name: str
     height: int | None

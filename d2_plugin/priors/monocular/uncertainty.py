@@ -1,4 +1,4 @@
-"""How wrong a monocular depth may be, told by what leaving regions of anchors out shows.
+"""How wrong a monocular depth may be, measured by leaving regions of anchors out.
 
 The residual at an anchor says nothing: the anchor shaped the map that it is compared with. So regions of anchors are
 left out of the local correction, and the corrected map is held against them. Their errors follow one shape in every
@@ -11,7 +11,7 @@ image to image; that one number, the scale, is measured in each image.
 with d the distance to the nearest anchor (image widths), g = |log(D / D of that anchor)|, e and e' the span of log D
 within 0.5 % and 2 % of the width, r = log(D / median anchor) where it is positive, and S how far the line may be off
 beyond the depths of the anchors (`extrapolation`). A pixel without an anchor is harder than an anchor that was left out
-(no texture, an edge, seen once): K = 1.25; on recordings with truth 1.3 left a room too cautious.
+(no texture, an edge, seen once): K = 1.25.
 
 A map that mostly holds but is far off at some things (a weak network) shows it in the tail of these errors, and the
 things it misses are those without anchors: the 98 % quantile, where it goes beyond the usual, enlarges all its sigma.
@@ -27,12 +27,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d2_plugin.priors.disk.confidence import divided
 from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.maps_on_disk import divided
 from d2_plugin.priors.monocular.correct import corrected_depth, corrected_without
 from d2_plugin.priors.monocular.error_shape import ErrorShape
 from d2_plugin.priors.monocular.extrapolation import extrapolation_error
-from d2_plugin.priors.monocular.native.order import median, quantile
+from d2_plugin.priors.monocular.order import median, quantile
 from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
 
@@ -49,18 +49,15 @@ COMPARED = 3
 SMALLEST, LARGEST = 0.05, 0.6
 """Sides of the regions, image widths; drawn evenly in their logarithm."""
 NIL = 0.8
-"""A map whose errors are larger than a constant one's by this factor adds nothing. Measured: noise .3 to .5, constant
-maps 1, a right map of a narrow pair (where anchors are dense and a constant bends as well) .9 to 2.8, others above."""
+"""A map whose errors are larger than a constant one's by this factor adds nothing."""
 LEAST = 200
 """With fewer left-out anchors in all, the scale is not known."""
 USUAL, EVIDENCE = 0.12, 3000
 """The scale of most maps, and how many anchors (at `WIDTH`) weigh as much: a few that lie together are held from near
-by, and do not make a map surer than usual. Measured on plaza, two views, 400 anchors: scale .03 where .1 is true; 2600
-anchors of another pair there: .065 where .1 is true."""
+by, and do not make a map surer than usual."""
 IN_TAIL, USUAL_TAIL = 0.98, 3.0
 """A quantile far out, and where it lies in maps that belong to their images, in units of the scale (2.33 if errors
-were normal). Measured in these units: 2.3 to 2.9, once 3.4; PyDNet, or the maps of another camera, 5 to 6. There errors
-away from anchors are 2.5 to 6 times what the scale alone declares, and 3 to 6 % of right stereo would be vetoed."""
+were normal)."""
 HOPELESS = 0.5
 """A larger sigma says nothing about depth: it becomes infinite."""
 
@@ -89,7 +86,7 @@ class Skill(NamedTuple):
 
 
 class Uncertainty(NamedTuple):
-    """How wrong a corrected monocular map may be; maps [H, W] float32, infinite where nothing tells."""
+    """How wrong a corrected monocular map may be; maps [H, W] float32, infinite where that is unknown."""
 
     sigma: np.ndarray
     """Relative standard deviation where the map stands alone."""
@@ -127,8 +124,8 @@ def monocular_uncertainty(
     sigma = _enlarged(np.hypot(between, extrapolation_error(small, anchors, kind, settings)), aligned.shape)
     left_out = AT_ANCHORS * skill.tail * skill.scale * divided(shape.left_out(), sure)
     at_anchors = _enlarged(left_out, aligned.shape)
-    told = (aligned > 0) & (sigma < HOPELESS) & (not skill.nil)
-    return Uncertainty(np.where(told, sigma, np.float32(np.inf)), at_anchors, skill)
+    usable = (aligned > 0) & (sigma < HOPELESS) & (not skill.nil)
+    return Uncertainty(np.where(usable, sigma, np.float32(np.inf)), at_anchors, skill)
 
 
 def measured_skill(
@@ -152,7 +149,7 @@ def measured_skill(
     constant = np.full(anchors.shape, median(anchors[anchors > 0]), np.float32)
     flat = corrected_without(constant, anchors, holes[:COMPARED], settings)
     without = [_log_error(depth, anchors, place) for depth, place in zip(flat, places)]
-    compared, alone = (median(np.concatenate(found)) for found in (errors[:COMPARED], without))
+    compared, alone = (median(np.concatenate(each)) for each in (errors[:COMPARED], without))
     all_ratios, error = np.concatenate(ratios), median(np.concatenate(errors))
     scale = _scale(all_ratios, int(np.count_nonzero(anchors)))
     return Skill(scale, error, alone / max(compared, np.finfo(float).tiny), _tail(all_ratios, scale))

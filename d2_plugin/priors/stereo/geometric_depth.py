@@ -13,12 +13,9 @@ from d2_plugin.priors.colmap import mvs
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths
-from d2_plugin.priors.stereo.gpu import kernel as gpu
 from d2_plugin.priors.stereo.patchmatch import patchmatch
-from d2_plugin.priors.stereo.patchmatch_kernel import compiles as patchmatch_compiles
-from d2_plugin.priors.stereo.reuse import MatchMemory, widened
+from d2_plugin.priors.stereo.reuse import MARGIN, MatchMemory, widened
 from d2_plugin.priors.stereo.settings import StereoSettings
-from d2_plugin.priors.stereo.sweep import sweep
 from d2_plugin.recordings.recording import Camera
 
 RawDepth = tuple[np.ndarray, np.ndarray]
@@ -27,12 +24,12 @@ RawDepth = tuple[np.ndarray, np.ndarray]
 Matcher = Callable[..., list[RawDepth]]
 """(grey uint8 [H, W] per camera, cameras, (near, far), settings, wanted) -> raw depth and cost per camera.
 
-`wanted` is None or bool [H, W] per camera: a matcher may leave out all other pixels, and should where that saves time.
+`wanted` is None or bool [H, W] per camera: a matcher may leave out all other pixels.
 """
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601, as every codec of the recordings uses
 
-MATCHERS: dict[str, Matcher] = {"patchmatch": patchmatch, "sweep": sweep, "colmap": mvs.colmap_patch_match}
+MATCHERS: dict[str, Matcher] = {"patchmatch": patchmatch, "colmap": mvs.colmap_patch_match}
 """Matchers by their name in the settings."""
 
 ON_DISK = ("sensor", "workspace")
@@ -73,9 +70,9 @@ def geometric_depth(
     match = MATCHERS[choose_matcher(matcher or settings.matcher)]
     small = [_shrunk(gray(image), camera, settings.max_pixels) for image, camera in zip(images, cameras)]
     grays, small_cameras = [pair[0] for pair in small], [pair[1] for pair in small]
-    wanted = None if memory is None else memory.wanted(grays, settings)
-    asked = None if wanted is None else [widened(mask, settings.reuse_margin) for mask in wanted]
-    raw = match(grays, small_cameras, depth_range, settings, asked)
+    wanted = None if memory is None else memory.wanted(grays)
+    matched = None if wanted is None else [widened(mask, MARGIN) for mask in wanted]
+    raw = match(grays, small_cameras, depth_range, settings, matched)
     if memory is not None:
         raw = memory.merge(grays, raw, wanted)
     filtered = filter_depths(grays, small_cameras, [depth for depth, _ in raw], [cost for _, cost in raw], settings)
@@ -94,9 +91,7 @@ def choose_matcher(name: str) -> str:
         if name not in MATCHERS:
             raise unknown_name("stereo matcher", name, [*MATCHERS, *ON_DISK, "auto"])
         return name
-    if not mvs.why_not_usable():
-        return "colmap"
-    return "patchmatch" if gpu.why_not_usable() is None or patchmatch_compiles() else "sweep"
+    return "patchmatch" if mvs.why_not_usable() else "colmap"
 
 
 def gray(image: np.ndarray) -> np.ndarray:
@@ -137,8 +132,6 @@ def enlarged(result: GeometricDepth, width: int, height: int, tolerance: float =
     return replace(
         result,
         depth=np.where(smooth, depth, 0).astype(np.float32),
-        cost=result.cost[row][:, column],
-        confirmations=result.confirmations[row][:, column],
         sigma=np.where(smooth, result.sigma[row][:, column], np.float32(np.inf)),
     )
 

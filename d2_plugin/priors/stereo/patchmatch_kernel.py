@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from d2_plugin import compiler
-from d2_plugin.compiler.prebuilt import find as find_prebuilt
+from d2_plugin.compiler import load_library
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import index_intrinsics, view_pair
 from d2_plugin.priors.stereo.pyramid import NO_MATCH, LevelView
@@ -28,8 +27,14 @@ HEADERS = [KERNELS / name for name in ("numbers.h", "lanes.h", "planes.h", "matc
 MOST_PIXELS = 2**31 - 1
 """Of all sources together: their places are 32-bit integers."""
 
+CONTRAST = 0.08
+"""Standard deviation of the bilateral weight over grey values in a matching window, in 0..1."""
+CONSENSUS_PASSES = 2
+"""How often each plane is averaged with those of its neighbours that agree with it."""
 CONSENSUS_RADIUS = 3
 """Half the side of the window over which planes are averaged, pixels."""
+CONSENSUS_TOLERANCE = 0.02
+"""Neighbouring planes agree when they pass within this share of the inverse depth."""
 
 
 _float, _int, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_void_p
@@ -42,8 +47,6 @@ class Source(ctypes.Structure):
         *((name, _int) for name in ("width", "height", "first")),
         ("A", _float * 9),
         ("k", _float * 3),
-        ("back_A", _float * 9),
-        ("back_k", _float * 3),
     )
 
 
@@ -54,20 +57,9 @@ class Task(ctypes.Structure):
         ("intrinsics", _float * 4),
         *((name, _int) for name in ("width", "height", "source_count", "rounds", "draw_planes", "explore", "threads")),
         ("seed", ctypes.c_uint32),
-        *((name, _float) for name in ("inverse_far", "inverse_near", "per_gray", "geometric_weight")),
-        *((name, _pointer) for name in ("gray", "wanted", "sources", "quads", "depths", "planes", "costs", "views")),
+        *((name, _float) for name in ("inverse_far", "inverse_near", "per_gray")),
+        *((name, _pointer) for name in ("gray", "wanted", "sources", "quads", "planes", "costs", "views")),
     )
-
-
-def compiles() -> bool:
-    """Whether the CPU kernels came compiled, or there is a compiler for them."""
-    if find_prebuilt("patchmatch", SOURCES, HEADERS, FLAGS) is not None:
-        return True
-    try:
-        compiler.find_compiler()
-    except compiler.NoCompiler:
-        return False
-    return True
 
 
 Arrays = dict[str, np.ndarray]
@@ -80,7 +72,7 @@ class PatchMatchKernel:
     Args:
         sources: per view, the numbers of the views it is matched with; 32 at most, one bit each in the kernel's mask.
         depth_range: near and far in world units.
-        settings: the `patchmatch_*` fields and `seed`.
+        settings: `seed`.
 
     Raises:
         NoCompiler: there is no C++ compiler.
@@ -91,21 +83,12 @@ class PatchMatchKernel:
         self._start()
 
     def _start(self) -> None:
-        self.library = compiler.load_library("patchmatch", SOURCES, HEADERS, FLAGS)
+        self.library = load_library("patchmatch", SOURCES, HEADERS, FLAGS)
 
-    def match(
-        self,
-        views: Sequence[LevelView],
-        index: int,
-        stage: int,
-        rounds: int,
-        explore: bool,
-        depths: Sequence[np.ndarray] | None = None,
-    ) -> None:
+    def match(self, views: Sequence[LevelView], index: int, stage: int, rounds: int, explore: bool) -> None:
         """Improve the planes of one view in place, after drawing them at stage 0; writes its cost.
 
-        `stage` also tells apart the random numbers of calls for the same view. With `depths`, a map per view, planes
-        are asked to agree with them as well.
+        `stage` also seeds the random numbers, so that calls for the same view draw different ones.
         """
         if not self.sources[index]:
             return
@@ -116,9 +99,6 @@ class PatchMatchKernel:
         arrays = self._view_arrays(view)
         arrays["views"] = np.zeros(view.gray.shape, np.uint32)
         arrays |= self._source_arrays(view, [views[other] for other in self.sources[index]])
-        if depths is not None:
-            task.geometric_weight = self.settings.patchmatch_geometric_weight
-            arrays["depths"] = np.concatenate([depths[other].ravel() for other in self.sources[index]])
         task.source_count = len(self.sources[index])
         self._spread(task, arrays)
         view.known |= view.cost < NO_MATCH
@@ -133,9 +113,9 @@ class PatchMatchKernel:
 
     def _average(self, task: Task, arrays: Arrays) -> np.ndarray:
         """The planes after all passes of the consensus."""
-        tolerance = _float(self.settings.patchmatch_consensus_tolerance)
+        tolerance = _float(CONSENSUS_TOLERANCE)
         planes, averaged = arrays["planes"], np.empty_like(arrays["planes"])
-        for _ in range(self.settings.patchmatch_consensus_passes):
+        for _ in range(CONSENSUS_PASSES):
             call = ctypes.byref(_pointed(task, arrays | {"planes": planes}))
             self.library.d2_consensus(call, CONSENSUS_RADIUS, tolerance, _pointer(averaged.ctypes.data))
             planes, averaged = averaged, np.empty_like(planes)
@@ -151,7 +131,7 @@ class PatchMatchKernel:
             threads=torch.get_num_threads(),
             inverse_far=1 / far,
             inverse_near=1 / near,
-            per_gray=per_squared_gray(self.settings.patchmatch_contrast),
+            per_gray=per_squared_gray(CONTRAST),
         )
 
     def _view_arrays(self, view: LevelView) -> Arrays:
@@ -188,14 +168,11 @@ def _intrinsics(camera: Camera) -> ctypes.Array:
 
 
 def _source(reference: LevelView, source: LevelView, first: int) -> Source:
-    forth, back = view_pair(reference.camera, source.camera), view_pair(source.camera, reference.camera)
-    nine, three = _float * 9, _float * 3
+    pair = view_pair(reference.camera, source.camera)
     return Source(
         source.camera.width,
         source.camera.height,
         first,
-        nine(*forth.A.ravel()),
-        three(*forth.k),
-        nine(*back.A.ravel()),
-        three(*back.k),
+        (_float * 9)(*pair.A.ravel()),
+        (_float * 3)(*pair.k),
     )

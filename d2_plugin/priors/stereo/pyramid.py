@@ -19,7 +19,7 @@ SMALLEST_SIDE = 12
 
 @dataclass(eq=False)
 class LevelView:
-    """One camera at one resolution, with what has been found there so far."""
+    """One camera at one resolution, with the planes so far."""
 
     camera: Camera
     gray: np.ndarray  # uint8 [H, W]
@@ -27,7 +27,7 @@ class LevelView:
     planes: np.ndarray  # float32 [H, W, 3]
     known: np.ndarray  # bool [H, W], whether anything matched here, at this or a coarser resolution
     cost: np.ndarray  # float32 [H, W]
-    wanted: np.ndarray | None  # bool [H, W], where a match is asked for; everywhere where None
+    wanted: np.ndarray | None  # bool [H, W], pixels to match; everywhere where None
 
 
 def levels(cameras: Sequence[Camera], rounds: Sequence[int]) -> list[tuple[int, int]]:

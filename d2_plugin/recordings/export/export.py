@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.reading import json_text
 from d2_plugin.recordings.export.base import Export, Written, refuse_skew, whole_folder
 from d2_plugin.recordings.export.colmap import write_colmap, write_multipleview
@@ -29,9 +30,6 @@ from d2_plugin.recordings.export.ply import PointCloud
 from d2_plugin.recordings.export.transforms_json import write_transforms
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.values import checked_arguments
-
-EXPORT_FILE = "export.json"
-"""Written last: a folder without it is half an export."""
 
 Writer = Callable[[Export], Written]
 
@@ -77,6 +75,7 @@ def export_recording(
     with whole_folder(path) as folder:
         written = WRITERS[layout](Export(recording, held_out, cloud, folder))
         described = json_text(_description(recording, layout, written, held_out), EXPORT_FILE, indent=1)
+        # Written last: a folder without it is half an export.
         (folder / EXPORT_FILE).write_text(described + "\n")
     return Path(path)
 

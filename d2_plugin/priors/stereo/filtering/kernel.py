@@ -1,4 +1,4 @@
-"""The compiled filter (`kernels/filter.cpp`, `kernels/precision.cpp`): the bits of the NumPy code in less time.
+"""The compiled filter (`kernels/filter.cpp`, `kernels/precision.cpp`).
 
 Compiled at first use; runs on `torch.get_num_threads()` threads, and results are the same bits for any number of them.
 """
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from d2_plugin.compiler import NoCompiler, load_library
+from d2_plugin.compiler import load_library
 
 SOURCES = tuple(Path(__file__).parent / "kernels" / name for name in ("filter.cpp", "precision.cpp"))
 _STEREO = Path(__file__).parents[1] / "kernels"
@@ -87,16 +87,13 @@ _CALLS = {"slopes": _Slopes, "coherence": _Coherence, "confirm": _Confirm, "scat
 
 
 @functools.cache
-def library() -> ctypes.CDLL | None:
-    """The compiled kernel; None without a compiler: NumPy then does the same.
+def library() -> ctypes.CDLL:
+    """The compiled kernel.
 
     Raises:
-        CompileError: see `d2_plugin.compiler.load_library`.
+        NoCompiler, CompileError: see `d2_plugin.compiler.load_library`.
     """
-    try:
-        kernel = load_library("filter", SOURCES, HEADERS, FLAGS)
-    except NoCompiler:
-        return None
+    kernel = load_library("filter", SOURCES, HEADERS, FLAGS)
     for name, call in _CALLS.items():
         function, size = getattr(kernel, f"d2_{name}"), getattr(kernel, f"d2_{name}_size")
         function.argtypes, function.restype = (ctypes.POINTER(call),), None
@@ -106,7 +103,11 @@ def library() -> ctypes.CDLL | None:
 
 
 def slopes(depth: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """See `coherence.reference_slopes`; depth is contiguous float32."""
+    """Inverse depth, and its slopes across and down per pixel, all float32 [H, W].
+
+    Slopes are the flatter one-sided difference over `reach` pixels: at a depth edge one side runs over the edge and is
+    the steeper one; a side without depth has no say. `depth` is contiguous float32, 0 where there is none.
+    """
     inverse, across, down = (np.empty_like(depth) for _ in range(3))
     maps = {"depth": depth, "inverse": inverse, "slope_x": across, "slope_y": down}
     _run("slopes", _Slopes(reach=reach), depth.shape, maps)
@@ -122,7 +123,17 @@ def coherence(
     stride: int,
     relative: float,
 ) -> np.ndarray:
-    """See `coherence.reference_share`; all arrays are contiguous."""
+    """Share [H, W] of the neighbours that lie on a pixel's tangent plane (see `coherence.surface_coherence`).
+
+    Args:
+        gray: uint8 [H, W]; all arrays are contiguous.
+        inverse: inverse depth float32 [H, W], 0 where there is none.
+        slopes: of inverse depth across and down, float32 [H, W].
+        weights: float32 [257] by difference of grey values; the last, 0, is that of a pixel outside.
+        radius: half the side of the window, pixels.
+        stride: pixels between the neighbours that are compared.
+        relative: a neighbour agrees within this share of the inverse depth.
+    """
     share = np.empty_like(inverse)
     arrays = {"gray": gray, "inverse": inverse, "slope_x": slopes[0], "slope_y": slopes[1], "weights": weights}
     call = _Coherence(radius=radius, stride=stride, relative=relative)
@@ -136,7 +147,7 @@ def confirm(
     vectors: dict[str, np.ndarray],
     maps: dict[str, np.ndarray],
 ) -> None:
-    """See `confirm.confirm`: add what one source says to the sums among `maps`, all contiguous.
+    """Add one source to the sums among `maps`, all contiguous (see `confirm.confirm`).
 
     Args:
         shape: [H, W] of the reference.
@@ -151,22 +162,22 @@ def confirm(
 
 
 def scatter(depth: np.ndarray, reach: int, slack: float) -> np.ndarray:
-    """See `precision.reference_scatter`; depth is contiguous float32."""
-    found = np.empty(depth.shape)
-    _run("scatter", _Scatter(reach=reach, slack=slack), depth.shape, {"depth": depth, "scatter": found})
-    return found
+    """See `precision.plane_scatter`; depth is contiguous float32, `slack` is added to the window's second moments."""
+    out = np.empty(depth.shape)
+    _run("scatter", _Scatter(reach=reach, slack=slack), depth.shape, {"depth": depth, "scatter": out})
+    return out
 
 
 def sigma(numbers: dict[str, float], maps: dict[str, np.ndarray]) -> np.ndarray:
-    """See `precision.reference_sigma`.
+    """See `precision.geometric_sigma`.
 
     Args:
         numbers: fields of d2::Sigma.
         maps: the contiguous arrays that it points to, but for the result.
     """
-    found = np.empty(maps["depth"].shape, np.float32)
-    _run("sigma", _Sigma(**numbers), found.shape, maps | {"sigma": found})
-    return found
+    out = np.empty(maps["depth"].shape, np.float32)
+    _run("sigma", _Sigma(**numbers), out.shape, maps | {"sigma": out})
+    return out
 
 
 def _run(name: str, call: Any, shape: tuple[int, ...], arrays: dict[str, np.ndarray]) -> None:

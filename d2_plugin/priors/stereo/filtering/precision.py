@@ -1,4 +1,4 @@
-"""How precise a geometric depth is: matching precision through the parallax, and what neighbours and sources say.
+"""How precise a geometric depth is: matching precision through the parallax, neighbours and confirming sources.
 
 A match that is off by e pixels puts the depth off by e / P, where P is the parallax: by how many pixels the match moves
 in the confirming sources when the depth changes by its own size. The match itself is as sharp as the image is: grey
@@ -23,7 +23,7 @@ from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.stereo.filtering import kernel
 
 MATCHING = 0.00293
-"""Error of the best match, pixels: next to nothing, what it is worth is told by the gradient."""
+"""Error of the best match, pixels: next to nothing; the gradient decides."""
 GRAY_NOISE = 1.3e-3
 """Error of the grey values (0..1) that a match compares: noise, exposure, resampling."""
 PER_INCOHERENCE = 2.83
@@ -53,7 +53,7 @@ def geometric_sigma(
 ) -> np.ndarray:
     """Relative standard deviation of D^g, float32 [H, W]; infinite where there is no depth or no parallax.
 
-    NaN in any of the maps says that nothing is known of the pixel, so its sigma is infinite too.
+    NaN in any of the maps means that nothing is known of the pixel, so its sigma is infinite too.
 
     Args:
         depth: D^g [H, W], 0 where there is none.
@@ -62,7 +62,6 @@ def geometric_sigma(
         spread: root mean square relative difference to the depths of the confirming sources [H, W].
         gradient: change of the grey value around the pixel [H, W], 0..1 per pixel (see `grey_gradient`).
     """
-    compiled = kernel.library() is not None
     maps: dict[str, np.ndarray] = {
         "depth": np.ascontiguousarray(depth, np.float32),
         "coherence": np.ascontiguousarray(coherence, np.float32),
@@ -71,7 +70,7 @@ def geometric_sigma(
         "spread": np.ascontiguousarray(spread, np.float64),
         "scatter": plane_scatter(depth),
     }
-    return kernel.sigma(_NUMBERS, maps) if compiled else reference_sigma(**maps)
+    return kernel.sigma(_NUMBERS, maps)
 
 
 _NUMBERS = {
@@ -83,34 +82,6 @@ _NUMBERS = {
     "of_spread": OF_SPREAD,
     "floor_squared": FLOOR**2,
 }
-
-
-def reference_sigma(
-    depth: np.ndarray,
-    coherence: np.ndarray,
-    gradient: np.ndarray,
-    parallax: np.ndarray,
-    spread: np.ndarray,
-    scatter: np.ndarray,
-) -> np.ndarray:
-    """What `kernel.sigma` returns, bit for bit, where there is no compiler.
-
-    Args:
-        depth: as above, float32 like the next two.
-        coherence: as above.
-        gradient: as above.
-        parallax: as above, float64 like the next two.
-        spread: as above.
-        scatter: about the plane of the window (see `plane_scatter`) [H, W].
-    """
-    known = (depth > 0) & (parallax > 0) & np.isfinite(depth) & ~np.isnan(coherence)
-    known &= np.isfinite(spread) & ~np.isnan(gradient)
-    coherence, spread = (np.where(known, map_, 0) for map_ in (coherence, spread))
-    pixels = MATCHING + GRAY_NOISE / np.where(known, np.maximum(gradient, FLATTEST), 1)
-    pixels = pixels + PER_INCOHERENCE * (1 - np.clip(coherence, 0, 1))
-    matching = pixels / np.where(known, parallax, 1)
-    variance = matching**2 + (OF_SCATTER * scatter) ** 2 + (OF_SPREAD * spread) ** 2 + FLOOR**2
-    return np.where(known, np.sqrt(variance), np.inf).astype(np.float32)
 
 
 def grey_gradient(gray: np.ndarray) -> np.ndarray:
@@ -132,44 +103,4 @@ def plane_scatter(depth: np.ndarray, window: int = WINDOW) -> np.ndarray:
         window: side of the window, pixels, odd.
     """
     depth = np.ascontiguousarray(depth, np.float32)
-    return (kernel.scatter if kernel.library() else reference_scatter)(depth, window // 2, SLACK)
-
-
-def reference_scatter(depth: np.ndarray, reach: int, slack: float) -> np.ndarray:
-    """What `kernel.scatter` returns, bit for bit, where there is no compiler: float64 [H, W].
-
-    Moments are about the window's own pixel: those about another one would differ by little from their products.
-
-    Args:
-        depth: float32 [H, W], 0, infinite or NaN where there is none.
-        reach: half the side of the window, pixels.
-        slack: added to the second moments of the columns and rows, pixels^2.
-    """
-    known = (depth > 0) & np.isfinite(depth)
-    weight, inverse = known.astype(np.float64), np.where(known, 1 / np.where(known, depth, 1).astype(np.float64), 0)
-
-    def down(values: np.ndarray, power: int) -> np.ndarray:
-        return _moment(values, reach, power)
-
-    def across(values: np.ndarray, power: int) -> np.ndarray:
-        return _moment(values.T, reach, power).T
-
-    rows, rising = down(weight, 0), down(inverse, 0)
-    share = 1 / np.maximum(across(rows, 0), 1)
-    u, uu = across(rows, 1) * share, across(rows, 2) * share
-    v, uv = (across(down(weight, 1), power) * share for power in (0, 1))
-    vv, y, uy = across(down(weight, 2), 0) * share, across(rising, 0) * share, across(rising, 1) * share
-    vy, yy = across(down(inverse, 1), 0) * share, across(down(inverse * inverse, 0), 0) * share
-    uu, vv, uv = uu - u * u + slack, vv - v * v + slack, uv - u * v
-    uy, vy, yy = uy - u * y, vy - v * y, yy - y * y
-    determinant = uu * vv - uv * uv
-    explained = (vv * uy * uy - 2 * uv * uy * vy + uu * vy * vy) / determinant
-    return np.where(known, np.sqrt(np.maximum(yy - explained, 0)) / np.where(known, inverse, 1), 0)
-
-
-def _moment(values: np.ndarray, reach: int, power: int) -> np.ndarray:
-    """Sum over the rows of a window around each pixel, [H, W], of values times a power of the row's offset."""
-    padded, total = np.pad(values, ((reach, reach), (0, 0))), np.zeros_like(values)
-    for offset in range(-reach, reach + 1):
-        total += float(offset**power) * padded[reach + offset : reach + offset + len(values)]
-    return total
+    return kernel.scatter(depth, window // 2, SLACK)

@@ -10,16 +10,14 @@ constexpr int kPartials = 16;           // sums over a window are added up in th
 constexpr float kNoMatch = 2.f;         // the worst 1 - NCC: outside of the source, behind it, or without texture
 constexpr float kMinVariance = 0.65f;   // grey levels squared (1e-5 in 0..1): below it NCC correlates rounding errors
 constexpr float kPerSquare = -kLog2E / 18.f;  // log2 of the weight per squared distance: standard deviation 3 pixels
-constexpr float kMaxReprojection = 3.f; // pixels; farther off does not count as worse
 
 extern "C" {
 
 // A source view as the reference sees it: pixel p of the reference at inverse depth q is at A p + k q in the source.
 struct Source {
   int width, height;
-  int first;                   // its first place in Task.quads and Task.depths
+  int first;                   // its first place in Task.quads
   float A[9], k[3];
-  float back_A[9], back_k[3];  // the same from the source to the reference
 };
 
 }  // extern "C"
@@ -114,28 +112,5 @@ struct Sums {
 
 // The largest column or row that a sample is read at: its right and lower neighbour lie in its quad.
 D2_FN float last_place(int size) { return larger(float(size) - 1.001f, 0.f); }
-
-// Forward-backward error in pixels: to the source by the plane, back by the source's own depth.
-template <class S>
-D2_FN S reprojection_error(const Source& source, const float* depths, const Plane<S>& plane, S u, S v) {
-  const auto row = [](const float* m, S x, S y) {
-    return mad(all<S>(m[0]), x, mad(all<S>(m[1]), y, all<S>(m[2])));
-  };
-  const float *A = source.A, *B = source.back_A, *k = source.k, *back_k = source.back_k;
-  const S q = plane.inverse_depth(u, v), z = mad(all<S>(k[2]), q, row(A + 6, u, v));
-  const S x = mad(all<S>(k[0]), q, row(A, u, v)) / z, y = mad(all<S>(k[1]), q, row(A + 3, u, v)) / z;
-  const float right = source.width - .5f, bottom = source.height - .5f;
-  const Mask<S> ahead = (q > 0.f) & (z > 1e-6f);
-  const Mask<S> inside = ahead & (x > -.5f) & (y > -.5f) & (x < right) & (y < bottom);
-  const S zero = all<S>(0.f);
-  const Whole<S> column = whole(pick(inside, x + .5f, zero)), line = whole(pick(inside, y + .5f, zero));
-  const S depth = look_up(depths, line * source.width + column + source.first);
-  const S back_z = mad(row(B + 6, x, y), depth, all<S>(back_k[2]));
-  const S du = mad(row(B, x, y), depth, all<S>(back_k[0])) / back_z - u;
-  const S dv = mad(row(B + 3, x, y), depth, all<S>(back_k[1])) / back_z - v;
-  const S most = all<S>(kMaxReprojection);
-  const Mask<S> back = inside & (depth > 0.f) & (back_z > 1e-6f);
-  return pick(back, smaller(root(mad(du, du, dv * dv)), most), most);
-}
 
 }  // namespace d2

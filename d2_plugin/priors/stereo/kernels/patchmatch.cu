@@ -2,7 +2,7 @@
 // shared memory. The same bits as patchmatch.cpp on a CPU with fused multiply-add.
 //
 // No header besides ours, so that NVRTC compiles it without a toolkit; tests run it on the CPU (tests/cuda_shim.h).
-// Defined by the host (gpu/kernel.py): D2_MAX_SOURCES, sources of a view; D2_CALL_SIZE, bytes of its Call.
+// Defined by the host (patchmatch_cuda.py): D2_MAX_SOURCES, sources of a view; D2_CALL_SIZE, bytes of its Call.
 #include "spread.h"
 
 #define D2_DEVICE __device__ __forceinline__
@@ -19,7 +19,7 @@ struct Call {
   float tolerance;
   float* averaged;  // [H, W, 3]
 };
-static_assert(sizeof(Call) == D2_CALL_SIZE, "Call differs between kernel.py and patchmatch.cu");
+static_assert(sizeof(Call) == D2_CALL_SIZE, "Call differs between patchmatch_cuda.py and patchmatch.cu");
 
 // The windows of a block, one array per sample so that threads read neighbouring words.
 struct Windows {

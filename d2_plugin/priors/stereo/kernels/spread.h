@@ -32,14 +32,12 @@ struct Task {
   unsigned seed;
   float inverse_far, inverse_near;  // planes outside of this range are not tried
   float per_gray;                   // see sample_weight
-  float geometric_weight;           // cost per pixel of forward-backward error; 0 switches the term off
   const unsigned char* gray;        // [H, W] of the reference
   const unsigned char* wanted;      // [H, W]: where it is 0 nothing is matched; null wants all
   const Source* sources;            // [source_count]
   const unsigned* quads;  // of all sources, per pixel its grey value and those right, below and lower right of it
-  const float* depths;    // of all sources, or null where no geometric term is wanted
   float* planes;          // [H, W, 3]
-  float* costs;           // [H, W]: 1 - NCC in 0..2 plus the geometric term, of what the planes are worth so far
+  float* costs;           // [H, W]: 1 - NCC in 0..2, of what the planes are worth so far
   unsigned* views;        // [H, W]: bit s says that source s was selected
 };
 
@@ -205,12 +203,7 @@ struct Turn {
       for (int s = 0; s < task.source_count; s++) {
         const Mask<S> selected = selection.weight[s] > 0.f;
         if (none(selected)) continue;
-        S found = costs(k, s);
-        if (task.geometric_weight > 0) {
-          const S error = reprojection_error(task.sources[s], task.depths, planes[k], sight.u, sight.v);
-          found = mad(all<S>(task.geometric_weight), error, found);
-        }
-        total = pick(selected, mad(selection.weight[s], found, total), total);
+        total = pick(selected, mad(selection.weight[s], costs(k, s), total), total);
       }
       const Mask<S> better = used[k] & (total < cost);
       cost = pick(better, total, cost), best = pick(better, planes[k], best);

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.calibration import Calibration, held_against_truth, truth_rounding
+from d2_plugin.priors.declared_error import DeclaredErrors, held_against_truth, truth_rounding
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.summary import PriorSummary
@@ -139,14 +139,14 @@ def test_a_rounded_truth_is_told_by_its_steps_and_an_exact_one_is_not() -> None:
     assert (truth_rounding(np.zeros((4, 4))) == 0).all()
 
 
-def measured(recording: Recording, names: list[str], path: Path) -> Calibration:
+def measured(recording: Recording, names: list[str], path: Path) -> DeclaredErrors:
     build_priors(recording, names, path, PriorSettings())
     found = held_against_truth(PriorStore.open(path), recording)
     assert found is not None
     return found
 
 
-def check(found: Calibration) -> None:
+def check(found: DeclaredErrors) -> None:
     """The target is 60 to 80 % and 90 %; a few frames may be a little beside it, agreed depth is too cautious."""
     for label, held in found.labels.items():
         if held.share >= 0.01:

@@ -1,7 +1,7 @@
-// What the other views say about the mono-only pixels of one: the questions of ask.py, pixel by pixel.
+// The mono-only pixels of each view of an instant compared with the other views (see evidence.py), pixel by pixel.
 //
-// The same operations in the same order as the NumPy code, nothing contracted; logarithms, exponentials and hypotenuses
-// are those of the C library. A pixel depends on no other, so results are the same bits for any number of threads.
+// Nothing is contracted; logarithms, exponentials and hypotenuses are those of the C library. A pixel depends on no
+// other, so results are the same bits for any number of threads.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -29,15 +29,15 @@ struct Pair {
   float gain[3];  // how much brighter the other shows everything, per channel: filled in here
 };
 
-// What one call works on, as kernel.py fills it in; the numbers are explained in ask.py and evidence.py.
-struct Ask {
+// What one call works on, as kernel.py fills it in; the numbers are explained there and in evidence.py.
+struct Instant {
   int32_t count, threads, compared, steps, fewest;
   float continuous, like, dark;
   double tolerance, at_best, alone, one_place, within, near, beside;
   double nudge, log_nudge, flattest, longest, met, missed, overshot;
   uint8_t label_mono, label_agreed, label_verified;
   const View* views;  // [count]
-  Pair* pairs;        // [count, count], of one who asks and one who is asked
+  Pair* pairs;        // [count, count], of the view whose pixels are compared and of the other
 };
 
 namespace {
@@ -48,13 +48,13 @@ struct Place {
   double x, y, z;
 };
 
-// What a view verified, prepared for those who ask.
+// What a view verified, prepared for the comparison.
 struct Surface {
   std::vector<float> depth;     // 0 elsewhere
   std::vector<double> inverse;  // 0 elsewhere
   std::vector<int64_t> some;    // pixels, evenly over the image
 
-  void read(const Ask& c, const View& view) {
+  void read(const Instant& c, const View& view) {
     const int64_t size = int64_t(view.width) * view.height;
     depth.resize(size), inverse.resize(size);
     int64_t count = 0;
@@ -71,7 +71,7 @@ struct Surface {
   }
 };
 
-// Another view as one who asks sees it.
+// Another view, as one view is compared with it.
 struct Other {
   const View& view;
   const Surface& surface;
@@ -102,7 +102,7 @@ int64_t nearest(const View& view, Place at) {
 }
 
 // Depth of another view's surface between the four pixels around a place; 0 where they are no surface.
-double between(const Ask& c, const Other& o, Place at) {
+double between(const Instant& c, const Other& o, Place at) {
   const int width = o.view.width, height = o.view.height;
   const bool inside = at.z > 0 && at.x >= 0 && at.y >= 0 && at.x <= width - 1 && at.y <= height - 1;
   if (std::min(width, height) < 2 || !inside) return 0;
@@ -120,14 +120,14 @@ double between(const Ask& c, const Other& o, Place at) {
 }
 
 // Log of a point's depth in the other view over the surface's there; false where that is unknown.
-bool miss(const Ask& c, const Other& o, Place at, double* missed) {
+bool miss(const Instant& c, const Other& o, Place at, double* missed) {
   const double there = between(c, o, at);
   *missed = there > 0 ? std::log(at.z / there) : 0;
   return there > 0;
 }
 
 // Secant step in log depth towards the surface, 0 where it is not known or runs along the ray.
-double step(const Ask& c, const Other& o, const Ray& ray, double depth, double missed) {
+double step(const Instant& c, const Other& o, const Ray& ray, double depth, double missed) {
   double ahead;
   const bool known = miss(c, o, ray.at(o.pair, depth * c.nudge), &ahead);
   const double slope = (ahead - missed) / c.log_nudge;
@@ -135,31 +135,31 @@ double step(const Ask& c, const Other& o, const Ray& ray, double depth, double m
   return std::min(std::max(-missed / slope, -c.longest), c.longest);
 }
 
-// A mono-only pixel, and the best that the views asked so far said.
-struct Asked {
+// A mono-only pixel, and the best that the views so far showed of it.
+struct MonoPixel {
   double depth, sigma;
   const uint8_t* colors;  // or null
   bool agreed, seen;
-  double found, precision;  // depth at which the ray meets a surface, 0 where there is none, and its sigma
+  double met, precision;  // depth at which the ray meets a surface, 0 where there is none, and its sigma
 };
 
-bool alike(const Ask& c, const Other& o, const Asked& asked, int64_t pixel) {
-  if (!asked.colors || !o.view.colors) return true;
+bool alike(const Instant& c, const Other& o, const MonoPixel& point, int64_t pixel) {
+  if (!point.colors || !o.view.colors) return true;
   bool same = true;
   const uint8_t* theirs = o.view.colors + 3 * pixel;
-  for (int i = 0; i < 3; i++) same &= std::fabs(asked.colors[i] * o.pair.gain[i] - theirs[i]) < c.like;
+  for (int i = 0; i < 3; i++) same &= std::fabs(point.colors[i] * o.pair.gain[i] - theirs[i]) < c.like;
   return same;
 }
 
 // Follow a ray to the surface of another view. `start` is where it begins there.
-void intersect(const Ask& c, const Other& o, const Ray& ray, Place start, Asked* asked) {
+void intersect(const Instant& c, const Other& o, const Ray& ray, Place start, MonoPixel* point) {
   double missed;
   if (!miss(c, o, start, &missed)) return;
   // NaN is no way.
-  const double way = c.within * asked->sigma, allowed = way > c.near ? c.near : way;
-  const double first = step(c, o, ray, asked->depth, missed);
+  const double way = c.within * point->sigma, allowed = way > c.near ? c.near : way;
+  const double first = step(c, o, ray, point->depth, missed);
   if (!(std::fabs(first) < c.overshot * allowed)) return;
-  double along = asked->depth * std::exp(first);
+  double along = point->depth * std::exp(first);
   Place at = ray.at(o.pair, along);
   bool known = miss(c, o, at, &missed);
   for (int i = 1; i < c.steps; i++) {
@@ -169,36 +169,36 @@ void intersect(const Ask& c, const Other& o, const Ray& ray, Place start, Asked*
     at = ray.at(o.pair, along);
     known = miss(c, o, at, &missed);
   }
-  const double moved = std::fabs(std::log(along / asked->depth));
+  const double moved = std::fabs(std::log(along / point->depth));
   if (!(known && std::fabs(missed) < c.met && moved < allowed)) return;
   const int64_t pixel = nearest(o.view, at);
-  if (!alike(c, o, *asked, pixel)) return;
-  asked->seen = true;
+  if (!alike(c, o, *point, pixel)) return;
+  point->seen = true;
   const double precision = std::hypot(double(o.view.sigma[pixel]), c.beside * moved);
-  if (precision < asked->precision) asked->found = along, asked->precision = precision;
+  if (precision < point->precision) point->met = along, point->precision = precision;
 }
 
-void ask(const Ask& c, const Other& o, double u, double v, Place start, Asked* asked) {
+void compare_pixel(const Instant& c, const Other& o, double u, double v, Place start, MonoPixel* point) {
   const int64_t pixel = nearest(o.view, start);
   if (pixel < 0) return;
   const uint8_t label = o.view.labels[pixel];
   const bool mono = label == c.label_mono || label == c.label_agreed;
   const double there = o.view.log[pixel];
   if (!(mono || label == c.label_verified) || !std::isfinite(there)) return;
-  if (mono) asked->seen = true;
-  if (mono && asked->agreed) return;
+  if (mono) point->seen = true;
+  if (mono && point->agreed) return;
   const double apart = std::fabs(std::log(start.z) - there);
   if (mono) {
-    asked->agreed = apart < c.tolerance && alike(c, o, *asked, pixel);
+    point->agreed = apart < c.tolerance && alike(c, o, *point, pixel);
   } else if (apart < c.missed) {
-    intersect(c, o, Ray(o.pair, u, v), start, asked);
+    intersect(c, o, Ray(o.pair, u, v), start, point);
   }
 }
 
 // The mono-only pixels of a row, packed, and where they land in another view.
 struct Row {
   std::vector<double> u, depth, x, y, z;
-  std::vector<Asked> asked;
+  std::vector<MonoPixel> pixels;
 
   // A plain loop, which compilers turn into vectors.
   void land(Pair pair, double v) {
@@ -212,7 +212,7 @@ struct Row {
   }
 };
 
-void inform_row(const Ask& c, const std::vector<Surface>& surfaces, int index, int row) {
+void compare_row(const Instant& c, const std::vector<Surface>& surfaces, int index, int row) {
   const View& view = c.views[index];
   Row r;
   for (int column = 0; column < view.width; column++) {
@@ -220,7 +220,7 @@ void inform_row(const Ask& c, const std::vector<Surface>& surfaces, int index, i
     if (view.labels[pixel] != c.label_mono) continue;
     const uint8_t* colors = view.colors ? view.colors + 3 * pixel : nullptr;
     r.u.push_back(column), r.depth.push_back(view.depth[pixel]);
-    r.asked.push_back({view.depth[pixel], view.sigma[pixel], colors, false, false, 0, kInfinity});
+    r.pixels.push_back({view.depth[pixel], view.sigma[pixel], colors, false, false, 0, kInfinity});
   }
   const int64_t count = r.u.size();
   r.x.resize(count), r.y.resize(count), r.z.resize(count);
@@ -228,19 +228,19 @@ void inform_row(const Ask& c, const std::vector<Surface>& surfaces, int index, i
     if (i == index) continue;
     const Other other{c.views[i], surfaces[i], c.pairs[index * c.count + i]};
     r.land(other.pair, row);
-    for (int64_t j = 0; j < count; j++) ask(c, other, r.u[j], row, {r.x[j], r.y[j], r.z[j]}, &r.asked[j]);
+    for (int64_t j = 0; j < count; j++) compare_pixel(c, other, r.u[j], row, {r.x[j], r.y[j], r.z[j]}, &r.pixels[j]);
   }
   for (int64_t j = 0; j < count; j++) {
-    const Asked& asked = r.asked[j];
+    const MonoPixel& point = r.pixels[j];
     const int64_t pixel = int64_t(row) * view.width + int64_t(r.u[j]);
-    if (asked.found > 0) {
+    if (point.met > 0) {
       view.new_labels[pixel] = c.label_verified;
-      view.new_depth[pixel] = float(asked.found), view.new_sigma[pixel] = float(asked.precision);
-    } else if (asked.agreed) {
+      view.new_depth[pixel] = float(point.met), view.new_sigma[pixel] = float(point.precision);
+    } else if (point.agreed) {
       view.new_labels[pixel] = c.label_agreed;
-      view.new_sigma[pixel] = float(std::hypot(view.agreeing * asked.sigma, c.at_best));
+      view.new_sigma[pixel] = float(std::hypot(view.agreeing * point.sigma, c.at_best));
     } else {
-      view.new_sigma[pixel] = float(std::fabs((asked.seen ? c.alone : 1) * asked.sigma));
+      view.new_sigma[pixel] = float(std::fabs((point.seen ? c.alone : 1) * point.sigma));
     }
   }
 }
@@ -253,7 +253,7 @@ float median(std::vector<float>& values) {
 }
 
 // How much brighter another camera shows what both verified; left as it is where that is too little.
-void compare(const Ask& c, const View& ours, const Surface& surface, const View& theirs, Pair* pair) {
+void measure_gain(const Instant& c, const View& ours, const Surface& surface, const View& theirs, Pair* pair) {
   if (!ours.colors || !theirs.colors || int64_t(surface.some.size()) < c.fewest) return;
   std::vector<float> ratios[3];
   for (auto& channel : ratios) channel.reserve(surface.some.size());
@@ -271,15 +271,15 @@ void compare(const Ask& c, const View& ours, const Surface& surface, const View&
   for (int i = 0; i < 3; i++) pair->gain[i] = median(ratios[i]);
 }
 
-void inform(const Ask& c) {
+void compare_views(const Instant& c) {
   std::vector<Surface> surfaces(c.count);
   parallel_for(c.threads, c.count, [&](int64_t i) { surfaces[i].read(c, c.views[i]); });
   parallel_for(c.threads, int64_t(c.count) * c.count, [&](int64_t i) {
     const int64_t ours = i / c.count, theirs = i % c.count;
-    if (ours != theirs) compare(c, c.views[ours], surfaces[ours], c.views[theirs], c.pairs + i);
+    if (ours != theirs) measure_gain(c, c.views[ours], surfaces[ours], c.views[theirs], c.pairs + i);
   });
   for (int i = 0; i < c.count; i++) {
-    parallel_for(c.threads, c.views[i].height, [&](int64_t row) { inform_row(c, surfaces, i, int(row)); });
+    parallel_for(c.threads, c.views[i].height, [&](int64_t row) { compare_row(c, surfaces, i, int(row)); });
   }
 }
 
@@ -288,9 +288,9 @@ void inform(const Ask& c) {
 
 extern "C" {
 
-int64_t d2_ask_size() { return sizeof(d2::Ask); }
+int64_t d2_instant_size() { return sizeof(d2::Instant); }
 int64_t d2_pair_size() { return sizeof(d2::Pair); }
 int64_t d2_view_size() { return sizeof(d2::View); }
 
-void d2_inform(const d2::Ask* call) { d2::inform(*call); }
+void d2_compare_views(const d2::Instant* call) { d2::compare_views(*call); }
 }

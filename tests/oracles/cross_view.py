@@ -1,55 +1,78 @@
-"""One view's points as the others see them: do their maps agree, and where do the points' rays meet their surfaces?
+"""`d2_plugin.priors.evidence` in NumPy: what the kernel of `cross_view` must return but for the last digits.
 
-What `kernel.ask` answers, where there is no compiler; the numbers and the types are those of both.
+NumPy and the C library round logarithms and exponentials differently.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.priors.geometry import ViewPair, interpolated_surface, view_pair
+from d2_plugin.priors.cross_view.kernel import (
+    BESIDE,
+    COMPARED,
+    DARK,
+    FEWEST,
+    FLATTEST,
+    LIKE,
+    LONGEST,
+    MET,
+    MISSED,
+    NEAR,
+    NUDGE,
+    ONE_PLACE,
+    OVERSHOT,
+    STEPS,
+    WITHIN,
+)
+from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, view_of
+from d2_plugin.priors.fuse import FusedPrior
+from d2_plugin.priors.geometry import ViewPair, view_pair
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera
+from oracles.surface import interpolated_surface
 
-WITHIN = 1.2
-"""A surface confirms a monocular depth within this many of its standard deviations. Farther ones are often another
-surface: on studio the 90 % quantile of the error is .011 within, .17 beyond."""
-NEAR = 0.1
-"""And within this relative difference, whatever is declared."""
-BESIDE = 0.03
-"""Share of the step to the surface that may remain as error."""
-LIKE = 0.04
-"""Largest difference of the colours (0..1, mean of 3x3 pixels) of one place in two images. A ray that passes a near
-thing which the map does not know meets the surface behind it. Measured on the surfaces that rays meet, those off by
-more than 5 %: studio 1.3 % and .4 % with this test, with a weak network (PyDNet) 48 and 13 %; plaza with it 1.5 and
-.1 %. It keeps 88 to 96 % of the right ones."""
-DARK = 20
-"""Of 255: a darker pixel does not tell how differently two cameras are exposed."""
-FEWEST = 100
-"""Nor do fewer pixels than this that both verified."""
-ONE_PLACE = 0.02
-"""Nor does a pixel whose depth in the other view is off by more, in log depth."""
-COMPARED = 8000
-"""About how many verified pixels are compared for it, evenly over the image."""
-STEPS = 3
-"""Secant steps along the ray."""
-NUDGE = 1.001
-"""Factor of depth between the two points of a secant."""
-FLATTEST = 0.2
-"""Where the miss changes by less per log depth, the surface runs along the ray."""
-LONGEST = 0.2
-"""Longest step, in log depth."""
-MET = 3e-3
-"""The ray has met the surface when their depths differ by less than this share."""
-MISSED = 0.5
-"""A ray that misses by more, in log depth, is not followed."""
-OVERSHOT = 2.0
-"""Nor one whose first step is so many times farther than allowed."""
+
+def with_evidence(
+    priors: Mapping[str, FusedPrior],
+    cameras: Mapping[str, Camera],
+    tolerance: float,
+    tails: Mapping[str, float] | None = None,
+) -> dict[str, FusedPrior]:
+    """As `evidence.with_evidence`."""
+    views = {name: View(**vars(view_of(prior))) for name, prior in priors.items()}
+    known = {name: tail for name, tail in (tails or {}).items() if tail >= 1}
+    return {
+        name: _informed(name, prior, views, cameras, tolerance, AGREED / known.get(name, 1.0))
+        for name, prior in priors.items()
+    }
+
+
+def _informed(
+    name: str,
+    prior: FusedPrior,
+    views: Mapping[str, View],
+    cameras: Mapping[str, Camera],
+    tolerance: float,
+    agreeing: float,
+) -> FusedPrior:
+    """The prior of one view with what the others say; `agreeing` is the factor of sigma where a map agrees."""
+    rows, columns = np.nonzero(prior.labels == Label.MONO)
+    depth, sigma = (map_[rows, columns].astype(np.float64) for map_ in (prior.depth, prior.sigma))
+    colors = views[name].colors
+    points = Points(columns, rows, depth, sigma, None if colors is None else colors[rows, columns])
+    answer = ask(points, name, views, cameras, tolerance)
+    met, agreed = answer.depth > 0, answer.agreed
+    factor = np.where(agreed, agreeing, np.where(answer.seen, ALONE, 1.0))
+    labels, depths, sigmas = prior.labels.copy(), prior.depth.copy(), prior.sigma.copy()
+    labels[rows, columns] = np.where(met, Label.VERIFIED, np.where(agreed, Label.AGREED, Label.MONO))
+    depths[rows, columns] = np.where(met, answer.depth, depth)
+    sigmas[rows, columns] = np.where(met, answer.sigma, np.hypot(factor * sigma, np.where(agreed, AT_BEST, 0)))
+    return replace(prior, depth=depths, labels=labels, sigma=sigmas)
 
 
 class Points(NamedTuple):
@@ -81,7 +104,7 @@ class Answer(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What one view tells the others; contiguous maps [H, W]."""
+    """One view of an instant; contiguous maps [H, W]."""
 
     labels: np.ndarray
     """`Label`, uint8."""

@@ -1,7 +1,7 @@
 """Medians and quantiles of vectors, each by a partition around one place.
 
-NumPy has that one compiled for vectors of numbers; its own median and quantile ask for several places at once, which is
-not. Measured: the median of 20,000 numbers takes 31 us instead of 200.
+NumPy has that one compiled for vectors of numbers; its own median and quantile look for several places at once, which
+takes six times as long.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Declared against true error: what share of D* lies within sigma and 2 sigma of the true depth.
 
 A normal error lies within sigma at 68 % and within 2 sigma at 95 % of the pixels. Real errors have longer tails, so
-60 to 80 % and at least 90 % count as calibrated here.
+60 to 80 % and at least 90 % count as honest here.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ lie between nearly all of them."""
 
 
 class CurvePoint(NamedTuple):
-    """One bin of the reliability curve; on the diagonal, error = sigma, it is calibrated."""
+    """One bin of the reliability curve; on the diagonal, error = sigma, it is honest."""
 
     sigma: float
     """Median declared sigma of the bin."""
@@ -42,7 +42,7 @@ class CurvePoint(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LabelCalibration:
+class LabelErrors:
     """How the pixels of one label compare with the truth; shares are NaN where there are no such pixels."""
 
     pixels: int
@@ -62,12 +62,12 @@ class LabelCalibration:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class DeclaredErrors:
     """D* of one recording held against its true depth."""
 
     views: int
     """Images that have both a prior and a true depth map."""
-    labels: dict[Label, LabelCalibration]
+    labels: dict[Label, LabelErrors]
     """The labels that some pixel carries."""
     sky_found: float
     """Share of the pixels without a true depth that are labelled far; NaN where there are none."""
@@ -78,9 +78,9 @@ class Calibration:
         header = f"{'label':10}{'share':>9}{'within sigma':>15}{'2 sigma':>10}{'sigma':>9}{'error':>9}"
         lines = [f"held against the true depth of {self.views} views:"]
         lines.append(header if self.labels else "no pixel with a true depth has a finite sigma")
-        for label, found in self.labels.items():
-            shares = f"{found.share:9.1%}{found.within:15.1%}{found.within_two:10.1%}"
-            lines.append(f"{shown(label):10}{shares}{found.sigma:9.4f}{found.error:9.4f}")
+        for label, errors in self.labels.items():
+            shares = f"{errors.share:9.1%}{errors.within:15.1%}{errors.within_two:10.1%}"
+            lines.append(f"{label_name(label):10}{shares}{errors.sigma:9.4f}{errors.error:9.4f}")
         if self.sky_found > 0 or self.false_far > 0:
             sky = f"{self.sky_found:.1%}" if np.isfinite(self.sky_found) else "none"
             lines.append(f"far: {sky} of the pixels without a true depth, {self.false_far:.1%} of the others")
@@ -97,10 +97,10 @@ def frames_with_truth(recording: Recording, cameras: Sequence[str], most: int | 
 
 def held_against_truth(
     store: PriorStore, recording: Recording, frames: Sequence[int] | None = None
-) -> Calibration | None:
+) -> DeclaredErrors | None:
     """Compare D* with the true depth of the recording, None where it has none.
 
-    Pixels at which nothing tells sigma, so that it is infinite, promise nothing and are left out. Where the truth
+    Pixels of an infinite sigma declare nothing and are left out. Where the truth
     itself is rounded, what rounding may do to it is added to sigma (see `truth_rounding`).
 
     Args:
@@ -121,16 +121,16 @@ def held_against_truth(
             rounding = truth_rounding(truth)
             views, pixels, sky = views + 1, pixels + truth.size, sky + int((~known).sum())
             sky_far, surface_far = sky_far + int((far & ~known).sum()), surface_far + int((far & known).sum())
-            for label, found in collected.items():
+            for label, pairs in collected.items():
                 mask = known & (labels == label) & np.isfinite(sigma)
                 error = np.abs(np.log(depth[mask] / truth[mask].astype(np.float64)))
-                found.append(np.stack([error, np.hypot(sigma[mask], rounding[mask])]))
+                pairs.append(np.stack([error, np.hypot(sigma[mask], rounding[mask])]))
     if not views:
         return None
-    held = {label: _held(np.concatenate(found, axis=1), pixels) for label, found in collected.items()}
-    return Calibration(
+    by_label = {label: _label_errors(np.concatenate(pairs, axis=1), pixels) for label, pairs in collected.items()}
+    return DeclaredErrors(
         views,
-        {label: found for label, found in held.items() if found.pixels},
+        {label: errors for label, errors in by_label.items() if errors.pixels},
         sky_far / sky if sky else float("nan"),
         surface_far / max(pixels - sky, 1),
     )
@@ -175,17 +175,17 @@ def reliability_curve(error: np.ndarray, sigma: np.ndarray) -> tuple[CurvePoint,
     )
 
 
-def _held(found: np.ndarray, pixels: int) -> LabelCalibration:
-    """Of errors and sigmas [2, K] of one label."""
-    error, sigma = found
+def _label_errors(pairs: np.ndarray, pixels: int) -> LabelErrors:
+    """Of errors and sigmas [2, K] of one label, out of so many `pixels` in all."""
+    error, sigma = pairs
     if not error.size:
         unknown = float("nan")
-        return LabelCalibration(0, 0.0, unknown, unknown, unknown, unknown)
+        return LabelErrors(0, 0.0, unknown, unknown, unknown, unknown)
     within, within_two = (float((error <= times * sigma).mean()) for times in (1, 2))
     medians, curve = (float(np.median(sigma)), float(np.median(error))), reliability_curve(error, sigma)
-    return LabelCalibration(error.size, error.size / pixels, within, within_two, *medians, curve)
+    return LabelErrors(error.size, error.size / pixels, within, within_two, *medians, curve)
 
 
-def shown(label: Label) -> str:
+def label_name(label: Label) -> str:
     """The label as a person reads it."""
     return "mono only" if label == Label.MONO else label.name.lower()

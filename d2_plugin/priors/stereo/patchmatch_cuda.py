@@ -1,4 +1,4 @@
-"""The kernels of PatchMatch on a CUDA device: the same planes as on the CPU, from the same mathematics.
+"""The kernels of PatchMatch on a CUDA device, through NVRTC: the same planes as on the CPU, from the same mathematics.
 
 `kernels/spread.h` holds the mathematics once. Where the CPU fuses multiplications and additions, as every one since
 2013 does, both devices return the same bits.
@@ -8,21 +8,64 @@ from __future__ import annotations
 
 import ctypes
 import functools
+from typing import Protocol
 
 import numpy as np
 import torch
 
 from d2_plugin.compiler.driver import Driver
-from d2_plugin.compiler.nvrtc import NoCuda, build
-from d2_plugin.priors.stereo.gpu.call import PROGRAM, THREADS, Call, Launcher, flags_for
-from d2_plugin.priors.stereo.patchmatch_kernel import CONSENSUS_RADIUS, Arrays, PatchMatchKernel, Task
+from d2_plugin.compiler.nvrtc import NoCuda, Program, build
+from d2_plugin.priors.stereo.patchmatch_kernel import (
+    CONSENSUS_PASSES,
+    CONSENSUS_RADIUS,
+    CONSENSUS_TOLERANCE,
+    HEADERS,
+    KERNELS,
+    Arrays,
+    PatchMatchKernel,
+    Task,
+)
+
+PROGRAM = Program(KERNELS / "patchmatch.cu", tuple(path for path in HEADERS if path.name != "lanes.h"))
+
+FLAGS = ("--std=c++17", "--fmad=false")
+"""No contraction: the kernels say themselves what is fused, so that all devices return the same bits."""
+
+THREADS = 64
+"""Of a block; THREADS of patchmatch.cu."""
+
+
+class Call(ctypes.Structure):
+    """d2::Call of kernels/patchmatch.cu: what one launch works on."""
+
+    _fields_ = (
+        ("task", Task),
+        ("colour", ctypes.c_int32),
+        ("round", ctypes.c_int32),
+        ("radius", ctypes.c_int32),
+        ("tolerance", ctypes.c_float),
+        ("averaged", ctypes.c_void_p),
+    )
+
+
+class Launcher(Protocol):
+    """Runs kernels of patchmatch.cu on one device."""
+
+    def launch(self, kernel: str, sources: int, blocks: int, call: Call) -> None:
+        """Enqueue `kernel`, compiled for that many sources, on `blocks` blocks of THREADS threads; `call` is copied."""
+
+
+def flags_for(sources: int) -> tuple[str, ...]:
+    """Flags of NVRTC, or nvcc, to compile the kernels for so many sources of a view."""
+    return (*FLAGS, f"-DD2_MAX_SOURCES={sources}", f"-DD2_CALL_SIZE={ctypes.sizeof(Call)}")
+
 
 LEAST_SOURCES = 2
 """The kernels compiled for so many sources also average planes, which needs none."""
 
 
 class CudaLauncher:
-    """Launches the kernels on one CUDA device, on torch's current stream (`call.Launcher`)."""
+    """Launches the kernels on one CUDA device, on torch's current stream (`Launcher`)."""
 
     def __init__(self, device: torch.device) -> None:
         """Compile (or find) the kernels and load them.
@@ -96,10 +139,10 @@ class CudaPatchMatchKernel(PatchMatchKernel):
     def _average(self, task: Task, arrays: Arrays) -> np.ndarray:
         on_device = self._moved(task, arrays)
         planes, averaged = on_device["planes"], torch.empty_like(on_device["planes"])
-        for _ in range(self.settings.patchmatch_consensus_passes):
+        for _ in range(CONSENSUS_PASSES):
             task.planes = planes.data_ptr()
             call = Call(task=task, radius=CONSENSUS_RADIUS, averaged=averaged.data_ptr())
-            call.tolerance = self.settings.patchmatch_consensus_tolerance
+            call.tolerance = CONSENSUS_TOLERANCE
             self._launcher.launch("d2_patchmatch_average", LEAST_SOURCES, _blocks(task.width * task.height), call)
             planes, averaged = averaged, planes
         return planes.cpu().numpy()

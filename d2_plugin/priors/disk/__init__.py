@@ -1,1 +1,0 @@
-"""Maps of numbers that lie beside the images: how they are read, and how sure they say they are."""

@@ -1,1 +1,0 @@
-"""PatchMatch on a CUDA device, through NVRTC."""

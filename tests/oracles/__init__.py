@@ -1,0 +1,1 @@
+"""NumPy twins of compiled kernels: what the kernels are tested against. Nothing that ships imports them."""

@@ -1,0 +1,230 @@
+"""The filter of geometric depth in NumPy: the bits that `d2_plugin.priors.stereo.filtering.kernel` must return."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from d2_plugin.priors.geometry import Projection, ViewPair, view_pair, viewing_rays
+from d2_plugin.priors.stereo.filtering.confirm import NUDGE, RELATIVE_DEPTH, REPROJECTION_MAX
+from d2_plugin.priors.stereo.filtering.precision import (
+    FLATTEST,
+    FLOOR,
+    GRAY_NOISE,
+    MATCHING,
+    OF_SCATTER,
+    OF_SPREAD,
+    PER_INCOHERENCE,
+)
+from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.recording import Camera
+from oracles.surface import interpolated_surface
+
+
+def coherence(
+    gray: np.ndarray,
+    inverse: np.ndarray,
+    slopes: tuple[np.ndarray, np.ndarray],
+    weights: np.ndarray,
+    radius: int,
+    stride: int,
+    relative: float,
+) -> np.ndarray:
+    """What `kernel.coherence` returns, bit for bit.
+
+    Args:
+        gray: uint8 [H, W].
+        inverse: inverse depth float32 [H, W], 0 where there is none.
+        slopes: of inverse depth across and down, float32 [H, W].
+        weights: float32 [257] by difference of grey values; the last, 0, is that of a pixel outside.
+        radius: half the side of the window, pixels.
+        stride: pixels between the neighbours that are asked.
+        relative: a neighbour agrees within this share of the inverse depth.
+    """
+    height, width = inverse.shape
+    padded_inverse = np.pad(inverse, radius)
+    values = gray.astype(np.int16)
+    padded_gray = np.pad(values, radius, constant_values=1000)
+    tolerance = np.float32(relative) * inverse
+    agreeing, total = np.zeros_like(inverse), np.zeros_like(inverse)
+    for dy, dx in _offsets(radius, stride):
+        window = np.s_[radius + dy : radius + dy + height, radius + dx : radius + dx + width]
+        weight = weights[np.minimum(np.abs(padded_gray[window] - values), 256)]
+        distance = padded_inverse[window] - inverse - dx * slopes[0] - dy * slopes[1]
+        total += weight
+        agreeing += weight * (np.abs(distance) < tolerance)
+    return agreeing / np.maximum(total, np.finfo(np.float32).tiny)
+
+
+def _offsets(radius: int, stride: int) -> list[tuple[int, int]]:
+    steps = range(-radius, radius + 1, stride)
+    return [(dy, dx) for dy in steps for dx in steps if (dy, dx) != (0, 0)]
+
+
+def slopes(depth: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What `kernel.slopes` returns, bit for bit: (inverse depth, its slopes), per pixel.
+
+    Args:
+        depth: float32 [H, W], 0 where there is none.
+        reach: pixels between the ends of a difference.
+
+    Returns:
+        inverse depth, 0 where there is none, and its slopes across and down: the flatter one-sided difference, since at
+        a depth edge one side runs over the edge and is the steeper one; a side without depth has no say. All float32.
+    """
+    valid = depth > 0
+    inverse = np.where(valid, 1 / np.where(valid, depth, 1), 0).astype(np.float32)
+    return inverse, np.ascontiguousarray(_vertical_slope(inverse.T, reach).T), _vertical_slope(inverse, reach)
+
+
+def _vertical_slope(inverse: np.ndarray, reach: int) -> np.ndarray:
+    """Slope of inverse depth down the columns."""
+    padded = np.pad(inverse, ((reach, reach), (0, 0)))
+    above, below = padded[: -2 * reach], padded[2 * reach :]
+    rise = np.where(above > 0, inverse - above, np.inf)
+    fall = np.where(below > 0, below - inverse, np.inf)
+    flatter = np.where(np.abs(rise) < np.abs(fall), rise, fall)
+    return (np.where(np.isfinite(flatter) & (inverse > 0), flatter, 0) / np.float32(reach)).astype(np.float32)
+
+
+def add_source(
+    sums: Any,
+    depth: np.ndarray,
+    theirs: np.ndarray,
+    reference: Camera,
+    source: Camera,
+    settings: StereoSettings,
+) -> None:
+    """Add what one source says of `depth` [H, W] to the sums: the bits of the kernel.
+
+    Each test is made of those alone that passed the one before.
+    """
+    rows, columns = np.nonzero(depth > 0)
+    u, v, depth = columns.astype(np.float32), rows.astype(np.float32), depth[rows, columns]
+    rays = viewing_rays(reference)[rows, columns]
+    pair, way_back = view_pair(reference, source), view_pair(source, reference)
+    forth = pair.project(u, v, depth)
+    seen = (sample_surface if settings.between_pixels else sample_nearest)(theirs, forth)
+    place = np.flatnonzero(seen > 0)
+    u, v, depth, rays, seen = u[place], v[place], depth[place], rays[place], seen[place]
+    forth = Projection(*(values[place] for values in forth))
+    back = way_back.project(forth.x, forth.y, seen)
+    off_x, off_y = back.x - u, back.y - v
+    near = np.sqrt(off_x * off_x + off_y * off_y) < np.float32(REPROJECTION_MAX)
+    near &= np.abs(back.z - depth) < np.float32(RELATIVE_DEPTH) * depth
+    near &= _meet(rays, depth, pair, settings)
+    nudged = pair.project(u[near].astype(np.float64), v[near].astype(np.float64), depth[near] * np.exp(NUDGE))
+    moved_x, moved_y = nudged.x - forth.x[near], nudged.y - forth.y[near]
+    squared = (moved_x * moved_x + moved_y * moved_y) / NUDGE**2
+    precision = np.where(np.isfinite(squared), squared, 0)
+    apart = back.z[near] / depth[near] - 1
+    at = rows[place][near], columns[place][near]
+    sums.confirming[at] += 1
+    sums.information[at] += precision
+    sums.difference[at] += precision * (apart * apart)
+
+
+def _meet(rays: np.ndarray, depth: np.ndarray, pair: ViewPair, settings: StereoSettings) -> np.ndarray:
+    """Whether the rays of both cameras meet at an angle that is allowed, [K].
+
+    |a x b| and a.b are its sine and cosine times the same length. In units of the depth, so that no unit of the world
+    overflows.
+    """
+    (x, y, z), direction = rays.T, pair.direction.astype(np.float32)
+    u, v, w = x - direction[0] / depth, y - direction[1] / depth, z - direction[2] / depth
+    p, q, r = y * w - z * v, z * u - x * w, x * v - y * u
+    sine, cosine = np.sqrt(p * p + q * q + r * r), x * u + y * v + z * w
+    low, high = np.deg2rad(settings.min_angle), np.deg2rad(settings.max_angle)
+    above = sine * np.float32(np.cos(low)) > cosine * np.float32(np.sin(low))
+    return above & (sine * np.float32(np.cos(high)) < cosine * np.float32(np.sin(high)))
+
+
+def sample_nearest(depth: np.ndarray, at: Projection) -> np.ndarray:
+    """`depth` at the nearest pixel of `at`, 0 outside of the image or behind the camera.
+
+    Nearest on purpose: a value interpolated across an occlusion edge belongs to no surface.
+    """
+    height, width = depth.shape
+    inside = (at.z > 0) & (at.x > -0.5) & (at.y > -0.5) & (at.x < width - 0.5) & (at.y < height - 0.5)
+    column = np.rint(np.where(inside, at.x, 0)).astype(np.int32)
+    row = np.rint(np.where(inside, at.y, 0)).astype(np.int32)
+    return np.where(inside, depth[row, column], 0)
+
+
+def sample_surface(depth: np.ndarray, at: Projection) -> np.ndarray:
+    """`depth` between the pixels around `at` where they are one surface, that of the nearest pixel elsewhere.
+
+    On a ground that is seen at a grazing angle, depth changes by more than 1 % from one pixel to the next.
+    """
+    inside = at.z > 0
+    known, between = interpolated_surface(depth, np.where(inside, at.x, -9), np.where(inside, at.y, -9))
+    return np.where(known, between, sample_nearest(depth, at)).astype(np.float32)
+
+
+def sigma(
+    depth: np.ndarray,
+    coherence: np.ndarray,
+    gradient: np.ndarray,
+    parallax: np.ndarray,
+    spread: np.ndarray,
+    scatter: np.ndarray,
+) -> np.ndarray:
+    """What `kernel.sigma` returns, bit for bit.
+
+    Args:
+        depth: as above, float32 like the next two.
+        coherence: as above.
+        gradient: as above.
+        parallax: as above, float64 like the next two.
+        spread: as above.
+        scatter: about the plane of the window (see `plane_scatter`) [H, W].
+    """
+    known = (depth > 0) & (parallax > 0) & np.isfinite(depth) & ~np.isnan(coherence)
+    known &= np.isfinite(spread) & ~np.isnan(gradient)
+    coherence, spread = (np.where(known, map_, 0) for map_ in (coherence, spread))
+    pixels = MATCHING + GRAY_NOISE / np.where(known, np.maximum(gradient, FLATTEST), 1)
+    pixels = pixels + PER_INCOHERENCE * (1 - np.clip(coherence, 0, 1))
+    matching = pixels / np.where(known, parallax, 1)
+    variance = matching**2 + (OF_SCATTER * scatter) ** 2 + (OF_SPREAD * spread) ** 2 + FLOOR**2
+    return np.where(known, np.sqrt(variance), np.inf).astype(np.float32)
+
+
+def scatter(depth: np.ndarray, reach: int, slack: float) -> np.ndarray:
+    """What `kernel.scatter` returns, bit for bit: float64 [H, W].
+
+    Moments are about the window's own pixel: those about another one would differ by little from their products.
+
+    Args:
+        depth: float32 [H, W], 0, infinite or NaN where there is none.
+        reach: half the side of the window, pixels.
+        slack: added to the second moments of the columns and rows, pixels^2.
+    """
+    known = (depth > 0) & np.isfinite(depth)
+    weight, inverse = known.astype(np.float64), np.where(known, 1 / np.where(known, depth, 1).astype(np.float64), 0)
+
+    def down(values: np.ndarray, power: int) -> np.ndarray:
+        return _moment(values, reach, power)
+
+    def across(values: np.ndarray, power: int) -> np.ndarray:
+        return _moment(values.T, reach, power).T
+
+    rows, rising = down(weight, 0), down(inverse, 0)
+    share = 1 / np.maximum(across(rows, 0), 1)
+    u, uu = across(rows, 1) * share, across(rows, 2) * share
+    v, uv = (across(down(weight, 1), power) * share for power in (0, 1))
+    vv, y, uy = across(down(weight, 2), 0) * share, across(rising, 0) * share, across(rising, 1) * share
+    vy, yy = across(down(inverse, 1), 0) * share, across(down(inverse * inverse, 0), 0) * share
+    uu, vv, uv = uu - u * u + slack, vv - v * v + slack, uv - u * v
+    uy, vy, yy = uy - u * y, vy - v * y, yy - y * y
+    determinant = uu * vv - uv * uv
+    explained = (vv * uy * uy - 2 * uv * uy * vy + uu * vy * vy) / determinant
+    return np.where(known, np.sqrt(np.maximum(yy - explained, 0)) / np.where(known, inverse, 1), 0)
+
+
+def _moment(values: np.ndarray, reach: int, power: int) -> np.ndarray:
+    """Sum over the rows of a window around each pixel, [H, W], of values times a power of the row's offset."""
+    padded, total = np.pad(values, ((reach, reach), (0, 0))), np.zeros_like(values)
+    for offset in range(-reach, reach + 1):
+        total += float(offset**power) * padded[reach + offset : reach + offset + len(values)]
+    return total

@@ -1,0 +1,360 @@
+"""Every compiled kernel of the priors returns what its NumPy oracle does, for any number of threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import cross_view as cross_view_oracle
+from oracles import stereo_filter as oracle
+
+from d2_plugin.compiler import NoCompiler, find_compiler
+from d2_plugin.errors import D2Error
+from d2_plugin.priors import build
+from d2_plugin.priors.evidence import with_evidence
+from d2_plugin.priors.fuse import FusedPrior
+from d2_plugin.priors.stereo.filtering import coherence, confirm, kernel, precision
+from d2_plugin.priors.stereo.geometric_depth import gray
+from d2_plugin.priors.stereo.patchmatch import patchmatch
+from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.protocol import Label
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.recording import Camera
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+pytest.importorskip("cv2")
+try:
+    find_compiler()
+except NoCompiler as error:
+    pytest.skip(str(error), allow_module_level=True)
+
+SETTINGS = StereoSettings()
+TOLERANCE = 0.02
+
+Rig = tuple[list[np.ndarray], list[Camera], list[np.ndarray]]
+"""Grey images, cameras, depth maps."""
+Maps = dict[str, np.ndarray]
+
+
+@pytest.fixture
+def with_threads():
+    """Calls a function once for each number of threads."""
+    before = torch.get_num_threads()
+
+    def calls(function: Callable, *numbers: int) -> list:
+        results = []
+        for number in numbers:
+            torch.set_num_threads(number)
+            results.append(function())
+        return results
+
+    yield calls
+    torch.set_num_threads(before)
+
+
+def camera(center: np.ndarray, angle: float, width: int, height: int, principal: tuple[float, float]) -> Camera:
+    """At `center`, turned by `angle` about the vertical; the principal point in shares of the image's size."""
+    T = np.eye(4)
+    T[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    T[:3, 3] = -T[:3, :3] @ center
+    K = np.array([[width, 0, principal[0] * width], [0, width, principal[1] * height], [0, 0, 1.0]])
+    return Camera("camera", width, height, K, T)
+
+
+class TestStereoFilter:
+    """Coherence and confirmation of stereo depth, bit for bit."""
+
+    @staticmethod
+    def rig(count: int, width: int, height: int, unit: float, noise: float, seed: int) -> Rig:
+        """Cameras side by side before a wall three units away, noisy and with holes."""
+        random, shape = np.random.default_rng(seed), (height, width)
+        places = [unit * np.array([0.5 * i, *random.normal(0, 0.1, 2)]) for i in range(count)]
+        cameras = [camera(place, random.normal(0, 0.05), width, height, (0.5, 0.5)) for place in places]
+        depths = [unit * 3 * np.exp(random.normal(0, noise, shape)) for _ in range(count)]
+        depths = [np.where(random.random(shape) < 0.9, depth, 0).astype(np.float32) for depth in depths]
+        return [random.integers(100, 130, shape).astype(np.uint8) for _ in range(count)], cameras, depths
+
+    @staticmethod
+    def compiled(rig: Rig, chosen: StereoSettings = SETTINGS) -> list[np.ndarray]:
+        """Coherence of every view, then what confirms each."""
+        grays, cameras, depths = rig
+        shares = [coherence.surface_coherence(*pair) for pair in zip(grays, depths)]
+        return shares + [map_ for i in range(len(cameras)) for map_ in confirm.confirm(i, cameras, depths, chosen)]
+
+    def expected(self, rig: Rig, chosen: StereoSettings = SETTINGS) -> list[np.ndarray]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(kernel, "slopes", oracle.slopes)
+            patch.setattr(kernel, "coherence", oracle.coherence)
+            patch.setattr(confirm, "_add_source", oracle.add_source)
+            return self.compiled(rig, chosen)
+
+    @settings(max_examples=30, deadline=None)
+    @given(
+        count=st.integers(2, 4),
+        width=st.integers(1, 70),
+        height=st.integers(1, 40),
+        exponent=st.integers(-8, 8),
+        noise=st.sampled_from([0.0, 1e-3, 0.02, 1.0]),
+        between=st.booleans(),
+        seed=st.integers(0, 1000),
+    )
+    def test_is_the_bits_of_the_oracle(
+        self, count: int, width: int, height: int, exponent: int, noise: float, between: bool, seed: int
+    ) -> None:
+        rig, chosen = (
+            self.rig(count, width, height, 10.0**exponent, noise, seed),
+            replace(SETTINGS, between_pixels=between),
+        )
+        for ours, theirs in zip(self.compiled(rig, chosen), self.expected(rig, chosen)):
+            np.testing.assert_array_equal(ours, theirs)
+
+    @pytest.mark.parametrize("name", ["studio", "plaza"])
+    def test_is_the_bits_of_the_oracle_on_a_recording(self, name: str, shared_data: Callable[[str], Path]) -> None:
+        recording, chosen = open_recording(shared_data(name)), ("00", "02", "05")
+        grays = [gray(recording.image(camera, 3)) for camera in chosen]
+        cameras = [recording.cameras[camera] for camera in chosen]
+        rig = grays, cameras, [depth for depth, _ in patchmatch(grays, cameras, (1.0, 80.0))]
+        for ours, theirs in zip(self.compiled(rig), self.expected(rig)):
+            np.testing.assert_array_equal(ours, theirs)
+
+    def test_does_not_depend_on_threads(self, with_threads: Callable) -> None:
+        rig = self.rig(3, 61, 43, 1.0, 1e-3, 1)
+        for ours, theirs in zip(*with_threads(lambda: self.compiled(rig), 1, 2)):
+            np.testing.assert_array_equal(ours, theirs)
+
+    def test_does_not_depend_on_the_unit_of_the_world(self) -> None:
+        """Cross products of float32 coordinates would end at 1e9 of a unit, and below 1e-10 of one."""
+        rigs = [self.rig(3, 60, 40, unit, 1e-3, 0) for unit in (2.0**-40, 1.0, 2.0**40)]
+        small, plain, large = ([confirm.confirm(i, *rig[1:], SETTINGS).sources for i in range(3)] for rig in rigs)
+        assert np.mean(plain) > 0.4
+        np.testing.assert_array_equal(small, plain)
+        np.testing.assert_array_equal(large, plain)
+
+    @pytest.mark.parametrize("limits", [(0.0, 180.0), (0.5, 5.0), (29.9, 30.1), (79.0, 90.0)])
+    def test_rays_meet_between_the_limits(self, limits: tuple[float, float]) -> None:
+        """Two cameras that look along z, side by side: the second one's ray to the middle has a known angle."""
+        size, depths = 41, [np.full((41, 41), 3.0, np.float32)] * 2
+        chosen = StereoSettings(min_angle=limits[0], max_angle=limits[1], between_pixels=False)
+        for degrees in (0.3, 1.0, 4.0, 30.0, 80.0):
+            one, slope = camera(np.zeros(3), 0.0, size, size, (0.5, 0.5)), np.tan(np.deg2rad(degrees))
+            T, K = np.eye(4), one.K.copy()
+            T[0, 3], K[0, 2] = -3 * slope, K[0, 2] + size * slope
+            pair = [one, replace(one, T_camera_world=T, K=K)]
+            assert confirm.confirm(0, pair, depths, chosen).sources[20, 20] == (limits[0] < degrees < limits[1]), (
+                degrees
+            )
+
+
+class TestPrecision:
+    """Sigma of stereo depth and the scatter about the plane of its window, bit for bit."""
+
+    @staticmethod
+    def maps(width: int, height: int, unit: float, noise: float, known: float, seed: int) -> Maps:
+        """A slanted plane, noisy and with holes, and what is known of it; some NaN, infinite or out of range."""
+        random = np.random.default_rng(seed)
+        v, u = np.mgrid[:height, :width]
+        depth = unit / (0.2 + 0.1 * u / width + 0.05 * v / height) * np.exp(random.normal(0, noise, (height, width)))
+        limits = {"coherence": 1.0, "parallax": 300.0, "spread": 0.02, "gradient": 0.1}
+        drawn = {name: high * random.random(depth.shape) for name, high in limits.items()}
+        drawn["depth"] = np.where(random.random(depth.shape) < known, depth, 0)
+        odd = [0.0, -1.0, np.nan, np.inf, -np.inf, 7.0]
+        return {
+            name: np.where(random.random(depth.shape) < 0.05, random.choice(odd, depth.shape), map_).astype(
+                np.float64 if name in ("parallax", "spread") else np.float32
+            )
+            for name, map_ in drawn.items()
+        }
+
+    @staticmethod
+    def compiled(maps: Maps, window: int = precision.WINDOW) -> tuple[np.ndarray, np.ndarray]:
+        """(sigma, scatter)."""
+        with np.errstate(all="ignore"):
+            depth = np.where(np.isfinite(maps["depth"]), maps["depth"], 0)
+            return precision.geometric_sigma(**maps), precision.plane_scatter(depth, window)
+
+    def expected(self, maps: Maps, window: int = precision.WINDOW) -> tuple[np.ndarray, np.ndarray]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(kernel, "sigma", lambda numbers, maps: oracle.sigma(**maps))
+            patch.setattr(kernel, "scatter", oracle.scatter)
+            return self.compiled(maps, window)
+
+    @settings(max_examples=40, deadline=None)
+    @given(
+        width=st.integers(1, 70),
+        height=st.integers(1, 40),
+        exponent=st.integers(-6, 6),
+        noise=st.sampled_from([0.0, 1e-3, 0.02, 3.0]),
+        known=st.sampled_from([0.1, 0.9, 1.0]),
+        window=st.sampled_from([1, 3, 7, 9]),
+        seed=st.integers(0, 1000),
+    )
+    def test_is_the_bits_of_the_oracle(
+        self, width: int, height: int, exponent: int, noise: float, known: float, window: int, seed: int
+    ) -> None:
+        maps = self.maps(width, height, 10.0**exponent, noise, known, seed)
+        for ours, theirs in zip(self.compiled(maps, window), self.expected(maps, window)):
+            assert ours.dtype == theirs.dtype
+            np.testing.assert_array_equal(ours, theirs)
+
+    @pytest.mark.parametrize("value", [1e-45, 1e-38, 1e-6, 1e6, 3e38, 0.0, -1.0, np.nan, np.inf])
+    @pytest.mark.parametrize("name", ["depth", "coherence", "parallax", "spread", "gradient"])
+    def test_is_the_bits_of_the_oracle_at_extremes(self, name: str, value: float) -> None:
+        maps = self.maps(30, 20, 1.0, 1e-3, 0.9, 0)
+        maps[name][::2, ::3] = value
+        for ours, theirs in zip(self.compiled(maps), self.expected(maps)):
+            np.testing.assert_array_equal(ours, theirs)
+        assert not np.isnan(self.compiled(maps)[0]).any()
+
+    def test_does_not_depend_on_threads(self, with_threads: Callable) -> None:
+        maps = self.maps(61, 43, 1.0, 1e-3, 0.9, 1)
+        for ours, theirs in zip(*with_threads(lambda: self.compiled(maps), 1, 5)):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+class TestCrossView:
+    """Labels bit for bit; depth and sigma but for the last digit, which logarithms of two libraries may turn."""
+
+    @staticmethod
+    def rig(sizes: list[tuple[int, int]], unit: float, noise: float, colored: bool, seed: int):
+        """Views of one wall: maps that differ, surfaces, holes, infinite sigmas, images of different brightness."""
+        random, priors, cameras = np.random.default_rng(seed), {}, {}
+        for index, (width, height) in enumerate(sizes):
+            place, angle = unit * random.normal(0, 0.3, 3), random.normal(0, 0.1)
+            view = camera(place, angle, width, height, tuple(random.normal(0.5, 0.1, 2)))
+            shape, truth = (height, width), wall(view, 3 * unit)
+            verified = random.random((height // 8 + 1, width // 8 + 1)).repeat(8, 0).repeat(8, 1)[:height, :width] < 0.6
+            depth = truth * np.exp(np.where(verified, 0, random.normal(0, noise) + random.normal(0, noise / 9, shape)))
+            labels = np.where(verified, Label.VERIFIED, Label.MONO)
+            labels = np.where(random.random(shape) < 0.1, random.integers(0, len(Label), shape), labels)
+            labels = np.where(depth > 0, labels, Label.EMPTY)
+            sigma = np.where(verified, 0.001, random.choice([0.01, 0.1, np.inf], shape))
+            colors = np.clip(random.normal(90 + 20 * index, 3, (*shape, 3)), 0, 255) if colored else None
+            maps = depth.astype(np.float32), labels.astype(np.uint8), sigma.astype(np.float32)
+            priors[str(index)] = FusedPrior(*maps, None if colors is None else colors.astype(np.uint8))
+            cameras[str(index)] = view
+        return priors, cameras
+
+    @staticmethod
+    def assert_same(one: Mapping[str, FusedPrior], other: Mapping[str, FusedPrior]) -> None:
+        for name, ours in one.items():
+            np.testing.assert_array_equal(ours.labels, other[name].labels)
+            np.testing.assert_allclose(ours.depth, other[name].depth, rtol=1e-6)
+            np.testing.assert_allclose(ours.sigma, other[name].sigma, rtol=1e-6)
+            assert (ours.depth.dtype, ours.sigma.dtype) == (np.float32, np.float32)
+
+    def assert_is_the_oracle(self, priors, cameras, tails: Mapping[str, float] | None = None) -> None:
+        with np.errstate(all="ignore"):
+            compiled = with_evidence(priors, cameras, TOLERANCE, tails)
+            self.assert_same(compiled, cross_view_oracle.with_evidence(priors, cameras, TOLERANCE, tails))
+
+    @settings(max_examples=40, deadline=None)
+    @given(
+        sizes=st.lists(st.tuples(st.integers(1, 70), st.integers(1, 40)), min_size=2, max_size=4),
+        exponent=st.integers(-6, 6),
+        noise=st.sampled_from([0.0, 0.01, 0.05, 1.0]),
+        colored=st.booleans(),
+        seed=st.integers(0, 1000),
+    )
+    def test_is_the_oracle(
+        self, sizes: list[tuple[int, int]], exponent: int, noise: float, colored: bool, seed: int
+    ) -> None:
+        rig = self.rig(sizes, 10.0**exponent, noise, colored, seed)
+        self.assert_is_the_oracle(*rig, {"0": 2.0, "1": float("nan")})
+
+    def test_the_random_rigs_reach_every_outcome(self) -> None:
+        """Else the test above would compare nothing."""
+        priors, cameras = self.rig([(70, 40)] * 3, 1.0, 0.02, True, 1)
+        changed = with_evidence(priors, cameras, TOLERANCE)
+        labels = {int(label) for n in priors for label in changed[n].labels[changed[n].labels != priors[n].labels]}
+        assert labels == {int(Label.AGREED), int(Label.VERIFIED)}
+
+    @pytest.mark.parametrize("value", [0.0, 1e-45, 1e-6, 1e6, 3e38, np.inf, -1.0, np.nan])
+    @pytest.mark.parametrize("map_", ["depth", "sigma"])
+    def test_is_the_oracle_on_numbers_that_no_prior_should_hold(self, map_: str, value: float) -> None:
+        priors, cameras = self.rig([(40, 30)] * 3, 1.0, 0.02, True, 2)
+        for prior in priors.values():
+            getattr(prior, map_)[::3, 1::2] = value
+        self.assert_is_the_oracle(priors, cameras)
+
+    @pytest.mark.parametrize(
+        "place",
+        [(0.0, 0.0, 0.0), (0.0, 0.0, 3.0), (0.0, 0.0, 5.0), (1e12, 0.0, 0.0)],
+        ids=["on one spot", "at the wall", "behind the wall", "far away"],
+    )
+    @pytest.mark.parametrize("turned", [0.0, np.pi / 2, np.pi])
+    @pytest.mark.parametrize("principal", [(0.5, 0.5), (-2.0, 9.0)])
+    def test_is_the_oracle_wherever_the_other_camera_stands(
+        self, place: tuple[float, float, float], turned: float, principal: tuple[float, float]
+    ) -> None:
+        priors, cameras = self.rig([(40, 30)] * 2, 1.0, 0.02, True, 3)
+        cameras["0"] = camera(np.zeros(3), 0.0, 40, 30, (0.5, 0.5))
+        cameras["1"] = camera(np.array(place), turned, 40, 30, principal)
+        self.assert_is_the_oracle(priors, cameras)
+
+    def test_does_not_depend_on_threads(self, with_threads: Callable) -> None:
+        rig = self.rig([(61, 43)] * 4, 1.0, 0.02, True, 1)
+        first, *others = with_threads(lambda: with_evidence(*rig, TOLERANCE), 1, 2, 5)
+        for other in others:
+            for name, prior in first.items():
+                for map_ in ("labels", "depth", "sigma"):
+                    np.testing.assert_array_equal(getattr(prior, map_), getattr(other[name], map_), map_)
+
+    def test_a_point_at_the_centre_of_another_camera_is_nowhere_in_its_image(self) -> None:
+        middle, shape = (20.5 / 41, 15.5 / 31), (31, 41)
+        cameras = {name: camera(np.array([0, 0, z]), 0.0, 41, 31, middle) for name, z in (("ours", 0), ("theirs", 2.0))}
+        prior = FusedPrior(np.full(shape, 2, np.float32), np.full(shape, 1, np.uint8), np.full(shape, 0.1, np.float32))
+        ours = with_evidence({"ours": prior, "theirs": prior}, cameras, TOLERANCE)["ours"]
+        assert (ours.labels == Label.MONO).all()
+        np.testing.assert_array_equal(ours.sigma, prior.sigma)
+
+    def test_maps_of_another_order_in_memory_are_read_alike_and_left_as_they_are(self) -> None:
+        priors, cameras = self.rig([(40, 30)] * 3, 1.0, 0.02, True, 4)
+        maps = ("depth", "labels", "sigma", "colors")
+        turned = {
+            name: FusedPrior(*(np.asfortranarray(getattr(prior, map_)) for map_ in maps))
+            for name, prior in priors.items()
+        }
+        before = {name: prior.labels.copy() for name, prior in turned.items()}
+        self.assert_same(with_evidence(priors, cameras, TOLERANCE), with_evidence(turned, cameras, TOLERANCE))
+        for name, prior in turned.items():
+            np.testing.assert_array_equal(prior.labels, before[name])
+
+    def test_the_gain_is_the_median_halfway_between_the_middle_two_of_an_even_number(self) -> None:
+        """Both verified the left half, where the other image is 1 to 1.3 times brighter; the right half tells."""
+        view, shape = camera(np.zeros(3), 0.0, 40, 30, (0.5, 0.5)), (30, 40)
+        left, top = np.arange(40)[None] < 20, np.arange(30)[:, None] < 15
+        labels = np.broadcast_to(np.where(left, Label.VERIFIED, Label.MONO), shape).astype(np.uint8)
+        depth, sigma = np.full(shape, 4, np.float32), np.full(shape, 0.05, np.float32)
+        greys = {"ours": np.full(shape, 100), "theirs": np.where(left, np.where(top, 100, 130), 103)}
+        images = {name: np.repeat(grey[..., None], 3, -1).astype(np.uint8) for name, grey in greys.items()}
+        priors = {name: FusedPrior(depth, labels, sigma, image) for name, image in images.items()}
+        compared = with_evidence(priors, {"ours": view, "theirs": view}, TOLERANCE)
+        assert (compared["ours"].labels[:, 22:] == Label.AGREED).all(), "the larger of the two is too bright for it"
+
+
+def wall(view: Camera, distance: float) -> np.ndarray:
+    """Planar depth [H, W] of the plane z = distance of the world, 0 where a ray does not meet it."""
+    u, v = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(view.K).T
+    R = view.T_camera_world[:3, :3]
+    toward, center = (rays @ R)[..., 2], -R.T @ view.T_camera_world[:3, 3]
+    return np.where(toward > 1e-3, (distance - center[2]) / np.where(toward > 1e-3, toward, 1), 0)
+
+
+def test_without_a_compiler_one_sentence_says_so_before_anything_is_built(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none() -> None:
+        raise NoCompiler("no C++ compiler found (looked for CXX, c++, g++, clang++): install g++ or clang++")
+
+    monkeypatch.setattr(build.filtering, "library", none)
+    room = synthetic_recording(cameras=2, held_out=0, frames=1, width=32, height=24)
+    with pytest.raises(D2Error, match=r"compiled kernels.*a platform wheel.*no C\+\+ compiler found.*install g\+\+"):
+        build.build_priors(room, list(room.cameras), tmp_path / "priors", build.PriorSettings())
+    assert not (tmp_path / "priors").exists()
