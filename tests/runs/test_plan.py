@@ -12,7 +12,6 @@ import pytest
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo import matched_depth
-from d2_plugin.priors.stereo.settings import NO_MATCHER
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import Camera, Recording, open_recording, select_frames
 from d2_plugin.recordings.cameras.calibration import pinhole, rigid

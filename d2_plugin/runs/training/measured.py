@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin.errors import D2Error
-from d2_plugin.store.files import hash_of
 from d2_plugin.runs.rows import Row, make_row, rms_error
 from d2_plugin.runs.saved.kinds import read_metrics
 from d2_plugin.runs.shared import Job, give_points
 from d2_plugin.runs.workers import worker_pool
+from d2_plugin.store.files import hash_of
 
 
 @dataclass(frozen=True, eq=False)
