@@ -102,7 +102,7 @@ def _enerf(recording: Recording, path: Path) -> Path:
 
 def _as_text(folder: Path) -> None:
     """The binary model of a folder as COLMAP writes it in text."""
-    from d2_plugin.recordings.readers.colmap_model import read_model
+    from d2_plugin.recordings.cameras.formats.colmap import read_model
 
     model = read_model(folder)
     cameras = [

@@ -12,12 +12,12 @@ def form(words: list[str]) -> Form:
     from d2_plugin.recordings.importing.settings import ImportSettings
 
     def run(settings: ImportSettings) -> str:
-        found = import_videos(settings, told=say)
-        recording = found.recording
+        imported = import_videos(settings, report=say)
+        recording = imported.recording
         say_notes(recording.notes)
         sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
         shown = ", ".join(f"{width}x{height}" for width, height in sizes)
         about = f"{len(recording.cameras)} cameras, {len(recording.frames)} frames at {recording.fps:g} per second"
-        return f"{about}, {shown} pixels in {found.folder}\n`d2 doctor {found.folder}` says what it lacks"
+        return f"{about}, {shown} pixels in {imported.folder}\n`d2 doctor {imported.folder}` says what it lacks"
 
     return Form.of("d2 import", __doc__, ImportSettings, run)

@@ -85,6 +85,14 @@ def write_png(path: Path, image: np.ndarray) -> None:
     write(path, _PNG_SIGNATURE, *(_png_chunk(kind, body) for kind, body in chunks), synced=False)
 
 
+def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
+    """RGB uint8 [H, W, 3] as a JPEG file."""
+    cv2 = opencv("writing JPEG images")
+    with parsing(f"an image of {image.shape[1]}x{image.shape[0]} pixels", "make it smaller, JPEG has 65535 a side"):
+        encoded: bytes = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    return encoded
+
+
 def shrink_image(image: np.ndarray, factor: int) -> np.ndarray:
     """Mean over blocks of factor x factor pixels, uint8 [H // factor, W // factor, 3]; an incomplete block is cut off.
 

@@ -11,12 +11,13 @@ from rigs import NOISE, arc, filmed, moved, seen_by, worst
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.calibrating import SolvedRig, scaled_by_board
-from d2_plugin.recordings.cameras.calibrating.align import aligned, rig_width
 from d2_plugin.recordings.cameras.calibrating.bundle import project
-from d2_plugin.recordings.cameras.calibrating.features import find_features, sampson
+from d2_plugin.recordings.cameras.calibrating.features import find_features
 from d2_plugin.recordings.cameras.calibrating.refine import RefinedPoses, refine_poses
+from d2_plugin.recordings.cameras.calibrating.rig import aligned
 from d2_plugin.recordings.cameras.calibrating.solve import solve_features
-from d2_plugin.recordings.cameras.calibration import rigid
+from d2_plugin.recordings.cameras.camera import rig_width, rigid
+from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
@@ -94,7 +95,7 @@ class TestRigsFromImagesAlone:
         degrees, share = worst(rig.cameras, truth)
         assert degrees < 0.1
         assert share < 0.003
-        assert rig_width(rig.cameras) == pytest.approx(1)
+        assert rig_width(rig.cameras.values()) == pytest.approx(1)
         np.testing.assert_allclose(rig.cameras["c0"].T_camera_world, np.eye(4), atol=1e-12)
         assert all(pixels < 3 * NOISE for pixels in rig.pixels.values())
         assert rig.scale.startswith("arbitrary")
@@ -148,7 +149,7 @@ class TestBoards:
         rig, truth = self.solved()
         images, board = filmed(truth, 0.25)
         scaled = scaled_by_board(rig, images, board)
-        assert rig_width(scaled.cameras) == pytest.approx(rig_width(truth), rel=0.003)
+        assert rig_width(scaled.cameras.values()) == pytest.approx(rig_width(truth.values()), rel=0.003)
         assert "sides of a board's squares" in scaled.scale
 
     def test_a_board_that_one_camera_saw_says_nothing(self) -> None:

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("cv2", reason="opencv is in the `calibration` extra")
 pytest.importorskip("yaml", reason="pyyaml is in the `calibration` extra")
 
-from d2_plugin.recordings.cameras.formats import CalibratedCamera, open_calibration
+from d2_plugin.recordings.cameras.calibration import CalibratedCamera, open_calibration
 
 POSE2SIM = """[cam_01]
 name = "cam_01"

@@ -17,7 +17,7 @@ pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
 from calibration_writers import CASES, Known, anipose, cameras_json, easymocap, panoptic, pose2sim, rig, transforms
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.cameras.formats import CalibratedCamera, open_calibration, read_calibration, scaled
+from d2_plugin.recordings.cameras.calibration import CalibratedCamera, open_calibration, read_calibration, scaled
 from d2_plugin.recordings.cameras.formats.cameras_json import to_json
 from d2_plugin.recordings.naming import arrange
 

@@ -15,7 +15,7 @@ pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
 
 from calibration_writers import CASES, rig
 
-from d2_plugin.recordings.cameras.formats import read_calibration
+from d2_plugin.recordings.cameras.calibration import read_calibration
 
 FEW, MANY = 20, 2000
 

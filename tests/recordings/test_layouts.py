@@ -11,7 +11,7 @@ import pytest
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import LAYOUTS, Layout, Recording, open_recording
 from d2_plugin.recordings.assembly import assembled
-from d2_plugin.recordings.cameras.calibration import checked_camera, pinhole
+from d2_plugin.recordings.cameras.camera import checked_camera, pinhole
 from d2_plugin.recordings.export.base import Export, Written
 from d2_plugin.recordings.export.export import EXPORT_FILE, WRITERS, export_recording
 from d2_plugin.recordings.files import numbered_files

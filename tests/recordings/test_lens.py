@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.cameras.calibration import pinhole
+from d2_plugin.recordings.cameras.camera import pinhole
 from d2_plugin.recordings.cameras.lens import Lens, UndistortedSource, black_share, opencv_lens
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.recording import Camera

@@ -13,9 +13,9 @@ from stand_in_recordings import five_cameras
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.cameras.formats.colmap import MODELS, ColmapCamera, find_model, read_model, read_points
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.images import write_png
-from d2_plugin.recordings.readers.colmap_model import MODELS, ColmapCamera, find_model, read_model, read_points
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 

@@ -16,13 +16,13 @@ from stand_in_recordings import smooth_recording
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, open_recording, select_cameras, select_frames
-from d2_plugin.recordings.cameras.calibration import pinhole
+from d2_plugin.recordings.cameras.camera import pinhole
+from d2_plugin.recordings.cameras.formats.colmap import read_model, read_points
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation, rotation_of_quaternion
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.export.n3dv import sorted_names
 from d2_plugin.recordings.export.ply import PointCloud
-from d2_plugin.recordings.readers.colmap_model import read_model, read_points
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 CLOUD = PointCloud(

@@ -11,7 +11,7 @@ from small_layouts import write_layout
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, open_recording
-from d2_plugin.recordings.readers.colmap_model import find_model, read_points
+from d2_plugin.recordings.cameras.formats.colmap import find_model, read_points
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 

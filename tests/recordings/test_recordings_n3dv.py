@@ -14,7 +14,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.images import write_png
-from d2_plugin.recordings.importing.plain import SKIP_LIMIT, VideoSource
+from d2_plugin.recordings.importing.video import VideoFrames
 from d2_plugin.recordings.readers.n3dv import camera_from_row
 
 ROW = np.array(
@@ -193,15 +193,15 @@ def test_a_recording_has_the_same_cameras_in_both_layouts(tmp_path: Path) -> Non
 
 
 def test_videos_give_the_same_frame_in_any_order(video: Path) -> None:
-    in_order = VideoSource({"a": video})
+    in_order = VideoFrames({"a": video})
     expected = [in_order.image("a", frame) for frame in range(20)]
-    jumping = VideoSource({"a": video})
+    jumping = VideoFrames({"a": video})
     for frame in (7, 3, 19, 0, 12, 12, 5, 6, 17):
         np.testing.assert_array_equal(jumping.image("a", frame), expected[frame])
 
 
 def test_reading_in_order_never_seeks(video: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = VideoSource({"a": video})
+    source = VideoFrames({"a": video})
     source.image("a", 0)
 
     class NoSeek:
@@ -221,14 +221,14 @@ def test_reading_in_order_never_seeks(video: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_a_video_source_travels_to_another_process(video: Path) -> None:
-    source = VideoSource({"a": video})
+    source = VideoFrames({"a": video})
     first = source.image("a", 4)
     again = pickle.loads(pickle.dumps(source))
     np.testing.assert_array_equal(again.image("a", 4), first)
 
 
 def test_a_frame_behind_the_end_of_a_video_is_refused(video: Path) -> None:
-    source = VideoSource({"a": video})
+    source = VideoFrames({"a": video})
     with pytest.raises(D2Error, match=r"frame 400 of .*cam00\.mp4 cannot be decoded"):
         source.image("a", 400)
     assert source.image("a", 2).shape == (64, 96, 3)

@@ -16,13 +16,12 @@ from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, open_recording, select_cameras
 from d2_plugin.recordings.cameras.calibrating import Board, scaled_by_board, solve_rig
-from d2_plugin.recordings.cameras.calibrating.align import rig_width
 from d2_plugin.recordings.cameras.calibrating.bundle import Tracks
 from d2_plugin.recordings.cameras.calibrating.features import find_features, of_a_still_camera
 from d2_plugin.recordings.cameras.calibrating.sharpen import sharpened
 from d2_plugin.recordings.cameras.calibrating.solve import solve_features
-from d2_plugin.recordings.cameras.calibration import pinhole
-from d2_plugin.recordings.cameras.formats import read_calibration
+from d2_plugin.recordings.cameras.calibration import read_calibration
+from d2_plugin.recordings.cameras.camera import pinhole, rig_width
 from d2_plugin.recordings.recording import Camera
 
 NEIGHBOURS = ("02", "03", "04", "05")
@@ -85,7 +84,7 @@ class TestBoards:
         assert degrees < 0.1
         assert share < 0.003
         scaled = scaled_by_board(rig, images, board)
-        assert rig_width(scaled.cameras) == pytest.approx(rig_width(truth), rel=0.005)
+        assert rig_width(scaled.cameras.values()) == pytest.approx(rig_width(truth.values()), rel=0.005)
 
     def test_half_of_a_charuco_board_is_enough_for_the_scale_and_half_of_a_plain_one_is_not(self) -> None:
         truth = arc(3)
@@ -94,7 +93,9 @@ class TestBoards:
         for taken in half.values():
             taken[0][:, 320:] = 128
         rig = self.solved(truth)
-        assert rig_width(scaled_by_board(rig, half, board).cameras) == pytest.approx(rig_width(truth), rel=0.01)
+        assert rig_width(scaled_by_board(rig, half, board).cameras.values()) == pytest.approx(
+            rig_width(truth.values()), rel=0.01
+        )
         with pytest.raises(D2Error, match="saw 0 sides of the board's squares .* show the whole board"):
             scaled_by_board(rig, half, replace(board, marker=None))
 
@@ -184,7 +185,7 @@ def test_videos_become_a_recording_without_a_calibration(
     degrees, share = worst(found, truth)
     assert degrees < 0.1
     assert share < 0.005
-    assert rig_width(found) == pytest.approx(rig_width(truth), rel=0.005)
+    assert rig_width(found.values()) == pytest.approx(rig_width(truth.values()), rel=0.005)
     told = json.loads((tmp_path / "c" / "calibration.json").read_text())
     assert {"verdict", "reprojection_error", "points", "doubt_degrees"} <= told["cameras"][0].keys()
     assert "note  poses were found from the videos; the scale of the world is from the distance" in said

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.importing.files import VideoFile
-from d2_plugin.recordings.importing.motion import offsets_from_motion
-from d2_plugin.recordings.importing.profiles import Watched
+from d2_plugin.recordings.importing.motion import Watched, offsets_from_motion
 from d2_plugin.recordings.importing.sound import Sound, lag_between, read_sound
-from d2_plugin.recordings.importing.timecode import shortest, timecode_seconds
+from d2_plugin.recordings.importing.video import VideoFile
 
 METHODS = ("auto", "timecode", "sound", "motion", "none")
 """How offsets are found; `none` says that all clocks begin together."""
@@ -28,6 +27,11 @@ TIMECODE_ERROR = 12**-0.5
 HEARD = 1e-3
 """Seconds at least that an offset from sound may be wrong: sound travels a third of a metre in that time."""
 
+DAY = 86_400
+"""Seconds after which a timecode begins anew."""
+
+_TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.])(\d{2,3})$")
+
 INSTEAD = "leave the camera out, give the offsets (--offsets NAME=FRAMES,...), or record a clap that all see and hear"
 
 
@@ -40,12 +44,6 @@ class Clock:
     """Standard error, seconds; 0 for what was given."""
     method: str
     """Where it comes from, such as `sound`."""
-    drift: float = 0.0
-    """Seconds that it loses per second."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
 
 
 class Evidence(NamedTuple):
@@ -75,9 +73,9 @@ def common_clock(videos: Mapping[str, VideoFile], how: str, watching: Watching) 
     evidence = _of_timecodes(videos) if how in ("auto", "timecode") else []
     if how in ("auto", "sound"):
         evidence += _of_sound({name: read_sound(video.path) for name, video in videos.items() if video.sound})
-    if how == "motion" or (how == "auto" and len(_linked(names, evidence)) < len(names)):
+    if how == "motion" or (how == "auto" and len(linked_names(names, [one[:2] for one in evidence])) < len(names)):
         evidence += _of_motion(watching(), names, videos)
-    linked = _linked(names, evidence)
+    linked = linked_names(names, [one[:2] for one in evidence])
     if len(linked) < len(names):
         lost = ", ".join(name for name in names if name not in linked)
         raise D2Error(f"nothing in {_what(how)} links {lost} with {', '.join(linked)}: {INSTEAD}")
@@ -102,6 +100,32 @@ def given_clock(videos: Mapping[str, VideoFile], given: Sequence[str]) -> dict[s
         if not said or not np.isfinite(found[name]):
             raise D2Error(f"--offsets says '{text}', expected NAME=FRAMES with a finite number: correct it")
     return {name: Clock(seconds, 0.0, "given") for name, seconds in found.items()}
+
+
+def timecode_seconds(text: str, rate: float) -> float | None:
+    """Seconds since midnight of an SMPTE timecode at `rate` frames per second; None where the text is none.
+
+    hours:minutes:seconds:frames, counted at the whole rate next to `rate`. Drop-frame timecode, with `;` before the
+    frames, leaves out the first two numbers (four at 59.94) of every minute but each tenth, so that the count keeps up
+    with the clock.
+    """
+    match = _TIMECODE.match(text.strip())
+    if match is None or rate <= 0:
+        return None
+    hours, minutes, seconds, frames = (int(match[place]) for place in (1, 2, 3, 5))
+    counted = round(rate)
+    if minutes > 59 or seconds > 59 or frames >= counted:
+        return None
+    number = ((hours * 60 + minutes) * 60 + seconds) * counted + frames
+    if match[4] in ";.":
+        passed = hours * 60 + minutes
+        number -= round(counted / 15) * (passed - passed // 10)
+    return number / rate
+
+
+def shortest(seconds: float) -> float:
+    """A difference of two times of day, the shorter way around midnight."""
+    return (seconds + DAY / 2) % DAY - DAY / 2
 
 
 def _of_timecodes(videos: Mapping[str, VideoFile]) -> list[Evidence]:
@@ -139,11 +163,11 @@ def _of_motion(watched: Mapping[str, Watched], names: Sequence[str], videos: Map
     ]
 
 
-def _linked(names: Sequence[str], evidence: Sequence[Evidence]) -> list[str]:
-    """Cameras that evidence links, over others or not, with the camera that is linked with most."""
+def linked_names(names: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[str]:
+    """The largest group of names that pairs link, over others or not, in the order of `names`."""
     groups: list[set[str]] = [{name} for name in names]
-    for one in evidence:
-        first, second = (next(group for group in groups if name in group) for name in (one.one, one.other))
+    for pair in pairs:
+        first, second = (next(group for group in groups if name in group) for name in pair)
         if first is not second:
             groups.remove(second)
             first |= second

@@ -13,7 +13,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.importing.clocks import Clock
-from d2_plugin.recordings.importing.files import VideoFile
+from d2_plugin.recordings.importing.video import VideoFile
 
 REACH = 0.75
 """An image farther than this many frames of the recording, or half of the camera's own, stands for no instant."""
@@ -56,7 +56,7 @@ def grid_of(
     Raises:
         D2Error: no instant at which all cameras recorded, or none of those that were asked for.
     """
-    taken = {name: _instants(video, clocks[name]) for name, video in videos.items()}
+    taken = {name: clocks[name].seconds + video.times for name, video in videos.items()}
     begin, end = max(one[0] for one in taken.values()), min(one[-1] for one in taken.values())
     fps = rate or _rounded(min((video.rate for video in videos.values() if video.rate), default=25.0))
     if end < begin - REACH / fps:
@@ -77,11 +77,6 @@ def grid_of(
     if not kept.any():
         raise D2Error("no instant is in all videos: correct --offsets, or choose other --times")
     return Grid(fps, *_chosen(numbers, near, kept), notes=_notes(kept, videos, fps))
-
-
-def _instants(video: VideoFile, clock: Clock) -> np.ndarray:
-    """[N] seconds on the common clock."""
-    return clock.seconds + video.times * (1 + clock.drift)
 
 
 def _rounded(rate: float) -> float:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.recordings.importing.files import container_of, pyav
+from d2_plugin.recordings.importing.video import container_of, pyav
 
 RATE = 16_000
 """Samples per second that are compared."""
@@ -64,8 +64,6 @@ class Lag(NamedTuple):
     seconds: float
     error: float
     """Standard error, seconds."""
-    drift: float
-    """Seconds that the other clock loses per second; 0 where it is within its error."""
 
 
 def read_sound(path: Path) -> Sound | None:
@@ -100,8 +98,11 @@ def lag_between(one: Sound, other: Sound) -> Lag | None:
         return None
     lag = _between_samples(correlation, peak) / RATE
     parts = _lags_of_parts(one.samples, other.samples, lag)
-    error, drift = _spread(parts)
-    return Lag(lag + one.start - other.start, error, drift)
+    error = 1 / RATE
+    if len(parts) > 1:
+        spread = 1.4826 * float(np.median(np.abs(parts - np.median(parts))))
+        error = max(1.2533 * spread / np.sqrt(len(parts)), error)
+    return Lag(lag + one.start - other.start, error)
 
 
 def phase_transform(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -137,11 +138,11 @@ def _between_samples(correlation: np.ndarray, peak: int) -> float:
 
 
 def _lags_of_parts(one: np.ndarray, other: np.ndarray, lag: float) -> np.ndarray:
-    """(middle of the part in seconds, lag in seconds) [n, 2] of the parts that share a clear event."""
+    """Lags in seconds [n] of the parts that share a clear event."""
     shift = round(lag * RATE)
     begin, end = max(shift, 0), min(len(one), len(other) + shift)
     count = int(min(max((end - begin) / (PART * RATE), 1), PARTS))
-    reach, found = int(AROUND * RATE), []
+    reach, lags = int(AROUND * RATE), []
     edges = np.linspace(begin, end, count + 1).astype(int)
     for first, last in pairwise(edges):
         correlation = phase_transform(one[first:last], other[first - shift : last - shift])
@@ -149,21 +150,5 @@ def _lags_of_parts(one: np.ndarray, other: np.ndarray, lag: float) -> np.ndarray
         noise = 1.4826 * float(np.median(np.abs(correlation))) + 1e-20
         if near.max() >= 5 * noise:
             peak = (int(near.argmax()) - reach) % len(correlation)
-            found.append([(first + last) / 2 / RATE, (shift + _between_samples(correlation, peak)) / RATE])
-    return np.array(found).reshape(-1, 2)
-
-
-def _spread(parts: np.ndarray) -> tuple[float, float]:
-    """(standard error of the lag in seconds, drift in seconds per second)."""
-    finest = 1 / RATE
-    if len(parts) < 2:
-        return finest, 0.0
-    spread = 1.4826 * float(np.median(np.abs(parts[:, 1] - np.median(parts[:, 1]))))
-    error = max(1.2533 * spread / np.sqrt(len(parts)), finest)
-    if len(parts) < 4:
-        return error, 0.0
-    times = parts[:, 0] - parts[:, 0].mean()
-    slope = float((times * parts[:, 1]).sum() / (times**2).sum())
-    left = parts[:, 1] - parts[:, 1].mean() - slope * times
-    slope_error = float(np.sqrt((left**2).sum() / (len(parts) - 2) / (times**2).sum())) + finest / np.ptp(parts[:, 0])
-    return error, slope if abs(slope) > 4 * slope_error else 0.0
+            lags.append((shift + _between_samples(correlation, peak)) / RATE)
+    return np.array(lags)

@@ -286,7 +286,7 @@ def test_a_video_that_moved_since_it_was_imported(given: Filmed, tmp_path: Path,
 def test_a_calibration_folder_is_not_searched_without_end(
     given: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("d2_plugin.recordings.importing.claimed.MOST_FILES", 5)
+    monkeypatch.setattr("d2_plugin.recordings.importing.steps.MOST_FILES", 5)
     (tmp_path / "home").mkdir()
     for number in range(6):
         (tmp_path / "home" / f"{number}.txt").write_text("")

@@ -131,8 +131,8 @@ def board_matches(
 
 def _corners_seen(board: Board, taken: Sequence[np.ndarray]) -> dict[tuple[int, int], np.ndarray]:
     """(moment, number of the corner) -> its pixel."""
-    found = [(moment, board.corners(image)) for moment, image in enumerate(taken, start=1)]  # 0 is the still
-    return {(moment, number): corner for moment, corners in found for number, corner in corners.items()}
+    moments = [(moment, board.corners(image)) for moment, image in enumerate(taken, start=1)]  # 0 is the still
+    return {(moment, number): corner for moment, corners in moments for number, corner in corners.items()}
 
 
 def _with_corners(features: Features, corners: Mapping[tuple[int, int], np.ndarray]) -> Features:

@@ -8,10 +8,17 @@ from dataclasses import replace
 import numpy as np
 
 from d2_plugin.recordings.cameras.calibrating.bundle import Bundle, Tracks, fitting, join_matches, project, triangulate
-from d2_plugin.recordings.cameras.calibrating.features import Features, Matches, Pair, pixel_error, silent_pycolmap
+from d2_plugin.recordings.cameras.calibrating.features import (
+    Features,
+    Matches,
+    Pair,
+    as_colmap,
+    essential_pose,
+    pixel_error,
+    silent_pycolmap,
+)
 from d2_plugin.recordings.cameras.calibrating.refine import bundled
-from d2_plugin.recordings.cameras.calibrating.verify import as_colmap, essential_pose
-from d2_plugin.recordings.cameras.calibration import rigid
+from d2_plugin.recordings.cameras.camera import rigid
 from d2_plugin.recordings.recording import Camera
 
 STARTS = 2

@@ -6,28 +6,28 @@ cameras started, and where they exposed together.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.progress import progress_bar
 from d2_plugin.recordings.cameras.calibrating.boards import Board, scaled_by_board
-from d2_plugin.recordings.cameras.calibrating.lenses import Lenses, lenses_of
 from d2_plugin.recordings.cameras.calibrating.rig import ARBITRARY, SolvedRig
 from d2_plugin.recordings.cameras.calibrating.solve import solve_rig
-from d2_plugin.recordings.cameras.formats import CalibratedCamera
-from d2_plugin.recordings.cameras.formats.cameras_json import to_json
-from d2_plugin.recordings.cameras.lens import UndistortedSource, resampled, resampling
-from d2_plugin.recordings.images import opencv, read_image
+from d2_plugin.recordings.cameras.calibration import open_calibration
+from d2_plugin.recordings.cameras.camera import CalibratedCamera, pinhole
+from d2_plugin.recordings.cameras.formats.cameras_json import camera_table
+from d2_plugin.recordings.cameras.lens import Lens
+from d2_plugin.recordings.cameras.undistort import UndistortedSource, Undistortion
+from d2_plugin.recordings.images import IMAGE_SUFFIXES, opencv, read_image
 from d2_plugin.recordings.importing.clocks import METHODS, Clock, common_clock, given_clock
-from d2_plugin.recordings.importing.files import VideoFile
 from d2_plugin.recordings.importing.grid import grid_of
-from d2_plugin.recordings.importing.source import Upright
-from d2_plugin.recordings.recording import Camera
+from d2_plugin.recordings.importing.settings import ImportChoices
+from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
 
 MOMENTS = 8
 """Images of each camera that are looked at, spread over the recording."""
@@ -38,7 +38,8 @@ BOARD_MOMENTS = 24
 TOGETHER = 0.1
 """Frames by which cameras may expose apart for what moves to be a witness."""
 
-IMAGES = (".png", ".jpg", ".jpeg")
+SHARED, EACH = "shared", "each"
+"""Focal lengths that are not known: one for all cameras, or one for each of them."""
 
 
 class _NeedsMotion(Exception):
@@ -46,18 +47,16 @@ class _NeedsMotion(Exception):
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """What a rig is solved from beside its videos, as `d2 import` takes it."""
+class Lenses:
+    """Cameras without poses, and whether their focal lengths are known, `SHARED` or `EACH` of its own."""
 
-    intrinsics: Path | None
-    focal: tuple[str, ...]
-    stills: Path | None
-    board: str | None
-    distance: tuple[str, ...] | None
+    cameras: dict[str, CalibratedCamera]
+    focal: str | None
+    """None where it is known."""
 
 
 def rig_of_videos(
-    videos: Mapping[str, VideoFile], evidence: Evidence, offsets: tuple[str, ...]
+    videos: Mapping[str, VideoFile], choices: ImportChoices
 ) -> tuple[tuple[CalibratedCamera, ...], SolvedRig]:
     """(the cameras with their poses, what is known about them).
 
@@ -66,44 +65,86 @@ def rig_of_videos(
     """
     if len(videos) < 2:
         raise D2Error("one video says nothing about where its camera stands: give two at least, or --calibration FILE")
-    board = None if evidence.board is None else Board.parsed(evidence.board)
-    distance = None if evidence.distance is None else _distance(evidence.distance, list(videos))
-    sizes = {name: video.turn.size(*video.size) for name, video in videos.items()}
-    lenses = lenses_of(evidence.intrinsics, evidence.focal, sizes)
-    stills = {} if evidence.stills is None else _stills(evidence.stills, lenses)
-    images = _images(videos, lenses, offsets, MOMENTS if board is None else BOARD_MOMENTS)
+    board = None if choices.board is None else Board.parsed(choices.board)
+    distance = None if choices.distance is None else _distance(choices.distance, list(videos))
+    lenses = _lenses(choices.intrinsics, choices.focal, {name: video.size for name, video in videos.items()})
+    stills = {} if choices.stills is None else _stills(choices.stills, lenses)
+    images = _images(videos, lenses, choices.offsets, MOMENTS if board is None else BOARD_MOMENTS)
     known = {name: camera.pinhole() for name, camera in lenses.cameras.items()}
     known |= {name: replace(known[taker], name=name) for name, (taker, _) in stills.items()}
-    seen = {name: image for name, (_, image) in stills.items()}
-    rig = solve_rig(images, known, seen, board, lenses.focal)
+    rig = solve_rig(images, known, {name: image for name, (_, image) in stills.items()}, board, lenses.focal)
     if board is not None:
         rig = scaled_by_board(rig, images, board)
     if distance is not None:
         rig = rig.scaled(*distance)
-    return tuple(_posed(lenses.cameras[name], rig.cameras[name]) for name in videos), rig
+    solved = (replace(lenses.cameras[name], T_camera_world=rig.cameras[name].T_camera_world) for name in videos)
+    return tuple(replace(one, lens=replace(one.lens, K=rig.cameras[one.name].K)) for one in solved), rig
 
 
 def calibration_table(cameras: tuple[CalibratedCamera, ...], rig: SolvedRig) -> dict[str, Any]:
     """The calibration as `--calibration` reads it, with what is known about each camera."""
-    entries = to_json(cameras)
-    verdicts = rig.verdicts()
-    for entry in entries:
-        name = entry["name"]
-        degrees, share = rig.doubt[name]
-        entry |= {"reprojection_error": rig.pixels[name], "points": rig.seen[name], "verdict": verdicts[name]}
-        entry |= {"doubt_degrees": degrees, "doubt_share_of_rig": share}
+    verdicts, entries = rig.verdicts(), []
+    for camera in cameras:
+        degrees, share = rig.doubt[camera.name]
+        known: dict[str, Any] = {"reprojection_error": rig.pixels[camera.name], "points": rig.seen[camera.name]}
+        known |= {"verdict": verdicts[camera.name], "doubt_degrees": degrees, "doubt_share_of_rig": share}
+        entries.append({**camera_table(camera), **known})
     return {"cameras": entries, "scale": rig.scale}
 
 
-def said_of(rig: SolvedRig) -> list[str]:
+def summary(rig: SolvedRig) -> list[str]:
     """What a person should know, a line each."""
     scale = [f"scale: {rig.scale} (--distance, --board)" if rig.scale == ARBITRARY else f"scale: {rig.scale}"]
     return [*(f"camera {name}: {verdict}" for name, verdict in rig.verdicts().items()), *scale]
 
 
-def _posed(camera: CalibratedCamera, found: Camera) -> CalibratedCamera:
-    T = found.T_camera_world
-    return replace(camera, matrix=found.K, rotation=T[:3, :3], translation=T[:3, 3])
+def _lenses(intrinsics: Path | None, focal: Sequence[str], sizes: Mapping[str, tuple[int, int]]) -> Lenses:
+    """The lenses of cameras whose upright images have `sizes` (width, height).
+
+    Raises:
+        D2Error: two sources, a number that no lens has, cameras that are not there or of two shapes that share one.
+    """
+    if intrinsics is not None:
+        if tuple(focal) != (SHARED,):
+            raise D2Error("--intrinsics and --focal both say how the lenses are: give one of them")
+        read = open_calibration(intrinsics, sizes)
+        return Lenses({one.name: replace(one, T_camera_world=np.eye(4)) for one in read.cameras}, None)
+    if tuple(focal) in ((SHARED,), (EACH,)):
+        if focal[0] == SHARED and len(set(sizes.values())) > 1:
+            raise D2Error(
+                "the videos have different sizes, so their cameras share no focal length: give --focal each, pixels "
+                "as --focal NAME=PIXELS,..., or --intrinsics FILE"
+            )
+        return Lenses({name: _ideal(name, size, float(max(size))) for name, size in sizes.items()}, focal[0])
+    lengths = _lengths(focal, list(sizes))
+    return Lenses({name: _ideal(name, size, lengths[name]) for name, size in sizes.items()}, None)
+
+
+def _lengths(focal: Sequence[str], names: Sequence[str]) -> dict[str, float]:
+    """Pixels by camera."""
+    lengths: dict[str, float] = {}
+    for text in focal:
+        name, named, number = text.rpartition("=")
+        if named and name not in names:
+            raise D2Error(f"--focal names camera '{name}', have {', '.join(names)}: correct the name")
+        try:
+            length = float(number)
+        except ValueError:
+            length = 0.0
+        if not (np.isfinite(length) and length > 0):
+            raise D2Error(
+                f"--focal says '{text}', expected shared, each, a number of pixels above 0, or NAME=PIXELS: correct it"
+            )
+        lengths |= {name: length} if named else dict.fromkeys(names, length)
+    lost = [name for name in names if name not in lengths]
+    if lost:
+        raise D2Error(f"--focal says nothing of camera {', '.join(lost)}: add NAME=PIXELS, or give one number for all")
+    return lengths
+
+
+def _ideal(name: str, size: tuple[int, int], length: float) -> CalibratedCamera:
+    """A camera without distortion whose principal point is the middle of the image."""
+    return CalibratedCamera(name, *size, Lens(pinhole(length, length, size[0] / 2, size[1] / 2)), np.eye(4))
 
 
 def _distance(words: tuple[str, ...], names: list[str]) -> tuple[str, str, float]:
@@ -122,9 +163,10 @@ def _distance(words: tuple[str, ...], names: list[str]) -> tuple[str, str, float
 
 def _stills(folder: Path, lenses: Lenses) -> dict[str, tuple[str, np.ndarray]]:
     """Name of a still -> (camera whose lens took it, its undistorted image in that camera's size)."""
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES) if folder.is_dir() else []
+    inside = sorted(folder.iterdir()) if folder.is_dir() else []
+    paths = [path for path in inside if path.suffix.lower() in IMAGE_SUFFIXES]
     if not paths:
-        raise D2Error(f"--stills {folder} is no folder with images ({', '.join(IMAGES)}): give one")
+        raise D2Error(f"--stills {folder} is no folder with images ({', '.join(IMAGE_SUFFIXES)}): give one")
     found = {}
     for path in paths:
         taker = _taker(path, lenses)
@@ -137,7 +179,7 @@ def _taker(path: Path, lenses: Lenses) -> str:
     called = [name for name in lenses.cameras if path.stem == name or path.stem.startswith((f"{name}_", f"{name}-"))]
     if called:
         return max(called, key=len)
-    lenses_are_one = len({(c.width, c.height, c.matrix.tobytes(), c.distortion) for c in lenses.cameras.values()}) == 1
+    lenses_are_one = len({(c.size, c.lens.K.tobytes(), c.lens.distortion) for c in lenses.cameras.values()}) == 1
     if lenses_are_one and lenses.focal != "each":
         return next(iter(lenses.cameras))
     raise D2Error(
@@ -149,15 +191,15 @@ def _taker(path: Path, lenses: Lenses) -> str:
 def _as_taken(path: Path, camera: CalibratedCamera) -> np.ndarray:
     """The still as a video of the same camera would show it."""
     cv2 = opencv("reading stills", "calibration")
-    image, size = read_image(path), (camera.width, camera.height)
+    image, size = read_image(path), camera.size
     if abs(image.shape[1] * size[1] - image.shape[0] * size[0]) > 0.01 * image.shape[0] * size[0]:
         raise D2Error(
             f"still {path.name} has {image.shape[1]}x{image.shape[0]} pixels and the video of its camera "
             f"{size[0]}x{size[1]}, another aspect: take stills in the video's mode, upright, not cropped"
         )
-    same = image.shape[1::-1] == size
-    image = image if same else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return resampled(image, resampling(camera.lens, size)) if camera.lens.bends else image
+    if image.shape[1::-1] != size:
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return Undistortion(camera).image(image)
 
 
 def _images(
@@ -167,34 +209,31 @@ def _images(
     clocks = _clocks(videos, offsets)
     indices = _together(videos, clocks, moments) if clocks is not None else None
     chosen = indices or {name: _spread(len(video.stamps), moments) for name, video in videos.items()}
-    upright = Upright(videos, {name: dict(enumerate(places)) for name, places in chosen.items()})
-    bent = {name: camera.lens for name, camera in lenses.cameras.items() if camera.lens.bends}
-    sizes = {name: (lenses.cameras[name].width, lenses.cameras[name].height) for name in bent}
-    source = UndistortedSource(upright, bent, sizes)
-    found: dict[str, list[np.ndarray]] = {}
-    with progress_bar("look at the videos", sum(map(len, chosen.values()))) as bar:
+    frames = VideoFrames(videos, {name: dict(enumerate(places)) for name, places in chosen.items()})
+    source = UndistortedSource(frames, {name: one for name, one in lenses.cameras.items() if one.lens.bends})
+    images: dict[str, list[np.ndarray]] = {}
+    with progress_bar("decode the videos", sum(map(len, chosen.values()))) as bar:
         done = 0
         for name, places in chosen.items():
-            found[name] = []
+            images[name] = []
             for moment in range(len(places)):
-                found[name].append(source.image(name, moment))
+                images[name].append(source.image(name, moment))
                 bar.update(done := done + 1, name)
     if indices is None:
-        return {name: [np.median(np.stack(taken), axis=0).astype(np.uint8)] for name, taken in found.items()}
-    return found
+        return {name: [np.median(np.stack(taken), axis=0).astype(np.uint8)] for name, taken in images.items()}
+    return images
 
 
 def _clocks(videos: Mapping[str, VideoFile], offsets: tuple[str, ...]) -> Mapping[str, Clock] | None:
     """When the cameras started; None where only motion could say it, which takes a calibration."""
 
-    def refuse() -> Any:
+    def refuse() -> NoReturn:
         raise _NeedsMotion
 
-    watching: Callable[[], Any] = refuse
     if len(offsets) != 1 or offsets[0] not in METHODS:
         return given_clock(videos, offsets)
     try:
-        return common_clock(videos, offsets[0], watching)
+        return common_clock(videos, offsets[0], refuse)
     except _NeedsMotion:
         return None
 
