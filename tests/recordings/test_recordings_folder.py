@@ -162,9 +162,9 @@ def test_a_chosen_camera_is_enough_where_others_are_broken(folder: Path) -> None
 
 def test_cameras_without_counterpart_are_named_and_left_out_only_when_asked(folder: Path) -> None:
     shutil.rmtree(folder / "images" / "test0")
-    refused(folder, r"camera test0 of .*cameras\.json has no folder")
+    refused(folder, r"camera test0 of .*cameras\.json has no image")
     (folder / "images" / "extra").mkdir()
-    refused(folder, r"camera extra is not in .*cameras\.json, which has train0, train1, test0")
+    refused(folder, r"camera extra has images but is not in .*cameras\.json, which has train0, train1, test0")
     recording = open_recording(folder, intersect=True)
     assert list(recording.cameras) == ["train0", "train1"]
     assert any("extra" in note and "test0" in note for note in recording.notes)

@@ -169,7 +169,7 @@ def test_missing_images_are_named_and_left_out_only_when_asked(tmp_path: Path) -
         ({"transform_matrix": [[1, 0], [0, 1]]}, "cannot be understood"),
         ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "not finite"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "no rotation"),
-        ({"time": None}, "cannot be understood"),
+        ({"time": None}, "time of an image in .* must be a number, got None"),
         ({"fl_x": "long"}, "fl_x of camera a .* must be a number, got 'long'"),
         ({"fl_x": -3}, "focal lengths"),
     ],
@@ -183,7 +183,7 @@ def test_files_that_cannot_be_are_refused(tmp_path: Path) -> None:
     refused(tmp_path, "that lists images")
     (tmp_path / "transforms.json").write_text('{"camera_angle_x": 1}')
     refused(tmp_path, "has no list 'frames'")
-    refused(write(tmp_path, [{"transform_matrix": []}], images=False), "has no 'file_path'")
+    refused(write(tmp_path, [{"transform_matrix": []}], images=False), "has no file_path")
     refused(write(tmp_path, [entry("a_0", time=0.0), entry("a_1")]), "some images .* have a time")
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [entry("a_0")]}))
     refused(tmp_path, "neither fl_x nor camera_angle_x")
