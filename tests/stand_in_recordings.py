@@ -39,6 +39,27 @@ class Smooth:
         """No monocular maps."""
 
 
+class _Renamed:
+    def __init__(self, recording: Recording, names: dict[str, str]) -> None:
+        self.recording, self.names = recording, names
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        return self.recording.image(self.names[camera], frame)
+
+    def depth(self, camera: str, frame: int) -> np.ndarray | None:
+        return self.recording.depth(self.names[camera], frame)
+
+    def mono(self, camera: str, frame: int) -> np.ndarray | None:
+        return self.recording.mono(self.names[camera], frame)
+
+
+def renamed(recording: Recording, names: tuple[str, ...], **changes: object) -> Recording:
+    """The recording with other names for its cameras, and other values of `changes` in each."""
+    old = dict(zip(names, recording.cameras, strict=True))
+    cameras = {name: replace(recording.cameras[was], name=name, **changes) for name, was in old.items()}
+    return replace(recording, cameras=cameras, source=_Renamed(recording, old))
+
+
 def smooth_recording(names: tuple[str, ...], frames: int = 20, width: int = 96, height: int = 64) -> Recording:
     """Cameras on an arc that declare near and far, named `names`, whose images are `Smooth`."""
     rig = synthetic_recording(len(names), 0, frames, width, height, fps=24.0)

@@ -149,6 +149,7 @@ MULTICAL = """{
 }
 """
 
+
 def read(path: Path, text: str, **sizes: tuple[int, int]) -> dict[str, CalibratedCamera]:
     path.write_text(text)
     return {camera.name: camera for camera in open_calibration(path, sizes or None).cameras}

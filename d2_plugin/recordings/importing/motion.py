@@ -36,11 +36,11 @@ ALIKE = 0.2
 RIVAL = 0.8
 """Another lag that is this good, outside of the peak, makes a camera's offset doubtful."""
 
-FINEST = 0.05
-"""Frames: no offset from motion is said to be surer."""
+ERROR = 0.25
+"""Frames: the standard error of an offset from motion."""
 
-PLANES, GROUPS = 48, 4
-"""Half-planes between the common limits of two images; the offsets are found again without each group of them."""
+PLANES = 48
+"""Half-planes between the common limits of two images."""
 
 FINE = 8
 """Steps per frame in which lags are compared; between them lies a parabola."""
@@ -64,24 +64,16 @@ class Watched(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """How well two cameras agree at each lag, by group of half-planes."""
+    """How well two cameras agree at each lag."""
 
     lags: np.ndarray  # [L] in steps: the clock of the other began so much later
-    products: np.ndarray  # [G, L]
-    squares: np.ndarray  # [2, G, L]
+    correlation: np.ndarray  # [L], 0 where too few frames are common
     common: np.ndarray  # [L] frames
 
-    def correlation(self, without: int | None = None) -> np.ndarray:
-        """[L], NaN where too few frames are common; `without` leaves out a group."""
-        kept = [group for group in range(len(self.products)) if group != without]
-        size = np.sqrt(np.prod(self.squares[:, kept].sum(1), axis=0))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            found = self.products[kept].sum(0) / size
-        return np.where((self.common >= LEAST_COMMON) & (size > 1e-9), found, np.nan)
-
-    def score(self, without: int | None = None) -> np.ndarray:
+    @property
+    def score(self) -> np.ndarray:
         """[L] Fisher's z of the correlation times the root of the common frames: a chance peak counts less."""
-        return np.nan_to_num(np.arctanh(np.clip(self.correlation(without), -0.999, 0.999)) * np.sqrt(self.common))
+        return np.arctanh(np.clip(self.correlation, -0.999, 0.999)) * np.sqrt(self.common)
 
 
 def small_images(videos: Mapping[str, VideoFile], cameras: Mapping[str, CalibratedCamera]) -> dict[str, Watched]:
@@ -102,6 +94,10 @@ def small_images(videos: Mapping[str, VideoFile], cameras: Mapping[str, Calibrat
     return watched
 
 
+Scores = Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
+"""Two cameras -> (lags [L] in steps, how well they agree at each [L])."""
+
+
 class Seen(NamedTuple):
     """What motion says about one camera."""
 
@@ -109,8 +105,6 @@ class Seen(NamedTuple):
     """When its clock began, after that of the first camera."""
     error: float
     """Standard error, seconds."""
-    alike: float
-    """Mean correlation with the other cameras at that offset."""
     doubt: str
     """Why it cannot be trusted; empty where it can."""
 
@@ -131,37 +125,26 @@ def offsets_from_motion(watched: Mapping[str, Watched], search: float) -> dict[s
         pair = curve_between(watched[one], watched[other], changes[one], changes[other], step, search)
         if pair is not None:
             curves[one, other] = pair
-    offsets = _agreed(names, curves, None)
-    without = np.array([list(_agreed(names, curves, group, offsets).values()) for group in range(GROUPS)])
-    spread = np.sqrt((GROUPS - 1) / GROUPS * ((without - without.mean(0)) ** 2).sum(0)) * step
-    found = {}
-    for place, name in enumerate(names):
-        alike, doubt = _trust(name, offsets, curves)
-        found[name] = Seen(offsets[name] * step, float(max(spread[place], FINEST * frame)), alike, doubt)
-    return found
+    scores = {pair: (curve.lags, curve.score) for pair, curve in curves.items()}
+    offsets = _agreed(names, scores)
+    return {name: Seen(offsets[name] * step, ERROR * frame, _doubt(name, offsets, curves, scores)) for name in names}
 
 
-def _agreed(
-    names: Sequence[str],
-    curves: Mapping[tuple[str, str], Curve],
-    without: int | None,
-    start: Mapping[str, float] | None = None,
-) -> dict[str, float]:
+def _agreed(names: Sequence[str], scores: Scores) -> dict[str, float]:
     """Offsets, in steps, at which the sum of the scores of all pairs has its peak."""
-    scores = {pair: (curve.lags, curve.score(without)) for pair, curve in curves.items()}
-    offsets = dict(start) if start is not None else _tree(names, scores)
+    offsets = _tree(names, scores)
     for _ in range(20):
         before = dict(offsets)
         for name in names[1:]:
             lags, total = _alone(name, offsets, scores)
             if len(lags):
-                offsets[name] = _summit(lags, total, near=None if start is None else offsets[name])
+                offsets[name] = _summit(lags, total)
         if all(abs(offsets[name] - before[name]) < 0.01 for name in names):
             break
     return offsets
 
 
-def _tree(names: Sequence[str], scores: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]) -> dict[str, float]:
+def _tree(names: Sequence[str], scores: Scores) -> dict[str, float]:
     """A start: from the first camera on, each is hung to the one that it agrees with best."""
     offsets = {names[0]: 0.0}
     while len(offsets) < len(names):
@@ -177,9 +160,7 @@ def _tree(names: Sequence[str], scores: Mapping[tuple[str, str], tuple[np.ndarra
     return offsets
 
 
-def _alone(
-    name: str, offsets: Mapping[str, float], scores: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
-) -> tuple[np.ndarray, np.ndarray]:
+def _alone(name: str, offsets: Mapping[str, float], scores: Scores) -> tuple[np.ndarray, np.ndarray]:
     """(offsets of one camera, sum of its scores there) with the other cameras where they are."""
     curves = []
     for (one, other), (lags, score) in scores.items():
@@ -193,10 +174,9 @@ def _alone(
     return places, np.sum([np.interp(places, lags, score, left=0, right=0) for lags, score in curves], axis=0)
 
 
-def _summit(places: np.ndarray, total: np.ndarray, near: float | None) -> float:
-    """The place of the peak, of that within a frame of `near` where given, by a parabola over half a frame."""
-    allowed = np.ones(len(places), bool) if near is None else np.abs(places - near) <= FINE
-    top = int(np.where(allowed, total, -np.inf).argmax())
+def _summit(places: np.ndarray, total: np.ndarray) -> float:
+    """The place of the peak, by a parabola over half a frame."""
+    top = int(total.argmax())
     low, high = max(top - FINE // 2, 0), min(top + FINE // 2, len(places) - 1)
     if high - low < 2:
         return float(places[top])
@@ -205,33 +185,25 @@ def _summit(places: np.ndarray, total: np.ndarray, near: float | None) -> float:
     return float(places[top] + np.clip(shift, -FINE / 2, FINE / 2))
 
 
-def _trust(name: str, offsets: Mapping[str, float], curves: Mapping[tuple[str, str], Curve]) -> tuple[float, str]:
-    """(mean correlation with the others, why the offset is doubtful)."""
-    correlations = [
-        float(np.interp(offsets[other] - offsets[one], curve.lags, np.nan_to_num(curve.correlation())))
-        for (one, other), curve in curves.items()
-        if name in (one, other)
-    ]
-    scores = {pair: (curve.lags, curve.score()) for pair, curve in curves.items()}
+def _doubt(name: str, offsets: Mapping[str, float], curves: Mapping[tuple[str, str], Curve], scores: Scores) -> str:
+    """Why a camera's offset cannot be trusted, or nothing."""
+    own = {pair: curve for pair, curve in curves.items() if name in pair}
     places, total = _alone(name, offsets, scores)
-    if not correlations or not len(places):
-        return 0.0, "it shares no view with another camera"
-    shared = max(
-        float(np.interp(offsets[other] - offsets[one], curve.lags, curve.common))
-        for (one, other), curve in curves.items()
-        if name in (one, other)
-    )
-    alike = float(np.mean(correlations))
+    if not own or not len(places):
+        return "it shares no view with another camera"
+    lags = {pair: offsets[pair[1]] - offsets[pair[0]] for pair in own}
+    shared = max(float(np.interp(lags[pair], curve.lags, curve.common)) for pair, curve in own.items())
+    alike = float(np.mean([np.interp(lags[pair], curve.lags, curve.correlation) for pair, curve in own.items()]))
     if shared < FEWEST:
-        return alike, f"it shares {shared:.0f} frames with the others, fewer than {FEWEST}"
+        return f"it shares {shared:.0f} frames with the others, fewer than {FEWEST}"
     if alike < ALIKE:
-        return alike, f"what moves in it does not move in the others (correlation {alike:.2f})"
+        return f"what moves in it does not move in the others (correlation {alike:.2f})"
     top = int(np.abs(places - offsets[name]).argmin())
     rival = _rival(total, top)
     if rival is not None and total[rival] > RIVAL * total[top]:
         frames = (places[rival] - places[top]) / FINE
-        return alike, f"an offset that differs by {frames:+.1f} frames is as good (is the motion repeated?)"
-    return alike, ""
+        return f"an offset that differs by {frames:+.1f} frames is as good (is the motion repeated?)"
+    return ""
 
 
 def _rival(total: np.ndarray, top: int) -> int | None:
@@ -315,7 +287,7 @@ def _resampled(profile: np.ndarray, times: np.ndarray, step: float) -> np.ndarra
 
 
 def _correlated(one: np.ndarray, other: np.ndarray, starts: tuple[float, float], step: float, search: float) -> Curve:
-    """Sums over the common time at every lag: products and squares about the means of that time."""
+    """The correlation over the common time at every lag, about the means of that time."""
     a, b = len(one), len(other)
     shifts = np.arange(-(b - 1), a)  # sample i + shift of `one` meets sample i of `other`
     begin, end = np.maximum(shifts, 0), np.minimum(a, b + shifts)
@@ -326,13 +298,12 @@ def _correlated(one: np.ndarray, other: np.ndarray, starts: tuple[float, float],
     sums, squares = zip(*(_running(one, begin, end), _running(other, begin - shifts, end - shifts)))
     product = product - sums[0] * sums[1] / count[:, None]
     spreads = [square - total**2 / count[:, None] for square, total in zip(squares, sums)]
+    size = np.sqrt(np.prod([spread.sum(1) for spread in spreads], axis=0).clip(0))
+    known = (count >= LEAST_COMMON * FINE) & (size > 1e-9)
+    correlation = np.where(known, product.sum(1) / np.where(known, size, 1), 0.0)
     lags = shifts + (starts[0] - starts[1]) / step
     kept = np.abs(lags) <= search / step + 1
-
-    def grouped(values: np.ndarray) -> np.ndarray:
-        return np.stack([part.sum(1) for part in np.array_split(values[kept], GROUPS, axis=1)])
-
-    return Curve(lags[kept], grouped(product), np.stack([grouped(s) for s in spreads]), count[kept] / FINE)
+    return Curve(lags[kept], correlation[kept], count[kept] / FINE)
 
 
 def _running(values: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
