@@ -59,16 +59,6 @@ def names_of(folder: Path) -> dict[str, str]:
     return json.loads((folder / "export.json").read_text())["cameras"]
 
 
-@pytest.mark.parametrize("layout", ["transforms", "colmap"])
-def test_uneven_cameras_read_back_the_same(uneven: Recording, layout: str, tmp_path: Path) -> None:
-    folder = export_recording(uneven, layout, tmp_path / layout, test_cameras=list(uneven.cameras)[:1], cloud=CLOUD)
-    back = open_recording(folder)
-    assert_same_cameras(back, uneven, names_of(folder))
-    assert back.frames == uneven.frames
-    for camera in uneven.cameras:
-        np.testing.assert_array_equal(back.image(camera, 1), uneven.image(camera, 1))
-
-
 @pytest.mark.parametrize("layout", ["transforms", "n3dv", "colmap"])
 def test_cameras_named_by_digits_in_any_order_read_back_the_same(layout: str, tmp_path: Path) -> None:
     whole = smooth_recording(("00", "01", "02", "03"), frames=6, width=32, height=24)

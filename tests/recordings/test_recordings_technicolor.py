@@ -121,11 +121,6 @@ def test_a_recording_written_in_the_layout_reads_back(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found.image(theirs.name, 1), original.image(ours.name, 1))
 
 
-def test_fields_may_be_separated_by_several_spaces(tmp_path: Path) -> None:
-    recording = open_recording(rig(tmp_path / "a", line=f"  {INTRINSICS}   {POSE.replace(' ', '  ')} "))
-    assert recording.cameras["00"].K[0, 0] == 30.5
-
-
 def test_cameras_without_images_are_named_and_left_out_only_when_asked(tmp_path: Path) -> None:
     path = rig(tmp_path / "a")
     for file in path.glob("*_02.png"):

@@ -24,7 +24,7 @@ APART = 0.75
 TIMECODE_ERROR = 12**-0.5
 """Frames: the standard deviation of what is rounded to whole frames."""
 
-HEARD = 1e-3
+SOUND_ERROR = 1e-3
 """Seconds at least that an offset from sound may be wrong: sound travels a third of a metre in that time."""
 
 DAY = 86_400
@@ -77,8 +77,9 @@ def common_clock(videos: Mapping[str, VideoFile], how: str, watching: Watching) 
         evidence += _of_motion(watching(), names, videos)
     linked = linked_names(names, [one[:2] for one in evidence])
     if len(linked) < len(names):
-        lost = ", ".join(name for name in names if name not in linked)
-        raise D2Error(f"nothing in {_what(how)} links {lost} with {', '.join(linked)}: {INSTEAD}")
+        alone = ", ".join(name for name in names if name not in linked)
+        what = {"auto": "timecode, sound or motion"}.get(how, f"the {how}")
+        raise D2Error(f"nothing in {what} links {alone} with {', '.join(linked)}: {INSTEAD}")
     return _solved(names, evidence, frame)
 
 
@@ -88,18 +89,18 @@ def given_clock(videos: Mapping[str, VideoFile], given: Sequence[str]) -> dict[s
     Raises:
         D2Error: what is no number, and cameras that there are not.
     """
-    found = dict.fromkeys(videos, 0.0)
+    starts = dict.fromkeys(videos, 0.0)
     for text in given:
-        name, said, frames = text.partition("=")
+        name, _, frames = text.partition("=")
         if name not in videos:
             raise D2Error(f"--offsets names camera '{name}', have {', '.join(videos)}: write NAME=FRAMES,NAME=FRAMES")
         try:
-            found[name] = float(frames) / (videos[name].rate or 25.0)
+            starts[name] = float(frames) / (videos[name].rate or 25.0)
         except ValueError:
-            raise D2Error(f"--offsets says '{text}', expected NAME=FRAMES such as {name}=-7.5: correct it") from None
-        if not said or not np.isfinite(found[name]):
-            raise D2Error(f"--offsets says '{text}', expected NAME=FRAMES with a finite number: correct it")
-    return {name: Clock(seconds, 0.0, "given") for name, seconds in found.items()}
+            starts[name] = np.nan
+        if not np.isfinite(starts[name]):
+            raise D2Error(f"--offsets says '{text}', expected NAME=FRAMES such as {name}=-7.5: correct it")
+    return {name: Clock(seconds, 0.0, "given") for name, seconds in starts.items()}
 
 
 def timecode_seconds(text: str, rate: float) -> float | None:
@@ -130,7 +131,7 @@ def shortest(seconds: float) -> float:
 
 def _of_timecodes(videos: Mapping[str, VideoFile]) -> list[Evidence]:
     read = {name: timecode_seconds(video.timecode or "", video.rate) for name, video in videos.items()}
-    starts = {name: found - float(videos[name].times[0]) for name, found in read.items() if found is not None}
+    starts = {name: time - float(videos[name].times[0]) for name, time in read.items() if time is not None}
     error = {name: TIMECODE_ERROR / (videos[name].rate or 25.0) for name in starts}
     return [
         Evidence(
@@ -141,22 +142,21 @@ def _of_timecodes(videos: Mapping[str, VideoFile]) -> list[Evidence]:
 
 
 def _of_sound(sounds: Mapping[str, Sound | None]) -> list[Evidence]:
-    found = []
-    for (one, heard), (other, also) in combinations(sounds.items(), 2):
-        lag = None if heard is None or also is None else lag_between(heard, also)
+    evidence = []
+    for (one, first), (other, second) in combinations(sounds.items(), 2):
+        lag = None if first is None or second is None else lag_between(first, second)
         if lag is not None:
-            found.append(Evidence(one, other, lag.seconds, max(lag.error, HEARD), "sound"))
-    return found
+            evidence.append(Evidence(one, other, lag.seconds, max(lag.error, SOUND_ERROR), "sound"))
+    return evidence
 
 
 def _of_motion(watched: Mapping[str, Watched], names: Sequence[str], videos: Mapping[str, VideoFile]) -> list[Evidence]:
     seen = offsets_from_motion(watched, search=max(float(np.ptp(video.times)) for video in videos.values()))
     doubtful = {name: one.doubt for name, one in seen.items() if one.doubt}
-    if doubtful and len(names) - len(doubtful) < 2:
-        raise D2Error(f"motion does not say when the cameras started ({next(iter(doubtful.values()))}): {INSTEAD}")
     if doubtful:
         name, why = next(iter(doubtful.items()))
-        raise D2Error(f"motion does not say when camera {name} started ({why}): {INSTEAD}")
+        whose = f"camera {name}" if len(names) - len(doubtful) > 1 else "the cameras"
+        raise D2Error(f"motion does not say when {whose} started ({why}): {INSTEAD}")
     return [
         Evidence(names[0], name, seen[name].seconds - seen[names[0]].seconds, seen[name].error, "motion")
         for name in names[1:]
@@ -179,12 +179,8 @@ def _solved(names: Sequence[str], evidence: Sequence[Evidence], frame: float) ->
     offsets, errors = _least_squares(names, evidence)
     if _worst(offsets, evidence, frame) is not None:
         raise D2Error(_contradiction(names, evidence, frame))
-    found = {}
-    for name in names:
-        own = [one for one in evidence if name in (one.one, one.other)]
-        best = min(own, key=lambda one: one.error)
-        found[name] = Clock(offsets[name], errors[name], best.method)
-    return found
+    best = {name: min((e for e in evidence if name in e[:2]), key=lambda e: e.error) for name in names}
+    return {name: Clock(offsets[name], errors[name], best[name].method) for name in names}
 
 
 def _least_squares(names: Sequence[str], evidence: Sequence[Evidence]) -> tuple[dict[str, float], dict[str, float]]:
@@ -203,12 +199,9 @@ def _least_squares(names: Sequence[str], evidence: Sequence[Evidence]) -> tuple[
 
 def _worst(offsets: Mapping[str, float], evidence: Sequence[Evidence], frame: float) -> tuple[Evidence, float] | None:
     """The evidence that differs most from the whole, and by how many seconds; None where all agree."""
-    found = None
-    for one in evidence:
-        off = abs(offsets[one.other] - offsets[one.one] - one.seconds)
-        if off > APART * frame + 3 * one.error and (found is None or off > found[1]):
-            found = one, off
-    return found
+    off = [(one, abs(offsets[one.other] - offsets[one.one] - one.seconds)) for one in evidence]
+    beyond = [(one, seconds) for one, seconds in off if seconds > APART * frame + 3 * one.error]
+    return max(beyond, key=lambda pair: pair[1], default=None)
 
 
 def _contradiction(names: Sequence[str], evidence: Sequence[Evidence], frame: float) -> str:
@@ -230,7 +223,3 @@ def _contradiction(names: Sequence[str], evidence: Sequence[Evidence], frame: fl
     if len(guilty) == 1:
         return f"{said} {between}, and without camera {guilty[0]} all agree (is it of another event?): {INSTEAD}"
     return f"{said} {between}: choose one with --offsets timecode, sound or motion, or give them, NAME=FRAMES,..."
-
-
-def _what(how: str) -> str:
-    return {"auto": "timecode, sound or motion"}.get(how, f"the {how}")

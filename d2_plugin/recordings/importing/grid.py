@@ -76,7 +76,13 @@ def grid_of(
         kept &= np.abs(off) <= reach
     if not kept.any():
         raise D2Error("no instant is in all videos: correct --offsets, or choose other --times")
-    return Grid(fps, *_chosen(numbers, near, kept), notes=_notes(kept, videos, fps))
+    frames = numbers[kept].tolist()
+    indices = {name: dict(zip(frames, place[kept].tolist())) for name, (place, _) in near.items()}
+    together = all(np.abs(off[kept]).max() <= TOGETHER for _, off in near.values())
+    lateness = (
+        {} if together else {name: dict(zip(frames, off[kept].round(6).tolist())) for name, (_, off) in near.items()}
+    )
+    return Grid(fps, indices, {} if together else lateness, _notes(kept, videos, fps))
 
 
 def _rounded(rate: float) -> float:
@@ -110,22 +116,10 @@ def _asked(numbers: np.ndarray, fps: float, times: Sequence[float] | None, frame
 
 def _nearest(taken: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(place in `taken` that is nearest to each wanted instant, how much later it is)."""
-    after = (
-        np.searchsorted(taken, wanted).clip(1, max(len(taken) - 1, 1)) if len(taken) > 1 else np.zeros(len(wanted), int)
-    )
+    after = np.searchsorted(taken, wanted).clip(0, len(taken) - 1)
     before = np.maximum(after - 1, 0)
     place = np.where(np.abs(taken[before] - wanted) <= np.abs(taken[after] - wanted), before, after)
     return place, taken[place] - wanted
-
-
-def _chosen(
-    numbers: np.ndarray, near: Mapping[str, tuple[np.ndarray, np.ndarray]], kept: np.ndarray
-) -> tuple[dict[str, dict[int, int]], dict[str, dict[int, float]]]:
-    indices = {name: dict(zip(numbers[kept].tolist(), place[kept].tolist())) for name, (place, _) in near.items()}
-    if all(np.abs(off[kept]).max() <= TOGETHER for _, off in near.values()):
-        return indices, {}
-    late = {name: dict(zip(numbers[kept].tolist(), off[kept].round(6).tolist())) for name, (_, off) in near.items()}
-    return indices, late
 
 
 def _notes(kept: np.ndarray, videos: Mapping[str, VideoFile], fps: float) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""When two cameras started, from what both heard: the generalised cross-correlation with phase transform.
+"""When two cameras started, from the sound of both: the generalised cross-correlation with phase transform.
 
 With the spectra A and B of the two sounds, the inverse transform of A conj(B) / |A conj(B)| has its peak at the lag of
 one behind the other: every frequency counts alike, so loudness, distance and the microphone's colour do not matter
@@ -25,13 +25,11 @@ MOST_SECONDS = 900.0
 """Of the sound that is read."""
 
 CLEAR = 12.0
-"""A peak this many standard deviations of the correlation high is an event that both heard. The largest of a million
+"""A peak this many standard deviations of the correlation high is an event that both recorded. The largest of a million
 samples of noise reaches 5."""
 
 DOUBTFUL = 0.6
-"""Another peak of this share of the highest makes it doubtful: a sound that repeats itself, or two events. In rooms of
-claps and noise the second highest reached 0.05 of the highest, 0.4 where next to nothing was heard; between recordings
-of different events 0.8 to 1."""
+"""Another peak of this share of the highest makes it doubtful: a sound that repeats itself, or two events."""
 
 BLUNT = 0.45
 """As much within `ECHO` is no single peak: two claps of different events, laid over each other, look like that."""
@@ -50,7 +48,7 @@ AROUND = 0.05
 
 
 class Sound(NamedTuple):
-    """What a camera heard, one channel."""
+    """The sound of a camera, one channel."""
 
     samples: np.ndarray
     """[N] float32 at `RATE` samples per second."""

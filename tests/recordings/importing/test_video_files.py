@@ -9,7 +9,7 @@ import pytest
 from videos import write_video
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.importing.video import Decoder, VideoFile, read_video, video_header, videos_below
+from d2_plugin.recordings.importing.video import Decoder, VideoFile, read_video, video_header
 
 pytest.importorskip("av")
 
@@ -74,13 +74,6 @@ def test_images_stand_as_players_show_them(tmp_path: Path, turn: int) -> None:
 def test_small_brightness_has_the_shape_of_the_upright_image(unsteady: tuple[Path, np.ndarray]) -> None:
     grey = Decoder(read_video(unsteady[0])).grey(2, 32)
     assert grey.shape == (24, 32)
-
-
-def test_a_folder_names_its_videos(unsteady: tuple[Path, np.ndarray]) -> None:
-    folder = unsteady[0].parent
-    (folder / "notes.txt").write_text("no video")
-    (folder / ".hidden.mp4").write_text("no video")
-    assert videos_below(folder) == (unsteady[0],)
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv", ".mts", ".m2ts", ".avi"])
