@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.recordings import Recording
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.export.n3dv import llff_row
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -100,3 +101,10 @@ def five_cameras(folder: Path) -> Path:
         for name, camera in recording.cameras.items()
     }
     return write_rows(recording, save_recording(replace(recording, cameras=rounded), folder), LLFF_DIGITS)
+
+
+def refused(path: Path, pattern: str, **options: object) -> None:
+    """Opening the recording in `path` is refused in one sentence that fits `pattern`."""
+    with pytest.raises(D2Error, match=pattern) as caught:
+        open_recording(path, **options)
+    assert "\n" not in str(caught.value)

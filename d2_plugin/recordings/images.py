@@ -57,8 +57,8 @@ def checked_image(image: object, what: str) -> np.ndarray:
     """What somebody handed over as an image; a D2Error where it is no RGB uint8 [H, W, 3]."""
     if isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.shape[2:] == (3,) and image.size:
         return image
-    found = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else shown(image)
-    raise D2Error(f"{what} is {found}, expected RGB uint8 [H, W, 3]: give an image as `read_image` returns it")
+    given = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else shown(image)
+    raise D2Error(f"{what} is {given}, expected RGB uint8 [H, W, 3]: give an image as `read_image` returns it")
 
 
 def read_numbers(path: Path) -> np.ndarray:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stand_in_recordings import refused
 
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.cameras.formats.colmap import MODELS, ColmapCamera, find_model, read_model, read_points
 from d2_plugin.recordings.export.export import export_recording
@@ -47,12 +47,6 @@ def two_cameras(path: Path, pattern: str = "{}_{:04d}.png") -> Path:
         for frame in range(3):
             write_grey(path / "images" / pattern.format(name, frame), 100 * i + frame)
     return path
-
-
-def refused(path: Path, pattern: str, **options: object) -> None:
-    with pytest.raises(D2Error, match=pattern) as caught:
-        open_recording(path, **options)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stand_in_recordings import refused
 
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.cameras.rotations import rotation_of_vector
 from d2_plugin.recordings.images import write_png
@@ -58,12 +58,6 @@ def scene(path: Path, folders: tuple[str, ...] = ("00", "11"), k1: float = 0.0, 
             file.parent.mkdir(parents=True, exist_ok=True)
             write_png(file, np.full((H, W, 3), 10 * int(folder) + frame, np.uint8))
     return path
-
-
-def refused(path: Path, pattern: str, **options: object) -> None:
-    with pytest.raises(D2Error, match=pattern) as caught:
-        open_recording(path, **options)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_real_rotation_vector_becomes_the_matrix_beside_it() -> None:

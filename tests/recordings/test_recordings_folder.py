@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stand_in_recordings import refused
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
@@ -38,12 +39,6 @@ def edit_calibration(folder: Path, camera: int | None, **changes: object) -> Non
     content = json.loads(path.read_text())
     (content if camera is None else content["cameras"][camera]).update(changes)
     path.write_text(json.dumps(content))
-
-
-def refused(folder: Path, pattern: str, **options: object) -> None:
-    with pytest.raises(D2Error, match=pattern) as caught:
-        open_recording(folder, **options)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_saved_recording_reads_back_bitwise(original: Recording, saved: Path) -> None:

@@ -14,8 +14,10 @@ import pytest
 from fuzzing import bounded_memory, expect_result_or_sentence, mutate_file
 from small_layouts import write_layout
 
-for _module in ("cv2", "yaml", "pycolmap", "av"):
-    pytest.importorskip(_module, reason="all formats need the `image`, `calibration` and `video` extras")
+pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+pytest.importorskip("yaml", reason="pyyaml is in the `calibration` extra")
+pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
+pytest.importorskip("av", reason="PyAV is in the `video` extra")
 
 from calibration_writers import CASES, rig
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stand_in_recordings import refused
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
@@ -32,12 +33,6 @@ def rig(path: Path, cameras: int = 3, frames: tuple[int, ...] = (151, 152), **op
                 path / f"{scene}{tag}_{frame:05d}_{camera:02d}.png", np.full((H, W, 3), 10 * camera + i, np.uint8)
             )
     return path
-
-
-def refused(path: Path, pattern: str, **options: object) -> None:
-    with pytest.raises(D2Error, match=pattern) as caught:
-        open_recording(path, **options)
-    assert "\n" not in str(caught.value)
 
 
 def test_the_last_two_numbers_of_a_name_are_frame_and_camera(tmp_path: Path) -> None:

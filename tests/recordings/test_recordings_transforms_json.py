@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stand_in_recordings import refused
 
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.images import read_image, write_png
@@ -45,12 +45,6 @@ def two_by_two(**more: object) -> Frames:
     return [
         entry(f"images/cam{c:02d}_{f:04d}", x=c, time=f / 30, **more) for c in (0, 7) for f in (0, 1)
     ]  # fmt: skip
-
-
-def refused(path: Path, pattern: str, **options: object) -> None:
-    with pytest.raises(D2Error, match=pattern) as caught:
-        open_recording(path, **options)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.fixture(scope="module")

@@ -77,7 +77,7 @@ def check_recording(recording: Recording, cameras: Sequence[str], scored: Sequen
     `scored` are those whose true depth will be read as well.
 
     Raises:
-        D2Error: an image or a map that cannot be read, among those looked at.
+        D2Error: an image or a map that cannot be read, among those read.
     """
     rig = [recording.cameras[name] for name in cameras]
     for name in scored:
@@ -159,12 +159,12 @@ def _frames(recording: Recording, cameras: int) -> tuple[int, ...]:
 def _plain(recording: Recording, cameras: Sequence[str]) -> Iterator[str]:
     """Images of one colour."""
     for name in cameras:
-        found: dict[str, list[int]] = {}
+        blank: dict[str, list[int]] = {}
         for frame in _frames(recording, len(cameras)):
             image = recording.image(name, frame)
             if all(_range(part).max() <= ONE_COLOUR for part in (image[::SPARSE, ::SPARSE], image)):
-                found.setdefault("black" if image.max() <= ONE_COLOUR else "of one colour", []).append(frame)
-        for what, frames in found.items():
+                blank.setdefault("black" if image.max() <= ONE_COLOUR else "of one colour", []).append(frame)
+        for what, frames in blank.items():
             yield f"camera {name} is {what} at frame {_some(frames)}: nothing can be learned from that"
 
 
@@ -173,7 +173,7 @@ def _some(frames: Sequence[int]) -> str:
 
 
 def _empty_masks(recording: Recording, cameras: Sequence[str], frames: Sequence[int]) -> Iterator[str]:
-    """Foreground masks without any foreground, among the frames looked at, a sentence for each camera.
+    """Foreground masks without any foreground, among the frames that are read, a sentence for each camera.
 
     Raises:
         D2Error: a camera of which nothing was recorded, or a mask that cannot be read.

@@ -35,8 +35,8 @@ def quaternion_of_rotation(rotation: np.ndarray) -> np.ndarray:
         [c - g, b + d, e - a - i, f + h],
         [d - b, c + g, f + h, i - a - e],
     ]
-    found = np.linalg.eigh(np.array(symmetric))[1][:, -1]
-    return found if found[0] >= 0 else -found
+    quaternion = np.linalg.eigh(np.array(symmetric))[1][:, -1]
+    return quaternion if quaternion[0] >= 0 else -quaternion
 
 
 def rotation_of_vector(vector: np.ndarray) -> np.ndarray:

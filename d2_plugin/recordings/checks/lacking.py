@@ -46,9 +46,9 @@ def findings(recording: Recording) -> list[Finding]:
     """
     rig = list(recording.cameras.values())
     parts = (_cameras(rig), _images(recording), _time(recording), _exposure(recording), _maps(recording))
-    found = [one for part in parts for one in part]
+    all_parts = [one for part in parts for one in part]
     notes = [*recording.notes, *check_recording(recording, list(recording.cameras))]
-    return [*found, *(Finding("check", "note", note) for note in notes)]
+    return [*all_parts, *(Finding("check", "note", note) for note in notes)]
 
 
 def _cameras(rig: Sequence[Camera]) -> Iterator[Finding]:

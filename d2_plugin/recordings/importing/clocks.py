@@ -185,16 +185,12 @@ def _solved(names: Sequence[str], evidence: Sequence[Evidence], frame: float) ->
 
 def _least_squares(names: Sequence[str], evidence: Sequence[Evidence]) -> tuple[dict[str, float], dict[str, float]]:
     """(offsets, standard errors) by weighted least squares; the first of `names` begins at 0."""
-    place = {name: index for index, name in enumerate(names)}
-    rows = np.zeros((len(evidence), len(names)))
-    for row, one in zip(rows, evidence):
-        row[place[one.other]], row[place[one.one]] = 1 / one.error, -1 / one.error
-    goal = np.array([one.seconds / one.error for one in evidence])
-    normal = rows[:, 1:].T @ rows[:, 1:]
-    inverse = np.linalg.pinv(normal)
-    solved = inverse @ rows[:, 1:].T @ goal
-    errors = np.sqrt(np.maximum(np.diag(inverse), 0))
-    return dict(zip(names, (0.0, *map(float, solved)))), dict(zip(names, (0.0, *map(float, errors))))
+    signs = np.array([[(name == one.other) - float(name == one.one) for name in names] for one in evidence])
+    errors = np.array([one.error for one in evidence])
+    rows, goal = signs[:, 1:] / errors[:, None], np.array([one.seconds for one in evidence]) / errors
+    inverse = np.linalg.pinv(rows.T @ rows)
+    offsets, own = inverse @ rows.T @ goal, np.sqrt(np.maximum(np.diag(inverse), 0))
+    return dict(zip(names, [0.0, *offsets.tolist()])), dict(zip(names, [0.0, *own.tolist()]))
 
 
 def _worst(offsets: Mapping[str, float], evidence: Sequence[Evidence], frame: float) -> tuple[Evidence, float] | None:

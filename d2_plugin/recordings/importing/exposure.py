@@ -53,8 +53,8 @@ def measured_exposures(recording: Recording, cameras: Sequence[str]) -> dict[str
             if len(p):
                 a, b = _around(images[one], p), _around(images[other], q)
                 ratios.setdefault((one, other), []).append(b - a)
-    pairs = {pair: found for pair, parts in ratios.items() if len(found := np.concatenate(parts)) >= FEWEST}
-    return _gains(cameras, {pair: _middle(found) for pair, found in pairs.items()})
+    joined = {pair: np.concatenate(parts) for pair, parts in ratios.items()}
+    return _gains(cameras, {pair: _middle(values) for pair, values in joined.items() if len(values) >= FEWEST})
 
 
 _Features = tuple[np.ndarray, np.ndarray]
@@ -109,25 +109,23 @@ def _middle(ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _gains(cameras: Sequence[str], pairs: dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]) -> dict[str, Exposure]:
     """Weighted least squares over the pairs, the mean of the logarithms 0."""
-    pairs = {pair: found for pair, found in pairs.items() if np.isfinite(found).all()}
+    pairs = {pair: values for pair, values in pairs.items() if np.isfinite(values).all()}
     names = linked_names(cameras, pairs)
+    kept = [pair for pair in pairs if pair[0] in names and pair[1] in names]
     if len(names) < 2:
         return {}
-    kept = [(pair, *found) for pair, found in pairs.items() if pair[0] in names and pair[1] in names]
+    signs = np.array([[(name == other) - float(name == one) for name in names] for one, other in kept])
     logs, errors = np.zeros((len(names), 3)), np.zeros((len(names), 3))
     for channel in range(3):
-        rows, goal = np.zeros((len(kept) + 1, len(names))), np.zeros(len(kept) + 1)
-        for row, ((one, other), middle, error) in enumerate(kept):
-            rows[row, names.index(other)], rows[row, names.index(one)] = 1 / error[channel], -1 / error[channel]
-            goal[row] = middle[channel] / error[channel]
-        rows[-1] = 1 / len(names) / 1e-4  # the mean is 0
-        inverse = np.linalg.pinv(rows.T @ rows)
+        middle, error = np.array([[part[channel] for part in pairs[pair]] for pair in kept]).T
+        rows, goal = signs / error[:, None], middle / error
+        inverse = np.linalg.pinv(rows.T @ rows)  # of all solutions the smallest, whose mean is 0
         logs[:, channel] = inverse @ rows.T @ goal
         # Pairs that contradict each other by more than their errors say that those are too small.
         free = len(kept) - len(names) + 1
         excess = float(((rows @ logs[:, channel] - goal) ** 2).sum()) / free if free > 0 else 1.0
         errors[:, channel] = np.sqrt(np.maximum(np.diag(inverse), 0) * max(excess, 1.0))
-    gains = np.exp(logs - logs.mean(0))
+    gains = np.exp(logs)
     return {name: Exposure(_three(gains[i]), _three(gains[i] * errors[i])) for i, name in enumerate(names)}
 
 

@@ -40,7 +40,7 @@ class ImportChoices(Settings):
     """Correct the poses of the calibration by features of all cameras; kept as they are where that mends nothing."""
 
     intrinsics: Path | None = None
-    """Without a calibration: a file with the lenses alone, in any of its formats; its poses are not looked at."""
+    """Without a calibration: a file with the lenses alone, in any of its formats; its poses are not used."""
     focal: tuple[str, ...] = ("shared",)
     """Without a calibration and intrinsics: focal lengths in pixels of the upright video, one number or NAME=PIXELS,
     joined by commas; or how they are found: shared (one for all cameras, as of phones of one model) or each."""

@@ -30,7 +30,7 @@ from d2_plugin.recordings.importing.settings import ImportChoices
 from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
 
 MOMENTS = 8
-"""Images of each camera that are looked at, spread over the recording."""
+"""Images of each camera that are read, spread over the recording."""
 
 BOARD_MOMENTS = 24
 """The same where a board was filmed, which is held in many places."""
@@ -61,7 +61,7 @@ def rig_of_videos(
     """(the cameras with their poses, what is known about them).
 
     Raises:
-        D2Error: one camera, words that say nothing, or videos that do not settle the rig: what to add is said.
+        D2Error: one camera, words that say nothing, or videos that do not settle the rig, with what to add.
     """
     if len(videos) < 2:
         raise D2Error("one video says nothing about where its camera stands: give two at least, or --calibration FILE")
@@ -136,9 +136,11 @@ def _lengths(focal: Sequence[str], names: Sequence[str]) -> dict[str, float]:
                 f"--focal says '{text}', expected shared, each, a number of pixels above 0, or NAME=PIXELS: correct it"
             )
         lengths |= {name: length} if named else dict.fromkeys(names, length)
-    lost = [name for name in names if name not in lengths]
-    if lost:
-        raise D2Error(f"--focal says nothing of camera {', '.join(lost)}: add NAME=PIXELS, or give one number for all")
+    missing = [name for name in names if name not in lengths]
+    if missing:
+        raise D2Error(
+            f"--focal says nothing of camera {', '.join(missing)}: add NAME=PIXELS, or give one number for all"
+        )
     return lengths
 
 
@@ -167,11 +169,11 @@ def _stills(folder: Path, lenses: Lenses) -> dict[str, tuple[str, np.ndarray]]:
     paths = [path for path in inside if path.suffix.lower() in IMAGE_SUFFIXES]
     if not paths:
         raise D2Error(f"--stills {folder} is no folder with images ({', '.join(IMAGE_SUFFIXES)}): give one")
-    found = {}
+    stills = {}
     for path in paths:
         taker = _taker(path, lenses)
-        found[f"still {path.stem}"] = taker, _as_taken(path, lenses.cameras[taker])
-    return found
+        stills[f"still {path.stem}"] = taker, _as_taken(path, lenses.cameras[taker])
+    return stills
 
 
 def _taker(path: Path, lenses: Lenses) -> str:

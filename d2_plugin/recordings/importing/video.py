@@ -195,8 +195,8 @@ def _first_frame(path: Path) -> tuple[tuple[int, int], int]:
 
 def videos_below(folder: Path) -> tuple[Path, ...]:
     """The videos directly in a folder, sorted by name."""
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
-    return tuple(path for path in found if not path.name.startswith("."))
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
+    return tuple(path for path in paths if not path.name.startswith("."))
 
 
 class Decoder:

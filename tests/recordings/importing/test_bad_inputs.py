@@ -28,7 +28,7 @@ NAMES = ("02", "03", "04")
 @pytest.fixture(scope="module")
 def room() -> Recording:
     """Cameras that are rolled by different angles, so that no two can be taken for each other."""
-    rendered = synthetic_recording(cameras=3, held_out=0, frames=14, width=240, height=136, arc_degrees=30.0)
+    rendered = synthetic_recording(cameras=3, held_out=0, frames=10, width=240, height=136, arc_degrees=30.0)
     cameras = {}
     for (name, camera), roll in zip(rendered.cameras.items(), (-0.2, 0.0, 0.35)):
         turn = np.eye(4)

@@ -77,10 +77,10 @@ def _moved(one: Features, other: Features, pairs: np.ndarray, limit: float) -> t
         rows = np.flatnonzero((moments == moment) & ~fixed)
         start, begin = one.pixels[pairs[rows, 0]], places[rows]
         warp = _similarity(one.shapes[pairs[rows, 0]], other.shapes[pairs[rows, 1]])
-        found, alike, step = _matched(one.greys[moment], other.greys[moment], start, begin, warp)
-        near = np.linalg.norm(found - begin, axis=1) < limit
+        ends, alike, step = _matched(one.greys[moment], other.greys[moment], start, begin, warp)
+        near = np.linalg.norm(ends - begin, axis=1) < limit
         good[rows] = near & (alike > ALIKE) & (step < STILL)
-        places[rows] = np.where(good[rows, None], found, begin)
+        places[rows] = np.where(good[rows, None], ends, begin)
     return places, good
 
 

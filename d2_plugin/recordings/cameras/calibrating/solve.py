@@ -64,10 +64,10 @@ def solve_rig(
 
     Args:
         images: camera -> its images RGB uint8 [H, W, 3] at moments that are the same for all cameras, undistorted.
-        intrinsics: camera -> its size and K, for the stills too; the poses in it are not looked at.
+        intrinsics: camera -> its size and K, for the stills too; the poses in it are not used.
         stills: more images of the same scene, a camera each: they connect cameras that see too little in common.
         board: corners of this board, where cameras saw it at the same moment, are matches too.
-        focal: "shared" or "each" where focal lengths are not known: those of `intrinsics` are not looked at then.
+        focal: "shared" or "each" where focal lengths are not known: those of `intrinsics` are not used then.
 
     Raises:
         D2Error: the images do not settle the pose of every camera; the sentence names those, and what to add.

@@ -199,12 +199,12 @@ def read_points(folder: Path) -> ColmapPoints:
 
 def _by_number(path: Path, pairs: Iterable[tuple[int, Any]]) -> dict[int, Any]:
     """Entries by their number, which no two share."""
-    found: dict[int, Any] = {}
+    entries: dict[int, Any] = {}
     for number, entry in pairs:
-        if number in found:
+        if number in entries:
             raise D2Error(f"{path} has two entries with number {number}: export the model again")
-        found[number] = entry
-    return found
+        entries[number] = entry
+    return entries
 
 
 _SUFFIXES = (".bin", ".txt")

@@ -66,7 +66,7 @@ def read_caliscope(document: Document) -> Cameras:
     known = [table for table in tables.values() if isinstance(table, dict) and "matrix" in table]
     if not known or (tables is not nested and not any("port" in table for table in known)):
         return None
-    found = []
+    cameras = []
     for key, table in tables.items():
         if not isinstance(table, dict) or table.get("ignore") is True:
             continue
@@ -78,8 +78,8 @@ def read_caliscope(document: Document) -> Cameras:
                 f"camera {name} in {document.place} has no {' and no '.join(missing)}: Caliscope could not place it; "
                 "calibrate it or remove its table"
             )
-        found.append(_toml_camera(table, name, document.place))
-    return found
+        cameras.append(_toml_camera(table, name, document.place))
+    return cameras
 
 
 def read_pose2sim(document: Document) -> Cameras:
@@ -124,7 +124,7 @@ def read_kalibr(document: Document) -> Cameras:
     if not has([document.table.get("cam0")], "camera_model", "intrinsics"):
         return None
     tables = {name: table for name, table in document.table.items() if name[:3] == "cam" and name[3:].isdecimal()}
-    pose, found = np.eye(4), []
+    pose, cameras = np.eye(4), []
     for number, name in enumerate(sorted(tables, key=lambda name: int(name[3:]))):
         place = f"{name} in {document.place}"
         table = object_of(tables[name], place)
@@ -135,8 +135,8 @@ def read_kalibr(document: Document) -> Cameras:
             if not np.allclose(link[3], [0, 0, 0, 1]):
                 raise D2Error(f"T_cn_cnm1 of {place} ends with the row {link[3].tolist()}, expected 0 0 0 1: {CORRECT}")
             pose = link @ pose
-        found.append(_kalibr_camera(table, name, pose, place))
-    return found
+        cameras.append(_kalibr_camera(table, name, pose, place))
+    return cameras
 
 
 def _kalibr_camera(table: Table, name: str, pose: np.ndarray, place: str) -> CalibratedCamera:
