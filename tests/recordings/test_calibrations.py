@@ -152,6 +152,8 @@ class TestRefusals:
     def test_yaml_that_unfolds(self, tmp_path: Path) -> None:
         (tmp_path / "a.yaml").write_text("a: &a [1]\ncam0: *a\n")
         self.refused(tmp_path / "a.yaml", "has YAML aliases")
+        (tmp_path / "b.yaml").write_text("cam0: " + "[" * 200_000 + "]" * 200_000)
+        self.refused(tmp_path / "b.yaml", "nested more than 64 deep")
 
     def test_a_camera_that_caliscope_could_not_place(self, tmp_path: Path) -> None:
         text = "[cameras.0]\ncam_id = 0\nsize = [4, 4]\nmatrix = [[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]\n"

@@ -21,6 +21,9 @@ CORRECT = "correct the file, see docs/calibration.md"
 MOST_BYTES = 1 << 26
 """Larger calibrations are refused: a rig of 500 cameras takes a few hundred kilobytes."""
 
+DEEPEST = 64
+"""Of lists and tables within each other in YAML."""
+
 NUMBER = Annotated[float, Range(-LARGEST_NUMBER, LARGEST_NUMBER)]
 
 Table = dict[str, Any]
@@ -121,6 +124,11 @@ def parse_yaml(text: str, place: str) -> Any:
         raise missing_extra("PyYAML", "calibration", f"reading {place}") from None
     loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # written in C where it is there
     with parsing(place, CORRECT):
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=loader)):
-            raise D2Error(f"{place} has YAML aliases (*name), which no calibration needs: {CORRECT}")
+        depth = 0
+        for event in yaml.parse(text, Loader=loader):
+            if isinstance(event, yaml.AliasEvent):
+                raise D2Error(f"{place} has YAML aliases (*name), which no calibration needs: {CORRECT}")
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST:  # libyaml goes down into lists of lists until the stack ends
+                raise D2Error(f"{place} is YAML nested more than {DEEPEST} deep: {CORRECT}")
         return yaml.load(text, Loader=loader)
