@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from d2_plugin.recordings.cameras.calibrating import Board
-from d2_plugin.recordings.cameras.calibrating.align import differences, rig_width
 from d2_plugin.recordings.cameras.calibrating.bundle import project
 from d2_plugin.recordings.cameras.calibrating.features import Features
-from d2_plugin.recordings.cameras.calibration import pinhole, rigid
+from d2_plugin.recordings.cameras.calibrating.rig import differences
+from d2_plugin.recordings.cameras.camera import pinhole, rig_width, rigid
 from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
@@ -54,7 +54,7 @@ def seen_by(cameras: dict[str, Camera], things: int = 250, wrong: float = 0.15, 
 
 def moved(cameras: dict[str, Camera], degrees: float, share: float, seed: int = 0) -> dict[str, Camera]:
     """Every camera turned by `degrees` about a random axis and moved by a `share` of the rig's width."""
-    rng, width = np.random.default_rng(seed), rig_width(cameras)
+    rng, width = np.random.default_rng(seed), rig_width(cameras.values())
     found = {}
     for name, camera in cameras.items():
         axis, shift = rng.normal(size=(2, 3))

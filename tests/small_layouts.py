@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from stand_in_recordings import smooth_recording, write_rows, write_videos
+from stand_in_recordings import renamed, smooth_recording, write_rows, write_videos
 
 from d2_plugin.recordings import Recording
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
@@ -23,26 +22,7 @@ W, H = 48, 32
 def small_recording() -> Recording:
     """Two cameras, two frames, true depth and monocular maps; it declares near and far."""
     room = synthetic_recording(cameras=2, held_out=0, frames=2, width=W, height=H)
-    cameras = {
-        f"cam{i:02d}": replace(camera, name=f"cam{i:02d}", near_far=(1.0, 9.0))
-        for i, camera in enumerate(room.cameras.values())
-    }
-    renamed = dict(zip(cameras, room.cameras, strict=True))
-    return replace(room, cameras=cameras, source=_Renamed(room, renamed))
-
-
-class _Renamed:
-    def __init__(self, recording: Recording, names: dict[str, str]) -> None:
-        self.recording, self.names = recording, names
-
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        return self.recording.image(self.names[camera], frame)
-
-    def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        return self.recording.depth(self.names[camera], frame)
-
-    def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        return self.recording.mono(self.names[camera], frame)
+    return renamed(room, ("cam00", "cam01"), near_far=(1.0, 9.0))
 
 
 def write_layout(name: str, path: Path) -> Path:
@@ -102,7 +82,7 @@ def _enerf(recording: Recording, path: Path) -> Path:
 
 def _as_text(folder: Path) -> None:
     """The binary model of a folder as COLMAP writes it in text."""
-    from d2_plugin.recordings.readers.colmap_model import read_model
+    from d2_plugin.recordings.cameras.formats.colmap import read_model
 
     model = read_model(folder)
     cameras = [

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.recordings import Recording
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.export.n3dv import llff_row
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -37,6 +38,27 @@ class Smooth:
 
     def mono(self, camera: str, frame: int) -> None:
         """No monocular maps."""
+
+
+class _Renamed:
+    def __init__(self, recording: Recording, names: dict[str, str]) -> None:
+        self.recording, self.names = recording, names
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        return self.recording.image(self.names[camera], frame)
+
+    def depth(self, camera: str, frame: int) -> np.ndarray | None:
+        return self.recording.depth(self.names[camera], frame)
+
+    def mono(self, camera: str, frame: int) -> np.ndarray | None:
+        return self.recording.mono(self.names[camera], frame)
+
+
+def renamed(recording: Recording, names: tuple[str, ...], **changes: object) -> Recording:
+    """The recording with other names for its cameras, and other values of `changes` in each."""
+    old = dict(zip(names, recording.cameras, strict=True))
+    cameras = {name: replace(recording.cameras[was], name=name, **changes) for name, was in old.items()}
+    return replace(recording, cameras=cameras, source=_Renamed(recording, old))
 
 
 def smooth_recording(names: tuple[str, ...], frames: int = 20, width: int = 96, height: int = 64) -> Recording:
@@ -79,3 +101,10 @@ def five_cameras(folder: Path) -> Path:
         for name, camera in recording.cameras.items()
     }
     return write_rows(recording, save_recording(replace(recording, cameras=rounded), folder), LLFF_DIGITS)
+
+
+def refused(path: Path, pattern: str, **options: object) -> None:
+    """Opening the recording in `path` is refused in one sentence that fits `pattern`."""
+    with pytest.raises(D2Error, match=pattern) as caught:
+        open_recording(path, **options)
+    assert "\n" not in str(caught.value)

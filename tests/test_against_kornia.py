@@ -19,13 +19,13 @@ K = np.array([[500.0, 0, 320], [0, 510.0, 240], [0, 0, 1]])
 def test_a_lens_bends_as_kornias(coefficients: tuple[float, ...]) -> None:
     k1, k2, p1, p2, k3 = coefficients
     pixels = np.random.default_rng(0).uniform((0, 0), (640, 480), (200, 2))
-    ours = Lens(K, (k1, k2, k3), (p1, p2)).recorded_pixels(pixels)
+    ours = Lens(K, "opencv", (k1, k2, p1, p2, k3)).recorded_pixels(pixels)
     theirs = kornia.geometry.calibration.distort_points(*map(torch.tensor, (pixels, K, np.array(coefficients))))
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
 
 
 def test_beyond_the_fold_kornia_puts_a_image_where_there_is_none() -> None:
-    lens = Lens(K, (-0.5,))
+    lens = Lens(K, "opencv", (-0.5,))
     corner = np.array([[320 + 500 * 1.2, 240.0]])  # r = 1.2: the polynomial grows up to r = .82
     theirs = kornia.geometry.calibration.distort_points(
         *map(torch.tensor, (corner, K, np.array([-0.5, 0, 0, 0], dtype=float)))

@@ -12,7 +12,7 @@ def form(words: list[str]) -> Form:
     from d2_plugin.recordings.importing.settings import ImportSettings
 
     def run(settings: ImportSettings) -> str:
-        imported = import_videos(settings, told=show)
+        imported = import_videos(settings, report=show)
         recording = imported.recording
         show_notes(recording.notes)
         sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})

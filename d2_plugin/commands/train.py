@@ -86,13 +86,13 @@ def _imported(given: Given, options: TrainOptions) -> Given:
     chosen = ImportChoices.from_dict(table_of_config(given, "import"), "import")
     folder = options.output.with_name(f"{options.output.name}-recording")
     settings = ImportSettings(videos=(videos,), calibration=options.calibration, output=folder, **vars(chosen))
-    import_videos(settings, told=show)
+    import_videos(settings, report=show)
     return replace(given, values={**given.values, "recording": str(folder)})
 
 
 def _refuse_videos(path: Path) -> None:
     """Say what a folder of nothing but videos needs."""
-    from d2_plugin.recordings.importing.files import videos_below
+    from d2_plugin.recordings.importing.video import videos_below
     from d2_plugin.recordings.layouts import LAYOUTS
 
     if path.is_dir() and not any(layout.recognised(path) for layout in LAYOUTS.values()) and videos_below(path):

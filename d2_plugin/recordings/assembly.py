@@ -19,11 +19,12 @@ import numpy as np
 from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import read_bytes, read_json
-from d2_plugin.recordings.cameras.lens import LARGEST_COEFFICIENT, Lens, UndistortedSource, black_share, refuse_black
+from d2_plugin.recordings.cameras.camera import CalibratedCamera
+from d2_plugin.recordings.cameras.undistort import UndistortedSource, refuse_black
 from d2_plugin.recordings.files import FrameFiles, numbered_files
 from d2_plugin.recordings.images import read_image
-from d2_plugin.recordings.masks import NO_MASKS, MaskFiles, find_masks
-from d2_plugin.recordings.recording import Camera, MonoKind, Recording, Source
+from d2_plugin.recordings.masks import MASK_FOLDERS, VALID_FOLDER, read_mask
+from d2_plugin.recordings.recording import MonoKind, Recording, Source
 from d2_plugin.values import shown
 
 log = logging.getLogger(__name__)
@@ -37,12 +38,13 @@ REPLACE = "replace the file or remove it"
 
 @dataclass(frozen=True)
 class FolderSource:
-    """Images and maps as files; every read opens one file."""
+    """Images, maps and masks as files by camera; every read opens one file."""
 
-    images: dict[str, FrameFiles]
-    depths: dict[str, FrameFiles]
-    monos: dict[str, FrameFiles]
-    masks: MaskFiles = NO_MASKS
+    images: Mapping[str, FrameFiles]
+    depths: Mapping[str, FrameFiles]
+    monos: Mapping[str, FrameFiles]
+    masks: Mapping[str, FrameFiles]
+    valid: Mapping[str, Path]
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3]."""
@@ -65,42 +67,45 @@ class FolderSource:
         return None if path is None else _map(path, None)
 
     def mask(self, camera: str, frame: int) -> np.ndarray | None:
-        """How much each pixel is foreground, float32 [H, W] in 0..1, or None."""
-        return self.masks.mask(camera, frame)
+        """How much each pixel is foreground, float32 [H, W] in 0..1, or None where nobody says."""
+        path = self.masks.get(camera, {}).get(frame)
+        return None if path is None else read_mask(path)
 
     def recorded(self, camera: str) -> np.ndarray | None:
         """Which pixels were recorded, bool [H, W], or None where all were."""
-        return self.masks.recorded(camera)
+        path = self.valid.get(camera)
+        return None if path is None else read_mask(path) > 0.5
 
 
 def assembled(
     path: Path,
-    cameras: dict[str, Camera],
+    cameras: Mapping[str, CalibratedCamera],
     images: Mapping[str, FrameFiles],
     frames: tuple[int, ...],
     fps: float,
+    where: str,
     notes: Iterable[str] = (),
-    lenses: Mapping[str, Lens] | None = None,
 ) -> Recording:
-    """The recording of `cameras` (pinholes) whose images are `images`; every note is also logged.
+    """The recording of `cameras`, in the size of their images, whose files are `images`; every note is also logged.
 
-    `lenses` describes the cameras whose recorded images are distorted; those are undistorted when read.
+    `where` names the file that describes the cameras. Images of cameras with a distortion are undistorted when read.
     """
+    pinholes = {name: camera.pinhole(where) for name, camera in cameras.items()}
     kind, emulated, mono_notes = _mono_description(path)
-    monos = _maps(path / "mono", list(cameras), ".npy")
-    masks, mask_notes = find_masks(path, cameras)
-    source: Source = FolderSource(dict(images), _maps(path / "depth", list(cameras), ".npz"), monos, masks)
-    for name, lens in (lenses or {}).items():
-        _check_lens(lens, name, path)
-    bent = {name: lens for name, lens in (lenses or {}).items() if name in cameras and lens.bends}
+    monos = _maps(path / "mono", cameras, ".npy")
+    masks, mask_notes = _masks(path, cameras)
+    valid = {name: path / VALID_FOLDER / f"{name}.png" for name in cameras}
+    valid = {name: file for name, file in valid.items() if file.is_file()}
+    source: Source = FolderSource(images, _maps(path / "depth", cameras, ".npz"), monos, masks, valid)
+    bent = {name: camera for name, camera in cameras.items() if camera.lens.bends}
     if bent:
-        source = UndistortedSource(source, bent, {name: (cameras[name].width, cameras[name].height) for name in bent})
-    all_notes = (*notes, *mono_notes, *mask_notes, *_lens_notes(bent, cameras))
+        source = UndistortedSource(source, bent)
+    all_notes = (*notes, *mono_notes, *mask_notes, *_lens_notes(bent))
     for note in all_notes:
         log.info("%s: %s", path.name, note)
     return Recording(
         name=path.resolve().name,
-        cameras=cameras,
+        cameras=pinholes,
         frames=frames,
         fps=fps,
         source=source,
@@ -111,30 +116,31 @@ def assembled(
     )
 
 
-def _lens_notes(bent: Mapping[str, Lens], cameras: Mapping[str, Camera]) -> tuple[str, ...]:
+def _lens_notes(bent: Mapping[str, CalibratedCamera]) -> tuple[str, ...]:
     if not bent:
         return ()
-    shares = {name: black_share(lens, cameras[name]) for name, lens in bent.items()}
+    shares = {name: refuse_black(camera) for name, camera in bent.items()}
     worst = max(shares, key=lambda name: shares[name])
-    refuse_black(shares[worst], worst)
     note = f"lens distortion of {', '.join(bent)} is undone when an image is read"
     if shares[worst] > BLACK_NOTED:
         note += f"; pixels that were not recorded are black: up to {shares[worst]:.1%} ({worst})"
     return (note,)
 
 
-def _check_lens(lens: Lens, name: str, path: Path) -> None:
-    numbers = np.array([*lens.K.ravel(), *lens.radial, *lens.tangential, *lens.denominator])
-    coefficients = numbers[lens.K.size :]
-    if not np.isfinite(numbers).all() or np.abs(coefficients).max(initial=0) > LARGEST_COEFFICIENT:
-        raise D2Error(
-            f"camera {name} of {path} has distortion coefficients {shown(coefficients.tolist())}, expected numbers of "
-            f"at most {LARGEST_COEFFICIENT:g} in size: correct the calibration"
-        )
+def _masks(path: Path, names: Iterable[str]) -> tuple[dict[str, FrameFiles], tuple[str, ...]]:
+    """(foreground masks that lie beside the images, a note that says which)."""
+    for folder in MASK_FOLDERS:
+        masks = {name: files for name, files in _maps(path / folder, names, None).items() if files}
+        if masks:
+            some = "" if masks.keys() == set(names) else f" of {', '.join(masks)}"
+            return masks, (f"foreground masks{some} from {folder}",)
+    return {}, ()
 
 
-def _maps(folder: Path, names: list[str], suffix: str) -> dict[str, FrameFiles]:
-    return {name: numbered_files(folder / name, (suffix,)) for name in names if (folder / name).is_dir()}
+def _maps(folder: Path, names: Iterable[str], suffix: str | None) -> dict[str, FrameFiles]:
+    """The files of each camera that has some in `folder`; images where there is no suffix."""
+    there = [name for name in names if (folder / name).is_dir()]
+    return {name: numbered_files(folder / name, *([(suffix,)] if suffix else [])) for name in there}
 
 
 def _mono_description(path: Path) -> tuple[MonoKind, bool, tuple[str, ...]]:
@@ -154,34 +160,25 @@ def _mono_description(path: Path) -> tuple[MonoKind, bool, tuple[str, ...]]:
     return cast(MonoKind, kind), emulated, notes if emulated else ()
 
 
+_EMULATED = re.compile(r"(?<!\bnot )\bemulated\b", re.IGNORECASE)
+
+
 def _emulated_by_text(path: Path) -> tuple[bool, tuple[str, ...]]:
     """Whether SOURCE.txt, or `mono` in cameras.json, says in words that the maps are emulated; and the note.
 
     Such maps must not pass for predictions because mono.json is missing.
     """
-    for file, said in (("SOURCE.txt", _words_of_source(path)), ("cameras.json", _words_of_calibration(path))):
-        if any(_EMULATED.search(words) for words in said):
-            return True, (f"monocular maps are emulated, not predicted ({file} says so)",)
-    return False, ()
-
-
-_EMULATED = re.compile(r"(?<!\bnot )\bemulated\b", re.IGNORECASE)
-
-
-def _words_of_source(path: Path) -> list[str]:
-    """What follows the word `mono` in each line of SOURCE.txt."""
     source = path / "SOURCE.txt"
     text = read_bytes(source, REPLACE).decode(errors="replace") if source.is_file() else ""
-    return re.findall(r"\bmono\b(.*)", text, re.IGNORECASE)
-
-
-def _words_of_calibration(path: Path) -> list[str]:
-    """`mono` in cameras.json, where there is such a file; a file of that name from another program counts as none."""
+    lines = re.findall(r"\bmono\b(.*)", text, re.IGNORECASE)
     try:
-        said = read_json(path / "cameras.json").get("mono")
-    except D2Error:
-        return []
-    return [said] if isinstance(said, str) else []
+        described = [str(read_json(path / "cameras.json").get("mono"))]
+    except D2Error:  # none, or a file of that name from another program
+        described = []
+    for file, words in (("SOURCE.txt", lines), ("cameras.json", described)):
+        if any(_EMULATED.search(word) for word in words):
+            return True, (f"monocular maps are emulated, not predicted ({file} says so)",)
+    return False, ()
 
 
 def _map(path: Path, key: str | None) -> np.ndarray:

@@ -1,10 +1,16 @@
-"""Which frame lies in which file: images and maps found by the number in their name."""
+"""Which camera and which frame a file shows: by the number in its name, or by its whole path where files are listed.
+
+Of listed images three habits are understood: CAMERA/FRAME.png, CAMERA_FRAME.png, and one image per camera. Folders
+called `images` or `.` say nothing about the camera, wherever they stand.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping
-from pathlib import Path
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple, Optional
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import shown_path
@@ -16,6 +22,18 @@ MOST_DIGITS = 9
 """Of a frame number."""
 
 _LAST_NUMBER = re.compile(r"(\d+)\D*$")
+_PREFIXED = re.compile(r"(?P<camera>.+)_(?P<frame>\d+)$")
+
+
+class Shot(NamedTuple):
+    """What an image's name says it shows."""
+
+    camera: str
+    frame: int
+
+
+Reading = Callable[[str], Optional[Shot]]  # noqa: UP045  at run time, on Python 3.9 too
+"""One way to read a name; None for a name that does not say both camera and frame."""
 
 
 def numbered_files(folder: Path, suffixes: Iterable[str] = IMAGE_SUFFIXES) -> FrameFiles:
@@ -29,16 +47,16 @@ def numbered_files(folder: Path, suffixes: Iterable[str] = IMAGE_SUFFIXES) -> Fr
 
 def collect(paths: Iterable[Path]) -> FrameFiles:
     """Frame number -> path; see `numbered_files`."""
-    found: FrameFiles = {}
+    files: FrameFiles = {}
     for path in paths:
         number = _LAST_NUMBER.search(path.stem)
         if number is None:
             raise D2Error(f"{path} has no frame number in its name: name it like 00012{path.suffix}")
-        frame = frame_number(number.group(1), path)
-        if frame in found:
-            raise D2Error(f"{found[frame].name} and {path.name} in {path.parent} are both frame {frame}: remove one")
-        found[frame] = path
-    return found
+        frame = frame_number(number[1], path)
+        if frame in files:
+            raise D2Error(f"{files[frame].name} and {path.name} in {path.parent} are both frame {frame}: remove one")
+        files[frame] = path
+    return files
 
 
 def frame_number(digits: str, path: Path | str) -> int:
@@ -69,21 +87,86 @@ def cameras_with_images(
     refused by name, or left out with a note where `intersect`. A camera that is asked for must have both.
     """
     known = list(calibrated)
-    unknown = [name for name in pictured if name not in known] if asked is None else []
-    if unknown and not intersect:
+    wanted = [*known, *(name for name in pictured if name not in known)] if asked is None else list(asked)
+    for name in wanted:
+        if name not in known and name not in pictured:
+            raise unknown_name("camera", name, known)
+    unknown = [name for name in wanted if name not in known]
+    missing = [name for name in wanted if name not in pictured]
+    both = [name for name in wanted if name in known and name in pictured]
+    may_leave_out = intersect and asked is None and both
+    if unknown and not may_leave_out:
         raise D2Error(
             f"camera {', '.join(unknown)} has images but is not in {where}, which has {', '.join(known)}: add its "
             "calibration or choose the cameras to read"
         )
-    names = known if asked is None else list(asked)
-    for name in names:
-        if name not in known:
-            raise unknown_name("camera", name, known)
-    missing = [name for name in names if name not in pictured]
-    if missing and (asked is not None or not intersect or len(missing) == len(names)):
+    if missing and not may_leave_out:
         raise D2Error(
             f"camera {', '.join(missing)} of {where} has no image: add its images or choose the cameras to read"
         )
     left_out = {"images": missing, "calibration": unknown}
-    notes = tuple(f"left out, {what} missing: {', '.join(cameras)}" for what, cameras in left_out.items() if cameras)
-    return [name for name in names if name in pictured], notes
+    parts = [f"{what} missing: {', '.join(cameras)}" for what, cameras in left_out.items() if cameras]
+    return both, (f"left out, {'; '.join(parts)}",) if parts else ()
+
+
+def in_folders(name: str) -> Shot | None:
+    """cam00/0012.png, or cam00_0012.png where there is no folder, as camera cam00 at frame 12."""
+    *folders, stem = _parts(name)
+    number = _LAST_NUMBER.search(stem)
+    if folders:
+        return Shot("_".join(folders), frame_number(number[1], name)) if number else None
+    return by_prefix(name)
+
+
+def by_prefix(name: str) -> Shot | None:
+    """train/cam00_0012.png as camera cam00 at frame 12, whatever the folder says."""
+    match = _PREFIXED.match(_parts(name)[-1])
+    return Shot(match["camera"], frame_number(match["frame"], name)) if match else None
+
+
+def arrange(names: Iterable[str], still: Callable[[list[str]], bool]) -> tuple[dict[str, Shot], Reading | None]:
+    """Camera and frame of every name, and the reading that was used.
+
+    `still` says whether the images of one presumed camera were taken from one pose. Where that holds for no reading,
+    as in a still scene photographed by one moving camera, every image is a camera of its own at frame 0 and the
+    reading is None.
+    """
+    names = list(dict.fromkeys(names))
+    for reading in (in_folders, by_prefix):
+        shots = {name: shot for name in names if (shot := reading(name)) is not None}
+        groups: dict[str, list[str]] = {}
+        for name, shot in shots.items():
+            groups.setdefault(shot.camera, []).append(name)
+        if len(shots) == len(names) and all(still(group) for group in groups.values()):
+            return shots, reading
+    parts = {name: _parts(name) for name in names}
+    repeated = max(Counter(part[-1] for part in parts.values()).values(), default=0) > 1
+    return {name: Shot("_".join(part) if repeated else part[-1], 0) for name, part in parts.items()}, None
+
+
+def images_below(folder: Path) -> dict[str, Path]:
+    """Every image under `folder` by its path relative to it, sorted."""
+    if not folder.is_dir():
+        raise D2Error(f"{folder} is no folder: expected the images of the recording there")
+    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    return {path.relative_to(folder).as_posix(): path for path in paths}
+
+
+def by_camera(shots: Mapping[str, Shot], files: Mapping[str, Path]) -> dict[str, FrameFiles]:
+    """Frame -> file per camera, sorted by camera; refuses two files of one camera and frame."""
+    taken: dict[str, FrameFiles] = {}
+    for name, (camera, frame) in shots.items():
+        own = taken.setdefault(camera, {})
+        if frame in own:
+            raise D2Error(f"{own[frame]} and {files[name]} are both frame {frame} of camera {camera}: remove one")
+        own[frame] = files[name]
+    return {camera: dict(sorted(taken[camera].items())) for camera in sorted(taken)}
+
+
+def _parts(name: str) -> list[str]:
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    if not parts:
+        raise D2Error(f"an image is called '{name}': every image needs the name of its file")
+    *folders, last = parts
+    stem = last[: -len(suffix)] if (suffix := PurePosixPath(last).suffix).lower() in IMAGE_SUFFIXES else last
+    return [folder for folder in folders if folder not in (".", "..", "/", "images")] + [stem]

@@ -57,8 +57,8 @@ def checked_image(image: object, what: str) -> np.ndarray:
     """What somebody handed over as an image; a D2Error where it is no RGB uint8 [H, W, 3]."""
     if isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.shape[2:] == (3,) and image.size:
         return image
-    found = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else shown(image)
-    raise D2Error(f"{what} is {found}, expected RGB uint8 [H, W, 3]: give an image as `read_image` returns it")
+    given = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else shown(image)
+    raise D2Error(f"{what} is {given}, expected RGB uint8 [H, W, 3]: give an image as `read_image` returns it")
 
 
 def read_numbers(path: Path) -> np.ndarray:
@@ -83,6 +83,14 @@ def write_png(path: Path, image: np.ndarray) -> None:
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(rows.tobytes(), 3)), (b"IEND", b""))
     write(path, _PNG_SIGNATURE, *(_png_chunk(kind, body) for kind, body in chunks), synced=False)
+
+
+def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
+    """RGB uint8 [H, W, 3] as a JPEG file."""
+    cv2 = opencv("writing JPEG images")
+    with parsing(f"an image of {image.shape[1]}x{image.shape[0]} pixels", "make it smaller, JPEG has 65535 a side"):
+        encoded: bytes = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    return encoded
 
 
 def shrink_image(image: np.ndarray, factor: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Which cameras to train on with two, three or four views, and which frames are compared, by data set.
+"""Which cameras to train on with two, three or four views, by data set.
 
 The paper's own camera lists are in a supplement that is not public; those of other publications are in
 `d2_plugin.recordings.protocols`. N3DV's four views are those of 4C4D; the other lists are this project's choice. Each
@@ -62,18 +62,6 @@ RIGS = {
 """By layout, as each data set numbers its cameras."""
 
 VIEWS = (2, 3, 4)
-
-FRAMES = {
-    "technicolor": {
-        "birthday": (151, 200),
-        "fabien": (51, 100),
-        "painter": (100, 149),
-        "theater": (51, 100),
-        "train": (151, 200),
-    },
-    "n3dv": {"": (0, 299)},
-}
-"""First and last frame that published comparisons use, by layout and scene ("" for all scenes)."""
 
 
 def is_preset(text: str) -> bool:
@@ -141,16 +129,6 @@ def _split(recording: Recording, text: str) -> CameraSplit:
     if text.removeprefix(PROTOCOL) in OURS:
         return camera_preset(recording, f"{PREFIX}{text.rpartition('-')[2]}")
     return protocol_split(recording, text) if is_protocol(text) else camera_preset(recording, text)
-
-
-def published_frames(recording: Recording) -> tuple[int, ...]:
-    """The frames of `recording` that published comparisons use; all of them where nothing is known."""
-    scenes = FRAMES.get(recording.layout, {})
-    for scene, (first, last) in scenes.items():
-        if recording.name.lower().startswith(scene):
-            chosen = tuple(frame for frame in recording.frames if first <= frame <= last)
-            return chosen or recording.frames
-    return recording.frames
 
 
 def _parsed(recording: Recording, preset: str) -> tuple[str, int]:

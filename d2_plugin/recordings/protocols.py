@@ -15,6 +15,7 @@ is refused with that sentence, since a list that was made up could be taken for 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 from d2_plugin.errors import D2Error, unknown_name
@@ -54,48 +55,40 @@ class CameraSplit(NamedTuple):
     notes: tuple[str, ...]
 
 
-class Protocol(NamedTuple):
-    """One named split."""
-
-    source: str
-    split: Callable[[Recording], CameraSplit]
-
-
-def _gc_4dgs(views: int) -> Protocol:
-    def split(recording: Recording) -> CameraSplit:
-        scene = next((name for name in GC_4DGS if name in recording.name.lower()), None)
-        if scene is None:
-            raise D2Error(
-                f"protocol:gc-4dgs-{views} has lists for {', '.join(GC_4DGS)} of N3DV and not for '{recording.name}': "
-                "name the folder after its scene, or choose protocol:ours-2, -3 or -4"
-            )
-        cameras = sorted(recording.cameras)
-        if len(cameras) < FEWEST_CAMERAS:
-            raise D2Error(
-                f"protocol:gc-4dgs-{views} counts the cameras of the whole recording, at least {FEWEST_CAMERAS}, and "
-                f"{recording.name} has {len(cameras)}: use the whole recording, or name the training cameras"
-            )
-        train = tuple(cameras[place] for place in GC_4DGS[scene][views])
-        return CameraSplit(train, (cameras[0],), ())
-
-    return Protocol("GC-4DGS, scripts/pre_dynerf/pose2MVS.py", split)
+def _gc_4dgs(recording: Recording, views: int) -> CameraSplit:
+    scene = next((name for name in GC_4DGS if name in recording.name.lower()), None)
+    if scene is None:
+        raise D2Error(
+            f"protocol:gc-4dgs-{views} has lists for {', '.join(GC_4DGS)} of N3DV and not for '{recording.name}': "
+            "name the folder after its scene, or choose protocol:ours-2, -3 or -4"
+        )
+    cameras = sorted(recording.cameras)
+    if len(cameras) < FEWEST_CAMERAS:
+        raise D2Error(
+            f"protocol:gc-4dgs-{views} counts the cameras of the whole recording, at least {FEWEST_CAMERAS}, and "
+            f"{recording.name} has {len(cameras)}: use the whole recording, or name the training cameras"
+        )
+    return CameraSplit(tuple(cameras[place] for place in GC_4DGS[scene][views]), (cameras[0],), ())
 
 
-def _4c4d() -> Protocol:
-    def split(recording: Recording) -> CameraSplit:
-        absent = [name for name in CAMERAS_4C4D if name not in recording.cameras]
-        if absent:
-            raise D2Error(
-                f"protocol:4c4d trains on {', '.join(CAMERAS_4C4D)} and {recording.name} has no {', '.join(absent)}: "
-                "use the whole recording, or name the training cameras"
-            )
-        return CameraSplit(CAMERAS_4C4D, tuple(name for name in recording.cameras if name not in CAMERAS_4C4D), ())
-
-    return Protocol("4C4D, default of scripts/n3v2blender.py", split)
+def _4c4d(recording: Recording) -> CameraSplit:
+    absent = [name for name in CAMERAS_4C4D if name not in recording.cameras]
+    if absent:
+        raise D2Error(
+            f"protocol:4c4d trains on {', '.join(CAMERAS_4C4D)} and {recording.name} has no {', '.join(absent)}: "
+            "use the whole recording, or name the training cameras"
+        )
+    return CameraSplit(CAMERAS_4C4D, tuple(name for name in recording.cameras if name not in CAMERAS_4C4D), ())
 
 
-PROTOCOLS: dict[str, Protocol] = {**{f"gc-4dgs-{views}": _gc_4dgs(views) for views in (2, 3, 4)}, "4c4d": _4c4d()}
-"""The published ones by name."""
+PROTOCOLS: dict[str, tuple[str, Callable[[Recording], CameraSplit]]] = {
+    **{
+        f"gc-4dgs-{views}": ("GC-4DGS, scripts/pre_dynerf/pose2MVS.py", partial(_gc_4dgs, views=views))
+        for views in (2, 3, 4)
+    },
+    "4c4d": ("4C4D, default of scripts/n3v2blender.py", _4c4d),
+}
+"""The published ones by name: where each is written, and its split."""
 
 
 def is_protocol(text: str) -> bool:
@@ -117,6 +110,7 @@ def protocol_split(recording: Recording, text: str) -> CameraSplit:
         )
     if name not in PROTOCOLS:
         raise unknown_name("protocol", name, known)
-    found = PROTOCOLS[name].split(recording)
-    said = f"{text} trains on {', '.join(found.train)} and scores {', '.join(found.test)} ({PROTOCOLS[name].source})"
-    return found._replace(notes=(said, *found.notes))
+    source, split = PROTOCOLS[name]
+    chosen = split(recording)
+    note = f"{text} trains on {', '.join(chosen.train)} and scores {', '.join(chosen.test)} ({source})"
+    return chosen._replace(notes=(note,))

@@ -12,8 +12,8 @@ from d2_plugin.priors.depth_on_disk import SensorDepth, find_depth_on_disk
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.settings import NO_MATCHER
 from d2_plugin.recordings import MonoKind, Recording
+from d2_plugin.recordings.cameras.formats.colmap import find_model, read_points
 from d2_plugin.recordings.checks.exposure import FEWEST, relative_exposures
-from d2_plugin.recordings.readers.colmap_model import find_model, read_points
 from d2_plugin.runs.overlap import Overlap, measure_overlap, measure_texture
 
 CHANGED = 12 / 255

@@ -11,8 +11,7 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks import Hook
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import Recording, open_recording
-from d2_plugin.recordings.cameras.check import check_recording
-from d2_plugin.recordings.checks.masked import check_background_weight
+from d2_plugin.recordings.cameras.check import check_background_weight, check_recording
 from d2_plugin.recordings.checks.memory import check_memory
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
 from d2_plugin.runs.saved.kinds import RUN

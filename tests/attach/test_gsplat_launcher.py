@@ -23,7 +23,7 @@ from d2_plugin.compat import gsplat as stand_in
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.protocol import RasterSettings
 from d2_plugin.rasterizer import reference
-from d2_plugin.recordings.export.gsplat import test_every as every_nth
+from d2_plugin.recordings.export.colmap import test_every as every_nth
 
 FILES = {
     "gsplat/__init__.py": "from .rendering import rasterization\n",

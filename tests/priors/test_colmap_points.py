@@ -14,7 +14,7 @@ from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.colmap.matching import fundamental_matrix, sampson_distance
 from d2_plugin.priors.colmap.points import SparsePoints, triangulate, triangulate_frames
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.cameras.calibration import pinhole, rigid
+from d2_plugin.recordings.cameras.camera import pinhole, rigid
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 

@@ -19,7 +19,7 @@ from d2_plugin.priors.depth_on_disk import DepthOnDisk, SensorDepth, find_depth_
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.protocol import Label
-from d2_plugin.recordings.cameras.calibration import pinhole
+from d2_plugin.recordings.cameras.camera import pinhole
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore

@@ -11,12 +11,13 @@ from rigs import NOISE, arc, filmed, moved, seen_by, worst
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.calibrating import SolvedRig, scaled_by_board
-from d2_plugin.recordings.cameras.calibrating.align import aligned, rig_width
 from d2_plugin.recordings.cameras.calibrating.bundle import project
-from d2_plugin.recordings.cameras.calibrating.features import find_features, sampson
+from d2_plugin.recordings.cameras.calibrating.features import find_features
 from d2_plugin.recordings.cameras.calibrating.refine import RefinedPoses, refine_poses
+from d2_plugin.recordings.cameras.calibrating.rig import aligned
 from d2_plugin.recordings.cameras.calibrating.solve import solve_features
-from d2_plugin.recordings.cameras.calibration import rigid
+from d2_plugin.recordings.cameras.camera import rig_width, rigid
+from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
@@ -26,11 +27,10 @@ cv2 = pytest.importorskip("cv2", reason="opencv is in the `calibration` extra")
 class TestRefinedPoses:
     """Better where that is proven, else as they were given."""
 
-    @pytest.mark.parametrize("seed", [0, 1])
-    def test_a_degree_and_a_hundredth_become_a_tenth(self, seed: int) -> None:
+    def test_a_degree_and_a_hundredth_become_a_tenth(self) -> None:
         truth = arc()
-        given = moved(truth, 1.0, 0.01, seed)
-        refined = refine_poses(given, seen_by(truth, seed=seed))
+        given = moved(truth, 1.0, 0.01)
+        refined = refine_poses(given, seen_by(truth))
         assert refined.accepted, refined.reason
         before, after = worst(given, truth), worst(refined.cameras, truth)
         assert after[0] < 0.1 * before[0]
@@ -39,15 +39,8 @@ class TestRefinedPoses:
         assert refined.pixels_after is not None
         assert refined.pixels_after < 0.5 * refined.pixels_before
         assert "poses refined: the error fell from" in refined.reason
-
-    def test_the_rig_as_a_whole_stays_where_it_was(self) -> None:
-        truth = arc()
-        given = moved(truth, 1.0, 0.01)
-        refined = refine_poses(given, seen_by(truth))
         centres = [np.mean([camera.centre for camera in rig.values()], axis=0) for rig in (refined.cameras, given)]
-        np.testing.assert_allclose(*centres, atol=1e-9)
-        for name, camera in refined.cameras.items():
-            np.testing.assert_array_equal(camera.K, given[name].K)
+        np.testing.assert_allclose(*centres, atol=1e-9)  # the rig as a whole stays where it was
 
     def test_right_poses_stay(self) -> None:
         truth = arc()
@@ -57,9 +50,9 @@ class TestRefinedPoses:
         assert "the poses stay" in refined.reason
 
     def test_matches_that_are_all_wrong_change_nothing(self) -> None:
-        truth = arc()
+        truth = arc(2)
         given = moved(truth, 1.0, 0.01)
-        refined = refine_poses(given, seen_by(truth, wrong=1.0))
+        refined = refine_poses(given, seen_by(truth, things=80, wrong=1.0))
         assert not refined.accepted
         assert refined.cameras == given
 
@@ -94,7 +87,7 @@ class TestRigsFromImagesAlone:
         degrees, share = worst(rig.cameras, truth)
         assert degrees < 0.1
         assert share < 0.003
-        assert rig_width(rig.cameras) == pytest.approx(1)
+        assert rig_width(rig.cameras.values()) == pytest.approx(1)
         np.testing.assert_allclose(rig.cameras["c0"].T_camera_world, np.eye(4), atol=1e-12)
         assert all(pixels < 3 * NOISE for pixels in rig.pixels.values())
         assert rig.scale.startswith("arbitrary")
@@ -128,9 +121,9 @@ class TestRigsFromImagesAlone:
         assert worst(rig.cameras, {name: truth[name] for name in ("c0", "c3")})[0] < 0.3
 
     def test_matches_that_are_all_wrong_are_refused(self) -> None:
-        truth = arc()
+        truth = arc(2)
         with pytest.raises(D2Error, match="add stills"):
-            solve_features(seen_by(truth, wrong=1.0), truth, tuple(truth))
+            solve_features(seen_by(truth, things=80, wrong=1.0), truth, tuple(truth))
 
 
 class TestBoards:
@@ -148,7 +141,7 @@ class TestBoards:
         rig, truth = self.solved()
         images, board = filmed(truth, 0.25)
         scaled = scaled_by_board(rig, images, board)
-        assert rig_width(scaled.cameras) == pytest.approx(rig_width(truth), rel=0.003)
+        assert rig_width(scaled.cameras.values()) == pytest.approx(rig_width(truth.values()), rel=0.003)
         assert "sides of a board's squares" in scaled.scale
 
     def test_a_board_that_one_camera_saw_says_nothing(self) -> None:

@@ -17,9 +17,10 @@ pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
 from calibration_writers import CASES, Known, anipose, cameras_json, easymocap, panoptic, pose2sim, rig, transforms
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.cameras.formats import CalibratedCamera, open_calibration, read_calibration, scaled
-from d2_plugin.recordings.cameras.formats.cameras_json import to_json
-from d2_plugin.recordings.naming import arrange
+from d2_plugin.recordings.cameras.calibration import open_calibration, read_calibration
+from d2_plugin.recordings.cameras.camera import CalibratedCamera, scaled
+from d2_plugin.recordings.cameras.formats.cameras_json import camera_table
+from d2_plugin.recordings.files import arrange
 
 POINTS = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3))
 """In front of every camera of `rig`."""
@@ -32,12 +33,13 @@ def in_first_camera(cameras: list[Known]) -> list[Known]:
 
 
 def assert_same(found: CalibratedCamera, known: Known, points: np.ndarray) -> None:
-    assert (found.width, found.height) == known.size
-    np.testing.assert_allclose(found.rotation, known.R, atol=1e-6)
-    np.testing.assert_allclose(found.translation, known.t, atol=1e-6)
+    R, t = found.T_camera_world[:3, :3], found.T_camera_world[:3, 3]
+    assert found.size == known.size
+    np.testing.assert_allclose(R, known.R, atol=1e-6)
+    np.testing.assert_allclose(t, known.t, atol=1e-6)
     half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    np.testing.assert_allclose(found.matrix - half, known.K, atol=1e-6)
-    seen = (points @ found.rotation.T + found.translation) @ found.pinhole().K.T
+    np.testing.assert_allclose(found.lens.K - half, known.K, atol=1e-6)
+    seen = (points @ R.T + t) @ found.pinhole().K.T
     recorded = found.lens.recorded_pixels(seen[:, :2] / seen[:, 2:])
     expected = known.project(points) + 0.5
     assert np.ptp(expected, axis=0).min() > 200, "the points cover too little of the image to say anything"
@@ -84,8 +86,8 @@ def test_recordings_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None
     cameras = rig()
     path = anipose(tmp_path, cameras)
     (found,) = read_calibration(path, {"cam_1": (640, 360)})
-    assert (found.width, found.height) == (640, 360)
-    seen = (POINTS @ found.rotation.T + found.translation) @ found.pinhole().K.T
+    assert found.size == (640, 360)
+    seen = (POINTS @ found.T_camera_world[:3, :3].T + found.T_camera_world[:3, 3]) @ found.pinhole().K.T
     half_size = found.lens.recorded_pixels(seen[:, :2] / seen[:, 2:])
     np.testing.assert_allclose(half_size, (cameras[1].project(POINTS) + 0.5) / 2, atol=0.01)
     with pytest.raises(D2Error, match="images of camera cam_1 are 720x1280 .* another aspect"):
@@ -94,7 +96,7 @@ def test_recordings_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None
 
 def test_our_own_json_says_everything(tmp_path: Path) -> None:
     cameras = read_calibration(anipose(tmp_path, rig()))
-    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": to_json(cameras)}))
+    (tmp_path / "cameras.json").write_text(json.dumps({"cameras": [camera_table(camera) for camera in cameras]}))
     for again, known in zip(read_calibration(tmp_path / "cameras.json"), rig(), strict=True):
         assert_same(again, known, POINTS)
 
@@ -150,6 +152,8 @@ class TestRefusals:
     def test_yaml_that_unfolds(self, tmp_path: Path) -> None:
         (tmp_path / "a.yaml").write_text("a: &a [1]\ncam0: *a\n")
         self.refused(tmp_path / "a.yaml", "has YAML aliases")
+        (tmp_path / "b.yaml").write_text("cam0: " + "[" * 200_000 + "]" * 200_000)
+        self.refused(tmp_path / "b.yaml", "nested more than 64 deep")
 
     def test_a_camera_that_caliscope_could_not_place(self, tmp_path: Path) -> None:
         text = "[cameras.0]\ncam_id = 0\nsize = [4, 4]\nmatrix = [[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]\n"
@@ -207,7 +211,7 @@ class TestNames:
         path = panoptic(tmp_path, [camera._replace(size=(1280, 720)) for camera in rig(names=cameras)])
         found = open_calibration(path, dict.fromkeys(recordings, (1280, 720)))
         assert [camera.name for camera in found.cameras] == list(recordings)
-        by_focal = {round(camera.matrix[0, 0]) - 900: camera.name for camera in found.cameras}
+        by_focal = {round(camera.lens.K[0, 0]) - 900: camera.name for camera in found.cameras}
         fit = {0: cameras[0], 1: cameras[1], 2: cameras[2]}
         for number, recording in by_focal.items():
             one, other = fit[number].lower(), recording.lower()
@@ -218,7 +222,7 @@ class TestNames:
     def test_by_order_with_a_note(self, tmp_path: Path) -> None:
         path = anipose(tmp_path, [camera._replace(size=(1280, 720)) for camera in rig()])
         found = open_calibration(path, dict.fromkeys(("kitchen", "attic", "cellar"), (1280, 720)))
-        assert [round(camera.matrix[0, 0]) for camera in found.cameras] == [902, 900, 901]
+        assert [round(camera.lens.K[0, 0]) for camera in found.cameras] == [902, 900, 901]
         (note,) = found.notes
         assert "attic is cam_0, cellar is cam_1, kitchen is cam_2" in note
 

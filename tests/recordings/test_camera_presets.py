@@ -10,7 +10,7 @@ from stand_in_recordings import five_cameras
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.presets import RIGS, VIEWS, camera_preset, is_preset, published_frames, resolve_cameras
+from d2_plugin.recordings.presets import RIGS, VIEWS, camera_preset, is_preset, resolve_cameras
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
@@ -109,11 +109,3 @@ def test_a_run_is_given_names_in_place_of_a_preset(tmp_path: Path) -> None:
     assert resolve_cameras("nowhere", ("a", "b")) == (("a", "b"), None, ())
     with pytest.raises(D2Error, match="mixes a preset with other names"):
         resolve_cameras(path, ("preset:2", "cam00"))
-
-
-def test_published_frames_are_those_of_the_scene() -> None:
-    recording = replace(recording_of("technicolor", name="Painter"), frames=tuple(range(90, 160)))
-    assert published_frames(recording) == tuple(range(100, 150))
-    assert published_frames(replace(recording, name="Birthday")) == tuple(range(151, 160))
-    assert published_frames(replace(recording, name="mine")) == recording.frames
-    assert published_frames(replace(recording, layout="n3dv", frames=tuple(range(400)))) == tuple(range(300))

@@ -11,7 +11,7 @@ import pytest
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, open_recording, select_cameras
-from d2_plugin.recordings.cameras.calibration import checked_camera
+from d2_plugin.recordings.cameras.camera import checked_camera
 from d2_plugin.recordings.cameras.check import check_recording
 from d2_plugin.recordings.checks import memory as memory_module
 from d2_plugin.recordings.checks.memory import available_bytes, check_memory, needed_bytes

@@ -12,7 +12,8 @@ from d2_plugin.errors import D2Error
 from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.recordings import LAYOUTS, Layout, Recording, open_recording
 from d2_plugin.recordings.assembly import assembled
-from d2_plugin.recordings.cameras.calibration import checked_camera, pinhole
+from d2_plugin.recordings.cameras.camera import CalibratedCamera, pinhole
+from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.export.base import Export, Written
 from d2_plugin.recordings.export.export import WRITERS, export_recording
 from d2_plugin.recordings.files import numbered_files
@@ -30,9 +31,9 @@ def open_tiny(path: Path, cameras: tuple[str, ...] | None = None, intersect: boo
     frames = tuple(images["only"])
     width, height = image_size(images["only"][frames[0]])
     focal = float((path / "focal.txt").read_text())
-    K = pinhole(focal, focal, width / 2, height / 2)
-    camera = checked_camera("only", (width, height), K, np.eye(4), None, "focal.txt")
-    return assembled(path, {"only": camera}, images, frames, 30.0)
+    lens = Lens(pinhole(focal, focal, width / 2, height / 2))
+    camera = CalibratedCamera("only", width, height, lens, np.eye(4))
+    return assembled(path, {"only": camera}, images, frames, 30.0, "focal.txt")
 
 
 def write_tiny(export: Export) -> Written:

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.cameras.calibration import pinhole
-from d2_plugin.recordings.cameras.lens import Lens, UndistortedSource, black_share, opencv_lens
+from d2_plugin.recordings.cameras.camera import CalibratedCamera, pinhole
+from d2_plugin.recordings.cameras.lens import Lens, checked_lens
+from d2_plugin.recordings.cameras.undistort import UndistortedSource, black_share
 from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 SIZE = (96, 64)
@@ -53,11 +53,16 @@ class Recorded:
     def mono(self, camera: str, frame: int) -> None: ...
 
 
+def of(lens: Lens) -> CalibratedCamera:
+    """A camera at the origin with this lens."""
+    return CalibratedCamera("a", *SIZE, lens, np.eye(4))
+
+
 LENSES = {
-    "barrel": Lens(K, (-0.12, 0.02)),
-    "pincushion": Lens(K, (0.08,)),
-    "decentred": Lens(K, (-0.05, 0.01, 0.002), (0.004, -0.003)),
-    "fisheye": Lens(K, (-0.03, 0.004, -0.001, 0.0002), fisheye=True),
+    "barrel": Lens(K, "opencv", (-0.12, 0.02)),
+    "pincushion": Lens(K, "opencv", (0.08,)),
+    "decentred": Lens(K, "opencv", (-0.05, 0.01, 0.004, -0.003, 0.002)),
+    "fisheye": Lens(K, "fisheye", (-0.03, 0.004, -0.001, 0.0002)),
     "skewed": Lens(K + np.array([[0, 3.0, 0], [0, 0, 0], [0, 0, 0]])),
 }
 
@@ -66,7 +71,7 @@ LENSES = {
 def test_an_undistorted_image_is_what_the_pinhole_sees(name: str) -> None:
     pytest.importorskip("cv2")
     lens = LENSES[name]
-    source = UndistortedSource(Recorded(lens), {"a": lens}, {"a": SIZE})
+    source = UndistortedSource(Recorded(lens), {"a": of(lens)})
     image, expected = source.image("a", 0).astype(float), texture(centres())
     recorded = lens.recorded_pixels(centres())
     inside = ((recorded > 1) & (recorded < np.array(SIZE) - 1)).all(axis=-1)
@@ -84,25 +89,25 @@ def test_both_models_are_opencvs(fisheye: bool) -> None:
     points = np.concatenate([rays, np.ones((50, 1))], axis=1)
     none = np.zeros(3)
     if fisheye:
-        lens = Lens(K, (0.05, -0.02, 0.004, -0.001), fisheye=True)
-        expected, _ = cv2.fisheye.projectPoints(points[:, None], none, none, K, np.array(lens.radial))
+        lens = Lens(K, "fisheye", (0.05, -0.02, 0.004, -0.001))
+        expected, _ = cv2.fisheye.projectPoints(points[:, None], none, none, K, np.array(lens.distortion))
     else:
-        lens = opencv_lens(K, np.array([-0.2, 0.05, 0.003, -0.002, 0.01]), "here")
+        lens = checked_lens(K, "opencv", np.array([-0.2, 0.05, 0.003, -0.002, 0.01]), "here")
         expected, _ = cv2.projectPoints(points, none, none, K, np.array([-0.2, 0.05, 0.003, -0.002, 0.01]))
     np.testing.assert_allclose(lens.recorded_pixels(rays * K[[0, 1], [0, 1]] + K[:2, 2]), expected[:, 0], atol=1e-9)
 
 
 def test_a_lens_without_distortion_changes_no_position() -> None:
-    lens = Lens(K, (0.0, 0.0))
+    lens = Lens(K, "opencv", (0.0, 0.0))
     assert not lens.bends
     np.testing.assert_allclose(lens.recorded_pixels(centres()), centres(), atol=1e-12)
-    assert Lens(K, fisheye=True).bends  # an ideal fisheye is no pinhole
+    assert Lens(K, "fisheye").bends  # an ideal fisheye is no pinhole
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(-0.8, -0.05), st.floats(0.0, 0.2))
 def test_rays_beyond_the_fold_of_the_polynomial_have_no_image(k1: float, k2: float) -> None:
-    lens = Lens(K, (k1, k2))
+    lens = Lens(K, "opencv", (k1, k2))
     radius = np.linspace(0.0, 6.0, 2001)
     distorted = lens.distort(np.stack([radius, np.zeros_like(radius)], axis=-1))[:, 0]
     known = np.isfinite(distorted)
@@ -112,10 +117,9 @@ def test_rays_beyond_the_fold_of_the_polynomial_have_no_image(k1: float, k2: flo
 
 
 def test_the_share_of_black_pixels_is_measured() -> None:
-    camera = Camera("a", *SIZE, K, np.eye(4))
-    assert black_share(Lens(K, (-0.1,)), camera) == 0  # a barrel is cut, not widened
-    wide = black_share(Lens(K, (0.4,)), camera)
-    x, y = np.moveaxis(Lens(K, (0.4,)).recorded_pixels(centres()), -1, 0)
+    assert black_share(of(Lens(K, "opencv", (-0.1,)))) == 0  # a barrel is cut, not widened
+    wide = black_share(of(Lens(K, "opencv", (0.4,))))
+    x, y = np.moveaxis(Lens(K, "opencv", (0.4,)).recorded_pixels(centres()), -1, 0)
     exact = 1 - ((x >= 0) & (x <= SIZE[0]) & (y >= 0) & (y <= SIZE[1])).mean()
     assert wide == pytest.approx(exact, abs=0.05)
     assert wide > 0.1
@@ -132,29 +136,29 @@ def test_a_lens_that_leaves_hardly_anything_of_a_image_is_refused(tmp_path: Path
 
 def test_pixels_outside_the_recorded_image_are_black() -> None:
     pytest.importorskip("cv2")
-    lens = Lens(K, (0.4,))
+    lens = Lens(K, "opencv", (0.4,))
     bright = Recorded(lens)
     bright.image = lambda camera, frame: np.full((SIZE[1], SIZE[0], 3), 200, np.uint8)
-    image = UndistortedSource(bright, {"a": lens}, {"a": SIZE}).image("a", 0)
+    image = UndistortedSource(bright, {"a": of(lens)}).image("a", 0)
     assert (image[0, 0] == 0).all()
     assert (image[32, 48] == 200).all()
-    np.testing.assert_array_equal(UndistortedSource(bright, {}, {}).image("a", 0), 200)
+    np.testing.assert_array_equal(UndistortedSource(bright, {}).image("a", 0), 200)
 
 
 def test_a_source_travels_to_another_process() -> None:
     pytest.importorskip("cv2")
     lens = LENSES["barrel"]
-    source = UndistortedSource(Recorded(lens), {"a": lens}, {"a": SIZE})
+    source = UndistortedSource(Recorded(lens), {"a": of(lens)})
     before = source.image("a", 0)
     again = pickle.loads(pickle.dumps(source))
-    assert not again._maps
+    assert not again._kept
     np.testing.assert_array_equal(again.image("a", 0), before)
 
 
 def test_a_rational_lens_is_opencvs() -> None:
     rational = (0.4, -0.1, 1e-3, 2e-3, 0.02, 0.5, 0.03, 0.01)
     cv2 = pytest.importorskip("cv2")
-    lens = opencv_lens(K, np.array(rational), "here")
+    lens = checked_lens(K, "opencv", np.array(rational), "here")
     rays = np.stack(np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.4, 0.4, 7)), axis=-1).reshape(-1, 2)
     points = np.column_stack([rays, np.ones(len(rays))])
     expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), np.array(rational))[0][:, 0]
@@ -163,15 +167,15 @@ def test_a_rational_lens_is_opencvs() -> None:
 
 def test_a_rational_lens_ends_before_it_folds_or_has_a_pole() -> None:
     rays = np.array([[0.9, 0.0], [1.1, 0.0], [3.0, 0.0]])
-    pole = opencv_lens(K, np.array([0, 0, 0, 0, 0, -1.0, 0, 0]), "here")  # r / (1 - r^2)
+    pole = checked_lens(K, "opencv", np.array([0, 0, 0, 0, 0, -1.0, 0, 0]), "here")  # r / (1 - r^2)
     np.testing.assert_allclose(pole.distort(rays)[:, 0], [0.9 / 0.19, np.nan, np.nan])
-    fold = opencv_lens(K, np.array([0, 0, 0, 0, 0, 1.0, 0, 0]), "here")  # r / (1 + r^2) is largest at 1
+    fold = checked_lens(K, "opencv", np.array([0, 0, 0, 0, 0, 1.0, 0, 0]), "here")  # r / (1 + r^2) is largest at 1
     np.testing.assert_allclose(fold.distort(rays)[:, 0], [0.9 / 1.81, np.nan, np.nan])
 
 
 def test_models_beyond_eight_coefficients_are_refused() -> None:
-    assert opencv_lens(K, np.zeros((1, 14)), "here").bends is False
+    assert checked_lens(K, "opencv", np.zeros((1, 14)), "here").bends is False
     with pytest.raises(D2Error, match="camera 3 in intri.yml has 12 distortion coefficients.*undistort the images"):
-        opencv_lens(K, np.array([0.1, 0, 0, 0, 0, 0, 0, 0.2, 0, 0, 0.1, 0]), "camera 3 in intri.yml")
-    with pytest.raises(D2Error, match="not finite"):
-        opencv_lens(K, np.array([math.nan, 0, 0, 0]), "here")
+        checked_lens(K, "opencv", np.array([0.1, 0, 0, 0, 0, 0, 0, 0.2, 0, 0, 0.1, 0]), "camera 3 in intri.yml")
+    with pytest.raises(D2Error, match="expected finite numbers"):
+        checked_lens(K, "opencv", np.array([math.nan, 0, 0, 0]), "here")

@@ -16,7 +16,9 @@ from d2_plugin.priors import construct
 from d2_plugin.priors.frame import Frame, view_digest
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.cameras.formats import CalibratedCamera, Undistortion
+from d2_plugin.recordings.cameras.camera import CalibratedCamera
+from d2_plugin.recordings.cameras.lens import Lens
+from d2_plugin.recordings.cameras.undistort import Undistortion
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.masks import MASK_FOLDERS
 from d2_plugin.runs.evaluation import evaluate
@@ -113,12 +115,11 @@ def test_masks_are_downscaled_and_saved_with_the_images(tmp_path: Path) -> None:
 class TestUndistortion:
     """What a lens did not record is no image."""
 
-    CAMERA = CalibratedCamera(
-        "a", W, H, np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), "opencv", (0.3, 0, 0, 0), np.eye(3), np.zeros(3)
-    )
+    LENS = Lens(np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]), "opencv", (0.3,))
+    CAMERA = CalibratedCamera("a", W, H, LENS, np.eye(4))
 
     def test_the_valid_region_is_where_a_white_image_stays_white(self) -> None:
-        undone = Undistortion.of(self.CAMERA)
+        undone = Undistortion(self.CAMERA)
         assert undone.valid is not None
         white = undone.image(np.full((H, W, 3), 255, np.uint8))
         assert (white[undone.valid] == 255).all()
@@ -127,7 +128,7 @@ class TestUndistortion:
         assert (white[~undone.valid].min(axis=-1) < 255).mean() > 0.5  # not much smaller than it has to be
 
     def test_a_pinhole_leaves_images_alone(self) -> None:
-        undone = Undistortion.of(replace(self.CAMERA, model="pinhole", distortion=()))
+        undone = Undistortion(replace(self.CAMERA, lens=Lens(self.LENS.K)))
         image = np.zeros((H, W, 3), np.uint8)
         assert undone.image(image) is image
         assert undone.valid is None

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stand_in_recordings import five_cameras
+from stand_in_recordings import refused
 
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.cameras.formats.colmap import MODELS, ColmapCamera, find_model, read_model, read_points
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.images import write_png
-from d2_plugin.recordings.readers.colmap_model import MODELS, ColmapCamera, find_model, read_model, read_points
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
@@ -50,27 +49,9 @@ def two_cameras(path: Path, pattern: str = "{}_{:04d}.png") -> Path:
     return path
 
 
-def refused(path: Path, pattern: str, **options: object) -> None:
-    with pytest.raises(D2Error, match=pattern) as caught:
-        open_recording(path, **options)
-    assert "\n" not in str(caught.value)
-
-
 @pytest.fixture(scope="module")
 def original() -> Recording:
     return synthetic_recording(cameras=2, held_out=1, frames=2, width=W, height=H)
-
-
-def test_an_exported_recording_reads_back(original: Recording, tmp_path: Path) -> None:
-    found = open_recording(export_recording(original, "colmap", tmp_path / "scene"))
-    assert found.layout == "colmap"
-    assert set(found.cameras) == set(original.cameras)
-    assert found.frames == original.frames
-    for name, camera in original.cameras.items():
-        np.testing.assert_allclose(found.cameras[name].K, camera.K, atol=1e-9)
-        np.testing.assert_allclose(found.cameras[name].T_camera_world, camera.T_camera_world, atol=1e-9)
-        for frame in original.frames:
-            np.testing.assert_array_equal(found.image(name, frame), original.image(name, frame))
 
 
 @pytest.mark.parametrize("binary", [True, False])
@@ -216,19 +197,3 @@ def test_damaged_models_are_refused_by_file(original: Recording, tmp_path: Path)
     (model / "images.bin").unlink()
     assert find_model(path) is None
     refused(path, "holds no COLMAP model", layout="colmap")
-
-
-def test_a_model_without_points_has_none(tmp_path: Path) -> None:
-    two_cameras(tmp_path)
-    assert read_points(tmp_path / "sparse" / "0").positions.shape == (0, 3)
-
-
-def test_rows_rounded_to_seven_digits_survive_a_model(tmp_path: Path) -> None:
-    real = open_recording(five_cameras(tmp_path / "source"), downscale=2)
-    found = open_recording(export_recording(real, "colmap", tmp_path / "scene"))
-    assert list(found.cameras) == list(real.cameras)
-    for name, camera in real.cameras.items():
-        np.testing.assert_allclose(found.cameras[name].K, camera.K, atol=1e-9)
-        # poses_bounds.npy keeps seven digits of its rotations, a quaternion is exactly orthonormal
-        np.testing.assert_allclose(found.cameras[name].T_camera_world, camera.T_camera_world, atol=1e-5)
-        np.testing.assert_array_equal(found.image(name, 0), real.image(name, 0))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 import sys
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -82,18 +81,6 @@ def test_only_reading_needs_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         opened.image("train0", 0)
 
 
-def test_a_written_png_is_valid_chunk_by_chunk(tmp_path: Path) -> None:
-    path = tmp_path / "image.png"
-    write_png(path, np.zeros((3, 4, 3), np.uint8))
-    data, kinds = path.read_bytes()[8:], []
-    while data:
-        length, kind = struct.unpack(">I4s", data[:8])
-        assert struct.unpack(">I", data[8 + length : 12 + length])[0] == zlib.crc32(data[4 : 8 + length])
-        kinds.append(kind)
-        data = data[12 + length :]
-    assert kinds == [b"IHDR", b"IDAT", b"IEND"]
-
-
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 5), st.integers(5, 23), st.integers(5, 23), st.integers(0, 2**31))
 def test_downscaling_a_image_is_opencvs_area_mean(factor: int, height: int, width: int, seed: int) -> None:
@@ -103,13 +90,6 @@ def test_downscaling_a_image_is_opencvs_area_mean(factor: int, height: int, widt
     area = cv2.resize(whole, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
     assert small.shape == area.shape
     assert np.abs(small.astype(int) - area).max() <= 1  # rounding of halves
-
-
-def test_downscaled_depth_never_lies_between_two_surfaces() -> None:
-    depth = np.full((8, 8), 2.0, np.float32)
-    depth[:, 3:] = 6.0  # an edge inside a block of two columns
-    small = shrink_depth(depth, 2)
-    assert set(np.unique(small)) == {2.0, 6.0}
 
 
 def test_downscaled_depth_averages_one_surface_and_ignores_unknown_pixels() -> None:
@@ -148,25 +128,10 @@ def test_a_downscaled_recording_projects_points_to_the_same_place() -> None:
     assert downscale(recording, 1) is recording
 
 
-def test_true_depth_and_downscaled_depth_agree(tmp_path: Path) -> None:
-    path = save_recording(synthetic_recording(cameras=1, frames=1, width=480, height=272), tmp_path / "scene")
-    full, half = open_recording(path), open_recording(path, downscale=2)
-    large, small = full.depth("train0", 0), half.depth("train0", 0)
-    corner = large[::2, ::2]
-    smooth = (np.abs(large[1::2, 1::2] - corner) < 0.005 * corner) & (corner > 0)
-    assert smooth.mean() > 0.5
-    assert np.abs(small / corner - 1)[smooth].max() < 0.02
-
-
 @pytest.mark.parametrize("factor", [0, -2, 1.5, True, "2"])
 def test_downscaling_wants_a_whole_number(factor: object) -> None:
     with pytest.raises(D2Error, match="no whole number of at least 1"):
         downscale(synthetic_recording(frames=1), factor)  # type: ignore[arg-type]
-
-
-def test_downscaling_leaves_at_least_one_pixel() -> None:
-    with pytest.raises(D2Error, match="leaves no pixel of camera train0"):
-        downscale(synthetic_recording(frames=1, width=16, height=16), 17)
 
 
 def test_selections_are_checked() -> None:

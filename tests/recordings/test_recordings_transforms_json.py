@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stand_in_recordings import five_cameras
+from stand_in_recordings import refused
 
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.images import read_image, write_png
@@ -48,12 +47,6 @@ def two_by_two(**more: object) -> Frames:
     ]  # fmt: skip
 
 
-def refused(path: Path, pattern: str, **options: object) -> None:
-    with pytest.raises(D2Error, match=pattern) as caught:
-        open_recording(path, **options)
-    assert "\n" not in str(caught.value)
-
-
 @pytest.fixture(scope="module")
 def original() -> Recording:
     return synthetic_recording(cameras=2, held_out=1, frames=3, width=W, height=H)
@@ -70,14 +63,6 @@ def test_an_exported_recording_reads_back(original: Recording, tmp_path: Path, h
         for frame in original.frames:
             np.testing.assert_array_equal(found.image(name, frame), original.image(name, frame))
     assert any("transforms_test.json lists test0" in note for note in found.notes) == bool(held_out)
-
-
-def test_opengl_axes_become_opencv_axes(tmp_path: Path) -> None:
-    camera = open_recording(write(tmp_path, two_by_two())).cameras["cam07"]
-    np.testing.assert_array_equal(camera.T_camera_world[:3, :3], np.diag([1, -1, -1]))
-    np.testing.assert_array_equal(camera.centre, [7, 0, 0])
-    ahead = camera.T_camera_world @ [7, 0, -2, 1]  # in front of a Blender camera is towards -z
-    np.testing.assert_array_equal(ahead[:3], [0, 0, 2])
 
 
 def test_the_angle_of_view_is_the_focal_length(tmp_path: Path) -> None:
@@ -169,7 +154,7 @@ def test_missing_images_are_named_and_left_out_only_when_asked(tmp_path: Path) -
         ({"transform_matrix": [[1, 0], [0, 1]]}, "cannot be understood"),
         ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "not finite"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "no rotation"),
-        ({"time": None}, "cannot be understood"),
+        ({"time": None}, "time of an image in .* must be a number, got None"),
         ({"fl_x": "long"}, "fl_x of camera a .* must be a number, got 'long'"),
         ({"fl_x": -3}, "focal lengths"),
     ],
@@ -183,15 +168,7 @@ def test_files_that_cannot_be_are_refused(tmp_path: Path) -> None:
     refused(tmp_path, "that lists images")
     (tmp_path / "transforms.json").write_text('{"camera_angle_x": 1}')
     refused(tmp_path, "has no list 'frames'")
-    refused(write(tmp_path, [{"transform_matrix": []}], images=False), "has no 'file_path'")
+    refused(write(tmp_path, [{"transform_matrix": []}], images=False), "has no file_path")
     refused(write(tmp_path, [entry("a_0", time=0.0), entry("a_1")]), "some images .* have a time")
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [entry("a_0")]}))
     refused(tmp_path, "neither fl_x nor camera_angle_x")
-
-
-def test_rows_rounded_to_seven_digits_survive_the_layout(tmp_path: Path) -> None:
-    real = open_recording(five_cameras(tmp_path / "source"), downscale=2)
-    found = open_recording(export_recording(real, "transforms", tmp_path / "scene", test_cameras=["cam00"]))
-    for name, camera in real.cameras.items():
-        np.testing.assert_allclose(found.cameras[name].K, camera.K, atol=1e-9)
-        np.testing.assert_allclose(found.cameras[name].T_camera_world, camera.T_camera_world, atol=1e-5)

@@ -14,7 +14,7 @@ from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo import matched_depth
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import Camera, Recording, open_recording, select_frames
-from d2_plugin.recordings.cameras.calibration import pinhole, rigid
+from d2_plugin.recordings.cameras.camera import pinhole, rigid
 from d2_plugin.recordings.cameras.rotations import rotation_of_vector
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.export.folder import save_recording

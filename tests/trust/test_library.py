@@ -15,7 +15,9 @@ from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, open_recording, select_cameras, select_frames
 from d2_plugin.recordings.cameras.calibrating import Board, refine, scaled_by_board, solve_rig
-from d2_plugin.recordings.cameras.formats import Undistortion, read_calibration, scaled
+from d2_plugin.recordings.cameras.calibration import read_calibration
+from d2_plugin.recordings.cameras.camera import scaled
+from d2_plugin.recordings.cameras.undistort import Undistortion
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.export.folder import described, save_recording
 from d2_plugin.recordings.importing.importing import import_videos
@@ -72,8 +74,8 @@ def of_a_recording(path: Path, recording: Recording) -> dict[str, Call]:
         "a frame's image": lambda wrong: recording.image("train0", "0" if wrong is True or wrong == 5 else wrong),
         "sizes": lambda wrong: read_calibration(path / "calibration.json", wrong if wrong is not None else {}),
         "scaled": lambda wrong: scaled([first], -1 if wrong in (5, 1.5) else wrong),
-        "Undistortion": Undistortion.of,
-        "an undistorted image": Undistortion.of(first).image,
+        "Undistortion": Undistortion,
+        "an undistorted image": Undistortion(first).image,
         "columns of a board": lambda wrong: Board(2 if wrong == 5 else wrong, 5, 0.04),
         "a board's image": Board(7, 5, 0.04).corners,
         "scaled_by_board": lambda wrong: scaled_by_board(wrong, {}, Board(7, 5, 0.04)),

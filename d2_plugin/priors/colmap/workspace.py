@@ -19,7 +19,7 @@ import numpy as np
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.colmap.dense_arrays import read_dense_array
 from d2_plugin.priors.stereo.settings import StereoSettings
-from d2_plugin.recordings.readers.colmap_model import ColmapImage, ColmapModel, read_model
+from d2_plugin.recordings.cameras.formats.colmap import ColmapImage, ColmapModel, read_model
 from d2_plugin.recordings.recording import Camera
 
 PLACES = ("colmap/{frame:05d}", "colmap", "dense", "colmap/{frame:05d}/dense", "colmap/dense")

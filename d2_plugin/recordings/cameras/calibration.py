@@ -1,156 +1,205 @@
-"""Numbers from a calibration file, checked before they become a `Camera`."""
+"""Calibration files of other tools: the formats in one table, and `read_calibration`, which finds the right one.
+
+Which camera of a file belongs to which recording, in this order: equal names; one name that holds the other (hd_00_05
+and 00_05); equal last numbers (int_cam1_img and cam01); and, with a note, the order of names where there are as many
+recordings as cameras. A way counts where it gives every recording one camera, and no camera twice.
+"""
 
 from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.recording import Camera
-from d2_plugin.values import shown
+from d2_plugin.reading import reaching
+from d2_plugin.recordings.cameras.camera import CalibratedCamera, rig_width, rigid
+from d2_plugin.recordings.cameras.formats import tools
+from d2_plugin.recordings.cameras.formats.cameras_json import read_cameras_json
+from d2_plugin.recordings.cameras.formats.colmap import read_colmap, read_rig_config
+from d2_plugin.recordings.cameras.formats.document import CORRECT, Document
+from d2_plugin.recordings.cameras.formats.easymocap import read_easymocap
+from d2_plugin.recordings.cameras.formats.transforms import read_transforms
+from d2_plugin.values import checked_arguments
 
-OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From OpenGL's camera axes (y up, z backward) to OpenCV's (y down, z forward), and back."""
+log = logging.getLogger(__name__)
 
-ROTATION_TOLERANCE = 1e-3
-"""Largest entry of R R^T - I that still counts as rounding in a text file."""
+LARGE_RIG = 100.0
+"""Rigs wider than this are noted: nobody films with two to ten cameras a hundred metres apart, while a room in
+millimetres or centimetres comes out this wide."""
 
-ASPECT_TOLERANCE = 0.01
-"""Relative difference of horizontal and vertical scale that still counts as rounding of a size to whole pixels."""
-
-LARGEST_NUMBER = 1e9
-"""Larger positions, depths and pixels are refused: float32, which everything is computed in, has 7 digits."""
-
-LARGEST_SIDE = 65_535
-"""Most pixels along a side, as JPEG has it."""
-
-FIELD_OF_VIEW = (0.5, 178.0)
-"""A camera that sees less or more than this, in degrees, is refused. What is unusual is noted, see `check`."""
-
-MOST_OBLIQUE = 80.0
-"""Degrees between a camera's axis and the middle of its image, at most: what is farther out is no principal point."""
-
-FOCAL_RATIO = 4.0
-"""fx and fy differ by less than this factor: anamorphic lenses reach 2."""
-
-FRAME_RATES = (1e-6, 1e6)
-"""Frames per second: from one in eleven days to a million."""
-
-LONGEST_NAME = 100
-"""Letters of a camera's name, which becomes a folder and part of file names."""
+FORMATS: dict[str, Callable[[Document], list[CalibratedCamera] | None]] = {
+    "folder": read_cameras_json,
+    "caliscope": tools.read_caliscope,
+    "pose2sim": tools.read_pose2sim,
+    "anipose": tools.read_anipose,
+    "easymocap": read_easymocap,
+    "kalibr": tools.read_kalibr,
+    "multical": tools.read_multical,
+    "panoptic": tools.read_panoptic,
+    "transforms": read_transforms,
+    "colmap": read_colmap,
+    "colmap_rig": read_rig_config,
+}
+"""By name, in the order in which a file is tried. A new format is one function in formats/ and one row."""
 
 
-def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """K [3, 3] float64 in pixels."""
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+@dataclass(frozen=True)
+class Calibration:
+    """What a calibration file says: its cameras, the name of its format, and what a person should know about it."""
+
+    cameras: tuple[CalibratedCamera, ...]
+    format: str
+    notes: tuple[str, ...]
 
 
-def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """T [4, 4] float64 from R [3, 3] and t [3]."""
-    transform = np.eye(4)
-    transform[:3, :3] = rotation
-    transform[:3, 3] = translation
-    return transform
+@checked_arguments
+def read_calibration(
+    path: Path | str, sizes: Mapping[str, tuple[int, int]] | None = None
+) -> tuple[CalibratedCamera, ...]:
+    """The cameras of a calibration file or folder in one of `FORMATS`; what is odd about it is logged.
+
+    Args:
+        path: a file; or a folder that is a COLMAP model, holds intri.yml and extri.yml, or one calibration file.
+        sizes: (width, height) in pixels of the recordings by name. The cameras come back under these names and in this
+            order, scaled to these sizes; cameras of the file without a recording are left out.
+
+    Raises:
+        D2Error: one sentence for an unknown format, a recording that the file does not describe, and numbers that no
+            camera has: among others rotations that are mirrored (left-handed) or not orthonormal.
+    """
+    calibration = open_calibration(path, sizes)
+    for note in calibration.notes:
+        log.warning("%s: %s", Path(path).name, note)
+    return calibration.cameras
 
 
-def resized(K: np.ndarray, calibrated: tuple[int, int], images: tuple[int, int], name: str, where: str) -> np.ndarray:
-    """K for images that are smaller or larger copies of the size (width, height) that was calibrated."""
-    if not all(1 <= length <= LARGEST_SIDE for length in (*calibrated, *images)):
+@checked_arguments
+def open_calibration(path: Path | str, sizes: Mapping[str, tuple[int, int]] | None = None) -> Calibration:
+    """`read_calibration` with the name of the format and the notes, which it does not log."""
+    if sizes is not None and not sizes:
+        raise D2Error(f"{path} is read for no recording: name at least one with its size, or leave the sizes out")
+    with reaching(path, CORRECT):
+        form, cameras = _recognised(Path(path))
+    names = [camera.name for camera in cameras]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise D2Error(f"{path} describes camera {twice} twice: remove one")
+    notes: tuple[str, ...] = ()
+    if sizes is not None:
+        cameras, notes = _matched(cameras, list(sizes), str(path))
+        cameras = [camera.of_size(sizes[camera.name], str(path)) for camera in cameras]
+    checked = tuple(_checked(camera, str(path)) for camera in cameras)
+    return Calibration(checked, form, (*notes, *_scale_notes(checked)))
+
+
+def _recognised(path: Path) -> tuple[str, list[CalibratedCamera]]:
+    """(format, cameras) of a file or folder, or of the one calibration in a folder that is none itself."""
+    if not path.exists():
+        raise D2Error(f"no such calibration: {path} is not there; give a calibration file or folder")
+    if path.stem in ("cameras", "images", "points3D") and path.suffix in (".bin", ".txt"):
+        path = path.parent  # a part of a COLMAP model
+    read = _read(path)
+    if read is None and path.is_dir():
+        files = [file for file in sorted(path.iterdir()) if file.suffix in (".toml", ".json", ".yaml", ".yml")]
+        several = {file.name: read for file in files if (read := _read(file)) is not None}
+        if len(several) != 1:
+            listed = ", ".join(several) or "none"
+            raise D2Error(f"{path} holds {len(several)} calibrations ({listed}), expected one: give the file")
+        (read,) = several.values()
+    if read is None:
         raise D2Error(
-            f"camera {name} in {where} has the size {shown(calibrated[0])} x {shown(calibrated[1])}, expected 1 to "
-            f"{LARGEST_SIDE} pixels: correct the calibration"
+            f"{path} is no calibration that can be read: expected one of {', '.join(FORMATS)}, see docs/calibration.md"
         )
-    if not (np.abs(K) <= LARGEST_NUMBER).all():
+    if not read[1]:
+        raise D2Error(f"{path} ({read[0]}) describes no camera: give a finished calibration")
+    return read
+
+
+def _read(path: Path) -> tuple[str, list[CalibratedCamera]] | None:
+    document = Document(path)
+    for name, read in FORMATS.items():
+        cameras = read(document)
+        if cameras is not None:
+            return name, cameras
+    return None
+
+
+def _checked(camera: CalibratedCamera, place: str) -> CalibratedCamera:
+    """The camera with the rotation nearest to the file's: six decimals leave R R^T off by 1e-6."""
+    if not camera.width:
+        raise D2Error(f"{place} names no size of the images of camera {camera.name}: give the recordings with it")
+    T = camera.T_camera_world
+    if np.isfinite(T).all() and np.linalg.det(T[:3, :3]) < 0:
         raise D2Error(
-            f"camera {name} in {where} has a K with a number that is not finite or larger than {LARGEST_NUMBER:g}: "
-            "correct the calibration"
+            f"camera {camera.name} in {place} has a mirrored pose (its R has determinant -1): the file was written "
+            "with left-handed axes; export it with right-handed ones"
         )
-    scale = np.array(images) / calibrated
-    if abs(scale[1] - scale[0]) > ASPECT_TOLERANCE * scale[0]:
+    camera.pinhole(place)
+    left, _, right = np.linalg.svd(T[:3, :3])
+    return replace(camera, T_camera_world=rigid(left @ right, T[:3, 3]))
+
+
+def _scale_notes(cameras: Sequence[CalibratedCamera]) -> tuple[str, ...]:
+    """A rig that is too wide for metres, with the scale that would mend it."""
+    width = rig_width(cameras)
+    if width <= LARGE_RIG:
+        return ()
+    millimetres = "millimetres (scale .001)"
+    unit = millimetres if width > 10 * LARGE_RIG else f"centimetres (scale .01) or, of a small rig, {millimetres}"
+    return (f"the cameras stand up to {width:.3g} apart, which looks like {unit} instead of metres: give that scale",)
+
+
+def _matched(
+    cameras: Sequence[CalibratedCamera], recordings: Sequence[str], place: str
+) -> tuple[list[CalibratedCamera], tuple[str, ...]]:
+    """(the cameras under the names of the recordings and in their order, notes)."""
+    by_name = {camera.name: camera for camera in cameras}
+    pairs = next(
+        (pairs for same in (_equal, _holds, _same_number) if (pairs := _pairs(by_name, recordings, same))), None
+    )
+    if pairs is not None:
+        return [replace(by_name[pairs[name]], name=name) for name in recordings], ()
+    if len(cameras) != len(recordings):
+        absent = [name for name in recordings if name not in by_name] or recordings
+        some = ", ".join(list(by_name)[:8]) + (f" and {len(by_name) - 8} more" if len(by_name) > 8 else "")
         raise D2Error(
-            f"images of camera {name} are {images[0]}x{images[1]} but {where} says {calibrated[0]}x"
-            f"{calibrated[1]}, another aspect: use images that are scaled, not cropped"
+            f"{place} has no camera for {', '.join(absent)}, only {some}: name the recordings as the calibration does"
         )
-    return np.diag([*scale, 1.0]) @ K
+    by_order = dict(zip(sorted(recordings, key=_natural), sorted(by_name, key=_natural)))
+    listed = ", ".join(f"{name} is {camera}" for name, camera in by_order.items())
+    note = f"names differ, so cameras were matched in the order of names ({listed}): rename them if that is wrong"
+    return [replace(by_name[by_order[name]], name=name) for name in recordings], (note,)
 
 
-def checked_camera(
-    name: str,
-    size: tuple[int, int],
-    K: np.ndarray,
-    T_camera_world: np.ndarray,
-    near_far: tuple[float, float] | None,
-    where: str,
-) -> Camera:
-    """A `Camera` of `size` (width, height), or one sentence that says which number in the file `where` is wrong."""
-
-    def refuse(problem: str) -> D2Error:
-        return D2Error(f"camera {name} in {where} {problem}: correct the calibration")
-
-    check_name(name, where)
-    if not (np.isfinite(K).all() and np.isfinite(T_camera_world).all()):
-        raise refuse("has a number that is not finite")
-    if min(size) < 1:
-        raise refuse(f"has the size {shown(size[0])}x{shown(size[1])}, expected at least one pixel")
-    if max(size) > LARGEST_SIDE:
-        raise refuse(f"has the size {shown(size[0])}x{shown(size[1])}, expected at most {LARGEST_SIDE} pixels a side")
-    if K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise refuse(f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}, expected positive pixels")
-    largest = max(np.abs(K[:2]).max(), np.abs(T_camera_world).max())
-    if largest > LARGEST_NUMBER:
-        raise refuse(f"has the number {largest:g}, expected pixels and positions of at most {LARGEST_NUMBER:g} in size")
-    if max(K[0, 0], K[1, 1]) > FOCAL_RATIO * min(K[0, 0], K[1, 1]):
-        raise refuse(f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}, expected nearly the same")
-    across, down = field_of_view(K, size)
-    if max(across, down) < FIELD_OF_VIEW[0] or max(across, down) > FIELD_OF_VIEW[1]:
-        raise refuse(
-            f"sees {across:.3g} x {down:.3g} degrees, expected {FIELD_OF_VIEW[0]:g} to {FIELD_OF_VIEW[1]:g} "
-            "(are the focal lengths in pixels of these images?)"
-        )
-    oblique = off_axis(K, size)
-    if oblique > MOST_OBLIQUE:
-        raise refuse(
-            f"has its principal point at ({K[0, 2]:g}, {K[1, 2]:g}), {oblique:.1f} degrees from the middle of the "
-            f"image, expected at most {MOST_OBLIQUE:g}"
-        )
-    rotation = T_camera_world[:3, :3]
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
-        raise refuse("has an R that is no rotation (orthonormal rows, determinant +1)")
-    if near_far is not None and not (1 / LARGEST_NUMBER < near_far[0] < near_far[1] < LARGEST_NUMBER):
-        raise refuse(f"has depth bounds {near_far[0]:g} to {near_far[1]:g}, expected 0 < near < far")
-    return Camera(name, size[0], size[1], K, T_camera_world, near_far)
+def _natural(name: str) -> list[tuple[int, str]]:
+    """A key that sorts cam2 before cam10."""
+    return [(int(part), "") if part.isdecimal() else (0, part.lower()) for part in re.split(r"(\d{1,18})", name)]
 
 
-def field_of_view(K: np.ndarray, size: tuple[int, int]) -> tuple[float, float]:
-    """What a camera sees across and down, degrees, wherever its principal point lies."""
-    edges = np.array([[0.0, 0.0], size])
-    angles = np.arctan2(edges - K[:2, 2], K[[0, 1], [0, 1]])
-    across, down = np.rad2deg(angles[1] - angles[0])
-    return float(across), float(down)
+def _pairs(
+    cameras: Mapping[str, CalibratedCamera], recordings: Sequence[str], same: Callable[[str, str], bool]
+) -> dict[str, str] | None:
+    """Recording -> camera where every recording has exactly one and no two share it, else None."""
+    candidates = {name: [camera for camera in cameras if same(camera, name)] for name in recordings}
+    pairs = {name: ones[0] for name, ones in candidates.items() if len(ones) == 1}
+    return pairs if len(set(pairs.values())) == len(recordings) else None
 
 
-def off_axis(K: np.ndarray, size: tuple[int, int]) -> float:
-    """Angle between a camera's axis and the ray through the middle of its image, degrees."""
-    middle = (np.array(size) / 2 - K[:2, 2]) / K[[0, 1], [0, 1]]
-    return float(np.rad2deg(np.arctan(np.hypot(*middle))))
+def _equal(camera: str, recording: str) -> bool:
+    return camera == recording
 
 
-def check_name(name: str, where: str) -> None:
-    """Refuse a camera's name that cannot be a folder of a prior or cannot be typed among others."""
-    unfit = not name or name != name.strip() or name in (".", "..") or len(name) > LONGEST_NAME
-    wrong = [letter for letter in name if letter in "/\\," or not letter.isprintable()]
-    if unfit or wrong:
-        why = f"holds {shown(wrong[0])}" if wrong else "is empty, a dot, too long, or has a space at an end"
-        raise D2Error(
-            f"the camera name {shown(name)} in {where} {why}: rename it, since names become folders and are joined by "
-            "commas"
-        )
+def _holds(camera: str, recording: str) -> bool:
+    """Whether one name stands in the other and does not cut a number or a word."""
+    edge, names = r"[^\W_]", (camera.lower(), recording.lower())
+    return any(re.search(rf"(?<!{edge}){re.escape(part)}(?!{edge})", whole) for part, whole in (names, reversed(names)))
 
 
-def checked_rate(fps: float, where: str) -> float:
-    """A frame rate, per second, or the sentence that it is none."""
-    if not FRAME_RATES[0] <= fps <= FRAME_RATES[1]:
-        raise D2Error(
-            f"{where} says fps {fps:g}, expected frames per second above 0, from {FRAME_RATES[0]:g} to "
-            f"{FRAME_RATES[1]:g}: correct the rate or the times"
-        )
-    return float(fps)
+def _same_number(camera: str, recording: str) -> bool:
+    one, other = (re.findall(r"\d{1,18}", name) for name in (camera, recording))
+    return bool(one) and bool(other) and int(one[-1]) == int(other[-1])

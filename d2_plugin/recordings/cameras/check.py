@@ -1,22 +1,23 @@
-"""A recording is looked at once, before work begins: calibrations that contradict the images, empty images.
+"""What is checked once, before work begins: calibrations that contradict the images, empty images and masks.
 
-What cannot be is refused where it is read. This finds what can be and is nearly always a mistake, and says it in notes:
+What is impossible is refused where it is read. This notes what is possible and nearly always a mistake:
 fields of view and positions out of the ordinary, cameras that see nothing that another one sees, images of one
 colour, and rigs whose epipolar lines miss the features that two images share. Maps of true depth that cannot be read
-are refused here already, not after the training that they are to judge.
+are refused here already, not after the training that they are to score.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.recordings.cameras.calibration import field_of_view
-from d2_plugin.recordings.checks.masked import empty_masks
+from d2_plugin.errors import D2Error
+from d2_plugin.recordings.cameras.camera import field_of_view
+from d2_plugin.recordings.cameras.epipolar import epipolar_lines, homogeneous, sift_features
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
 
@@ -76,15 +77,28 @@ def check_recording(recording: Recording, cameras: Sequence[str], scored: Sequen
     `scored` are those whose true depth will be read as well.
 
     Raises:
-        D2Error: an image or a map that cannot be read, among those looked at.
+        D2Error: an image or a map that cannot be read, among those read.
     """
     rig = [recording.cameras[name] for name in cameras]
     for name in scored:
         for frame in _frames(recording, len(scored)):
             recording.depth(name, frame)
-    masks = empty_masks(recording, cameras, _frames(recording, len(cameras)))
+    masks = _empty_masks(recording, cameras, _frames(recording, len(cameras)))
     seen = (*_views(rig), *_origin(rig), *_alone(rig), *_plain(recording, cameras))
     return (*seen, *masks, *_contradicted(recording, cameras))
+
+
+def check_background_weight(recording: Recording, cameras: Sequence[str], weight: float) -> None:
+    """Refuse a weight that would change nothing, since there is no mask.
+
+    Raises:
+        D2Error: no training camera has a foreground mask at the first frame.
+    """
+    if weight < 1 and all(recording.mask(name, recording.frames[0]) is None for name in cameras):
+        raise D2Error(
+            f"--background-weight is {weight:g} and {recording.name} has no foreground mask: put masks at "
+            "masks/CAMERA/FRAME.png, or leave the weight at 1"
+        )
 
 
 def _views(rig: Sequence[Camera]) -> Iterator[str]:
@@ -145,14 +159,36 @@ def _frames(recording: Recording, cameras: int) -> tuple[int, ...]:
 def _plain(recording: Recording, cameras: Sequence[str]) -> Iterator[str]:
     """Images of one colour."""
     for name in cameras:
-        found: dict[str, list[int]] = {}
+        blank: dict[str, list[int]] = {}
         for frame in _frames(recording, len(cameras)):
             image = recording.image(name, frame)
             if all(_range(part).max() <= ONE_COLOUR for part in (image[::SPARSE, ::SPARSE], image)):
-                found.setdefault("black" if image.max() <= ONE_COLOUR else "of one colour", []).append(frame)
-        for what, frames in found.items():
-            listed = ", ".join(map(str, frames[:5])) + (", ..." if len(frames) > 5 else "")
-            yield f"camera {name} is {what} at frame {listed}: nothing can be learned from that"
+                blank.setdefault("black" if image.max() <= ONE_COLOUR else "of one colour", []).append(frame)
+        for what, frames in blank.items():
+            yield f"camera {name} is {what} at frame {_some(frames)}: nothing can be learned from that"
+
+
+def _some(frames: Sequence[int]) -> str:
+    return ", ".join(map(str, frames[:5])) + (", ..." if len(frames) > 5 else "")
+
+
+def _empty_masks(recording: Recording, cameras: Sequence[str], frames: Sequence[int]) -> Iterator[str]:
+    """Foreground masks without any foreground, among the frames that are read, a sentence for each camera.
+
+    Raises:
+        D2Error: a camera of which nothing was recorded, or a mask that cannot be read.
+    """
+    for name in cameras:
+        recorded = recording.recorded(name)
+        if recorded is not None and not recorded.any():
+            raise D2Error(
+                f"nothing of camera {name} was recorded, as its mask in valid/ and its lens say: correct that mask, or "
+                "leave the camera out"
+            )
+        masks = {frame: recording.mask(name, frame) for frame in frames}
+        empty = [frame for frame, mask in masks.items() if mask is not None and not mask.any()]
+        if empty:
+            yield f"the foreground mask of camera {name} is empty at frame {_some(empty)}: white counts as foreground"
 
 
 def _range(image: np.ndarray) -> np.ndarray:
@@ -178,8 +214,7 @@ def _swapped(recording: Recording) -> tuple[str, str] | None:
         a, b = recording.cameras[one], recording.cameras[other]
         exchanged = {one: replace(b, name=one), other: replace(a, name=other)}
         trial = replace(recording, cameras={**recording.cameras, **exchanged})
-        pairs = [_pair(trial, *pair, features) for pair in _neighbours(trial, names)]
-        checked = [pair for pair in pairs if pair is not None]
+        checked = _checked(trial, names, features)
         if checked and not any(pair.missed for pair in checked):
             return one, other
     return None
@@ -189,9 +224,7 @@ def _contradicted(recording: Recording, cameras: Sequence[str]) -> Iterator[str]
     """Pairs whose calibration misses the features that their images share."""
     if len(cameras) < 2:
         return
-    features = {name: _features(recording, name) for name in cameras}
-    pairs = [_pair(recording, one, other, features) for one, other in _neighbours(recording, cameras)]
-    checked = [pair for pair in pairs if pair is not None]
+    checked = _checked(recording, cameras, {name: _features(recording, name) for name in cameras})
     wrong = [pair for pair in checked if pair.missed]
     if not wrong:
         return
@@ -202,6 +235,11 @@ def _contradicted(recording: Recording, cameras: Sequence[str]) -> Iterator[str]
         f"the calibration misses features that two images share, {listed}{', ...' if len(wrong) > 4 else ''} "
         f"(median; good calibrations miss by one): check R, t and K of {whose}"
     )
+
+
+def _checked(recording: Recording, cameras: Sequence[str], features: Mapping[str, _Features]) -> list[_Pair]:
+    pairs = [_pair(recording, *pair, features) for pair in _neighbours(recording, cameras)]
+    return [pair for pair in pairs if pair is not None]
 
 
 def _suspects(checked: Sequence[_Pair]) -> list[str]:
@@ -222,22 +260,24 @@ def _neighbours(recording: Recording, cameras: Sequence[str]) -> list[tuple[str,
     return pairs[:MOST_PAIRS]
 
 
-def _features(recording: Recording, name: str) -> tuple[np.ndarray, np.ndarray | None]:
+_Features = tuple[np.ndarray, np.ndarray]
+
+
+def _features(recording: Recording, name: str) -> _Features:
     """Positions [n, 2] in pixels of the recording (centres at i + 0.5) and descriptors of the first image."""
-    cv2 = opencv("looking at a recording")
+    cv2 = opencv("checking a recording")
     image = recording.image(name, recording.frames[0])
     factor = min(LONG_SIDE / max(image.shape[:2]), 1.0)
     small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
-    points, descriptors = cv2.SIFT_create(1000).detectAndCompute(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), None)
-    scale = np.array(image.shape[1::-1]) / small.shape[1::-1]
-    return (np.array([point.pt for point in points]).reshape(-1, 2) + 0.5) * scale, descriptors
+    pixels, descriptors, _ = sift_features(small, 1000, "checking a recording")
+    return pixels * np.array(image.shape[1::-1]) / small.shape[1::-1], descriptors
 
 
-def _pair(recording: Recording, one: str, other: str, features: dict) -> _Pair | None:
+def _pair(recording: Recording, one: str, other: str, features: Mapping[str, _Features]) -> _Pair | None:
     """How far the calibration misses the features that two images share; None where they share too few."""
-    cv2 = opencv("looking at a recording")
+    cv2 = opencv("checking a recording")
     (points, descriptors), (others, other_descriptors) = features[one], features[other]
-    if descriptors is None or other_descriptors is None or min(len(points), len(others)) < ENOUGH:
+    if min(len(points), len(others)) < ENOUGH:
         return None
     two_best = cv2.BFMatcher().knnMatch(descriptors, other_descriptors, k=2)
     good = [best for best, second in two_best if best.distance < 0.8 * second.distance]
@@ -247,20 +287,10 @@ def _pair(recording: Recording, one: str, other: str, features: dict) -> _Pair |
     p, q = points[[match.queryIdx for match in once]], others[[match.trainIdx for match in once]]
     a, b = recording.cameras[one], recording.cameras[other]
     diagonal = float(np.hypot(a.width, a.height))
-    found = cv2.findFundamentalMat(p, q, cv2.FM_RANSAC, max(diagonal / 500, 1.0), 0.999, 2000)
-    inside = found[1].ravel() > 0 if found[1] is not None else np.zeros(len(p), bool)
+    _, mask = cv2.findFundamentalMat(p, q, cv2.FM_RANSAC, max(diagonal / 500, 1.0), 0.999, 2000)
+    inside = mask.ravel() > 0 if mask is not None else np.zeros(len(p), bool)
     if inside.sum() < max(ENOUGH, ENOUGH_SHARE * len(p)) or np.allclose(a.centre, b.centre):
         return None
-    distance = float(np.median(_epipolar_distance(a, b, p[inside], q[inside])))
+    off = np.abs((epipolar_lines(a, b, p[inside]) * homogeneous(q[inside])).sum(axis=1))
+    distance = float(np.median(off))
     return _Pair(one, other, int(inside.sum()), distance, distance > max(MISSED * diagonal, 4.0))
-
-
-def _epipolar_distance(one: Camera, other: Camera, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Distance [n], pixels, of each `q` in `other` from the epipolar line of its `p` in `one`."""
-    relative = other.T_camera_world @ np.linalg.inv(one.T_camera_world)
-    x, y, z = relative[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    fundamental = np.linalg.inv(other.K).T @ cross @ relative[:3, :3] @ np.linalg.inv(one.K)
-    ends = np.ones((len(p), 1))
-    lines = np.hstack([p, ends]) @ fundamental.T
-    return np.abs((lines * np.hstack([q, ends])).sum(axis=1)) / np.linalg.norm(lines[:, :2], axis=1).clip(1e-300)

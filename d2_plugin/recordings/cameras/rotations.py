@@ -35,14 +35,12 @@ def quaternion_of_rotation(rotation: np.ndarray) -> np.ndarray:
         [c - g, b + d, e - a - i, f + h],
         [d - b, c + g, f + h, i - a - e],
     ]
-    found = np.linalg.eigh(np.array(symmetric))[1][:, -1]
-    return found if found[0] >= 0 else -found
+    quaternion = np.linalg.eigh(np.array(symmetric))[1][:, -1]
+    return quaternion if quaternion[0] >= 0 else -quaternion
 
 
 def rotation_of_vector(vector: np.ndarray) -> np.ndarray:
     """Rotation [3, 3] about `vector` [3] by its length in radians (Rodrigues)."""
-    angle = np.linalg.norm(vector)
-    x, y, z = vector
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    # sin(a) / a and (1 - cos(a)) / a^2, finite at a = 0; np.sinc(x) is sin(pi x) / (pi x).
-    return np.eye(3) + np.sinc(angle / np.pi) * cross + 0.5 * np.sinc(angle / 2 / np.pi) ** 2 * (cross @ cross)
+    half = float(np.linalg.norm(vector)) / 2
+    axis = 0.5 * np.sinc(half / np.pi) * np.asarray(vector)  # sin(half) / (2 half), finite at 0
+    return rotation_of_quaternion(np.array([np.cos(half), *axis]))

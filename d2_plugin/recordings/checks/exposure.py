@@ -62,7 +62,7 @@ def _median(values: np.ndarray, axis: int) -> np.ndarray:
 
 def _brightness(recording: Recording, camera: str, positions: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Logarithm of each channel [P, 3] around the points' pixels; NaN where one says nothing."""
-    found = np.full((len(positions), 3), np.nan)
+    logarithms = np.full((len(positions), 3), np.nan)
     seconds = np.array([recording.seconds(frame) for frame in recording.frames])
     nearest = np.abs(seconds[:, None] - times).argmin(0)
     columns, rows, inside = _pixels(recording.cameras[camera], positions)
@@ -70,8 +70,8 @@ def _brightness(recording: Recording, camera: str, positions: np.ndarray, times:
         here = inside & (nearest == index)
         image = recording.image(camera, recording.frames[index]).astype(float)
         values = _around(image, rows[here], columns[here])
-        found[here] = np.where((values > DARK) & (values < BRIGHT), np.log(np.maximum(values, 1)), np.nan)
-    return found
+        logarithms[here] = np.where((values > DARK) & (values < BRIGHT), np.log(np.maximum(values, 1)), np.nan)
+    return logarithms
 
 
 def _around(image: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,34 +21,34 @@ SHORT_SIDE = 180
 """Images with a shorter side have little to match."""
 
 UNEQUAL, UNEQUAL_TIME = 0.02, 0.25
-"""Gain off the mean, and lateness in frames, that are worth a word."""
+"""Gain off the mean, and lateness in frames, that are noted."""
 
 
 class Finding(NamedTuple):
     """One line."""
 
     verdict: str
-    """`has`, `lacks` or `look`."""
+    """`has`, `lacks` or `check`."""
     what: str
-    said: str
+    text: str
 
 
 def lacking_text(recording: Recording) -> str:
     """All findings, aligned."""
-    return "\n".join(f"{one.verdict:>6}  {one.what:11} {one.said}" for one in findings(recording))
+    return "\n".join(f"{one.verdict:>6}  {one.what:11} {one.text}" for one in findings(recording))
 
 
 def findings(recording: Recording) -> list[Finding]:
     """What a recording has and lacks.
 
     Raises:
-        D2Error: an image that cannot be read, among those looked at.
+        D2Error: an image that cannot be read, among those read.
     """
     rig = list(recording.cameras.values())
     parts = (_cameras(rig), _images(recording), _time(recording), _exposure(recording), _maps(recording))
-    found = [one for part in parts for one in part]
+    all_parts = [one for part in parts for one in part]
     notes = [*recording.notes, *check_recording(recording, list(recording.cameras))]
-    return [*found, *(Finding("look", "note", note) for note in notes)]
+    return [*all_parts, *(Finding("check", "note", note) for note in notes)]
 
 
 def _cameras(rig: Sequence[Camera]) -> Iterator[Finding]:
@@ -57,8 +56,9 @@ def _cameras(rig: Sequence[Camera]) -> Iterator[Finding]:
         yield Finding("lacks", "cameras", "one camera: without a second one nothing can be triangulated or verified")
         return
     apart = neighbour_angles(rig)
-    said = f"{len(rig)}, {min(apart):.0f} to {max(apart):.0f} degrees from the nearest other one"
-    yield Finding("has", "cameras", said)
+    yield Finding(
+        "has", "cameras", f"{len(rig)}, {min(apart):.0f} to {max(apart):.0f} degrees from the nearest other one"
+    )
     far = [camera.name for camera, angle in zip(rig, apart) if angle > FAR_APART]
     if far:
         yield Finding(
@@ -68,12 +68,11 @@ def _cameras(rig: Sequence[Camera]) -> Iterator[Finding]:
 
 def neighbour_angles(rig: Sequence[Camera]) -> list[float]:
     """Degrees from each camera's optical axis to the nearest other camera's."""
-    axes = {camera.name: camera.T_camera_world[2, :3] for camera in rig}
-    found = {camera.name: 180.0 for camera in rig}
-    for one, other in combinations(axes, 2):
-        angle = float(np.rad2deg(np.arccos(np.clip(axes[one] @ axes[other], -1, 1))))
-        found[one], found[other] = min(found[one], angle), min(found[other], angle)
-    return list(found.values())
+    axes = np.stack([camera.T_camera_world[2, :3] for camera in rig])
+    angles = np.rad2deg(np.arccos(np.clip(axes @ axes.T, -1, 1)))
+    np.fill_diagonal(angles, 180.0)
+    nearest: list[float] = angles.min(axis=1).tolist()
+    return nearest
 
 
 def _images(recording: Recording) -> Iterator[Finding]:
@@ -90,20 +89,20 @@ def _time(recording: Recording) -> Iterator[Finding]:
     late = [abs(seconds) * recording.fps for one in recording.late.values() for seconds in one.values()]
     steps = Path(recording.path, "import", "clocks.json") if recording.path is not None else None
     if late:
-        word = "look" if max(late) > UNEQUAL_TIME else "has"
+        word = "check" if max(late) > UNEQUAL_TIME else "has"
         yield Finding(word, "clock", f"cameras exposed up to {max(late):.2f} frames apart; each keeps its own instants")
     elif steps is None or not steps.is_file():
-        yield Finding("look", "clock", "nothing says how the cameras were synchronised: d2 takes equal frame numbers")
+        yield Finding("check", "clock", "nothing says how the cameras were synchronised: d2 takes equal frame numbers")
 
 
 def _exposure(recording: Recording) -> Iterator[Finding]:
     known = [name for name in recording.cameras if name in recording.exposures]
     if not known:
-        yield Finding("look", "exposure", "not measured: triangulated points will decide whether exposures differ")
+        yield Finding("check", "exposure", "not measured: triangulated points will decide whether exposures differ")
         return
     off = {name: float(np.abs(np.log(recording.exposures[name].gain)).max()) for name in known}
     worst = max(off, key=lambda name: off[name])
-    word = "look" if off[worst] > UNEQUAL else "has"
+    word = "check" if off[worst] > UNEQUAL else "has"
     yield Finding(word, "exposure", f"measured; {worst} is off the mean by {off[worst]:.1%} at most")
     unknown = [name for name in recording.cameras if name not in known]
     if unknown:
@@ -120,6 +119,6 @@ def _maps(recording: Recording) -> Iterator[Finding]:
         truth = recording.depth(camera, frame) is not None
     except D2Error:
         truth = True
-    yield Finding("has" if truth else "look", "truth", "true depth" if truth else "no true depth: depth is not scored")
+    yield Finding("has" if truth else "check", "truth", "true depth" if truth else "no true depth: depth is not scored")
     masked = recording.mask(camera, frame) is not None
-    yield Finding("has" if masked else "look", "masks", "of the foreground" if masked else "none: not needed")
+    yield Finding("has" if masked else "check", "masks", "of the foreground" if masked else "none: not needed")

@@ -12,10 +12,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings.recording import Recording
 
 BYTES_PER_PIXEL = 110
-"""Of every training camera, at the peak of building its prior or of rendering it.
-
-Peak of the process of `d2 priors` with two cameras, measured and estimated: 643 and 705 MiB at 1280x720, 956 and 947
-at 1920x1080; two of 8000x4500 took 7.4 GiB, estimated 7.9."""
+"""Of every training camera, at the peak of building its prior or of rendering it."""
 
 BASE_BYTES = 1 << 29
 """What Python, torch and the Gaussians take whatever the size of the images."""
@@ -34,8 +31,8 @@ def needed_bytes(recording: Recording, cameras: Sequence[str], downscale: int = 
 
 def available_bytes() -> int | None:
     """Memory that this process may still take: what is free on the machine, within its limits; None where unknown."""
-    found = [*_free_on_linux(), *_left_of_group(), *_left_of_process()]
-    return min(found) if found else None
+    limits = [*_free_on_linux(), *_left_of_group(), *_left_of_process()]
+    return min(limits) if limits else None
 
 
 def check_memory(recording: Recording, cameras: Sequence[str]) -> None:
@@ -72,8 +69,8 @@ def check_bytes(needed: float, what: str, remedy: str) -> None:
 
 def _free_on_linux() -> list[int]:
     with suppress(OSError, ValueError):
-        found = re.search(r"MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text())
-        return [int(found[1]) * 1024] if found else []
+        free = re.search(r"MemAvailable:\s+(\d+) kB", Path("/proc/meminfo").read_text())
+        return [int(free[1]) * 1024] if free else []
     return []
 
 

@@ -70,12 +70,6 @@ def refuse_off_centre(camera: Camera, layout: str) -> None:
         )
 
 
-def refuse_skew(camera: Camera) -> None:
-    """Raise `D2Error` for a camera whose pixel axes are not perpendicular: no layout can say so."""
-    if camera.K[0, 1] != 0:
-        raise D2Error(f"camera {camera.name} has skew {camera.K[0, 1]:g}, which no layout holds: undistort it first")
-
-
 @contextmanager
 def whole_folder(path: Path | str) -> Iterator[Path]:
     """Within it, a folder to write to, which takes the place of `path` at the end: there is all of it, or nothing.

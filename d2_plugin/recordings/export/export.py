@@ -21,10 +21,9 @@ import numpy as np
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.reading import json_text
-from d2_plugin.recordings.export.base import Export, Written, refuse_skew, whole_folder
-from d2_plugin.recordings.export.colmap import write_colmap, write_multipleview
-from d2_plugin.recordings.export.colmap_frames import write_colmap_frames
-from d2_plugin.recordings.export.gsplat import write_gsplat
+from d2_plugin.recordings.cameras.formats.cameras_json import refuse_skew
+from d2_plugin.recordings.export.base import Export, Written, whole_folder
+from d2_plugin.recordings.export.colmap import write_colmap, write_colmap_frames, write_gsplat, write_multipleview
 from d2_plugin.recordings.export.n3dv import write_n3dv
 from d2_plugin.recordings.export.ply import PointCloud
 from d2_plugin.recordings.export.transforms_json import write_transforms
@@ -41,7 +40,7 @@ WRITERS: dict[str, Writer] = {
     "colmap_frames": write_colmap_frames,
     "gsplat": write_gsplat,
 }
-"""By the name of the layout. A new layout is one module beside this one and one row here."""
+"""By the name of the layout. A new layout is one function in a module beside this one and one row here."""
 
 
 @checked_arguments
@@ -71,7 +70,7 @@ def export_recording(
     if cloud is not None:
         cloud.check()
     for camera in recording.cameras.values():
-        refuse_skew(camera)
+        refuse_skew(camera.name, camera.K)
     with whole_folder(path) as folder:
         written = WRITERS[layout](Export(recording, held_out, cloud, folder))
         described = json_text(_description(recording, layout, written, held_out), EXPORT_FILE, indent=1)

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.reading import json_text
-from d2_plugin.recordings.export.base import refuse_skew, whole_folder
+from d2_plugin.recordings.cameras.formats.cameras_json import camera_table
+from d2_plugin.recordings.export.base import whole_folder
 from d2_plugin.recordings.images import write_png
-from d2_plugin.recordings.masks import MASK_FOLDERS, VALID_FOLDER, as_image
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.masks import MASK_FOLDERS, VALID_FOLDER, write_mask
+from d2_plugin.recordings.recording import Recording
 from d2_plugin.values import checked_arguments
 
 
@@ -28,8 +29,7 @@ def save_recording(recording: Recording, path: Path | str) -> Path:
                 _save_frame(recording, folder, camera, frame)
             recorded = recording.recorded(camera)
             if recorded is not None:
-                (folder / VALID_FOLDER).mkdir(exist_ok=True)
-                write_png(folder / VALID_FOLDER / f"{camera}.png", as_image(recorded))
+                write_mask(folder / VALID_FOLDER / f"{camera}.png", recorded)
         if recording.mono_kind is not None:
             declared = {"kind": recording.mono_kind, "emulated": recording.mono_emulated}
             (folder / "mono" / "mono.json").write_text(json_text(declared, "mono.json") + "\n")
@@ -51,7 +51,7 @@ def _save_frame(recording: Recording, folder: Path, camera: str, frame: int) -> 
         np.save(place("mono", ".npy"), mono.astype(np.float32))
     mask = recording.mask(camera, frame)
     if mask is not None:
-        write_png(place(MASK_FOLDERS[0], ".png"), as_image(mask))
+        write_mask(place(MASK_FOLDERS[0], ".png"), mask)
 
 
 def described(recording: Recording) -> dict[str, Any]:
@@ -69,13 +69,5 @@ def described(recording: Recording) -> dict[str, Any]:
         "notes": list(recording.notes),
         "fps": recording.fps,
         "bounds": bounds,
-        "cameras": [_camera_entry(camera) for camera in recording.cameras.values()],
+        "cameras": [camera_table(camera) for camera in recording.cameras.values()],
     }
-
-
-def _camera_entry(camera: Camera) -> dict[str, Any]:
-    refuse_skew(camera)
-    fx, fy, cx, cy = (float(camera.K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    rotation, translation = camera.T_camera_world[:3, :3].tolist(), camera.T_camera_world[:3, 3].tolist()
-    size = {"width": camera.width, "height": camera.height}
-    return {"name": camera.name, **size, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "R": rotation, "t": translation}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.reading import json_text
-from d2_plugin.recordings.cameras.calibration import OPENGL_TO_OPENCV
+from d2_plugin.recordings.cameras.camera import OPENGL_TO_OPENCV
 from d2_plugin.recordings.export.base import Export, Written
 from d2_plugin.recordings.export.ply import write_point_cloud
 from d2_plugin.recordings.recording import Camera

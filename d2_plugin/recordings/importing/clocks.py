@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.importing.files import VideoFile
-from d2_plugin.recordings.importing.motion import offsets_from_motion
-from d2_plugin.recordings.importing.profiles import Watched
+from d2_plugin.recordings.importing.motion import Watched, offsets_from_motion
 from d2_plugin.recordings.importing.sound import Sound, lag_between, read_sound
-from d2_plugin.recordings.importing.timecode import shortest, timecode_seconds
+from d2_plugin.recordings.importing.video import VideoFile
 
 METHODS = ("auto", "timecode", "sound", "motion", "none")
 """How offsets are found; `none` says that all clocks begin together."""
@@ -25,8 +24,13 @@ APART = 0.75
 TIMECODE_ERROR = 12**-0.5
 """Frames: the standard deviation of what is rounded to whole frames."""
 
-HEARD = 1e-3
+SOUND_ERROR = 1e-3
 """Seconds at least that an offset from sound may be wrong: sound travels a third of a metre in that time."""
+
+DAY = 86_400
+"""Seconds after which a timecode begins anew."""
+
+_TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.])(\d{2,3})$")
 
 INSTEAD = "leave the camera out, give the offsets (--offsets NAME=FRAMES,...), or record a clap that all see and hear"
 
@@ -40,12 +44,6 @@ class Clock:
     """Standard error, seconds; 0 for what was given."""
     method: str
     """Where it comes from, such as `sound`."""
-    drift: float = 0.0
-    """Seconds that it loses per second."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
 
 
 class Evidence(NamedTuple):
@@ -75,12 +73,13 @@ def common_clock(videos: Mapping[str, VideoFile], how: str, watching: Watching) 
     evidence = _of_timecodes(videos) if how in ("auto", "timecode") else []
     if how in ("auto", "sound"):
         evidence += _of_sound({name: read_sound(video.path) for name, video in videos.items() if video.sound})
-    if how == "motion" or (how == "auto" and len(_linked(names, evidence)) < len(names)):
+    if how == "motion" or (how == "auto" and len(linked_names(names, [one[:2] for one in evidence])) < len(names)):
         evidence += _of_motion(watching(), names, videos)
-    linked = _linked(names, evidence)
+    linked = linked_names(names, [one[:2] for one in evidence])
     if len(linked) < len(names):
-        lost = ", ".join(name for name in names if name not in linked)
-        raise D2Error(f"nothing in {_what(how)} links {lost} with {', '.join(linked)}: {INSTEAD}")
+        alone = ", ".join(name for name in names if name not in linked)
+        what = {"auto": "timecode, sound or motion"}.get(how, f"the {how}")
+        raise D2Error(f"nothing in {what} links {alone} with {', '.join(linked)}: {INSTEAD}")
     return _solved(names, evidence, frame)
 
 
@@ -90,23 +89,49 @@ def given_clock(videos: Mapping[str, VideoFile], given: Sequence[str]) -> dict[s
     Raises:
         D2Error: what is no number, and cameras that there are not.
     """
-    found = dict.fromkeys(videos, 0.0)
+    starts = dict.fromkeys(videos, 0.0)
     for text in given:
-        name, said, frames = text.partition("=")
+        name, _, frames = text.partition("=")
         if name not in videos:
             raise D2Error(f"--offsets names camera '{name}', have {', '.join(videos)}: write NAME=FRAMES,NAME=FRAMES")
         try:
-            found[name] = float(frames) / (videos[name].rate or 25.0)
+            starts[name] = float(frames) / (videos[name].rate or 25.0)
         except ValueError:
-            raise D2Error(f"--offsets says '{text}', expected NAME=FRAMES such as {name}=-7.5: correct it") from None
-        if not said or not np.isfinite(found[name]):
-            raise D2Error(f"--offsets says '{text}', expected NAME=FRAMES with a finite number: correct it")
-    return {name: Clock(seconds, 0.0, "given") for name, seconds in found.items()}
+            starts[name] = np.nan
+        if not np.isfinite(starts[name]):
+            raise D2Error(f"--offsets says '{text}', expected NAME=FRAMES such as {name}=-7.5: correct it")
+    return {name: Clock(seconds, 0.0, "given") for name, seconds in starts.items()}
+
+
+def timecode_seconds(text: str, rate: float) -> float | None:
+    """Seconds since midnight of an SMPTE timecode at `rate` frames per second; None where the text is none.
+
+    hours:minutes:seconds:frames, counted at the whole rate next to `rate`. Drop-frame timecode, with `;` before the
+    frames, leaves out the first two numbers (four at 59.94) of every minute but each tenth, so that the count keeps up
+    with the clock.
+    """
+    match = _TIMECODE.match(text.strip())
+    if match is None or rate <= 0:
+        return None
+    hours, minutes, seconds, frames = (int(match[place]) for place in (1, 2, 3, 5))
+    counted = round(rate)
+    if minutes > 59 or seconds > 59 or frames >= counted:
+        return None
+    number = ((hours * 60 + minutes) * 60 + seconds) * counted + frames
+    if match[4] in ";.":
+        passed = hours * 60 + minutes
+        number -= round(counted / 15) * (passed - passed // 10)
+    return number / rate
+
+
+def shortest(seconds: float) -> float:
+    """A difference of two times of day, the shorter way around midnight."""
+    return (seconds + DAY / 2) % DAY - DAY / 2
 
 
 def _of_timecodes(videos: Mapping[str, VideoFile]) -> list[Evidence]:
     read = {name: timecode_seconds(video.timecode or "", video.rate) for name, video in videos.items()}
-    starts = {name: found - float(videos[name].times[0]) for name, found in read.items() if found is not None}
+    starts = {name: time - float(videos[name].times[0]) for name, time in read.items() if time is not None}
     error = {name: TIMECODE_ERROR / (videos[name].rate or 25.0) for name in starts}
     return [
         Evidence(
@@ -117,33 +142,32 @@ def _of_timecodes(videos: Mapping[str, VideoFile]) -> list[Evidence]:
 
 
 def _of_sound(sounds: Mapping[str, Sound | None]) -> list[Evidence]:
-    found = []
-    for (one, heard), (other, also) in combinations(sounds.items(), 2):
-        lag = None if heard is None or also is None else lag_between(heard, also)
+    evidence = []
+    for (one, first), (other, second) in combinations(sounds.items(), 2):
+        lag = None if first is None or second is None else lag_between(first, second)
         if lag is not None:
-            found.append(Evidence(one, other, lag.seconds, max(lag.error, HEARD), "sound"))
-    return found
+            evidence.append(Evidence(one, other, lag.seconds, max(lag.error, SOUND_ERROR), "sound"))
+    return evidence
 
 
 def _of_motion(watched: Mapping[str, Watched], names: Sequence[str], videos: Mapping[str, VideoFile]) -> list[Evidence]:
     seen = offsets_from_motion(watched, search=max(float(np.ptp(video.times)) for video in videos.values()))
     doubtful = {name: one.doubt for name, one in seen.items() if one.doubt}
-    if doubtful and len(names) - len(doubtful) < 2:
-        raise D2Error(f"motion does not say when the cameras started ({next(iter(doubtful.values()))}): {INSTEAD}")
     if doubtful:
         name, why = next(iter(doubtful.items()))
-        raise D2Error(f"motion does not say when camera {name} started ({why}): {INSTEAD}")
+        whose = f"camera {name}" if len(names) - len(doubtful) > 1 else "the cameras"
+        raise D2Error(f"motion does not say when {whose} started ({why}): {INSTEAD}")
     return [
         Evidence(names[0], name, seen[name].seconds - seen[names[0]].seconds, seen[name].error, "motion")
         for name in names[1:]
     ]
 
 
-def _linked(names: Sequence[str], evidence: Sequence[Evidence]) -> list[str]:
-    """Cameras that evidence links, over others or not, with the camera that is linked with most."""
+def linked_names(names: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[str]:
+    """The largest group of names that pairs link, over others or not, in the order of `names`."""
     groups: list[set[str]] = [{name} for name in names]
-    for one in evidence:
-        first, second = (next(group for group in groups if name in group) for name in (one.one, one.other))
+    for pair in pairs:
+        first, second = (next(group for group in groups if name in group) for name in pair)
         if first is not second:
             groups.remove(second)
             first |= second
@@ -155,36 +179,25 @@ def _solved(names: Sequence[str], evidence: Sequence[Evidence], frame: float) ->
     offsets, errors = _least_squares(names, evidence)
     if _worst(offsets, evidence, frame) is not None:
         raise D2Error(_contradiction(names, evidence, frame))
-    found = {}
-    for name in names:
-        own = [one for one in evidence if name in (one.one, one.other)]
-        best = min(own, key=lambda one: one.error)
-        found[name] = Clock(offsets[name], errors[name], best.method)
-    return found
+    best = {name: min((e for e in evidence if name in e[:2]), key=lambda e: e.error) for name in names}
+    return {name: Clock(offsets[name], errors[name], best[name].method) for name in names}
 
 
 def _least_squares(names: Sequence[str], evidence: Sequence[Evidence]) -> tuple[dict[str, float], dict[str, float]]:
     """(offsets, standard errors) by weighted least squares; the first of `names` begins at 0."""
-    place = {name: index for index, name in enumerate(names)}
-    rows = np.zeros((len(evidence), len(names)))
-    for row, one in zip(rows, evidence):
-        row[place[one.other]], row[place[one.one]] = 1 / one.error, -1 / one.error
-    goal = np.array([one.seconds / one.error for one in evidence])
-    normal = rows[:, 1:].T @ rows[:, 1:]
-    inverse = np.linalg.pinv(normal)
-    solved = inverse @ rows[:, 1:].T @ goal
-    errors = np.sqrt(np.maximum(np.diag(inverse), 0))
-    return dict(zip(names, (0.0, *map(float, solved)))), dict(zip(names, (0.0, *map(float, errors))))
+    signs = np.array([[(name == one.other) - float(name == one.one) for name in names] for one in evidence])
+    errors = np.array([one.error for one in evidence])
+    rows, goal = signs[:, 1:] / errors[:, None], np.array([one.seconds for one in evidence]) / errors
+    inverse = np.linalg.pinv(rows.T @ rows)
+    offsets, own = inverse @ rows.T @ goal, np.sqrt(np.maximum(np.diag(inverse), 0))
+    return dict(zip(names, [0.0, *offsets.tolist()])), dict(zip(names, [0.0, *own.tolist()]))
 
 
 def _worst(offsets: Mapping[str, float], evidence: Sequence[Evidence], frame: float) -> tuple[Evidence, float] | None:
     """The evidence that differs most from the whole, and by how many seconds; None where all agree."""
-    found = None
-    for one in evidence:
-        off = abs(offsets[one.other] - offsets[one.one] - one.seconds)
-        if off > APART * frame + 3 * one.error and (found is None or off > found[1]):
-            found = one, off
-    return found
+    off = [(one, abs(offsets[one.other] - offsets[one.one] - one.seconds)) for one in evidence]
+    beyond = [(one, seconds) for one, seconds in off if seconds > APART * frame + 3 * one.error]
+    return max(beyond, key=lambda pair: pair[1], default=None)
 
 
 def _contradiction(names: Sequence[str], evidence: Sequence[Evidence], frame: float) -> str:
@@ -206,7 +219,3 @@ def _contradiction(names: Sequence[str], evidence: Sequence[Evidence], frame: fl
     if len(guilty) == 1:
         return f"{said} {between}, and without camera {guilty[0]} all agree (is it of another event?): {INSTEAD}"
     return f"{said} {between}: choose one with --offsets timecode, sound or motion, or give them, NAME=FRAMES,..."
-
-
-def _what(how: str) -> str:
-    return {"auto": "timecode, sound or motion"}.get(how, f"the {how}")

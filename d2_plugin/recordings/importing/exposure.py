@@ -1,7 +1,7 @@
 """Each camera's gain, from pixels of two cameras that show the same point of a surface.
 
 Features of two images of one instant are matched, and kept where they lie on the epipolar line of the calibration
-and their triangulated point falls back on both. What the cameras see there is compared by `relative_exposures`.
+and their triangulated point falls back on both.
 """
 
 from __future__ import annotations
@@ -11,7 +11,9 @@ from itertools import combinations
 
 import numpy as np
 
+from d2_plugin.recordings.cameras.epipolar import epipolar_lines, homogeneous, sift_features
 from d2_plugin.recordings.images import opencv
+from d2_plugin.recordings.importing.clocks import linked_names
 from d2_plugin.recordings.recording import Camera, Exposure, Recording
 
 FRAMES = 6
@@ -30,7 +32,7 @@ LIKELY = 380.0
 """A match whose descriptor differs by more than `DISTINCT` times this is none: SIFT's have the length 512."""
 
 FEWEST = 20
-"""Matches of two cameras, over all instants, that tell a gain."""
+"""Matches of two cameras, over all instants, that a gain takes."""
 
 DARK, BRIGHT = 10, 245
 """Values of a pixel, of 255, beyond which a channel says nothing about gain: noise, or clipped."""
@@ -45,52 +47,35 @@ def measured_exposures(recording: Recording, cameras: Sequence[str]) -> dict[str
     chosen = np.unique(np.linspace(0, len(recording.frames) - 1, FRAMES).round().astype(int))
     for frame in (recording.frames[i] for i in chosen):
         images = {name: recording.image(name, frame) for name in cameras}
-        features = {name: _features(image) for name, image in images.items()}
+        features = {name: sift_features(image, FEATURES, "measuring exposure")[:2] for name, image in images.items()}
         for one, other in combinations(cameras, 2):
             p, q = _matched(recording.cameras[one], recording.cameras[other], features[one], features[other])
             if len(p):
                 a, b = _around(images[one], p), _around(images[other], q)
                 ratios.setdefault((one, other), []).append(b - a)
-    pairs = {pair: found for pair, parts in ratios.items() if len(found := np.concatenate(parts)) >= FEWEST}
-    return _gains(cameras, {pair: _middle(found) for pair, found in pairs.items()})
+    joined = {pair: np.concatenate(parts) for pair, parts in ratios.items()}
+    return _gains(cameras, {pair: _middle(values) for pair, values in joined.items() if len(values) >= FEWEST})
 
 
-def _features(image: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """(places [n, 2] in pixels, descriptors)."""
-    cv2 = opencv("measuring exposure")
-    # Without `enable_precise_upscale` OpenCV's SIFT is a quarter of a pixel too far right and down.
-    sift = cv2.SIFT_create(FEATURES, enable_precise_upscale=True)
-    found, descriptors = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
-    return np.array([point.pt for point in found]).reshape(-1, 2) + 0.5, descriptors
+_Features = tuple[np.ndarray, np.ndarray]
 
 
-def _matched(one: Camera, other: Camera, features: tuple, others: tuple) -> tuple[np.ndarray, np.ndarray]:
+def _matched(one: Camera, other: Camera, features: _Features, others: _Features) -> _Features:
     """Places [n, 2] of the same points in two images: each is the other's best by far along its epipolar line."""
     (p, descriptors), (q, other_descriptors) = features, others
-    if descriptors is None or other_descriptors is None or np.allclose(one.centre, other.centre):
+    if not len(p) or not len(q) or np.allclose(one.centre, other.centre):
         return np.zeros((0, 2)), np.zeros((0, 2))
     reach = max(DIAGONAL * np.hypot(other.width, other.height), 0.7)
-    far = epipolar_distances(one, other, p, q) > 2 * reach
+    far = np.abs(epipolar_lines(one, other, p) @ homogeneous(q).T) > 2 * reach
     products = descriptors @ other_descriptors.T
     squares = (descriptors**2).sum(1)[:, None] + (other_descriptors**2).sum(1) - 2 * products
     distance = np.where(far, np.inf, np.sqrt(np.maximum(squares, 0)))
     best, back = distance.argmin(1), distance.argmin(0)
     first, second = np.partition(distance, 1, axis=1)[:, :2].T if len(q) > 1 else (distance[:, 0], distance[:, 0])
-    index = np.arange(len(p))
-    kept = np.isfinite(first) & (first < DISTINCT * np.minimum(second, LIKELY)) & (back[best] == index)
+    kept = np.isfinite(first) & (first < DISTINCT * np.minimum(second, LIKELY)) & (back[best] == np.arange(len(p)))
     p, q = p[kept], q[best[kept]]
     near = _consistent(one, other, p, q) if len(p) else np.zeros(0, bool)
     return p[near], q[near]
-
-
-def epipolar_distances(one: Camera, other: Camera, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Distance [n, m], pixels, of each `q` [m, 2] in `other` from the epipolar line of each `p` [n, 2] in `one`."""
-    relative = other.T_camera_world @ np.linalg.inv(one.T_camera_world)
-    x, y, z = relative[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    fundamental = np.linalg.inv(other.K).T @ cross @ relative[:3, :3] @ np.linalg.inv(one.K)
-    lines = np.column_stack([p, np.ones(len(p))]) @ fundamental.T
-    return np.abs(lines @ np.column_stack([q, np.ones(len(q))]).T) / np.linalg.norm(lines[:, :2], axis=1)[:, None]
 
 
 def _consistent(one: Camera, other: Camera, p: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -124,37 +109,24 @@ def _middle(ratios: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _gains(cameras: Sequence[str], pairs: dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]) -> dict[str, Exposure]:
     """Weighted least squares over the pairs, the mean of the logarithms 0."""
-    pairs = {pair: found for pair, found in pairs.items() if np.isfinite(found).all()}
-    names = _largest_group(cameras, list(pairs))
+    pairs = {pair: values for pair, values in pairs.items() if np.isfinite(values).all()}
+    names = linked_names(cameras, pairs)
+    kept = [pair for pair in pairs if pair[0] in names and pair[1] in names]
     if len(names) < 2:
         return {}
-    kept = [(pair, *found) for pair, found in pairs.items() if pair[0] in names and pair[1] in names]
+    signs = np.array([[(name == other) - float(name == one) for name in names] for one, other in kept])
     logs, errors = np.zeros((len(names), 3)), np.zeros((len(names), 3))
     for channel in range(3):
-        rows, goal = np.zeros((len(kept) + 1, len(names))), np.zeros(len(kept) + 1)
-        for row, ((one, other), middle, error) in enumerate(kept):
-            rows[row, names.index(other)], rows[row, names.index(one)] = 1 / error[channel], -1 / error[channel]
-            goal[row] = middle[channel] / error[channel]
-        rows[-1] = 1 / len(names) / 1e-4  # the mean is 0
-        inverse = np.linalg.pinv(rows.T @ rows)
+        middle, error = np.array([[part[channel] for part in pairs[pair]] for pair in kept]).T
+        rows, goal = signs / error[:, None], middle / error
+        inverse = np.linalg.pinv(rows.T @ rows)  # of all solutions the smallest, whose mean is 0
         logs[:, channel] = inverse @ rows.T @ goal
         # Pairs that contradict each other by more than their errors say that those are too small.
         free = len(kept) - len(names) + 1
         excess = float(((rows @ logs[:, channel] - goal) ** 2).sum()) / free if free > 0 else 1.0
         errors[:, channel] = np.sqrt(np.maximum(np.diag(inverse), 0) * max(excess, 1.0))
-    gains = np.exp(logs - logs.mean(0))
+    gains = np.exp(logs)
     return {name: Exposure(_three(gains[i]), _three(gains[i] * errors[i])) for i, name in enumerate(names)}
-
-
-def _largest_group(cameras: Sequence[str], pairs: Sequence[tuple[str, str]]) -> list[str]:
-    groups = [{name} for name in cameras]
-    for one, other in pairs:
-        first, second = (next(group for group in groups if name in group) for name in (one, other))
-        if first is not second:
-            groups.remove(second)
-            first |= second
-    largest = max(groups, key=len)
-    return [name for name in cameras if name in largest]
 
 
 def _three(values: np.ndarray) -> tuple[float, float, float]:

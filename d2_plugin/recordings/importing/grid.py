@@ -13,7 +13,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.importing.clocks import Clock
-from d2_plugin.recordings.importing.files import VideoFile
+from d2_plugin.recordings.importing.video import VideoFile
 
 REACH = 0.75
 """An image farther than this many frames of the recording, or half of the camera's own, stands for no instant."""
@@ -56,7 +56,7 @@ def grid_of(
     Raises:
         D2Error: no instant at which all cameras recorded, or none of those that were asked for.
     """
-    taken = {name: _instants(video, clocks[name]) for name, video in videos.items()}
+    taken = {name: clocks[name].seconds + video.times for name, video in videos.items()}
     begin, end = max(one[0] for one in taken.values()), min(one[-1] for one in taken.values())
     fps = rate or _rounded(min((video.rate for video in videos.values() if video.rate), default=25.0))
     if end < begin - REACH / fps:
@@ -76,12 +76,13 @@ def grid_of(
         kept &= np.abs(off) <= reach
     if not kept.any():
         raise D2Error("no instant is in all videos: correct --offsets, or choose other --times")
-    return Grid(fps, *_chosen(numbers, near, kept), notes=_notes(kept, videos, fps))
-
-
-def _instants(video: VideoFile, clock: Clock) -> np.ndarray:
-    """[N] seconds on the common clock."""
-    return clock.seconds + video.times * (1 + clock.drift)
+    frames = numbers[kept].tolist()
+    indices = {name: dict(zip(frames, place[kept].tolist())) for name, (place, _) in near.items()}
+    together = all(np.abs(off[kept]).max() <= TOGETHER for _, off in near.values())
+    lateness = (
+        {} if together else {name: dict(zip(frames, off[kept].round(6).tolist())) for name, (_, off) in near.items()}
+    )
+    return Grid(fps, indices, {} if together else lateness, _notes(kept, videos, fps))
 
 
 def _rounded(rate: float) -> float:
@@ -115,22 +116,10 @@ def _asked(numbers: np.ndarray, fps: float, times: Sequence[float] | None, frame
 
 def _nearest(taken: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(place in `taken` that is nearest to each wanted instant, how much later it is)."""
-    after = (
-        np.searchsorted(taken, wanted).clip(1, max(len(taken) - 1, 1)) if len(taken) > 1 else np.zeros(len(wanted), int)
-    )
+    after = np.searchsorted(taken, wanted).clip(0, len(taken) - 1)
     before = np.maximum(after - 1, 0)
     place = np.where(np.abs(taken[before] - wanted) <= np.abs(taken[after] - wanted), before, after)
     return place, taken[place] - wanted
-
-
-def _chosen(
-    numbers: np.ndarray, near: Mapping[str, tuple[np.ndarray, np.ndarray]], kept: np.ndarray
-) -> tuple[dict[str, dict[int, int]], dict[str, dict[int, float]]]:
-    indices = {name: dict(zip(numbers[kept].tolist(), place[kept].tolist())) for name, (place, _) in near.items()}
-    if all(np.abs(off[kept]).max() <= TOGETHER for _, off in near.values()):
-        return indices, {}
-    late = {name: dict(zip(numbers[kept].tolist(), off[kept].round(6).tolist())) for name, (_, off) in near.items()}
-    return indices, late
 
 
 def _notes(kept: np.ndarray, videos: Mapping[str, VideoFile], fps: float) -> tuple[str, ...]:

@@ -15,7 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.recordings.importing.profiles import FINE, GROUPS, Curve, Watched, changes_of, curve_between
+from d2_plugin.progress import progress_bar
+from d2_plugin.recordings.cameras.camera import CalibratedCamera
+from d2_plugin.recordings.cameras.undistort import Undistortion
+from d2_plugin.recordings.importing.video import Decoder, VideoFile
+from d2_plugin.recordings.recording import Camera
 
 LONG_SIDE = 160
 """Pixels of the images that are compared."""
@@ -32,8 +36,66 @@ ALIKE = 0.2
 RIVAL = 0.8
 """Another lag that is this good, outside of the peak, makes a camera's offset doubtful."""
 
-FINEST = 0.05
-"""Frames: no offset from motion is said to be surer."""
+ERROR = 0.25
+"""Frames: the standard error of an offset from motion."""
+
+PLANES = 48
+"""Half-planes between the common limits of two images."""
+
+FINE = 8
+"""Steps per frame in which lags are compared; between them lies a parabola."""
+
+NOISE = (2.0, 3.0)
+"""Change counts above this many times a pixel's usual change, and this many levels of 255 more."""
+
+LEAST_COMMON = 5
+"""Frames that two cameras must share at a lag."""
+
+
+class Watched(NamedTuple):
+    """Small images of a camera that stands still."""
+
+    camera: Camera
+    """The pinhole of the small images."""
+    images: np.ndarray
+    """[T, h, w] uint8, brightness."""
+    times: np.ndarray
+    """[T] seconds on the clock of the video."""
+
+
+class Curve(NamedTuple):
+    """How well two cameras agree at each lag."""
+
+    lags: np.ndarray  # [L] in steps: the clock of the other began so much later
+    correlation: np.ndarray  # [L], 0 where too few frames are common
+    common: np.ndarray  # [L] frames
+
+    @property
+    def score(self) -> np.ndarray:
+        """[L] Fisher's z of the correlation times the root of the common frames: a chance peak counts less."""
+        return np.arctanh(np.clip(self.correlation, -0.999, 0.999)) * np.sqrt(self.common)
+
+
+def small_images(videos: Mapping[str, VideoFile], cameras: Mapping[str, CalibratedCamera]) -> dict[str, Watched]:
+    """Small undistorted images of all cameras, from the beginning."""
+    watched = {}
+    with progress_bar("decode for motion", sum(min(len(v.stamps), MOST_FRAMES) for v in videos.values())) as bar:
+        done = 0
+        for name, video in videos.items():
+            decoder, count = Decoder(video), min(len(video.stamps), MOST_FRAMES)
+            images = []
+            for index in range(count):
+                images.append(decoder.grey(index, LONG_SIDE))
+                bar.update(done := done + 1, name)
+            decoder.close()
+            undistortion = Undistortion(cameras[name].of_size(images[0].shape[::-1]))
+            straight = np.stack([undistortion.image(image) for image in images])
+            watched[name] = Watched(undistortion.camera, straight, video.times[:count])
+    return watched
+
+
+Scores = Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
+"""Two cameras -> (lags [L] in steps, how well they agree at each [L])."""
 
 
 class Seen(NamedTuple):
@@ -43,8 +105,6 @@ class Seen(NamedTuple):
     """When its clock began, after that of the first camera."""
     error: float
     """Standard error, seconds."""
-    alike: float
-    """Mean correlation with the other cameras at that offset."""
     doubt: str
     """Why it cannot be trusted; empty where it can."""
 
@@ -65,37 +125,26 @@ def offsets_from_motion(watched: Mapping[str, Watched], search: float) -> dict[s
         pair = curve_between(watched[one], watched[other], changes[one], changes[other], step, search)
         if pair is not None:
             curves[one, other] = pair
-    offsets = _agreed(names, curves, None)
-    without = np.array([list(_agreed(names, curves, group, offsets).values()) for group in range(GROUPS)])
-    spread = np.sqrt((GROUPS - 1) / GROUPS * ((without - without.mean(0)) ** 2).sum(0)) * step
-    found = {}
-    for place, name in enumerate(names):
-        alike, doubt = _trust(name, offsets, curves)
-        found[name] = Seen(offsets[name] * step, float(max(spread[place], FINEST * frame)), alike, doubt)
-    return found
+    scores = {pair: (curve.lags, curve.score) for pair, curve in curves.items()}
+    offsets = _agreed(names, scores)
+    return {name: Seen(offsets[name] * step, ERROR * frame, _doubt(name, offsets, curves, scores)) for name in names}
 
 
-def _agreed(
-    names: Sequence[str],
-    curves: Mapping[tuple[str, str], Curve],
-    without: int | None,
-    start: Mapping[str, float] | None = None,
-) -> dict[str, float]:
+def _agreed(names: Sequence[str], scores: Scores) -> dict[str, float]:
     """Offsets, in steps, at which the sum of the scores of all pairs has its peak."""
-    scores = {pair: (curve.lags, curve.score(without)) for pair, curve in curves.items()}
-    offsets = dict(start) if start is not None else _tree(names, scores)
+    offsets = _tree(names, scores)
     for _ in range(20):
         before = dict(offsets)
         for name in names[1:]:
             lags, total = _alone(name, offsets, scores)
             if len(lags):
-                offsets[name] = _summit(lags, total, near=None if start is None else offsets[name])
+                offsets[name] = _summit(lags, total)
         if all(abs(offsets[name] - before[name]) < 0.01 for name in names):
             break
     return offsets
 
 
-def _tree(names: Sequence[str], scores: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]) -> dict[str, float]:
+def _tree(names: Sequence[str], scores: Scores) -> dict[str, float]:
     """A start: from the first camera on, each is hung to the one that it agrees with best."""
     offsets = {names[0]: 0.0}
     while len(offsets) < len(names):
@@ -111,9 +160,7 @@ def _tree(names: Sequence[str], scores: Mapping[tuple[str, str], tuple[np.ndarra
     return offsets
 
 
-def _alone(
-    name: str, offsets: Mapping[str, float], scores: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
-) -> tuple[np.ndarray, np.ndarray]:
+def _alone(name: str, offsets: Mapping[str, float], scores: Scores) -> tuple[np.ndarray, np.ndarray]:
     """(offsets of one camera, sum of its scores there) with the other cameras where they are."""
     curves = []
     for (one, other), (lags, score) in scores.items():
@@ -127,10 +174,9 @@ def _alone(
     return places, np.sum([np.interp(places, lags, score, left=0, right=0) for lags, score in curves], axis=0)
 
 
-def _summit(places: np.ndarray, total: np.ndarray, near: float | None) -> float:
-    """The place of the peak, of that within a frame of `near` where given, by a parabola over half a frame."""
-    allowed = np.ones(len(places), bool) if near is None else np.abs(places - near) <= FINE
-    top = int(np.where(allowed, total, -np.inf).argmax())
+def _summit(places: np.ndarray, total: np.ndarray) -> float:
+    """The place of the peak, by a parabola over half a frame."""
+    top = int(total.argmax())
     low, high = max(top - FINE // 2, 0), min(top + FINE // 2, len(places) - 1)
     if high - low < 2:
         return float(places[top])
@@ -139,33 +185,25 @@ def _summit(places: np.ndarray, total: np.ndarray, near: float | None) -> float:
     return float(places[top] + np.clip(shift, -FINE / 2, FINE / 2))
 
 
-def _trust(name: str, offsets: Mapping[str, float], curves: Mapping[tuple[str, str], Curve]) -> tuple[float, str]:
-    """(mean correlation with the others, why the offset is doubtful)."""
-    correlations = [
-        float(np.interp(offsets[other] - offsets[one], curve.lags, np.nan_to_num(curve.correlation())))
-        for (one, other), curve in curves.items()
-        if name in (one, other)
-    ]
-    scores = {pair: (curve.lags, curve.score()) for pair, curve in curves.items()}
+def _doubt(name: str, offsets: Mapping[str, float], curves: Mapping[tuple[str, str], Curve], scores: Scores) -> str:
+    """Why a camera's offset cannot be trusted, or nothing."""
+    own = {pair: curve for pair, curve in curves.items() if name in pair}
     places, total = _alone(name, offsets, scores)
-    if not correlations or not len(places):
-        return 0.0, "it shares no view with another camera"
-    shared = max(
-        float(np.interp(offsets[other] - offsets[one], curve.lags, curve.common))
-        for (one, other), curve in curves.items()
-        if name in (one, other)
-    )
-    alike = float(np.mean(correlations))
+    if not own or not len(places):
+        return "it shares no view with another camera"
+    lags = {pair: offsets[pair[1]] - offsets[pair[0]] for pair in own}
+    shared = max(float(np.interp(lags[pair], curve.lags, curve.common)) for pair, curve in own.items())
+    alike = float(np.mean([np.interp(lags[pair], curve.lags, curve.correlation) for pair, curve in own.items()]))
     if shared < FEWEST:
-        return alike, f"it shares {shared:.0f} frames with the others, fewer than {FEWEST}"
+        return f"it shares {shared:.0f} frames with the others, fewer than {FEWEST}"
     if alike < ALIKE:
-        return alike, f"what moves in it does not move in the others (correlation {alike:.2f})"
+        return f"what moves in it does not move in the others (correlation {alike:.2f})"
     top = int(np.abs(places - offsets[name]).argmin())
     rival = _rival(total, top)
     if rival is not None and total[rival] > RIVAL * total[top]:
         frames = (places[rival] - places[top]) / FINE
-        return alike, f"an offset that differs by {frames:+.1f} frames is as good (is the motion repeated?)"
-    return alike, ""
+        return f"an offset that differs by {frames:+.1f} frames is as good (is the motion repeated?)"
+    return ""
 
 
 def _rival(total: np.ndarray, top: int) -> int | None:
@@ -178,3 +216,100 @@ def _rival(total: np.ndarray, top: int) -> int | None:
             outside[place] = False
             place += way
     return int(np.where(outside, total, -np.inf).argmax()) if outside.any() else None
+
+
+def changes_of(one: Watched) -> tuple[np.ndarray, np.ndarray]:
+    """(change per second [T - 1, h, w] beyond what is usual for the pixel, the instants [T - 1] in the middle)."""
+    steps = np.diff(one.times)
+    change = np.abs(np.diff(one.images.astype(np.int16), axis=0)).astype(np.float32)
+    usual = np.median(change, axis=0)
+    change = np.maximum(change - NOISE[0] * usual - NOISE[1], 0) * (np.median(steps) / steps)[:, None, None]
+    return change.astype(np.float32), (one.times[1:] + one.times[:-1]) / 2
+
+
+def curve_between(
+    one: Watched, other: Watched, changes: tuple, other_changes: tuple, step: float, search: float
+) -> Curve | None:
+    """The agreement of two cameras over the lag; None where no half-plane is in both images."""
+    angles = _angles(one.camera, other.camera)
+    low, high = (pick(bound(angle, q) for angle in angles) for pick, bound, q in ((max, _at, 0.01), (min, _at, 0.99)))
+    if not high > low:
+        return None
+    profiles = [
+        _resampled(_profile(change, angle, low, high), times, step)
+        for (change, times), angle in zip((changes, other_changes), angles)
+    ]
+    starts = (float(changes[1][0]), float(other_changes[1][0]))
+    return _correlated(profiles[0], profiles[1], starts, step, search)
+
+
+def _at(angles: np.ndarray, share: float) -> float:
+    return float(np.nanquantile(angles, share))
+
+
+def _angles(one: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Angle [h, w] of each pixel's half-plane around the line that joins the cameras; NaN next to that line."""
+    axis = other.centre - one.centre
+    axis /= np.linalg.norm(axis) + 1e-300
+    ahead = one.T_camera_world[2, :3] + other.T_camera_world[2, :3]
+    ahead = ahead - axis * (axis @ ahead)
+    if np.linalg.norm(ahead) < 1e-6:  # the cameras look at each other: any direction across the line will do
+        ahead = np.cross(axis, one.T_camera_world[0, :3])
+    ahead /= np.linalg.norm(ahead)
+    across = np.cross(axis, ahead)
+
+    def of(camera: Camera) -> np.ndarray:
+        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(camera.K).T @ camera.T_camera_world[:3, :3]
+        off = np.hypot(rays @ ahead, rays @ across) / np.linalg.norm(rays, axis=-1)
+        return np.where(off > 0.1, np.arctan2(rays @ across, rays @ ahead), np.nan)
+
+    return of(one), of(other)
+
+
+def _profile(change: np.ndarray, angles: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Mean change [T, PLANES] of the pixels of each half-plane."""
+    with np.errstate(invalid="ignore"):
+        place = np.floor((angles - low) / (high - low) * PLANES)
+        inside = (place >= 0) & (place < PLANES)
+    places = place[inside].astype(int)
+    pixels = np.maximum(np.bincount(places, minlength=PLANES), 1)
+    rows = change[:, inside]
+    return np.stack([np.bincount(places, row, minlength=PLANES) for row in rows]) / pixels
+
+
+def _resampled(profile: np.ndarray, times: np.ndarray, step: float) -> np.ndarray:
+    """The profile [N, PLANES] every `step` seconds from its first instant on, linear between."""
+    wanted = np.arange(times[0], times[-1] + step / 2, step)
+    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+    share = ((wanted - times[after - 1]) / (times[after] - times[after - 1])).clip(0, 1)[:, None]
+    return profile[after - 1] * (1 - share) + profile[after] * share
+
+
+def _correlated(one: np.ndarray, other: np.ndarray, starts: tuple[float, float], step: float, search: float) -> Curve:
+    """The correlation over the common time at every lag, about the means of that time."""
+    a, b = len(one), len(other)
+    shifts = np.arange(-(b - 1), a)  # sample i + shift of `one` meets sample i of `other`
+    begin, end = np.maximum(shifts, 0), np.minimum(a, b + shifts)
+    count = end - begin
+    size = 1 << int(np.ceil(np.log2(a + b)))
+    spectra = np.fft.rfft(one, size, axis=0) * np.conj(np.fft.rfft(other, size, axis=0))
+    product = np.fft.irfft(spectra, size, axis=0)[shifts % size]
+    sums, squares = zip(*(_running(one, begin, end), _running(other, begin - shifts, end - shifts)))
+    product = product - sums[0] * sums[1] / count[:, None]
+    spreads = [square - total**2 / count[:, None] for square, total in zip(squares, sums)]
+    size = np.sqrt(np.prod([spread.sum(1) for spread in spreads], axis=0).clip(0))
+    known = (count >= LEAST_COMMON * FINE) & (size > 1e-9)
+    correlation = np.where(known, product.sum(1) / np.where(known, size, 1), 0.0)
+    lags = shifts + (starts[0] - starts[1]) / step
+    kept = np.abs(lags) <= search / step + 1
+    return Curve(lags[kept], correlation[kept], count[kept] / FINE)
+
+
+def _running(values: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sums of the values, and of their squares, from `begin` to `end`."""
+    both = []
+    for power in (values, values**2):
+        total = np.vstack([np.zeros((1, power.shape[1])), np.cumsum(power, axis=0)])
+        both.append(total[end] - total[begin])
+    return both[0], both[1]

@@ -1,14 +1,12 @@
-"""What `d2 import` takes, and what of it makes two imports the same."""
+"""What `d2 import` takes."""
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.importing.source import Cut
 from d2_plugin.settings import Count, Positional, Range, Settings
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
@@ -42,7 +40,7 @@ class ImportChoices(Settings):
     """Correct the poses of the calibration by features of all cameras; kept as they are where that mends nothing."""
 
     intrinsics: Path | None = None
-    """Without a calibration: a file with the lenses alone, in any of its formats; its poses are not looked at."""
+    """Without a calibration: a file with the lenses alone, in any of its formats; its poses are not used."""
     focal: tuple[str, ...] = ("shared",)
     """Without a calibration and intrinsics: focal lengths in pixels of the upright video, one number or NAME=PIXELS,
     joined by commas; or how they are found: shared (one for all cameras, as of phones of one model) or each."""
@@ -82,31 +80,3 @@ def check_calibration(settings: ImportSettings) -> None:
         )
     if settings.calibration is None and settings.unit is not None:
         raise D2Error("--unit says what a calibration is in, and none is given: give --distance or --board for a scale")
-
-
-def cut_of(choices: ImportChoices, name: str, size: tuple[int, int]) -> Cut:
-    """What is kept of images of `size` of one camera.
-
-    Raises:
-        D2Error: a part that is not written WIDTHxHEIGHT+LEFT+TOP, or lies outside of the image.
-    """
-    whole = Cut(0, 0, *size, choices.scale)
-    for text in choices.crop:
-        camera, named, part = text.rpartition("=")
-        if named and camera != name:
-            continue
-        match = re.fullmatch(r"(\d{1,6})x(\d{1,6})\+(\d{1,6})\+(\d{1,6})", part.strip())
-        if match is None:
-            raise D2Error(f"--crop says '{text}', expected WIDTHxHEIGHT+LEFT+TOP such as 1280x720+0+100: correct it")
-        width, height, left, top = map(int, match.groups())
-        whole = Cut(left, top, width, height, choices.scale)
-    whole.check(name, size)
-    return whole
-
-
-def check_names(choices: ImportChoices, names: list[str]) -> None:
-    """Refuse a part for a camera that there is not."""
-    for text in choices.crop:
-        camera, named, _ = text.rpartition("=")
-        if named and camera not in names:
-            raise D2Error(f"--crop names camera '{camera}', have {', '.join(names)}: correct the name")

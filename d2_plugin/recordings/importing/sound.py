@@ -1,4 +1,4 @@
-"""When two cameras started, from what both heard: the generalised cross-correlation with phase transform.
+"""When two cameras started, from the sound of both: the generalised cross-correlation with phase transform.
 
 With the spectra A and B of the two sounds, the inverse transform of A conj(B) / |A conj(B)| has its peak at the lag of
 one behind the other: every frequency counts alike, so loudness, distance and the microphone's colour do not matter
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.recordings.importing.files import container_of, pyav
+from d2_plugin.recordings.importing.video import container_of, pyav
 
 RATE = 16_000
 """Samples per second that are compared."""
@@ -25,13 +25,11 @@ MOST_SECONDS = 900.0
 """Of the sound that is read."""
 
 CLEAR = 12.0
-"""A peak this many standard deviations of the correlation high is an event that both heard. The largest of a million
+"""A peak this many standard deviations of the correlation high is an event that both recorded. The largest of a million
 samples of noise reaches 5."""
 
 DOUBTFUL = 0.6
-"""Another peak of this share of the highest makes it doubtful: a sound that repeats itself, or two events. In rooms of
-claps and noise the second highest reached 0.05 of the highest, 0.4 where next to nothing was heard; between recordings
-of different events 0.8 to 1."""
+"""Another peak of this share of the highest makes it doubtful: a sound that repeats itself, or two events."""
 
 BLUNT = 0.45
 """As much within `ECHO` is no single peak: two claps of different events, laid over each other, look like that."""
@@ -50,7 +48,7 @@ AROUND = 0.05
 
 
 class Sound(NamedTuple):
-    """What a camera heard, one channel."""
+    """The sound of a camera, one channel."""
 
     samples: np.ndarray
     """[N] float32 at `RATE` samples per second."""
@@ -64,8 +62,6 @@ class Lag(NamedTuple):
     seconds: float
     error: float
     """Standard error, seconds."""
-    drift: float
-    """Seconds that the other clock loses per second; 0 where it is within its error."""
 
 
 def read_sound(path: Path) -> Sound | None:
@@ -100,8 +96,11 @@ def lag_between(one: Sound, other: Sound) -> Lag | None:
         return None
     lag = _between_samples(correlation, peak) / RATE
     parts = _lags_of_parts(one.samples, other.samples, lag)
-    error, drift = _spread(parts)
-    return Lag(lag + one.start - other.start, error, drift)
+    error = 1 / RATE
+    if len(parts) > 1:
+        spread = 1.4826 * float(np.median(np.abs(parts - np.median(parts))))
+        error = max(1.2533 * spread / np.sqrt(len(parts)), error)
+    return Lag(lag + one.start - other.start, error)
 
 
 def phase_transform(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -137,11 +136,11 @@ def _between_samples(correlation: np.ndarray, peak: int) -> float:
 
 
 def _lags_of_parts(one: np.ndarray, other: np.ndarray, lag: float) -> np.ndarray:
-    """(middle of the part in seconds, lag in seconds) [n, 2] of the parts that share a clear event."""
+    """Lags in seconds [n] of the parts that share a clear event."""
     shift = round(lag * RATE)
     begin, end = max(shift, 0), min(len(one), len(other) + shift)
     count = int(min(max((end - begin) / (PART * RATE), 1), PARTS))
-    reach, found = int(AROUND * RATE), []
+    reach, lags = int(AROUND * RATE), []
     edges = np.linspace(begin, end, count + 1).astype(int)
     for first, last in pairwise(edges):
         correlation = phase_transform(one[first:last], other[first - shift : last - shift])
@@ -149,21 +148,5 @@ def _lags_of_parts(one: np.ndarray, other: np.ndarray, lag: float) -> np.ndarray
         noise = 1.4826 * float(np.median(np.abs(correlation))) + 1e-20
         if near.max() >= 5 * noise:
             peak = (int(near.argmax()) - reach) % len(correlation)
-            found.append([(first + last) / 2 / RATE, (shift + _between_samples(correlation, peak)) / RATE])
-    return np.array(found).reshape(-1, 2)
-
-
-def _spread(parts: np.ndarray) -> tuple[float, float]:
-    """(standard error of the lag in seconds, drift in seconds per second)."""
-    finest = 1 / RATE
-    if len(parts) < 2:
-        return finest, 0.0
-    spread = 1.4826 * float(np.median(np.abs(parts[:, 1] - np.median(parts[:, 1]))))
-    error = max(1.2533 * spread / np.sqrt(len(parts)), finest)
-    if len(parts) < 4:
-        return error, 0.0
-    times = parts[:, 0] - parts[:, 0].mean()
-    slope = float((times * parts[:, 1]).sum() / (times**2).sum())
-    left = parts[:, 1] - parts[:, 1].mean() - slope * times
-    slope_error = float(np.sqrt((left**2).sum() / (len(parts) - 2) / (times**2).sum())) + finest / np.ptp(parts[:, 0])
-    return error, slope if abs(slope) > 4 * slope_error else 0.0
+            lags.append((shift + _between_samples(correlation, peak)) / RATE)
+    return np.array(lags)

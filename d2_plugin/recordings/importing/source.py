@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import shown_path
-from d2_plugin.recordings.cameras.formats import CalibratedCamera
-from d2_plugin.recordings.cameras.lens import UndistortedSource
+from d2_plugin.recordings.cameras.camera import CalibratedCamera
+from d2_plugin.recordings.cameras.formats.cameras_json import camera_table, read_camera
+from d2_plugin.recordings.cameras.undistort import UndistortedSource, recorded_at
 from d2_plugin.recordings.images import opencv
-from d2_plugin.recordings.importing.decoding import Decoder
-from d2_plugin.recordings.importing.files import Turn, VideoFile
+from d2_plugin.recordings.importing.settings import ImportChoices
+from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
 from d2_plugin.recordings.recording import Camera
 
 
@@ -51,7 +53,7 @@ class Cut:
 
     def check(self, name: str, size: tuple[int, int]) -> None:
         """Refuse a part that lies outside of an image of `size`, or nothing left of it."""
-        if min(self.left, self.top) < 0 or self.left + self.width > size[0] or self.top + self.height > size[1]:
+        if self.left + self.width > size[0] or self.top + self.height > size[1]:
             raise D2Error(
                 f"--crop {self.width}x{self.height}+{self.left}+{self.top} lies outside of camera {name}, which has "
                 f"{size[0]}x{size[1]} pixels: give WIDTHxHEIGHT+LEFT+TOP inside of it"
@@ -60,55 +62,53 @@ class Cut:
             raise D2Error(f"--scale {self.scale:g} leaves less than 8 pixels of camera {name}: choose a larger one")
 
 
-@dataclass(frozen=True)
-class Upright:
-    """The images as they are decoded."""
+def cuts_of(choices: ImportChoices, sizes: Mapping[str, tuple[int, int]]) -> dict[str, Cut]:
+    """What is kept of the images of each camera, whose images have `sizes`.
 
-    videos: Mapping[str, VideoFile]
-    indices: Mapping[str, Mapping[int, int]]
-    """By camera, the video's frame of each frame of the recording."""
-    _decoders: dict[str, Decoder] = field(default_factory=dict, repr=False, compare=False)
-
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        """RGB uint8 [H, W, 3], upright."""
-        index = self.indices[camera].get(frame)
-        if index is None:
-            raise D2Error(f"camera {camera} has no frame {frame}: choose one of the recording's frames")
-        if camera not in self._decoders:
-            self._decoders[camera] = Decoder(self.videos[camera])
-        return self._decoders[camera].image(index)
-
-    def depth(self, camera: str, frame: int) -> None:
-        """None: a video carries no true depth."""
-
-    def mono(self, camera: str, frame: int) -> None:
-        """None: a video carries no monocular maps."""
-
-    def __reduce__(self) -> tuple[Any, ...]:  # another process opens its own decoders
-        return Upright, (self.videos, self.indices)
+    Raises:
+        D2Error: a part that is not written WIDTHxHEIGHT+LEFT+TOP, lies outside of the image or is of no camera.
+    """
+    cuts = {name: Cut(0, 0, *size, choices.scale) for name, size in sizes.items()}
+    for text in choices.crop:
+        camera, named, part = text.rpartition("=")
+        if named and camera not in sizes:
+            raise D2Error(f"--crop names camera '{camera}', have {', '.join(sizes)}: correct the name")
+        match = re.fullmatch(r"(\d{1,6})x(\d{1,6})\+(\d{1,6})\+(\d{1,6})", part.strip())
+        if match is None:
+            raise D2Error(f"--crop says '{text}', expected WIDTHxHEIGHT+LEFT+TOP such as 1280x720+0+100: correct it")
+        width, height, left, top = map(int, match.groups())
+        cuts |= dict.fromkeys([camera] if named else sizes, Cut(left, top, width, height, choices.scale))
+    for name, cut in cuts.items():
+        cut.check(name, sizes[name])
+    return cuts
 
 
 @dataclass(frozen=True)
 class VideosSource:
     """The images of a recording that stays in its videos; not for several threads at the same time."""
 
-    upright: Upright
+    videos: Mapping[str, VideoFile]
+    indices: Mapping[str, Mapping[int, int]]
+    """By camera, the video's frame of each frame of the recording."""
     cameras: Mapping[str, CalibratedCamera]
     cuts: Mapping[str, Cut]
-    _straight: UndistortedSource = field(init=False, repr=False, compare=False)
+    _undistorted: UndistortedSource = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        bent = {name: camera.lens for name, camera in self.cameras.items() if camera.lens.bends}
-        sizes = {name: (self.cameras[name].width, self.cameras[name].height) for name in bent}
-        object.__setattr__(self, "_straight", UndistortedSource(self.upright, bent, sizes))
+        bent = {name: camera for name, camera in self.cameras.items() if camera.lens.bends}
+        object.__setattr__(self, "_undistorted", UndistortedSource(VideoFrames(self.videos, self.indices), bent))
+
+    def pinholes(self) -> dict[str, Camera]:
+        """The cameras of the images that it gives."""
+        return {name: self.cuts[name].camera(camera) for name, camera in self.cameras.items()}
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3]: undistorted, black where nothing was recorded, cut and made smaller."""
-        image = self._straight.image(camera, frame)
+        image = self._undistorted.image(camera, frame)
         expected = self.cameras[camera]
         if image.shape[:2] != (expected.height, expected.width):
             raise D2Error(
-                f"frame {frame} of {shown_path(self.upright.videos[camera].path)} is {image.shape[1]}x"
+                f"frame {frame} of {shown_path(self.videos[camera].path)} is {image.shape[1]}x"
                 f"{image.shape[0]} pixels and the first one {expected.width}x{expected.height}: the size changes "
                 "within the video, so choose --times of one size"
             )
@@ -130,49 +130,32 @@ class VideosSource:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, from which `from_dict` makes the same."""
-        return {name: self._camera(name) for name in self.cameras}
+        return {
+            name: {
+                "video": self.videos[name].as_dict(),
+                "frames": list(self.indices[name]),
+                "places": list(self.indices[name].values()),
+                "cut": asdict(self.cuts[name]),
+                "camera": camera_table(camera),
+            }
+            for name, camera in self.cameras.items()
+        }
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], folder: Path) -> VideosSource:
         """What `as_dict` made; paths are relative to `folder` where they are not absolute."""
-        videos, indices, cameras, cuts = {}, {}, {}, {}
-        for name, entry in table.items():
-            video = VideoFile.from_dict(entry["video"])
-            videos[name] = replace(video, path=folder / video.path)
-            indices[name] = dict(zip(entry["frames"], entry["places"]))
-            lens = {key: np.array(entry[key], np.float64) for key in ("matrix", "rotation", "translation")}
-            width, height = videos[name].turn.size(*video.size)
-            cameras[name] = CalibratedCamera(
-                name, width, height, model=entry["model"], distortion=tuple(entry["distortion"]), **lens
-            )
-            cuts[name] = Cut(**entry["cut"])
-        return cls(Upright(videos, indices), cameras, cuts)
-
-    def _camera(self, name: str) -> dict[str, Any]:
-        camera, cut, places = self.cameras[name], self.cuts[name], self.upright.indices[name]
-        lens = {key: getattr(camera, key).tolist() for key in ("matrix", "rotation", "translation")}
-        return {
-            "video": self.upright.videos[name].as_dict(),
-            "frames": list(places),
-            "places": list(places.values()),
-            "cut": {key: getattr(cut, key) for key in ("left", "top", "width", "height", "scale")},
-            "model": camera.model,
-            "distortion": list(camera.distortion),
-            **lens,
-        }
+        videos = {name: VideoFile.from_dict(entry["video"]) for name, entry in table.items()}
+        return cls(
+            {name: replace(video, path=folder / video.path) for name, video in videos.items()},
+            {name: dict(zip(entry["frames"], entry["places"])) for name, entry in table.items()},
+            {name: read_camera(entry["camera"], str(folder)) for name, entry in table.items()},
+            {name: Cut(**entry["cut"]) for name, entry in table.items()},
+        )
 
 
 def valid_pixels(camera: CalibratedCamera, cut: Cut) -> np.ndarray:
     """Which pixels of what is left [h, w] were recorded by the camera, bool."""
-    small = cut.camera(camera)
-    columns, rows = (np.arange(length) + 0.5 for length in (small.width, small.height))
-    x, y = np.meshgrid(columns / small.width * cut.width + cut.left, rows / small.height * cut.height + cut.top)
-    recorded = camera.lens.recorded_pixels(np.stack([x, y], axis=-1))
-    with np.errstate(invalid="ignore"):
-        inside = ((recorded >= 0.5) & (recorded <= np.array([camera.width, camera.height]) - 0.5)).all(axis=-1)
-    return np.asarray(inside)
-
-
-def unturned(video: VideoFile) -> VideoFile:
-    """The video as it is stored: for a calibration that was made of stored images."""
-    return replace(video, turn=Turn(0))
+    width, height = cut.size
+    columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
+    x, y = np.meshgrid(columns / width * cut.width + cut.left, rows / height * cut.height + cut.top)
+    return recorded_at(camera, np.stack([x, y], axis=-1))

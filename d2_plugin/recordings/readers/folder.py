@@ -1,34 +1,39 @@
 """The folder layout: images/<camera>/<frame>.(png|jpg), cameras.json and, optionally, depth/ and mono/ maps.
 
-`cameras.json` holds {"fps", "cameras": [{"name", "width", "height", "fx", "fy", "cx", "cy", "R", "t"}], "bounds":
-{camera: [near, far]}} with OpenCV axes, x_cam = R X + t and the centre of pixel i at i + 0.5. Where a camera has a
-`model` and its `distortion` as well (see d2_plugin.recordings.cameras.formats), its images are undistorted when read.
-depth/<camera>/<frame>.npz holds true planar z under the key "depth" (0 = unknown). mono/<camera>/<frame>.npy holds a
-monocular prediction: affine-invariant inverse depth, unless mono/mono.json says otherwise with
-{"kind": "metric" | "relative", "emulated": bool}.
+The cameras are described in `d2_plugin.recordings.cameras.formats.cameras_json`; beside them cameras.json may hold
+
+    "fps", "bounds": {camera: [near, far]}
+    "exposures": {camera: {"gain": [r, g, b], "error": [r, g, b]}}    measured when videos were imported
+    "late": {camera: {frame: seconds}}                                cameras that did not expose together
+
+Maps: see `d2_plugin.recordings.assembly`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Optional
+from typing import Annotated, Any
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error
 from d2_plugin.reading import field, read_json
 from d2_plugin.recordings.assembly import CORRECT, assembled
-from d2_plugin.recordings.cameras.calibration import checked_rate
-from d2_plugin.recordings.cameras.formats.cameras_json import read_entry
-from d2_plugin.recordings.cameras.formats.document import NUMBER
-from d2_plugin.recordings.cameras.lens import Lens
-from d2_plugin.recordings.files import common_frames, numbered_files
+from d2_plugin.recordings.cameras.camera import CalibratedCamera, checked_rate
+from d2_plugin.recordings.cameras.formats.cameras_json import read_camera
+from d2_plugin.recordings.files import cameras_with_images, common_frames, frame_number, numbered_files
 from d2_plugin.recordings.images import image_size
-from d2_plugin.recordings.readers.measured import with_measured
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.recording import Exposure, Recording
+from d2_plugin.values import Range
 
 CALIBRATION = "cameras.json"
 
 DEFAULT_FPS = 30.0
 """Frame rate that is assumed, with a note, where cameras.json names none."""
+
+GAIN = Annotated[float, Range(1e-3, 1e3)]
+ERROR = Annotated[float, Range(0, 1e3)]
+LATE = Annotated[float, Range(-1e3, 1e3)]
 
 
 def is_folder(path: Path) -> bool:
@@ -42,80 +47,66 @@ def open_folder(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
     `cameras` restricts everything, checks included, to the named ones; `intersect` leaves out, with a note, cameras
     that have images without calibration or calibration without images, which are otherwise refused by name.
     """
+    where = str(path / CALIBRATION)
     description = read_json(path / CALIBRATION, CORRECT)
-    calibrated = _calibrations(description, path / CALIBRATION)
+    calibrated = _calibrated(description, where)
     pictured = {folder.name: folder for folder in sorted((path / "images").iterdir()) if folder.is_dir()}
-    names, notes = _agreed(list(calibrated), list(pictured), cameras, intersect, path)
+    names, notes = cameras_with_images(calibrated, pictured, cameras, intersect, path / CALIBRATION)
     images = {name: numbered_files(pictured[name]) for name in names}
     frames, frame_notes = common_frames(images, path / "images")
     for name in names:
-        _check_size(calibrated[name][0], images[name][frames[0]])
-    fps, fps_notes = _frame_rate(description, path, len(frames))
-    pinholes = {name: calibrated[name][0] for name in names}
-    lenses = {name: calibrated[name][1] for name in names}
-    recording = assembled(path, pinholes, images, frames, fps, (*notes, *frame_notes, *fps_notes), lenses)
-    return with_measured(recording, description, str(path / CALIBRATION))
+        _check_size(calibrated[name], images[name][frames[0]])
+    fps, fps_notes = DEFAULT_FPS, (f"cameras.json names no fps: {DEFAULT_FPS:g} taken",) if len(frames) > 1 else ()
+    if "fps" in description:
+        fps, fps_notes = checked_rate(field(description, "fps", float, where, CORRECT), where), ()
+    chosen = {name: calibrated[name] for name in names}
+    recording = assembled(path, chosen, images, frames, fps, where, (*notes, *frame_notes, *fps_notes))
+    return with_measured(recording, description, where)
 
 
-def _calibrations(description: dict[str, Any], path: Path) -> dict[str, tuple[Camera, Lens]]:
+def _calibrated(description: Mapping[str, Any], where: str) -> dict[str, CalibratedCamera]:
     entries = description.get("cameras")
     if not isinstance(entries, list) or not entries:
-        raise D2Error(f"{path} has no list 'cameras': write one entry per camera")
-    bounds = field(description, "bounds", dict, str(path), CORRECT, default={})
-    found: dict[str, tuple[Camera, Lens]] = {}
+        raise D2Error(f"{where} has no list 'cameras': write one entry per camera")
+    bounds = field(description, "bounds", dict, where, CORRECT, default={})
+    cameras: dict[str, CalibratedCamera] = {}
     for entry in entries:
-        camera, lens = _calibration(entry, bounds, path)
-        if camera.name in found:
-            raise D2Error(f"{path} describes camera {camera.name} twice: remove one entry")
-        found[camera.name] = (camera, lens)
-    return found
+        camera = read_camera(entry, where, bounds)
+        camera.pinhole(where)
+        if camera.name in cameras:
+            raise D2Error(f"{where} describes camera {camera.name} twice: remove one entry")
+        cameras[camera.name] = camera
+    return cameras
 
 
-def _calibration(entry: Any, bounds: dict[str, Any], path: Path) -> tuple[Camera, Lens]:
-    """The pinhole camera of the undistorted images, and the lens of the recorded ones."""
-    camera = read_entry(entry, str(path)).recorded(None, str(path))
-    pair = Optional[tuple[NUMBER, NUMBER]]  # noqa: UP045  at run time, on Python 3.9 too
-    near_far = field(bounds, camera.name, pair, f"bounds in {path}", CORRECT, default=None)
-    return camera.pinhole(str(path), near_far), camera.lens
-
-
-def _agreed(
-    calibrated: list[str], pictured: list[str], asked: tuple[str, ...] | None, intersect: bool, path: Path
-) -> tuple[list[str], tuple[str, ...]]:
-    """(cameras to read, notes), or a refusal that names what does not fit."""
-    wanted = calibrated + [name for name in pictured if name not in calibrated] if asked is None else list(asked)
-    for name in wanted:
-        if name not in calibrated and name not in pictured:
-            raise unknown_name("camera", name, {*calibrated, *pictured})
-    no_calibration = [name for name in wanted if name not in calibrated]
-    no_images = [name for name in wanted if name not in pictured]
-    both = [name for name in wanted if name in calibrated and name in pictured]
-    if both and intersect and (no_calibration or no_images):
-        return both, (f"left out, calibration or images missing: {', '.join([*no_calibration, *no_images])}",)
-    if no_calibration:
-        raise D2Error(
-            f"camera {', '.join(no_calibration)} is not in {path / 'cameras.json'}, which has {', '.join(calibrated)}: "
-            "add its calibration or choose the cameras to read"
-        )
-    if no_images:
-        raise D2Error(
-            f"camera {', '.join(no_images)} of {path / 'cameras.json'} has no folder in {path / 'images'}: "
-            "add its images or choose the cameras to read"
-        )
-    return both, ()
-
-
-def _check_size(camera: Camera, first: Path) -> None:
+def _check_size(camera: CalibratedCamera, first: Path) -> None:
     width, height = image_size(first)
-    if (width, height) != (camera.width, camera.height):
+    if (width, height) != camera.size:
         raise D2Error(
             f"{first} is {width}x{height} pixels but cameras.json says {camera.width}x{camera.height} for camera "
             f"{camera.name}: resize the images or correct the calibration"
         )
 
 
-def _frame_rate(description: dict[str, Any], path: Path, frames: int) -> tuple[float, tuple[str, ...]]:
-    if "fps" not in description:
-        return DEFAULT_FPS, (f"cameras.json names no fps: {DEFAULT_FPS:g} taken",) if frames > 1 else ()
-    where = str(path / CALIBRATION)
-    return checked_rate(field(description, "fps", float, where, CORRECT), where), ()
+def with_measured(recording: Recording, description: Mapping[str, Any], where: str) -> Recording:
+    """The recording with the exposures and the lateness of its cameras, where the file has them."""
+    exposures, late = (field(description, key, dict, where, CORRECT, default={}) for key in ("exposures", "late"))
+    return replace(
+        recording,
+        exposures={name: _exposure(exposures, name, where) for name in recording.cameras if name in exposures},
+        late={name: _late(late, name, recording.frames, where) for name in recording.cameras if name in late},
+    )
+
+
+def _exposure(table: Mapping[str, Any], name: str, where: str) -> Exposure:
+    place = f"exposures of camera {name} in {where}"
+    entry = field(table, name, dict, f"exposures in {where}", CORRECT)
+    gain = field(entry, "gain", tuple[GAIN, GAIN, GAIN], place, CORRECT)
+    return Exposure(gain, field(entry, "error", tuple[ERROR, ERROR, ERROR], place, CORRECT))
+
+
+def _late(table: Mapping[str, Any], name: str, frames: tuple[int, ...], where: str) -> dict[int, float]:
+    place, wanted = f"late of camera {name} in {where}", set(frames)
+    entry = field(table, name, dict, f"late in {where}", CORRECT)
+    numbers = {key: frame_number(key, f"{place}: {key}") for key in entry if str(key).isdecimal()}
+    return {number: field(entry, key, LATE, place, CORRECT) for key, number in numbers.items() if number in wanted}

@@ -17,11 +17,12 @@ import numpy as np
 from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.assembly import assembled
-from d2_plugin.recordings.cameras.calibration import LARGEST_NUMBER, checked_camera, checked_rate, pinhole, rigid
+from d2_plugin.recordings.cameras.camera import LARGEST_NUMBER, CalibratedCamera, checked_rate, pinhole, rigid
+from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.files import FrameFiles, cameras_with_images, collect, common_frames, numbered_files
 from d2_plugin.recordings.images import IMAGE_SUFFIXES, image_size
-from d2_plugin.recordings.importing.plain import VideoSource, video_header
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.importing.video import VideoFrames, video_header
+from d2_plugin.recordings.recording import Recording
 
 log = logging.getLogger(__name__)
 
@@ -83,22 +84,17 @@ def _assigned(
     )
 
 
-def camera_from_row(row: np.ndarray, name: str, size: tuple[int, int] | None, where: str) -> Camera:
-    """The OpenCV camera of one row [17] of poses_bounds.npy for images of `size` (width, height).
+def camera_from_row(row: np.ndarray, name: str, size: tuple[int, int] | None, where: str) -> CalibratedCamera:
+    """The camera of one row [17] of poses_bounds.npy for images of `size` (width, height).
 
     `size` None means the size in the row; another one must have the same aspect and scales the focal length.
     """
     pose = np.asarray(row[:15], np.float64).reshape(3, 5)
     height, width, focal = pose[:, 4]
-    if not np.isfinite(row).all() or min(height, width) < 1:
+    if not (np.abs(row) <= LARGEST_NUMBER).all() or min(height, width) < 1:
         raise D2Error(
-            f"the row of camera {name} in {where} has a number that is not finite or a size below one pixel: "
-            "correct the calibration"
-        )
-    if np.abs(row).max() > LARGEST_NUMBER:
-        raise D2Error(
-            f"the row of camera {name} in {where} has the number {np.abs(row).max():g}, expected at most "
-            f"{LARGEST_NUMBER:g} in size: correct the calibration"
+            f"the row of camera {name} in {where} has a number that is not finite, one beyond {LARGEST_NUMBER:g} or a "
+            "size below one pixel: correct the calibration"
         )
     size = size or (round(width), round(height))
     scale = size[0] / width
@@ -109,9 +105,9 @@ def camera_from_row(row: np.ndarray, name: str, size: tuple[int, int] | None, wh
         )
     # Columns of the row are down, right, back; OpenCV's rows are right, down, forward.
     rotation = np.stack([pose[:, 1], pose[:, 0], -pose[:, 2]])
-    K = pinhole(focal * scale, focal * scale, size[0] / 2, size[1] / 2)
+    lens = Lens(pinhole(focal * scale, focal * scale, size[0] / 2, size[1] / 2))
     transform = rigid(rotation, -rotation @ pose[:, 3])
-    return checked_camera(name, size, K, transform, (float(row[15]), float(row[16])), where)
+    return CalibratedCamera(name, *size, lens, transform, (float(row[15]), float(row[16])))
 
 
 def _rows(path: Path) -> np.ndarray:
@@ -124,15 +120,16 @@ def _rows(path: Path) -> np.ndarray:
 def _from_videos(
     path: Path, rows: dict[str, np.ndarray], videos: dict[str, Path], names: list[str], notes: tuple[str, ...]
 ) -> Recording:
-    found = {name: video_header(videos[name]) for name in names}
-    frames, frame_notes = common_frames({name: range(header.frames) for name, header in found.items()}, path)
+    headers = {name: video_header(videos[name]) for name in names}
+    frames, frame_notes = common_frames({name: range(header.frames) for name, header in headers.items()}, path)
     where = str(path / POSES)
+    cameras = {name: camera_from_row(rows[name], name, headers[name].size, where) for name in names}
     return Recording(
         name=path.resolve().name,
-        cameras={name: camera_from_row(rows[name], name, found[name].size, where) for name in names},
+        cameras={name: camera.pinhole(where) for name, camera in cameras.items()},
         frames=frames,
-        fps=checked_rate(found[names[0]].fps or N3DV_FPS, str(videos[names[0]])),
-        source=VideoSource({name: videos[name] for name in names}),
+        fps=checked_rate(headers[names[0]].fps or N3DV_FPS, str(videos[names[0]])),
+        source=VideoFrames({name: videos[name] for name in names}),
         path=path,
         notes=(*notes, *frame_notes, *_known_flaws(path, names)),
     )
@@ -145,7 +142,8 @@ def _from_images(
     frames, frame_notes = common_frames(files, path)
     where = str(path / POSES)
     cameras = {name: camera_from_row(rows[name], name, image_size(files[name][frames[0]]), where) for name in names}
-    return assembled(path, cameras, files, frames, N3DV_FPS, (*notes, *frame_notes, *_known_flaws(path, names)))
+    notes = (*notes, *frame_notes, *_known_flaws(path, names))
+    return assembled(path, cameras, files, frames, N3DV_FPS, where, notes)
 
 
 def _known_flaws(path: Path, names: list[str]) -> tuple[str, ...]:
@@ -165,11 +163,11 @@ def _extracted(path: Path) -> dict[str, FrameFiles]:
     for pattern in ("cam*/images", "cam*", "images/*"):
         folders = [folder for folder in sorted(path.glob(pattern)) if folder.is_dir()]
         cameras = [folder.parent.name if folder.name == "images" else folder.name for folder in folders]
-        found = {camera: numbered_files(folder) for camera, folder in zip(cameras, folders)}
-        if found and all(found.values()):
-            return found
-        if not partly and any(found.values()):
-            partly = found
+        files = {camera: numbered_files(folder) for camera, folder in zip(cameras, folders)}
+        if files and all(files.values()):
+            return files
+        if not partly and any(files.values()):
+            partly = files
     return partly or dict(_by_prefix(path / "images"))
 
 

@@ -17,15 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import read_text, said
+from d2_plugin.reading import parsing, read_text
 from d2_plugin.recordings.assembly import assembled
-from d2_plugin.recordings.cameras.calibration import LARGEST_NUMBER, checked_camera, pinhole, rigid
-from d2_plugin.recordings.cameras.lens import Lens
+from d2_plugin.recordings.cameras.camera import LARGEST_NUMBER, CalibratedCamera, pinhole, rigid
+from d2_plugin.recordings.cameras.lens import checked_lens
 from d2_plugin.recordings.cameras.rotations import rotation_of_quaternion
-from d2_plugin.recordings.files import FrameFiles, cameras_with_images, common_frames, frame_number
+from d2_plugin.recordings.files import FrameFiles, Shot, by_camera, cameras_with_images, common_frames, frame_number
 from d2_plugin.recordings.images import IMAGE_SUFFIXES, image_size
-from d2_plugin.recordings.naming import Shot, by_camera
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.recording import Recording
 
 PARAMETERS = "cameras_parameters.txt"
 UNDISTORTED, DISTORTED = 12, 14
@@ -62,33 +61,20 @@ def open_technicolor(path: Path, cameras: tuple[str, ...] | None = None, interse
     Cameras are named 00 to 15. Those without images are refused by name, or left out with a note where `intersect`.
     """
     rows = _rows(path / PARAMETERS)
-    shown, scene = _images(path)
-    names, notes = cameras_with_images(sorted(rows), shown, cameras, intersect, path / PARAMETERS)
-    images, damage_notes = _repaired({name: shown[name] for name in names}, scene)
+    pictured, scene = _images(path)
+    names, notes = cameras_with_images(sorted(rows), pictured, cameras, intersect, path / PARAMETERS)
+    images, damage_notes = _repaired({name: pictured[name] for name in names}, scene)
     frames, frame_notes = common_frames(images, path)
     calibrated = {name: _camera(name, rows[name], images[name][frames[0]], scene, path) for name in names}
-    return assembled(
-        path,
-        {name: camera for name, (camera, _) in calibrated.items()},
-        images,
-        frames,
-        TECHNICOLOR_FPS,
-        (*notes, *damage_notes, *frame_notes),
-        {name: lens for name, (_, lens) in calibrated.items()},
-    )
+    where = str(path / PARAMETERS)
+    return assembled(path, calibrated, images, frames, TECHNICOLOR_FPS, where, (*notes, *damage_notes, *frame_notes))
 
 
 def _rows(path: Path) -> dict[str, np.ndarray]:
     """Numbers of each camera by its name."""
-    try:
+    with parsing(str(path), "expected a header and one line of numbers per camera"):
         lines = [line.split() for line in read_text(path).splitlines()[1:] if line.strip()]
         rows = [np.array([float(field) for field in line]) for line in lines]
-    except D2Error:
-        raise
-    except ValueError as failure:
-        raise D2Error(
-            f"cannot read {path} ({said(failure)}): expected a header and one line of numbers per camera"
-        ) from None
     for number, row in enumerate(rows):
         if row.size not in (UNDISTORTED, DISTORTED):
             raise D2Error(
@@ -134,18 +120,16 @@ def _repaired(images: dict[str, FrameFiles], scene: str) -> tuple[dict[str, Fram
     return repaired, tuple(notes)
 
 
-def _camera(name: str, row: np.ndarray, image: Path, scene: str, path: Path) -> tuple[Camera, Lens]:
-    """The pinhole camera of the undistorted images, and the lens of the recorded ones."""
-    where = str(path / PARAMETERS)
+def _camera(name: str, row: np.ndarray, image: Path, scene: str, path: Path) -> CalibratedCamera:
+    where = f"camera {name} in {path / PARAMETERS}"
     focal, cu, cv, aspect, skew = row[:5]
-    distortion = tuple(row[5:-7].tolist()) if "undist" not in image.stem.lower() else ()
+    distortion = row[5:-7] if "undist" not in image.stem.lower() else ()
     if not np.abs(row).max() <= LARGEST_NUMBER:
-        raise D2Error(f"camera {name} in {where} has a number beyond {LARGEST_NUMBER:g}: correct the calibration")
+        raise D2Error(f"{where} has a number beyond {LARGEST_NUMBER:g}: correct the calibration")
     K = pinhole(focal, aspect * focal, cu, cv)
     K[0, 1] = skew
-    try:
+    with parsing(f"the rotation of {where}", "correct the calibration"):
         pose = rigid(rotation_of_quaternion(row[-7:-3]), row[-3:])
-    except ValueError as failure:
-        raise D2Error(f"camera {name} in {where} has no rotation ({failure}): correct the calibration") from None
-    lens = Lens(K, distortion)
-    return checked_camera(name, image_size(image), lens.pinhole, pose, NEAR_FAR.get(scene), where), lens
+    return CalibratedCamera(
+        name, *image_size(image), checked_lens(K, "opencv", distortion, where), pose, NEAR_FAR.get(scene)
+    )

@@ -8,23 +8,17 @@ without times from many poses is one instant. Intrinsics may stand at the top or
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Optional
-
-import numpy as np
+from typing import NamedTuple, Optional
 
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.reading import field, read_json, said
+from d2_plugin.reading import field, read_json
 from d2_plugin.recordings.assembly import CORRECT, assembled
-from d2_plugin.recordings.cameras.calibration import LARGEST_NUMBER, check_name, checked_rate
-from d2_plugin.recordings.cameras.formats.transforms import read_entry
-from d2_plugin.recordings.cameras.lens import Lens
-from d2_plugin.recordings.files import common_frames
+from d2_plugin.recordings.cameras.camera import CalibratedCamera, check_name, checked_rate
+from d2_plugin.recordings.cameras.formats.transforms import ListedImage, camera_of, listed_images, still
+from d2_plugin.recordings.files import Shot, arrange, by_camera, common_frames
 from d2_plugin.recordings.images import IMAGE_SUFFIXES, image_size
-from d2_plugin.recordings.naming import Shot, arrange, by_camera
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.recording import Recording
 
 FILES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
 """All that are there are read; their images are joined."""
@@ -32,22 +26,12 @@ FILES = ("transforms.json", "transforms_train.json", "transforms_val.json", "tra
 STATIC_FPS = 30.0
 """Frame rate of files without times, where it means nothing."""
 
-SAME_POSE = 1e-5
-"""Largest difference of the matrices of one camera; these files are converted, not estimated per image."""
 
-TIME_DIGITS = 12
-"""Decimals of a time that count: splits are written by programs that divide in another order."""
+class _Entry(NamedTuple):
+    """One image, its file and who lists it."""
 
-
-@dataclass(frozen=True, eq=False)
-class _Entry:
-    """One image as a file lists it."""
-
-    name: str  # path without the leading ./, with a suffix
+    image: ListedImage
     file: Path
-    matrix: np.ndarray  # [4, 4] camera to world, OpenGL axes
-    time: float | None
-    intrinsics: Mapping[str, Any]
     listed_in: Path
 
 
@@ -74,49 +58,19 @@ def open_transforms(path: Path, cameras: tuple[str, ...] | None = None, intersec
     frames, frame_notes = common_frames(images, path)
     first = {shot.camera: entries[name] for name, shot in shots.items() if shot.frame == frames[0]}
     calibrated = {name: _camera(name, first[name]) for name in images}
-    return assembled(
-        path,
-        {name: camera for name, (camera, _) in calibrated.items()},
-        images,
-        frames,
-        fps,
-        (*notes, *_split_notes(entries, shots), *frame_notes),
-        {name: lens for name, (_, lens) in calibrated.items()},
-    )
+    notes = (*notes, *_split_notes(entries, shots), *frame_notes)
+    return assembled(path, calibrated, images, frames, fps, str(path), notes)
 
 
 def _entries(path: Path) -> dict[str, _Entry]:
-    found: dict[str, _Entry] = {}
+    entries: dict[str, _Entry] = {}
     for listed_in in (path / name for name in FILES if (path / name).is_file()):
-        content = read_json(listed_in, CORRECT)
-        frames = content.get("frames")
-        if not isinstance(frames, list):
-            raise D2Error(f"{listed_in} has no list 'frames': write one entry per image")
-        common = {key: value for key, value in content.items() if key != "frames"}
-        for frame in frames:
-            entry = _entry(frame, common, listed_in)
-            found.setdefault(entry.name, entry)  # an image that several files list counts once
-    if not found:
+        for image in listed_images(read_json(listed_in, CORRECT), str(listed_in)):
+            file = _image_file(listed_in.parent / image.name)
+            entries.setdefault(image.name, _Entry(image, file, listed_in))  # listed by several files, it counts once
+    if not entries:
         raise D2Error(f"{path} has no transforms.json or transforms_train.json that lists images: give one that does")
-    return found
-
-
-def _entry(frame: Any, common: Mapping[str, Any], listed_in: Path) -> _Entry:
-    try:
-        name = str(frame["file_path"])
-        matrix = np.array(frame["transform_matrix"], np.float64)
-        matrix = np.vstack([matrix, [0, 0, 0, 1]]) if matrix.shape == (3, 4) else matrix.reshape(4, 4)
-        time = round(float(frame["time"]), TIME_DIGITS) if "time" in frame else None
-        file = _image_file(listed_in.parent / name)
-    except KeyError as missing:
-        raise D2Error(f"an image in {listed_in} has no {missing}: add it") from None
-    except (TypeError, ValueError, OverflowError) as failure:
-        raise D2Error(f"an image in {listed_in} cannot be understood ({said(failure)}): {CORRECT}") from None
-    if not np.isfinite(matrix).all() or (time is not None and not math.isfinite(time)):
-        raise D2Error(f"{name} in {listed_in} has a number that is not finite: correct the file")
-    if np.abs(matrix).max() > LARGEST_NUMBER:
-        raise D2Error(f"{name} in {listed_in} has a matrix with {np.abs(matrix).max():g} in it: correct the file")
-    return _Entry(name.removeprefix("./"), file, matrix, time, {**common, **frame}, listed_in)
+    return entries
 
 
 def _image_file(path: Path) -> Path:
@@ -141,8 +95,8 @@ def _present(entries: dict[str, _Entry], intersect: bool) -> tuple[dict[str, _En
 def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], float]:
     """Camera and frame of every image, and frames per unit of time."""
     declared = _rate(next(iter(entries.values())), path)
-    shots, _ = arrange(entries, lambda group: _still([entries[name] for name in group]))
-    times = {name: entry.time for name, entry in entries.items() if entry.time is not None}
+    shots, _ = arrange(entries, lambda group: still([entries[name].image for name in group]))
+    times = {name: entry.image.time for name, entry in entries.items() if entry.image.time is not None}
     instants = set(times.values())
     if not instants or (len(instants) == 1 and len(times) == len(entries)):
         return shots, declared or STATIC_FPS
@@ -160,7 +114,7 @@ def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], flo
 
 def _rate(entry: _Entry, path: Path) -> float | None:
     """The frame rate that a file declares, or None."""
-    rate = field(entry.intrinsics, "fps", Optional[float], str(entry.listed_in), CORRECT, None)  # noqa: UP045
+    rate = field(entry.image.table, "fps", Optional[float], str(entry.listed_in), CORRECT, None)  # noqa: UP045
     return checked_rate(rate, str(path)) if rate else None  # 0 is how some programs say that there is none
 
 
@@ -175,17 +129,12 @@ def _timed(shots: dict[str, Shot], times: dict[str, float]) -> tuple[dict[str, S
     return counted, (len(distinct) - 1) / (distinct[-1] - distinct[0])
 
 
-def _still(group: list[_Entry]) -> bool:
-    first = group[0].matrix
-    return all(np.abs(entry.matrix - first).max() <= SAME_POSE * max(np.abs(first).max(), 1) for entry in group)
-
-
-def _camera(name: str, entry: _Entry) -> tuple[Camera, Lens]:
-    """The pinhole camera of the undistorted images, and the lens of the recorded ones."""
+def _camera(name: str, entry: _Entry) -> CalibratedCamera:
     size, where = image_size(entry.file), str(entry.listed_in)
     check_name(name, where)
-    camera = read_entry(name, entry.intrinsics, entry.matrix, size, where).recorded(size, where)
-    return camera.pinhole(where), camera.lens
+    camera = camera_of(entry.image, name, size, where).of_size(size, where)
+    camera.pinhole(where)
+    return camera
 
 
 def _split_notes(entries: dict[str, _Entry], shots: dict[str, Shot]) -> tuple[str, ...]:

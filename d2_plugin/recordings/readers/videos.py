@@ -5,19 +5,16 @@ The videos are decoded when an image is asked for, so they must stay where they 
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 from d2_plugin.durable import Kind, read_table
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import shown_path
-from d2_plugin.recordings.importing.files import VideoFile, read_video
 from d2_plugin.recordings.importing.source import VideosSource
-from d2_plugin.recordings.readers.measured import with_measured
+from d2_plugin.recordings.importing.video import VideoFile, read_video
+from d2_plugin.recordings.readers.folder import with_measured
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.selection import select_cameras
-
-log = logging.getLogger(__name__)
 
 TABLE = "videos.json"
 KIND = Kind("description of videos", 1, "import the videos again into another folder")
@@ -36,14 +33,13 @@ def open_videos(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
         source = VideosSource.from_dict(table["cameras"], path)
         fps, notes = float(table["recording"]["fps"]), tuple(table["recording"]["notes"])
         names = list(source.cameras)
-        pinholes = {name: source.cuts[name].camera(source.cameras[name]) for name in names}
-        frames = tuple(source.upright.indices[names[0]])
+        pinholes, frames = source.pinholes(), tuple(source.indices[names[0]])
     except (KeyError, TypeError, IndexError) as failure:
         raise D2Error(f"{where} cannot be understood ({failure!r}): {KIND.remedy}") from None
     recording = Recording(path.resolve().name, pinholes, frames, fps, source, path, notes=notes, layout="videos")
     recording = with_measured(recording, table["recording"], str(where))
     for name in names if cameras is None else [name for name in cameras if name in names]:
-        _refuse_changed(source.upright.videos[name], name)
+        _refuse_changed(source.videos[name], name)
     return recording if cameras is None else select_cameras(recording, cameras)
 
 
@@ -55,5 +51,9 @@ def _refuse_changed(video: VideoFile, name: str) -> None:
             "with --images png, which needs no videos afterwards"
         )
     now = read_video(video.path)
-    if now.size != video.size or len(now.stamps) != len(video.stamps) or (now.stamps != video.stamps).any():
+    if (
+        now.stored_size != video.stored_size
+        or len(now.stamps) != len(video.stamps)
+        or (now.stamps != video.stamps).any()
+    ):
         raise D2Error(f"{shown_path(video.path)} is not the video that was imported: put it back, or import again")

@@ -87,9 +87,9 @@ def _first_hits(scene: Scene, camera: Camera, directions: np.ndarray, seconds: f
     owner = np.full(distance.shape, -1)
     for index, solid in enumerate(scene.solids):
         rays = _candidates(camera, solid, seconds)
-        found = _distances(solid, camera.centre[:, None], directions[:, rays], seconds)
-        nearer = found < distance[rays]
-        distance[rays[nearer]] = found[nearer]
+        reached = _distances(solid, camera.centre[:, None], directions[:, rays], seconds)
+        nearer = reached < distance[rays]
+        distance[rays[nearer]] = reached[nearer]
         owner[rays[nearer]] = index
     return distance, owner
 

@@ -19,7 +19,7 @@ from functools import lru_cache
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.cameras.calibration import pinhole, rigid
+from d2_plugin.recordings.cameras.camera import pinhole, rigid
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic import materials
 from d2_plugin.recordings.synthetic.raycast import Motion, Room, Scene, Solid, render_color, render_depth
@@ -35,20 +35,14 @@ ROOM_LOW, ROOM_HIGH = np.array([-2.6, -5.0, 0.0]), np.array([2.6, 2.0, 2.9])
 """Corners of the room; the cameras stand inside."""
 
 
-@dataclass(frozen=True)
-class MonocularEmulation:
-    """How far the emulated monocular maps are from exact inverse depth."""
+EDGE_BLUR = 0.006
+"""Of an emulated monocular map: the standard deviation of its blur, as a fraction of the image's width."""
 
-    edge_blur: float = 0.006
-    """Standard deviation of the blur, as a fraction of the image's width."""
-    fixed_bias: float = 0.07
-    """Relative local bias that stays the same in all frames of a camera, standard deviation."""
-    frame_bias: float = 0.03
-    """Relative local bias drawn anew for every frame, standard deviation."""
-    scale: tuple[float, float] = (4.0, 16.0)
-    """Range of the random scale of a frame."""
-    shift: tuple[float, float] = (-1.0, 2.0)
-    """Range of the random shift of a frame, added after scaling."""
+FIXED_BIAS, FRAME_BIAS = 0.07, 0.03
+"""Its relative local bias, standard deviation: the same in all frames of a camera, and drawn anew for every frame."""
+
+SCALE, SHIFT = (4.0, 16.0), (-1.0, 2.0)
+"""Ranges of its random scale, and of the shift that is added after scaling, of a frame."""
 
 
 @checked_arguments
@@ -62,7 +56,6 @@ def synthetic_recording(
     fps: float = 12.0,
     arc_degrees: float = 50.0,
     moving: bool = True,
-    emulation: MonocularEmulation = MonocularEmulation(),
 ) -> Recording:
     """The recording of `d2 demo`; the same arguments give the same images.
 
@@ -81,7 +74,7 @@ def synthetic_recording(
             f"{fps:g} fps is not possible: give at least one camera and frame, 8x8 pixels and fps above 0"
         )
     placed = arc_cameras(cameras, held_out, width, height, arc_degrees)
-    source = SyntheticSource(furnished_room(seed, moving), placed, fps, seed, emulation)
+    source = SyntheticSource(furnished_room(seed, moving), placed, fps, seed)
     return Recording(
         name="synthetic",
         cameras=placed,
@@ -147,7 +140,6 @@ class SyntheticSource:
     cameras: dict[str, Camera]
     fps: float
     seed: int
-    emulation: MonocularEmulation
     _cache: OrderedDict[tuple[str, str, int], np.ndarray] = field(default_factory=OrderedDict, repr=False)
 
     def image(self, camera: str, frame: int) -> np.ndarray:
@@ -160,14 +152,13 @@ class SyntheticSource:
 
     def mono(self, camera: str, frame: int) -> np.ndarray:
         """Emulated monocular prediction float32 [H, W]: affine-invariant inverse depth, larger is nearer."""
-        number, settings = list(self.cameras).index(camera), self.emulation
+        number = list(self.cameras).index(camera)
         depth = self.depth(camera, frame)
         fixed = np.random.default_rng([self.seed, 1, number])
         changing = np.random.default_rng([self.seed, 2, number, frame])
-        bias = settings.fixed_bias * _smooth_field(fixed, depth.shape)
-        bias = bias + settings.frame_bias * _smooth_field(changing, depth.shape)
-        scale, shift = changing.uniform(*settings.scale), changing.uniform(*settings.shift)
-        return emulated_monocular(depth, bias, scale, shift, settings.edge_blur * depth.shape[1])
+        bias = FIXED_BIAS * _smooth_field(fixed, depth.shape) + FRAME_BIAS * _smooth_field(changing, depth.shape)
+        scale, shift = changing.uniform(*SCALE), changing.uniform(*SHIFT)
+        return emulated_monocular(depth, bias, scale, shift, EDGE_BLUR * depth.shape[1])
 
     def _kept(
         self, what: str, camera: str, frame: int, render: Callable[[Scene, Camera, float], np.ndarray]

@@ -15,7 +15,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import NoSuchFile, field, read_json
-from d2_plugin.recordings.cameras.calibration import LARGEST_NUMBER, LARGEST_SIDE, ROTATION_TOLERANCE
+from d2_plugin.recordings.cameras.camera import LARGEST_NUMBER, LARGEST_SIDE, ROTATION_TOLERANCE
 from d2_plugin.values import Range
 from d2_plugin.viewing.paths import Lens, Pose
 

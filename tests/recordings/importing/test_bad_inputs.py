@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from recorded import Filmed, Shooting, video
+from stand_in_recordings import renamed
 from videos import write_video
 
 from d2_plugin.commands.cli import main
-from d2_plugin.recordings import Recording, open_recording, select_cameras
-from d2_plugin.recordings.selection import select_frames
+from d2_plugin.recordings import Recording, open_recording, select_frames
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("av")
 pytest.importorskip("cv2")
@@ -25,14 +26,21 @@ NAMES = ("02", "03", "04")
 
 
 @pytest.fixture(scope="module")
-def studio(shared_data: Callable[[str], Path]) -> Recording:
-    return select_cameras(open_recording(shared_data("studio")), NAMES)
+def room() -> Recording:
+    """Cameras that are rolled by different angles, so that no two can be taken for each other."""
+    rendered = synthetic_recording(cameras=3, held_out=0, frames=10, width=240, height=136, arc_degrees=30.0)
+    cameras = {}
+    for (name, camera), roll in zip(rendered.cameras.items(), (-0.2, 0.0, 0.35)):
+        turn = np.eye(4)
+        turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
+        cameras[name] = replace(camera, T_camera_world=turn @ camera.T_camera_world)
+    source = replace(rendered.source, cameras=cameras)
+    return renamed(replace(rendered, cameras=cameras, source=source), NAMES)
 
 
 @pytest.fixture(scope="module")
-def filmed(studio: Recording, tmp_path_factory: pytest.TempPathFactory) -> Filmed:
-    short = select_frames(studio, studio.frames[:10])
-    return video(short, tmp_path_factory.mktemp("good"), {name: Shooting() for name in NAMES}, sound=True)
+def filmed(room: Recording, tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+    return video(room, tmp_path_factory.mktemp("good"), {name: Shooting() for name in NAMES}, sound=True)
 
 
 @pytest.fixture
@@ -87,31 +95,25 @@ def swap(given: Filmed) -> None:
     (given.videos / "x.mp4").rename(other)
 
 
-def millimetres(given: Filmed) -> None:
-    def edit(cameras: dict[str, Any]) -> None:
-        for name in NAMES:
-            cameras[name]["t"] = [1000 * value for value in cameras[name]["t"]]
-
-    change(given, edit)
+def edited(edit: Callable[[dict[str, Any]], object]) -> Callable[[Filmed], None]:
+    """Spoils the calibration, whose entries `edit` takes by name."""
+    return lambda given: change(given, edit)
 
 
-def mirrored(given: Filmed) -> None:
-    change(given, lambda c: c["03"].update(R=[[-x for x in c["03"]["R"][0]], *c["03"]["R"][1:]]))
+def overwritten(name: str, content: bytes | None) -> Callable[[Filmed], None]:
+    """Writes something else into a file, or removes it."""
+
+    def spoil(given: Filmed) -> None:
+        path = given.folder / name
+        path.unlink() if content is None else path.write_bytes(content)
+
+    return spoil
 
 
-def turned_away(given: Filmed) -> None:
-    """A pose that is another camera's."""
-    change(given, lambda c: c["03"].update(R=(np.diag([-1, 1, -1]) @ c["03"]["R"]).tolist()))
-
-
-def wrong_focal(given: Filmed) -> None:
-    change(given, lambda c: [c[name].update(fx=3 * c[name]["fx"], fy=3 * c[name]["fy"]) for name in ("03",)])
-
-
-def left_handed(given: Filmed) -> None:
-    """All poses as a tool with left-handed axes writes them."""
-    flip = np.diag([1.0, 1.0, -1.0])
-    change(given, lambda c: [c[name].update(R=(np.array(c[name]["R"]) @ flip).tolist()) for name in NAMES])
+def flipped(table: dict[str, Any], *names: str) -> None:
+    """Poses as a tool with left-handed axes writes them."""
+    for name in names:
+        table[name].update(R=(np.array(table[name]["R"]) @ np.diag([1.0, 1.0, -1.0])).tolist())
 
 
 def of_another_rig(given: Filmed) -> None:
@@ -126,85 +128,56 @@ def of_another_rig(given: Filmed) -> None:
     change(given, edit)
 
 
-def no_number(given: Filmed) -> None:
-    change(given, lambda c: c["03"].update(t=[float("nan"), 0, 0]))
-
-
-def other_aspect(given: Filmed) -> None:
-    change(given, lambda c: c["03"].update(width=2 * c["03"]["width"]))
-
-
-def one_place(given: Filmed) -> None:
-    change(given, lambda c: [c[name].update(R=np.eye(3).tolist(), t=[0, 0, 0]) for name in NAMES])
-
-
-def missing_camera(given: Filmed) -> None:
-    change(given, lambda c: c["all"]["cameras"].remove(c["03"]))
-
-
 def called_alike(given: Filmed) -> None:
     (given.videos / "more").mkdir()
     shutil.copy(given.videos / "03.mp4", given.videos / "03.mov")
 
 
-def nothing(given: Filmed) -> None:
-    """The words alone are wrong."""
-
-
-def no_videos(given: Filmed) -> None:
-    for path in given.videos.iterdir():
-        path.unlink()
-
-
-def text(given: Filmed) -> None:
-    (given.videos / "03.mp4").write_text("not a video\n" * 1000)
-
-
-def empty(given: Filmed) -> None:
-    (given.videos / "03.mp4").write_bytes(b"")
-
-
-def garbage(given: Filmed) -> None:
-    given.calibration.write_text("{]")
-
-
-def no_calibration(given: Filmed) -> None:
-    given.calibration.unlink()
-
-
-CASES: list[tuple[Callable[[Filmed], None], list[str], str]] = [
+CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
     (no_frames, [], r"has no frame|no frame of video"),
     (damaged, [], r"can(not)? be decoded.*(repair|replace) the"),
     (cut_off, [], r"cannot read video .*03\.mp4.*replace the file or leave its camera out"),
-    (text, [], r"03\.mp4.*replace the file or leave its camera out"),
-    (empty, [], r"03\.mp4.*replace the file or leave its camera out"),
+    (overwritten("videos/03.mp4", b"not a video\n" * 1000), [], r"03\.mp4.*replace the file or leave its camera out"),
+    (overwritten("videos/03.mp4", b""), [], r"03\.mp4.*replace the file or leave its camera out"),
     (only_sound, [], r"03\.mp4 holds audio and no image: give a video"),
-    (no_videos, [], r"holds no video: give videos, or a folder"),
+    (lambda given: [path.unlink() for path in given.videos.iterdir()], [], r"holds no video: give videos, or a folder"),
     (called_alike, [], r"are both called 03: name each video like its camera"),
     (swap, [], r"cameras 02 and 04 are swapped: exchange"),
-    (turned_away, ["--offsets", "none"], r"03"),
-    (wrong_focal, [], r"does not fit the videos: .*03"),
-    (mirrored, [], r"camera 03 .*mirrored.*right-handed"),
-    (left_handed, [], r"camera 02 .*mirrored.*right-handed"),
+    (edited(lambda c: c["03"].update(R=(np.diag([-1, 1, -1]) @ c["03"]["R"]).tolist())), ["--offsets", "none"], r"03"),
+    (
+        edited(lambda c: c["03"].update(fx=3 * c["03"]["fx"], fy=3 * c["03"]["fy"])),
+        [],
+        r"does not fit the videos: .*03",
+    ),
+    (edited(lambda c: flipped(c, "03")), [], r"camera 03 .*mirrored.*right-handed"),
+    (edited(lambda c: flipped(c, *NAMES)), [], r"camera 02 .*mirrored.*right-handed"),
     (of_another_rig, [], r"does not fit the videos: "),
-    (no_number, [], r"(NaN|not finite)"),
-    (other_aspect, [], r"another aspect"),
-    (millimetres, [], r"up to \d+ apart, which is no metres: say what it is with --unit mm"),
-    (one_place, [], r"puts all cameras at one place: give a calibration with their poses|does not fit"),
-    (missing_camera, [], r"no camera for 03"),
-    (garbage, [], r"not JSON|no calibration that can be read"),
-    (no_calibration, [], r"no such calibration|there is no such file|is not there"),
-    (nothing, ["--offsets", "07=3"], r"--offsets names camera '07', have 02, 03, 04"),
-    (nothing, ["--offsets", "03=soon"], r"--offsets says '03=soon', expected NAME=FRAMES"),
-    (nothing, ["--offsets", "03=900"], r"camera 0\d stopped .* seconds before camera 03 began"),
-    (nothing, ["--offsets", "timecode"], r"nothing in the timecode links"),
-    (nothing, ["--times", "40,50"], r"--times asks for 40 to 50 seconds"),
-    (nothing, ["--frames", "500"], r"--frames asks for 500"),
-    (nothing, ["--crop", "9000x10+0+0"], r"lies outside of camera 02, which has"),
-    (nothing, ["--crop", "all of it"], r"--crop says 'all of it', expected WIDTHxHEIGHT\+LEFT\+TOP"),
-    (nothing, ["--crop", "09=10x10+0+0"], r"--crop names camera '09', have 02, 03, 04"),
-    (nothing, ["--scale", "0.001"], r"--scale 0.001 leaves less than 8 pixels"),
-    (nothing, ["--scale", "0"], r"scale"),
+    (edited(lambda c: c["03"].update(t=[float("nan"), 0, 0])), [], r"(NaN|not finite)"),
+    (edited(lambda c: c["03"].update(width=2 * c["03"]["width"])), [], r"another aspect"),
+    (
+        edited(lambda c: [c[name].update(t=[1000 * value for value in c[name]["t"]]) for name in NAMES]),
+        [],
+        r"up to \d+ apart, which is no metres: say what it is with --unit mm",
+    ),
+    (
+        edited(lambda c: [c[name].update(R=np.eye(3).tolist(), t=[0, 0, 0]) for name in NAMES]),
+        [],
+        r"puts all cameras at one place: give a calibration with their poses|does not fit",
+    ),
+    (edited(lambda c: c["all"]["cameras"].remove(c["03"])), [], r"no camera for 03"),
+    (overwritten("cameras.json", b"{]"), [], r"not JSON|no calibration that can be read"),
+    (overwritten("cameras.json", None), [], r"no such calibration|there is no such file|is not there"),
+    (lambda given: None, ["--offsets", "07=3"], r"--offsets names camera '07', have 02, 03, 04"),
+    (lambda given: None, ["--offsets", "03=soon"], r"--offsets says '03=soon', expected NAME=FRAMES"),
+    (lambda given: None, ["--offsets", "03=900"], r"camera 0\d stopped .* seconds before camera 03 began"),
+    (lambda given: None, ["--offsets", "timecode"], r"nothing in the timecode links"),
+    (lambda given: None, ["--times", "40,50"], r"--times asks for 40 to 50 seconds"),
+    (lambda given: None, ["--frames", "500"], r"--frames asks for 500"),
+    (lambda given: None, ["--crop", "9000x10+0+0"], r"lies outside of camera 02, which has"),
+    (lambda given: None, ["--crop", "all of it"], r"--crop says 'all of it', expected WIDTHxHEIGHT\+LEFT\+TOP"),
+    (lambda given: None, ["--crop", "09=10x10+0+0"], r"--crop names camera '09', have 02, 03, 04"),
+    (lambda given: None, ["--scale", "0.001"], r"--scale 0.001 leaves less than 8 pixels"),
+    (lambda given: None, ["--scale", "0"], r"scale"),
 ]
 
 
@@ -247,18 +220,18 @@ def test_another_import_and_another_folder_are_not_written_over(
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
 
 
-def test_one_video_of_another_event(studio: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_one_video_of_another_event(room: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The same room, another take: sound of its own, and things that move at other times."""
-    take = video(studio, tmp_path / "one", {name: Shooting() for name in NAMES}, sound=True, sounds={"04": 99})
+    take = video(room, tmp_path / "one", {name: Shooting() for name in NAMES}, sound=True, sounds={"04": 99})
     words = ["import", str(take.videos), "--calibration", str(take.calibration), "--output", str(tmp_path / "c")]
     assert main([*words, "--offsets", "sound"]) == 2
     said = capsys.readouterr().err
     assert "nothing in the sound links 04 with 02, 03: leave the camera out, give the offsets" in said
 
 
-def test_timecode_against_sound(studio: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_timecode_against_sound(room: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shots = {name: Shooting(timecode="01:00:00:00") for name in NAMES}
-    take = video(studio, tmp_path / "one", {**shots, "04": Shooting(timecode="01:00:00:09")}, sound=True)
+    take = video(room, tmp_path / "one", {**shots, "04": Shooting(timecode="01:00:00:09")}, sound=True)
     words = ["import", str(take.videos), "--calibration", str(take.calibration), "--output", str(tmp_path / "c")]
     assert main(words) == 2
     assert "sound and timecode contradict each other" in capsys.readouterr().err
@@ -286,7 +259,7 @@ def test_a_video_that_moved_since_it_was_imported(given: Filmed, tmp_path: Path,
 def test_a_calibration_folder_is_not_searched_without_end(
     given: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("d2_plugin.recordings.importing.claimed.MOST_FILES", 5)
+    monkeypatch.setattr("d2_plugin.recordings.importing.steps.MOST_FILES", 5)
     (tmp_path / "home").mkdir()
     for number in range(6):
         (tmp_path / "home" / f"{number}.txt").write_text("")

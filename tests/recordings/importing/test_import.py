@@ -14,12 +14,13 @@ from recorded import Filmed, Shooting, video
 from d2_plugin.commands.cli import main
 from d2_plugin.durable import read_table
 from d2_plugin.recordings import Recording, open_recording, select_cameras
-from d2_plugin.recordings.cameras.formats import CalibratedCamera
+from d2_plugin.recordings.cameras.camera import CalibratedCamera
+from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.checks.lacking import lacking_text
-from d2_plugin.recordings.importing.claimed import KIND
 from d2_plugin.recordings.importing.importing import import_videos
 from d2_plugin.recordings.importing.settings import ImportSettings
 from d2_plugin.recordings.importing.source import Cut, valid_pixels
+from d2_plugin.recordings.importing.steps import KIND
 from d2_plugin.recordings.selection import select_frames
 
 pytest.importorskip("av")
@@ -133,7 +134,7 @@ def test_crop_and_scale_move_the_camera_with_the_image(filmed: Filmed, imported:
 
 def test_margins_of_undistorted_images_are_not_valid() -> None:
     K = np.array([[90.0, 0, 50], [0, 90, 40], [0, 0, 1]])
-    camera = CalibratedCamera("a", 100, 80, K, "opencv", (0.3, 0, 0, 0, 0), np.eye(3), np.zeros(3))
+    camera = CalibratedCamera("a", 100, 80, Lens(K, "opencv", (0.3,)), np.eye(4))
     valid = valid_pixels(camera, Cut(0, 0, 100, 80, 0.5))
     assert valid.shape == (40, 50)
     assert valid[20, 25]

@@ -13,12 +13,17 @@ from recorded import SOUND_RATE, graded, room_sound
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, open_recording
-from d2_plugin.recordings.importing.clocks import Evidence, _solved, common_clock, given_clock
-from d2_plugin.recordings.importing.files import Turn, VideoFile
-from d2_plugin.recordings.importing.motion import offsets_from_motion
-from d2_plugin.recordings.importing.profiles import Watched
+from d2_plugin.recordings.importing.clocks import (
+    Evidence,
+    _solved,
+    common_clock,
+    given_clock,
+    shortest,
+    timecode_seconds,
+)
+from d2_plugin.recordings.importing.motion import Watched, offsets_from_motion
 from d2_plugin.recordings.importing.sound import RATE, Sound, lag_between
-from d2_plugin.recordings.importing.timecode import shortest, timecode_seconds
+from d2_plugin.recordings.importing.video import VideoFile
 
 cv2 = pytest.importorskip("cv2")
 
@@ -123,7 +128,7 @@ def test_motion_of_another_event_is_doubted(shared_data: Callable[[str], Path]) 
 
 
 def a_video(rate: int, timecode: str | None) -> VideoFile:
-    return VideoFile(Path("a.mp4"), (64, 48), Turn(0), np.arange(10), Fraction(1, rate), timecode)
+    return VideoFile(Path("a.mp4"), (64, 48), 0, np.arange(10), Fraction(1, rate), timecode)
 
 
 def never() -> dict:

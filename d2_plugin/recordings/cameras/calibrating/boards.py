@@ -63,8 +63,8 @@ class Board(Settings):
         grey = cv2.cvtColor(checked_image(image, "the image of a board"), cv2.COLOR_RGB2GRAY)
         if self.marker is not None:
             return self._charuco(cv2, grey)
-        found, corners = cv2.findChessboardCornersSB(grey, (self.columns - 1, self.rows - 1))
-        return {i: corner + 0.5 for i, corner in enumerate(corners.reshape(-1, 2))} if found else {}
+        whole, corners = cv2.findChessboardCornersSB(grey, (self.columns - 1, self.rows - 1))
+        return {i: corner + 0.5 for i, corner in enumerate(corners.reshape(-1, 2))} if whole else {}
 
     def _charuco(self, cv2: Any, grey: np.ndarray) -> dict[int, np.ndarray]:
         number = getattr(cv2.aruco, self.dictionary, None)
@@ -131,8 +131,8 @@ def board_matches(
 
 def _corners_seen(board: Board, taken: Sequence[np.ndarray]) -> dict[tuple[int, int], np.ndarray]:
     """(moment, number of the corner) -> its pixel."""
-    found = [(moment, board.corners(image)) for moment, image in enumerate(taken, start=1)]  # 0 is the still
-    return {(moment, number): corner for moment, corners in found for number, corner in corners.items()}
+    moments = [(moment, board.corners(image)) for moment, image in enumerate(taken, start=1)]  # 0 is the still
+    return {(moment, number): corner for moment, corners in moments for number, corner in corners.items()}
 
 
 def _with_corners(features: Features, corners: Mapping[tuple[int, int], np.ndarray]) -> Features:
@@ -178,13 +178,13 @@ def _sides(
     """Lengths between neighbouring corners of the board at one moment, in the unit of the rig."""
     names, across = tuple(rig.cameras), board.columns - 1
     corners = {name: seen.get((name, moment), {}) for name in names}
-    numbers = sorted({number for found in corners.values() for number in found})
+    numbers = sorted({number for own in corners.values() for number in own})
     features, rows = {}, np.full((len(numbers), len(names)), -1)
     for column, name in enumerate(names):
-        found = corners[name]
-        places = [i for i, number in enumerate(numbers) if number in found]
+        own = corners[name]
+        places = [i for i, number in enumerate(numbers) if number in own]
         rows[places, column] = np.arange(len(places))
-        pixels = np.array([found[numbers[i]] for i in places]).reshape(-1, 2)
+        pixels = np.array([own[numbers[i]] for i in places]).reshape(-1, 2)
         features[name] = Features(pixels, np.zeros((len(places), 128), np.float32), np.full(len(places), moment))
     bundle = fitting(triangulate(rig.cameras, features, Tracks(names, rows)), features, CORNER_ERROR)
     where = {tuple(row): number for row, number in zip(rows.tolist(), numbers, strict=True)}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.recordings.cameras.calibrating.features import Features, Matches, pixel_error, silent_pycolmap
-from d2_plugin.recordings.cameras.calibration import pinhole, rigid
+from d2_plugin.recordings.cameras.camera import pinhole, rigid
 from d2_plugin.recordings.recording import Camera
 
 SMALLEST_ANGLE = 1.0
@@ -51,13 +51,13 @@ class Bundle:
 
     def errors(self, features: Mapping[str, Features]) -> np.ndarray:
         """Reprojection errors [n, cameras] in pixels, in the columns of the tracks; NaN where a camera saw nothing."""
-        found = np.full(self.tracks.seen.shape, np.nan)
+        errors = np.full(self.tracks.seen.shape, np.nan)
         for name, camera in self.cameras.items():
             seen = self.tracks.column(name)
             rows = seen >= 0
             missed = project(camera, self.points[rows]) - features[name].pixels[seen[rows]]
-            found[rows, self.tracks.names.index(name)] = np.linalg.norm(missed, axis=1)
-        return found
+            errors[rows, self.tracks.names.index(name)] = np.linalg.norm(missed, axis=1)
+        return errors
 
 
 def project(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -182,9 +182,9 @@ def _solve(pycolmap: ModuleType, rec: Any, scale: float, focal: bool) -> None:
 
 
 def _moved(camera: Camera, rec: Any, number: int, focal: bool) -> Camera:
-    found = rec.images[number].cam_from_world()
+    pose = rec.images[number].cam_from_world()
     K = camera.K
     if focal:
         length = float(rec.images[number].camera.params[0])
         K = pinhole(length, length, K[0, 2], K[1, 2])
-    return replace(camera, K=K, T_camera_world=rigid(found.rotation.matrix(), np.asarray(found.translation)))
+    return replace(camera, K=K, T_camera_world=rigid(pose.rotation.matrix(), np.asarray(pose.translation)))

@@ -1,4 +1,4 @@
-"""Features of images and what two cameras saw of the same thing at the same moment.
+"""Features of images, what two cameras saw of the same thing at the same moment, and which of it one motion explains.
 
 A camera that stands still is one camera however many images it took: the features of all its moments are one list.
 Only features of the same moment are matched, so whatever moves is as good a witness as a wall. The cameras' images
@@ -11,19 +11,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from d2_plugin.extras import import_pycolmap
-from d2_plugin.recordings.images import checked_image, opencv
+from d2_plugin.recordings.cameras.camera import rigid
+from d2_plugin.recordings.cameras.epipolar import sampson, sift_features
+from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
 
 MOST_FEATURES = 4000
 """Per image."""
 
 LEAST_CONTRAST = 0.005
-"""OpenCV's is .04: faint features are many, and false matches are found out by geometry. Studio 01 02 03 04, 320x180:
-poses within .14 degrees at .015 and 1500 features an image, within .09 at .005 and 4000."""
+"""An eighth of OpenCV's: faint features are many, and geometry sorts out false matches."""
 
 RATIO = 0.85
 """The best match is nearer than the second best by this factor, on square roots of SIFT."""
@@ -38,6 +40,9 @@ PIXEL_ERROR = 1.5
 """Largest distance of a match from its epipolar line, in pixels of images of up to `LONG_SIDE`."""
 
 LONG_SIDE = 960.0
+
+LEAST_INLIERS = 0.05
+"""Share of inliers that RANSAC looks for, at least."""
 
 Pair = tuple[str, str]
 Matches = dict[Pair, np.ndarray]
@@ -63,21 +68,16 @@ def silent_pycolmap(purpose: str) -> ModuleType:
     return pycolmap
 
 
-def find_features(images: Sequence[np.ndarray], recorded: np.ndarray | None = None) -> Features:
-    """Features of one camera's images RGB uint8 [H, W, 3], none where `recorded` [H, W] says that nothing was."""
-    return _found(images, [recorded] * len(images))
-
-
 def of_a_still_camera(images: Sequence[np.ndarray], recorded: np.ndarray | None = None) -> Features:
     """Features of what stands still, once and as moment 0, then of what moves in each of the images.
 
     A wall that is seen at ten moments is one witness, not ten.
     """
     if len(images) < 3:
-        return find_features([images[0], *images], recorded)
+        return find_features([images[0], *images], [recorded] * (len(images) + 1))
     still = np.median(np.stack(images), axis=0).astype(np.uint8)
     masks = [_moving(image, still) & (True if recorded is None else recorded) for image in images]
-    return _found([still, *images], [recorded, *masks])
+    return find_features([still, *images], [recorded, *masks])
 
 
 def _moving(image: np.ndarray, still: np.ndarray) -> np.ndarray:
@@ -88,23 +88,18 @@ def _moving(image: np.ndarray, still: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.dilate(moving, np.ones((9, 9)))) > 0
 
 
-def _found(images: Sequence[np.ndarray], masks: Sequence[np.ndarray | None]) -> Features:
+def find_features(images: Sequence[np.ndarray], masks: Sequence[np.ndarray | None] | None = None) -> Features:
+    """Features of one camera's images RGB uint8 [H, W, 3], only where masks bool [H, W] are true."""
     cv2 = opencv("calibrating from images", "calibration")
-    # Without `enable_precise_upscale` OpenCV's SIFT is a quarter of a pixel too far right and down.
-    sift = cv2.SIFT_create(MOST_FEATURES, contrastThreshold=LEAST_CONTRAST, enable_precise_upscale=True)
-    pixels, descriptors, shapes = [np.zeros((0, 2))], [np.zeros((0, 128), np.float32)], [np.zeros((0, 2))]
-    moments, greys = [np.zeros(0, int)], []
-    for moment, (image, mask) in enumerate(zip(images, masks, strict=True)):
-        greys.append(cv2.cvtColor(checked_image(image, f"image {moment} of a camera"), cv2.COLOR_RGB2GRAY))
-        points, found = sift.detectAndCompute(greys[-1], None if mask is None else mask.astype(np.uint8))
-        if found is None:
-            continue
-        pixels.append(np.array([point.pt for point in points]) + 0.5)
-        descriptors.append(np.sqrt(found / np.maximum(found.sum(axis=1, keepdims=True), 1e-12)))
-        shapes.append(np.array([(point.size, np.deg2rad(point.angle)) for point in points]))
-        moments.append(np.full(len(points), moment))
-    places, kinds = (np.concatenate(pixels), np.concatenate(descriptors)), np.concatenate(shapes)
-    return Features(*places, np.concatenate(moments), kinds, tuple(greys))
+    masks = masks or [None] * len(images)
+    parts = [
+        sift_features(image, MOST_FEATURES, "calibrating from images", LEAST_CONTRAST, mask)
+        for image, mask in zip(images, masks, strict=True)
+    ]
+    pixels, descriptors, shapes = (np.concatenate(part) for part in zip(*parts))
+    roots = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
+    moments = np.repeat(np.arange(len(images)), [len(part[0]) for part in parts])
+    return Features(pixels, roots, moments, shapes, tuple(cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in images))
 
 
 def match_all(features: Mapping[str, Features]) -> Matches:
@@ -113,7 +108,7 @@ def match_all(features: Mapping[str, Features]) -> Matches:
 
 
 def _match(one: Features, other: Features) -> np.ndarray:
-    found = [np.zeros((0, 2), int)]
+    matches = [np.zeros((0, 2), int)]
     for moment in np.intersect1d(one.moments, other.moments):
         rows, columns = np.flatnonzero(one.moments == moment), np.flatnonzero(other.moments == moment)
         if min(len(rows), len(columns)) < 2:
@@ -125,8 +120,8 @@ def _match(one: Features, other: Features) -> np.ndarray:
         near, second = (np.sqrt(np.maximum(2 - 2 * two[:, place], 0)) for place in (0, 1))
         mutual = products.argmax(axis=0)[best] == np.arange(len(rows))
         good = mutual & (near < RATIO * second)
-        found.append(np.stack([rows[good], columns[best[good]]], axis=1))
-    return _distinct(np.concatenate(found), one, other)
+        matches.append(np.stack([rows[good], columns[best[good]]], axis=1))
+    return _distinct(np.concatenate(matches), one, other)
 
 
 def _distinct(matches: np.ndarray, one: Features, other: Features) -> np.ndarray:
@@ -140,20 +135,62 @@ def pixel_error(camera: Camera) -> float:
     return PIXEL_ERROR * max(max(camera.width, camera.height) / LONG_SIDE, 0.5)
 
 
-def fundamental(one: Camera, other: Camera) -> np.ndarray:
-    """F [3, 3] with q^T F p = 0 for pixels p of `one` and q of `other`."""
-    relative = other.T_camera_world @ np.linalg.inv(one.T_camera_world)
-    x, y, z = relative[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    product: np.ndarray = np.linalg.inv(other.K).T @ cross @ relative[:3, :3] @ np.linalg.inv(one.K)
-    return product
+def verified(
+    matches: Matches, features: Mapping[str, Features], cameras: Mapping[str, Camera], near: float | None = None
+) -> Matches:
+    """The matches that an essential matrix explains; pairs of cameras with too few are left out.
+
+    `near`, in pixels, first drops matches farther than that from where the poses of `cameras` expect them.
+    """
+    explained: Matches = {}
+    for (a, b), pairs in matches.items():
+        if near is not None:
+            p, q = features[a].pixels[pairs[:, 0]], features[b].pixels[pairs[:, 1]]
+            pairs = pairs[sampson(cameras[a], cameras[b], p, q) < near]
+        result = _ransac((a, b), pairs, features, cameras)
+        inside = np.zeros(len(pairs), bool) if result is None else np.asarray(result["inlier_mask"], bool)
+        if inside.sum() >= ENOUGH_MATCHES:
+            explained[a, b] = pairs[inside]
+    return explained
 
 
-def sampson(one: Camera, other: Camera, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Distance [n] in pixels, to first order, of pairs [n, 2] from the nearest that `one` and `other` allow."""
-    F, ends = fundamental(one, other), np.ones((len(p), 1))
-    ph, qh = np.hstack([p, ends]), np.hstack([q, ends])
-    there, back = ph @ F.T, qh @ F
-    squares = (there[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
-    distance: np.ndarray = np.abs((qh * there).sum(axis=1)) / np.sqrt(squares).clip(1e-300)
-    return distance
+def essential_pose(
+    pair: Pair, pairs: np.ndarray, features: Mapping[str, Features], cameras: Mapping[str, Camera]
+) -> np.ndarray | None:
+    """T [4, 4] from the first camera to the second, which stands a unit away; None where the pairs say nothing."""
+    result = _ransac(pair, pairs, features, cameras)
+    if result is None:
+        return None
+    cv2 = opencv("finding cameras", "calibration")
+    rays = []
+    for name, column in zip(pair, (0, 1), strict=True):
+        K, pixels = cameras[name].K, features[name].pixels[pairs[:, column]]
+        rays.append((pixels - K[:2, 2]) / K[[0, 1], [0, 1]])
+    _, rotation, translation, _ = cv2.recoverPose(np.asarray(result["E"]), rays[0], rays[1], np.eye(3))
+    return rigid(rotation, translation[:, 0])
+
+
+def _ransac(
+    pair: Pair, pairs: np.ndarray, features: Mapping[str, Features], cameras: Mapping[str, Camera]
+) -> dict[str, Any] | None:
+    if len(pairs) < ENOUGH_MATCHES:
+        return None
+    pycolmap = silent_pycolmap("verifying matches")
+    one, other = (cameras[name] for name in pair)
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.random_seed, options.min_inlier_ratio = pixel_error(one), 0, LEAST_INLIERS
+    p, q = features[pair[0]].pixels[pairs[:, 0]], features[pair[1]].pixels[pairs[:, 1]]
+    result: dict[str, Any] | None = pycolmap.estimate_essential_matrix(p, q, as_colmap(one), as_colmap(other), options)
+    return result
+
+
+def as_colmap(camera: Camera) -> Any:
+    """A pinhole camera as pycolmap has it; both put the centre of the first pixel at 0.5."""
+    K = camera.K
+    return silent_pycolmap("calibrating").Camera(
+        camera_id=1,
+        model="PINHOLE",
+        width=camera.width,
+        height=camera.height,
+        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+    )

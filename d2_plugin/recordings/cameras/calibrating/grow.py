@@ -8,10 +8,17 @@ from dataclasses import replace
 import numpy as np
 
 from d2_plugin.recordings.cameras.calibrating.bundle import Bundle, Tracks, fitting, join_matches, project, triangulate
-from d2_plugin.recordings.cameras.calibrating.features import Features, Matches, Pair, pixel_error, silent_pycolmap
+from d2_plugin.recordings.cameras.calibrating.features import (
+    Features,
+    Matches,
+    Pair,
+    as_colmap,
+    essential_pose,
+    pixel_error,
+    silent_pycolmap,
+)
 from d2_plugin.recordings.cameras.calibrating.refine import bundled
-from d2_plugin.recordings.cameras.calibrating.verify import as_colmap, essential_pose
-from d2_plugin.recordings.cameras.calibration import rigid
+from d2_plugin.recordings.cameras.camera import rigid
 from d2_plugin.recordings.recording import Camera
 
 STARTS = 2
@@ -100,10 +107,10 @@ def _resect(camera: Camera, features: Features, seen: np.ndarray, points: np.nda
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error, options.ransac.random_seed = 2 * pixel_error(camera), 0
     pixels, there = features.pixels[seen[:, 0]], points[seen[:, 1]]
-    found = pycolmap.estimate_and_refine_absolute_pose(pixels, there, as_colmap(camera), options)
-    if found is None or found["num_inliers"] < max(FEWEST_SEEN, LEAST_SHARE * len(seen)):
+    estimate = pycolmap.estimate_and_refine_absolute_pose(pixels, there, as_colmap(camera), options)
+    if estimate is None or estimate["num_inliers"] < max(FEWEST_SEEN, LEAST_SHARE * len(seen)):
         return None
-    pose = found["cam_from_world"]
+    pose = estimate["cam_from_world"]
     placed = replace(camera, T_camera_world=rigid(pose.rotation.matrix(), np.asarray(pose.translation)))
     errors = np.linalg.norm(project(placed, there) - pixels, axis=1)
     return placed if np.isfinite(errors).any() else None

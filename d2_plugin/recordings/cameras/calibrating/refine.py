@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.cameras.calibrating.align import aligned, differences
 from d2_plugin.recordings.cameras.calibrating.bundle import Bundle, Tracks, adjust, fitting, join_matches, triangulate
 from d2_plugin.recordings.cameras.calibrating.features import (
     Features,
@@ -21,15 +20,16 @@ from d2_plugin.recordings.cameras.calibrating.features import (
     match_all,
     of_a_still_camera,
     pixel_error,
-    sampson,
+    verified,
 )
+from d2_plugin.recordings.cameras.calibrating.rig import aligned, differences
 from d2_plugin.recordings.cameras.calibrating.sharpen import sharpened
-from d2_plugin.recordings.cameras.calibrating.verify import verified
+from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.values import checked_arguments
 
 MOMENTS = 6
-"""Frames that are looked at, spread over the recording."""
+"""Frames that are read, spread over the recording."""
 
 REACH = 0.04
 """Matches farther from where the given poses expect them are not believed, in diagonals of the image."""
@@ -89,32 +89,26 @@ def refine(recording: Recording, cameras: Sequence[str] | None = None, moments: 
     names = list(recording.cameras if cameras is None else cameras)
     if len(names) < 2:
         raise D2Error(f"poses are refined between cameras, and {recording.name} has {len(names)} to train: name two")
-    features = look(recording, names, moments)
-    given = {name: recording.cameras[name] for name in names}
-    return refine_poses(given, features)
-
-
-def look(recording: Recording, cameras: Sequence[str], moments: int = MOMENTS) -> dict[str, Features]:
-    """Features of the named cameras at frames spread over the recording."""
     chosen = np.unique(np.linspace(0, len(recording.frames) - 1, moments).round().astype(int))
     frames = [recording.frames[i] for i in chosen]
-    return {
+    features = {
         name: of_a_still_camera([recording.image(name, frame) for frame in frames], recording.recorded(name))
-        for name in cameras
+        for name in names
     }
+    return refine_poses({name: recording.cameras[name] for name in names}, features)
 
 
 def refine_poses(given: Mapping[str, Camera], features: Mapping[str, Features]) -> RefinedPoses:
-    """`refine` for features that were found already."""
+    """`refine` for features that are there already."""
     diagonal = max(float(np.hypot(camera.width, camera.height)) for camera in given.values())
     matches = verified(match_all(features), features, given, REACH * diagonal)
     names = tuple(given)
     features, tracks_of_all = sharpened(features, join_matches(matches, names), given)
     halves = [halved(matches, features, given, which) for which in (0, 1)]
     tracks = [join_matches(half, names) for half in halves]
-    lost = _undetermined(given, tracks)
-    if lost:
-        return _kept(given, lost)
+    why = _undetermined(given, tracks)
+    if why:
+        return _kept(given, why)
     whole = bundled(given, features, tracks_of_all)
     parts = [bundled(given, features, half) for half in tracks]
     if whole is None or parts[0] is None or parts[1] is None:
@@ -146,12 +140,16 @@ def bundled(
 
 def halved(matches: Matches, features: Mapping[str, Features], given: Mapping[str, Camera], which: int) -> Matches:
     """The matches whose place in the first of all cameras that sees them lies in one half of the cells."""
-    found = {}
-    for (a, b), pairs in matches.items():
-        size = np.array([given[a].width, given[a].height])
-        cells = np.floor(features[a].pixels[pairs[:, 0]] / size * CELLS).astype(int)
-        found[a, b] = pairs[cells.sum(axis=1) % 2 == which]
-    return found
+    return {
+        (a, b): pairs[half_of(features[a].pixels[pairs[:, 0]], given[a]) == which] for (a, b), pairs in matches.items()
+    }
+
+
+def half_of(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """In which half of the cells of an image pixels [n, 2] lie, 0 or 1 [n]."""
+    cells = np.floor(pixels / (camera.width, camera.height) * CELLS).astype(int)
+    half: np.ndarray = cells.sum(axis=1) % 2
+    return half
 
 
 def _undetermined(given: Mapping[str, Camera], tracks: Sequence[Tracks]) -> str:
@@ -186,14 +184,14 @@ def _judged(
     larger = _mean_square(changes) > BEYOND_DOUBT**2 * _mean_square(doubt)
     falls = all(new < FALLS_TO * old for new, old in zip(after, before, strict=True))
     pixels = float(np.sqrt(np.mean(np.square(before)))), float(np.sqrt(np.mean(np.square(after))))
-    told = f"from {pixels[0]:.2f} to {pixels[1]:.2f} pixels"
-    degrees, share = (max(change[i] for change in changes.values()) for i in (0, 1))
+    change = f"from {pixels[0]:.2f} to {pixels[1]:.2f} pixels"
+    degrees, share = (max(one[i] for one in changes.values()) for i in (0, 1))
     if falls and bool(larger.any()):
-        reason = f"poses refined: the error fell {told}, by up to {degrees:.2g} degrees and {share:.2%} of the rig"
+        reason = f"poses refined: the error fell {change}, by up to {degrees:.2g} degrees and {share:.2%} of the rig"
     elif not falls:
-        reason = f"the poses stay: others would change the error {told}, which is no clear fall"
+        reason = f"the poses stay: others would change the error {change}, which is no clear fall"
     else:
-        reason = f"the poses stay: two halves of the images differ about them by as much as they would change, {told}"
+        reason = f"the poses stay: two halves of the images differ about them by as much as they would change, {change}"
     accepted = falls and bool(larger.any())
     cameras = laid if accepted else dict(given)
     return RefinedPoses(cameras, accepted, reason, *pixels, changes, doubt, len(whole.points))

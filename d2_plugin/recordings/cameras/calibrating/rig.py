@@ -1,4 +1,4 @@
-"""What was found out about a rig: where its cameras stand, how exactly that is known, and how large the world is."""
+"""A rig: where its cameras stand, how exactly that is known, how large the world is, and how it lies over another."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.cameras.calibrating.align import rig_width
 from d2_plugin.recordings.cameras.calibrating.bundle import Bundle
 from d2_plugin.recordings.cameras.calibrating.features import Features
+from d2_plugin.recordings.cameras.camera import rig_width, rigid
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.values import checked_arguments
 
@@ -20,7 +20,7 @@ ARBITRARY = "arbitrary: give the distance of two cameras, or video a board"
 
 @dataclass(frozen=True, eq=False)
 class SolvedRig:
-    """A rig that was found; the first camera's axes are the world's, and the width of the rig is 1."""
+    """A rig that was solved; the first camera's axes are the world's, and the width of the rig is 1."""
 
     cameras: dict[str, Camera]
     pixels: dict[str, float]
@@ -32,7 +32,7 @@ class SolvedRig:
     deviations."""
     scale: str = ARBITRARY
     focals: dict[str, float] = field(default_factory=dict)
-    """Camera -> share by which two halves of the images differ about its focal length, where that was found."""
+    """Camera -> share by which two halves of the images differ about its focal length, where that was bundle."""
 
     def verdicts(self) -> dict[str, str]:
         """A sentence per camera."""
@@ -54,33 +54,32 @@ class SolvedRig:
                 f"a distance of {distance:g} between {one} and {other} says no scale: name two cameras of "
                 f"{', '.join(self.cameras)} and how far they stand apart, above 0"
             )
-        found = float(np.linalg.norm(self.cameras[one].centre - self.cameras[other].centre))
-        return self.times(distance / found, f"from the distance {distance:g} of {one} and {other}")
+        apart = float(np.linalg.norm(self.cameras[one].centre - self.cameras[other].centre))
+        return self.times(distance / apart, f"from the distance {distance:g} of {one} and {other}")
 
     def times(self, factor: float, why: str) -> SolvedRig:
         """The same rig, `factor` times as large; `why` says how that is known."""
-        cameras = {}
-        for name, camera in self.cameras.items():
-            T = camera.T_camera_world.copy()
-            T[:3, 3] *= factor
-            cameras[name] = replace(camera, T_camera_world=T)
+        size = np.array([[1, 1, 1, factor]] * 3 + [[1, 1, 1, 1]])
+        cameras = {
+            name: replace(camera, T_camera_world=camera.T_camera_world * size) for name, camera in self.cameras.items()
+        }
         return replace(self, cameras=cameras, scale=why)
 
     @classmethod
     def of(
         cls,
-        found: Bundle,
+        bundle: Bundle,
         features: Mapping[str, Features],
         doubt: Mapping[str, tuple[float, float]],
         focals: Mapping[str, float],
         wanted: tuple[str, ...],
     ) -> SolvedRig:
         """The `wanted` cameras of a bundle, in the axes of the first one and with a width of 1."""
-        errors = found.errors(features)
-        first = np.linalg.inv(found.cameras[wanted[0]].T_camera_world)
-        poses = {name: found.cameras[name].T_camera_world @ first for name in wanted}
-        cameras = {name: replace(found.cameras[name], T_camera_world=pose) for name, pose in poses.items()}
-        by_camera = {name: errors[:, found.tracks.names.index(name)] for name in wanted}
+        errors = bundle.errors(features)
+        first = np.linalg.inv(bundle.cameras[wanted[0]].T_camera_world)
+        poses = {name: bundle.cameras[name].T_camera_world @ first for name in wanted}
+        cameras = {name: replace(bundle.cameras[name], T_camera_world=pose) for name, pose in poses.items()}
+        by_camera = {name: errors[:, bundle.tracks.names.index(name)] for name in wanted}
         rig = cls(
             cameras,
             {name: float(np.nanmedian(missed)) for name, missed in by_camera.items()},
@@ -88,4 +87,43 @@ class SolvedRig:
             {name: doubt[name] for name in wanted},
             focals={name: focals[name] for name in wanted if name in focals},
         )
-        return rig.times(1 / rig_width(cameras), ARBITRARY)
+        return rig.times(1 / rig_width(cameras.values()), ARBITRARY)
+
+
+def aligned(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> dict[str, Camera]:
+    """`cameras` in the world of `onto`: rotated by the mean of the rotations between the two, scaled by their spreads.
+
+    Rotations settle the turn because the centres of two cameras, or of several on a line, do not.
+    """
+    rotation, scale, shift = similarity(cameras, onto)
+    laid = {}
+    for name, camera in cameras.items():
+        R = camera.T_camera_world[:3, :3] @ rotation.T
+        centre = scale * rotation @ camera.centre + shift
+        laid[name] = replace(camera, T_camera_world=rigid(R, -R @ centre))
+    return laid
+
+
+def similarity(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> tuple[np.ndarray, float, np.ndarray]:
+    """(R [3, 3], s, t [3]): x in the world of `cameras` is s R x + t in that of `onto`."""
+    names = [name for name in cameras if name in onto]
+    between = sum(onto[name].T_camera_world[:3, :3].T @ cameras[name].T_camera_world[:3, :3] for name in names)
+    left, _, right = np.linalg.svd(between)
+    rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    here, there = (np.stack([rig[name].centre for name in names]) for rig in (cameras, onto))
+    spread = np.linalg.norm(here - here.mean(axis=0))
+    scale = float(np.linalg.norm(there - there.mean(axis=0)) / spread) if spread > 0 else 1.0
+    return rotation, scale, there.mean(axis=0) - scale * rotation @ here.mean(axis=0)
+
+
+def differences(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> dict[str, tuple[float, float]]:
+    """Camera -> (degrees, share of the rig's width) that it differs by, once the rigs are laid over each other."""
+    width = rig_width(onto.values()) or 1.0
+    laid = aligned(cameras, onto)
+    apart = {}
+    for name in laid:
+        turn = laid[name].T_camera_world[:3, :3] @ onto[name].T_camera_world[:3, :3].T
+        sine = np.linalg.norm(turn - turn.T) / (2 * np.sqrt(2))  # accurate at small angles, as a cosine is not
+        degrees = np.rad2deg(np.arctan2(sine, (np.trace(turn) - 1) / 2))
+        apart[name] = (float(degrees), float(np.linalg.norm(laid[name].centre - onto[name].centre) / width))
+    return apart

@@ -19,8 +19,7 @@ from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
 
 RADIUS = 5
-"""Pixels from the middle of a patch to its edge: larger ones reach over edges of things. Studio 01 02 03 04 at 320x180,
-poses within: .06 degrees at 5, .09 at 7, .12 at 10."""
+"""Pixels from the middle of a patch to its edge: larger ones reach over edges of things."""
 
 WIDTH = 3.5
 """Standard deviation, pixels, of the weight of a patch's pixels."""
@@ -78,10 +77,10 @@ def _moved(one: Features, other: Features, pairs: np.ndarray, limit: float) -> t
         rows = np.flatnonzero((moments == moment) & ~fixed)
         start, begin = one.pixels[pairs[rows, 0]], places[rows]
         warp = _similarity(one.shapes[pairs[rows, 0]], other.shapes[pairs[rows, 1]])
-        found, alike, step = _matched(one.greys[moment], other.greys[moment], start, begin, warp)
-        near = np.linalg.norm(found - begin, axis=1) < limit
+        ends, alike, step = _matched(one.greys[moment], other.greys[moment], start, begin, warp)
+        near = np.linalg.norm(ends - begin, axis=1) < limit
         good[rows] = near & (alike > ALIKE) & (step < STILL)
-        places[rows] = np.where(good[rows, None], found, begin)
+        places[rows] = np.where(good[rows, None], ends, begin)
     return places, good
 
 

@@ -15,7 +15,6 @@ from dataclasses import replace
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.cameras.calibrating.align import differences
 from d2_plugin.recordings.cameras.calibrating.boards import Board, board_matches
 from d2_plugin.recordings.cameras.calibrating.bundle import Bundle, Tracks, join_matches
 from d2_plugin.recordings.cameras.calibrating.features import (
@@ -24,13 +23,13 @@ from d2_plugin.recordings.cameras.calibrating.features import (
     find_features,
     match_all,
     of_a_still_camera,
+    verified,
 )
 from d2_plugin.recordings.cameras.calibrating.grow import grown
-from d2_plugin.recordings.cameras.calibrating.refine import CELLS, SCHEDULE, bundled
-from d2_plugin.recordings.cameras.calibrating.rig import SolvedRig
+from d2_plugin.recordings.cameras.calibrating.refine import SCHEDULE, bundled, half_of
+from d2_plugin.recordings.cameras.calibrating.rig import SolvedRig, differences
 from d2_plugin.recordings.cameras.calibrating.sharpen import sharpened
-from d2_plugin.recordings.cameras.calibrating.verify import verified
-from d2_plugin.recordings.cameras.calibration import pinhole
+from d2_plugin.recordings.cameras.camera import pinhole
 from d2_plugin.recordings.images import checked_image
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.values import checked_arguments
@@ -65,10 +64,10 @@ def solve_rig(
 
     Args:
         images: camera -> its images RGB uint8 [H, W, 3] at moments that are the same for all cameras, undistorted.
-        intrinsics: camera -> its size and K, for the stills too; the poses in it are not looked at.
+        intrinsics: camera -> its size and K, for the stills too; the poses in it are not used.
         stills: more images of the same scene, a camera each: they connect cameras that see too little in common.
         board: corners of this board, where cameras saw it at the same moment, are matches too.
-        focal: "shared" or "each" where focal lengths are not known: those of `intrinsics` are not looked at then.
+        focal: "shared" or "each" where focal lengths are not known: those of `intrinsics` are not used then.
 
     Raises:
         D2Error: the images do not settle the pose of every camera; the sentence names those, and what to add.
@@ -89,7 +88,7 @@ def solve_features(
     corners: Matches | None = None,
     focal: str | None = None,
 ) -> SolvedRig:
-    """`solve_rig` for features that were found already.
+    """`solve_rig` for features that are there already.
 
     `wanted` are the cameras that must be settled, `corners` matches that are known beside those of descriptors.
     """
@@ -98,16 +97,16 @@ def solve_features(
     known = known if focal is None else _likely_focal(matched, features, known)
     matches = verified(matched, features, known)
     tracks = join_matches(matches, tuple(features))
-    found = grown(matches, tracks, features, known)
-    lost = list(wanted) if found is None else [name for name in wanted if name not in found.cameras]
-    if found is None or lost:
-        raise D2Error(f"the images do not settle where camera {', '.join(lost)} stands: {ADD}")
-    features, tracks = sharpened(features, tracks.within(found.cameras), found.cameras)
+    bundle = grown(matches, tracks, features, known)
+    unsettled = list(wanted) if bundle is None else [name for name in wanted if name not in bundle.cameras]
+    if bundle is None or unsettled:
+        raise D2Error(f"the images do not settle where camera {', '.join(unsettled)} stands: {ADD}")
+    features, tracks = sharpened(features, tracks.within(bundle.cameras), bundle.cameras)
     schedule = SCHEDULE if any(features[name].greys is None for name in tracks.names) else FINE
-    found = bundled(found.cameras, features, tracks, schedule, focal) or found
-    doubt, focals = _doubt(found, tracks, features, schedule, focal)
+    bundle = bundled(bundle.cameras, features, tracks, schedule, focal) or bundle
+    doubt, focals = _doubt(bundle, tracks, features, schedule, focal)
     _refuse_unsure(doubt, focals, wanted)
-    return SolvedRig.of(found, features, doubt, focals, tuple(wanted))
+    return SolvedRig.of(bundle, features, doubt, focals, tuple(wanted))
 
 
 def _of_one_size(name: str, taken: Sequence[np.ndarray]) -> Sequence[np.ndarray]:
@@ -138,15 +137,15 @@ def _likely_focal(matches: Matches, features: Mapping[str, Features], known: Map
 
 
 def _doubt(
-    found: Bundle,
+    bundle: Bundle,
     tracks: Tracks,
     features: Mapping[str, Features],
     schedule: Sequence[tuple[float, float]],
     focal: str | None,
 ) -> tuple[dict[str, tuple[float, float]], dict[str, float]]:
     """What two halves of the images differ by about poses and focal lengths; nothing where one does not hold."""
-    halves = _halves(tracks, features, found.cameras)
-    one, other = (bundled(found.cameras, features, half, schedule, focal) for half in halves)
+    halves = _halves(tracks, features, bundle.cameras)
+    one, other = (bundled(bundle.cameras, features, half, schedule, focal) for half in halves)
     if one is None or other is None:
         return {}, {}
     doubt = differences(one.cameras, other.cameras)
@@ -163,9 +162,7 @@ def _halves(tracks: Tracks, features: Mapping[str, Features], cameras: Mapping[s
     for column, name in enumerate(tracks.names):
         rows = np.flatnonzero(first == column)
         if len(rows):
-            size = np.array([cameras[name].width, cameras[name].height])
-            cells = np.floor(features[name].pixels[tracks.seen[rows, column]] / size * CELLS).astype(int)
-            which[rows] = cells.sum(axis=1) % 2
+            which[rows] = half_of(features[name].pixels[tracks.seen[rows, column]], cameras[name])
     return [Tracks(tracks.names, tracks.seen[which == half]) for half in (0, 1)]
 
 

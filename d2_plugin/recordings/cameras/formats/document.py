@@ -11,8 +11,9 @@ from typing import Annotated, Any
 import numpy as np
 
 from d2_plugin.errors import D2Error, missing_extra
-from d2_plugin.reading import field, parse_json, parsing, read_bytes, read_text, read_toml, said
-from d2_plugin.recordings.cameras.calibration import LARGEST_NUMBER
+from d2_plugin.older import tomllib
+from d2_plugin.reading import field, parse_json, parsing, read_bytes, read_text, said
+from d2_plugin.recordings.cameras.camera import LARGEST_NUMBER
 from d2_plugin.values import Range, shown
 
 CORRECT = "correct the file, see docs/calibration.md"
@@ -20,11 +21,17 @@ CORRECT = "correct the file, see docs/calibration.md"
 MOST_BYTES = 1 << 26
 """Larger calibrations are refused: a rig of 500 cameras takes a few hundred kilobytes."""
 
+DEEPEST = 64
+"""Of lists and tables within each other in YAML."""
+
 NUMBER = Annotated[float, Range(-LARGEST_NUMBER, LARGEST_NUMBER)]
+
+Table = dict[str, Any]
+"""What stands between braces in a file, or under a heading: names and whatever the file says."""
 
 
 class Document:
-    """A calibration file or folder; each property is its content in one notation, or None where it is another one."""
+    """A calibration file or folder."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -35,48 +42,48 @@ class Document:
         return str(self.path)
 
     @cached_property
-    def text(self) -> str:
-        """The text of the file, empty for a folder."""
+    def content(self) -> Any:
+        """The value of a JSON or YAML file or the tables of a TOML file; None for a folder and for OpenCV's YAML."""
         if self.path.is_dir():
-            return ""
+            return None
         if read_bytes(self.path, CORRECT, MOST_BYTES)[:1] == b"\x80":
             raise D2Error(
                 f"{self.path} is a pickle, which can run any program when it is opened: convert it to TOML with "
                 "Pose2Sim's or OpenCap's own tool"
             )
-        return read_text(self.path, CORRECT, MOST_BYTES)
+        text = read_text(self.path, CORRECT, MOST_BYTES)
+        if re.match(r"\s*(\{|\[\s*\{)", text):
+            return parse_json(text, self.place, CORRECT)
+        if text.startswith("%YAML"):
+            return None
+        plain_yaml = re.search(r"^[\w.-]+:(\s|$)", text, re.MULTILINE)
+        if plain_yaml and not re.search(r"^\s*\[", text, re.MULTILINE):
+            return parse_yaml(text, self.place)
+        with parsing(f"{self.place}, which is not valid TOML", CORRECT):
+            return tomllib.loads(text)
 
-    @cached_property
-    def notation(self) -> str:
-        """`json`, `opencv` (its YAML), `yaml`, `toml`, or nothing for a folder."""
-        if self.path.is_dir():
-            return ""
-        if re.match(r"\s*(\{|\[\s*\{)", self.text):
-            return "json"
-        if self.text.startswith("%YAML"):
-            return "opencv"
-        plain_yaml = re.search(r"^[\w.-]+:(\s|$)", self.text, re.MULTILINE)
-        return "yaml" if plain_yaml and not re.search(r"^\s*\[", self.text, re.MULTILINE) else "toml"
+    @property
+    def table(self) -> Table:
+        """The content where it has names, else nothing."""
+        return self.content if isinstance(self.content, dict) else {}
 
-    @cached_property
-    def json(self) -> Any:
-        """The value of a JSON file, else None."""
-        return parse_json(self.text, self.place, CORRECT) if self.notation == "json" else None
+    def cameras(self) -> list[Any]:
+        """The entries of a list `cameras`, else nothing."""
+        entries = self.table.get("cameras")
+        return entries if isinstance(entries, list) else []
 
-    @cached_property
-    def toml(self) -> dict[str, Any] | None:
-        """The tables of a TOML file, else None."""
-        return read_toml(self.path, CORRECT) if self.notation == "toml" else None
 
-    @cached_property
-    def yaml(self) -> Any:
-        """The value of a YAML file that OpenCV did not write, else None."""
-        return _yaml(self.text, self.place) if self.notation == "yaml" else None
+def has(entries: Any, *names: str) -> bool:
+    """Whether the first of a list of objects has all these names: how formats of one shape are told apart."""
+    first = entries[0] if isinstance(entries, list) and entries else None
+    return isinstance(first, dict) and first.keys() >= set(names)
 
-    def table(self) -> dict[str, Any]:
-        """The tables of a TOML file or the object of a JSON or YAML file; empty where it is something else."""
-        content = self.json or self.toml or self.yaml
-        return content if isinstance(content, dict) else {}
+
+def object_of(entry: Any, what: str) -> Table:
+    """An entry of a list that must be an object; `what` says which."""
+    if not isinstance(entry, dict):
+        raise D2Error(f"{what} cannot be understood ({shown(entry)} is no object): {CORRECT}")
+    return entry
 
 
 def numbers(table: Mapping[str, Any], key: str, shape: tuple[int, ...], place: str) -> np.ndarray:
@@ -96,6 +103,11 @@ def numbers(table: Mapping[str, Any], key: str, shape: tuple[int, ...], place: s
     return array.reshape(shape)
 
 
+def coefficients(table: Mapping[str, Any], key: str, place: str) -> np.ndarray:
+    """The distortion under `key`, [n]; none where the file has none."""
+    return numbers(table, key, (-1,), place) if key in table else np.zeros(0)
+
+
 def size_of(table: Mapping[str, Any], key: str, place: str) -> tuple[int, int]:
     """(width, height) under `key`; some tools write whole numbers with a decimal point."""
     width, height = numbers(table, key, (2,), place)
@@ -104,13 +116,19 @@ def size_of(table: Mapping[str, Any], key: str, place: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _yaml(text: str, place: str) -> Any:
-    """YAML without aliases, which can unfold to any size."""
+def parse_yaml(text: str, place: str) -> Any:
+    """Lists, tables and words of YAML, without types (a number is a word) and aliases, which can unfold to any size."""
     try:
         import yaml
     except ImportError:
         raise missing_extra("PyYAML", "calibration", f"reading {place}") from None
+    loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # written in C where it is there
     with parsing(place, CORRECT):
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
-            raise D2Error(f"{place} has YAML aliases (*name), which no calibration needs: {CORRECT}")
-        return yaml.safe_load(text)
+        depth = 0
+        for event in yaml.parse(text, Loader=loader):
+            if isinstance(event, yaml.AliasEvent):
+                raise D2Error(f"{place} has YAML aliases (*name), which no calibration needs: {CORRECT}")
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST:  # libyaml goes down into lists of lists until the stack ends
+                raise D2Error(f"{place} is YAML nested more than {DEEPEST} deep: {CORRECT}")
+        return yaml.load(text, Loader=loader)

@@ -1,0 +1,197 @@
+"""Calibrations of Pose2Sim, Caliscope, Anipose, Kalibr, Multical and CMU Panoptic.
+
+All of them give a K for pixels whose first centre lies at 0, OpenCV's coefficients and a pose from world to camera.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Optional
+
+import numpy as np
+
+from d2_plugin.errors import D2Error
+from d2_plugin.reading import field
+from d2_plugin.recordings.cameras.camera import OPENCV_CENTRE, CalibratedCamera, pinhole, rigid
+from d2_plugin.recordings.cameras.formats.document import (
+    CORRECT,
+    Document,
+    Table,
+    coefficients,
+    has,
+    numbers,
+    object_of,
+    size_of,
+)
+from d2_plugin.recordings.cameras.lens import checked_lens
+from d2_plugin.recordings.cameras.rotations import rotation_of_vector
+
+Cameras = Optional[list[CalibratedCamera]]  # noqa: UP045  at run time, on Python 3.9 too
+
+CENTIMETRES = 0.01
+"""Of the positions in CMU Panoptic's files, in metres."""
+
+KALIBR_DISTORTIONS = {"radtan": ("opencv", 4), "equidistant": ("fisheye", 4), "none": ("pinhole", 0)}
+"""Kalibr's name -> model and number of coefficients."""
+
+MULTICAL_MODELS = ("standard", "rational", "thin_prism", "tilted", "opencv", "fisheye")
+"""All but the last are OpenCV's vector at different lengths."""
+
+TOML_LENGTHS = (0, 1, 2, 4, 5, 8, 12, 14)
+"""Coefficients that OpenCV's vector of distortions may have; aniposelib also writes k1 alone, and k1 k2."""
+
+
+def _camera(
+    name: str,
+    place: str,
+    size: tuple[int, int],
+    K: np.ndarray,
+    model: str,
+    distortion: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+) -> CalibratedCamera:
+    """A camera whose first pixel has its centre at 0 in `K`."""
+    K = K + [[0, 0, OPENCV_CENTRE], [0, 0, OPENCV_CENTRE], [0, 0, 0]]
+    return CalibratedCamera(name, *size, checked_lens(K, model, distortion, place), rigid(rotation, translation))
+
+
+def read_caliscope(document: Document) -> Cameras:
+    """camera_array.toml: tables [cameras.0], [cameras.1], ... (older: [cam_0] with a `port`), called cam_N.
+
+    Raises:
+        D2Error: a camera without a pose, which Caliscope writes for cameras that it could not place.
+    """
+    nested = document.table.get("cameras")
+    tables = nested if isinstance(nested, dict) else _toml_tables(document)
+    known = [table for table in tables.values() if isinstance(table, dict) and "matrix" in table]
+    if not known or (tables is not nested and not any("port" in table for table in known)):
+        return None
+    cameras = []
+    for key, table in tables.items():
+        if not isinstance(table, dict) or table.get("ignore") is True:
+            continue
+        number = str(table.get("cam_id", table.get("port", key)))
+        name = number if number.startswith("cam") else f"cam_{number}"
+        missing = [part for part in ("matrix", "rotation", "translation") if part not in table]
+        if missing:
+            raise D2Error(
+                f"camera {name} in {document.place} has no {' and no '.join(missing)}: Caliscope could not place it; "
+                "calibrate it or remove its table"
+            )
+        cameras.append(_toml_camera(table, name, document.place))
+    return cameras
+
+
+def read_pose2sim(document: Document) -> Cameras:
+    """Calib*.toml: tables whose `distortions` are k1 k2 p1 p2, and [metadata] with `adjusted`."""
+    tables, metadata = _toml_tables(document), document.table.get("metadata")
+    marked = isinstance(metadata, dict) and "adjusted" in metadata
+    lengths = [len(d) if isinstance(d := table.get("distortions"), list) else -1 for table in tables.values()]
+    return read_anipose(document) if marked and set(lengths) == {4} else None
+
+
+def read_anipose(document: Document) -> Cameras:
+    """calibration.toml: tables [cam_0], [cam_1], ... with `matrix`, in the unit of the board."""
+    tables = _toml_tables(document)
+    return [_toml_camera(table, str(table.get("name", key)), document.place) for key, table in tables.items()] or None
+
+
+def _toml_tables(document: Document) -> dict[str, Table]:
+    return {name: table for name, table in document.table.items() if isinstance(table, dict) and "matrix" in table}
+
+
+def _toml_camera(table: Table, name: str, document: str) -> CalibratedCamera:
+    place = f"camera {name} in {document}"
+    values = coefficients(table, "distortions", place)
+    fisheye = field(table, "fisheye", bool, place, CORRECT, default=False)
+    if fisheye and len(values) == 5 and values[4] == 0:
+        values = values[:4]  # a fisheye written in the place of five coefficients
+    if len(values) not in ((0, 4) if fisheye else TOML_LENGTHS):
+        raise D2Error(f"{place} has {len(values)} distortions, expected 4 or 5 (a fisheye 4): {CORRECT}")
+    rotation = numbers(table, "rotation", (-1,), place)
+    if rotation.size != 9:  # older files of Caliscope have the matrix
+        rotation = rotation_of_vector(numbers(table, "rotation", (3,), place))
+    K, translation = numbers(table, "matrix", (3, 3), place), numbers(table, "translation", (3,), place)
+    model, size = "fisheye" if fisheye else "opencv", size_of(table, "size", place)
+    return _camera(name, place, size, K, model, values, rotation.reshape(3, 3), translation)
+
+
+def read_kalibr(document: Document) -> Cameras:
+    """camchain.yaml: cam0, cam1, ... whose `T_cn_cnm1` maps points of the camera before to this one; metres.
+
+    The world is camera 0's. Cameras of the model `pinhole` are read, with radtan, equidistant or no distortion.
+    """
+    if not has([document.table.get("cam0")], "camera_model", "intrinsics"):
+        return None
+    tables = {name: table for name, table in document.table.items() if name[:3] == "cam" and name[3:].isdecimal()}
+    pose, cameras = np.eye(4), []
+    for number, name in enumerate(sorted(tables, key=lambda name: int(name[3:]))):
+        place = f"{name} in {document.place}"
+        table = object_of(tables[name], place)
+        if name != f"cam{number}":
+            raise D2Error(f"{place} is out of the chain, expected cam{number} there: {CORRECT}")
+        if number:
+            link = numbers(table, "T_cn_cnm1", (4, 4), place)
+            if not np.allclose(link[3], [0, 0, 0, 1]):
+                raise D2Error(f"T_cn_cnm1 of {place} ends with the row {link[3].tolist()}, expected 0 0 0 1: {CORRECT}")
+            pose = link @ pose
+        cameras.append(_kalibr_camera(table, name, pose, place))
+    return cameras
+
+
+def _kalibr_camera(table: Table, name: str, pose: np.ndarray, place: str) -> CalibratedCamera:
+    remedy = "calibrate it with Kalibr's pinhole-equi or pinhole-radtan"
+    model = field(table, "camera_model", str, place, CORRECT)
+    if model != "pinhole":
+        raise D2Error(f"{place} has the camera model {model}, which cannot be undistorted here: {remedy}")
+    distortion = field(table, "distortion_model", str, place, CORRECT, default="none")
+    if distortion not in KALIBR_DISTORTIONS:
+        raise D2Error(
+            f"{place} has the distortion model {distortion}, expected {', '.join(KALIBR_DISTORTIONS)}: {remedy}"
+        )
+    model, count = KALIBR_DISTORTIONS[distortion]
+    values = numbers(table, "distortion_coeffs", (count,), place) if count else np.zeros(0)
+    K, size = pinhole(*numbers(table, "intrinsics", (4,), place)), size_of(table, "resolution", place)
+    return _camera(name, place, size, K, model, values, pose[:3, :3], pose[:3, 3])
+
+
+def read_multical(document: Document) -> Cameras:
+    """calibration.json: intrinsics under `cameras`, poses from the rig to each camera under `camera_poses`.
+
+    Where a master camera was chosen, poses are called "camera_to_master". The unit is that of the board.
+    """
+    cameras, poses = document.table.get("cameras"), document.table.get("camera_poses")
+    if not isinstance(cameras, dict) or not isinstance(poses, dict):
+        return None
+    return [_multical_camera(name, table, poses, document.place) for name, table in cameras.items()]
+
+
+def _multical_camera(name: str, entry: Any, poses: Table, document: str) -> CalibratedCamera:
+    place = f"camera {name} in {document}"
+    table = object_of(entry, place)
+    model = field(table, "model", str, place, CORRECT, default="standard")
+    if model not in MULTICAL_MODELS:
+        raise D2Error(f"{place} has the model {model}, expected one of {', '.join(MULTICAL_MODELS)}: {CORRECT}")
+    keys = [key for key in poses if key == name or key.startswith(f"{name}_to_")]
+    if len(keys) != 1 or not isinstance(poses[keys[0]], dict):
+        raise D2Error(f"{place} has {len(keys)} poses in camera_poses, expected one: calibrate it again or remove it")
+    pose, K = poses[keys[0]], numbers(table, "K", (3, 3), place)
+    rotation, translation = numbers(pose, "R", (3, 3), place), numbers(pose, "T", (3,), place)
+    model, distortion = "fisheye" if model == "fisheye" else "opencv", coefficients(table, "dist", place)
+    return _camera(name, place, size_of(table, "image_size", place), K, model, distortion, rotation, translation)
+
+
+def read_panoptic(document: Document) -> Cameras:
+    """calibration_SEQUENCE.json of CMU's Panoptic Studio: hundreds of cameras (HD, VGA, Kinect), in centimetres."""
+    if not has(document.cameras(), "K", "distCoef", "resolution"):
+        return None
+    return [_panoptic_camera(entry, document.place) for entry in document.cameras()]
+
+
+def _panoptic_camera(entry: Any, document: str) -> CalibratedCamera:
+    table = object_of(entry, f"a camera in {document}")
+    name = field(table, "name", str, f"a camera in {document}", CORRECT)
+    place = f"camera {name} in {document}"
+    K, distortion = numbers(table, "K", (3, 3), place), numbers(table, "distCoef", (-1,), place)
+    rotation, translation = numbers(table, "R", (3, 3), place), CENTIMETRES * numbers(table, "t", (3,), place)
+    return _camera(name, place, size_of(table, "resolution", place), K, "opencv", distortion, rotation, translation)

@@ -1,0 +1,296 @@
+"""A video: what its container says about it, and its images by their time stamps, decoded when asked for (PyAV).
+
+Times are those of the container, so a variable frame rate is honoured; frame numbers times a rate would not be. The
+file is walked through once without decoding more than one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d2_plugin.errors import D2Error
+from d2_plugin.extras import import_av
+from d2_plugin.reading import opened, parsing, said, shown_path
+from d2_plugin.recordings.images import MOST_PIXELS
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".360", ".lrv")
+"""Endings by which a folder's videos are listed."""
+
+REMEDY = "replace the file or leave its camera out"
+
+SKIP_LIMIT = 48
+"""A frame at most this far ahead is reached by decoding on; any other by a seek, which starts at a key frame."""
+
+MOST_FRAMES = 10_000_000
+"""A video that has more is damaged: this many are four days at 30 per second."""
+
+ATOMS = (b"ftyp", b"styp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
+"""What an MP4 or MOV may begin with, behind its length."""
+
+BEGINNINGS = (b"\x1aE\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3")
+"""Of Matroska and WebM, of an MPEG program stream and of MPEG video."""
+
+PACKETS = ((0, 188), (4, 196))
+"""Where the first two packets of an MPEG transport stream begin, without and with time codes."""
+
+
+@dataclass(frozen=True, eq=False)
+class VideoFile:
+    """One video as its container describes it."""
+
+    path: Path
+    stored_size: tuple[int, int]
+    """(width, height) in pixels before the turn."""
+    turn: int
+    """How a stored image becomes an upright one: 0, 90, 180 or 270 degrees, counter-clockwise."""
+    stamps: np.ndarray
+    """[N] int64, ascending: when each frame is shown, in units of `unit`."""
+    unit: Fraction
+    """Seconds."""
+    timecode: str | None = None
+    sound: bool = False
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the upright images."""
+        width, height = self.stored_size
+        return (height, width) if self.turn % 180 else (width, height)
+
+    def upright(self, stored: np.ndarray) -> np.ndarray:
+        """A stored image [H, W, ...], turned."""
+        return np.ascontiguousarray(np.rot90(stored, self.turn // 90)) if self.turn else stored
+
+    @property
+    def times(self) -> np.ndarray:
+        """[N] seconds on the clock of the file, which the sound shares."""
+        return self.stamps * float(self.unit)
+
+    @property
+    def rate(self) -> float:
+        """Frames per second, those that were dropped counted as well; 0 for a single frame."""
+        if len(self.stamps) < 2:
+            return 0.0
+        steps = np.diff(self.stamps)
+        # The whole length, since the median of stamps that are rounded to whole units is rounded itself.
+        return float(np.maximum(np.rint(steps / np.median(steps)), 1).sum() / (steps.sum() * float(self.unit)))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, from which `from_dict` makes the same."""
+        kept = {"path": str(self.path), "size": list(self.stored_size), "turn": self.turn, "sound": self.sound}
+        unit = [self.unit.numerator, self.unit.denominator]
+        return {**kept, "timecode": self.timecode, "unit": unit, "stamps": self.stamps.tolist()}
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> VideoFile:
+        """What `as_dict` made."""
+        (width, height), stamps = table["size"], np.array(table["stamps"], np.int64)
+        unit = Fraction(*table["unit"])
+        return cls(Path(table["path"]), (width, height), table["turn"], stamps, unit, table["timecode"], table["sound"])
+
+
+class VideoHeader(NamedTuple):
+    """What is known of a video without walking through it."""
+
+    frames: int
+    fps: float  # 0 where the file does not say
+    size: tuple[int, int]  # width, height in pixels, upright
+
+
+def pyav() -> ModuleType:
+    """The module av."""
+    return import_av("reading videos with their time stamps")
+
+
+@contextmanager
+def container_of(path: Path) -> Iterator[Any]:
+    """The opened file; whatever FFmpeg says against it becomes one sentence."""
+    av = pyav()
+    _check_container(path)
+    with parsing(f"video {shown_path(path)}", REMEDY), av.open(str(path)) as container:
+        yield container
+
+
+def _check_container(path: Path) -> None:
+    """Refuse what holds no video itself: FFmpeg also follows playlists and scripts to other files and addresses."""
+    with opened(path, REMEDY) as file:  # a pipe or a device would block
+        head = file.read(256)
+    riff = head[:4] == b"RIFF" and head[8:11] == b"AVI"
+    transport = any(head[first : first + 1] == b"G" == head[second : second + 1] for first, second in PACKETS)
+    if not (riff or transport or head[4:8] in ATOMS or head[:4] in BEGINNINGS):
+        raise D2Error(f"{shown_path(path)} is no video in an MP4, MOV, Matroska, WebM, AVI or MPEG container: {REMEDY}")
+
+
+def read_video(path: Path) -> VideoFile:
+    """Sizes, time stamps, turn, timecode and sound of a video.
+
+    Raises:
+        D2Error: no video, no frame, a first frame that cannot be decoded, or sizes that no video has.
+    """
+    with container_of(path) as container:
+        stream = _image_stream(container, path)
+        stamps, unit = _stamps(container, stream, path), Fraction(stream.time_base)
+        places = [container, *container.streams.video, *container.streams]
+        timecode = next((place.metadata["timecode"] for place in places if "timecode" in place.metadata), None)
+        sound = bool(container.streams.audio)
+    size, turn = _first_frame(path)
+    return VideoFile(path, size, turn, stamps, unit, timecode, sound)
+
+
+def video_header(path: Path) -> VideoHeader:
+    """Number of frames, frame rate and size from the header and the first frame; errors as `read_video`."""
+    with container_of(path) as container:
+        stream = _image_stream(container, path)
+        frames, fps = stream.frames, float(stream.average_rate or 0)
+    (width, height), turn = _first_frame(path)
+    frames = frames or len(read_video(path).stamps)  # not every container says it
+    if frames > MOST_FRAMES:
+        raise D2Error(f"video {shown_path(path)} says {frames} frames, at most {MOST_FRAMES}: {REMEDY}")
+    return VideoHeader(frames, fps, (height, width) if turn % 180 else (width, height))
+
+
+def _image_stream(container: Any, path: Path) -> Any:
+    if not container.streams.video:
+        kinds = " and ".join(sorted({stream.type for stream in container.streams})) or "nothing"
+        raise D2Error(f"{shown_path(path)} holds {kinds} and no image: give a video of the camera")
+    return container.streams.video[0]
+
+
+def _stamps(container: Any, stream: Any, path: Path) -> np.ndarray:
+    """When each frame is shown; frames that an edit list leaves out are none."""
+    stamps: set[int] = set()
+    for packet in container.demux(stream):
+        stamp = packet.dts if packet.pts is None else packet.pts
+        if stamp is not None and packet.size and not packet.is_discard:
+            stamps.add(stamp)
+        if len(stamps) > MOST_FRAMES:
+            raise D2Error(f"video {shown_path(path)} has more than {MOST_FRAMES} frames: {REMEDY}")
+    if not stamps:
+        raise D2Error(f"video {shown_path(path)} has no frame: {REMEDY}")
+    return np.array(sorted(stamps), np.int64)
+
+
+def _first_frame(path: Path) -> tuple[tuple[int, int], int]:
+    """(size as stored, turn) of the images, from the first one."""
+    with container_of(path) as container:
+        try:
+            frame = next(container.decode(video=0))
+        except (StopIteration, pyav().error.FFmpegError) as failure:
+            why = f" ({said(failure)})" if not isinstance(failure, StopIteration) else ""
+            raise D2Error(f"no frame of video {shown_path(path)} can be decoded{why}: {REMEDY}") from None
+        if not 0 < frame.width * frame.height <= MOST_PIXELS:
+            raise D2Error(
+                f"video {shown_path(path)} has images of {frame.width}x{frame.height} pixels, at most {MOST_PIXELS}: "
+                f"{REMEDY}"
+            )
+        return (frame.width, frame.height), 90 * (round(float(frame.rotation) / 90) % 4)
+
+
+def videos_below(folder: Path) -> tuple[Path, ...]:
+    """The videos directly in a folder, sorted by name."""
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
+    return tuple(path for path in paths if not path.name.startswith("."))
+
+
+class Decoder:
+    """Decodes one video and remembers where it stands: frames in ascending order are decoded once each."""
+
+    def __init__(self, video: VideoFile) -> None:
+        self.video = video
+        self._container: Any = None
+        self._frames: Iterator[Any] = iter(())
+        self._reached = -1
+        """Index of the frame that was decoded last."""
+
+    def image(self, index: int) -> np.ndarray:
+        """RGB uint8 [H, W, 3] of frame `index`, upright.
+
+        Raises:
+            D2Error: the frame cannot be decoded, or only in part.
+        """
+        return self.video.upright(self._frame(index).to_ndarray(format="rgb24"))
+
+    def grey(self, index: int, long_side: int) -> np.ndarray:
+        """Brightness uint8 [h, w] of frame `index`, upright, made small: at most `long_side` pixels."""
+        frame = self._frame(index)
+        scale = min(long_side / max(frame.width, frame.height), 1.0)
+        width, height = max(round(scale * frame.width), 1), max(round(scale * frame.height), 1)
+        small = frame.reformat(width=width, height=height, format="gray", interpolation="AREA")
+        return self.video.upright(small.to_ndarray())
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if self._container is not None:
+            self._container.close()
+        self._container, self._reached = None, -1
+
+    def _frame(self, index: int) -> Any:
+        """The decoded frame whose stamp is that of `index`."""
+        why = ""
+        try:
+            self._approach(index)
+            for frame in self._frames:
+                stamp = frame.pts if frame.pts is not None else frame.dts
+                place = -1 if stamp is None else int(np.searchsorted(self.video.stamps, stamp))
+                if place < index:
+                    continue
+                self._reached = place
+                if place > index or frame.is_corrupt:
+                    break
+                return frame
+        except (pyav().error.FFmpegError, OSError, IndexError) as failure:
+            why = f" ({said(failure)})"
+        self.close()
+        raise D2Error(
+            f"frame {index} of {shown_path(self.video.path)} cannot be decoded{why}: repair the video, leave its "
+            "camera out, or choose other --times"
+        )
+
+    def _approach(self, index: int) -> None:
+        """Open the file where it is not, and stand at most `SKIP_LIMIT` frames before `index` if one can."""
+        if self._container is None:
+            _check_container(self.video.path)
+            self._container = pyav().open(str(self.video.path))
+            self._container.streams.video[0].thread_type = "AUTO"
+            self._frames = self._container.decode(video=0)
+        if not 0 < index - self._reached <= SKIP_LIMIT:
+            stream = self._container.streams.video[0]
+            self._container.seek(int(self.video.stamps[index]), stream=stream, backward=True)
+            self._frames = self._container.decode(video=0)
+
+
+@dataclass(frozen=True)
+class VideoFrames:
+    """Upright images out of one video per camera, decoded when asked for; not for several threads at the same time."""
+
+    videos: Mapping[str, VideoFile | Path]
+    """A path is walked through when its first image is asked for."""
+    indices: Mapping[str, Mapping[int, int]] | None = None
+    """By camera, the video's frame of each frame of the recording; the same where None."""
+    _decoders: dict[str, Decoder] = field(default_factory=dict, repr=False, compare=False)
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        """RGB uint8 [H, W, 3]."""
+        index = frame if self.indices is None else self.indices[camera].get(frame)
+        if index is None:
+            raise D2Error(f"camera {camera} has no frame {frame}: choose one of the recording's frames")
+        if camera not in self._decoders:
+            video = self.videos[camera]
+            self._decoders[camera] = Decoder(video if isinstance(video, VideoFile) else read_video(video))
+        return self._decoders[camera].image(index)
+
+    def depth(self, camera: str, frame: int) -> None:
+        """None: a video carries no true depth."""
+
+    def mono(self, camera: str, frame: int) -> None:
+        """None: a video carries no monocular maps."""
+
+    def __reduce__(self) -> tuple[Any, ...]:  # another process opens its own decoders
+        return VideoFrames, (self.videos, self.indices)
