@@ -7,35 +7,19 @@ the span of its own insertions.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
-from d2_plugin.compat import threedgs
+from d2_plugin.compat import inria
+from d2_plugin.compat.inria import GaussianRasterizationSettings
+
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
 NO_DEPTH = 15.0
 """Of pixels that let more than half of the light through (forward.cu:308)."""
 
 
-class GaussianRasterizationSettings(NamedTuple):
-    """The camera and constants of one image, as in the original; matrices act on row vectors."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-    prefiltered: bool = False
-    antialiasing: bool = False
-
-
-class GaussianRasterizer(threedgs.GaussianRasterizer):
+class GaussianRasterizer(inria.GaussianRasterizer):
     """As in 3DGS with the channels that the colours have, and a depth [1, H, W] without gradients."""
 
     def forward(

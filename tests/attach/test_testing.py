@@ -47,6 +47,20 @@ def test_the_bundled_backbones_keep_the_contract(backbone: str, temporal: bool) 
     assert set(check_backbone(lambda: make(backbone, temporal))) == {*CHECKS, "state"}
 
 
+def test_what_rounding_leaves_in_a_last_row_is_no_mistake() -> None:
+    """As torch.linalg.inv leaves it in float32."""
+
+    def make_rounded() -> Example:
+        example = make()
+        rounded = torch.tensor([1.5e-8, 0, -1.5e-8, 0]).expand(4, 4) * torch.eye(4)[3][:, None]
+        noise = torch.tensor([[0, 1.5e-8, 0], [0, 0, 0], [1.5e-8, 0, 0]])
+        shift = {"T_camera_world": lambda v: v.T_camera_world + rounded, "K": lambda v: v.K + noise}
+        with_view(**shift)(example.backbone)
+        return example
+
+    assert check_backbone(make_rounded)
+
+
 def test_what_the_example_lacks_is_not_checked() -> None:
     made = check_backbone(lambda: Example(make().backbone, make_views()))
     assert set(CHECKS) - set(made) == {"moments", "grow", "rendered depth"}
@@ -96,28 +110,28 @@ def one_listener(adapter: WatchedModel) -> None:
 
 def early(adapter: WatchedModel) -> None:
     """Tells before the change."""
-    tell, select = adapter._tell, type(adapter.model).select
+    report, select = adapter._report, type(adapter.model).select
 
-    def tell_first(index: torch.Tensor) -> None:
-        tell(index)
+    def report_first(index: torch.Tensor) -> None:
+        report(index)
         select(adapter.model, index)
 
-    adapter.model.select = tell_first
+    adapter.model.select = report_first
 
 
 def reversed_rows(adapter: WatchedModel) -> None:
-    tell = adapter._tell
-    adapter._tell = lambda index: tell(index.flip(0))
+    report = adapter._report
+    adapter._report = lambda index: report(index.flip(0))
 
 
 def past_the_end(adapter: WatchedModel) -> None:
-    tell = adapter._tell
-    adapter._tell = lambda index: tell(index + 100)
+    report = adapter._report
+    adapter._report = lambda index: report(index + 100)
 
 
 def as_mask(adapter: WatchedModel) -> None:
-    tell = adapter._tell
-    adapter._tell = lambda index: tell(index >= 0)
+    report = adapter._report
+    adapter._report = lambda index: report(index >= 0)
 
 
 def keeps_instead(adapter: WatchedModel) -> None:
