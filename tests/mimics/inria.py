@@ -286,7 +286,7 @@ class InriaModel:
         self.optimizer.load_state_dict(opt_dict)
 
 
-def densify(gaussians, opt, iteration: int, gradient: Tensor, seen: Tensor, radii: Tensor, faint: float = 0.005) -> None:
+def densify(gaussians, opt, iteration: int, gradient: Tensor, seen: Tensor, radii: Tensor, faint=0.005) -> None:
     """What all of them do between backward and the optimizer's step, while they densify."""
     if iteration >= opt.densify_until_iter:
         return
