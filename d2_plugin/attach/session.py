@@ -17,6 +17,7 @@ from d2_plugin import registry
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.prior import Store
+from d2_plugin.hooks.reports import Report
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import Backbone
 
@@ -25,6 +26,10 @@ log = logging.getLogger(__name__)
 Adapter = Callable[..., Backbone]
 Place = tuple[str, str]
 """A module of the repository and one of its attributes."""
+
+
+MUCH_GROWTH = 3
+"""Gaussians of the trainer's own densification for each one that D2 inserted, above which the log names them."""
 
 
 @dataclass
@@ -131,6 +136,7 @@ class Session:
         self.hooks: D2Hooks | None = None
         self._iteration, self._counted = 0, False
         self._drawn, self._batch = 0, 0
+        self._inserted, self._others, self._growth_logged = 0, 0, False
 
     def wrap(self) -> None:
         """Override the choke points of the repository's modules; call before its script runs.
@@ -183,6 +189,7 @@ class Session:
         """Make the adapter and the hooks of the objects seen, for a run of that many iterations."""
         self.hooks = D2Hooks(self._configured(iterations), self.recipe.backbone(self.objects), self.store)
         self._iteration, self._counted, self._drawn, self._batch = 0, False, 0, 0
+        self._inserted, self._others = 0, len(self.hooks.backbone)
         self.hooks.tell(iterations)
 
     def _configured(self, iterations: int | None) -> D2Config:
@@ -264,8 +271,20 @@ class Session:
     def _after_step(self) -> None:
         if self.hooks is None:
             return
-        self.hooks.step(self._iteration)
+        self._note_growth(self.hooks.step(self._iteration))
         self._counted, self._drawn, self._batch = False, 0, self._drawn
+
+    def _note_growth(self, report: Report) -> None:
+        """Log once that the trainer's own densification outgrows what D2 inserted; it splits inserted ones as well."""
+        self._inserted, self._others = self._inserted + report.inserted, self._others - report.removed
+        own = report.gaussians - self._inserted - self._others
+        if self._inserted and own > MUCH_GROWTH * self._inserted and not self._growth_logged:
+            self._growth_logged = True
+            log.warning(
+                "iteration %d: the trainer's own densification has made %d Gaussians beside the %d that D2 inserted: "
+                "end it earlier or raise its threshold if that is too many",
+                report.step, own, self._inserted,
+            )  # fmt: skip
 
 
 def attribute_of(module: str, attribute: str) -> Any:
