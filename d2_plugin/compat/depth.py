@@ -24,23 +24,19 @@ log = logging.getLogger(__name__)
 class GaussianRasterizer(inria.GaussianRasterizer):
     """As in 3DGS, and depth [1, H, W] = sum of w z with gradients."""
 
-    def forward(
+    def forward(  # type: ignore[override]
         self,
         means3D: Tensor,
         means2D: Tensor,
         opacities: Tensor,
-        shs: Tensor | None = None,
-        colors_precomp: Tensor | None = None,
-        scales: Tensor | None = None,
-        rotations: Tensor | None = None,
-        cov3D_precomp: Tensor | None = None,
         means2D_densify: Tensor | None = None,
+        **others: Tensor | None,
     ) -> tuple[Tensor, ...]:
         """Color [3, H, W], radii [N] int32 and depth [1, H, W]."""
         if means2D_densify is not None:
             _warn_of_signed_gradients()
             means2D = means2D + means2D_densify
-        drawn = self._draw(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        drawn = self._draw(means3D, means2D, opacities, **others)
         return drawn.color, drawn.radii, drawn.depth
 
 

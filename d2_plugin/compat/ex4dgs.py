@@ -36,16 +36,11 @@ class GaussianRasterizer(inria.GaussianRasterizer):
         means2D: Tensor,
         dir3D: Tensor | None,
         opacities: Tensor,
-        shs: Tensor | None = None,
-        colors_precomp: Tensor | None = None,
-        scales: Tensor | None = None,
-        rotations: Tensor | None = None,
-        cov3D_precomp: Tensor | None = None,
+        **others: Tensor | None,
     ) -> tuple[Tensor, ...]:
         """Color [3, H, W], radii [N] int32, depth [1, H, W], flow [3, H, W], acc [1, H, W] and indices [1, H, W]."""
         rows = torch.nonzero(self._in_frustum(means3D.detach())).squeeze(-1)
-        shape = scales, rotations, cov3D_precomp
-        splats, colors = self._chosen(rows, means3D, opacities, shs, colors_precomp, *shape)
+        splats, colors = self._chosen(rows, means3D, opacities, **others)
         return self._outputs(splats, colors, means2D, dir3D, len(means3D))
 
     def _outputs(

@@ -210,34 +210,15 @@ class GaussianRasterizer(nn.Module):
         return positions @ forward[:3] + forward[3] > SETTINGS.near
 
     def forward(
-        self,
-        means3D: Tensor,
-        means2D: Tensor,
-        opacities: Tensor,
-        shs: Tensor | None = None,
-        colors_precomp: Tensor | None = None,
-        scales: Tensor | None = None,
-        rotations: Tensor | None = None,
-        cov3D_precomp: Tensor | None = None,
+        self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **others: Tensor | None
     ) -> tuple[Tensor, ...]:
-        """Color [3, H, W] and radii [N] int32, with gradients to every tensor given."""
-        drawn = self._draw(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        """Color [3, H, W] and radii [N] int32, with gradients to every tensor given; for `others` see `_chosen`."""
+        drawn = self._draw(means3D, means2D, opacities, **others)
         return drawn.color, drawn.radii
 
-    def _draw(
-        self,
-        means3D: Tensor,
-        means2D: Tensor,
-        opacities: Tensor,
-        shs: Tensor | None,
-        colors_precomp: Tensor | None,
-        scales: Tensor | None,
-        rotations: Tensor | None,
-        cov3D_precomp: Tensor | None,
-    ) -> Drawn:
+    def _draw(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **others: Tensor | None) -> Drawn:
         rows = torch.arange(len(means3D), device=means3D.device)
-        shape = scales, rotations, cov3D_precomp
-        splats, colors = self._chosen(rows, means3D, opacities, shs, colors_precomp, *shape)
+        splats, colors = self._chosen(rows, means3D, opacities, **others)
         return draw(self.raster_settings, splats, colors, self.raster_settings.bg, means2D, len(rows))
 
     def _chosen(
@@ -245,13 +226,13 @@ class GaussianRasterizer(nn.Module):
         rows: Tensor,
         means3D: Tensor,
         opacities: Tensor,
-        shs: Tensor | None,
-        colors_precomp: Tensor | None,
-        scales: Tensor | None,
-        rotations: Tensor | None,
-        cov3D_precomp: Tensor | None,
+        shs: Tensor | None = None,
+        colors_precomp: Tensor | None = None,
+        scales: Tensor | None = None,
+        rotations: Tensor | None = None,
+        cov3D_precomp: Tensor | None = None,
     ) -> tuple[Splats, Tensor]:
-        """The Gaussians of `rows` [M], and their colours [M, C]."""
+        """The Gaussians of `rows` [M], and their colours [M, C]; arguments as the originals have them."""
         settings = self.raster_settings
         exactly_one("shs or colors_precomp", shs, colors_precomp)
         shape_given(scales, rotations, cov3D_precomp)

@@ -23,17 +23,9 @@ class GaussianRasterizer(inria.GaussianRasterizer):
     """As in 3DGS with the channels that the colours have, and a depth [1, H, W] without gradients."""
 
     def forward(
-        self,
-        means3D: Tensor,
-        means2D: Tensor,
-        opacities: Tensor,
-        shs: Tensor | None = None,
-        colors_precomp: Tensor | None = None,
-        scales: Tensor | None = None,
-        rotations: Tensor | None = None,
-        cov3D_precomp: Tensor | None = None,
+        self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **others: Tensor | None
     ) -> tuple[Tensor, ...]:
         """Channels [C, H, W], radii [N] int32 and depth [1, H, W]."""
-        drawn = self._draw(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        drawn = self._draw(means3D, means2D, opacities, **others)
         depth, alpha = drawn.depth.detach(), drawn.alpha.detach()
         return drawn.color, drawn.radii, torch.where(alpha > 0.5, depth / alpha, NO_DEPTH)
