@@ -59,7 +59,7 @@ class GsplatAdapter(Resizing):
         state: the strategy's state; without it, only appended rows are understood (MCMC's `sample_add`), and anything
             else resets what hooks count, with a warning.
         view: from the trainer's camera to a `View`; not needed where the trainer passes views.
-        parser: of gsplat's examples, in the place of `view`: items of its data sets are then told by their poses.
+        parser: of gsplat's examples, in the place of `view`: items of its data sets are then known by their poses.
         scene: gsplat 1.6's `GaussianScene`, which keeps a component for every row.
         slice_at: the 3D Gaussians of a view, for models that change over time; by default the parameters as they are.
         new_rows: raw rows of further parameters (velocities, times, ...) for inserted points.

@@ -152,7 +152,7 @@ class ViewsByPose:
         near = torch.nonzero(_distances(self.poses, pose) < self.tolerance).squeeze(-1)
         if len(near) != 1:
             raise D2Error(
-                f"{len(near)} images have the pose of this view: gsplat's images are told by their poses, so give "
+                f"{len(near)} images have the pose of this view: gsplat's images are known by their poses, so give "
                 "it one instant of the recording (`d2 export-recording --format gsplat`), and no pose_opt or pose_noise"
             )
         key = self.keys[int(near)]

@@ -200,7 +200,7 @@ def needed(script: Path, conditional: bool = True) -> dict[str, str]:
     Imports inside functions and inside `try` wait or may fail, so they are left out, and so is the standard library.
     Those under an `if` depend on options; they are left out unless `conditional`.
     """
-    found: dict[str, str] = {}
+    packages: dict[str, str] = {}
     root, seen, waiting = script.parent, set[Path](), [script]
     while waiting:
         file = waiting.pop()
@@ -214,8 +214,8 @@ def needed(script: Path, conditional: bool = True) -> dict[str, str]:
             if inside is not None:
                 waiting.append(inside)
             elif top not in _standard_library() and not any((base / top).is_dir() for base in roots):
-                found.setdefault(top, f"{file.relative_to(root)}:{line}")
-    return found
+                packages.setdefault(top, f"{file.relative_to(root)}:{line}")
+    return packages
 
 
 def missing(script: Path, replaced: set[str]) -> dict[str, str]:

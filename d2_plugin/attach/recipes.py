@@ -31,7 +31,7 @@ def _enter_stage(adapter: Any, named: Mapping[str, Any]) -> None:
 
 
 def _spacetime(adapter: Adapter, objects: Objects) -> Backbone:
-    """Its Scene is told the number of frames, and the folder colmap_N says the first of them."""
+    """Its Scene gets the number of frames, and N of the folder colmap_N is the first of them."""
     (dataset, *_), named = objects.given["scene"]
     first = Path(dataset.source_path).name.split("_")[1:2]
     number = int(first[0]) if first and first[0].isdigit() else 0

@@ -2,8 +2,8 @@
 
 hustvl/4DGaussians and ingra14m/Deformable-3D-Gaussians import these under the same name. The latter also passes
 `means2D_densify`, whose gradient is the sum over pixels of absolute values there (its issue 72). Here it is the signed
-sum, that of `means2D`, which is smaller: with densify_grad_threshold = .0002, 3D Gaussian Splatting's, in the place of
-.0007 about as many Gaussians are split; the log says so.
+sum, that of `means2D`, which is smaller, so fewer Gaussians exceed its densify_grad_threshold of .0007; 3D Gaussian
+Splatting uses .0002 for the signed sum.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 class GaussianRasterizer(inria.GaussianRasterizer):
     """As in 3DGS, and depth [1, H, W] = sum of w z with gradients."""
 
-    def forward(  # type: ignore[override]
+    def forward(
         self,
         means3D: Tensor,
         means2D: Tensor,

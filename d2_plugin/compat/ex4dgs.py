@@ -58,8 +58,8 @@ class GaussianRasterizer(inria.GaussianRasterizer):
             still = Splats(*(field.detach() for field in splats))
             sums = rasterize(still, dir3D[splats.rows], view_of(settings), constants).color.permute(2, 0, 1)
             flow = torch.where(weighed, sums / acc.detach(), 0.0).contiguous()
-        nobody = torch.full_like(drawn.alpha, -1, dtype=torch.int32)
-        return drawn.color, drawn.radii, depth, flow, drawn.alpha, nobody
+        no_index = torch.full_like(drawn.alpha, -1, dtype=torch.int32)
+        return drawn.color, drawn.radii, depth, flow, drawn.alpha, no_index
 
     def _in_frustum(self, means: Tensor) -> Tensor:
         settings = self.raster_settings

@@ -116,11 +116,11 @@ def view_of(settings: Any) -> View:
 
 
 def _compare_focal_lengths(settings: Any, focal_x: float, focal_y: float) -> None:
-    said = (0.5 * settings.image_width / settings.tanfovx, 0.5 * settings.image_height / settings.tanfovy)
-    if abs(said[0] - focal_x) > 1e-3 * focal_x or abs(said[1] - focal_y) > 1e-3 * focal_y:
+    focal = (0.5 * settings.image_width / settings.tanfovx, 0.5 * settings.image_height / settings.tanfovy)
+    if abs(focal[0] - focal_x) > 1e-3 * focal_x or abs(focal[1] - focal_y) > 1e-3 * focal_y:
         _warn_once(
-            f"the field of view stands for focal lengths of {said[0]:.1f} and {said[1]:.1f} pixels but the projection "
-            f"matrix has {focal_x:.1f} and {focal_y:.1f}, which are used for footprints, too"
+            f"the field of view stands for focal lengths of {focal[0]:.1f} and {focal[1]:.1f} pixels but the "
+            f"projection matrix has {focal_x:.1f} and {focal_y:.1f}, which are used for footprints, too"
         )
 
 
