@@ -63,6 +63,7 @@ class GsplatAdapter(Resizing):
         scene: gsplat 1.6's `GaussianScene`, which keeps a component for every row.
         slice_at: the 3D Gaussians of a view, for models that change over time; by default the parameters as they are.
         new_rows: raw rows of further parameters (velocities, times, ...) for inserted points.
+        settings: constants of the rasterizer.
     """
 
     def __init__(
@@ -76,13 +77,14 @@ class GsplatAdapter(Resizing):
         scene: Any = None,
         slice_at: SliceOf | None = None,
         new_rows: RowsOf | None = None,
+        settings: RasterSettings = GSPLAT,
     ) -> None:
         super().__init__()
         for name in ("means", "scales", "quats", "opacities"):
             if name not in parameters:
                 raise D2Error(f"parameters have {', '.join(parameters)} but no '{name}', which gsplat's names include")
         self.parameters, self.optimizers, self.state = parameters, optimizers, state
-        self.settings = GSPLAT
+        self.settings = settings
         self._view = view if parser is None else ViewsByPose(parser)
         self._slice, self._new_rows, self.scene = slice_at, new_rows, scene
         self._known = 0
