@@ -18,6 +18,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.protocol import View
 
 from .keys import PriorKey
+from .shared import optional
 
 
 def inria_view(camera: Any, key: PriorKey, time: float, like: Tensor) -> View:
@@ -41,7 +42,7 @@ def intrinsics(camera: Any, width: int, height: int) -> Tensor:
     From the projection P (clip = P camera, w = z): f_x = P_00 W / 2 and c_x = (P_02 + 1) W / 2, rows alike.
     """
     half = torch.tensor([width / 2, height / 2], dtype=torch.float64)
-    projection = getattr(camera, "projection_matrix", None)
+    projection = optional(camera, "projection_matrix")
     if projection is not None:
         P = projection.detach().T.double().cpu()
         focal, centre = P.diagonal()[:2] * half, (P[:2, 2] + 1) * half

@@ -13,12 +13,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
-from d2_plugin.protocol import Points, RasterSettings, Splats, View
+from d2_plugin.protocol import Points, Splats, View
 
 from .inria import InriaAdapter
 from .inverse_deformation import Inversion, invert_at_times
 from .keys import KeyOf
+from .shared import optional, splats_of
 
 log = logging.getLogger(__name__)
 
@@ -37,8 +37,6 @@ class Deformable3DAdapter(InriaAdapter):
         warm_up: iteration from which the field is used (opt.warm_up).
         in_warm_up: whether hooks run before it. The trainer's own reports are drawn with the untrained field until
             then, which widens every Gaussian by about .04 units and hides what hooks gain (docs/results/attach.md).
-        is_6dof: whether the field returns rigid motions [N, 4, 4] (dataset.is_6dof); read from the network by default.
-        settings: constants of its rasterizer, where they were changed.
         key: finds the prior of a camera; needed where the image's name does not say camera and frame
         (poses_bounds.npy with images 0000.png).
     """
@@ -50,15 +48,13 @@ class Deformable3DAdapter(InriaAdapter):
         *,
         warm_up: int = 3000,
         in_warm_up: bool = True,
-        is_6dof: bool | None = None,
-        settings: RasterSettings | None = None,
         key: KeyOf | None = None,
     ) -> None:
-        super().__init__(gaussians, settings, key)
+        super().__init__(gaussians, key)
         self.deform, self.warm_up, self.in_warm_up = deform, warm_up, in_warm_up
         if warm_up > 1 and not in_warm_up:
             log.info("the trainer uses its field from iteration %d on: hooks wait until then", warm_up)
-        self.is_6dof = bool(getattr(deform.deform, "is_6dof", False)) if is_6dof is None else is_6dof
+        self.is_6dof = bool(optional(deform.deform, "is_6dof", False))
         self.inversion: Inversion | None = None
 
     def trained(self) -> dict[str, Tensor]:
@@ -78,14 +74,12 @@ class Deformable3DAdapter(InriaAdapter):
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable in the model's and in the field's parameters."""
         model = self.gaussians
-        rows = torch.arange(len(self), device=model._xyz.device)
         opacities = torch.sigmoid(model._opacity.squeeze(-1))
         means, scales, rotations = model._xyz, model._scaling.exp(), torch.nn.functional.normalize(model._rotation)
         if self.deforms:
             motion, rotation, scaling = self._field(model._xyz.detach(), view.time)
             means, scales, rotations = self._moved(means, motion), scales + scaling, rotations + rotation
-        factors = rotation_matrices_3d(rotations.T) * scales.T
-        return Splats(means, covariances_from_factors(factors), opacities, rows)
+        return splats_of(means, scales, rotations, opacities)
 
     def _field(self, positions: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
         return self.deform.step(positions, positions.new_full((len(positions), 1), time))

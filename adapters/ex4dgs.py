@@ -18,11 +18,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
-from d2_plugin.protocol import Points, RasterSettings, Splats, View
+from d2_plugin.protocol import Points, Splats, View
 
 from .inria import InriaAdapter
 from .keys import KeyOf, PriorKey, key_from_image_name, key_of_technicolor
+from .shared import splats_of
 
 SMALL = 1e-6
 """Guards of the rasterizer's opacity compensation (cuda_rasterizer/forward.cu, computeCov2D)."""
@@ -42,7 +42,6 @@ class Ex4DGSAdapter(InriaAdapter):
         gaussians: the model, after `training_setup` and, when resuming, after `restore`.
         near, far: dataset.near and dataset.far.
         first_frame: number of the frame whose image is 0.png, where the prior counts from elsewhere.
-        settings: constants of its rasterizer, where they were changed.
         key: finds the prior of a camera; needed where the image's path does not say camera and frame.
     """
 
@@ -59,13 +58,12 @@ class Ex4DGSAdapter(InriaAdapter):
         near: float = 0.2,
         far: float = 1e10,
         first_frame: int = 0,
-        settings: RasterSettings | None = None,
         key: KeyOf | None = None,
     ) -> None:
-        constants = settings or replace(RasterSettings(), near=near, blur=float(gaussians.kernel_size))
-        super().__init__(gaussians, constants, key)
+        super().__init__(gaussians, key)
+        self.settings = replace(self.settings, near=near, blur=float(gaussians.kernel_size))
         self.far, self.first_frame = far, first_frame
-        self._told = self._sizes()
+        self._reported = self._sizes()
 
     def __len__(self) -> int:
         return sum(self._sizes())
@@ -74,14 +72,14 @@ class Ex4DGSAdapter(InriaAdapter):
         """The 3D Gaussians at `view.time`, opacities compensated for the blur of this view's pixels."""
         model, time = self.gaussians, view.time
         means = model.get_xyz_at_t(time)
-        factors = rotation_matrices_3d(model.get_rotation_at_t(time).T) * model.get_scaling().T
-        covariances, opacities = covariances_from_factors(factors), model.get_opacity_at_t(time).squeeze(-1)
         camera = means @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
         rows = torch.nonzero(self._in_frustum(camera.detach(), view)).squeeze(-1)
-        compensation = self._compensation(camera[rows], covariances[rows], view)
-        return Splats(means[rows], covariances[rows], opacities[rows] * compensation, rows)
+        scales, rotations = model.get_scaling()[rows], model.get_rotation_at_t(time)[rows]
+        splats = splats_of(means[rows], scales, rotations, model.get_opacity_at_t(time)[rows, 0], rows)
+        compensation = self._compensation(camera[rows], splats.covariances, view)
+        return splats._replace(opacities=splats.opacities * compensation)
 
-    def _coefficients(self) -> Tensor:
+    def _harmonics(self) -> Tensor:
         model = self.gaussians
         static = torch.cat([model._features_dc, model._features_rest], 1)
         return torch.cat([static, torch.cat([model._features_dc_motion, model._features_rest_motion], 1)])
@@ -123,7 +121,7 @@ class Ex4DGSAdapter(InriaAdapter):
 
         Images are CAMERA/FRAME.png (N3V) or SCENE_undist_FRAME_CAMERA.png (Technicolor, dataset_readers.py:143).
         """
-        image = str(getattr(camera, "image_path", None) or camera.image_name)
+        image = self.image_name(camera) or str(camera.image_name)
         in_folders = PurePosixPath(image).stem.isdigit()
         key = key_from_image_name(image) if in_folders else key_of_technicolor(image)
         return key._replace(frame=self.first_frame + key.frame)
@@ -139,7 +137,7 @@ class Ex4DGSAdapter(InriaAdapter):
         index = self._index(*kept)
 
         def report() -> Tensor:
-            self._told = self._sizes()
+            self._reported = self._sizes()
             return index
 
         return report
@@ -150,9 +148,9 @@ class Ex4DGSAdapter(InriaAdapter):
         `extract_dynamic_points_from_static` appends to the second table by itself and then prunes the first, so what
         it appended is first seen here.
         """
-        told, self._told = self._told, self._sizes()
+        before, self._reported = self._reported, self._sizes()
         device = self.gaussians._xyz.device
         static, dynamic = static.to(device), dynamic.to(device)
-        static = torch.where(static < told[0], static, -1)
-        dynamic = torch.where(dynamic < told[1], dynamic + told[0], -1)
+        static = torch.where(static < before[0], static, -1)
+        dynamic = torch.where(dynamic < before[1], dynamic + before[0], -1)
         return torch.cat([static, dynamic])

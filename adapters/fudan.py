@@ -19,17 +19,17 @@ from torch import Tensor
 from d2_plugin.gaussians.rotation4d import (
     condition_on_time,
     covariances_from_factors,
-    rotation_matrices_3d,
     rotation_matrices_4d,
     temporal_marginal,
     time_row,
 )
 from d2_plugin.gaussians.slicing import MARGINAL_CUT, slice_gaussians, unit_quaternions
-from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
+from d2_plugin.protocol import Points, ResizeListener, Splats, View
 
 from .cameras import correct_fields_of_view
 from .inria import InriaAdapter
 from .keys import KeyOf
+from .shared import optional, seen_colors, splats_of
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,6 @@ class FudanAdapter(InriaAdapter):
         scene: its `Scene`; where transforms.json carries focal lengths, the fields of view of its cameras are -1 and
             get corrected (see `correct_fields_of_view`), but only if a hook is on: without hooks nothing changes.
         correct_fov: False leaves the fields of view alone, to continue a model that was trained with them.
-        settings: constants of its rasterizer, where they were changed.
         key: finds the prior of a camera; needed where the image's name does not say camera and frame.
     """
 
@@ -57,10 +56,9 @@ class FudanAdapter(InriaAdapter):
         scene: Any = None,
         *,
         correct_fov: bool = True,
-        settings: RasterSettings | None = None,
         key: KeyOf | None = None,
     ) -> None:
-        super().__init__(gaussians, settings, key)
+        super().__init__(gaussians, key)
         self._scene, self._correct_fov, self._warned = scene, correct_fov, False
 
     def on_resize(self, listener: ResizeListener) -> None:
@@ -74,7 +72,7 @@ class FudanAdapter(InriaAdapter):
 
     def view(self, camera: Any) -> View:
         """See `InriaAdapter.view`; a camera whose field of view is still -1 is named once."""
-        if getattr(camera, "FoVx", 0) == -1 and not self._warned:
+        if optional(camera, "FoVx", 0) == -1 and not self._warned:
             log.warning(
                 "camera '%s' has a field of view of -1, so the trainer draws footprints of another size than D2 "
                 "surveys: give the adapter the scene, which corrects it",
@@ -101,11 +99,11 @@ class FudanAdapter(InriaAdapter):
 
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3]; 4D spherical harmonics where the model has them (sh_utils.py:117)."""
-        model, degree = self.gaussians, int(getattr(self.gaussians, "active_sh_degree_t", 0))
-        if not degree or model.gaussian_dim == 3 or getattr(model, "force_sh_3d", False):
-            return self._harmonics(view, splats)
-        duration = model.time_duration[1] - model.time_duration[0]
-        return self._harmonics(view, splats, (view.time - model._t[splats.rows, 0]) / duration, degree)
+        model, time_degree = self.gaussians, int(optional(self.gaussians, "active_sh_degree_t", 0))
+        if not time_degree or model.gaussian_dim == 3 or optional(model, "force_sh_3d", False):
+            return super().colors(view, splats)
+        phase = (view.time - model._t[splats.rows, 0]) / (model.time_duration[1] - model.time_duration[0])
+        return seen_colors(self._harmonics(), view, splats, int(model.active_sh_degree), phase, time_degree)
 
     def _slice_rotated(self, time: float) -> Splats:
         """With `prefilter_var` added to the temporal variance, in the marginal alone (gaussian_model.py:244)."""
@@ -130,10 +128,10 @@ class FudanAdapter(InriaAdapter):
         extra = _prefilter(model)
         with torch.no_grad():
             rows = self._alive(time, model._scaling_t[:, 0].exp() + extra)
-        factors = rotation_matrices_3d(unit_quaternions(model._rotation[rows])) * model._scaling[rows].T.exp()
         marginal = temporal_marginal(time - model._t[rows, 0], model._scaling_t[rows, 0].exp() + extra)
         opacities = torch.sigmoid(model._opacity[rows, 0]) * marginal
-        return Splats(model._xyz[rows], covariances_from_factors(factors), opacities, rows)
+        rotations = unit_quaternions(model._rotation[rows]).T
+        return splats_of(model._xyz[rows], model._scaling[rows].exp(), rotations, opacities, rows)
 
     def _alive(self, time: float, variance: Tensor) -> Tensor:
         marginal = temporal_marginal(time - self.gaussians._t[:, 0], variance)
@@ -158,4 +156,4 @@ class FudanAdapter(InriaAdapter):
 
 def _prefilter(model: Any) -> float:
     """Variance added to every temporal extent; 0 where it is off (negative) or unknown (older snapshots, 4C4D)."""
-    return max(getattr(model, "prefilter_var", 0.0), 0.0)
+    return max(optional(model, "prefilter_var", 0.0), 0.0)

@@ -14,20 +14,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
 from d2_plugin.gaussians.slicing import unit_quaternions
-from d2_plugin.gaussians.spherical_harmonics import SH_C0
-from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
-from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
+from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from .keys import ViewsByPose
+from .shared import (
+    Resizing,
+    appended,
+    constant_harmonics,
+    finite,
+    identities,
+    replaced,
+    seen_colors,
+    splats_of,
+    with_rows,
+)
 
 ROWS = "d2_rows"
 """The column in the strategy's state: the number of each row plus one, since gsplat marks what is new with zeros."""
@@ -35,11 +42,14 @@ ROWS = "d2_rows"
 NO_ROWS = {"binoms"}
 """Tensors in a strategy's state that have no row per Gaussian (MCMC's table of binomials)."""
 
+GSPLAT = RasterSettings(near=0.01)
+"""Of gsplat's rasterizer, where the user does not change them."""
+
 SliceOf = Callable[[Mapping[str, Tensor], View], Splats]
 RowsOf = Callable[[Points], Mapping[str, Tensor]]
 
 
-class GsplatAdapter:
+class GsplatAdapter(Resizing):
     """A dict of parameters, one Adam each, as a `d2_plugin.protocol.Backbone`.
 
     Args:
@@ -49,11 +59,11 @@ class GsplatAdapter:
         state: the strategy's state; without it, only appended rows are understood (MCMC's `sample_add`), and anything
             else resets what hooks count, with a warning.
         view: from the trainer's camera to a `View`; not needed where the trainer passes views.
-        parser: of gsplat's examples, in the place of `view`: items of its data sets are then told by their poses.
+        parser: of gsplat's examples, in the place of `view`: items of its data sets are then known by their poses.
         scene: gsplat 1.6's `GaussianScene`, which keeps a component for every row.
         slice_at: the 3D Gaussians of a view, for models that change over time; by default the parameters as they are.
         new_rows: raw rows of further parameters (velocities, times, ...) for inserted points.
-        settings: constants of the rasterizer; by default gsplat's, whose near plane is .01.
+        settings: constants of the rasterizer.
     """
 
     def __init__(
@@ -67,21 +77,21 @@ class GsplatAdapter:
         scene: Any = None,
         slice_at: SliceOf | None = None,
         new_rows: RowsOf | None = None,
-        settings: RasterSettings | None = None,
+        settings: RasterSettings = GSPLAT,
     ) -> None:
+        super().__init__()
         for name in ("means", "scales", "quats", "opacities"):
             if name not in parameters:
                 raise D2Error(f"parameters have {', '.join(parameters)} but no '{name}', which gsplat's names include")
         self.parameters, self.optimizers, self.state = parameters, optimizers, state
-        self.settings = settings or RasterSettings(near=0.01)
+        self.settings = settings
         self._view = view if parser is None else ViewsByPose(parser)
         self._slice, self._new_rows, self.scene = slice_at, new_rows, scene
-        self._listeners: list[ResizeListener] = []
         self._known = 0
         self._renumber()
 
     def __len__(self) -> int:
-        """N; what the strategy did since the last look is reported to the listeners first."""
+        """N; what the strategy did in the meantime is reported to the listeners first."""
         self._report_changes()
         return self._count
 
@@ -101,9 +111,8 @@ class GsplatAdapter:
         if self._slice is not None:
             return self._slice(self.parameters, view)
         p = self.parameters
-        factors = rotation_matrices_3d(unit_quaternions(p["quats"])) * p["scales"].T.exp()
-        rows = torch.arange(self._count, device=p["means"].device)
-        return Splats(p["means"], covariances_from_factors(factors), torch.sigmoid(p["opacities"]), rows)
+        rotations = unit_quaternions(p["quats"]).T
+        return splats_of(p["means"], p["scales"].exp(), rotations, torch.sigmoid(p["opacities"]))
 
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] from sh0 and shN, or from `colors` (logit)."""
@@ -111,9 +120,7 @@ class GsplatAdapter:
         if "sh0" not in p:
             return torch.sigmoid(p["colors"][splats.rows, :3])
         coefficients = torch.cat([p["sh0"], p["shN"]], 1) if "shN" in p else p["sh0"]
-        degree = round(coefficients.shape[1] ** 0.5) - 1
-        centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
-        return harmonic_colors(coefficients[splats.rows], splats.means - centre, None, degree, 0)
+        return seen_colors(coefficients, view, splats, round(coefficients.shape[1] ** 0.5) - 1)
 
     def trained(self) -> dict[str, Tensor]:
         """The tensors that are trained, by name."""
@@ -126,15 +133,13 @@ class GsplatAdapter:
         The strategy's evidence (grad2d, count, radii, ...) is kept, with zeros for the new rows.
         """
         self._report_changes()
-        finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
-        points = points.select(finite)
+        points = finite(points)
         rows, count = self._rows(points), len(points.positions)
-        index = torch.arange(self._count + count, device=points.positions.device)
-        index[self._count :] = -1
-        for name in self.parameters:
-            self._replace(name, partial(_appended, rows[name]), new_moments=rows[name])
+        for name, old in list(self.parameters.items()):
+            self.parameters[name] = with_rows(self.optimizers[name], old, rows[name])
         if self.scene is not None:
-            self.scene.on_sample_add(index.new_zeros(count))
+            self.scene.on_sample_add(torch.zeros(count, dtype=torch.long, device=points.positions.device))
+        index = appended(self._known, self._count, points.positions.device)
         self._change_state(lambda old: torch.cat([old, old.new_zeros(count, *old.shape[1:])]), index)
         return count
 
@@ -143,15 +148,11 @@ class GsplatAdapter:
         """Delete the rows where `mask` [N] is True from parameters, moments and the strategy's state."""
         self._report_changes()
         index = torch.nonzero(~mask).squeeze(-1)
-        for name in self.parameters:
-            self._replace(name, lambda old: old[index])
+        for name, old in list(self.parameters.items()):
+            self._keep(name, old, index)
         if self.scene is not None:
             self.scene.on_remove(mask)
         self._change_state(lambda old: old[index], index)
-
-    def on_resize(self, listener: ResizeListener) -> None:
-        """Register a listener for every structural change; the strategy's own are seen at the next look."""
-        self._listeners.append(listener)
 
     @property
     def _count(self) -> int:
@@ -160,14 +161,12 @@ class GsplatAdapter:
     def _rows(self, points: Points) -> dict[str, Tensor]:
         """Raw rows of every parameter; refuses a parameter whose starting value is not known."""
         count, like = len(points.positions), points.positions
-        quats = like.new_zeros(count, 4)
-        quats[:, 0] = 1
         known = {
             "means": points.positions,
             "scales": points.scales.log()[:, None].repeat(1, 3),
-            "quats": quats,
+            "quats": identities(count, like),
             "opacities": torch.logit(points.opacities, eps=1e-6),
-            "sh0": ((points.colors - 0.5) / SH_C0)[:, None, :],
+            "sh0": constant_harmonics(points.colors),
             "colors": torch.logit(points.colors, eps=1e-3),
         }
         if "shN" in self.parameters:
@@ -182,23 +181,15 @@ class GsplatAdapter:
                 )
         return {name: known[name] for name in self.parameters}
 
-    def _replace(self, name: str, change: Callable[[Tensor], Tensor], new_moments: Tensor | None = None) -> None:
-        """Swap one parameter in the dict and its optimizer, its moments changed alike or padded with zeros."""
-        old, optimizer = self.parameters[name], self.optimizers[name]
-        new = torch.nn.Parameter(change(old.detach()), requires_grad=old.requires_grad)
+    def _keep(self, name: str, old: Tensor, index: Tensor) -> None:
+        """The rows of `index` of one parameter, in the dict and in its optimizer, with their moments."""
+        optimizer = self.optimizers[name]
         moments = optimizer.state.pop(old, {})
         for key, value in moments.items():
-            if key == "step" or not isinstance(value, Tensor) or value.shape[:1] != old.shape[:1]:
-                continue
-            if new_moments is None:
-                moments[key] = change(value)
-            else:
-                moments[key] = torch.cat([value, torch.zeros_like(new_moments).to(value)])
-        if moments:
-            optimizer.state[new] = moments
-        for group in optimizer.param_groups:
-            group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
-        self.parameters[name] = new
+            if key != "step" and isinstance(value, Tensor) and value.shape[:1] == old.shape[:1]:
+                moments[key] = value[index]
+        kept = torch.nn.Parameter(old.detach()[index], requires_grad=old.requires_grad)
+        self.parameters[name] = replaced(optimizer, old, kept, moments)
 
     def _change_state(self, change: Callable[[Tensor], Tensor], index: Tensor) -> None:
         state = {} if self.state is None else self.state
@@ -206,25 +197,24 @@ class GsplatAdapter:
             if isinstance(value, Tensor) and key not in NO_ROWS and value.shape[:1] == (self._known,):
                 state[key] = change(value)
         self._renumber()
-        self._tell(index)
+        self._report(index)
 
     def _report_changes(self) -> None:
-        """Tell listeners what the strategy did: a row keeps its number, its copies and new rows are -1."""
+        """Report what the strategy did: a row keeps its number, its copies and new rows are -1."""
         numbers = None if self.state is None else self.state.get(ROWS)
         if numbers is None or len(numbers) != self._count:
             self._report_growth()
         elif len(numbers) != self._known or not torch.equal(numbers, self._numbers()):
             index = _first_occurrences(numbers - 1)
             self._renumber()
-            self._tell(index)
+            self._report(index)
 
     def _report_growth(self) -> None:
         """Without row numbers: growth means appended rows (gsplat's sample_add); D2Hooks notices shrinking."""
         if self._count > self._known:
-            index = self._numbers() - 1
-            index[self._known :] = -1
+            index = appended(self._known, self._count, self.parameters["means"].device)
             self._renumber()
-            self._tell(index)
+            self._report(index)
         elif self._count < self._known:
             self._renumber()
 
@@ -236,18 +226,10 @@ class GsplatAdapter:
     def _numbers(self) -> Tensor:
         return torch.arange(1, self._count + 1, device=self.parameters["means"].device)
 
-    def _tell(self, index: Tensor) -> None:
-        for listener in self._listeners:
-            listener(index)
-
 
 def gsplat_view(camera: str, frame: int, time: float, camtoworld: Tensor, K: Tensor, width: int, height: int) -> View:
     """The view of one camera of gsplat's data sets: camtoworld [4, 4] or [1, 4, 4] in OpenCV axes, K likewise."""
     return View(camera, frame, time, torch.linalg.inv(camtoworld.reshape(4, 4)), K.reshape(3, 3), width, height)
-
-
-def _appended(new: Tensor, old: Tensor) -> Tensor:
-    return torch.cat([old, new.to(old)])
 
 
 def _first_occurrences(rows: Tensor) -> Tensor:

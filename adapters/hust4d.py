@@ -17,15 +17,13 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
 from d2_plugin.gaussians.slicing import unit_quaternions
-from d2_plugin.gaussians.spherical_harmonics import channel_count
-from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
-from d2_plugin.protocol import Points, RasterSettings, Splats, View
+from d2_plugin.protocol import Points, Splats, View
 
 from .inria import InriaAdapter, RenderedCamera
 from .inverse_deformation import Inversion, invert_at_times
 from .keys import KeyOf, PriorKey, key_from_image_name
+from .shared import optional, seen_colors, splats_of
 
 STAGES = ("coarse", "fine")
 
@@ -44,7 +42,6 @@ class Hust4DAdapter(InriaAdapter):
         stage: "coarse" or "fine", the variable of that name in `scene_reconstruction`.
         active_stages: the stages in which hooks run. The coarse one fits one still scene to all instants, which the
             prior of a moving surface contradicts, so it is left alone by default.
-        settings: constants of its rasterizer, where they were changed.
         key: finds the prior of a camera; needed where the image's path does not say camera and frame.
     """
 
@@ -57,14 +54,13 @@ class Hust4DAdapter(InriaAdapter):
         stage: str,
         *,
         active_stages: tuple[str, ...] = ("fine",),
-        settings: RasterSettings | None = None,
         key: KeyOf | None = None,
     ) -> None:
-        super().__init__(gaussians, settings, key)
+        super().__init__(gaussians, key)
         self.enter_stage(stage)
         self.active_stages = active_stages
         self.inversion: Inversion | None = None
-        self._dataset = getattr(getattr(scene, "train_camera", None), "dataset", None)
+        self._dataset = optional(optional(scene, "train_camera"), "dataset")
 
     def enter_stage(self, stage: str) -> None:
         """From now on the model is drawn as in this stage."""
@@ -78,49 +74,32 @@ class Hust4DAdapter(InriaAdapter):
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable in the model's and in the field's parameters."""
-        model = self.gaussians
-        positions, log_scales, rotations, logits = model._xyz, model._scaling, model._rotation, model._opacity
-        if self.stage == "fine" and len(self):
-            positions, log_scales, rotations, logits = self._field(positions, log_scales, rotations, logits, view.time)
-        factors = rotation_matrices_3d(unit_quaternions(rotations)) * log_scales.T.exp()
-        rows = torch.arange(len(self), device=positions.device)
-        return Splats(positions, covariances_from_factors(factors), torch.sigmoid(logits.squeeze(-1)), rows)
+        xyz, log_scales, rotations, logits, _ = self._raw_at(view.time)
+        return splats_of(xyz, log_scales.exp(), unit_quaternions(rotations).T, torch.sigmoid(logits.squeeze(-1)))
 
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] from the harmonics as the field leaves them: it deforms those too, unless `no_dshs` is set."""
-        features = self._features_at(view.time) if self.stage == "fine" and len(self) else self._coefficients()
-        degree = int(getattr(self.gaussians, "active_sh_degree", 0))
-        centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
-        chosen = features[splats.rows, : channel_count(degree, 0)]
-        return harmonic_colors(chosen, splats.means - centre, None, degree, 0)
+        return seen_colors(
+            self._raw_at(view.time)[4], view, splats, int(optional(self.gaussians, "active_sh_degree", 0))
+        )
 
-    def _features_at(self, time: float) -> Tensor:
-        """Harmonics [N, C, 3] of all rows in the fine stage."""
-        model, times = self.gaussians, self.gaussians._xyz.new_full((len(self), 1), time)
-        raw = model._xyz, model._scaling, model._rotation, model._opacity
-        features: Tensor = model._deformation(*raw, self._coefficients(), times)[4]
-        return features
+    def _raw_at(self, time: float) -> tuple[Tensor, ...]:
+        """Positions, log-scales, quaternions, logits and harmonics of all rows at an instant, before activation."""
+        model = self.gaussians
+        raw = model._xyz, model._scaling, model._rotation, model._opacity, self._harmonics()
+        return self._field(raw, time) if self.stage == "fine" and len(self) else raw
 
-    def _field(
-        self, positions: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, time: float
-    ) -> tuple[Tensor, ...]:
-        """Deformed raw attributes; colours are not needed, but its forward wants some."""
-        features = positions.new_zeros(len(positions), *self._feature_shape())
-        times = positions.new_full((len(positions), 1), time)
-        return self.gaussians._deformation(positions, log_scales, rotations, logits, features, times)[:4]
-
-    def _feature_shape(self) -> tuple[int, int]:
-        constant, rest = self.gaussians._features_dc, self.gaussians._features_rest
-        return constant.shape[1] + rest.shape[1], 3
+    def _field(self, raw: tuple[Tensor, ...], time: float) -> tuple[Tensor, ...]:
+        """Raw attributes, deformed."""
+        moved: tuple[Tensor, ...] = self.gaussians._deformation(*raw, raw[0].new_full((len(raw[0]), 1), time))
+        return moved
 
     def _time(self, camera: Any) -> float:
         """In 0..1 of the clip, unlike `timestamp` elsewhere."""
         return float(camera.time)
 
     def _default_key(self, camera: Any) -> PriorKey:
-        if self._dataset is None:
-            return key_from_image_name(str(camera.image_name))
-        return key_from_image_name(str(self.image_name(camera)))
+        return key_from_image_name(str(camera.image_name if self._dataset is None else self.image_name(camera)))
 
     def image_name(self, camera: Any) -> str | None:
         """Path of the image, from the data set: the camera's object has its place there and nothing more."""
@@ -128,7 +107,7 @@ class Hust4DAdapter(InriaAdapter):
             camera = camera.camera
         if self._dataset is None or not hasattr(camera, "uid"):
             return None
-        paths, index = getattr(self._dataset, "image_paths", None), int(camera.uid)
+        paths, index = optional(self._dataset, "image_paths"), int(camera.uid)
         if paths is not None:
             return str(paths[index])
         # Data sets of Blender, COLMAP and HyperNeRF give CameraInfo instead; the last one's path is the folder alone.
@@ -150,18 +129,20 @@ class Hust4DAdapter(InriaAdapter):
         self.gaussians.densification_postfix(*self._raw_rows(points), table)
 
     def _inside(self, points: Points) -> Points:
-        corners = torch.stack([torch.as_tensor(corner).to(points.positions) for corner in self._box()])
+        box = self.gaussians._deformation.get_aabb
+        corners = torch.stack(
+            [torch.as_tensor(corner).to(points.positions) for corner in (box() if callable(box) else box)]
+        )
         low, high = corners.amin(0), corners.amax(0)
         inside = ((points.positions >= low) & (points.positions <= high)).all(-1)
         return points.select(inside)
 
-    def _box(self) -> tuple[Tensor, Tensor]:
-        box = self.gaussians._deformation.get_aabb
-        return box() if callable(box) else box
-
     def _deformed(self, positions: Tensor, time: float) -> Tensor:
-        if not len(positions):
-            return positions
-        count = len(positions)
-        blank = positions.new_zeros(count, 3), positions.new_zeros(count, 4), positions.new_zeros(count, 1)
-        return self._field(positions, *blank, time)[0]
+        """Where the field carries canonical positions."""
+        return self._field(self._blank(positions), time)[0] if len(positions) else positions
+
+    def _blank(self, positions: Tensor) -> tuple[Tensor, ...]:
+        """Raw attributes of rows of which only the positions matter; the field's forward wants them all."""
+        zeros, count = positions.new_zeros, len(positions)
+        channels = self.gaussians._features_dc.shape[1] + self.gaussians._features_rest.shape[1]
+        return positions, zeros(count, 3), zeros(count, 4), zeros(count, 1), zeros(count, channels, 3)

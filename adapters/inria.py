@@ -19,15 +19,13 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.spherical_harmonics import SH_C0, channel_count
-from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
-from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
+from d2_plugin.protocol import Points, RasterSettings, Splats, View
 from d2_plugin.rasterizer import rasterize
 
 from .cameras import inria_view
 from .keys import KeyOf, PriorKey, key_from_image_name
 from .probe import Probe, probe_package
-from .renders import Renders
+from .shared import Renders, Resizing, appended, constant_harmonics, finite, identities, optional, seen_colors
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +52,7 @@ class RenderedCamera:
     package: Mapping[str, Any]
 
 
-class InriaAdapter(ABC):
+class InriaAdapter(Resizing, ABC):
     """Base of the adapters: everything of the contract but `slice_at` and `_append`.
 
     `key` finds the prior of a camera object; by default it is read from the image's name.
@@ -67,15 +65,15 @@ class InriaAdapter(ABC):
     evidence: ClassVar[dict[str, float]] = {"xyz_gradient_accum": 0.0, "denom": 0.0, "max_radii2D": 0.0}
     """Statistics of existing Gaussians that the repository's insertion would erase, with the value for a new row."""
 
-    def __init__(self, gaussians: Any, settings: RasterSettings | None = None, key: KeyOf | None = None) -> None:
-        self.gaussians, self.settings = gaussians, settings or RasterSettings()
+    def __init__(self, gaussians: Any, key: KeyOf | None = None) -> None:
+        super().__init__()
+        self.gaussians, self.settings = gaussians, RasterSettings()
         self.probe: Probe | None = None
         self._key = key
-        self._listeners: list[ResizeListener] = []
         self._renders: Renders[Mapping[str, Any]] = Renders()
         self._step = 0
         self._overridden: dict[str, Any] = {}
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
         self._attach()
 
     def __len__(self) -> int:
@@ -102,7 +100,7 @@ class InriaAdapter(ABC):
         """Path of the image that a camera shows, where its object says it: an export's names are found by it."""
         if isinstance(camera, RenderedCamera):
             camera = camera.camera
-        path = getattr(camera, "image_path", None)
+        path = optional(camera, "image_path")
         return None if path is None else str(path)
 
     def begin_step(self, step: int) -> None:
@@ -117,23 +115,16 @@ class InriaAdapter(ABC):
 
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] of the sliced Gaussians as seen in `view`, from the spherical harmonics."""
-        return self._harmonics(view, splats)
+        return seen_colors(self._harmonics(), view, splats, int(optional(self.gaussians, "active_sh_degree", 0)))
 
-    def _coefficients(self) -> Tensor:
+    def _harmonics(self) -> Tensor:
         """Spherical harmonics [N, C, 3] of all rows."""
-        rest = getattr(self.gaussians, "_features_rest", None)
-        constant = self.gaussians._features_dc
-        return constant if rest is None else torch.cat([constant, rest], 1)
-
-    def _harmonics(self, view: View, splats: Splats, phase: Tensor | None = None, time_degree: int = 0) -> Tensor:
-        degree = int(getattr(self.gaussians, "active_sh_degree", 0))
-        coefficients = self._coefficients()[splats.rows, : channel_count(degree, time_degree)]
-        centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
-        return harmonic_colors(coefficients, splats.means - centre, phase, degree, time_degree)
+        return torch.cat([self.gaussians._features_dc, self.gaussians._features_rest], 1)
 
     def trained(self) -> dict[str, Tensor]:
         """The tensors that the trainer's optimizer changes, by the names of its groups."""
-        groups = getattr(getattr(self.gaussians, "optimizer", None), "param_groups", [])
+        optimizer = optional(self.gaussians, "optimizer")
+        groups = [] if optimizer is None else optimizer.param_groups
         named = [(group.get("name", "parameter"), group["params"]) for group in groups]
         return {
             name if len(values) == 1 else f"{name}.{i}": value
@@ -148,20 +139,15 @@ class InriaAdapter(ABC):
         Points that are not finite are dropped. The evidence that the backbone gathered for its own densification is
         put back afterwards: its `densification_postfix` zeroes it for all Gaussians.
         """
-        finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
         before = len(self)
         with self._evidence_kept():
-            self._append(points.select(finite))
+            self._append(finite(points))
         return len(self) - before
 
     @torch.no_grad()
     def remove(self, mask: Tensor) -> None:
         """Delete the rows where `mask` [N] is True, by the repository's own function."""
         self.gaussians.prune_points(mask)
-
-    def on_resize(self, listener: ResizeListener) -> None:
-        """Register a listener for every structural change, the backbone's own densification included."""
-        self._listeners.append(listener)
 
     def rendered(self, camera: Any, package: Mapping[str, Any]) -> RenderedCamera:
         """Pass this to `D2Hooks.loss` instead of the camera where the trainer's `package` may save a second render.
@@ -175,7 +161,7 @@ class InriaAdapter(ABC):
         once."""
         package = self._renders.take(view)
         if package is None:
-            self._say_once("no render of the trainer was passed along: D2 renders depth with its own rasterizer")
+            self._log_once("no render of the trainer was passed along: D2 renders depth with its own rasterizer")
             return None
         if self.probe is None or not self.probe.final:
             self.probe = self._probed(view, package)
@@ -183,9 +169,9 @@ class InriaAdapter(ABC):
             return None
         return package["depth"].reshape(view.height, view.width), package["alpha"].reshape(view.height, view.width)
 
-    def _say_once(self, sentence: str) -> None:
-        if sentence not in self._said:
-            self._said.add(sentence)
+    def _log_once(self, sentence: str) -> None:
+        if sentence not in self._logged:
+            self._logged.add(sentence)
             log.info("%s", sentence)
 
     def detach(self) -> None:
@@ -210,11 +196,11 @@ class InriaAdapter(ABC):
         return self._key(camera) if self._key is not None else self._default_key(camera)
 
     def _default_key(self, camera: Any) -> PriorKey:
-        return key_from_image_name(str(getattr(camera, "image_path", None) or camera.image_name))
+        return key_from_image_name(self.image_name(camera) or str(camera.image_name))
 
     def _attach(self) -> None:
         """Override the structural methods; stages attach again to the same instance, so the last adapter wins."""
-        earlier = getattr(self.gaussians, "d2_adapter", None)
+        earlier = optional(self.gaussians, "d2_adapter")
         if earlier is not None:
             earlier.detach()
         for name in self.appending:
@@ -225,7 +211,7 @@ class InriaAdapter(ABC):
         object.__setattr__(self.gaussians, "d2_adapter", self)
 
     def _override(self, name: str, prepare: Callable[..., Report]) -> None:
-        original = getattr(self.gaussians, name, None)
+        original = optional(self.gaussians, name)
         if original is None:
             raise D2Error(
                 f"{type(self.gaussians).__name__} has no {name}, which {type(self).__name__} needs: "
@@ -236,7 +222,7 @@ class InriaAdapter(ABC):
         def reporting(*arguments: Any, **named: Any) -> Any:
             report = prepare(*arguments, **named)
             result = original(*arguments, **named)
-            self._tell(report())
+            self._report(report())
             return result
 
         object.__setattr__(self.gaussians, name, reporting)
@@ -244,26 +230,17 @@ class InriaAdapter(ABC):
     def _before_append(self, *_: Any, **__: Any) -> Report:
         count = len(self)
 
-        def report() -> Tensor:
-            index = torch.arange(len(self), device=self.gaussians._xyz.device)
-            index[count:] = -1
-            return index
-
-        return report
+        return lambda: appended(count, len(self), self.gaussians._xyz.device)
 
     def _before_prune(self, mask: Tensor, *_: Any, **__: Any) -> Report:
         index = torch.nonzero(~mask).squeeze(-1)
         return lambda: index
 
-    def _tell(self, index: Tensor) -> None:
-        for listener in self._listeners:
-            listener(index)
-
     @contextmanager
     def _evidence_kept(self) -> Iterator[None]:
         """Lets an insertion run, then restores the accumulators of the old rows, with fresh ones for the new rows."""
-        found = {name: getattr(self.gaussians, name, None) for name in self.evidence}
-        before = {name: value for name, value in found.items() if isinstance(value, Tensor) and value.numel()}
+        known = {name: optional(self.gaussians, name) for name in self.evidence}
+        before = {name: value for name, value in known.items() if isinstance(value, Tensor) and value.numel()}
         count = len(self.gaussians._xyz)
         yield
         added = len(self.gaussians._xyz) - count
@@ -274,16 +251,14 @@ class InriaAdapter(ABC):
     def _raw_rows(self, points: Points) -> RawRows:
         """Raw rows of isotropic Gaussians in the shapes that this model has."""
         model, count = self.gaussians, len(points.positions)
-        rotation = points.positions.new_zeros(count, 4)
-        rotation[:, 0] = 1
-        rest = getattr(model, "_features_rest", None)
+        rest = optional(model, "_features_rest")
         return RawRows(
             xyz=points.positions,
-            features_dc=((points.colors - 0.5) / SH_C0)[:, None, :],
+            features_dc=constant_harmonics(points.colors),
             features_rest=points.positions.new_zeros(count, *(rest.shape[1:] if rest is not None else (0, 3))),
             opacity=torch.logit(points.opacities, eps=1e-6)[:, None],
             scaling=points.scales.log()[:, None].repeat(1, model._scaling.shape[1]),
-            rotation=rotation,
+            rotation=identities(count, points.positions),
         )
 
     def _probed(self, view: View, package: Mapping[str, Any]) -> Probe:
@@ -292,5 +267,5 @@ class InriaAdapter(ABC):
             splats = self.slice_at(view)
             own = rasterize(splats, splats.means.new_zeros(len(splats.means), 1), view, self.settings)
         probe = probe_package(package, own, (self.gaussians._xyz, self.gaussians._opacity))
-        self._say_once(probe.sentence)
+        self._log_once(probe.sentence)
         return probe

@@ -99,15 +99,37 @@ def invert_at_times(
     for time in points.times.unique().tolist():
         chosen = torch.nonzero(points.times == time).squeeze(-1)
         moved = deformed(present, time)
-        found = invert_deformation(
+        inversion = invert_deformation(
             partial(_at, deformed, time),
             points.positions[chosen],
             moved,
             moved - present,
             tolerance * points.scales[chosen],
         )
-        positions[chosen], accepted[chosen], residuals[chosen] = found
+        positions[chosen], accepted[chosen], residuals[chosen] = inversion
     return Inversion(positions, accepted, residuals)
+
+
+def invert_some(
+    points: Points, chosen: Tensor, deformed: Callable[[Tensor, float], Tensor], present: Tensor
+) -> tuple[Points, Inversion]:
+    """The points with those of a mask [K] at their canonical positions; the rest as in `invert_at_times`."""
+    inversion = invert_at_times(points.select(chosen), deformed, present)
+    positions = points.positions.clone()
+    positions[chosen] = inversion.positions
+    return points._replace(positions=positions), inversion
+
+
+def values_of_neighbours(points: Points, means_at: Callable[[float], Tensor], values: Tensor) -> Tensor:
+    """For each point the row of `values` [N, ...] of the Gaussian that is nearest at the point's own time, [K, ...].
+
+    `means_at` gives the positions [N, 3] at a time; zeros where there is no Gaussian.
+    """
+    nearest = values.new_zeros(len(points.positions), *values.shape[1:])
+    for time in points.times.unique().tolist() if len(values) else ():
+        chosen = points.times == time
+        nearest[chosen] = neighbour_offsets(points.positions[chosen], means_at(time).detach(), values)
+    return nearest
 
 
 def _at(deformed: Callable[[Tensor, float], Tensor], time: float, positions: Tensor) -> Tensor:

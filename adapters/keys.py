@@ -104,21 +104,26 @@ class KeysByPose:
     """
 
     def __init__(self, cameras: Mapping[str, Tensor], frame: Callable[[Any], int], tolerance: float = 1e-3) -> None:
-        self.names = list(cameras)
-        self.poses = torch.stack([torch.as_tensor(pose).double().cpu() for pose in cameras.values()])
+        self.names, self.poses = list(cameras), torch.stack([torch.as_tensor(pose) for pose in cameras.values()])
         self.frame, self.tolerance = frame, tolerance
 
     def __call__(self, camera: Any) -> PriorKey:
         """The key of a camera object of the Inria family."""
-        pose = camera.world_view_transform.detach().T.double().cpu()
-        distances = (self.poses - pose).abs().flatten(1).amax(1)
+        pose = camera.world_view_transform.detach().T
+        distances = _distances(self.poses, pose)
         nearest = int(distances.argmin())
-        if distances[nearest] > self.tolerance * max(1.0, float(pose.abs().max())):
+        if distances[nearest] > self.tolerance:
             raise D2Error(
                 f"camera '{getattr(camera, 'image_name', camera)}' stands at none of the known poses (the nearest, "
                 f"{self.names[nearest]}, differs by {float(distances[nearest]):.3g}): give poses in the trainer's world"
             )
         return PriorKey(self.names[nearest], self.frame(camera))
+
+
+def _distances(poses: Tensor, pose: Tensor) -> Tensor:
+    """How far poses [P, 4, 4] lie from one, in the world's unit per unit of distance, [P]."""
+    scale = max(1.0, float(pose.abs().max()))
+    return (poses.double().cpu() - pose.double().cpu()).abs().flatten(1).amax(1) / scale
 
 
 class ViewsByPose:
@@ -133,7 +138,7 @@ class ViewsByPose:
     def __init__(
         self, parser: Any, key: Callable[[str], PriorKey] = key_from_image_name, tolerance: float = 1e-4
     ) -> None:
-        self.poses = torch.as_tensor(parser.camtoworlds).double().cpu()
+        self.poses = torch.as_tensor(parser.camtoworlds)
         self.keys, self.tolerance = [key(name) for name in parser.image_names], tolerance
 
     def __call__(self, item: Any) -> View:
@@ -144,11 +149,10 @@ class ViewsByPose:
         """
         pose, K = item["camtoworld"].detach().reshape(4, 4), item["K"].detach().reshape(3, 3)
         height, width = item["image"].shape[-3:-1] if "image" in item else (item["height"], item["width"])
-        distances = (self.poses - pose.double().cpu()).abs().flatten(1).amax(1)
-        near = torch.nonzero(distances < self.tolerance * max(1.0, float(pose.abs().max()))).squeeze(-1)
+        near = torch.nonzero(_distances(self.poses, pose) < self.tolerance).squeeze(-1)
         if len(near) != 1:
             raise D2Error(
-                f"{len(near)} images have the pose of this view: gsplat's images are told by their poses, so give "
+                f"{len(near)} images have the pose of this view: gsplat's images are known by their poses, so give "
                 "it one instant of the recording (`d2 export-recording --format gsplat`), and no pose_opt or pose_noise"
             )
         key = self.keys[int(near)]

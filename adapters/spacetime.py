@@ -15,12 +15,12 @@ from typing import Any
 
 import torch
 
-from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
 from d2_plugin.gaussians.slicing import unit_quaternions
-from d2_plugin.protocol import Points, RasterSettings, Splats, View
+from d2_plugin.protocol import Points, Splats, View
 
 from .inria import InriaAdapter
 from .keys import KeyOf, PriorKey, frame_of_time
+from .shared import optional, splats_of
 
 
 class SpacetimeAdapter(InriaAdapter):
@@ -33,7 +33,6 @@ class SpacetimeAdapter(InriaAdapter):
         gaussians: the model, after `training_setup`.
         duration: number of frames, the variable of that name in train.py; timestamps are frame / duration.
         first_frame: number of the frame at time 0.
-        settings: constants of its rasterizer, where they were changed.
         key: finds the prior of a camera; needed where `image_name` is not the camera's name in the prior store.
     """
 
@@ -47,10 +46,9 @@ class SpacetimeAdapter(InriaAdapter):
         duration: int,
         *,
         first_frame: int = 0,
-        settings: RasterSettings | None = None,
         key: KeyOf | None = None,
     ) -> None:
-        super().__init__(gaussians, settings, key)
+        super().__init__(gaussians, key)
         self.duration, self.first_frame = duration, first_frame
 
     def slice_at(self, view: View) -> Splats:
@@ -63,8 +61,7 @@ class SpacetimeAdapter(InriaAdapter):
         first, second, third = model._motion[rows].split(3, 1)
         means = model._xyz[rows] + first * since + second * since**2 + third * since**3
         rotations = unit_quaternions(model._rotation[rows] + since * model._omega[rows])
-        factors = rotation_matrices_3d(rotations) * model._scaling[rows].T.exp()
-        return Splats(means, covariances_from_factors(factors), self._opacities(view.time, rows), rows)
+        return splats_of(means, model._scaling[rows].exp(), rotations.T, self._opacities(view.time, rows), rows)
 
     def colors(self, view: View, splats: Splats) -> torch.Tensor:
         """RGB [M, 3] as stored, which is the lite model's; the full model's decoder is left out."""
@@ -89,8 +86,7 @@ class SpacetimeAdapter(InriaAdapter):
         """
         model, rows, count = self.gaussians, self._raw_rows(points), len(points.positions)
         zeros = points.positions.new_zeros
-        width = getattr(model, "trbfslinit", None)
-        widths = points.positions.new_full((count, 1), 1.0 if width is None else float(width))
+        widths = points.positions.new_full((count, 1), float(optional(model, "trbfslinit", 1.0)))
         if points.lifetimes is not None:
             widths = torch.minimum(widths, (points.lifetimes * math.sqrt(2)).log()[:, None])
         model.densification_postfix(

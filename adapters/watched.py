@@ -1,4 +1,4 @@
-"""What the adapters of the bundled backbones share: they hear of one model's changes and remember its renders."""
+"""What the adapters of the bundled backbones share: they observe one model's changes and keep its renders."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from torch import Tensor
 
 from d2_plugin.backbones.model import Observer, SplatModel
 from d2_plugin.gaussians.trained import trained_tensors
-from d2_plugin.protocol import RasterSettings, Render, ResizeListener, Splats, View
+from d2_plugin.protocol import RasterSettings, Render, Splats, View
 
-from .renders import Renders
+from .shared import Renders, Resizing
 
 Model = TypeVar("Model", bound=SplatModel)
 
 
-class WatchedModel(Observer, Generic[Model]):
-    """One model and what it tells its observers: every change of its Gaussians, and every render.
+class WatchedModel(Resizing, Observer, Generic[Model]):
+    """One model, of which every change of its Gaussians and every render is observed.
 
     An adapter of a bundled backbone adds `insert`; everything else of the contract is here.
     """
 
     def __init__(self, model: Model) -> None:
+        super().__init__()
         self.model = model
-        self._listeners: list[ResizeListener] = []
         self._renders: Renders[tuple[Tensor, Tensor]] = Renders()
         model.observers.append(self)
 
@@ -60,20 +60,16 @@ class WatchedModel(Observer, Generic[Model]):
         """Delete the rows where `mask` [N] is True."""
         self.model.select(torch.nonzero(~mask).squeeze(-1))
 
-    def on_resize(self, listener: ResizeListener) -> None:
-        """Register a listener for every structural change, the backbone's own densification included."""
-        self._listeners.append(listener)
-
     def rendered_depth(self, view: View) -> tuple[Tensor, Tensor] | None:
         """Depth sum and alpha of the trainer's render of this view in the present step, or None; hands it out once."""
         return self._renders.take(view)
 
     def resized(self, index: Tensor) -> None:
         """The model's Gaussians changed, by its own densification or through this adapter."""
-        self._tell(index)
+        self._report(index)
 
     def rendered(self, view: View, render: Render) -> None:
-        """Remember a render; one without gradients only makes the earlier render of its view forgotten."""
+        """Keep a render; one without gradients only drops the earlier render of its view."""
         self._renders.take(view)
         if render.alpha.requires_grad:
             self._renders.put(view, (render.depth_sum, render.alpha))
@@ -81,7 +77,3 @@ class WatchedModel(Observer, Generic[Model]):
     def optimized(self) -> None:
         """The parameters changed: renders made with the old ones are out of date and forgotten."""
         self._renders.forget()
-
-    def _tell(self, index: Tensor) -> None:
-        for listener in self._listeners:
-            listener(index)

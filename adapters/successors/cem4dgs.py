@@ -38,8 +38,8 @@ class CEM4DGSAdapter(Ex4DGSAdapter):
     def __len__(self) -> int:
         return len(self.gaussians._xyz)
 
-    def _coefficients(self) -> Tensor:
-        return torch.cat([self.gaussians._features_dc, self.gaussians._features_rest], 1)
+    def _harmonics(self) -> Tensor:
+        return InriaAdapter._harmonics(self)
 
     @torch.no_grad()
     def remove(self, mask: Tensor) -> None:

@@ -18,34 +18,20 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.slicing import slice_gaussians
-from d2_plugin.gaussians.spherical_harmonics import SH_C0
-from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
-from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
+from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from ..keys import KeyOf, PriorKey, key_from_image_name
+from ..shared import Resizing, appended, constant_harmonics, finite, identities, optional, seen_colors, with_rows
 
 CONSTANTS = RasterSettings(alpha_max=1 - 1e-6)
 """Of its rasterizer (rasterization_config.h): alpha is not clamped; near comes from the camera."""
-
-COLUMNS = (
-    "spatial_means",
-    "temporal_means",
-    "sh_coefficients_0",
-    "sh_coefficients_rest",
-    "opacities",
-    "spatial_scales",
-    "temporal_scales",
-    "left_isoclinic_rotations",
-    "right_isoclinic_rotations",
-)
-"""Names of the optimizer's groups; the model keeps each under the same name with an underscore in front."""
 
 LEFT_SIGNS, RIGHT_SIGNS = (1.0, -1.0, 1.0, -1.0), (1.0, -1.0, 1.0, 1.0)
 """From its quaternions to Yang's. It rotates v = x + yi + zj + tk as l v r, Yang w = t + zi + yj + xk as l w conj(r).
 Reversing the order of the axes is w = j v (-i), hence l' = j l j and r' = conj(i r i) up to a common sign."""
 
 
-class FasterGS4DAdapter:
+class FasterGS4DAdapter(Resizing):
     """A `Gaussians` of FasterGS4D as a `d2_plugin.protocol.Backbone`.
 
     Rows change in two methods only: `prune`, after `adaptive_density_control` has appended, and `sort`, which orders
@@ -54,13 +40,13 @@ class FasterGS4DAdapter:
     Args:
         gaussians: `model.gaussians`, after `training_setup`.
         duration: of the clip in the unit of `view.timestamp`, which its data sets bring to 0..1.
-        settings: constants of its rasterizer, where they were changed.
         key: finds the prior of a view; needed where the image's path does not say camera and frame.
     """
 
-    def __init__(
-        self, gaussians: Any, duration: float = 1.0, *, settings: RasterSettings | None = None, key: KeyOf | None = None
-    ) -> None:
+    settings = CONSTANTS
+
+    def __init__(self, gaussians: Any, duration: float = 1.0, *, key: KeyOf | None = None) -> None:
+        super().__init__()
         missing = [name for name in ("prune", "sort", "_temporal_means") if not hasattr(gaussians, name)]
         if missing:
             raise D2Error(
@@ -68,10 +54,8 @@ class FasterGS4DAdapter:
                 "give it model.gaussians of the branch FasterGS4D"
             )
         self.gaussians, self.duration = gaussians, duration
-        self.settings = settings or CONSTANTS
         self._key = key
-        self._listeners: list[ResizeListener] = []
-        self._told = len(self)
+        self._reported = len(self)
         self._watch("prune", lambda mask: torch.nonzero(~mask).squeeze(-1))
         self._watch("sort", lambda ordering: ordering)
 
@@ -82,7 +66,7 @@ class FasterGS4DAdapter:
         """The view of NeRFICG's `View` (Datasets/utils.py), which holds camera, pose and time, or a `View` as it is."""
         if isinstance(camera, View):
             return camera
-        lens = getattr(camera, "camera", None)
+        lens = optional(camera, "camera")
         if lens is None or not hasattr(lens, "focal_x"):
             kind = type(camera).__name__
             raise D2Error(f"a camera of type {kind} has no perspective `camera`: pass the trainer's view")
@@ -112,10 +96,8 @@ class FasterGS4DAdapter:
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] from the spherical harmonics in use."""
         model = self.gaussians
-        coefficients = torch.cat([model._sh_coefficients_0, model._sh_coefficients_rest], 1)[splats.rows]
-        centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
-        degree = int(model.active_sh_degree)
-        return harmonic_colors(coefficients[:, : (degree + 1) ** 2], splats.means - centre, None, degree, 0)
+        harmonics = torch.cat([model._sh_coefficients_0, model._sh_coefficients_rest], 1)
+        return seen_colors(harmonics, view, splats, int(model.active_sh_degree))
 
     @torch.no_grad()
     def insert(self, points: Points) -> int:
@@ -125,16 +107,15 @@ class FasterGS4DAdapter:
         of the duration, or with their lifetime where that is shorter. `_densification_info` is kept, with zeros for the
         new rows.
         """
-        finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
-        rows, before = self._rows(points.select(finite)), len(self)
-        for group in self.gaussians.optimizer.param_groups:
-            self._extend(group, rows[group["name"]])
-        evidence, added = self.gaussians._densification_info, int(finite.sum())
+        points, model, before = finite(points), self.gaussians, len(self)
+        rows, added = self._rows(points), len(points.positions)
+        for group in model.optimizer.param_groups:
+            name = group["name"]
+            setattr(model, f"_{name}", with_rows(model.optimizer, group["params"][0], rows[name]))
+        evidence = model._densification_info
         if evidence is not None:
-            self.gaussians._densification_info = torch.cat([evidence, evidence.new_zeros(len(evidence), added)], 1)
-        index = torch.arange(len(self), device=points.positions.device)
-        index[before:] = -1
-        self._tell(index)
+            model._densification_info = torch.cat([evidence, evidence.new_zeros(len(evidence), added)], 1)
+        self._report(appended(before, len(self), points.positions.device))
         return added
 
     @torch.no_grad()
@@ -142,41 +123,22 @@ class FasterGS4DAdapter:
         """Delete the rows where `mask` [N] is True, by the repository's own function."""
         self.gaussians.prune(mask)
 
-    def on_resize(self, listener: ResizeListener) -> None:
-        """Register a listener for every structural change, the backbone's own densification included."""
-        self._listeners.append(listener)
-
     def _rows(self, points: Points) -> dict[str, Tensor]:
         model, count = self.gaussians, len(points.positions)
-        identity = points.positions.new_zeros(count, 4)
-        identity[:, 0] = 1
         extents = points.times.new_full((count, 1), 0.5 * math.log(self.duration / 5))
         if points.lifetimes is not None:
             extents = torch.minimum(extents, points.lifetimes.log()[:, None])
         return {
             "spatial_means": points.positions,
             "temporal_means": points.times[:, None],
-            "sh_coefficients_0": ((points.colors - 0.5) / SH_C0)[:, None, :],
+            "sh_coefficients_0": constant_harmonics(points.colors),
             "sh_coefficients_rest": points.positions.new_zeros(count, *model._sh_coefficients_rest.shape[1:]),
             "opacities": torch.logit(points.opacities, eps=1e-6)[:, None],
             "spatial_scales": points.scales.log()[:, None].repeat(1, 3),
             "temporal_scales": extents,
-            "left_isoclinic_rotations": identity,
-            "right_isoclinic_rotations": identity.clone(),
+            "left_isoclinic_rotations": identities(count, points.positions),
+            "right_isoclinic_rotations": identities(count, points.positions),
         }
-
-    def _extend(self, group: dict[str, Any], rows: Tensor) -> None:
-        """New rows at the end of one column, with moments of zero."""
-        optimizer, old = self.gaussians.optimizer, group["params"][0]
-        new = torch.nn.Parameter(torch.cat([old.detach(), rows.to(old)]))
-        moments = optimizer.state.pop(old, {})
-        for name in ("exp_avg", "exp_avg_sq"):
-            if name in moments:
-                moments[name] = torch.cat([moments[name], torch.zeros_like(rows)])
-        if moments:
-            optimizer.state[new] = moments
-        group["params"][0] = new
-        setattr(self.gaussians, f"_{group['name']}", new)
 
     def _watch(self, name: str, kept: Callable[[Tensor], Tensor]) -> None:
         """Override a method on the instance: `kept` gives the rows that its argument keeps, in their new order."""
@@ -184,21 +146,20 @@ class FasterGS4DAdapter:
 
         def reporting(argument: Tensor) -> None:
             rows = kept(argument)
-            index = torch.where(rows < self._told, rows, -1)  # beyond: appended just now, and not yet reported
+            index = torch.where(rows < self._reported, rows, -1)  # beyond: appended since the last report
             original(argument)
-            self._tell(index)
+            self._report(index)
 
         object.__setattr__(self.gaussians, name, reporting)
 
-    def _tell(self, index: Tensor) -> None:
-        self._told = len(self)
-        for listener in self._listeners:
-            listener(index)
+    def _report(self, index: Tensor) -> None:
+        self._reported = len(self)
+        super()._report(index)
 
 
 def _key_of_image(view: Any) -> PriorKey:
     """Its data sets number frames through all cameras; only the path of the image says which is which."""
-    image = getattr(view, "_rgb", None)
+    image = optional(view, "_rgb")
     if image is None:
         raise D2Error("a view without an image does not say its camera: give the adapter a function `key`")
     return key_from_image_name(str(image.path))

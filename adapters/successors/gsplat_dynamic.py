@@ -17,13 +17,13 @@ import torch
 from torch import Tensor, nn
 
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
 from d2_plugin.gaussians.slicing import unit_quaternions
-from d2_plugin.protocol import Points, RasterSettings, Splats, View
+from d2_plugin.protocol import Points, Splats, View
 
 from ..gsplat_dict import GsplatAdapter, gsplat_view
-from ..inverse_deformation import Inversion, invert_at_times, neighbour_offsets
+from ..inverse_deformation import Inversion, invert_some, values_of_neighbours
 from ..keys import frame_of_time
+from ..shared import finite, splats_of
 
 MASK = "dynamic_mask"
 """Which Gaussians the network deforms, bool [N], in the strategy's state."""
@@ -45,7 +45,6 @@ class GsplatDynamicAdapter(GsplatAdapter):
         frames: how many of them make one unit of time, for cameras that are the data set's items.
         camera: name in the prior store of the camera that took them.
         view: from another camera object to a `View`.
-        settings: constants of the rasterizer; by default gsplat's.
     """
 
     def __init__(
@@ -59,21 +58,19 @@ class GsplatDynamicAdapter(GsplatAdapter):
         frames: int | None = None,
         camera: str = "cam00",
         view: Callable[[object], View] | None = None,
-        settings: RasterSettings | None = None,
     ) -> None:
         if MASK not in state:
             raise D2Error(f"the strategy's state has no '{MASK}': attach after DynamicStrategy.initialize_state")
         self.hexplane, self.deform_net = hexplane, deform_net
         self.frames, self.camera = frames, camera
         self.inversion: Inversion | None = None
-        super().__init__(parameters, optimizers, state, view=view or self._view_of_item, settings=settings)
+        super().__init__(parameters, optimizers, state, view=view or self._view_of_item)
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable in the parameters, the planes and the network."""
         means, quats, logits = self._deformed(view.time)
-        factors = rotation_matrices_3d(unit_quaternions(quats)) * self.parameters["scales"].T.exp()
-        rows = torch.arange(len(means), device=means.device)
-        return Splats(means, covariances_from_factors(factors), torch.sigmoid(logits.squeeze(-1)), rows)
+        scales, rotations = self.parameters["scales"].exp(), unit_quaternions(quats).T
+        return splats_of(means, scales, rotations, torch.sigmoid(logits.squeeze(-1)))
 
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] as stored."""
@@ -82,15 +79,10 @@ class GsplatDynamicAdapter(GsplatAdapter):
     @torch.no_grad()
     def insert(self, points: Points) -> int:
         """See `GsplatAdapter.insert`; the new rows are marked as their neighbours are."""
-        finite = torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0)
-        points = points.select(finite)
-        moving = self._neighbours_move(points)
+        points = finite(points)
+        moving = values_of_neighbours(points, lambda time: self._deformed(time)[0], self._state[MASK])
         if bool(moving.any()):
-            chosen = points.select(moving)
-            self.inversion = invert_at_times(chosen, self._as_new, self.parameters["means"].detach())
-            positions = points.positions.clone()
-            positions[moving] = self.inversion.positions
-            points = points._replace(positions=positions)
+            points, self.inversion = invert_some(points, moving, self._as_new, self.parameters["means"].detach())
         added = super().insert(points)
         self._state[MASK][len(self) - added :] = moving
         return added
@@ -128,16 +120,6 @@ class GsplatDynamicAdapter(GsplatAdapter):
             return positions
         count, zeros = len(positions), positions.new_zeros
         return self._moved(positions, zeros(count, 4), zeros(count, 1), time)[0]
-
-    def _neighbours_move(self, points: Points) -> Tensor:
-        """Whether the present Gaussian nearest to each point, at the point's own time, is deformed; bool [K]."""
-        found = torch.zeros(len(points.positions), dtype=torch.bool, device=points.positions.device)
-        marks = self._state[MASK][:, None]
-        for time in points.times.unique().tolist() if len(marks) else ():
-            chosen = points.times == time
-            means = self._deformed(time)[0].detach()
-            found[chosen] = neighbour_offsets(points.positions[chosen], means, marks).squeeze(-1)
-        return found
 
     def _view_of_item(self, item: object) -> View:
         """An item of its data set: camtoworld, K, time and the image of one frame."""

@@ -14,7 +14,7 @@ from d2_plugin.protocol import Points
 
 from ..hust4d import Hust4DAdapter
 from ..inria import InriaAdapter
-from ..inverse_deformation import invert_at_times, neighbour_offsets
+from ..inverse_deformation import invert_some, values_of_neighbours
 
 FULL_WEIGHT = 1.0
 """Largest compositing weight noted for a new row: `weight_prune` takes rows of low weight, also those never drawn."""
@@ -33,73 +33,32 @@ class Swift4DAdapter(Hust4DAdapter):
 
     evidence = InriaAdapter.evidence
 
-    def _field(
-        self, positions: Tensor, log_scales: Tensor, rotations: Tensor, logits: Tensor, time: float
-    ) -> tuple[Tensor, ...]:
+    def _field(self, raw: tuple[Tensor, ...], time: float) -> tuple[Tensor, ...]:
         """Raw attributes of all rows at an instant; rows that do not move pass as they are."""
-        raw = positions, log_scales, rotations, logits
         moving = torch.nonzero(self._moves(self.gaussians._dynamic)).squeeze(-1)
         if not len(moving):
             return raw
-        moved = self._moved(*(part[moving] for part in raw), time=time)
+        moved = self._hashed(tuple(part[moving] for part in raw), time)
         return tuple(part.index_copy(0, moving, now) for part, now in zip(raw, moved))
 
-    def _features_at(self, time: float) -> Tensor:
-        """Harmonics [N, C, 3] of all rows in the fine stage; rows that do not move keep theirs."""
-        model, features = self.gaussians, self._coefficients()
-        moving = torch.nonzero(self._moves(model._dynamic)).squeeze(-1)
-        if not len(moving):
-            return features
-        raw = model._xyz, model._scaling, model._rotation, model._opacity, features
-        times = model._xyz.new_full((len(moving), 1), time)
-        now = model._FDhash(*(part[moving] for part in raw), times)[4]
-        return features.index_copy(0, moving, now.to(features))
-
-    def _moved(self, *raw: Tensor, time: float) -> list[Tensor]:
+    def _hashed(self, raw: tuple[Tensor, ...], time: float) -> list[Tensor]:
         """What the hash grid makes of raw attributes; tiny-cuda-nn computes in half precision, the model does not."""
-        positions = raw[0]
-        times = positions.new_full((len(positions), 1), time)
-        features = positions.new_zeros(len(positions), *self._feature_shape())
-        fields = self.gaussians._FDhash(*raw, features, times)  # in the order positions, scales, rotations, opacities
-        return [now.to(part) for part, now in zip(raw, fields)]
+        times = raw[0].new_full((len(raw[0]), 1), time)
+        return [now.to(part) for part, now in zip(raw, self.gaussians._FDhash(*raw, times))]
 
     def _moves(self, logits: Tensor) -> Tensor:
         return (logits > self.gaussians.dynamic_thro).squeeze(-1)
 
     def _append(self, points: Points) -> None:
         """Through its own function, which wants the logit and the largest weight of each new row as well."""
-        logits = self._neighbours_logits(points)
-        if self.stage == "fine" and bool(self._moves(logits).any()):
-            points = self._canonical(points, self._moves(logits))
+        model = self.gaussians
+        logits = values_of_neighbours(points, lambda time: self._raw_at(time)[0], model._dynamic.detach())
+        moving = self._moves(logits)
+        if self.stage == "fine" and bool(moving.any()):
+            points, self.inversion = invert_some(points, moving, self._deformed, model._xyz.detach())
         weights = points.scales.new_full((len(points.positions),), FULL_WEIGHT)
-        self.gaussians.densification_postfix(logits, *self._raw_rows(points), weights)
-
-    def _neighbours_logits(self, points: Points) -> Tensor:
-        """[K, 1], of the present Gaussian nearest to each point at the point's own time."""
-        model, found = self.gaussians, self.gaussians._dynamic.new_zeros(len(points.positions), 1)
-        if not len(self):
-            return found
-        for time in points.times.unique().tolist():
-            chosen = points.times == time
-            means = self._deformed(model._xyz, time) if self.stage == "fine" else model._xyz
-            found[chosen] = neighbour_offsets(points.positions[chosen], means.detach(), model._dynamic.detach())
-        return found
-
-    def _canonical(self, points: Points, moving: Tensor) -> Points:
-        """Points on what moves at the places that the field carries onto them; a place outside of its box stays."""
-        chosen = points.select(moving)
-        self.inversion = invert_at_times(chosen, self._as_new, self.gaussians._xyz.detach())
-        positions = points.positions.clone()
-        positions[moving] = self.inversion.positions
-        return points._replace(positions=positions)
+        model.densification_postfix(logits, *self._raw_rows(points), weights)
 
     def _deformed(self, positions: Tensor, time: float) -> Tensor:
-        """Where the rows of the model are at an instant."""
-        model = self.gaussians
-        return self._field(positions, model._scaling, model._rotation, model._opacity, time)[0]
-
-    def _as_new(self, positions: Tensor, time: float) -> Tensor:
         """Where rows at these positions would be if all of them moved."""
-        zeros = positions.new_zeros
-        count = len(positions)
-        return self._moved(positions, zeros(count, 3), zeros(count, 4), zeros(count, 1), time=time)[0]
+        return self._hashed(self._blank(positions), time)[0] if len(positions) else positions

@@ -28,32 +28,26 @@ from d2_plugin.reading import json_text
 
 def main(words: list[str]) -> int:
     """Run the trainer; the exit code of the launcher."""
-    from d2_plugin.attach.launch import SESSIONS, parsed, prepare
-    from d2_plugin.attach.recipes import Objects
+    from d2_plugin.attach.launch import parsed, prepare
     from d2_plugin.errors import D2Error
 
     logging.basicConfig(level=logging.INFO, format="d2: %(message)s")
     at = words.index("--")
     outcome_file, seed, *held_out = words[:at]
     options, command = parsed(words[at + 1 :])
-    objects = Objects()
     move_seeds(int(seed))
     try:
-        found = prepare(options, command)
-        kind = SESSIONS[found.kind]
-        kind.remember(found, objects)
-        session = None if options.d2 is None else kind(found, options.d2, exported=options.exported)
-        if session is not None:
-            session.wrap()
+        session = prepare(options, command)
         start = time.process_time()
         runpy.run_path(command[0], run_name="__main__")
         seconds = time.process_time() - start
     except D2Error as error:
         sys.stderr.write(f"d2: {error}\n")
         return 2
+    objects = session.objects
     trained = [objects.model] if objects.deform is None else [objects.model, objects.deform]
     outcome = {"gaussians": count(objects.model), "digest": digest(trained), "cpu_seconds": round(seconds, 1)}
-    if session is not None and session.hooks is not None:
+    if session.hooks is not None:
         session.end()
         telling = session.hooks.telling
         outcome |= {"inserted": telling.inserted, "removed": telling.removed}

@@ -1,4 +1,4 @@
-"""Trainers that say device="cuda" and .cuda() everywhere, on a machine without a GPU: cuda means cpu from then on."""
+"""Trainers that say device="cuda" and .cuda() everywhere, run on the CPU: cuda means cpu from then on."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class _Event:
 
 def run_on_cpu() -> None:
     """Make `cuda` mean `cpu` in this process, from here on; cannot be undone."""
-    log.warning("there is no GPU: in this process device 'cuda' means 'cpu', and times of CUDA events are 0")
+    log.warning("in this process device 'cuda' means 'cpu', and times of CUDA events are 0")
     torch.Tensor.cuda = lambda self, *_, **__: self  # type: ignore[method-assign]
     torch.nn.Module.cuda = lambda self, *_, **__: self  # type: ignore[method-assign]
     torch.cuda.Event = _Event  # type: ignore[misc, assignment]
@@ -50,6 +50,8 @@ def run_on_cpu() -> None:
     for name in _TYPES:
         setattr(torch.cuda, name, getattr(torch, name))
     torch.cuda.current_device = lambda: 0
+    torch.cuda.device_count = lambda: 0
+    torch.cuda.is_available = lambda: False
     CudaMeansCpu().__enter__()
 
 

@@ -16,12 +16,9 @@ from functools import wraps
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
-from d2_plugin.attach.recipes import Objects, Recipe, adapter_of
-from d2_plugin.attach.session import AddGradient, Session, keep_instances, remember
+from d2_plugin.attach.session import AddGradient, Session
 from d2_plugin.errors import D2Error
-from d2_plugin.plugin import D2Hooks
 
 log = logging.getLogger(__name__)
 
@@ -73,96 +70,65 @@ def _is_stand_in(package: str) -> bool:
     return spec is not None and spec.origin is None and not spec.submodule_search_locations
 
 
-def remember_gsplat(recipe: Recipe, objects: Objects) -> None:
-    """As `session.remember`: the parser of the data, the parameters, and the settings of the script."""
-    remember(recipe, objects)
-    if importlib.util.find_spec("gsplat.scene") is not None:  # since 1.6
-        keep_instances(importlib.import_module("gsplat.scene").GaussianScene, "gaussians", objects)
-    strategies = importlib.import_module("gsplat.strategy")
-    for name in STRATEGIES:
-        kind = getattr(strategies, name)
-        kind.check_sanity = _keeping_model(kind.check_sanity, objects)
-    distributed: Any = importlib.import_module("gsplat.distributed")
-    distributed.cli = _keeping_settings(distributed.cli, objects)
-
-
-def _keeping_model(check_sanity: Callable[..., Any], objects: Objects) -> Callable[..., Any]:
-    @wraps(check_sanity)
-    def keeping(strategy: Any, params: Any, optimizers: Any, *arguments: Any, **named: Any) -> Any:
-        objects.model = Model(params, optimizers)
-        return check_sanity(strategy, params, optimizers, *arguments, **named)
-
-    return keeping
-
-
-def _keeping_settings(cli: Callable[..., Any], objects: Objects) -> Callable[..., Any]:
-    @wraps(cli)
-    def keeping(main: Callable[..., Any], settings: Any, *arguments: Any, **named: Any) -> Any:
-        objects.options = settings
-        return cli(main, settings, *arguments, **named)
-
-    return keeping
-
-
 class GsplatSession(Session):
     """One run of simple_trainer.py with D2 attached; steps are counted from 1."""
 
-    remember = staticmethod(remember_gsplat)
-
     def wrap(self) -> None:
         """Override the choke points; call before the script runs."""
-        self.remember(self.recipe, self.objects)
-        strategies = importlib.import_module("gsplat.strategy")
+        super().wrap()
+        if importlib.util.find_spec("gsplat.scene") is not None:  # since 1.6
+            self.keep_instances(importlib.import_module("gsplat.scene").GaussianScene, "gaussians")
+        strategies, distributed = (importlib.import_module(f"gsplat.{name}") for name in ("strategy", "distributed"))
+        wrap_attribute(distributed, "cli", self._keeping_settings)
         for name in STRATEGIES:
             kind = getattr(strategies, name)
-            kind.initialize_state = self._attaching_to(kind.initialize_state)
-            kind.step_post_backward = self._stepping(kind.step_post_backward)
-        for module, attribute in PLACES:
-            found = importlib.import_module(module)
-            setattr(found, attribute, self._drawing(getattr(found, attribute)))
+            wrap_attribute(kind, "check_sanity", self._keeping_model)
+            wrap_attribute(kind, "initialize_state", self._attaching_to)
+            wrap_attribute(kind, "step_post_backward", self._stepping)
+        for module, attribute in PLACES if self.config is not None else ():
+            wrap_attribute(importlib.import_module(module), attribute, self._drawing)
 
     def _source(self) -> str | None:
         """What the script's parser reads."""
         return getattr(self.objects.scene, "data_dir", None)
 
-    def _attaching_to(self, initialize_state: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(initialize_state)
-        def attaching(*arguments: Any, **named: Any) -> Any:
-            state = self.objects.state = initialize_state(*arguments, **named)
-            backbone = self.recipe.build(adapter_of(self.recipe), self.objects)
-            iterations = getattr(self.objects.options, "max_steps", None)
-            self.hooks = D2Hooks(self._configured(iterations), backbone, self.store)
-            self._iteration, self._told, self._drawn, self._batch = 0, False, 0, 1
-            self.hooks.tell(iterations, writer=self.writer)
-            return state
+    def _keeping_settings(self, cli: Callable[..., Any], main: Any, settings: Any, *more: Any, **named: Any) -> Any:
+        self.objects.options = settings
+        return cli(main, settings, *more, **named)
 
-        return attaching
+    def _keeping_model(
+        self, check_sanity: Callable[..., Any], strategy: Any, params: Any, optimizers: Any, *more: Any, **named: Any
+    ) -> Any:
+        self.objects.model = Model(params, optimizers)
+        return check_sanity(strategy, params, optimizers, *more, **named)
 
-    def _stepping(self, step_post_backward: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(step_post_backward)
-        def stepping(*arguments: Any, **named: Any) -> Any:
-            result = step_post_backward(*arguments, **named)
-            self._after_step()
-            return result
+    def _attaching_to(self, initialize_state: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        state = self.objects.state = initialize_state(*arguments, **named)
+        if self.config is not None:
+            self.attach(getattr(self.objects.options, "max_steps", None))
+        return state
 
-        return stepping
+    def _stepping(self, step_post_backward: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        result = step_post_backward(*arguments, **named)
+        self._after_step()
+        return result
 
-    def _drawing(self, rasterization: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(rasterization)
-        def drawing(*arguments: Any, **named: Any) -> Any:
-            drawn = rasterization(*arguments, **named)
-            if self.hooks is None or not (torch.is_grad_enabled() and drawn[0].requires_grad):
-                return drawn
-            size = {"width": named["width"], "height": named["height"]}
-            poses = torch.linalg.inv(named["viewmats"].detach())
-            seen = [{"camtoworld": pose, "K": K, **size} for pose, K in zip(poses, named["Ks"])]
-            return self._with_term(self.hooks, seen, drawn)
+    def _drawing(self, rasterization: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        drawn = rasterization(*arguments, **named)
+        if self.hooks is None or not (torch.is_grad_enabled() and drawn[0].requires_grad):
+            return drawn
+        size = {"width": named["width"], "height": named["height"]}
+        poses = torch.linalg.inv(named["viewmats"].detach())
+        term = self._term(self.hooks, [{"camtoworld": pose, "K": K, **size} for pose, K in zip(poses, named["Ks"])])
+        return drawn if term is None else (AddGradient.apply(drawn[0], term, 1.0), *drawn[1:])
 
-        return drawing
 
-    def _with_term(self, hooks: D2Hooks, seen: list[dict[str, Any]], drawn: Any) -> Any:
-        self._iteration, self._told = self._iteration + (not self._told), True
-        term = hooks.loss(self._iteration, seen)
-        if isinstance(term, Tensor) and term.requires_grad:
-            return (AddGradient.apply(drawn[0], term, 1.0), *drawn[1:])
-        return drawn
+def wrap_attribute(owner: Any, name: str, around: Callable[..., Any]) -> None:
+    """Replace a function of a module or a class by `around`, which gets the original before the arguments."""
+    original = getattr(owner, name)
+
+    @wraps(original)
+    def wrapped(*arguments: Any, **named: Any) -> Any:
+        return around(original, *arguments, **named)
+
+    setattr(owner, name, wrapped)

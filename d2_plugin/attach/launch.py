@@ -14,77 +14,52 @@ from typing import NoReturn
 import torch
 
 from d2_plugin.attach.cpu import run_on_cpu
-from d2_plugin.attach.gsplat import GsplatSession, put_in_place
-from d2_plugin.attach.originals import provide
-from d2_plugin.attach.packages import stand_in_for
-from d2_plugin.attach.recipes import RECIPES, Recipe, recipe
+from d2_plugin.attach.packages import provide, stand_in_for
+from d2_plugin.attach.recipes import RECIPES, recipe
 from d2_plugin.attach.repairs import repair
-from d2_plugin.attach.session import Session, found_in
+from d2_plugin.attach.session import Session
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
-
-SESSIONS: dict[str, type[Session]] = {"trainer": Session, "gsplat": GsplatSession}
-"""By the kind of a recipe, what follows its run."""
-
-log = logging.getLogger(__name__)
 
 
 def main(arguments: Sequence[str]) -> int:
     """Run a script with D2 attached; a mistake in the input is one sentence on stderr and exit code 2."""
     logging.basicConfig(level=logging.INFO, format="d2: %(message)s")
     try:
-        session = launch(*parsed(arguments))
+        options, command = parsed(arguments)
+        session = prepare(options, command)
+        runpy.run_path(command[0], run_name="__main__")
     except D2Error as error:
         sys.stderr.write(f"d2: {error}\n")
         return 2
-    if session is not None:
-        session.end()
+    session.end()
     return 0
 
 
-def launch(options: argparse.Namespace, command: Sequence[str]) -> Session | None:
-    """Prepare the process for the repository and run `command`, its script and arguments, inside it."""
-    found = prepare(options, command)
-    session = None
-    if options.d2 is not None:
-        session = SESSIONS[found.kind](found, options.d2, exported=options.exported)
-        session.wrap()
-    runpy.run_path(command[0], run_name="__main__")
-    return session
-
-
-def prepare(options: argparse.Namespace, command: Sequence[str]) -> Recipe:
-    """All that has to be done before the script runs, but D2 itself: paths, stand-ins, repairs; returns the recipe."""
+def prepare(options: argparse.Namespace, command: Sequence[str]) -> Session:
+    """All that has to be done before the script `command[0]` runs: paths, stand-ins, repairs, and D2 around it."""
     script = Path(command[0])
     if not script.is_file():
         raise D2Error(f"no script at {script}: give the repository's train.py and its arguments after --")
-    _check_device(options.cpu)
+    if not options.cpu and not torch.cuda.is_available():
+        raise D2Error("this trainer needs a GPU and torch finds none: add --cpu to try it on the CPU, which is slow")
     if options.d2 is not None:
-        D2Config.from_toml(options.d2)  # a mistake is told now, not when the trainer has read its images
+        D2Config.from_toml(options.d2)  # a mistake stops here, not when the trainer has read its images
     sys.argv = list(command)
-    found = recipe(options.repository)
+    repository = recipe(options.repository)
     folder = script.resolve().parent
-    sys.path[:0] = [str(folder), *(str(folder / name) for name in found.folders)]
+    sys.path[:0] = [str(folder), *(str(folder / name) for name in repository.folders)]
     repair()
-    stand_in_for(script.resolve(), {original.name for original in found.originals})
-    provide(found.originals, script.parent, options.cpu)
+    stand_in_for(script.resolve(), {original.name for original in repository.originals})
+    provide(repository.originals, script.parent, options.cpu, options.stand_ins)
     if options.cpu:
         run_on_cpu()
-    if found.kind == "gsplat":
-        put_in_place()
-    if found.mend is not None:
-        for place in found.models:
-            found.mend(found_in(*place))
+    if repository.prepare is not None:
+        repository.prepare()
     os.execv = _refuse_restart  # type: ignore[assignment]
-    return found
-
-
-def _check_device(cpu: bool) -> None:
-    if torch.cuda.is_available() == (not cpu):
-        return
-    if cpu:
-        raise D2Error("--cpu is for machines without a GPU, and this one has one: leave it out")
-    raise D2Error("this trainer needs a GPU and torch finds none: add --cpu to try it on the CPU, which is slow")
+    session = (repository.session or Session)(repository, options.d2, exported=options.exported)
+    session.wrap()
+    return session
 
 
 def _refuse_restart(path: str, arguments: Sequence[str]) -> NoReturn:
@@ -108,12 +83,15 @@ def parsed(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m d2_plugin.attach",
-        usage="%(prog)s REPOSITORY [--d2 FILE] [--exported DIR] [--cpu] -- train.py ARGUMENTS...",
+        usage="%(prog)s REPOSITORY [--d2 FILE] [--exported DIR] [--cpu | --stand-ins] -- train.py ARGUMENTS...",
         description="Run another repository's train.py with D2 attached, no line of it edited.",
     )
     parser.add_argument("repository", choices=sorted(RECIPES), help="which codebase the script belongs to")
     parser.add_argument("--d2", type=Path, default=None, help="configuration of D2; without it the bare trainer runs")
     exported = "folder that d2 export-recording wrote, if the prior was built from its source"
     parser.add_argument("--exported", type=Path, default=None, help=exported)
-    parser.add_argument("--cpu", action="store_true", help="no GPU: cuda means cpu, D2's modules replace CUDA builds")
+    device = parser.add_mutually_exclusive_group()
+    device.add_argument("--cpu", action="store_true", help="cuda means cpu, and D2's modules replace CUDA builds")
+    broken = "on a GPU, too, D2's modules replace CUDA builds that cannot be loaded"
+    device.add_argument("--stand-ins", action="store_true", help=broken)
     return parser

@@ -1,7 +1,7 @@
-"""Packages that a repository imports and this environment lacks: what can stand in for them, and how to get the rest.
+"""What a repository imports and this environment lacks: packages, and modules that the repository builds in CUDA.
 
 What a script needs is read from its own files (`needed`), so that it holds for any snapshot of a repository. Nothing is
-installed: stand-ins live in the memory of the process.
+installed: stand-ins live in the memory of the process. `d2 doctor --attach` prints the report `needs`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from d2_plugin.attach.session import Original, Recipe
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import read_bytes, said
 
@@ -33,8 +36,9 @@ class StandIn:
     why: str
 
 
-VISION = "d2_plugin.compat.vision"
-KINEMATIC = "d2_plugin.compat.kinematic"
+COMPAT = "d2_plugin.compat"
+WIDTH = 48
+"""Of the column of names in the report."""
 
 SCRIPT = "give the trainer's repository or its script"
 MOST_SCRIPT = 1 << 24
@@ -43,27 +47,27 @@ MOST_SCRIPT = 1 << 24
 STAND_INS = {
     "torchvision": StandIn(
         {
-            "torchvision.utils.make_grid": f"{VISION}:make_grid",
-            "torchvision.utils.save_image": f"{VISION}:save_image",
-            "torchvision.transforms.ToTensor": f"{VISION}:ToTensor",
-            "torchvision.transforms.ToPILImage": f"{VISION}:ToPILImage",
-            "torchvision.transforms.functional.resize": f"{VISION}:resize",
+            "torchvision.utils.make_grid": f"{COMPAT}.vision:make_grid",
+            "torchvision.utils.save_image": f"{COMPAT}.vision:save_image",
+            "torchvision.transforms.ToTensor": f"{COMPAT}.vision:ToTensor",
+            "torchvision.transforms.ToPILImage": f"{COMPAT}.vision:ToPILImage",
+            "torchvision.transforms.functional.resize": f"{COMPAT}.vision:resize",
         },
         "its wheel must match the build of torch",
     ),
     "mmcv": StandIn(
-        {"mmcv.Config": "d2_plugin.compat.python_config:Config", "mmcv.ops.knn": "d2_plugin.compat.knn:knn"},
+        {"mmcv.Config": f"{COMPAT}.python_config:Config", "mmcv.ops.knn": f"{COMPAT}.nearest:knn"},
         "the version that has Config (below 2) builds on few machines",
     ),
     "pytorch3d": StandIn(
         {
-            f"pytorch3d.transforms.{name}": f"{KINEMATIC}:{name}"
+            f"pytorch3d.transforms.{name}": f"{COMPAT}.kinematic:{name}"
             for name in ("quaternion_apply", "quaternion_invert", "quaternion_multiply")
         },
         "it is built for one torch and one CUDA, and the trainer calls three functions of it",
     ),
     "faiss": StandIn(
-        {f"faiss.{name}": f"{KINEMATIC}:{name}" for name in ("StandardGpuResources", "GpuIndexFlatL2")},
+        {f"faiss.{name}": f"{COMPAT}.nearest:{name}" for name in ("StandardGpuResources", "GpuIndexFlatL2")},
         "the build for GPUs is not on the package index, and the trainer asks for one nearest neighbour",
     ),
     "open3d": StandIn({}, "the trainer imports it and calls nothing of it"),
@@ -86,13 +90,117 @@ def _standard_library() -> frozenset[str]:
     return getattr(sys, "stdlib_module_names", frozenset())
 
 
+def needs(recipe: Recipe, path: Path) -> str:
+    """One line for each package that is missing or stood in for, and one that says whether the launcher can run.
+
+    `path` is the repository's folder, or its script.
+    """
+    script = path if path.is_file() else path / recipe.script
+    if not script.is_file():
+        raise D2Error(f"no {recipe.script} in {path}: give the folder of the repository, or its script")
+    beside = [script.parent / name for name in recipe.folders]  # gsplat's examples import gsplat, one folder up
+    absent = missing(script, {original.name for original in recipe.originals})
+    absent = {name: where for name, where in absent.items() if not any((folder / name).is_dir() for folder in beside)}
+    certain = needed(script, conditional=False)
+    to_install = [name for name in absent if name not in STAND_INS and name in certain]
+    lines = [f"{script} imports {len(needed(script))} packages at once"]
+    for name, where in absent.items():
+        if name in STAND_INS:
+            way = f"the launcher stands in for it; {STAND_INS[name].why}"
+        else:
+            way = f"run `{pip_command([name])}`" if name in to_install else "some options alone import it"
+        lines.append(f"{name:{WIDTH}}missing ({where}): {way}")
+    lines += [_built(original, script.parent) for original in recipe.originals]
+    if not torch.cuda.is_available():
+        lines.append(f"{'GPU':{WIDTH}}none: give the launcher --cpu, which is slow")
+    verdict = f"install what is missing: `{pip_command(to_install)}`" if to_install else "the launcher can run it"
+    return "\n".join([*lines, verdict])
+
+
+def _built(original: Original, folder: Path) -> str:
+    """Whether a module that the repository builds in CUDA is there; it is not loaded."""
+    if original.file is not None:
+        there = (folder / original.file).is_file()
+        state = "built at its first import, with a GPU" if there else f"no {original.file}"
+    else:
+        there = _is_there(original.name.split(".")[0])
+        state = "installed" if there else "not built"
+    ours = "" if there and torch.cuda.is_available() else f": {original.stand_in} can stand in for it"
+    return f"{original.name:{WIDTH}}{state}{ours}"
+
+
+def provide(originals: tuple[Original, ...], folder: Path, on_cpu: bool, replace_broken: bool) -> None:
+    """Load every original, or put our stand-in into its place, and log which.
+
+    Args:
+        originals: what the repository needs.
+        folder: where its script lies.
+        on_cpu: its CUDA builds cannot run, so they are not tried.
+        replace_broken: whether ours takes the place of an original that cannot be loaded.
+
+    Raises:
+        D2Error: an original cannot be loaded and must not be replaced.
+    """
+    for original in originals:
+        reason = "it needs a GPU" if on_cpu else _failure(original, folder)
+        if reason is None:
+            log.info("%s: the original is used", original.name)
+        elif on_cpu or replace_broken:
+            _put(original)
+            log.warning("%s: %s stands in for it (%s)", original.name, original.stand_in, reason)
+        else:
+            raise D2Error(
+                f"{original.name} cannot be loaded ({reason}): build it as the repository says, or give --stand-ins "
+                "to train with D2's own rasterizer in its place"
+            )
+
+
+def _failure(original: Original, folder: Path) -> str | None:
+    """Why the original cannot be loaded, or None; a module inside the repository is built once, here."""
+    try:
+        if original.loader is not None:
+            module, attribute = original.loader
+            if getattr(importlib.import_module(module), attribute, original) is None:
+                return f"{module} finds no kernels and cannot build them"
+        elif original.file is None:
+            importlib.import_module(original.name)
+        elif (folder / original.file).is_file():
+            _import_file(original.name, folder / original.file)
+        else:
+            return f"no file {original.file}"
+    except Exception as error:  # a failed build raises anything: ImportError, OSError, RuntimeError, CalledProcessError
+        sys.modules.pop(original.name, None)
+        return f"its import failed: {said(error)}"
+    return None
+
+
+def _import_file(name: str, path: Path) -> None:
+    """Import one file under its full name without its package, whose other imports may fail for other reasons."""
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path} is no module that Python can load")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+
+
+def _put(original: Original) -> None:
+    """Our module under the original's name, with a package above it where there is none."""
+    parent, _, _ = original.name.rpartition(".")
+    if parent and original.file is None and not _is_there(parent):
+        package = types.ModuleType(parent)
+        package.__path__ = []
+        sys.modules[parent] = package
+    sys.modules[original.name] = importlib.import_module(original.stand_in)
+
+
 def needed(script: Path, conditional: bool = True) -> dict[str, str]:
     """Packages that `script` and the files of its repository import at once, and where first; from the files alone.
 
     Imports inside functions and inside `try` wait or may fail, so they are left out, and so is the standard library.
     Those under an `if` depend on options; they are left out unless `conditional`.
     """
-    found: dict[str, str] = {}
+    packages: dict[str, str] = {}
     root, seen, waiting = script.parent, set[Path](), [script]
     while waiting:
         file = waiting.pop()
@@ -106,8 +214,8 @@ def needed(script: Path, conditional: bool = True) -> dict[str, str]:
             if inside is not None:
                 waiting.append(inside)
             elif top not in _standard_library() and not any((base / top).is_dir() for base in roots):
-                found.setdefault(top, f"{file.relative_to(root)}:{line}")
-    return found
+                packages.setdefault(top, f"{file.relative_to(root)}:{line}")
+    return packages
 
 
 def missing(script: Path, replaced: set[str]) -> dict[str, str]:
@@ -117,7 +225,7 @@ def missing(script: Path, replaced: set[str]) -> dict[str, str]:
 
 
 def stand_in_for(script: Path, replaced: set[str]) -> None:
-    """Put a stand-in where there is one and say so.
+    """Put a stand-in where there is one, and log it.
 
     Raises:
         D2Error: packages are missing that nothing stands in for; one sentence with the pip command.

@@ -1,79 +1,16 @@
-"""What the launcher must know of each repository: names of modules, and how its adapter is made."""
+"""What the launcher knows of each repository, in one place: names of modules, and how its adapter is made."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from d2_plugin import registry
+from d2_plugin.attach.gsplat import GsplatSession, put_in_place
 from d2_plugin.attach.repairs import saves_parents
+from d2_plugin.attach.session import Adapter, Objects, Original, Recipe
 from d2_plugin.errors import unknown_name
 from d2_plugin.protocol import Backbone
-
-Adapter = Callable[..., Backbone]
-
-
-@dataclass
-class Objects:
-    """The trainer's own objects, as they come into being."""
-
-    model: Any = None
-    options: Any = None
-    """What `training_setup` was given: the optimization parameters."""
-    state: Any = None
-    """Of gsplat's strategy."""
-    scene: Any = None
-    """What knows the cameras."""
-    gaussians: Any = None
-    """gsplat 1.6's GaussianScene."""
-    deform: Any = None
-    given: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = field(default_factory=dict)
-    """By the name of the field, what its instance was made from: arguments, and named ones."""
-
-
-@dataclass(frozen=True)
-class Original:
-    """A module that a repository builds in CUDA, and ours that can take its place.
-
-    `file` is where it lies inside the repository, relative to the script; None for an installed package.
-    """
-
-    name: str
-    stand_in: str
-    file: str | None = None
-
-
-_KNN = Original("simple_knn._C", "d2_plugin.compat.nearest")
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """One codebase."""
-
-    adapter: str
-    """Name among the entry points `d2_plugin.adapters`."""
-    build: Callable[[Adapter, Objects], Backbone]
-    originals: tuple[Original, ...]
-    models: tuple[tuple[str, str], ...] = (("scene.gaussian_model", "GaussianModel"),)
-    """Classes that the repository may train, where they are imported from."""
-    renderers: tuple[tuple[str, str], ...] = (("gaussian_renderer", "render"),)
-    """Functions that draw a training view."""
-    kind: str = "trainer"
-    """`trainer`: a GaussianModel with training_setup; `gsplat`: dicts and a strategy."""
-    script: str = "train.py"
-    """What trains, relative to the repository."""
-    folders: tuple[str, ...] = ()
-    """Folders below the script's that it puts on the path itself."""
-    averages_gradients: bool = False
-    """Whether the trainer divides the gradients of a batch afterwards, instead of each loss before."""
-    mend: Callable[[Any], None] | None = None
-    """Repairs each class of `models` for newer libraries."""
-    heard: Callable[[Any, Mapping[str, Any]], None] | None = None
-    """Hands the adapter what it needs from the named arguments of each render."""
-    seen: dict[str, tuple[str, str]] = field(default_factory=lambda: {"scene": ("scene", "Scene")})
-    """Classes whose latest instance is remembered, by its field of `Objects`."""
 
 
 def _fudan(adapter: Adapter, objects: Objects) -> Backbone:
@@ -85,16 +22,16 @@ def _deformable3d(adapter: Adapter, objects: Objects) -> Backbone:
 
 
 def _hust4d(adapter: Adapter, objects: Objects) -> Backbone:
-    return adapter(objects.model, objects.scene, "coarse")  # each render says the stage, see `_hear_stage`
+    return adapter(objects.model, objects.scene, "coarse")  # each render says the stage, see `_enter_stage`
 
 
-def _hear_stage(adapter: Any, named: Mapping[str, Any]) -> None:
+def _enter_stage(adapter: Any, named: Mapping[str, Any]) -> None:
     if "stage" in named:
         adapter.enter_stage(named["stage"])
 
 
 def _spacetime(adapter: Adapter, objects: Objects) -> Backbone:
-    """Its Scene is told the number of frames, and the folder colmap_N says the first of them."""
+    """Its Scene gets the number of frames, and N of the folder colmap_N is the first of them."""
     (dataset, *_), named = objects.given["scene"]
     first = Path(dataset.source_path).name.split("_")[1:2]
     number = int(first[0]) if first and first[0].isdigit() else 0
@@ -110,6 +47,7 @@ def _gsplat(adapter: Adapter, objects: Objects) -> Backbone:
     return adapter(*objects.model, objects.state, parser=objects.scene, scene=objects.gaussians)
 
 
+_KNN = Original("simple_knn._C", "d2_plugin.compat.nearest")
 _SPLATTING = "thirdparty.gaussian_splatting"
 _STG_RASTERIZERS = tuple(
     Original(f"diff_gaussian_rasterization_{kind}", "d2_plugin.compat.spacetime") for kind in ("ch3", "ch9")
@@ -134,7 +72,7 @@ RECIPES = {
         (
             Original("diff_gaussian_rasterization", "d2_plugin.compat.fourd"),
             _KNN,
-            Original("fused_ssim", "d2_plugin.compat.similarity"),
+            Original("fused_ssim", "d2_plugin.compat.vision"),
         ),
     ),
     "deformable3d": Recipe(
@@ -147,7 +85,7 @@ RECIPES = {
         "hust4d",
         _hust4d,
         (Original("diff_gaussian_rasterization", "d2_plugin.compat.depth"), _KNN),
-        heard=_hear_stage,
+        before_loss=_enter_stage,
     ),
     "spacetime": Recipe(
         "spacetime",
@@ -174,14 +112,16 @@ RECIPES = {
             _KNN,
         ),
         models=(("scene.v_gaussian_model", "VGaussianModel"),),
-        mend=saves_parents,
+        prepare=saves_parents,
     ),
     "gsplat": Recipe(
         "gsplat",
         _gsplat,
-        (Original("gsplat.csrc", "d2_plugin.compat.gsplat"),),
-        kind="gsplat",
+        (Original("gsplat.csrc", "d2_plugin.compat.gsplat", loader=("gsplat.cuda._backend", "_C")),),
         models=(),
+        renderers=(),
+        session=GsplatSession,
+        prepare=put_in_place,
         script="examples/simple_trainer.py",
         folders=("..",),
         seen={"scene": ("datasets.colmap", "Parser")},
@@ -194,8 +134,3 @@ def recipe(name: str) -> Recipe:
     if name not in RECIPES:
         raise unknown_name("repository", name, RECIPES)
     return RECIPES[name]
-
-
-def adapter_of(found: Recipe) -> Adapter:
-    """The adapter of a recipe, by entry point."""
-    return registry.load(registry.ADAPTERS, found.adapter)

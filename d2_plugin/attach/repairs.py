@@ -1,4 +1,4 @@
-"""What newer libraries took away and the repositories still use, given back in the memory of this process."""
+"""What newer libraries dropped and the repositories still use, restored in the memory of this process."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from d2_plugin.attach.session import attribute_of
+
 log = logging.getLogger(__name__)
 
 NUMPY_NAMES = {"NaN": np.nan, "Inf": np.inf, "float": float, "int": int, "object": object, "product": np.prod}
@@ -16,7 +18,7 @@ NUMPY_NAMES = {"NaN": np.nan, "Inf": np.inf, "float": float, "int": int, "object
 
 
 def repair() -> None:
-    """Apply every repair that this environment needs; each is said."""
+    """Apply every repair that this environment needs, and log each."""
     for sentence in (_numpy(), _pillow(), _joblib(), _json()):
         if sentence:
             log.info("%s", sentence)
@@ -26,7 +28,7 @@ def _numpy() -> str | None:
     gone = [name for name in NUMPY_NAMES if name not in vars(np)]
     for name in gone:
         setattr(np, name, NUMPY_NAMES[name])
-    return f"numpy {np.__version__} has no np.{', np.'.join(gone)}: given back for this process" if gone else None
+    return f"numpy {np.__version__} has no np.{', np.'.join(gone)}: restored for this process" if gone else None
 
 
 def _pillow() -> str | None:
@@ -70,11 +72,12 @@ def _json() -> str:
     return "numbers of numpy are written as JSON like Python's own"
 
 
-def saves_parents(model: Any) -> None:
+def saves_parents() -> None:
     """cem-4dgs saves -1, the parent of a splat that has none, as unsigned: numpy 2 refuses what numpy 1 wrapped around.
 
-    `model` is its class VGaussianModel, whose `save_ply` then sees the number that numpy 1 wrote.
+    The `save_ply` of its class VGaussianModel then sees the number that numpy 1 wrote.
     """
+    model = attribute_of("scene.v_gaussian_model", "VGaussianModel")
     original = model.save_ply
 
     @wraps(original)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -13,45 +13,87 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.attach.recipes import Objects, Recipe, adapter_of
+from d2_plugin import registry
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.prior import Store
+from d2_plugin.hooks.reports import Report
 from d2_plugin.plugin import D2Hooks
+from d2_plugin.protocol import Backbone
 
 log = logging.getLogger(__name__)
 
-
-def remember(recipe: Recipe, objects: Objects) -> None:
-    """Keep the trainer's own objects as they come into being; what they compute is not touched."""
-    for name, place in recipe.seen.items():
-        keep_instances(found_in(*place), name, objects)
-    for place in recipe.models:
-        model = found_in(*place)
-        model.training_setup = _keeping(model.training_setup, objects)
+Adapter = Callable[..., Backbone]
+Place = tuple[str, str]
+"""A module of the repository and one of its attributes."""
 
 
-def keep_instances(kind: type, name: str, objects: Objects) -> None:
-    """Keep the latest instance of a class, and what it was made from, under `name`."""
-    original = kind.__init__  # type: ignore[misc]
-
-    @wraps(original)
-    def remembering(instance: Any, *arguments: Any, **named: Any) -> None:
-        # Before the call: a scene builds its model inside, and may be asked for before it returns.
-        setattr(objects, name, instance)
-        objects.given[name] = arguments, named
-        original(instance, *arguments, **named)
-
-    kind.__init__ = remembering  # type: ignore[misc]  # a foreign class, overridden for all its instances
+MUCH_GROWTH = 3
+"""Gaussians of the trainer's own densification for each one that D2 inserted, above which the log names them."""
 
 
-def _keeping(training_setup: Callable[..., Any], objects: Objects) -> Callable[..., Any]:
-    @wraps(training_setup)
-    def keeping(model: Any, options: Any, *arguments: Any, **named: Any) -> Any:
-        objects.model, objects.options = model, options
-        return training_setup(model, options, *arguments, **named)
+@dataclass
+class Objects:
+    """The trainer's own objects, as they come into being."""
 
-    return keeping
+    model: Any = None
+    options: Any = None
+    """What `training_setup` was given: the optimization parameters."""
+    state: Any = None
+    """Of gsplat's strategy."""
+    scene: Any = None
+    """What knows the cameras."""
+    gaussians: Any = None
+    """gsplat 1.6's GaussianScene."""
+    deform: Any = None
+    given: dict[str, tuple[tuple[Any, ...], dict[str, Any]]] = field(default_factory=dict)
+    """By the name of the field, what its instance was made from: arguments, and named ones."""
+
+
+@dataclass(frozen=True)
+class Original:
+    """A module that a repository builds in CUDA, and ours that can take its place.
+
+    `file` is where it lies inside the repository, relative to the script; None for an installed package. `loader` is
+    the module and its attribute that hold what the package itself loaded or built, where that need not be `name`.
+    """
+
+    name: str
+    stand_in: str
+    file: str | None = None
+    loader: Place | None = None
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What the launcher must know of one codebase."""
+
+    adapter: str
+    """Name among the entry points `d2_plugin.adapters`."""
+    build: Callable[[Adapter, Objects], Backbone]
+    originals: tuple[Original, ...]
+    models: tuple[Place, ...] = (("scene.gaussian_model", "GaussianModel"),)
+    """Classes that the repository may train, where they are imported from."""
+    renderers: tuple[Place, ...] = (("gaussian_renderer", "render"),)
+    """Functions that draw a training view."""
+    session: type[Session] | None = None
+    """What attaches to it, where it is not a GaussianModel with training_setup."""
+    script: str = "train.py"
+    """What trains, relative to the repository."""
+    folders: tuple[str, ...] = ()
+    """Folders below the script's that it puts on the path itself."""
+    averages_gradients: bool = False
+    """Whether the trainer divides the gradients of a batch afterwards, instead of each loss before."""
+    prepare: Callable[[], None] | None = None
+    """Called before the script runs, once stand-ins are in place."""
+    before_loss: Callable[[Any, Mapping[str, Any]], None] | None = None
+    """Hands the adapter what it needs from the named arguments of each render."""
+    seen: Mapping[str, Place] = field(default_factory=lambda: {"scene": ("scene", "Scene")})
+    """Classes whose latest instance is remembered, by its field of `Objects`."""
+
+    def backbone(self, objects: Objects) -> Backbone:
+        """The adapter, made from the trainer's objects."""
+        return self.build(registry.load(registry.ADAPTERS, self.adapter), objects)
 
 
 class AddGradient(torch.autograd.Function):
@@ -82,58 +124,76 @@ class Session:
     """
 
     def __init__(
-        self, recipe: Recipe, config: D2Config | Path, store: Store | None = None, exported: Path | None = None
+        self,
+        recipe: Recipe,
+        config: D2Config | Path | None,
+        store: Store | None = None,
+        exported: Path | None = None,
     ) -> None:
-        """A configuration in a file gets its schedules once the trainer says how long it runs."""
+        """A configuration in a file gets its schedules once the trainer says how long it runs; None: a bare run."""
         self.recipe, self.config, self.store, self.exported = recipe, config, store, exported
         self.objects = Objects()
         self.hooks: D2Hooks | None = None
-        self.writer: Any = None
-        self._iteration, self._told = 0, False
+        self._iteration, self._counted = 0, False
         self._drawn, self._batch = 0, 0
-
-    remember = staticmethod(remember)
-    """How this kind of script's own objects are kept; for a bare run as well."""
+        self._inserted, self._others, self._growth_logged = 0, 0, False
 
     def wrap(self) -> None:
-        """Override the choke points of the repository's modules; call before its script runs."""
-        self.remember(self.recipe, self.objects)
+        """Override the choke points of the repository's modules; call before its script runs.
+
+        In a bare run the trainer's objects are remembered, and what they compute is not touched.
+        """
+        for name, place in self.recipe.seen.items():
+            self.keep_instances(attribute_of(*place), name)
         for place in self.recipe.models:
-            model = found_in(*place)
+            model = attribute_of(*place)
             model.training_setup = self._attaching(model.training_setup)
             if hasattr(model, "update_learning_rate"):
-                model.update_learning_rate = self._listening(model.update_learning_rate)
-        for module, attribute in self.recipe.renderers:
-            setattr(importlib.import_module(module), attribute, self._rendering(found_in(module, attribute)))
+                model.update_learning_rate = self._counting(model.update_learning_rate)
+        for place in self.recipe.renderers if self.config is not None else ():
+            setattr(importlib.import_module(place[0]), place[1], self._rendering(attribute_of(*place)))
 
-    def summary(self) -> str:
-        """What D2 did, in one line."""
-        if self.hooks is None:
-            return "the trainer never called training_setup: D2 was not attached"
-        return self.hooks.telling.summary()
+    def keep_instances(self, kind: type, name: str) -> None:
+        """Keep the latest instance of a class, and what it was made from, under `name` of the objects."""
+        original = kind.__init__  # type: ignore[misc]
+
+        @wraps(original)
+        def remembering(instance: Any, *arguments: Any, **named: Any) -> None:
+            # Before the call: a scene builds its model inside, and may be asked for before it returns.
+            setattr(self.objects, name, instance)
+            self.objects.given[name] = arguments, named
+            original(instance, *arguments, **named)
+
+        kind.__init__ = remembering  # type: ignore[misc]  # a foreign class, overridden for all its instances
 
     def end(self) -> None:
-        """Say what D2 did, at the end of the script."""
-        if self.hooks is None:
-            log.warning("%s", self.summary())
-        else:
+        """Log what D2 did, at the end of the script."""
+        if self.hooks is not None:
             self.hooks.telling.end()
+        elif self.config is not None:
+            log.warning("the trainer never called training_setup: D2 was not attached")
 
     def _attaching(self, training_setup: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(training_setup)
         def attaching(model: Any, options: Any, *arguments: Any, **named: Any) -> Any:
+            self.objects.model, self.objects.options = model, options
             result = training_setup(model, options, *arguments, **named)
-            backbone = self.recipe.build(adapter_of(self.recipe), self.objects)
-            iterations = getattr(options, "iterations", None)
-            self.hooks = D2Hooks(self._configured(iterations), backbone, self.store)
-            self._watch(model.optimizer)
-            self._iteration, self._told, self._drawn, self._batch = 0, False, 0, 0
-            self.hooks.tell(iterations, writer=self.writer)
+            if self.config is not None:
+                self.attach(getattr(options, "iterations", None))
+                self._watch(model.optimizer)
             return result
 
         return attaching
 
+    def attach(self, iterations: int | None) -> None:
+        """Make the adapter and the hooks of the objects seen, for a run of that many iterations."""
+        self.hooks = D2Hooks(self._configured(iterations), self.recipe.backbone(self.objects), self.store)
+        self._iteration, self._counted, self._drawn, self._batch = 0, False, 0, 0
+        self._inserted, self._others = 0, len(self.hooks.backbone)
+        self.hooks.tell(iterations)
+
     def _configured(self, iterations: int | None) -> D2Config:
+        assert self.config is not None
         config = self.config if isinstance(self.config, D2Config) else D2Config.from_toml(self.config, iterations)
         exported = self.exported or self._export_read(config)
         return config if exported is None else replace(config, exported=str(exported))
@@ -152,13 +212,13 @@ class Session:
         arguments, _ = self.objects.given.get("scene", ((), {}))
         return getattr(arguments[0], "source_path", None) if arguments else None
 
-    def _listening(self, update_learning_rate: Callable[..., Any]) -> Callable[..., Any]:
+    def _counting(self, update_learning_rate: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(update_learning_rate)
-        def listening(model: Any, iteration: int, *arguments: Any, **named: Any) -> Any:
-            self._iteration, self._told = iteration, True
+        def counting(model: Any, iteration: int, *arguments: Any, **named: Any) -> Any:
+            self._iteration, self._counted = iteration, True
             return update_learning_rate(model, iteration, *arguments, **named)
 
-        return listening
+        return counting
 
     def _rendering(self, render: Callable[..., Mapping[str, Any]]) -> Callable[..., Mapping[str, Any]]:
         @wraps(render)
@@ -167,23 +227,28 @@ class Session:
             training = torch.is_grad_enabled() and package["render"].requires_grad
             if self.hooks is None or model is not self.objects.model or not training:
                 return package
-            if self.recipe.heard is not None:
-                self.recipe.heard(self.hooks.backbone, named)
+            if self.recipe.before_loss is not None:
+                self.recipe.before_loss(self.hooks.backbone, named)
             return self._with_loss(self.hooks, camera, package)
 
         return rendering
 
     def _with_loss(self, hooks: D2Hooks, camera: Any, package: Mapping[str, Any]) -> Mapping[str, Any]:
-        if not self._told:
-            self._iteration, self._told = self._iteration + 1, True
         self._drawn += 1
         rendered = getattr(hooks.backbone, "rendered", None)
         view = rendered(camera, package) if rendered is not None else camera
-        term = hooks.loss(self._iteration, [view])
-        if self._batch and isinstance(term, Tensor) and term.requires_grad:
+        term = self._term(hooks, [view])
+        if self._batch and term is not None:
             weight = 1.0 if self.recipe.averages_gradients else 1 / self._batch
             return {**package, "render": AddGradient.apply(package["render"], term, weight)}
         return package
+
+    def _term(self, hooks: D2Hooks, views: list[Any]) -> Tensor | None:
+        """D2's loss of views in the present iteration, if it has a gradient."""
+        if not self._counted:
+            self._iteration, self._counted = self._iteration + 1, True
+        term = hooks.loss(self._iteration, views)
+        return term if isinstance(term, Tensor) and term.requires_grad else None
 
     def _watch(self, optimizer: torch.optim.Optimizer) -> None:
         """Run `D2Hooks.step` after the first zero_grad behind every step; on this instance alone."""
@@ -206,11 +271,23 @@ class Session:
     def _after_step(self) -> None:
         if self.hooks is None:
             return
-        self.hooks.step(self._iteration)
-        self._told, self._drawn, self._batch = False, 0, self._drawn
+        self._note_growth(self.hooks.step(self._iteration))
+        self._counted, self._drawn, self._batch = False, 0, self._drawn
+
+    def _note_growth(self, report: Report) -> None:
+        """Log once that the trainer's own densification outgrows what D2 inserted; it splits inserted ones as well."""
+        self._inserted, self._others = self._inserted + report.inserted, self._others - report.removed
+        own = report.gaussians - self._inserted - self._others
+        if self._inserted and own > MUCH_GROWTH * self._inserted and not self._growth_logged:
+            self._growth_logged = True
+            log.warning(
+                "iteration %d: the trainer's own densification has made %d Gaussians beside the %d that D2 inserted: "
+                "end it earlier or raise its threshold if that is too many",
+                report.step, own, self._inserted,
+            )  # fmt: skip
 
 
-def found_in(module: str, attribute: str) -> Any:
+def attribute_of(module: str, attribute: str) -> Any:
     """An attribute of one of the repository's modules; its own imports may fail with errors of their own."""
     try:
         return getattr(importlib.import_module(module), attribute)

@@ -51,9 +51,10 @@ def run(settings: Doctor) -> str:
     if settings.attach is not None:
         if settings.path is None:
             raise D2Error("a trainer is examined by both its name and its folder: d2 doctor --attach fudan FOLDER")
-        from d2_plugin.attach.needs import needs
+        from d2_plugin.attach.packages import needs
+        from d2_plugin.attach.recipes import recipe
 
-        return needs(settings.attach, settings.path)
+        return needs(recipe(settings.attach), settings.path)
     if settings.path is None:
         return report()
     from d2_plugin.recordings import open_recording

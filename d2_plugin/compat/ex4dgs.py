@@ -12,82 +12,35 @@ uses neither), and the index of the strongest Gaussian of each pixel, which the 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from d2_plugin.compat.inria import (
-    SETTINGS,
-    StandIn,
-    colors_of,
-    covariances_of,
-    draw,
-    exactly_one,
-    given,
-    shape_given,
-    view_of,
-)
+from d2_plugin.compat import inria
+from d2_plugin.compat.inria import SETTINGS, GaussianRasterizationSettings, draw, view_of
 from d2_plugin.protocol import Splats
 from d2_plugin.rasterizer import rasterize
+
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
 FRUSTUM = 1.3
 """Gaussians whose centre projects beyond this multiple of the half image are not drawn (auxiliary.h, in_frustum)."""
 
 
-class GaussianRasterizationSettings(NamedTuple):
-    """The camera and constants of one image, as in the original; matrices act on row vectors."""
+class GaussianRasterizer(inria.GaussianRasterizer):
+    """As in 3DGS, with errors that come back through the flow."""
 
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    kernel_size: float
-    subpixel_offset: Tensor
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-    prefiltered: bool = False
-    min_depth: float = 0.2
-    max_depth: float = 100.0
-    debug: bool = False
-
-
-class GaussianRasterizer(StandIn):
-    """The original's module: construct it with settings for every image, call it with the Gaussians."""
-
-    raster_settings: GaussianRasterizationSettings
-
-    def forward(
+    def forward(  # type: ignore[override]  # `dir3D` stands before the opacities in the original
         self,
         means3D: Tensor,
         means2D: Tensor,
         dir3D: Tensor | None,
         opacities: Tensor,
-        shs: Tensor | None = None,
-        colors_precomp: Tensor | None = None,
-        scales: Tensor | None = None,
-        rotations: Tensor | None = None,
-        cov3D_precomp: Tensor | None = None,
+        **others: Tensor | None,
     ) -> tuple[Tensor, ...]:
         """Color [3, H, W], radii [N] int32, depth [1, H, W], flow [3, H, W], acc [1, H, W] and indices [1, H, W]."""
-        settings = self.raster_settings
-        exactly_one("shs or colors_precomp", shs, colors_precomp)
-        shape_given(scales, rotations, cov3D_precomp)
         rows = torch.nonzero(self._in_frustum(means3D.detach())).squeeze(-1)
-        if cov3D_precomp is None:
-            shape = given(scales, "scales")[rows], given(rotations, "rotations")[rows]
-            covariances = covariances_of(*shape, settings.scale_modifier)
-        else:
-            covariances = cov3D_precomp[rows]
-        if colors_precomp is None:
-            colors = colors_of(given(shs, "shs")[rows], settings.sh_degree, means3D[rows], settings.campos)
-        else:
-            colors = colors_precomp[rows]
-        splats = Splats(means3D[rows], covariances, opacities.squeeze(-1)[rows], rows)
+        splats, colors = self._chosen(rows, means3D, opacities, **others)
         return self._outputs(splats, colors, means2D, dir3D, len(means3D))
 
     def _outputs(
@@ -105,8 +58,8 @@ class GaussianRasterizer(StandIn):
             still = Splats(*(field.detach() for field in splats))
             sums = rasterize(still, dir3D[splats.rows], view_of(settings), constants).color.permute(2, 0, 1)
             flow = torch.where(weighed, sums / acc.detach(), 0.0).contiguous()
-        nobody = torch.full_like(drawn.alpha, -1, dtype=torch.int32)
-        return drawn.color, drawn.radii, depth, flow, drawn.alpha, nobody
+        no_index = torch.full_like(drawn.alpha, -1, dtype=torch.int32)
+        return drawn.color, drawn.radii, depth, flow, drawn.alpha, no_index
 
     def _in_frustum(self, means: Tensor) -> Tensor:
         settings = self.raster_settings

@@ -3,49 +3,35 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from d2_plugin.compat.inria import StandIn, colors_of, covariances_of, draw, exactly_one, given, harmonics, shape_given
+from d2_plugin.compat import inria
+from d2_plugin.compat.inria import (
+    GaussianRasterizationSettings,
+    colors_of,
+    covariances_of,
+    draw,
+    exactly_one,
+    given,
+    harmonics,
+    shape_given,
+)
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_4d, time_row
 from d2_plugin.protocol import Splats
+
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
 MARGINAL_MIN = 0.05
 """Gaussians whose temporal factor is not above this are skipped (forward.cu, computeCov3D_conditional)."""
 
 
-class GaussianRasterizationSettings(NamedTuple):
-    """The camera, time and constants of one image, as in the original; matrices act on row vectors."""
+class GaussianRasterizer(inria.GaussianRasterizer):
+    """As in 3DGS, for Gaussians that are sliced at the settings' timestamp."""
 
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    sh_degree_t: int
-    campos: Tensor
-    timestamp: float
-    time_duration: float
-    rot_4d: bool
-    gaussian_dim: int
-    force_sh_3d: bool
-    prefiltered: bool = False
-    debug: bool = False
-
-
-class GaussianRasterizer(StandIn):
-    """The original's module: construct it with settings for every image, call it with the Gaussians."""
-
-    raster_settings: GaussianRasterizationSettings
-
-    def forward(
+    def forward(  # type: ignore[override]  # other arguments, as in the original
         self,
         means3D: Tensor,
         means2D: Tensor,

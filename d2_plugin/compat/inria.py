@@ -1,14 +1,14 @@
-"""What all variants of diff_gaussian_rasterization share: from their arguments to this plugin's rasterizer and back."""
+"""`diff_gaussian_rasterization` of graphdeco-inria/gaussian-splatting, and what all its variants share."""
 
 from __future__ import annotations
 
+import functools
 import logging
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from d2_plugin.compat.absolute import Drawing, WithAbsoluteGradient
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
 from d2_plugin.gaussians.spherical_harmonics import basis
@@ -25,16 +25,34 @@ TILE = 16
 """Side of Inria's tiles in pixels; a Gaussian that touches none has radius 0."""
 
 
-class StandIn(nn.Module):
-    """What all of Inria's heirs call GaussianRasterizer: it is made anew for every image."""
+class GaussianRasterizationSettings(NamedTuple):
+    """The camera and constants of one image, by name, as all variants know them; matrices act on row vectors."""
 
-    def __init__(self, raster_settings: Any) -> None:
-        super().__init__()
-        self.raster_settings = raster_settings
-
-    def markVisible(self, positions: Tensor) -> Tensor:
-        """bool [N]: which positions [N, 3] lie before the near plane."""
-        return in_front(positions, self.raster_settings.viewmatrix)
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool = False
+    debug: bool = False
+    antialiasing: bool = False
+    # 4D (fourd.py)
+    sh_degree_t: int = 0
+    timestamp: float = 0.0
+    time_duration: float = 1.0
+    rot_4d: bool = False
+    gaussian_dim: int = 3
+    force_sh_3d: bool = False
+    # Ex4DGS (ex4dgs.py)
+    kernel_size: float = 0.1
+    subpixel_offset: Tensor | None = None
+    min_depth: float = 0.2
+    max_depth: float = 100.0
 
 
 class Drawn(NamedTuple):
@@ -53,7 +71,6 @@ def draw(
     background: Tensor,
     means2D: Tensor | None,
     count: int,
-    absolute: Tensor | None = None,
     constants: RasterSettings = SETTINGS,
 ) -> Drawn:
     """Composite `splats`, which are rows `splats.rows` of `count` Gaussians.
@@ -66,7 +83,6 @@ def draw(
         means2D: [N, 3] or [N, 2]; receives dL/d(normalised device coordinate) as its gradient, which is dL/d(pixel)
             times half the image's size: the unit that `densify_grad_threshold` is in. Its values are not used.
         count: N.
-        absolute: [N, 3]; receives the sum over pixels of absolute gradients in the same unit (`absolute.py`).
         constants: those of the variant's rasterizer, where they are not Inria's.
     """
     view = view_of(settings)
@@ -76,14 +92,10 @@ def draw(
         offsets = (chosen - chosen.detach()) * chosen.new_tensor([0.5 * view.width, 0.5 * view.height])
     background = background.to(colors)[: colors.shape[1]]  # SpacetimeGaussians gives nine values for three channels
     image = rasterize(splats, colors, view, constants, background=background, screen_offsets=offsets)
-    color = image.color
-    if absolute is not None and absolute.requires_grad:
-        drawing = Drawing(Splats(*(field.detach() for field in splats)), colors.detach(), view, constants)
-        color = WithAbsoluteGradient.apply(color, absolute, drawing)
     radii = torch.zeros(count, dtype=torch.int32, device=splats.means.device)
     radii[splats.rows] = screen_radii(splats, view, constants)
     # Contiguous, as the originals': trainers call .view on the image.
-    return Drawn(color.permute(2, 0, 1).contiguous(), image.depth_sum[None], image.alpha[None], radii)
+    return Drawn(image.color.permute(2, 0, 1).contiguous(), image.depth_sum[None], image.alpha[None], radii)
 
 
 def view_of(settings: Any) -> View:
@@ -103,19 +115,18 @@ def view_of(settings: Any) -> View:
     return View("", 0, 0.0, world_view.T.float().contiguous(), K.float(), width, height)
 
 
-_contradictions: set[tuple[float, float]] = set()
-
-
 def _compare_focal_lengths(settings: Any, focal_x: float, focal_y: float) -> None:
-    said = (0.5 * settings.image_width / settings.tanfovx, 0.5 * settings.image_height / settings.tanfovy)
-    if abs(said[0] - focal_x) > 1e-3 * focal_x or abs(said[1] - focal_y) > 1e-3 * focal_y:
-        if not _contradictions:
-            log.warning(
-                "the field of view stands for focal lengths of %.1f and %.1f pixels but the projection matrix has %.1f "
-                "and %.1f, which are used for footprints, too",
-                *said, focal_x, focal_y,
-            )  # fmt: skip
-        _contradictions.add(said)
+    focal = (0.5 * settings.image_width / settings.tanfovx, 0.5 * settings.image_height / settings.tanfovy)
+    if abs(focal[0] - focal_x) > 1e-3 * focal_x or abs(focal[1] - focal_y) > 1e-3 * focal_y:
+        _warn_once(
+            f"the field of view stands for focal lengths of {focal[0]:.1f} and {focal[1]:.1f} pixels but the "
+            f"projection matrix has {focal_x:.1f} and {focal_y:.1f}, which are used for footprints, too"
+        )
+
+
+@functools.cache
+def _warn_once(sentence: str) -> None:
+    log.warning("%s", sentence)
 
 
 def covariances_of(scales: Tensor, rotations: Tensor, scale_modifier: float) -> Tensor:
@@ -155,16 +166,9 @@ def screen_radii(splats: Splats, view: View, constants: RasterSettings = SETTING
     first = ((pixels - radii[:, None]) / TILE).trunc().clamp(min=0).minimum(tiles)
     last = ((pixels + radii[:, None] + TILE - 1) / TILE).trunc().clamp(min=0).minimum(tiles)
     touching = ((last - first).prod(-1) > 0) & radii.isfinite()
-    found = torch.zeros(len(splats.means), dtype=torch.int32, device=radii.device)
-    found[front] = torch.where(touching, radii, torch.zeros_like(radii)).to(torch.int32)
-    return found
-
-
-@torch.no_grad()
-def in_front(positions: Tensor, viewmatrix: Tensor) -> Tensor:
-    """bool [N]: the near test of markVisible, which is all that Inria's sources do there."""
-    forward = viewmatrix.reshape(4, 4)[:, 2].to(positions)
-    return positions @ forward[:3] + forward[3] > SETTINGS.near
+    all_radii = torch.zeros(len(splats.means), dtype=torch.int32, device=radii.device)
+    all_radii[front] = torch.where(touching, radii, torch.zeros_like(radii)).to(torch.int32)
+    return all_radii
 
 
 def exactly_one(what: str, first: object | None, second: object | None) -> None:
@@ -186,3 +190,60 @@ def shape_given(scales: Tensor | None, rotations: Tensor | None, cov3D_precomp: 
     if (scales is None) != (rotations is None):
         raise D2Error("the rasterizer takes scales and rotations together, got one of them: give both")
     exactly_one("scales with rotations or cov3D_precomp", scales, cov3D_precomp)
+
+
+class GaussianRasterizer(nn.Module):
+    """The original's module: it is made anew with the settings of every image, and called with the Gaussians."""
+
+    def __init__(self, raster_settings: Any) -> None:
+        if raster_settings.antialiasing:
+            raise D2Error(
+                "antialiasing needs the original rasterizer, this stand-in has none: switch it off or build it"
+            )
+        super().__init__()
+        self.raster_settings = raster_settings
+
+    @torch.no_grad()
+    def markVisible(self, positions: Tensor) -> Tensor:
+        """bool [N]: which positions [N, 3] lie before the near plane, which is all that Inria's sources test."""
+        forward = self.raster_settings.viewmatrix.reshape(4, 4)[:, 2].to(positions)
+        return positions @ forward[:3] + forward[3] > SETTINGS.near
+
+    def forward(
+        self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **others: Tensor | None
+    ) -> tuple[Tensor, ...]:
+        """Color [3, H, W] and radii [N] int32, with gradients to every tensor given; for `others` see `_chosen`."""
+        drawn = self._draw(means3D, means2D, opacities, **others)
+        return drawn.color, drawn.radii
+
+    def _draw(self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **others: Tensor | None) -> Drawn:
+        rows = torch.arange(len(means3D), device=means3D.device)
+        splats, colors = self._chosen(rows, means3D, opacities, **others)
+        return draw(self.raster_settings, splats, colors, self.raster_settings.bg, means2D, len(rows))
+
+    def _chosen(
+        self,
+        rows: Tensor,
+        means3D: Tensor,
+        opacities: Tensor,
+        shs: Tensor | None = None,
+        colors_precomp: Tensor | None = None,
+        scales: Tensor | None = None,
+        rotations: Tensor | None = None,
+        cov3D_precomp: Tensor | None = None,
+    ) -> tuple[Splats, Tensor]:
+        """The Gaussians of `rows` [M], and their colours [M, C]; arguments as the originals have them."""
+        settings = self.raster_settings
+        exactly_one("shs or colors_precomp", shs, colors_precomp)
+        shape_given(scales, rotations, cov3D_precomp)
+        means = means3D[rows]
+        if cov3D_precomp is None:
+            shape = given(scales, "scales")[rows], given(rotations, "rotations")[rows]
+            covariances = covariances_of(*shape, settings.scale_modifier)
+        else:
+            covariances = cov3D_precomp[rows]
+        if colors_precomp is None:
+            colors = colors_of(given(shs, "shs")[rows], settings.sh_degree, means, settings.campos)
+        else:
+            colors = colors_precomp[rows]
+        return Splats(means, covariances, opacities.squeeze(-1)[rows], rows), colors

@@ -1,7 +1,10 @@
-"""`simple_knn._C.distCUDA2`: the mean squared distance of every point to its three nearest neighbours."""
+"""Nearest neighbours: `simple_knn._C.distCUDA2`, `mmcv.ops.knn`, and what cem-4dgs calls of faiss."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,17 +35,17 @@ def distCUDA2(points: Tensor) -> Tensor:
     if count < 2:
         return torch.zeros(count, device=points.device)
     neighbours = min(NEIGHBOURS, count - 1)
-    found = points.new_empty(count, neighbours)
+    squared = points.new_empty(count, neighbours)
     open_rows = torch.arange(count, device=points.device)
     side = _first_side(points)
     while len(open_rows) * count > PAIRS and side > 0:
         nearest = _within_cells(points, open_rows, side, neighbours)
         certain = nearest[:, -1] <= side * side  # whatever lies outside the 27 cells is farther away than one side
-        found[open_rows[certain]] = nearest[certain]
+        squared[open_rows[certain]] = nearest[certain]
         open_rows, side = open_rows[~certain], 2 * side
     for rows in open_rows.split(max(PAIRS // count, 1)):
-        found[rows] = _among_all(points, rows, neighbours)
-    return found.mean(1).float()
+        squared[rows] = _among_all(points, rows, neighbours)
+    return squared.mean(1).float()
 
 
 def _first_side(points: Tensor) -> float:
@@ -105,3 +108,44 @@ def _nearest_of_runs(
     rank = torch.arange(neighbours, device=rows.device)
     index = (start[:, None] + rank).clamp(max=max(len(by_row) - 1, 0))
     return torch.where(rank < counts[:, None], squared[by_row[index]], torch.inf)
+
+
+def knn(k: int, xyz: Tensor, center_xyz: Tensor | None = None, transposed: bool = False) -> Tensor:
+    """As mmcv's: indices [B, k, M] int32 of the k points of `xyz` [B, N, 3] nearest to each of `center_xyz` [B, M, 3].
+
+    A point that is its own centre is its own nearest one, as in the original. `transposed` says [B, 3, N].
+    """
+    centers = xyz if center_xyz is None else center_xyz
+    if transposed:
+        xyz, centers = xyz.transpose(1, 2), centers.transpose(1, 2)
+    pairs = [_nearest(points, queries, k)[1] for points, queries in zip(xyz, centers)]
+    return torch.stack(pairs).transpose(1, 2).contiguous().int()
+
+
+class StandardGpuResources:
+    """faiss's; there are none to hold."""
+
+
+class GpuIndexFlatL2:
+    """faiss's exact index of points by squared distance."""
+
+    def __init__(self, resources: Any, size: int) -> None:
+        self._points = torch.empty(0, size)
+
+    def add(self, points: np.ndarray) -> None:
+        """Points [N, size] float32 after those that are there."""
+        self._points = torch.cat([self._points, torch.from_numpy(np.ascontiguousarray(points))])
+
+    def search(self, queries: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Squared distances [M, k] float32 and indices [M, k] int64 of the k nearest points, the nearest first."""
+        distances, indices = _nearest(self._points, torch.from_numpy(np.ascontiguousarray(queries)), k)
+        return distances.square().numpy(), indices.numpy()
+
+
+def _nearest(points: Tensor, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Distances and indices [M, k] of the points [N, D] nearest to each query [M, D]."""
+    exact = "donot_use_mm_for_euclid_dist"
+    parts = queries.split(max(PAIRS // max(len(points), 1), 1))
+    each = [torch.cdist(part, points, compute_mode=exact).topk(k, largest=False) for part in parts]
+    distances, indices = (torch.cat(values) for values in zip(*each))
+    return distances, indices

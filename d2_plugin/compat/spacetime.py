@@ -7,49 +7,25 @@ the span of its own insertions.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
-from d2_plugin.compat import threedgs
+from d2_plugin.compat import inria
+from d2_plugin.compat.inria import GaussianRasterizationSettings
+
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
 
 NO_DEPTH = 15.0
 """Of pixels that let more than half of the light through (forward.cu:308)."""
 
 
-class GaussianRasterizationSettings(NamedTuple):
-    """The camera and constants of one image, as in the original; matrices act on row vectors."""
-
-    image_height: int
-    image_width: int
-    tanfovx: float
-    tanfovy: float
-    bg: Tensor
-    scale_modifier: float
-    viewmatrix: Tensor
-    projmatrix: Tensor
-    sh_degree: int
-    campos: Tensor
-    prefiltered: bool = False
-    antialiasing: bool = False
-
-
-class GaussianRasterizer(threedgs.GaussianRasterizer):
+class GaussianRasterizer(inria.GaussianRasterizer):
     """As in 3DGS with the channels that the colours have, and a depth [1, H, W] without gradients."""
 
     def forward(
-        self,
-        means3D: Tensor,
-        means2D: Tensor,
-        opacities: Tensor,
-        shs: Tensor | None = None,
-        colors_precomp: Tensor | None = None,
-        scales: Tensor | None = None,
-        rotations: Tensor | None = None,
-        cov3D_precomp: Tensor | None = None,
+        self, means3D: Tensor, means2D: Tensor, opacities: Tensor, **others: Tensor | None
     ) -> tuple[Tensor, ...]:
         """Channels [C, H, W], radii [N] int32 and depth [1, H, W]."""
-        drawn = self._draw(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
+        drawn = self._draw(means3D, means2D, opacities, **others)
         depth, alpha = drawn.depth.detach(), drawn.alpha.detach()
         return drawn.color, drawn.radii, torch.where(alpha > 0.5, depth / alpha, NO_DEPTH)

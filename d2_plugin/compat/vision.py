@@ -1,4 +1,4 @@
-"""What trainers call of torchvision on their way through a training: grids, saving images, PIL images to tensors.
+"""What trainers call of torchvision on their way through a training, of `fused_ssim`, and of packages for LPIPS.
 
 torchvision has to match torch to the last digit of its build, which is why it is so often missing.
 """
@@ -14,6 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
+
+from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.photometric import ssim
 
 
 def make_grid(tensor: Tensor | Sequence[Tensor], nrow: int = 8, padding: int = 2, **_: Any) -> Tensor:
@@ -83,3 +86,13 @@ class NoLpips(torch.nn.Module):
 def lpips(x: Tensor, y: Tensor, net_type: str = "alex", version: str = "0.1") -> Tensor:
     """In the place of the module `lpipsPyTorch` of a repository, whose networks are downloaded: NaN for any pair."""
     return x.new_tensor(math.nan)
+
+
+def fused_ssim(img1: Tensor, img2: Tensor, padding: str = "same", train: bool = True) -> Tensor:
+    """Mean SSIM of images [B, C, H, W] in 0..1, a scalar with gradients to both (rahul-goel/fused-ssim, for 4C4D).
+
+    Only `padding="same"`, zeros around the image, which is 3D Gaussian Splatting's. `train` changes nothing here.
+    """
+    if padding != "same":
+        raise D2Error(f"fused_ssim with padding '{padding}' needs the original, this stand-in has 'same' only")
+    return torch.stack([ssim(one.permute(1, 2, 0), other.permute(1, 2, 0)) for one, other in zip(img1, img2)]).mean()

@@ -69,12 +69,12 @@ def check_backbone(make: Callable[[], Example]) -> tuple[str, ...]:
 
 def _guarded(name: str, sentences: Iterator[str]) -> list[str]:
     """A check's sentences; an exception of the backbone is one more, and never hides the others."""
-    found: list[str] = []
+    violations: list[str] = []
     try:
-        found.extend(sentences)
+        violations.extend(sentences)
     except Exception as error:  # a third party's code may raise anything, and the report must go on
-        found.append(f"{name}: the backbone raised {type(error).__name__}: {error}")
-    return found
+        violations.append(f"{name}: the backbone raised {type(error).__name__}: {error}")
+    return violations
 
 
 def _missing_members(example: Example) -> Iterator[str]:

@@ -88,9 +88,9 @@ def _insert(example: Example) -> Iterator[str]:
     backbone, view = example.backbone, example.views[-1]
     points, count = some_points(example, view), len(example.backbone)
     added: list[int] = []
-    found, index = _edited(example, "insert", lambda: added.append(backbone.insert(points)))
-    if found:
-        yield from found
+    mistakes, index = _edited(example, "insert", lambda: added.append(backbone.insert(points)))
+    if mistakes:
+        yield from mistakes
         return
     if added[0] != len(backbone) - count:
         yield f"insert returns {added[0]} but {len(backbone) - count} Gaussians were added"
@@ -129,11 +129,11 @@ def _insert_nothing(example: Example) -> Iterator[str]:
 
 def _remove(example: Example) -> Iterator[str]:
     mask, count = some_rows(example), len(example.backbone)
-    found, index = _edited(example, "remove", lambda: example.backbone.remove(mask))
-    yield from found
-    if not found and len(example.backbone) != count - int(mask.sum()):
+    mistakes, index = _edited(example, "remove", lambda: example.backbone.remove(mask))
+    yield from mistakes
+    if not mistakes and len(example.backbone) != count - int(mask.sum()):
         yield f"remove was given {int(mask.sum())} rows and took {count - len(example.backbone)}: True means delete"
-    elif not found and set(index.tolist()) != set(torch.nonzero(~mask.cpu()).squeeze(-1).tolist()):
+    elif not mistakes and set(index.tolist()) != set(torch.nonzero(~mask.cpu()).squeeze(-1).tolist()):
         yield "remove deletes other rows than those whose mask is True"
 
 
@@ -158,15 +158,15 @@ def _moments(example: Example) -> Iterator[str]:
     """Every optimizer state with one row per Gaussian is painted with row numbers, and must follow its Gaussian."""
     count = len(example.backbone)
     _paint(example, count)
-    found, index = _edited(example, "remove", lambda: example.backbone.remove(some_rows(example)))
-    yield from found
-    if found:
+    mistakes, index = _edited(example, "remove", lambda: example.backbone.remove(some_rows(example)))
+    yield from mistakes
+    if mistakes:
         return
     yield from _painted(example, "remove", index)
     _paint(example, len(example.backbone))
     points = some_points(example, example.views[0])
-    found, index = _edited(example, "insert", lambda: example.backbone.insert(points))
-    if not found:
+    mistakes, index = _edited(example, "insert", lambda: example.backbone.insert(points))
+    if not mistakes:
         yield from _painted(example, "insert", index)
 
 

@@ -35,9 +35,11 @@ def _camera(view: View) -> Iterator[str]:
         yield f"{where} the rotation of T_camera_world is not orthonormal: is it transposed, or scaled?"
     elif torch.linalg.det(rotation) < 0:
         yield f"{where} T_camera_world mirrors the world: axes are x right, y down, z forward"
-    if view.T_camera_world[3].tolist() != [0, 0, 0, 1]:
+    last_row = view.T_camera_world.new_tensor([0, 0, 0, 1])
+    if not torch.allclose(view.T_camera_world[3], last_row, atol=1e-5):  # an inverse in float32 leaves 1.5e-8
         yield f"{where} the last row of T_camera_world is not 0 0 0 1: it maps column vectors, so transpose it"
-    if view.K[0, 0] <= 0 or view.K[1, 1] <= 0 or view.K[2].tolist() != [0, 0, 1] or view.K[0, 1] != 0:
+    is_last = torch.allclose(view.K[2], view.K.new_tensor([0, 0, 1]), atol=1e-5)
+    if (view.K.diagonal()[:2] <= 0).any() or not is_last or view.K[0, 1] != 0:  # the rasterizer refuses any skew
         yield f"{where} K must hold positive focal lengths in pixels, no skew and a last row 0 0 1"
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 from mimics import deformable3d, ex4dgs, fudan, hust4d, spacetime
 from mimics.inria import cameras_of, default_options
-from mimics.workplace import HOOKS, some_points
+from mimics.page import attached
+from mimics.workplace import HOOKS, furnish, some_points
+from repositories import run
 from tiny import TinyStore, make_views
 from torch import Tensor
 
@@ -206,18 +209,18 @@ class TestEx4DGS:
     def test_static_rows_that_become_dynamic_are_followed(self) -> None:
         model, _ = ex4dgs.make()
         model.training_setup(default_options())
-        adapter, told = Ex4DGSAdapter(model), []
-        adapter.on_resize(told.append)
+        adapter, reports = Ex4DGSAdapter(model), []
+        adapter.on_resize(reports.append)
         model.xyz_error_min_timestamp.zero_()
         with torch.no_grad():
             model._xyz_disp[:6] = 1.0
             model.extract_dynamic_points_from_static()
-        assert len(told) == 1
-        assert told[0].tolist() == [*range(6, 60), *[-1] * 6]
+        assert len(reports) == 1
+        assert reports[0].tolist() == [*range(6, 60), *[-1] * 6]
         adapter.insert(some_points(2))
-        assert told[1].tolist() == [*range(54), -1, -1, *range(54, 60)], "appended static rows land in the middle"
+        assert reports[1].tolist() == [*range(54), -1, -1, *range(54, 60)], "appended static rows land in the middle"
         adapter.remove(torch.arange(62) >= 58)
-        assert told[2].tolist() == list(range(58))
+        assert reports[2].tolist() == list(range(58))
         assert len(model._xyz_motion) == 2
 
     def test_inserted_rows_survive_the_next_prune(self) -> None:
@@ -287,3 +290,28 @@ def test_without_rotation_in_time_fudan_keeps_the_log_of_a_variance() -> None:
     adapter._append(some_points(1)._replace(lifetimes=torch.tensor([0.02])))
     torch.testing.assert_close(rows[7].exp().sqrt(), torch.tensor([[0.02]]))
     assert rows[8] is None
+
+
+def test_hooks_may_wait_for_the_field_of_a_warm_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until iteration 30 the mimic fits one still scene to all instants, as Deformable-3D-Gaussians until 3000."""
+    furnish(tmp_path, monkeypatch)
+    source = attached(deformable3d, "deformable3d", "d2.backbone.in_warm_up = False")
+    assert not run("deformable3d", source, stop=29).d2.trace
+    assert min(entry.step for entry in run("deformable3d", source, stop=45).d2.trace) == 30
+    models = deformable3d.make()[:2]
+    assert Deformable3DAdapter(*models, warm_up=30).active(1)
+    assert not Deformable3DAdapter(*models, warm_up=30, in_warm_up=False).active(29)
+
+
+def test_attaching_again_takes_the_place_of_the_first() -> None:
+    """Stages of one run attach to one model more than once."""
+    model, scene = hust4d.make()
+    model.training_setup(default_options())
+    reports: list[str] = []
+    for stage in ("coarse", "fine"):
+        adapter = Hust4DAdapter(model, scene, stage)
+        adapter.on_resize(lambda index, stage=stage: reports.append(stage))
+    adapter.insert(some_points(2))
+    assert reports == ["fine"]
+    adapter.detach()
+    assert "prune_points" not in vars(model)

@@ -11,7 +11,7 @@ from rasterizer_arguments import gaussians, inria_camera, view_24x16
 from splat_scenes import single
 from torch import Tensor
 
-from d2_plugin.compat import fourd, threedgs
+from d2_plugin.compat import fourd
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 
@@ -66,7 +66,7 @@ class TestFourD:
         raster = fourd.GaussianRasterizer(fourd.GaussianRasterizationSettings(**at))
         *_, covariances = raster(**arguments)
         np.testing.assert_allclose(covariances[0], covariance, atol=1e-8)
-        expected = threedgs.GaussianRasterizer(threedgs.GaussianRasterizationSettings(**camera))(
+        expected = fourd.inria.GaussianRasterizer(fourd.inria.GaussianRasterizationSettings(**camera))(
             torch.tensor([sliced], dtype=torch.float64),
             torch.zeros(1, 3),
             torch.tensor([[0.9 * marginal]], dtype=torch.float64),

@@ -13,8 +13,8 @@ from mimics.inria import Camera
 from rasterizer_arguments import inria_camera
 from splat_scenes import random_scene
 
-from d2_plugin.compat import depth, ex4dgs, kinematic, spacetime, vision
-from d2_plugin.compat.knn import knn
+from d2_plugin.compat import depth, ex4dgs, kinematic, nearest, spacetime, vision
+from d2_plugin.compat.nearest import knn
 from d2_plugin.compat.python_config import Config
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d
 from d2_plugin.protocol import RasterSettings, Splats
@@ -133,11 +133,11 @@ class TestPackages:
 
     def test_nearest_points_are_those_of_all_distances(self) -> None:
         points = torch.rand(1, 50, 3, generator=torch.Generator().manual_seed(0))
-        found = knn(2, points, points, False)
+        nearest_ones = knn(2, points, points, False)
         distances = torch.cdist(points[0], points[0])
-        assert found.shape == (1, 2, 50)
-        assert torch.equal(found[0, 0].long(), torch.arange(50))
-        assert torch.equal(found[0, 1].long(), distances.fill_diagonal_(9).argmin(1))
+        assert nearest_ones.shape == (1, 2, 50)
+        assert torch.equal(nearest_ones[0, 0].long(), torch.arange(50))
+        assert torch.equal(nearest_ones[0, 1].long(), distances.fill_diagonal_(9).argmin(1))
 
 
 class TestKinematic:
@@ -165,14 +165,14 @@ class TestKinematic:
         )
 
     def test_the_nearest_point_is_found(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(kinematic, "PAIRS", 100)  # in several parts
+        monkeypatch.setattr(nearest, "PAIRS", 100)  # in several parts
         points, queries = (self.rotations(seed)[:, :3].float().numpy() for seed in (4, 5))
-        index = kinematic.GpuIndexFlatL2(kinematic.StandardGpuResources(), 3)
+        index = nearest.GpuIndexFlatL2(nearest.StandardGpuResources(), 3)
         index.add(points[:20])
         index.add(points[20:])
-        distances, found = index.search(queries, 1)
+        distances, nearest_ones = index.search(queries, 1)
         squared = ((queries[:, None] - points[None]) ** 2).sum(-1)
-        assert np.array_equal(found[:, 0], squared.argmin(1))
+        assert np.array_equal(nearest_ones[:, 0], squared.argmin(1))
         np.testing.assert_allclose(distances[:, 0], squared.min(1), rtol=1e-4)
 
 

@@ -18,11 +18,13 @@ from tiny import TinyStore
 from d2_plugin import D2Config, D2Error, D2Hooks
 from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
-from d2_plugin.attach import originals
+from d2_plugin.attach import launch
 from d2_plugin.attach.launch import main
-from d2_plugin.attach.recipes import Original, recipe
-from d2_plugin.attach.session import AddGradient, Session
+from d2_plugin.attach.packages import provide
+from d2_plugin.attach.recipes import RECIPES, recipe
+from d2_plugin.attach.session import AddGradient, Original, Session
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
+from d2_plugin.hooks.reports import Report
 from d2_plugin.store.exported import RenamedStore
 
 DEPTH_LOSS = D2Config(depth_loss=DepthLossConfig(start=2))
@@ -102,7 +104,19 @@ class TestSession:
         positions, session = run_wrapped(EDITS, monkeypatch)
         assert session.hooks.telling.inserted > 0
         assert len(positions) == len(session.hooks.backbone)
-        assert session.summary().startswith(f"densify, prune, depth_loss: {session.hooks.telling.inserted} inserted")
+
+    def test_growth_beyond_what_was_inserted_is_logged_once(self, caplog: pytest.LogCaptureFixture) -> None:
+        session = Session(recipe("fudan"), EDITS, TinyStore())
+        session._others = 100  # Gaussians when D2 was attached
+        session._note_growth(Report(inserted=10, removed=0, gaussians=130, step=1))
+        session._note_growth(Report(inserted=0, removed=20, gaussians=120, step=2))
+        assert not caplog.records
+        for step in (3, 4):
+            session._note_growth(Report(inserted=0, removed=0, gaussians=121, step=step))
+        assert (
+            caplog.text.count("iteration 3: the trainer's own densification has made 31 Gaussians beside the 10") == 1
+        )
+        assert len(caplog.records) == 1
 
     def test_renders_without_gradients_are_not_part_of_the_training(self, monkeypatch: pytest.MonkeyPatch) -> None:
         session = Session(recipe("fudan"), DEPTH_LOSS, TinyStore())
@@ -119,17 +133,6 @@ class TestSession:
         assert session._drawn == 0
         render(scene.train_cameras[1.0][0], gaussians, [0, 0, 0])
         assert session._drawn == 1
-
-    def test_iterations_are_the_trainer_s_own(self) -> None:
-        """fudan says them before rendering and begins with 2, Deformable-3D-Gaussians after the step."""
-        session = Session(recipe("fudan"), DEPTH_LOSS, TinyStore())
-        session.wrap()
-        from scene.gaussian_model import GaussianModel
-
-        assert not hasattr(GaussianModel, "update_learning_rate")
-        listening = session._listening(lambda model, iteration: iteration)
-        assert listening(None, 7) == 7
-        assert (session._iteration, session._told) == (7, True)
 
 
 def _fudan_with_three_lines(config: D2Config) -> torch.Tensor:
@@ -205,6 +208,9 @@ class TestNames:
             RenamedStore.of_export(TinyStore(), tmp_path)
 
 
+STAND_IN = "d2_plugin.compat.nearest"
+
+
 class TestOriginals:
     NAME = "a_module_built_in_cuda"
 
@@ -214,23 +220,44 @@ class TestOriginals:
         for name in [name for name in sys.modules if name.split(".")[0] == self.NAME]:
             del sys.modules[name]
 
-    def test_what_can_be_imported_stays(self, tmp_path: Path) -> None:
+    def test_what_can_be_loaded_stays(self, tmp_path: Path) -> None:
         (tmp_path / "built.py").write_text("value = 1\n")
-        originals.provide((Original(self.NAME, "d2_plugin.compat.nearest", "built.py"),), tmp_path, on_cpu=False)
+        provide((Original(self.NAME, STAND_IN, "built.py"),), tmp_path, on_cpu=False, replace_broken=False)
         assert sys.modules[self.NAME].value == 1
 
-    def test_ours_takes_the_place_of_what_cannot_and_says_why(self, tmp_path: Path, caplog) -> None:
+    def test_ours_takes_the_place_of_what_cannot_where_it_may_and_says_why(self, tmp_path: Path, caplog) -> None:
         (tmp_path / "built.py").write_text("raise RuntimeError('no nvcc')\n")
-        wanted = Original(f"{self.NAME}.part", "d2_plugin.compat.nearest", "built.py")
-        installed = Original(f"{self.NAME}._C", "d2_plugin.compat.nearest")
-        originals.provide((wanted, installed), tmp_path, on_cpu=False)
+        wanted = Original(f"{self.NAME}.part", STAND_IN, "built.py")
+        installed, absent = (
+            Original(f"{self.NAME}._C", STAND_IN),
+            Original(f"{self.NAME}.absent", STAND_IN, "absent.py"),
+        )
+        provide((wanted, installed, absent), tmp_path, on_cpu=False, replace_broken=True)
         assert sys.modules[f"{self.NAME}.part"].distCUDA2(torch.rand(0, 3)).shape == (0,)
         exec(f"from {self.NAME}._C import distCUDA2")
         assert "d2_plugin.compat.nearest stands in for it (its import failed: no nvcc)" in caplog.text
+        assert "(no file absent.py)" in caplog.text
 
-    def test_a_file_that_is_not_there_is_named(self, tmp_path: Path, caplog) -> None:
-        originals.provide((Original(self.NAME, "d2_plugin.compat.nearest", "built.py"),), tmp_path, on_cpu=False)
-        assert "(no file built.py)" in caplog.text
+    def test_on_a_gpu_nothing_is_replaced_unasked(self, tmp_path: Path) -> None:
+        with pytest.raises(D2Error, match=r"cannot be loaded \(no file built.py\): build it .* or give --stand-ins"):
+            provide((Original(self.NAME, STAND_IN, "built.py"),), tmp_path, on_cpu=False, replace_broken=False)
+
+    @pytest.mark.parametrize(("built", "works"), [("object()", True), ("None", False)])
+    def test_gsplat_is_what_its_own_loader_loads_or_builds(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, built: str, works: bool
+    ) -> None:
+        """As PyPI ships it, it builds its kernels at first use and never has `gsplat.csrc`."""
+        for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
+            monkeypatch.delitem(sys.modules, name)
+        (tmp_path / "gsplat" / "cuda").mkdir(parents=True)
+        for folder in ("gsplat", "gsplat/cuda"):
+            (tmp_path / folder / "__init__.py").touch()
+        (tmp_path / "gsplat" / "cuda" / "_backend.py").write_text(f"_C = {built}\n")
+        monkeypatch.syspath_prepend(str(tmp_path))
+        provide(RECIPES["gsplat"].originals, tmp_path, on_cpu=False, replace_broken=True)
+        assert ("gsplat.csrc" in sys.modules) == (not works)
+        for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
+            del sys.modules[name]
 
 
 def launched(*arguments: str, folder: Path) -> subprocess.CompletedProcess:
@@ -264,8 +291,8 @@ class TestCommand:
         assert main(["fudan", "--", str(tmp_path / "train.py")]) == 2
         assert "no script at" in capsys.readouterr().err
 
-    @pytest.mark.skipif(torch.cuda.is_available(), reason="asks what happens without a GPU")
-    def test_without_a_gpu_the_cpu_has_to_be_asked_for(self, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    def test_without_a_gpu_the_cpu_has_to_be_asked_for(self, tmp_path: Path, monkeypatch, capsys) -> None:
+        monkeypatch.setattr(launch.torch.cuda, "is_available", lambda: False)
         (tmp_path / "train.py").touch()
         assert main(["fudan", "--", str(tmp_path / "train.py")]) == 2
         assert "add --cpu to try it on the CPU" in capsys.readouterr().err

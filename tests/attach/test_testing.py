@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import pytest
 import torch
 from tiny import BACKBONES, make_adapter, make_model, make_views
+from torch import Tensor
+from torch.optim import Optimizer
 
 from d2_plugin.adapters.watched import WatchedModel
 from d2_plugin.backbones.densify import grow
-from d2_plugin.protocol import RasterSettings, Render, Splats, View
+from d2_plugin.protocol import Points, RasterSettings, Render, Splats, View
 from d2_plugin.testing import CHECKS, ContractError, Example, check_backbone
 
 
@@ -45,6 +47,20 @@ def make(backbone: str = "yang4d", temporal: bool = True) -> Example:
 @pytest.mark.parametrize("backbone", BACKBONES)
 def test_the_bundled_backbones_keep_the_contract(backbone: str, temporal: bool) -> None:
     assert set(check_backbone(lambda: make(backbone, temporal))) == {*CHECKS, "state"}
+
+
+def test_what_rounding_leaves_in_a_last_row_is_no_mistake() -> None:
+    """As torch.linalg.inv leaves it in float32."""
+
+    def make_rounded() -> Example:
+        example = make()
+        rounded = torch.tensor([1.5e-8, 0, -1.5e-8, 0]).expand(4, 4) * torch.eye(4)[3][:, None]
+        noise = torch.tensor([[0, 0, 0], [0, 0, 0], [1.5e-8, 0, 0]])
+        shift = {"T_camera_world": lambda v: v.T_camera_world + rounded, "K": lambda v: v.K + noise}
+        with_view(**shift)(example.backbone)
+        return example
+
+    assert check_backbone(make_rounded)
 
 
 def test_what_the_example_lacks_is_not_checked() -> None:
@@ -85,6 +101,43 @@ def with_slice(change: Callable[[Splats], Splats]) -> Callable[[WatchedModel], N
     return apply
 
 
+def with_insert(change: Callable[[Points], Points]) -> Callable[[WatchedModel], None]:
+    """An adapter that inserts something else than it was given."""
+
+    def apply(adapter: WatchedModel) -> None:
+        insert = adapter.insert
+        adapter.insert = lambda points: insert(change(points))
+
+    return apply
+
+
+def with_report(change: Callable[[Tensor], Tensor]) -> Callable[[WatchedModel], None]:
+    """An adapter whose reports are different."""
+
+    def apply(adapter: WatchedModel) -> None:
+        report = adapter._report
+        adapter._report = lambda index: report(change(index))
+
+    return apply
+
+
+def after_remove(change: Callable[[Optimizer, Mapping[str, Tensor]], None]) -> Callable[[WatchedModel], None]:
+    """An adapter that does something to the optimizer after a removal; gets the first moments from before."""
+
+    def apply(adapter: WatchedModel) -> None:
+        remove = adapter.remove
+
+        def changed(mask: Tensor) -> None:
+            optimizer = adapter.model.gaussians.optimizer
+            before = {g["name"]: optimizer.state[g["params"][0]]["exp_avg"].clone() for g in optimizer.param_groups}
+            remove(mask)
+            change(optimizer, before)
+
+        adapter.remove = changed
+
+    return apply
+
+
 def silent(adapter: WatchedModel) -> None:
     adapter._listeners = []
     adapter.on_resize = lambda listener: None
@@ -95,29 +148,9 @@ def one_listener(adapter: WatchedModel) -> None:
 
 
 def early(adapter: WatchedModel) -> None:
-    """Tells before the change."""
-    tell, select = adapter._tell, type(adapter.model).select
-
-    def tell_first(index: torch.Tensor) -> None:
-        tell(index)
-        select(adapter.model, index)
-
-    adapter.model.select = tell_first
-
-
-def reversed_rows(adapter: WatchedModel) -> None:
-    tell = adapter._tell
-    adapter._tell = lambda index: tell(index.flip(0))
-
-
-def past_the_end(adapter: WatchedModel) -> None:
-    tell = adapter._tell
-    adapter._tell = lambda index: tell(index + 100)
-
-
-def as_mask(adapter: WatchedModel) -> None:
-    tell = adapter._tell
-    adapter._tell = lambda index: tell(index >= 0)
+    """Reports before the change."""
+    report, select = adapter._report, type(adapter.model).select
+    adapter.model.select = lambda index: (report(index), select(adapter.model, index))
 
 
 def keeps_instead(adapter: WatchedModel) -> None:
@@ -130,51 +163,20 @@ def overcounts(adapter: WatchedModel) -> None:
     adapter.insert = lambda points: insert(points) + 1
 
 
-def elsewhere(adapter: WatchedModel) -> None:
-    insert = adapter.insert
-    adapter.insert = lambda points: insert(points._replace(positions=points.positions + 0.7))
-
-
-def wide(adapter: WatchedModel) -> None:
-    insert = adapter.insert
-    adapter.insert = lambda points: insert(points._replace(scales=points.scales * 5))
-
-
-def faint(adapter: WatchedModel) -> None:
-    insert = adapter.insert
-    adapter.insert = lambda points: insert(points._replace(opacities=points.opacities * 0.1))
-
-
-def forgets_moments(adapter: WatchedModel) -> None:
-    remove = adapter.remove
-
-    def forgetful(mask: torch.Tensor) -> None:
-        remove(mask)
-        adapter.model.gaussians.optimizer.state.clear()
-
-    adapter.remove = forgetful
-
-
-def stale_moments(adapter: WatchedModel) -> None:
+def stale(optimizer: Optimizer, before: Mapping[str, Tensor]) -> None:
     """Moments of the first rows stay in front, whichever rows are kept."""
-    remove = adapter.remove
-
-    def stale(mask: torch.Tensor) -> None:
-        optimizer = adapter.model.gaussians.optimizer
-        old = {
-            group["name"]: optimizer.state[group["params"][0]]["exp_avg"].clone() for group in optimizer.param_groups
-        }
-        remove(mask)
-        for group in optimizer.param_groups:
-            state = optimizer.state[group["params"][0]]
-            state["exp_avg"].copy_(old[group["name"]][: len(state["exp_avg"])])
-
-    adapter.remove = stale
+    for group in optimizer.param_groups:
+        moments = optimizer.state[group["params"][0]]["exp_avg"]
+        moments.copy_(before[group["name"]][: len(moments)])
 
 
-def draws(adapter: WatchedModel) -> None:
-    insert = adapter.insert
-    adapter.insert = lambda points: (torch.rand(1), insert(points))[1]
+def draws(points: Points) -> Points:
+    torch.rand(1)
+    return points
+
+
+def refuses(points: Points) -> Points:
+    raise RuntimeError("no room")
 
 
 def normalised_depth(adapter: WatchedModel) -> None:
@@ -188,7 +190,7 @@ def normalised_depth(adapter: WatchedModel) -> None:
 
 
 def any_camera(adapter: WatchedModel) -> None:
-    kept: list[tuple[torch.Tensor, torch.Tensor]] = []
+    kept: list[tuple[Tensor, Tensor]] = []
     rendered = adapter.rendered
 
     def remember(view: View, render: Render) -> None:
@@ -225,18 +227,11 @@ def swaps_a_batch(adapter: WatchedModel) -> None:
     adapter._renders.put, adapter.rendered_depth = remember, wrong
 
 
-def refuses(adapter: WatchedModel) -> None:
-    def fail(points: object) -> int:
-        raise RuntimeError("no room")
-
-    adapter.insert = fail
-
-
-def transposed(view: object) -> torch.Tensor:
+def transposed(view: object) -> Tensor:
     return view.T_camera_world.T
 
 
-def mirrored(view: object) -> torch.Tensor:
+def mirrored(view: object) -> Tensor:
     return torch.diag(torch.tensor([1.0, -1, 1, 1])) @ view.T_camera_world
 
 
@@ -261,22 +256,22 @@ def mirrored(view: object) -> torch.Tensor:
         (silent, "own densification goes from 60 to .* without a report"),
         (one_listener, "reported to one listener only"),
         (early, "report N_new rows, after the change"),
-        (reversed_rows, "are not those of the rows that the report names"),
-        (past_the_end, "reports rows outside -1..59"),
-        (as_mask, "reports torch.bool .* expected an index"),
+        (with_report(lambda index: index.flip(0)), "are not those of the rows that the report names"),
+        (with_report(lambda index: index + 100), "reports rows outside -1..59"),
+        (with_report(lambda index: index >= 0), "reports torch.bool .* expected an index"),
         (keeps_instead, "remove was given 20 rows and took 40"),
         (overcounts, "insert returns 9 but 8 Gaussians were added"),
-        (elsewhere, "are not where their points are"),
-        (wide, "have a standard deviation of .* asked for"),
-        (faint, "have an opacity of .* asked for"),
-        (forgets_moments, "has lost its state"),
-        (stale_moments, "does not stay on its row"),
-        (draws, "the global random state changes"),
+        (with_insert(lambda p: p._replace(positions=p.positions + 0.7)), "are not where their points are"),
+        (with_insert(lambda p: p._replace(scales=p.scales * 5)), "have a standard deviation of .* asked for"),
+        (with_insert(lambda p: p._replace(opacities=p.opacities * 0.1)), "have an opacity of .* asked for"),
+        (after_remove(lambda optimizer, _: optimizer.state.clear()), "has lost its state"),
+        (after_remove(stale), "does not stay on its row"),
+        (with_insert(draws), "the global random state changes"),
         (normalised_depth, "depth_sum is not the slice's"),
         (any_camera, "render of one camera for another"),
         (last_only, "rendered_depth knows the last render alone"),
         (swaps_a_batch, "the render of one camera of a batch for another"),
-        (refuses, "insert: the backbone raised RuntimeError: no room"),
+        (with_insert(refuses), "insert: the backbone raised RuntimeError: no room"),
     ],
 )
 def test_each_violation_gets_its_sentence(change: Callable[[WatchedModel], None], sentence: str) -> None:

@@ -157,7 +157,7 @@ def test_a_trainer_runs_in_its_own_process_and_leaves_rows_and_a_table(
 
     monkeypatch.setattr("benchmarks.trainers.bench.prepare", prepared)
     monkeypatch.setattr(Source, "seconds", 0.1)
-    monkeypatch.setenv("PYTHONPATH", str(TESTS))
+    monkeypatch.setenv("PYTHONPATH", f"{TESTS.parent}{os.pathsep}{TESTS}")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     page = tmp_path / "page.md"
     page.write_text("<!-- rows -->\n<!-- end -->\n")

@@ -7,11 +7,12 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor, nn
 
-from d2_plugin.rasterizer import RasterSettings, Splats
-
-from .ex4dgs import Scene, opacity_compensation
+from . import ex4dgs
+from .ex4dgs import Scene, render, training
 from .fastergs4d import product
-from .inria import InriaModel, cameras_of, covariances, default_options, draw, initial_points, l1_loss, shuffled
+from .inria import InriaModel, cameras_of, initial_points
+
+__all__ = ["make", "render", "training"]
 
 STATIC = (
     *InriaModel.columns,
@@ -22,16 +23,15 @@ STATIC = (
 MOTION = (("motion_xyz", "_xyz_motion"), ("motion_rotation", "_rotation_motion"))
 
 
-class GaussianModel(InriaModel):
+class GaussianModel(ex4dgs.GaussianModel):
     """Splats of level 0 drift; those of level 1 hang on a motion, whose number in the joint table is their parent."""
 
     columns = (*STATIC, *MOTION)
-    accumulated = ("xyz_gradient_accum", "denom", "xyz_error_accum", "xyz_ssim_error_accum", "error_denom")
-    kept = ("xyz_error_min", "xyz_error_min_timestamp", "min_radii2D")
-    kernel_size, duration, time_shift, interval = 0.1, 1, 1, 1
+    saved = (*ex4dgs.GaussianModel.kept, "_parent", "_level")
+    rgb = InriaModel.rgb
 
     def create_from_pcd(self, points, colors, scale: float = 0.15) -> None:
-        super().create_from_pcd(points, colors, scale)
+        InriaModel.create_from_pcd(self, points, colors, scale)
         count = len(points)
         span = torch.zeros(count, 2, 1)
         span[:, 1] = 1
@@ -43,13 +43,7 @@ class GaussianModel(InriaModel):
         self._parent, self._level = torch.full((count, 1), -1), torch.zeros(count, 1, dtype=torch.long)
 
     def rates(self, opt: SimpleNamespace) -> dict[str, float]:
-        return super().rates(opt) | dict.fromkeys([name for name, _ in (*STATIC[6:], *MOTION)], 1e-3)
-
-    def training_setup(self, training_args: SimpleNamespace) -> None:
-        super().training_setup(training_args)
-        count = len(self._xyz)
-        self.xyz_error_min, self.xyz_error_min_timestamp = torch.full((count, 1), 1000.0), torch.full((count, 1), -1.0)
-        self.min_radii2D = torch.full((count,), 1000.0)
+        return InriaModel.rates(self, opt) | dict.fromkeys([name for name, _ in (*STATIC[6:], *MOTION)], 1e-3)
 
     def _joint(self, t: float) -> tuple[Tensor, Tensor]:
         """Positions and rotations of splats and motions together, children carried by their parents."""
@@ -94,16 +88,6 @@ class GaussianModel(InriaModel):
         for name in (*self.accumulated, *self.kept, "max_radii2D"):
             setattr(self, name, getattr(self, name)[~static_mask])
 
-    def cat_tensors_to_optimizer(self, new: dict[str, Tensor]) -> None:
-        for group, moments in self._each_column():
-            if group["name"] in new:
-                rows = new[group["name"]]
-                padded = {key: torch.cat([value, torch.zeros_like(rows)]) for key, value in moments.items()}
-                self._swap(group, torch.cat([group["params"][0], rows]), padded)
-
-    def densification_postfix(self, *values: Tensor) -> None:
-        self._added(self.columns, values)
-
     def densification_postfix_onlystatic(
         self, new_xyz, new_features_dc, new_features_rest, new_opacity, new_scaling, new_rotation, new_xyz_disp,
         new_opacity_duration_center, new_opacity_duration_var,
@@ -112,11 +96,6 @@ class GaussianModel(InriaModel):
             new_xyz, new_features_dc, new_features_rest, new_opacity, new_scaling, new_rotation, new_xyz_disp,
             new_opacity_duration_center, new_opacity_duration_var,
         ))  # fmt: skip
-
-    def _added(self, columns, values: tuple[Tensor, ...]) -> None:
-        self.cat_tensors_to_optimizer({name: value for (name, _), value in zip(columns, values, strict=True)})
-        self._zero_accumulators()
-        self.max_radii2D, self.min_radii2D = torch.zeros(len(self._xyz)), torch.full((len(self._xyz),), 1000.0)
 
     def densify_and_clone(self, grads: Tensor, threshold: float, extent: float) -> None:
         """The errors, parents and levels are lengthened by the caller, splats before motions."""
@@ -156,67 +135,8 @@ class GaussianModel(InriaModel):
         if self._xyz.isnan().any():
             self.prune_points(self._xyz.isnan().any(1))
 
-    def recording(self) -> tuple[object, ...]:
-        return super().recording(), tuple(getattr(self, name) for name in (*self.kept, "_parent", "_level"))
-
-    def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
-        super().restore(model_args[0], training_args)
-        for name, value in zip((*self.kept, "_parent", "_level"), model_args[1], strict=True):
-            setattr(self, name, value.clone())
-
-
-def render(viewpoint_camera, pc, bg_color, near=0.2) -> dict[str, Tensor]:
-    """As Ex4DGS draws, of the splats alone; depth is divided by `acc`."""
-    t = viewpoint_camera.timestamp
-    means = pc.get_xyz_at_t(t)
-    cov = covariances(pc.get_scaling(), pc.get_rotation_at_t(t))
-    opacities = pc.get_opacity_at_t(t).squeeze(-1)
-    opacities = opacities * opacity_compensation(means, cov, viewpoint_camera, pc.kernel_size)
-    projected = torch.cat([means, torch.ones(len(means), 1)], 1) @ viewpoint_camera.full_proj_transform
-    inside = (projected[:, :2] / projected[:, 3:]).abs().amax(1) <= 1.3
-    rows = torch.nonzero(inside & (projected[:, 3] > near)).squeeze(1)
-    splats = Splats(means[rows], cov[rows], opacities[rows], rows)
-    settings = RasterSettings(near=near, blur=pc.kernel_size)
-    package = draw(splats, pc.rgb[rows], viewpoint_camera, len(means), bg_color, settings)
-    acc = package.pop("alpha")
-    return package | {"acc": acc, "depth_sum": package["depth"], "depth": package["depth"] / acc.clamp_min(1e-9)}
-
 
 def make() -> tuple[GaussianModel, Scene]:
     gaussians = GaussianModel()
     gaussians.create_from_pcd(*initial_points())
     return gaussians, Scene(cameras_of(timestamp=lambda view: view.frame))
-
-
-def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
-    opt = opt or default_options()
-    dataset, first_iter = SimpleNamespace(white_background=False, near=0.2, far=100.0), 0
-    gaussians.training_setup(opt)
-    if checkpoint:
-        (model_params, first_iter) = checkpoint
-        gaussians.restore(model_params, opt)
-
-    bg_color = [1, 1, 1] if dataset.white_background else [0, 0, 0]
-    for iteration in range(first_iter + 1, min(opt.iterations, stop) + 1):
-        torch.manual_seed(iteration)
-        viewpoint_cam = scene.cameras[shuffled(len(scene.cameras), iteration)[0]]
-        render_pkg = render(viewpoint_cam, gaussians, bg_color, near=dataset.near)
-        loss = l1_loss(render_pkg["render"], viewpoint_cam.original_image)
-        loss.backward()
-
-        with torch.no_grad():
-            if iteration < opt.densify_until_iter:
-                seen, radii = render_pkg["visibility_filter"], render_pkg["radii"]
-                gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
-                gaussians.add_densification_stats(render_pkg["viewspace_points"].grad, seen)
-                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
-                    gaussians.densify_and_prune(opt.densify_grad_threshold, 0.01, scene.cameras_extent, None)
-                elif iteration % 17 == 0:
-                    gaussians.extract_dynamic_points_from_static()
-            if iteration < opt.iterations:
-                gaussians.optimizer.step()
-                gaussians.optimizer.zero_grad(set_to_none=True)
-
-                gaussians.prune_nan_points()
-
-    return SimpleNamespace(**locals())

@@ -15,6 +15,7 @@ from .inria import (
     cameras_of,
     covariances,
     default_options,
+    densify,
     draw,
     initial_points,
     l1_loss,
@@ -127,14 +128,10 @@ def training(
         loss = l1_loss(image, viewpoint_cam.original_image)
         loss.backward()
         with torch.no_grad():
-            seen = visibility_filter
-            gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
-            if iteration < opt.densify_until_iter:
-                gaussians.add_densification_stats(render_pkg_re["viewspace_points_densify"].grad, seen)
-                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
-                    gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005, scene.cameras_extent, None)
-                if iteration % opt.opacity_reset_interval == 0:
-                    gaussians.reset_opacity()
+            gradient = render_pkg_re["viewspace_points_densify"].grad
+            densify(gaussians, opt, iteration, gradient, visibility_filter, radii)
+            if iteration < opt.densify_until_iter and iteration % opt.opacity_reset_interval == 0:
+                gaussians.reset_opacity()
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 deform.optimizer.step()

@@ -15,6 +15,7 @@ from .inria import (
     cameras_of,
     covariances,
     default_options,
+    densify,
     draw,
     initial_points,
     l1_loss,
@@ -36,6 +37,7 @@ class GaussianModel(InriaModel):
     columns = (*STATIC, *DYNAMIC)
     accumulated = ("xyz_gradient_accum", "denom", "xyz_error_accum", "xyz_ssim_error_accum", "error_denom")
     kept = ("xyz_error_min", "xyz_error_min_timestamp", "min_radii2D")
+    saved = kept
     kernel_size, duration, time_shift = 0.1, 1, 1
 
     def create_from_pcd(self, points, colors, scale: float = 0.15) -> None:
@@ -153,12 +155,12 @@ class GaussianModel(InriaModel):
         if any(mask.any() for mask in masks):
             self.prune_points(*masks)
 
-    def recording(self) -> tuple[object, ...]:
-        return super().recording(), tuple(getattr(self, name) for name in self.kept)
+    def capture(self) -> tuple[object, ...]:
+        return super().capture(), tuple(getattr(self, name) for name in self.saved)
 
     def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
         super().restore(model_args[0], training_args)
-        for name, value in zip(self.kept, model_args[1], strict=True):
+        for name, value in zip(self.saved, model_args[1], strict=True):
             setattr(self, name, value.clone())
 
 
@@ -236,14 +238,10 @@ def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, 
         gaussians.mark_error(loss.item(), viewpoint_cam.timestamp)
         with torch.no_grad():
             static_num = gaussians._xyz.shape[0]
-            if iteration < opt.densify_until_iter:
-                seen, radii = render_pkg["visibility_filter"][:static_num], render_pkg["radii"][:static_num]
-                gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
-                gaussians.add_densification_stats(render_pkg["viewspace_points"].grad[:static_num], seen)
-                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
-                    gaussians.densify_and_prune(opt.densify_grad_threshold, 0.01, scene.cameras_extent, None)
-                elif iteration % 17 == 0:
-                    gaussians.extract_dynamic_points_from_static()
+            seen, radii = render_pkg["visibility_filter"][:static_num], render_pkg["radii"][:static_num]
+            densify(gaussians, opt, iteration, render_pkg["viewspace_points"].grad[:static_num], seen, radii, 0.01)
+            if iteration < opt.densify_until_iter and iteration % 17 == 0:
+                gaussians.extract_dynamic_points_from_static()
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none=True)

@@ -186,7 +186,7 @@ class Trainer:
         self.model.gaussians.optimizer.load_state_dict(saved["optimizer"])
         self.model.gaussians._densification_info = saved["info"].clone()
 
-    def recording(self) -> dict[str, object]:
+    def capture(self) -> dict[str, object]:
         g = self.model.gaussians
         values = {name: getattr(g, f"_{name}").detach().clone() for name in RATES}
         return {"values": values, "optimizer": g.optimizer.state_dict(), "info": g._densification_info}

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from d2_plugin.gaussians.slicing import slice_gaussians
 
-from .inria import Camera, InriaModel, cameras_of, default_options, draw, initial_points, l1_loss, shuffled
+from .inria import Camera, InriaModel, cameras_of, default_options, densify, draw, initial_points, l1_loss, shuffled
 
 
 class GaussianModel(InriaModel):
@@ -100,14 +100,9 @@ def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, 
         batch_viewspace_point_grad = torch.stack(batch_point_grad, 1).sum(1)
         batch_viewspace_point_grad[visibility_filter] *= batch_size / visibility_count[visibility_filter]
         with torch.no_grad():
-            if iteration < opt.densify_until_iter:
-                seen = visibility_filter
-                gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
-                gaussians.add_densification_stats(batch_viewspace_point_grad.unsqueeze(1), seen)
-                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
-                    gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005, scene.cameras_extent, None)
-                if iteration % opt.opacity_reset_interval == 0:
-                    gaussians.reset_opacity()
+            densify(gaussians, opt, iteration, batch_viewspace_point_grad.unsqueeze(1), visibility_filter, radii)
+            if iteration < opt.densify_until_iter and iteration % opt.opacity_reset_interval == 0:
+                gaussians.reset_opacity()
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none = True)

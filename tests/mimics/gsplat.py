@@ -125,7 +125,8 @@ def render(splats, view) -> SimpleNamespace:
     colors = (0.5 + SH_C0 * p["sh0"][:, 0] + 0 * p["shN"].sum((1, 2))[:, None]).clamp_min(0)
     offsets = torch.zeros(len(rows), 2, requires_grad=True)
     sliced = Splats(p["means"], cov, torch.sigmoid(p["opacities"]), rows)
-    return SimpleNamespace(image=rasterize(sliced, colors, view, screen_offsets=offsets).color, offsets=offsets)
+    out = rasterize(sliced, colors, view, screen_offsets=offsets)
+    return SimpleNamespace(image=out.color, depth_sum=out.depth_sum, offsets=offsets)
 
 
 class DefaultStrategy:

@@ -15,6 +15,7 @@ from .inria import (
     cameras_of,
     covariances,
     default_options,
+    densify,
     draw,
     initial_points,
     l1_loss,
@@ -87,8 +88,8 @@ class GaussianModel(InriaModel):
         self._deformation_accum = self._deformation_accum[~mask]
         self._deformation_table = self._deformation_table[~mask]
 
-    def recording(self) -> tuple[object, ...]:
-        return super().recording(), self._deformation.state_dict(), self._deformation_table
+    def capture(self) -> tuple[object, ...]:
+        return super().capture(), self._deformation.state_dict(), self._deformation_table
 
     def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
         model_args, field, self._deformation_table = model_args
@@ -159,12 +160,7 @@ def scene_reconstruction(gaussians, scene, stage, opt, checkpoint, stop, train_i
         loss.backward()
         viewspace_point_tensor_grad = sum(package["viewspace_points"].grad for package in packages)
         with torch.no_grad():
-            if iteration < opt.densify_until_iter:
-                seen = visibility_filter
-                gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
-                gaussians.add_densification_stats(viewspace_point_tensor_grad, seen)
-                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
-                    gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005, scene.cameras_extent, None)
+            densify(gaussians, opt, iteration, viewspace_point_tensor_grad, visibility_filter, radii)
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none = True)

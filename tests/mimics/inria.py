@@ -271,7 +271,7 @@ class InriaModel:
                 value = torch.logit(self.get_opacity.clamp(max=0.3))
                 self._swap(group, value, {key: torch.zeros_like(value) for key in moments})
 
-    def recording(self) -> tuple[object, ...]:
+    def capture(self) -> tuple[object, ...]:
         values = tuple(getattr(self, attribute) for _, attribute in self.columns)
         evidence = tuple(getattr(self, name) for name in (*self.accumulated, "max_radii2D"))
         return values, evidence, self.optimizer.state_dict()
@@ -284,6 +284,16 @@ class InriaModel:
         for name, value in zip((*self.accumulated, "max_radii2D"), evidence, strict=True):
             setattr(self, name, value.clone())
         self.optimizer.load_state_dict(opt_dict)
+
+
+def densify(gaussians, opt, iteration: int, gradient: Tensor, seen: Tensor, radii: Tensor, faint=0.005) -> None:
+    """What all of them do between backward and the optimizer's step, while they densify."""
+    if iteration >= opt.densify_until_iter:
+        return
+    gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
+    gaussians.add_densification_stats(gradient, seen)
+    if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+        gaussians.densify_and_prune(opt.densify_grad_threshold, faint, 2.0, None)
 
 
 def initial_points(count: int = 60, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -31,6 +31,7 @@ def changed_lines(page: str) -> list[str]:
 
 def attached(mimic: ModuleType, page: str, after_first: str = "") -> ModuleType:
     """The mimic with the page's lines in its `training`; `after_first` is code to run after line 1."""
+    mimic = sys.modules[mimic.training.__module__]  # cem4dgs is trained by Ex4DGS's loop
     lines = inspect.getsource(mimic).splitlines()
     for before, added, after in added_lines(page):
         if re.match(r"(from|import) ", added):

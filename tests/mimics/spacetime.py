@@ -15,6 +15,7 @@ from .inria import (
     cameras_of,
     covariances,
     default_options,
+    densify,
     draw,
     initial_points,
     l1_loss,
@@ -137,12 +138,8 @@ def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, 
             gaussians.optimizer.zero_grad(set_to_none = True)#
         gaussians.set_batch_gradient(opt.batch_size)
         with torch.no_grad():
-            if iteration < opt.densify_until_iter:
-                seen, radii = render_pkg["visibility_filter"], render_pkg["radii"]
-                gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
-                gaussians.add_densification_stats(render_pkg["viewspace_points"].grad, seen)
-                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
-                    gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005, scene.cameras_extent, None)
+            seen, radii = render_pkg["visibility_filter"], render_pkg["radii"]
+            densify(gaussians, opt, iteration, render_pkg["viewspace_points"].grad, seen, radii)
             if iteration == 80:
                 gaussians.omegamask = torch.ones(len(gaussians._xyz), 1, dtype=torch.bool)
             if iteration >= 80 and gaussians._omega.grad is not None:

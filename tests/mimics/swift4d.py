@@ -10,7 +10,17 @@ from torch import Tensor, nn
 from d2_plugin.rasterizer import Splats
 
 from .hust4d import Scene
-from .inria import InriaModel, cameras_of, covariances, default_options, draw, initial_points, l1_loss, shuffled
+from .inria import (
+    InriaModel,
+    cameras_of,
+    covariances,
+    default_options,
+    densify,
+    draw,
+    initial_points,
+    l1_loss,
+    shuffled,
+)
 
 
 class SpaceTimeHashingField(nn.Module):
@@ -87,10 +97,10 @@ class GaussianModel(InriaModel):
         self.prune_points(self._max_weight < weight_threshold)
         self._max_weight = self._max_weight * 0.0
 
-    def recording(self) -> tuple[object, ...]:
+    def capture(self) -> tuple[object, ...]:
         """With what the repository's own leaves out: without logits and field nothing could go on."""
         field = self._FDhash.state_dict(), self.hash_optimizer.state_dict()
-        return super().recording(), self._dynamic.detach().clone(), self._max_weight.clone(), field
+        return super().capture(), self._dynamic.detach().clone(), self._max_weight.clone(), field
 
     def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
         model_args, dynamic, self._max_weight, (field, moments) = model_args
@@ -155,15 +165,10 @@ def scene_reconstruction(gaussians, scene, stage, opt, checkpoint, stop, args=No
         loss.backward()
         viewspace_point_tensor_grad = sum(package["viewspace_points"].grad for package in packages)
         with torch.no_grad():
-            if iteration < opt.densify_until_iter:
-                seen = visibility_filter
-                gaussians.max_radii2D[seen] = torch.max(gaussians.max_radii2D[seen], radii[seen])
-                gaussians.add_densification_stats(viewspace_point_tensor_grad, seen)
-                gaussians._max_weight = torch.max(gaussians._max_weight, last_max_weight)
-                if iteration % 31 == 0:
-                    gaussians.weight_prune(0.02)
-                if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
-                    gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005, scene.cameras_extent, None)
+            gaussians._max_weight = torch.max(gaussians._max_weight, last_max_weight)
+            densify(gaussians, opt, iteration, viewspace_point_tensor_grad, visibility_filter, radii)
+            if iteration < opt.densify_until_iter and iteration % 31 == 0:
+                gaussians.weight_prune(0.02)
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none = True)

@@ -107,7 +107,7 @@ def test_batches_of_views_with_resets_and_restored_checkpoints(
     source.WITH_MARKS = with_marks
     options = default_options(batch_size=batch, opacity_reset_interval=11, densify_grad_threshold=3e-2)
     first = source.training(*mimic.make(), opt=options, stop=18)
-    checkpoint = copy.deepcopy((first.gaussians.recording(), 18))
+    checkpoint = copy.deepcopy((first.gaussians.capture(), 18))
     kept.state = copy.deepcopy(first.d2.state_dict())
     second = source.training(*mimic.make(), opt=options, checkpoint=checkpoint, stop=36)
     for outcome, steps in ((first, 18), (second, 36)):

@@ -1,0 +1,122 @@
+"""What adapters share: listeners, the renders of a step, and points and splats in the shapes that trainers have."""
+
+from __future__ import annotations
+
+from typing import Any, Generic, TypeVar
+
+import torch
+from torch import Tensor
+
+from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
+from d2_plugin.gaussians.spherical_harmonics import SH_C0, channel_count
+from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
+from d2_plugin.protocol import Points, ResizeListener, Splats, View
+
+Render = TypeVar("Render")
+
+
+class Resizing:
+    """The listeners to structural changes."""
+
+    def __init__(self) -> None:
+        self._listeners: list[ResizeListener] = []
+
+    def on_resize(self, listener: ResizeListener) -> None:
+        """Register a listener for every structural change, the trainer's own densification included."""
+        self._listeners.append(listener)
+
+    def _report(self, index: Tensor) -> None:
+        for listener in self._listeners:
+            listener(index)
+
+
+class Renders(Generic[Render]):
+    """Renders of the views of one step, a batch of them as well, by camera and frame; each is handed out once.
+
+    A render holds a graph, and is out of date once the parameters change: whoever keeps them calls `forget` then.
+    """
+
+    def __init__(self) -> None:
+        self._by_key: dict[tuple[str, int], Render] = {}
+
+    def put(self, view: View, render: Render) -> None:
+        """Keep the render of a view; a later one of the same camera and frame takes its place."""
+        self._by_key[view.camera, view.frame] = render
+
+    def take(self, view: View) -> Render | None:
+        """The render of this view, if there is one that has not been handed out."""
+        return self._by_key.pop((view.camera, view.frame), None)
+
+    def forget(self) -> None:
+        """Forget all renders."""
+        self._by_key.clear()
+
+
+def optional(owner: Any, name: str, default: Any = None) -> Any:
+    """An attribute that some versions of a repository lack or leave at None; `default` there."""
+    value = getattr(owner, name, None)
+    return default if value is None else value
+
+
+def finite(points: Points) -> Points:
+    """The points that can be inserted."""
+    return points.select(torch.isfinite(points.positions).all(-1) & torch.isfinite(points.scales) & (points.scales > 0))
+
+
+def splats_of(
+    means: Tensor, scales: Tensor, rotations: Tensor, opacities: Tensor, rows: Tensor | None = None
+) -> Splats:
+    """Splats from activated values: scales [M, 3], quaternions [M, 4], whose length scales the covariance if it is not
+    1, and opacities [M]; all rows where none are given."""
+    factors = rotation_matrices_3d(rotations.T) * scales.T
+    rows = torch.arange(len(means), device=means.device) if rows is None else rows
+    return Splats(means, covariances_from_factors(factors), opacities, rows)
+
+
+def seen_colors(
+    harmonics: Tensor, view: View, splats: Splats, degree: int, phase: Tensor | None = None, time_degree: int = 0
+) -> Tensor:
+    """RGB [M, 3] of splats as seen in `view`, from the spherical harmonics [N, C, 3] of all rows."""
+    centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
+    chosen = harmonics[splats.rows, : channel_count(degree, time_degree)]
+    return harmonic_colors(chosen, splats.means - centre, phase, degree, time_degree)
+
+
+def constant_harmonics(colors: Tensor) -> Tensor:
+    """The coefficients [K, 1, 3] of colours [K, 3] that are the same from everywhere."""
+    return ((colors - 0.5) / SH_C0)[:, None, :]
+
+
+def identities(count: int, like: Tensor) -> Tensor:
+    """Quaternions [count, 4] that turn nothing."""
+    rotations = like.new_zeros(count, 4)
+    rotations[:, 0] = 1
+    return rotations
+
+
+def appended(before: int, after: int, device: torch.device) -> Tensor:
+    """The index of a change that appends rows at the end."""
+    index = torch.arange(after, device=device)
+    index[before:] = -1
+    return index
+
+
+def with_rows(optimizer: torch.optim.Optimizer, old: Tensor, rows: Tensor) -> torch.nn.Parameter:
+    """A parameter with new rows at the end in the place of `old` in its optimizer, with moments of zero there."""
+    new = torch.nn.Parameter(torch.cat([old.detach(), rows.to(old)]), requires_grad=old.requires_grad)
+    moments = optimizer.state.pop(old, {})
+    for name, value in moments.items():
+        if isinstance(value, Tensor) and value.shape[:1] == old.shape[:1] and name != "step":
+            moments[name] = torch.cat([value, torch.zeros_like(rows).to(value)])
+    return replaced(optimizer, old, new, moments)
+
+
+def replaced(
+    optimizer: torch.optim.Optimizer, old: Tensor, new: torch.nn.Parameter, moments: dict[str, Any]
+) -> torch.nn.Parameter:
+    """`new` in the place of `old` in the optimizer, with these moments."""
+    if moments:
+        optimizer.state[new] = moments
+    for group in optimizer.param_groups:
+        group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
+    return new

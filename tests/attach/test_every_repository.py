@@ -1,0 +1,144 @@
+"""Three lines attach D2 to every repository, and none of the repository's own behaviour is lost."""
+
+from __future__ import annotations
+
+import copy
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mimics.page import attached, changed_lines
+from mimics.workplace import furnish, some_points
+from repositories import MIMICS, VARIANTS, run, saved, snapshot
+from torch import Tensor
+
+from d2_plugin import D2Config
+from d2_plugin.adapters.successors.gsplat_dynamic import GsplatDynamicAdapter
+from d2_plugin.protocol import Backbone
+from d2_plugin.rasterizer import rasterize
+from d2_plugin.registry import ADAPTERS, load
+from d2_plugin.testing import Example, check_backbone
+
+LINES = (r'd2 = D2Hooks\.attach\("d2\.toml", "%s", ', r"loss = loss \+ .*d2\.loss\(", r"d2\.step\(")
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a prior and a d2.toml; the one camera of gsplat's dynamic trainer is the middle one there."""
+    monkeypatch.setitem(GsplatDynamicAdapter.__init__.__kwdefaults__, "camera", "cam1")
+    return furnish(tmp_path, monkeypatch)
+
+
+def same(a: SimpleNamespace, b: SimpleNamespace) -> bool:
+    one, other = snapshot(a), snapshot(b)
+    assert one
+    return one.keys() == other.keys() and all(torch.equal(one[key], other[key]) for key in one)
+
+
+def resuming(hooks: type, state: dict) -> type:
+    """D2Hooks whose `attach` goes on from a state, as one line after the first does; not in a stage before."""
+
+    class Resuming(hooks):
+        @classmethod
+        def attach(cls, *arguments, **options):
+            d2 = hooks.attach(*arguments, **options)
+            d2.load_state_dict(state)
+            return d2
+
+    return Resuming
+
+
+@pytest.mark.parametrize("name", MIMICS)
+class TestTraining:
+    def test_three_lines_and_an_import_attach_d2(self, name: str) -> None:
+        lines = changed_lines(name)
+        assert len(lines) == 3
+        for pattern in LINES:
+            expected = pattern % name if "%s" in pattern else pattern
+            assert sum(bool(re.search(expected, line)) for line in lines) == 1
+
+    def test_all_hooks_off_is_bitwise_the_bare_loop(self, name: str, workplace: Path) -> None:
+        (workplace / "d2.toml").write_text(D2Config().to_toml())
+        assert same(run(name), run(name, attached(MIMICS[name], name)))
+
+    def test_a_resumed_run_is_bitwise_the_uninterrupted_one(self, name: str, workplace: Path) -> None:
+        source = attached(MIMICS[name], name)
+        whole, first = run(name, source), run(name, source, stop=53)
+        assert {entry.hook for entry in whole.d2.trace} == {"densify", "prune", "depth_loss"}
+        assert all(value.isfinite().all() for value in snapshot(whole).values())
+        checkpoint, state = copy.deepcopy((saved(name, first), 53)), copy.deepcopy(first.d2.state_dict())
+        forgetful = run(name, source, checkpoint=copy.deepcopy(checkpoint))
+        source.D2Hooks = resuming(source.D2Hooks, state)
+        assert same(whole, run(name, source, checkpoint=checkpoint))
+        assert not same(whole, forgetful), "D2's state does not matter: this could not fail"
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+class TestAdapter:
+    def test_the_slice_draws_what_the_repository_draws(self, name: str) -> None:
+        standing = VARIANTS[name]()
+        for camera in standing.cameras:
+            view = standing.adapter.view(camera)
+            splats = standing.adapter.slice_at(view)
+            own = rasterize(splats, torch.zeros(len(splats.means), 1), view, standing.adapter.settings)
+            assert bool((own.alpha > 0.3).any())
+            torch.testing.assert_close(own.depth_sum, standing.draw(camera), rtol=1e-4, atol=1e-4)
+
+    def test_it_is_registered_and_keeps_the_public_contract(self, name: str) -> None:
+        def make() -> Example:
+            made = VARIANTS[name]()
+            grow = next(iter(made.edits.values()))
+            return Example(made.adapter, made.cameras, optimizers=made.optimizers, grow=grow)
+
+        assert isinstance(make().backbone, load(ADAPTERS, name.split()[0]))
+        assert isinstance(make().backbone, Backbone)
+        assert {"moments", "grow"} <= set(check_backbone(make))
+
+    @settings(max_examples=30, deadline=None)
+    @given(data=st.data())
+    def test_rows_are_followed_through_any_edits(self, name: str, data: st.DataObject) -> None:
+        """Rows are numbered anew before every edit; the reports to listeners must lead back to the numbers."""
+        standing, reports = VARIANTS[name](), []
+        adapter = standing.adapter
+        adapter.on_resize(reports.append)
+        edits = standing.edits | {
+            "insert": lambda: adapter.insert(some_points(3)),
+            "d2 removes": lambda: adapter.remove(torch.arange(len(adapter)) % 5 == 1),
+        }
+        for action in data.draw(st.lists(st.sampled_from([*edits]), max_size=8)):
+            numbers = torch.arange(float(len(adapter)))
+            parts = standing.tables()
+            for part, values in zip(parts, numbers.split([len(part) for part in parts]), strict=True):
+                part.copy_(values)
+            reports.clear()
+            edits[action]()
+            count, index = len(adapter), torch.arange(len(numbers))
+            for report in reports:
+                index = torch.where(report >= 0, index[report.clamp(min=0)], -1)
+            now = torch.cat(standing.tables())
+            assert len(now) == len(index) == count
+            assert torch.equal(now[index >= 0], numbers[index[index >= 0]])
+
+    def test_an_insertion_keeps_the_densification_evidence(self, name: str) -> None:
+        adapter = VARIANTS[name]().adapter
+        if not hasattr(adapter, "evidence"):
+            pytest.skip("has no statistics by these names; see the tests of its own")
+        model, count = adapter.gaussians, len(adapter)
+        if name == "spacetime":
+            model.omegamask = torch.ones(count, 1)
+        before: dict[str, Tensor] = {}
+        for kind in adapter.evidence:
+            value = getattr(model, kind)
+            before[kind] = torch.arange(1.0, 1 + value.numel()).view_as(value)
+            setattr(model, kind, before[kind].clone())
+        rows = len(model._xyz)
+        assert adapter.insert(some_points(5)) == 5
+        for kind, old in before.items():
+            value = getattr(model, kind)
+            assert len(value) == rows + 5, kind
+            assert torch.equal(value[:rows], old), kind
+            assert (value[rows:] == adapter.evidence[kind]).all(), kind

@@ -1,0 +1,119 @@
+"""FasterGS4D, gsplat's contrib.dynamic, Swift4D and CEM-4DGS: what is particular to each."""
+
+from __future__ import annotations
+
+from functools import partial
+from types import SimpleNamespace
+
+import pytest
+import torch
+from mimics import gsplat_dynamic
+from mimics.workplace import some_points
+from repositories import clone, make_cem4dgs, make_fastergs4d, make_gsplat_dynamic, make_swift4d
+from torch import Tensor
+
+from d2_plugin import D2Error
+from d2_plugin.adapters.successors.fastergs4d import FasterGS4DAdapter
+from d2_plugin.adapters.successors.gsplat_dynamic import GsplatDynamicAdapter
+from d2_plugin.protocol import Points
+
+
+class TestFasterGS4D:
+    def test_an_insertion_keeps_the_densification_info(self) -> None:
+        standing = make_fastergs4d()
+        standing.model._densification_info += torch.arange(60.0)
+        assert standing.adapter.insert(some_points(4)) == 4
+        assert torch.equal(standing.model._densification_info[1], torch.cat([torch.arange(60.0), torch.zeros(4)]))
+
+    def test_growth_is_told_with_the_prune_that_follows_it(self) -> None:
+        standing = make_fastergs4d()
+        reports: list[Tensor] = []
+        standing.adapter.on_resize(reports.append)
+        standing.edits["grow"]()
+        assert len(reports) == 1
+        assert len(reports[0]) == len(standing.adapter) > 60
+        assert (reports[0][60:] == -1).all()
+
+    def test_another_object_or_camera_is_refused(self) -> None:
+        with pytest.raises(D2Error, match="SimpleNamespace has no prune, which FasterGS4DAdapter needs"):
+            FasterGS4DAdapter(SimpleNamespace(_spatial_means=torch.zeros(1, 3)))
+        with pytest.raises(D2Error, match="a camera of type dict has no perspective `camera`"):
+            make_fastergs4d().adapter.view({})
+
+
+class TestSwift4D:
+    def test_points_move_where_their_surroundings_move(self) -> None:
+        """The nearest logit decides, and what moves is put where the field carries it onto the point."""
+        standing = make_swift4d()
+        model, view = standing.model, standing.adapter.view(standing.cameras[0])
+        placed = standing.adapter.slice_at(view).means.detach()
+        moving, still = (torch.nonzero(model._dynamic[:, 0] > 0)[0], torch.nonzero(model._dynamic[:, 0] < 0)[0])
+        near = torch.cat([placed[moving], placed[still]]) + 1e-3
+        ones = torch.ones(2)
+        points = Points(near, torch.rand(2, 3), ones / 2, ones * 0.05, ones * view.time)
+        assert standing.adapter.insert(points) == 2
+        assert (model._dynamic[-2:, 0] > 0).tolist() == [True, False]
+        assert standing.adapter.inversion.accepted.all()
+        found = standing.adapter.slice_at(view).means[-2:]
+        torch.testing.assert_close(found, near, atol=0.03, rtol=0)
+        assert not torch.equal(model._xyz[-2], near[0])
+
+    def test_inserted_rows_survive_the_next_weight_prune(self) -> None:
+        """It takes what was hardly seen since the last one, also what was inserted a moment ago."""
+        standing = make_swift4d()
+        standing.adapter.insert(some_points(3))
+        with torch.no_grad():
+            standing.model.weight_prune(0.02)
+        assert len(standing.adapter) == 3
+        assert standing.model._max_weight.tolist() == [0.0] * 3
+
+    def test_the_coarse_stage_draws_a_still_scene_and_is_left_alone(self) -> None:
+        standing = make_swift4d("coarse")
+        splats = standing.adapter.slice_at(standing.adapter.view(standing.cameras[0]))
+        assert torch.equal(splats.means, standing.model._xyz)
+        assert not standing.adapter.active(1)
+
+
+class TestCEM4DGS:
+    def test_children_keep_their_motion_through_every_edit(self) -> None:
+        """A mark in each motion's origin is found again from its child, whatever was inserted, cloned or removed."""
+        standing = make_cem4dgs()
+        model, adapter = standing.model, standing.adapter
+        model._xyz_motion.data[:, 0, 0] = torch.arange(100.0, 100 + len(model._xyz_motion))
+        children = torch.nonzero(model._level[:60, 0] == 1).squeeze(1)
+        model._features_rest.data[children, 0, 0] = motion_of(model, children)
+        for action in (lambda: adapter.insert(some_points(5)), partial(clone, model),
+                       lambda: adapter.remove(torch.arange(len(adapter)) % 4 == 0)):  # fmt: skip
+            action()
+            children = torch.nonzero(model._level[: len(model._xyz), 0] == 1).squeeze(1)
+            assert len(children)
+            assert torch.equal(motion_of(model, children), model._features_rest.data[children, 0, 0])
+            assert len(model._parent) == len(model._level) == len(model._xyz) + len(model._xyz_motion)
+        assert len(adapter) == len(model._xyz)
+
+
+def motion_of(model, children: Tensor) -> Tensor:
+    """The mark of each child's motion."""
+    return model._xyz_motion.data[model._parent[children, 0] - len(model._xyz), 0, 0]
+
+
+class TestGsplatDynamic:
+    def test_inserted_rows_are_marked_as_their_neighbours_are(self) -> None:
+        standing = make_gsplat_dynamic()
+        adapter, view = standing.adapter, standing.adapter.view(standing.cameras[1])
+        placed = adapter.slice_at(view).means.detach()
+        moving, still = torch.tensor([1]), torch.tensor([0])
+        near = torch.cat([placed[moving], placed[still]]) + 1e-3
+        ones = torch.ones(2)
+        assert adapter.insert(Points(near, torch.rand(2, 3), ones / 2, ones * 0.05, ones * view.time)) == 2
+        assert adapter.state["dynamic_mask"][-2:].tolist() == [True, False]
+        torch.testing.assert_close(adapter.slice_at(view).means[-2:], near, atol=0.03, rtol=0)
+
+    def test_an_item_without_its_number_of_frames_is_refused(self) -> None:
+        params, optimizers, hexplane, net = gsplat_dynamic.make()
+        with pytest.raises(D2Error, match="the strategy's state has no 'dynamic_mask'"):
+            GsplatDynamicAdapter(params, optimizers, {}, hexplane, net)
+        state = {"dynamic_mask": torch.ones(60, dtype=torch.bool)}
+        adapter = GsplatDynamicAdapter(params, optimizers, state, hexplane, net)
+        with pytest.raises(D2Error, match=r"got no number of frames: pass views.*`frames=`"):
+            adapter.view(gsplat_dynamic.items()[0])
