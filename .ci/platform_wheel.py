@@ -51,7 +51,7 @@ def libraries() -> list[Library]:
 
     compiler.load_library = note  # before the modules below are loaded, which import it by name
     from d2_plugin.compat import absolute
-    from d2_plugin.gaussians import native_adam, native_image, native_slice, native_ssim
+    from d2_plugin.gaussians import native_background, native_slice, native_ssim
     from d2_plugin.hooks import native_depth_loss
     from d2_plugin.priors.cross_view import kernel as cross_view
     from d2_plugin.priors.monocular.native import library as monocular
@@ -60,7 +60,7 @@ def libraries() -> list[Library]:
     from d2_plugin.priors.stereo.settings import StereoSettings
     from d2_plugin.rasterizer import native
 
-    gaussians = native, native_slice, native_ssim, native_image, native_adam, native_depth_loss
+    gaussians = native, native_slice, native_ssim, native_background, native_depth_loss
     modules = *gaussians, filtering, monocular, cross_view, absolute
     loads = [*(module.library for module in modules), lambda: PatchMatchKernel([], (1.0, 2.0), StereoSettings())]
     for load in loads:

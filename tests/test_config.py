@@ -122,7 +122,7 @@ def test_schedules_fit_the_length_of_a_run(iterations: int) -> None:
 @pytest.mark.parametrize(
     ("table", "sentence"),
     [
-        ({"initial_opacity": 0}, r"backbone\.initial_opacity must be above 0 and at most 1, got 0"),
+        ({"position_rate": 0}, r"backbone\.position_rate must be above 0, got 0"),
         ({"sh_degree": 4}, r"backbone\.sh_degree must be at least 0 and at most 3, got 4"),
         ({"densify": {"every": 0}}, r"backbone\.densify\.every must be at least 1 steps, got 0"),
         ({"raster": {"near": -1}}, r"backbone\.raster\.near must be above 0 world units, got -1"),

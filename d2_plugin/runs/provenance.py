@@ -75,7 +75,6 @@ def about(run: Run, trainer: Any) -> dict[str, Any]:
         "retired": run.retired,
         "background": getattr(trainer.model, "background", None) is not None,
         "appearance": getattr(trainer.model, "appearance", None) is not None,
-        "clocks": None if getattr(trainer.model, "clocks", None) is None else trainer.model.clocks.in_frames(),
         "prior": run.prior,
         "plan": scene.plan.as_dict(),
         "recording": scene.recording.name,

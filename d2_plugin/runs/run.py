@@ -117,7 +117,7 @@ class Run:
                     bar.update(step, f"loss {loss:.4f}{built}")
                     watching(step, loss)
 
-                while trainer.step < iterations and not getattr(trainer, "stopped", False):
+                while trainer.step < iterations:
                     until = min((trainer.step // chunk + 1) * chunk, iterations)
                     with self._timed("train"), watched(trainer, self._checkpoint) as finite:
                         trainer.run(until, finite(on_step))
