@@ -116,14 +116,14 @@ class StepScene:
     def _attach(self, model: object) -> D2Hooks:
         adapter: Any = registry.load(registry.ADAPTERS, "yang4d")
         config = D2Config(depth_loss=DepthLossConfig())
-        return D2Hooks.from_config(config, adapter(model), store=RandomPrior(self.width, self.height))
+        return D2Hooks(config, adapter(model), store=RandomPrior(self.width, self.height))
 
 
 def works_of(scene: StepScene) -> dict[str, Callable[[], object]]:
     """The rasterizer's forward and backward on the model's Gaussians, a bare step, and one with the depth loss."""
     bare, guided = scene.trainer(guided=False), scene.trainer(guided=True)
     for view in scene.frames.views[:WARM]:
-        guided.d2._prior.known(view)
+        guided.d2.prior.known(view)
     return {
         RASTER: _rasterizer(scene, bare.model),
         "step": lambda: bare.run(bare.step + 1),

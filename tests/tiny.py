@@ -106,7 +106,7 @@ def make_trainer(
     """A trainer of the tiny scene, with D2 attached where a configuration is given."""
 
     def attach(model: SplatModel) -> D2Hooks:
-        return D2Hooks.from_config(config, backbone=make_adapter(model), store=TinyStore())
+        return D2Hooks(config, make_adapter(model), TinyStore())
 
     settings = TrainSettings(iterations=iterations, seed=3)
     return kind(make_model(**model), TinyFrames(), settings, attach if config is not None else None)

@@ -131,9 +131,10 @@ class GsplatSession(Session):
             state = self.objects.state = initialize_state(*arguments, **named)
             backbone = self.recipe.build(adapter_of(self.recipe), self.objects)
             iterations = getattr(self.objects.options, "max_steps", None)
-            self.hooks = D2Hooks(self._configured(iterations), backbone, self.store)
+            self.hooks = D2Hooks.from_config(
+                self._configured(iterations), backbone, self.store, iterations=iterations, writer=self.writer
+            )
             self._iteration, self._told, self._drawn, self._batch = 0, False, 0, 1
-            self.hooks.tell(iterations, writer=self.writer)
             return state
 
         return attaching

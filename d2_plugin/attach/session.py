@@ -110,14 +110,14 @@ class Session:
         """What D2 did, in one line."""
         if self.hooks is None:
             return "the trainer never called training_setup: D2 was not attached"
-        return self.hooks.telling.summary()
+        return self.hooks.log.summary()
 
     def end(self) -> None:
         """Say what D2 did, at the end of the script."""
         if self.hooks is None:
             log.warning("%s", self.summary())
         else:
-            self.hooks.telling.end()
+            self.hooks.log.end()
 
     def _attaching(self, training_setup: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(training_setup)
@@ -125,10 +125,11 @@ class Session:
             result = training_setup(model, options, *arguments, **named)
             backbone = self.recipe.build(adapter_of(self.recipe), self.objects)
             iterations = getattr(options, "iterations", None)
-            self.hooks = D2Hooks(self._configured(iterations), backbone, self.store)
+            self.hooks = D2Hooks.from_config(
+                self._configured(iterations), backbone, self.store, iterations=iterations, writer=self.writer
+            )
             self._watch(model.optimizer)
             self._iteration, self._told, self._drawn, self._batch = 0, False, 0, 0
-            self.hooks.tell(iterations, writer=self.writer)
             return result
 
         return attaching

@@ -213,7 +213,7 @@ class Run:
         write_text(self.folder / "d2.toml", config.to_toml())
         guidance, priors = self.guidance, self.priors
         others = {} if guidance is None else guidance.hooks(self.scene, self._points(), priors)
-        return D2Hooks.from_config(config, backbone=adapter(model), hooks=others)
+        return D2Hooks(config, adapter(model), hooks=others)
 
     def _identity(self) -> dict[str, Any]:
         """What makes two runs the same run, as run.json has it."""

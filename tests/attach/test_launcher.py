@@ -100,9 +100,9 @@ class TestSession:
 
     def test_edits_happen_after_zero_grad_and_are_counted(self, monkeypatch: pytest.MonkeyPatch) -> None:
         positions, session = run_wrapped(EDITS, monkeypatch)
-        assert session.hooks.telling.inserted > 0
+        assert session.hooks.log.inserted > 0
         assert len(positions) == len(session.hooks.backbone)
-        assert session.summary().startswith(f"densify, prune, depth_loss: {session.hooks.telling.inserted} inserted")
+        assert session.summary().startswith(f"densify, prune, depth_loss: {session.hooks.log.inserted} inserted")
 
     def test_renders_without_gradients_are_not_part_of_the_training(self, monkeypatch: pytest.MonkeyPatch) -> None:
         session = Session(recipe("fudan"), DEPTH_LOSS, TinyStore())

@@ -143,7 +143,7 @@ class TestWords:
             (["--densify.budget-per-view", "-5"], "--densify.budget-per-view must be at least"),
             (["--densify.scale", "-1"], "--densify.scale must be above 0"),
             (["--densify.opacity", "2"], "--densify.opacity must be"),
-            (["--densify.cell", "0"], "--densify.cell must be"),
+            (["--densify.spacing", "0"], "--densify.spacing must be"),
             (["--densify.tau-v", "nan"], "--densify.tau-v must be"),
             (["--d2.views-per-evaluation", "-3"], "--d2.views-per-evaluation must be at least 1"),
             (["--plan.temporal", "maybe"], "--plan.temporal must be"),
