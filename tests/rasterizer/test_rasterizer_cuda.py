@@ -37,7 +37,7 @@ from cuda_cases import (
 from d2_plugin import D2Error
 from d2_plugin.compiler import NoCompiler
 from d2_plugin.protocol import Label, RasterSettings, Render, Splats
-from d2_plugin.rasterizer import cuda, native, ops, rasterize, reference, survey
+from d2_plugin.rasterizer import autograd, cuda, native, rasterize, reference, survey
 
 
 @pytest.fixture(autouse=True)
@@ -233,7 +233,9 @@ def test_outputs_without_an_upstream_gradient_count_as_zero(backend: torch.devic
     expected = gradients_of_kernels(scene, backend, zeros)
     scene, outputs = render_kernels(scene, backend)
     absent = [part.to(backend, torch.float32) if i == given else None for i, part in enumerate(upstream)]
-    found = cuda.backward(*absent, *inputs_of(scene), *camera_of(scene), ops._constants(scene.settings), *outputs)
+    found = cuda.backward(
+        *absent, *inputs_of(scene), *camera_of(scene), autograd.constants_of(scene.settings), *outputs
+    )
     assert all(torch.equal(a, b) for a, b in zip(found, expected))
 
 
@@ -317,7 +319,7 @@ def test_cpu_and_gpu_kernels_agree(backend: torch.device) -> None:
     upstream = random_upstream(scene)
     single = scene.to(torch.device("cpu"), torch.float32)
     camera = camera_of(single)
-    constants = ops._constants(scene.settings)
+    constants = autograd.constants_of(scene.settings)
     outputs = native.rasterize(*inputs_of(single), *camera, 64, 48, constants)
     assert_same_image(scene, render_kernels(scene, backend)[1], Render(*(part.double() for part in outputs[:4])))
     gradients = native.backward(*(part.float() for part in upstream), *inputs_of(single), *camera, constants, *outputs)
@@ -343,7 +345,7 @@ def test_more_pairs_than_slots_can_number_are_refused() -> None:
 
 @pytest.mark.cuda
 def test_the_device_decides(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The public functions on CUDA tensors: kernels, not the reference; autograd; opcheck; a prior left on the CPU."""
+    """The public functions on CUDA tensors: kernels, not the reference; autograd; a prior left on the CPU."""
     if not torch.cuda.is_available():
         pytest.skip("no CUDA device (torch.cuda.is_available() is False)")
     monkeypatch.setattr(reference, "rasterize", None)
@@ -362,8 +364,6 @@ def test_the_device_decides(monkeypatch: pytest.MonkeyPatch) -> None:
     assert survey(
         splats, scene.view, make_prior(make_scene(300)), near_edge=with_edge(make_scene(300)).near_edge
     ).hits.is_cuda
-    camera = (*camera_of(scene), 64, 48, ops._constants(RasterSettings()))
-    torch.library.opcheck(torch.ops.d2.rasterize.default, (*inputs, *camera))
 
 
 @pytest.mark.cuda

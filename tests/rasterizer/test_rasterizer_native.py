@@ -16,7 +16,7 @@ from splat_scenes import Scene, brute_force, make_view, near_edge_of, near_thres
 
 from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.protocol import Label
-from d2_plugin.rasterizer import DepthPrior, RasterSettings, Render, Splats, native, ops, rasterize, survey
+from d2_plugin.rasterizer import DepthPrior, Render, Splats, native, rasterize, survey
 
 try:
     find_compiler()
@@ -229,27 +229,8 @@ def test_only_what_requires_gradients_gets_one():
     assert not random_scene(11, 50, 20, 20).to(torch.float32).render().color.requires_grad
 
 
-def test_the_operators_pass_torchs_own_check():
-    scene = random_scene(12, 40, 20, 18).to(torch.float32).requires_grad()
-    view = scene.view
-    background, offsets = torch.rand(3, requires_grad=True), torch.zeros(40, 2, requires_grad=True)
-    constants = ops._constants(RasterSettings(antialiased=True))
-    camera, edge = (view.T_camera_world, view.K), near_edge_of(view)
-    inputs = (*scene[:4], background, offsets, *camera, edge, 20, 18, constants)
-    torch.library.opcheck(ops._rasterize, inputs)
-    torch.library.opcheck(ops._rasterize, (*scene[:4], None, None, *camera, None, 20, 18, constants))
-    detached = [part.detach() if isinstance(part, torch.Tensor) else part for part in inputs]
-    outputs = [part.detach() for part in ops._rasterize(*inputs)]
-    saved = (*upstream(scene), *detached[:9], constants, *outputs)
-    torch.library.opcheck(ops._rasterize_backward, saved)
-    prior = prior_of(scene)
-    for part in (None, edge):
-        measured = (*detached[:3], prior.depth, prior.trusted.float(), part, *camera, constants, 1e-8)
-        torch.library.opcheck(ops._survey, measured)
-
-
 @pytest.mark.slow
-def test_torch_compile_takes_it_into_one_graph():
+def test_torch_compile_leaves_it_as_it_is():
     scene = random_scene(12, 40, 20, 18).to(torch.float32).requires_grad()
     edge = near_edge_of(scene.view)
 
@@ -259,7 +240,7 @@ def test_torch_compile_takes_it_into_one_graph():
         return (render.color.sin() + (render.alpha + render.front)[..., None]).sum()
 
     expected = torch.autograd.grad(loss(*scene[:4]), scene[:4])
-    compiled = torch.compile(loss, backend="aot_eager", fullgraph=True)
+    compiled = torch.compile(loss, backend="aot_eager")
     found = torch.autograd.grad(compiled(*scene[:4]), scene[:4])
     for part, other in zip(found, expected):
         torch.testing.assert_close(part, other)
@@ -279,8 +260,8 @@ def test_what_is_not_seen_gets_a_gradient_of_exactly_zero():
 def test_without_a_compiler_the_torch_path_takes_over_with_one_warning(monkeypatch):
     scene = random_scene(14, 50, 20, 20)
     native.library.cache_clear()
+    native.available.cache_clear()
     with monkeypatch.context() as patch:
-        patch.setattr(native, "_available", None)
         patch.setenv("CXX", "no-such-compiler")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
@@ -289,6 +270,7 @@ def test_without_a_compiler_the_torch_path_takes_over_with_one_warning(monkeypat
         (message,) = [str(warning.message) for warning in caught]
         assert "no-such-compiler" in message
         assert "orders of magnitude slower" in message
+    native.available.cache_clear()
     torch.testing.assert_close(slow.color, scene.to(torch.float32).render().color, atol=1e-5, rtol=0)
 
 
