@@ -230,6 +230,7 @@ def test_only_what_requires_gradients_gets_one():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
 def test_torch_compile_leaves_it_as_it_is():
     scene = random_scene(12, 40, 20, 18).to(torch.float32).requires_grad()
     edge = near_edge_of(scene.view)
