@@ -16,10 +16,10 @@ from tiny import ALL_HOOKS
 from d2_plugin import D2Config, D2Error
 from d2_plugin.backbones import deform, yang4d
 from d2_plugin.backbones.trainer import TrainSettings
-from d2_plugin.config import DensifyConfig, PruneConfig, for_iterations
+from d2_plugin.config import DensifyConfig, PruneConfig
 from d2_plugin.hooks.table import HOOKS
 from d2_plugin.protocol import RasterSettings
-from d2_plugin.runs.settings import HOOK_NAMES, TABLES, RunSettings, check
+from d2_plugin.runs.settings import RunSettings, check
 from d2_plugin.settings import Settings, declared, table_of
 
 
@@ -105,18 +105,6 @@ def test_a_file_says_its_version_and_another_one_is_refused(tmp_path: Path) -> N
         D2Config.from_toml(path)
 
 
-@pytest.mark.parametrize("iterations", [1, 19, 900, 30_000])
-def test_schedules_fit_the_length_of_a_run(iterations: int) -> None:
-    config = for_iterations(HOOKS, iterations)
-    assert config.hooks == tuple(HOOKS)
-    every, pruning = (max(least, min(100, iterations // 20)) for least in (5, 10))
-    assert (config.densify.every, config.prune.every) == (every, pruning)
-    assert config.densify.start == max(1, min(every, iterations // 40))
-    assert config.densify.budget_per_view == 10 * iterations
-    assert config.densify.stop == max(iterations // 2, every + 1)
-    assert (config.prune.start, config.prune.stop) == (iterations // 5, 2 * iterations // 3)
-
-
 @pytest.mark.parametrize(
     ("table", "sentence"),
     [
@@ -134,11 +122,6 @@ def test_schedules_fit_the_length_of_a_run(iterations: int) -> None:
 def test_a_wrong_backbone_is_one_sentence(table: dict[str, Any], sentence: str) -> None:
     with pytest.raises(D2Error, match=sentence):
         deform.settings_from(table)
-
-
-def test_lists_of_toml_are_tuples_of_settings() -> None:
-    assert deform.settings_from({"hexplane": {"resolutions": [8, 16]}}).hexplane.resolutions == (8, 16)
-    assert not yang4d.settings_from({}, temporal=False).temporal
 
 
 RUN = RunSettings("room", ("a",))
@@ -178,8 +161,3 @@ def test_a_run_survives_its_file_and_names_another_version() -> None:
     assert RunSettings.from_table({k: v for k, v in table.items() if k != "version"}, "run.json") == settings
     with pytest.raises(D2Error, match=r"run\.json has settings of version 9"):
         RunSettings.from_table(table | {"version": 9}, "run.json")
-
-
-def test_names_of_hooks_and_tables_follow_the_one_table() -> None:
-    assert HOOK_NAMES == ("prior", "densify", "prune", "depth_loss")
-    assert TABLES == ("backbone", "d2", "densify", "prune", "depth_loss", "priors", "plan")

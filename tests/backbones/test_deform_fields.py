@@ -98,12 +98,6 @@ class TestFields:
         for part, expected, factor in zip(scaled(1e3 * positions, 0.4), field(positions, 0.4), (1e3, 1, 1)):
             torch.testing.assert_close(part, factor * expected)
 
-    def test_the_start_is_drawn_from_its_own_generator(self, kind: str) -> None:
-        before = torch.get_rng_state()
-        a, b = make_model(backbone=kind), make_model(backbone=kind)
-        assert torch.equal(before, torch.get_rng_state())
-        assert all(torch.equal(x, y) for x, y in zip(a.field.parameters(), b.field.parameters()))
-
 
 class TestMlp:
     def test_is_a_network_on_the_encoded_place_and_time_together(self) -> None:

@@ -32,16 +32,6 @@ class TestCharbonnier:
         expected = 0.1 * kornia.losses.charbonnier_loss(r / 0.1, torch.zeros_like(r))
         torch.testing.assert_close(charbonnier(r, 0.1), expected)
 
-    @pytest.mark.parametrize("value", [0.0, 1e-30, 1e20])
-    def test_is_finite_with_finite_gradient_at_extremes_in_float32(self, value: float) -> None:
-        r = torch.tensor([value], requires_grad=True)
-        loss = charbonnier(r, 0.01)
-        loss.sum().backward()
-        assert torch.isfinite(r.grad).all()
-        assert loss.item() == pytest.approx(value if value > 1 else 0.0, rel=1e-6, abs=1e-12)
-        if value == 0:
-            assert r.grad.item() == 0
-
 
 class TestThePapersLoss:
     def test_counts_only_pixels_that_are_trusted_and_validly_rendered(self) -> None:
@@ -116,16 +106,6 @@ def loss_and_gradients(
 
 class TestSupervision:
     """What a render costs: the paper's formula over all maps, and what lets light through."""
-
-    @pytest.mark.parametrize("seed", range(3))
-    def test_is_the_papers_mean_over_verified_pixels(self, seed: int) -> None:
-        """L = mean over Omega^v and M^r of sqrt(r^2 + e^2) - e, r = (D_hat - D*) / (D* + eps), in plain numbers."""
-        prior, (z, a) = prior_of(seed, 9, 13, LABELS[:4], paper=True), render_of(9, 13)
-        counted = prior.verified & (a > 0.5)
-        residual = ((z / (a + 1e-8) - prior.depth) / (prior.depth + 1e-8))[counted].double()
-        expected = (torch.sqrt(residual**2 + 0.01**2) - 0.01).mean()
-        loss, *_ = loss_and_gradients((z, a), prior, torch.float64, PAPER)
-        torch.testing.assert_close(loss, expected, rtol=1e-6, atol=0)
 
     @pytest.mark.parametrize("opaque", [0.0, 3.0])
     def test_gradcheck(self, opaque: float) -> None:

@@ -65,20 +65,25 @@ def backend(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     return torch.device("cpu")
 
 
+def assert_as_the_reference(scene: Scene, backend: torch.device) -> Render:
+    render, upstream, expected = reference_with_gradients(scene)
+    assert_same_image(scene, render_kernels(scene, backend)[1], render)
+    assert_same_gradients(gradients_of_kernels(scene, backend, upstream), expected)
+    return render
+
+
 edges = pytest.mark.parametrize("edge", [False, True], ids=["", "edge"])
 
 
 @edges
+@pytest.mark.parametrize("antialiased", [False, True], ids=["", "antialiased"])
 @pytest.mark.parametrize("size", [(64, 48), (67, 41), (1, 1), (15, 33)], ids=lambda size: "{}x{}".format(*size))
 def test_image_and_gradients_are_the_references_at_any_size(
-    backend: torch.device, size: tuple[int, int], edge: bool
+    backend: torch.device, size: tuple[int, int], antialiased: bool, edge: bool
 ) -> None:
-    scene = make_scene(300, *size)
+    scene = make_scene(300, *size, settings=RasterSettings(antialiased=antialiased))
     scene = with_edge(scene) if edge else scene
-    render, upstream, expected = reference_with_gradients(scene)
-    _, outputs = render_kernels(scene, backend)
-    assert_same_image(scene, outputs, render)
-    assert_same_gradients(gradients_of_kernels(scene, backend, upstream), expected)
+    assert_as_the_reference(scene, backend)
 
 
 @edges
@@ -86,10 +91,7 @@ def test_image_and_gradients_are_the_references_at_any_size(
 def test_any_number_of_color_channels(backend: torch.device, channels: int, edge: bool) -> None:
     scene = make_scene(120, 40, 24, channels=channels)
     scene = with_edge(scene) if edge else scene
-    render, upstream, expected = reference_with_gradients(scene)
-    _, outputs = render_kernels(scene, backend)
-    assert_same_image(scene, outputs, render)
-    assert_same_gradients(gradients_of_kernels(scene, backend, upstream), expected)
+    assert_as_the_reference(scene, backend)
 
 
 @edges
@@ -199,10 +201,7 @@ def test_a_near_edge_changes_nothing_but_the_front(backend: torch.device) -> Non
 def test_gradients_outside_of_the_fov_clamp(backend: torch.device) -> None:
     """Long Gaussians whose centres lie far beside the image, where the Jacobian stands still."""
     scene = make_scene(60, settings=RasterSettings(fov_clamp=0.6), scale=0.3)
-    render, upstream, expected = reference_with_gradients(scene)
-    _, outputs = render_kernels(scene, backend)
-    assert_same_image(scene, outputs, render)
-    assert_same_gradients(gradients_of_kernels(scene, backend, upstream), expected)
+    assert_as_the_reference(scene, backend)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -279,15 +278,6 @@ def test_survey_is_the_references(backend: torch.device, scene: Scene, more: boo
         assert relative_error(getattr(found, name), getattr(expected, name)) < GRADIENT_TOLERANCE
     off = (found.max_weight.cpu() - expected.max_weight).abs() > FORWARD_TOLERANCE
     assert off.sum() <= 0.02 * len(off), "more than those whose maximum may lie at a cut-off"
-
-
-@pytest.mark.parametrize("label", Label)
-def test_survey_counts_verified_and_agreed_pixels_and_no_others(backend: torch.device, label: Label) -> None:
-    scene = make_scene(60)
-    prior = make_prior(scene)
-    prior.labels.fill_(label)
-    counted = label in (Label.VERIFIED, Label.AGREED)
-    assert bool(survey_kernels(scene, prior, backend).hits.any()) == counted
 
 
 def test_no_result_depends_on_the_order_of_warps_and_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
