@@ -114,6 +114,8 @@ class SplatModel(ABC):
         coefficients = self.harmonics().coefficients
         if len(splats.rows) < len(self):
             coefficients = coefficients.index_select(0, splats.rows)
+        if not (self.settings.sh_degree or time_degree):
+            return sh.constant_colors(coefficients)
         centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
         return sh.colors(coefficients, splats.means - centre, phase, self.settings.sh_degree, time_degree)
 
