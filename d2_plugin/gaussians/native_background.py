@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from d2_plugin.compiler import NoCompiler, load_library
+from d2_plugin.compiler import load_kernel
 from d2_plugin.gaussians.native_slice import FLAGS, KERNELS, SHARED_HEADERS
 
 
@@ -30,21 +30,13 @@ class _Call(ctypes.Structure):
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """The compiled kernel; None without a compiler, of which the rasterizer has warned already.
+    """The compiled kernel; None without a compiler.
 
     Raises:
-        CompileError: see `d2_plugin.compiler.load_library`.
+        CompileError: see `d2_plugin.compiler.load_kernel`.
     """
-    try:
-        kernel = load_library("background", (KERNELS / "background.cpp",), SHARED_HEADERS, FLAGS)
-    except NoCompiler:
-        return None
-    for name in ("d2_background", "d2_background_backward"):
-        getattr(kernel, name).argtypes, getattr(kernel, name).restype = (ctypes.POINTER(_Call),), None
-    kernel.d2_background_size.restype = ctypes.c_int64
-    size = kernel.d2_background_size()
-    assert size == ctypes.sizeof(_Call), "the call differs between native_background.py and background.cpp"
-    return kernel
+    results = {"d2_background": None, "d2_background_backward": None}
+    return load_kernel("background", KERNELS / "background.cpp", SHARED_HEADERS, FLAGS, _Call, results)
 
 
 def can_composite(*parts: Tensor) -> bool:

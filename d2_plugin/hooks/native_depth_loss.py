@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from d2_plugin.compiler import NoCompiler, load_library
+from d2_plugin.compiler import load_kernel
 from d2_plugin.hooks.prior import KnownMaps
 from d2_plugin.rasterizer.frame import KERNELS as RASTERIZER_KERNELS
 
@@ -39,21 +39,12 @@ class _Call(ctypes.Structure):
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """The compiled kernel; None without a compiler, of which the rasterizer has warned already.
+    """The compiled kernel; None without a compiler.
 
     Raises:
-        CompileError: see `d2_plugin.compiler.load_library`.
+        CompileError: see `d2_plugin.compiler.load_kernel`.
     """
-    try:
-        kernel = load_library("depth_loss", (SOURCE,), HEADERS, FLAGS)
-    except NoCompiler:
-        return None
-    call = (ctypes.POINTER(_Call),)
-    kernel.d2_depth_loss.argtypes, kernel.d2_depth_loss.restype = call, ctypes.c_double
-    kernel.d2_depth_loss_size.restype = ctypes.c_int64
-    size = kernel.d2_depth_loss_size()
-    assert size == ctypes.sizeof(_Call), "the call differs between native_depth_loss.py and depth_loss.cpp"
-    return kernel
+    return load_kernel("depth_loss", SOURCE, HEADERS, FLAGS, _Call, {"d2_depth_loss": ctypes.c_double})
 
 
 def can_compare(depth_sum: Tensor, alpha: Tensor, known: KnownMaps) -> bool:
