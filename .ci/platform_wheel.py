@@ -50,7 +50,7 @@ def libraries() -> list[Library]:
         raise Noted
 
     compiler.load_library = note  # before the modules below are loaded, which import it by name
-    from d2_plugin.gaussians import native_adam, native_image, native_slice, native_ssim
+    from d2_plugin.gaussians import native_background, native_slice, native_ssim
     from d2_plugin.hooks import native_depth_loss
     from d2_plugin.priors.cross_view import kernel as cross_view
     from d2_plugin.priors.stereo.filtering import kernel as filtering
@@ -58,7 +58,7 @@ def libraries() -> list[Library]:
     from d2_plugin.priors.stereo.settings import StereoSettings
     from d2_plugin.rasterizer import native
 
-    gaussians = native, native_slice, native_ssim, native_image, native_adam, native_depth_loss
+    gaussians = native, native_slice, native_ssim, native_background, native_depth_loss
     modules = *gaussians, filtering, cross_view
     loads = [*(module.library for module in modules), lambda: PatchMatchKernel([], (1.0, 2.0), StereoSettings())]
     for load in loads:

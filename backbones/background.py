@@ -14,8 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from d2_plugin.gaussians.native_adam import Adam
-from d2_plugin.gaussians.native_image import can_draw, composite_background
+from d2_plugin.gaussians.native_background import can_composite, composite_background
 from d2_plugin.gaussians.spherical_harmonics import basis
 from d2_plugin.rasterizer import Render, View
 
@@ -40,7 +39,7 @@ class Background:
         self.constant = nn.Parameter(torch.zeros(1, 3, device=device))
         self.harmonics = nn.Parameter(torch.zeros((DEGREE + 1) ** 2 - 1, 3, device=device))
         groups = [{"params": [self.constant], "lr": RATE}, {"params": [self.harmonics], "lr": RATE / 5}]
-        self.optimizer = Adam(groups, eps=1e-15)
+        self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
         self._bases: dict[tuple[Any, ...], Tensor] = {}
 
     @torch.no_grad()
@@ -68,15 +67,10 @@ class Background:
 
     def behind(self, render: Render, view: View) -> Render:
         """The render with the background where the Gaussians leave some of a ray."""
-        return self.joined(render, view)._replace(alpha=render.alpha)
-
-    def joined(self, render: Render, view: View) -> Render:
-        """The same; gradients of the alpha that it returns are added up along with the background's."""
         basis = self._basis(view)
-        if can_draw(render.color, basis):
-            parts = render.color, render.alpha, basis, self.constant, self.harmonics
-            color, alpha = composite_background(*parts, _nodes(view))
-            return render._replace(color=color, alpha=alpha)
+        parts = render.color, render.alpha, basis, self.constant, self.harmonics
+        if can_composite(render.color, render.alpha, basis):
+            return render._replace(color=composite_background(*parts, _nodes(view)))
         return render._replace(color=render.color + (1 - render.alpha)[..., None] * self._interpolated(view, basis))
 
     def _interpolated(self, view: View, basis: Tensor) -> Tensor:

@@ -17,20 +17,25 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import MovingGaussians, moving_gaussians
-from d2_plugin.gaussians.native_adam import Adam
 from d2_plugin.gaussians.native_slice import STATIC
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d
 from d2_plugin.gaussians.slicing import slice_gaussians, unit_quaternions
 from d2_plugin.rasterizer import Splats, View
-from d2_plugin.settings import NotNegative, Positive, Seed, Share
+from d2_plugin.settings import Seed, Share
 
-from .clocks import Clocks
 from .deform_fields import Box, Field, HexPlaneField, HexPlaneSettings, MlpField, MlpSettings, Offsets
-from .model import SplatModel, SplatSettings, decayed_rate, shared_rates
+from .model import INITIAL_OPACITY, ROTATION_RATE, SplatModel, SplatSettings, decayed_rate, shared_rates
 from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, refuse_temporal
 from .trainer import Trainer, TrainSettings
 
 __all__ = ["Deform", "DeformSettings", "TrainSettings", "Trainer", "create", "initial_rows", "settings_from"]
+
+
+TIME_NOISE = 5e-3
+"""Standard deviation of the noise on a training step's time at the first step, as a share of the duration; it falls to
+zero at half of the run. Official: a tenth of the frame interval, in real scenes."""
+FIELD_DECAY = 0.1
+"""Learning rates of the field at the last step, as a share of the first; exponential in between."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +46,6 @@ class DeformSettings(SplatSettings):
     """Kind of the deformation field."""
     warm_up: Share = 0.075
     """Share of the run without deformation: the canonical Gaussians settle first. Official: 3000 of 40000 steps."""
-    time_noise: NotNegative = 5e-3
-    """Standard deviation of the noise on a training step's time at the first step, as a share of the duration; it falls
-    to zero at half of the run. Official: a tenth of the frame interval, in real scenes."""
-    field_decay: Positive = 0.1
-    """Learning rates of the field at the last step, as a share of the first; exponential in between."""
     seed: Seed = 0
     """Seed of the field's start and of the noise on time; the global random state is never used."""
     mlp: MlpSettings = dataclasses.field(default_factory=MlpSettings)
@@ -65,17 +65,16 @@ class Deform(SplatModel):
     def __init__(
         self, rows: Mapping[str, Tensor], settings: DeformSettings, extent: float, duration: float, box: Box
     ) -> None:
-        rates = shared_rates(settings, extent) | {"rotations": settings.rotation_rate}
+        rates = shared_rates(settings, extent) | {"rotations": ROTATION_RATE}
         super().__init__(rows, rates, settings, extent)
         self.duration = max(duration, 1e-12)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self.field: Field | None = None
         self.deforms = False
         self._noise = 0.0
-        self._instants: list[tuple[str, Tensor]] = []
         if settings.temporal:
             self.field = make_field(settings, box, self._generator).to(rows["positions"])
-            self.field_optimizer = Adam(self.field.parameter_groups(), eps=1e-15, fused=True)
+            self.field_optimizer = torch.optim.Adam(self.field.parameter_groups(), eps=1e-15, fused=True)
             self.deforms = settings.warm_up <= 0
 
     @classmethod
@@ -84,7 +83,7 @@ class Deform(SplatModel):
     ) -> Deform:
         """A model that starts at coloured points of any times: positions [N, 3] world, colors [N, 3] in 0..1."""
         scales = nearest_neighbour_scales(positions).clamp(max=0.1 * extent)
-        opacities = torch.full_like(scales, settings.initial_opacity)
+        opacities = torch.full_like(scales, INITIAL_OPACITY)
         rows = initial_rows(positions, colors, scales, opacities, settings)
         return cls(rows, settings, extent, duration, Box.around(positions, extent))
 
@@ -100,27 +99,12 @@ class Deform(SplatModel):
             raise D2Error(f"the time of camera '{view.camera}', frame {view.frame} is NaN: give every view a time")
         raw = self._canonical()
         noise = self._noise if torch.is_grad_enabled() else 0.0
-        time = view.time if self.clocks is None else self._instant(self.clocks, view)
-        offsets = self.offsets(raw["positions"], time + noise)
+        offsets = self.offsets(raw["positions"], view.time + noise)
         if offsets is not None:
             raw["positions"] = raw["positions"] + offsets.positions
             raw["log_scales"] = raw["log_scales"] + offsets.log_scales
             raw["left"] = raw["left"] + offsets.rotations
         return slice_gaussians(raw)
-
-    def _instant(self, clocks: Clocks, view: View) -> Tensor:
-        """The time of a view by its camera's clock, whose gradient `feel_time` wants."""
-        time = torch.tensor(clocks.time_of(view), dtype=torch.float64, requires_grad=torch.is_grad_enabled())
-        if time.requires_grad:
-            self._instants.append((view.camera, time))
-        return time
-
-    def feel_time(self, clocks: Clocks, view: View) -> None:
-        """See `SplatModel.feel_time`: what all slices of the camera's views in this step say."""
-        felt = [time.grad for camera, time in self._instants if camera == view.camera and time.grad is not None]
-        if felt:
-            clocks.feel(view.camera, torch.stack(felt).sum())
-        self._instants.clear()
 
     def _canonical(self) -> dict[str, Tensor]:
         g = self.gaussians
@@ -131,7 +115,7 @@ class Deform(SplatModel):
         still = self.field is None or not self.deforms
         return moving_gaussians(self._canonical(), self.harmonics()) if still else None
 
-    def offsets(self, positions: Tensor, time: float | Tensor) -> Offsets | None:
+    def offsets(self, positions: Tensor, time: float) -> Offsets | None:
         """What the field adds at canonical `positions` [K, 3]; None where nothing is deformed (warm-up, no time)."""
         if self.field is None or not self.deforms or not len(positions):
             return None
@@ -142,9 +126,8 @@ class Deform(SplatModel):
         return rotation_matrices_3d(unit_quaternions(rows["rotations"]))
 
     def regularization(self) -> Tensor | float:
-        """What keeps the field smooth, and what `SplatModel` adds."""
-        smooth = self.field.regularization() if self.field is not None and self.deforms else 0.0
-        return smooth + super().regularization()
+        """What keeps the field smooth."""
+        return self.field.regularization() if self.field is not None and self.deforms else 0.0
 
     def optimize(self, step: int, iterations: int) -> None:
         """One step of both optimizers, gradients cleared; learning rates and noise for the next step set."""
@@ -154,9 +137,9 @@ class Deform(SplatModel):
         self.field_optimizer.step()
         self.field_optimizer.zero_grad(set_to_none=True)
         for group, start in zip(self.field_optimizer.param_groups, self.field.parameter_groups()):
-            group["lr"] = decayed_rate(start["lr"], start["lr"] * self.settings.field_decay, step, iterations)
+            group["lr"] = decayed_rate(start["lr"], start["lr"] * FIELD_DECAY, step, iterations)
         self.deforms = step >= self.settings.warm_up * iterations
-        strength = max(1 - 2 * step / max(iterations, 1), 0.0) * self.settings.time_noise * self.duration
+        strength = max(1 - 2 * step / max(iterations, 1), 0.0) * TIME_NOISE * self.duration
         self._noise = strength * torch.randn((), generator=self._generator).item()
 
     def state_dict(self) -> dict[str, Any]:

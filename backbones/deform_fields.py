@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from d2_plugin.errors import D2Error
-from d2_plugin.settings import AtLeastOne, Count, NotNegative, Settings
+from d2_plugin.settings import AtLeastOne, NotNegative, Settings
 
 SPLITS = (3, 4, 3)
 """Columns of the last layer: offsets of position, quaternion and log-scales."""
@@ -37,6 +37,17 @@ class Offsets(NamedTuple):
     log_scales: Tensor  # [N, 3]
 
 
+POSITION_OCTAVES, TIME_OCTAVES = 6, 6
+"""Frequencies with which `MlpField` encodes positions and time. Official: 10, and 10 or 6."""
+HIDDEN = 64
+"""Neurons of the hidden layer of `HexPlaneField`."""
+PLANE_RATE = 1e-2
+"""Learning rate of the planes at the first step."""
+SMOOTH_SPACE, SMOOTH_TIME, STILL = 2e-4, 1e-3, 1e-4
+"""Weights of the planes' squared second differences in space and along time, and of |1 - plane| of those with time: a
+plane of ones changes nothing. Official names: plane_tv_weight, time_smoothness_weight, l1_time_planes."""
+
+
 @dataclass(frozen=True)
 class MlpSettings(Settings):
     """Network of `MlpField`."""
@@ -45,14 +56,8 @@ class MlpSettings(Settings):
     """Neurons of a hidden layer. Official: 256, on a GPU."""
     depth: AtLeastOne = 4
     """Hidden layers, with a skip connection to the middle one. Official: 8."""
-    position_octaves: Count = 6
-    """Frequencies of the encoding of positions. Official: 10."""
-    time_octaves: Count = 6
-    """Frequencies of the encoding of time. Official: 10, or 6 for synthetic scenes."""
     rate: NotNegative = 2e-4
-    """Learning rate of the network at the first step. Official: 8e-4.
-    Studio, four views, backbone alone, 2000 steps, held-out PSNR: 24.5, 24.6 dB at 2e-4 (seeds 0, 1), 23.5 at 5e-4
-    (seed 0)."""
+    """Learning rate of the network at the first step. Official: 8e-4."""
 
 
 @dataclass(frozen=True)
@@ -65,19 +70,8 @@ class HexPlaneSettings(Settings):
     """Nodes of the planes along each axis of space, one number per level. Official: 64 and 128."""
     instants: AtLeastOne = 10
     """Nodes of the planes along time. Official: half the number of frames."""
-    width: AtLeastOne = 64
-    """Neurons of the hidden layer."""
-    plane_rate: NotNegative = 1e-2
-    """Learning rate of the planes at the first step."""
     network_rate: NotNegative = 3e-4
-    """Learning rate of the network at the first step.
-    Studio, as for `MlpSettings.rate`: 25.8, 25.0 dB at 3e-4 (seeds 0, 1), 25.3 at 1e-3 (seed 0)."""
-    smooth_space: NotNegative = 2e-4
-    """Weight of the squared second differences of planes in space. Official name: plane_tv_weight."""
-    smooth_time: NotNegative = 1e-3
-    """Weight of the squared second differences along time. Official name: time_smoothness_weight."""
-    still: NotNegative = 1e-4
-    """Weight of |1 - plane| of the planes with time: a plane of ones changes nothing. Official name: l1_time_planes."""
+    """Learning rate of the network at the first step."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -113,17 +107,14 @@ class Field(nn.Module, ABC):
         self.register_buffer("reach", box.reach.detach().clone())
         self.unit = box.unit
 
-    def forward(self, positions: Tensor, fraction: float | Tensor) -> Offsets:
-        """Offsets of `positions` [N, 3] (world; no gradient) at `fraction` of the duration, clamped to 0..1.
-
-        A fraction that is a tensor, a scalar, has a gradient.
-        """
+    def forward(self, positions: Tensor, fraction: float) -> Offsets:
+        """Offsets of `positions` [N, 3] (world; no gradient) at `fraction` of the duration, clamped to 0..1."""
         columns = self.columns((positions.detach() - self.centre) / self.reach, min(max(fraction, 0.0), 1.0))
         place, turn, size = columns.split(SPLITS, -1)
         return Offsets(self.unit * place, turn, size)
 
     @abstractmethod
-    def columns(self, places: Tensor, fraction: float | Tensor) -> Tensor:
+    def columns(self, places: Tensor, fraction: float) -> Tensor:
         """The last layer [N, 10] for places [N, 3] in units of the box, -1..1 inside."""
 
     @abstractmethod
@@ -141,8 +132,7 @@ class MlpField(Field):
     def __init__(self, box: Box, settings: MlpSettings, generator: torch.Generator) -> None:
         super().__init__(box)
         self.settings = settings
-        width, place = settings.width, 3 * (1 + 2 * settings.position_octaves)
-        instant = 1 + 2 * settings.time_octaves
+        width, place, instant = settings.width, 3 * (1 + 2 * POSITION_OCTAVES), 1 + 2 * TIME_OCTAVES
         hidden = settings.depth - 1
         self.skip = hidden // 2
         self.hidden = nn.ModuleList(linear(width, width, generator) for _ in range(hidden))
@@ -150,10 +140,10 @@ class MlpField(Field):
         self.instant = nn.ModuleList(linear(instant, width, generator) for _ in self.place)
         self.heads = zero_linear(width, sum(SPLITS))
 
-    def columns(self, places: Tensor, fraction: float | Tensor) -> Tensor:
+    def columns(self, places: Tensor, fraction: float) -> Tensor:
         """See `Field.columns`; the encoded time enters as one row that all Gaussians share."""
-        place = octaves(places, self.settings.position_octaves)
-        instant = octaves(_one(2 * fraction - 1, places), self.settings.time_octaves)
+        place = octaves(places, POSITION_OCTAVES)
+        instant = octaves(places.new_tensor([2 * fraction - 1]), TIME_OCTAVES)
         enters = [at_place(place) + at_time(instant) for at_place, at_time in zip(self.place, self.instant)]
         state = F.relu(enters[0])
         for i, layer in enumerate(self.hidden):
@@ -176,10 +166,10 @@ class HexPlaneField(Field):
         grids = [torch.empty(3, channels, r, r).uniform_(0.1, 0.5, generator=generator) for r in settings.resolutions]
         self.space = nn.ParameterList(grids)
         self.time = nn.ParameterList(torch.ones(3, channels, instants, r) for r in settings.resolutions)
-        self.features = linear(channels * len(settings.resolutions), settings.width, generator)
-        self.heads = zero_linear(settings.width, sum(SPLITS))
+        self.features = linear(channels * len(settings.resolutions), HIDDEN, generator)
+        self.heads = zero_linear(HIDDEN, sum(SPLITS))
 
-    def columns(self, places: Tensor, fraction: float | Tensor) -> Tensor:
+    def columns(self, places: Tensor, fraction: float) -> Tensor:
         """See `Field.columns`; outside the box the planes keep their border values."""
         inside = places.clamp(-1, 1).T.contiguous()
         levels = [self._level(space, time, inside, fraction) for space, time in zip(self.space, self.time)]
@@ -190,20 +180,19 @@ class HexPlaneField(Field):
         planes = [*self.space, *self.time]
         network = [*self.features.parameters(), *self.heads.parameters()]
         return [
-            {"params": planes, "lr": self.settings.plane_rate, "name": "planes"},
+            {"params": planes, "lr": PLANE_RATE, "name": "planes"},
             {"params": network, "lr": self.settings.network_rate, "name": "network"},
         ]
 
     def regularization(self) -> Tensor:
         """Smooth planes, and nothing that changes in time without need (4DGaussians, regulation.py)."""
-        s = self.settings
         space = sum(bend(plane, -1) + bend(plane, -2) for plane in self.space)
         time = sum(bend(plane, -2) for plane in self.time)
         still = sum((1 - plane).abs().mean() for plane in self.time)
-        return s.smooth_space * space + s.smooth_time * time + s.still * still
+        return SMOOTH_SPACE * space + SMOOTH_TIME * time + STILL * still
 
     @staticmethod
-    def _level(space: Tensor, time: Tensor, places: Tensor, fraction: float | Tensor) -> Tensor:
+    def _level(space: Tensor, time: Tensor, places: Tensor, fraction: float) -> Tensor:
         """Features [C, N] of places [3, N] in -1..1, from planes [3, C, R, R] and [3, C, T, R]."""
         pairs = torch.stack([torch.stack([places[b], places[a]], -1) for a, b in SPACE_PAIRS])
         planes = F.grid_sample(space, pairs[:, None], align_corners=True, padding_mode="border")[:, :, 0]
@@ -213,23 +202,17 @@ class HexPlaneField(Field):
         return x * y * z
 
 
-def _one(value: float | Tensor, like: Tensor) -> Tensor:
-    """A number, or a scalar with a gradient, as [1]."""
-    return value.to(like).reshape(1) if isinstance(value, Tensor) else like.new_tensor([value])
-
-
 def octaves(values: Tensor, count: int) -> Tensor:
     """[..., D * (1 + 2 count)]: the values, and sine and cosine of pi times 1, 2, 4, ... of each; values [..., D]."""
     angles = (values[..., None] * (math.pi * 2.0 ** torch.arange(count, device=values.device))).flatten(-2)
     return torch.cat([values, angles.sin(), angles.cos()], -1)
 
 
-def at_instant(planes: Tensor, fraction: float | Tensor) -> Tensor:
+def at_instant(planes: Tensor, fraction: float) -> Tensor:
     """Lines [3, C, R]: planes [3, C, T, R] interpolated at `fraction` (0..1) of their time."""
     last = planes.shape[2] - 1
     before = min(int(fraction * last), max(last - 1, 0))
     weight = fraction * last - before
-    weight = weight.to(planes) if isinstance(weight, Tensor) else weight
     return torch.lerp(planes[:, :, before], planes[:, :, min(before + 1, last)], weight)
 
 

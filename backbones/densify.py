@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from d2_plugin.settings import Count, Every, NotNegative, Positive, Settings, Share, Steps
+from d2_plugin.settings import Count, Every, NotNegative, Settings, Share
 
 from .gaussians import Gaussians
-from .relocate import relocate, wander
+
+DENSE = 0.01
+"""Gaussians larger than this share of the extent are split, smaller ones cloned."""
+FAINT = 0.005
+"""Gaussians below this opacity are pruned."""
+HUGE = 0.5
+"""Gaussians larger than this share of the extent are pruned."""
+SHRINK = math.log(1.6)
+"""What the log-scales of the two children of a split Gaussian are smaller by."""
 
 
 class Growable(Protocol):
@@ -29,15 +38,10 @@ class Growable(Protocol):
 
 @dataclass(frozen=True)
 class DensifySettings(Settings):
-    """When the backbone clones, splits, prunes and resets."""
+    """When the backbone clones, splits and prunes, as 3D Gaussian Splatting does; opacities are never reset."""
 
     enabled: bool = True
     """Whether the backbone changes the number of its Gaussians at all."""
-    method: Literal["split", "relocate"] = "split"
-    """What an edit does: "split" clones and splits where the screen-space gradient is large and prunes (3DGS),
-    "relocate" moves the Gaussians that pruning would remove to opaque ones and grows by a share (3DGS-MCMC).
-    "relocate" with growth 0.1 against "split", four views, 500 steps, one seed: studio -.68 dB with D2 and -.26
-    without, plaza -1.50 and -.56."""
     start: Share = 0.05
     """Share of the run before the first edit."""
     stop: Share = 0.6
@@ -45,46 +49,22 @@ class DensifySettings(Settings):
     every: Every = 100
     """Steps between edits."""
     gradient: NotNegative = 1e-3
-    """Mean screen-space gradient (in units of half the image) above which a Gaussian is cloned or split.
-    Studio, four views, backbone alone, 2000 steps, seeds 0 1 2, held-out PSNR: 25.4, 24.9, 26.1 dB at 1e-3 (4,300
-    Gaussians); 26.4, 24.3, 23.9 dB at 5e-4 (10,700). The official 2e-4 only overfits where there are few views."""
-    dense_fraction: Positive = 0.01
-    """Gaussians larger than this fraction of the extent are split, smaller ones cloned."""
-    opacity: Share = 0.005
-    """Gaussians below this opacity are pruned."""
-    scale_fraction: Positive = 0.5
-    """Gaussians larger than this fraction of the extent are pruned."""
-    reset_every: Steps = 0
-    """Steps between opacity resets to 0.01; 0 never resets.
-    Official: every 3000 of 30000 steps. In runs of some thousand steps a reset costs 1 dB on studio."""
+    """Mean screen-space gradient (in units of half the image) above which a Gaussian is cloned or split. The official
+    2e-4 overfits where there are few views."""
     budget: Count = 100_000
     """No growth beyond this number of Gaussians."""
-    growth: NotNegative = 0.05
-    """By what share an edit of method "relocate" increases their number."""
-    wander: NotNegative = 0.1
-    """Noise of method "relocate" on the positions of nearly transparent Gaussians, in their standard deviations a
-    step; it falls to none at the last step."""
 
 
 @torch.no_grad()
 def densify(model: Growable, settings: DensifySettings, step: int, iterations: int, generator: torch.Generator) -> None:
-    """Clone, split, prune and reset as scheduled; all structure changes go through model.append and model.select."""
-    if not settings.enabled or not settings.start * iterations <= step <= settings.stop * iterations:
+    """Clone, split and prune as scheduled; all structure changes go through model.append and model.select."""
+    begun = settings.enabled and settings.start * iterations <= step <= settings.stop * iterations
+    if not begun or step % settings.every:
         return
-    if settings.method == "relocate":
-        wander(model, settings.wander * (1 - step / max(iterations, 1)), generator)
-    if step % settings.every == 0:
-        if settings.method == "relocate":
-            room = min(int(settings.growth * len(model)), max(settings.budget - len(model), 0))
-            relocate(model, ~kept(model, settings), room, generator)
-        else:
-            grow(model, settings, generator)
-            prune(model, settings)
-        for value in model.gaussians.statistics.values():
-            value.zero_()
-    if settings.reset_every and step % settings.reset_every == 0:
-        logits = model.gaussians["opacity_logits"]
-        model.gaussians.overwrite("opacity_logits", logits.clamp(max=torch.logit(torch.tensor(0.01)).item()))
+    grow(model, settings, generator)
+    prune(model)
+    for value in model.gaussians.statistics.values():
+        value.zero_()
 
 
 def grow(model: Growable, settings: DensifySettings, generator: torch.Generator) -> None:
@@ -95,7 +75,7 @@ def grow(model: Growable, settings: DensifySettings, generator: torch.Generator)
     room = max(settings.budget - len(model), 0)
     if len(wanted) > room:
         wanted = wanted[mean_gradient[wanted].topk(room).indices.sort().values]
-    large = model.gaussians["log_scales"][wanted].exp().amax(-1) > settings.dense_fraction * model.extent
+    large = model.gaussians["log_scales"][wanted].exp().amax(-1) > DENSE * model.extent
     cloned, split = wanted[~large], wanted[large]
     raw = {name: value.detach() for name, value in model.gaussians.parameters.items()}
     rows = {name: torch.cat([value[cloned], value[split], value[split]]) for name, value in raw.items()}
@@ -108,23 +88,17 @@ def grow(model: Growable, settings: DensifySettings, generator: torch.Generator)
         model.select(torch.nonzero(keep).squeeze(-1))
 
 
-def prune(model: Growable, settings: DensifySettings) -> None:
+def prune(model: Growable, faint: float = FAINT, huge: float = HUGE) -> None:
     """Remove Gaussians that are nearly transparent or as large as the scene."""
-    keep = kept(model, settings)
+    raw = model.gaussians
+    opaque = torch.sigmoid(raw["opacity_logits"]) >= faint
+    keep = opaque & (raw["log_scales"].exp().amax(-1) <= huge * model.extent)
     if not keep.all():
         model.select(torch.nonzero(keep).squeeze(-1))
 
 
-def kept(model: Growable, settings: DensifySettings) -> Tensor:
-    """Which Gaussians [N] are neither nearly transparent nor as large as the scene."""
-    raw = model.gaussians
-    opaque = torch.sigmoid(raw["opacity_logits"]) >= settings.opacity
-    bounded = raw["log_scales"].exp().amax(-1) <= settings.scale_fraction * model.extent
-    return opaque & bounded
-
-
 def _scatter_children(model: Growable, rows: dict[str, Tensor], children: slice, generator: torch.Generator) -> None:
-    """Move split children to samples of their parent Gaussian (in 4D where there is time) and shrink them by 1.6."""
+    """Move split children to samples of their parent Gaussian (in 4D where there is time) and shrink them."""
     parents = {name: value[children] for name, value in rows.items()}
     temporal = "times" in rows
     scales = parents["log_scales"].exp()
@@ -133,7 +107,7 @@ def _scatter_children(model: Growable, rows: dict[str, Tensor], children: slice,
     noise = torch.randn(scales.shape, generator=generator, dtype=scales.dtype).to(scales.device)
     offset = (model.rotations(parents) * (scales * noise).T).sum(1).T
     rows["positions"][children] += offset[:, :3]
-    rows["log_scales"][children] -= torch.log(torch.tensor(1.6))
+    rows["log_scales"][children] -= SHRINK
     if temporal:
         rows["times"][children] += offset[:, 3]
-        rows["log_time_scales"][children] -= torch.log(torch.tensor(1.6))
+        rows["log_time_scales"][children] -= SHRINK

@@ -8,8 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from d2_plugin.gaussians.native_adam import Adam
-
 
 class Gaussians:
     """N Gaussians as named tensors with one row each, and one Adam with a parameter group per name.
@@ -24,7 +22,7 @@ class Gaussians:
         self.parameters = {name: nn.Parameter(value.detach().clone()) for name, value in rows.items()}
         self.statistics: dict[str, Tensor] = {}
         groups = [{"params": [p], "lr": learning_rates[name], "name": name} for name, p in self.parameters.items()]
-        self.optimizer = Adam(groups, lr=0.0, eps=1e-15, fused=True)
+        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15, fused=True)
 
     def __len__(self) -> int:
         return len(next(iter(self.parameters.values())))
@@ -60,16 +58,6 @@ class Gaussians:
     def overwrite(self, name: str, values: Tensor) -> None:
         """Set one named tensor and forget its moments (an opacity reset, for instance)."""
         self._replace(name, lambda old: values.to(old), keep_moments=False)
-
-    @torch.no_grad()
-    def revise(self, name: str, index: Tensor, values: Tensor, keep: bool = False) -> None:
-        """Set some rows of one named tensor; their moments are zero from then on, unless they are to be kept."""
-        parameter = self.parameters[name]
-        parameter.index_copy_(0, index, values.to(parameter))
-        moments = {} if keep else self.optimizer.state.get(parameter, {})
-        for key in ("exp_avg", "exp_avg_sq"):
-            if key in moments:
-                moments[key].index_fill_(0, index, 0.0)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that an exact continuation needs."""

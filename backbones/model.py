@@ -15,20 +15,25 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
-from d2_plugin.gaussians.native_image import add_screen_gradients, can_draw, constant_colors
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 from d2_plugin.settings import NotNegative, Positive, Range, Settings
 
 from .appearance import Appearance
 from .background import Background
-from .clocks import Clocks, ClockSettings
 from .densify import DensifySettings, densify
-from .dropout import Dropout
-from .early_stop import EarlyStopSettings
 from .gaussians import Gaussians
 
 STATISTICS = ("screen_gradient", "seen")
 """Per Gaussian: summed length of the screen-space gradient, and the number of views that had one."""
+
+INITIAL_OPACITY = 0.1
+"""Opacity of the Gaussians at the start."""
+LAST_POSITION_RATE = 0.01
+"""Learning rate of positions at the last step, as a share of that at the first; exponential in between."""
+ROTATION_RATE = 2e-3
+"""Learning rate of quaternions."""
+COLOR_RATE = 1e-2
+"""Learning rate of the constant colour; higher harmonics learn at a twentieth of it."""
 
 
 @dataclass(frozen=True)
@@ -40,49 +45,25 @@ class SplatSettings(Settings):
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the view-dependent colour."""
     position_rate: Positive = 3e-4
-    """Learning rate of positions at the first step, times the extent of the scene.
-    Studio, native 4D Gaussians alone, held-out PSNR after 1210 steps: 25.3 dB at 3e-4, 24.9 at 1e-4."""
-    position_rate_final: Positive = 3e-6
-    """The same at the last step; exponential in between."""
+    """Learning rate of positions at the first step, times the extent of the scene."""
     scale_rate: NotNegative = 1e-2
-    """Learning rate of log-scales. As above: 24.6 dB at 5e-3, 25.3 at 1e-2, 24.9 at 2e-2."""
-    rotation_rate: NotNegative = 2e-3
-    """Learning rate of quaternions."""
+    """Learning rate of log-scales."""
     opacity_rate: NotNegative = 5e-2
-    """Learning rate of opacity logits. As above: 24.5 dB at 2e-2, 25.3 at 5e-2."""
-    color_rate: NotNegative = 1e-2
-    """Learning rate of the constant colour; higher harmonics learn at a twentieth of it."""
-    initial_opacity: Annotated[float, Range(0, 1, open_low=True)] = 0.1
-    """Opacity of the Gaussians at the start."""
-    opacity_weight: NotNegative = 0.0
-    """Weight of the mean opacity in the loss; what no image needs fades and is pruned. 3DGS-MCMC: 0.01.
-    At 0.01, 500 steps, one seed: studio -.04 dB with D2 and -.01 without, plaza -.75 and +.43; SSIM1 never rises."""
-    scale_weight: NotNegative = 0.0
-    """Weight of the mean standard deviation, in extents of the scene, in the loss. 3DGS-MCMC: 0.01 in its own unit.
-    At 0.1, 500 steps, one seed: studio +.22 dB with D2 and -.19 without, plaza -.91 and -.81."""
-    dropout: Annotated[float, Range(0, 1, open_high=True)] = 0.0
-    """Chance that a training render leaves a Gaussian out, at the last step; it grows from none. DropGaussian: 0.2.
-    At 0.2, 500 steps, one seed: studio +.26 dB with D2 and -1.29 without, plaza -.57 and +.58."""
+    """Learning rate of opacity logits."""
     background: bool = True
     """Whether directions have a colour of their own at infinity, behind all Gaussians: for skies, and for what no
-    training camera has seen, which is black without it. 500 steps with D2, seed 0: studio 25.95 dB without, 30.73 with;
-    plaza 19.97 and 21.84."""
+    training camera has seen, which is black without it."""
     appearance: bool = False
     """Whether each training camera has an affine change of colour of its own. `d2 train` switches it on where the
-    cameras' exposures differ.
-    Studio with gains from .8 to 1.2, alone, 500 steps, one seed: 20.83 dB without, 23.88 with."""
-    clocks: ClockSettings = field(default_factory=ClockSettings)
-    """Shifts in time that cameras learn."""
+    cameras' exposures differ."""
     raster: RasterSettings = field(default_factory=RasterSettings)
     """Constants of the rasterizer."""
     densify: DensifySettings = field(default_factory=DensifySettings)
     """The backbone's own density control."""
-    early_stop: EarlyStopSettings = field(default_factory=EarlyStopSettings)
-    """Whether held-out patches end a run before its last step."""
 
 
 class Observer:
-    """What somebody may want to hear of a model: an entry of `SplatModel.observers`; here nothing is done with it."""
+    """Callbacks of a model, an entry of `SplatModel.observers`; by default they do nothing."""
 
     def resized(self, index: Tensor) -> None:
         """The Gaussians changed: row r was row index[r] before, -1 for a new one."""
@@ -109,8 +90,6 @@ class SplatModel(ABC):
         self.gaussians.statistics = {name: rows["positions"].new_zeros(len(rows["positions"])) for name in STATISTICS}
         self.background = Background(self.gaussians.device) if settings.background else None
         self.appearance = Appearance(self.gaussians.device) if settings.appearance else None
-        self.dropout = Dropout(settings.dropout) if settings.dropout else None
-        self.clocks = Clocks(settings.clocks) if settings.clocks.learn and settings.temporal else None
         self.observers: list[Observer] = []
         self.screen_offsets: Tensor | None = None
         self._drawn: Tensor | None = None
@@ -132,12 +111,11 @@ class SplatModel(ABC):
 
     def harmonic_colors(self, view: View, splats: Splats, phase: Tensor | None = None, time_degree: int = 0) -> Tensor:
         """Spherical harmonics in the direction of view, with `phase` [M] (fraction of the duration) also in time."""
-        base = self.gaussians["base_colors"]
-        if not (self.settings.sh_degree or time_degree) and can_draw(base):
-            return constant_colors(base, splats.rows if len(splats.rows) < len(self) else None)
         coefficients = self.harmonics().coefficients
         if len(splats.rows) < len(self):
             coefficients = coefficients.index_select(0, splats.rows)
+        if not (self.settings.sh_degree or time_degree):
+            return sh.constant_colors(coefficients)
         centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
         return sh.colors(coefficients, splats.means - centre, phase, self.settings.sh_degree, time_degree)
 
@@ -162,52 +140,31 @@ class SplatModel(ABC):
         splats = self.slice_at(view)
         colors = self.colors(view, splats)
         self._drawn = splats.rows
-        if self.dropout is not None and torch.is_grad_enabled():
-            splats = splats._replace(opacities=self.dropout.thinned(splats.opacities))
         self.screen_offsets = _zeros(splats.means).requires_grad_(torch.is_grad_enabled())
         render = rasterize(
             splats, colors, view, self.settings.raster, background=background, screen_offsets=self.screen_offsets
         )
-        own = self.background if background is None else None
-        shown = render if own is None else own.joined(render, view)
+        if self.background is not None and background is None:
+            render = self.background.behind(render, view)
         for observer in self.observers:
-            observer.rendered(view, render._replace(alpha=shown.alpha))
-        render = shown
+            observer.rendered(view, render)
         return render if self.appearance is None else self.appearance.seen_by(view.camera, render)
 
-    def look_at(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None:
-        """What the model takes from the training images before the first step: background colours, frame rates."""
+    def start_from(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None:
+        """Before the first step: colours of the background from the training images, see `Background.start_from`."""
         if self.background is not None:
             self.background.start_from(views, images)
-        if self.clocks is not None:
-            self.clocks.look_at(views)
 
     def regularization(self) -> Tensor | float:
         """A term of the training loss that concerns no image; 0.0 where there is none."""
-        s = self.settings
-        total: Tensor | float = 0.0
-        if s.opacity_weight:
-            total = total + s.opacity_weight * torch.sigmoid(self.gaussians["opacity_logits"]).mean()
-        if s.scale_weight:
-            total = total + s.scale_weight / self.extent * self.gaussians["log_scales"].exp().mean()
-        return total
-
-    @abstractmethod
-    def feel_time(self, clocks: Clocks, view: View) -> None:
-        """After backward: tell the clocks how the loss changes with the time of the view."""
+        return 0.0
 
     @torch.no_grad()
     def accumulate(self, view: View) -> None:
         """After backward: add the last render's screen-space gradient, in units of half the image, per Gaussian."""
         if self.screen_offsets is None or self.screen_offsets.grad is None or self._drawn is None:
             raise D2Error("there is no screen-space gradient yet: render a view and go backward before accumulate")
-        if self.clocks is not None:
-            self.feel_time(self.clocks, view)
         gradient, statistics = self.screen_offsets.grad, self.gaussians.statistics
-        if can_draw(gradient, *statistics.values()):
-            sums = statistics["screen_gradient"], statistics["seen"]
-            add_screen_gradients(gradient, self._drawn, (view.width, view.height), *sums)
-            return
         half = gradient.new_tensor([view.width / 2, view.height / 2])
         length = (gradient * half).norm(dim=-1)
         statistics["screen_gradient"].index_add_(0, self._drawn, length)
@@ -221,13 +178,8 @@ class SplatModel(ABC):
             self.background.optimize()
         if self.appearance is not None:
             self.appearance.optimize()
-        if self.clocks is not None:
-            self.clocks.optimize(step, iterations)
-        if self.dropout is not None:
-            self.dropout.advance(step, iterations)
-        s = self.settings
-        rate = decayed_rate(s.position_rate, s.position_rate_final, step, iterations)
-        self.gaussians.set_learning_rate("positions", rate * self.extent)
+        first = self.settings.position_rate * self.extent
+        self.gaussians.set_learning_rate("positions", decayed_rate(first, LAST_POSITION_RATE * first, step, iterations))
         for observer in self.observers:
             observer.optimized()
 
@@ -241,22 +193,21 @@ class SplatModel(ABC):
         self.gaussians.append(rows)
         index = torch.arange(len(self), device=self.gaussians.device)
         index[before:] = -1
-        self._tell(index)
+        self._report_resize(index)
 
     def select(self, index: Tensor) -> None:
         """Keep the rows `index`. All shrinking and reordering goes through here."""
         self.gaussians.select(index)
-        self._tell(index)
+        self._report_resize(index)
 
-    def _tell(self, index: Tensor) -> None:
+    def _report_resize(self, index: Tensor) -> None:
         for observer in self.observers:
             observer.resized(index)
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, statistics and optimizer: enough for a bitwise continuation."""
-        parts = {"background": self.background, "appearance": self.appearance, "dropout": self.dropout}
-        clocks = {} if self.clocks is None else {"clocks": self.clocks.state_dict()}
-        return clocks | self.gaussians.state_dict() | {name: part.state_dict() for name, part in parts.items() if part}
+        parts = {"background": self.background, "appearance": self.appearance}
+        return self.gaussians.state_dict() | {name: part.state_dict() for name, part in parts.items() if part}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`; the state says whether there is a background and an appearance."""
@@ -264,10 +215,6 @@ class SplatModel(ABC):
         self.background = Background(self.gaussians.device) if "background" in state else None
         if self.background is not None:
             self.background.load_state_dict(state["background"])
-        if self.dropout is not None:
-            self.dropout.load_state_dict(state["dropout"])
-        if self.clocks is not None:
-            self.clocks.load_state_dict(state["clocks"])
         self.appearance = Appearance(self.gaussians.device) if "appearance" in state else None
         if self.appearance is not None:
             self.appearance.load_state_dict(state["appearance"])
@@ -286,8 +233,8 @@ def shared_rates(settings: SplatSettings, extent: float) -> dict[str, float]:
         "positions": settings.position_rate * extent,
         "log_scales": settings.scale_rate,
         "opacity_logits": settings.opacity_rate,
-        "base_colors": settings.color_rate,
-        "harmonics": settings.color_rate / 20,
+        "base_colors": COLOR_RATE,
+        "harmonics": COLOR_RATE / 20,
     }
 
 

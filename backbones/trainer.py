@@ -16,22 +16,11 @@ from d2_plugin.gaussians.photometric import photometric_loss
 from d2_plugin.rasterizer import Render, View
 from d2_plugin.settings import Seed, Settings, Share, Steps
 
-from .early_stop import EarlyStop, EarlyStopSettings
-
-
-class Chosen(Protocol):
-    """What the loop needs of a backbone's settings."""
-
-    @property
-    def early_stop(self) -> EarlyStopSettings: ...
-
 
 class Model(Protocol):
     """What the loop needs of a backbone."""
 
-    @property
-    def settings(self) -> Chosen: ...
-    def look_at(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None: ...
+    def start_from(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None: ...
     def render(self, view: View, background: Tensor | None = None) -> Render: ...
     def regularization(self) -> Tensor | float: ...
     def accumulate(self, view: View) -> None: ...
@@ -87,29 +76,22 @@ class Trainer:
     ) -> None:
         self.model, self.frames, self.settings = model, frames, settings
         self.step = 0
-        self.early_stop = EarlyStop(model.settings.early_stop, settings.seed)
-        model.look_at(frames.views, frames.image)
+        model.start_from(frames.views, frames.image)
         self.loss: Tensor | None = None
         """The last step's loss with all its terms, for whoever watches that it stays finite."""
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
         self.d2 = attach(model) if attach else None  # D2, line 1: after the optimizer exists
 
-    @property
-    def stopped(self) -> bool:
-        """Whether held-out patches of the training images have ended the run before its last step."""
-        return self.early_stop.stopped
-
     def run(self, until: int | None = None, on_step: Callable[[int, float], None] | None = None) -> None:
         """Train up to and including step `until` (default: all); `on_step(step, loss)` reports each one."""
         model, iterations, d2 = self.model, self.settings.iterations, self.d2
-        while self.step < (iterations if until is None else until) and not self.stopped:
+        while self.step < (iterations if until is None else until):
             self.step += 1
             index = self._next_view()
             view = self.frames.views[index]
             render = model.render(view)
-            target = self.early_stop.target(index, self._image(index), render.color)
-            loss = photometric_loss(render.color, target, self.settings.ssim_weight, self._weights(index))
+            loss = photometric_loss(render.color, self._image(index), self.settings.ssim_weight, self._weights(index))
             logged = loss.item()
             regularization = model.regularization()
             if not isinstance(regularization, float):
@@ -133,7 +115,6 @@ class Trainer:
             "model": self.model.state_dict(),
             "generator": self._generator.get_state(),
             "queue": list(self._queue),
-            "early_stop": self.early_stop.state_dict(),
             "d2": self.d2.state_dict() if self.d2 is not None else None,
         }
 
@@ -143,7 +124,6 @@ class Trainer:
         self.model.load_state_dict(state["model"])
         self._generator.set_state(state["generator"].cpu())
         self._queue = list(state["queue"])
-        self.early_stop.load_state_dict(state.get("early_stop", {"rounds": [], "errors": []}))  # absent until 0.1.0
         if self.d2 is not None:
             self.d2.load_state_dict(state["d2"])
 
@@ -158,8 +138,6 @@ class Trainer:
     def _next_view(self) -> int:
         """Every view once, in a new random order each time round; views that join begin a new round."""
         opened = self._opened(self.step)
-        if not self._queue:
-            self.early_stop.end_round()
         if not self._queue or opened > self._opened(max(self.step - 1, 1)):
             self._queue = torch.randperm(opened, generator=self._generator).tolist()
         return self._queue.pop()

@@ -20,14 +20,17 @@ from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, rotation_matrices_4d
 from d2_plugin.gaussians.slicing import slice_gaussians, unit_quaternions
 from d2_plugin.rasterizer import Splats, View
-from d2_plugin.settings import Count, NotNegative
+from d2_plugin.settings import Count
 
-from .clocks import Clocks
-from .model import SplatModel, SplatSettings, shared_rates
+from .model import INITIAL_OPACITY, ROTATION_RATE, SplatModel, SplatSettings, shared_rates
 from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, refuse_temporal
 from .trainer import Trainer, TrainSettings
 
 __all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "initial_rows", "settings_from"]
+
+
+TIME_RATE = 1.6e-3
+"""Learning rate of mean times, relative to the duration."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +39,6 @@ class Yang4DSettings(SplatSettings):
 
     sh_time_degree: Count = 0
     """Number of cosines in time that modulate the colour; 0: constant in time."""
-    time_rate: NotNegative = 1.6e-3
-    """Learning rate of mean times, relative to the duration."""
     couples_time: bool = True
     """False keeps time apart from space: one quaternion instead of two, and every Gaussian stands still while it lives
     (the official code's rot_4d off)."""
@@ -55,10 +56,10 @@ class Yang4D(SplatModel):
     def __init__(self, rows: Mapping[str, Tensor], settings: Yang4DSettings, extent: float, duration: float) -> None:
         self.duration = max(duration, 1e-12)
         rates = shared_rates(settings, extent) | {
-            "times": settings.time_rate * self.duration,
+            "times": TIME_RATE * self.duration,
             "log_time_scales": settings.scale_rate,
-            "left": settings.rotation_rate,
-            "right": settings.rotation_rate,
+            "left": ROTATION_RATE,
+            "right": ROTATION_RATE,
         }
         super().__init__(rows, rates, settings, extent)
 
@@ -68,7 +69,7 @@ class Yang4D(SplatModel):
     ) -> Yang4D:
         """A model that starts at coloured points: positions [N, 3] world, colors [N, 3] in 0..1, times [N]."""
         scales = nearest_neighbour_scales(positions).clamp(max=0.1 * extent)
-        opacities = torch.full_like(scales, settings.initial_opacity)
+        opacities = torch.full_like(scales, INITIAL_OPACITY)
         rows = initial_rows(positions, colors, times, scales, opacities, settings, duration)
         return cls(rows, settings, extent, duration)
 
@@ -80,14 +81,7 @@ class Yang4D(SplatModel):
         """
         if self.settings.temporal and math.isnan(view.time):
             raise D2Error(f"the time of camera '{view.camera}', frame {view.frame} is NaN: give every view a time")
-        time = view.time if self.clocks is None else self.clocks.time_of(view)
-        return slice_gaussians(self._raw(), time)
-
-    def feel_time(self, clocks: Clocks, view: View) -> None:
-        """See `SplatModel.feel_time`: only differences of times count, so a later view is as good as earlier means."""
-        gradient = self.gaussians["times"].grad
-        if gradient is not None:
-            clocks.feel(view.camera, -gradient.sum())
+        return slice_gaussians(self._raw(), view.time)
 
     def _raw(self) -> dict[str, Tensor]:
         parameters = self.gaussians.parameters
@@ -105,8 +99,7 @@ class Yang4D(SplatModel):
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] of the sliced Gaussians as seen in `view`, at its time."""
         degree = _time_degree(self.settings)
-        time = view.time if self.clocks is None else self.clocks.time_of(view)
-        phase = (time - self.gaussians["times"][splats.rows]) / self.duration if degree else None
+        phase = (view.time - self.gaussians["times"][splats.rows]) / self.duration if degree else None
         return self.harmonic_colors(view, splats, phase, degree)
 
     def harmonics(self) -> Harmonics:

@@ -28,11 +28,6 @@ BASELINE = 0.05
 FPS = 30.0
 DRAWN = 50_000
 """Gaussians that are drawn at random."""
-STANDING = dict.fromkeys(("position_rate", "position_rate_final"), 1e-30) | dict.fromkeys(
-    ("scale_rate", "rotation_rate", "opacity_rate", "color_rate", "time_rate"), 0.0
-)
-"""Learning rates that move no float32. Images and depth are random: what they would teach is another model for each
-work: after some hundred steps those with D2 took nearly a fifth longer to draw."""
 WARM = 80
 """Views whose known pixels are found before a step is timed: a run finds them in its first round."""
 
@@ -98,8 +93,12 @@ class StepScene:
         """A trainer of the native backbone whose Gaussians stay as they are: no density control, steps of no length."""
         backbone: Any = registry.load(registry.BACKBONES, "yang4d")
         duration = max(view.time for view in self.frames.views)
-        settings = backbone.settings_from({"densify": {"enabled": False}, **STANDING})
+        settings = backbone.settings_from({"densify": {"enabled": False}, "position_rate": 1e-30})
         model = backbone.Yang4D(self._rows(backbone, settings, duration), settings, 5.0, duration)
+        # Images and depth are random: what they would teach is another model for each work, and after some hundred
+        # steps those with D2 took nearly a fifth longer to draw.
+        for group in model.gaussians.optimizer.param_groups:
+            group["lr"] = 0.0
         training = backbone.TrainSettings(iterations=1_000_000)
         return backbone.Trainer(model, self.frames, training, self._attach if guided else None)
 
@@ -118,14 +117,14 @@ class StepScene:
     def _attach(self, model: object) -> D2Hooks:
         adapter: Any = registry.load(registry.ADAPTERS, "yang4d")
         config = D2Config(depth_loss=DepthLossConfig())
-        return D2Hooks.from_config(config, adapter(model), store=RandomPrior(self.width, self.height))
+        return D2Hooks(config, adapter(model), store=RandomPrior(self.width, self.height))
 
 
 def works_of(scene: StepScene) -> dict[str, Callable[[], object]]:
     """The rasterizer's forward and backward on the model's Gaussians, a bare step, and one with the depth loss."""
     bare, guided = scene.trainer(guided=False), scene.trainer(guided=True)
     for view in scene.frames.views[:WARM]:
-        guided.d2._prior.known(view)
+        guided.d2.prior.known(view)
     return {
         RASTER: _rasterizer(scene, bare.model),
         "step": lambda: bare.run(bare.step + 1),

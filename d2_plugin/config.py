@@ -1,8 +1,7 @@
 """The configuration of D2: its prior, and one table per hook. A hook is switched on by its presence. TOML in and out.
 
 The paper's supplement, which fixes thresholds, weights and schedules, is not public: the defaults are this project's
-own choices, set by measurement. "Studio" in a docstring means the rendered recording (320x180, four training views
-00 02 05 07, frames 0 to 8, emulated monocular depth, one seed), the numbers are held-out PSNR.
+own choices, set by measurement.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from d2_plugin.hooks.depth_loss import DepthLossConfig
 from d2_plugin.hooks.prune import PruneConfig
 from d2_plugin.hooks.table import HOOKS
 from d2_plugin.reading import NoSuchFile, read_toml
-from d2_plugin.settings import FORMAT, NONE, AtLeastOne, Count, Range, Seed, Settings, Share, of_this_format
+from d2_plugin.settings import FORMAT, NONE, AtLeastOne, Count, Range, Seed, Settings, of_this_format
 from d2_plugin.values import checked_arguments
 
 __all__ = ["D2Config", "DensifyConfig", "DepthLossConfig", "PruneConfig", "for_iterations"]
@@ -53,15 +52,17 @@ class D2Config(_HookTables):
     """Training views surveyed at each structure update, taken in turn over all cameras and frames; at the first one at
     least one of each camera seen so far."""
     retire_after: Count = 5
-    """A structure hook retires after this many evaluations in a row that change next to nothing; 0: never."""
-    retire_below: Share = 1e-3
-    """An evaluation that changes a smaller share of the Gaussians than this has changed next to nothing."""
+    """A structure hook retires after this many evaluations in a row that change next to nothing (less than a thousandth
+    of the Gaussians); 0: never."""
     remove_at_most: Annotated[float, Range(0, 1, open_low=True)] = 0.9
     """Largest share of the Gaussians that all hooks together remove in one step; what is more waits for the next
     evaluation, where it must be asked for again. 1 sets no limit, as the paper."""
     finite_every: Count = 100
-    """Steps from one look to the next at whether all parameters are finite numbers; before hooks edit Gaussians and
-    before their state is saved it is looked as well. Training stops where one is not; 0 never looks."""
+    """Steps from one check to the next that all parameters are finite; they are checked before hooks edit Gaussians and
+    before their state is saved as well. Training stops where one is not; 0 never checks."""
+    prior_memory_mb: Annotated[int, Range(1, 1_000_000, unit="MB")] = 512
+    """Memory for priors that were read, on the backbone's device: about 17 bytes a pixel and view. The least recently
+    used leave first and are read again."""
     seed: Seed = 0
     """Seed of D2's own random generator."""
 
@@ -89,8 +90,8 @@ class D2Config(_HookTables):
             table = read_toml(path, "correct the configuration")
         except NoSuchFile:
             raise D2Error(f"no configuration at {path}: write one, or pass the settings as a dict") from None
-        told = {} if iterations is None else {"iterations": iterations}
-        config = cls.from_dict(told | of_this_format(table, str(path)))
+        length = {} if iterations is None else {"iterations": iterations}
+        config = cls.from_dict(length | of_this_format(table, str(path)))
         below = {name: str(path.parent / value) for name in ("prior", "exported") if (value := getattr(config, name))}
         return replace(config, **cast("dict[str, Any]", below))
 

@@ -1,8 +1,8 @@
 """D2Hooks: the only thing a trainer sees. Three lines attach it:
 
-d2 = D2Hooks.from_config("d2.toml", backbone=adapter)      # after the optimizer exists
-loss = loss + d2.loss(step, views)                         # before backward, never +=
-d2.step(step)                                              # after optimizer.step() and zero_grad(), before saving
+d2 = D2Hooks.from_config("d2.toml", backbone=adapter, iterations=30_000)   # after the optimizer exists
+loss = loss + d2.loss(step, views)                                         # before backward, never +=
+d2.step(step)                                     # after optimizer.step() and zero_grad(), before saving
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from d2_plugin.hooks.edits import Idle, followed, limited
 from d2_plugin.hooks.expected import check_backbone, check_state, check_step, converted, fitting_state
 from d2_plugin.hooks.finite import FiniteCheck
 from d2_plugin.hooks.prior import Store
-from d2_plugin.hooks.reports import Listener, Report, Telling, Trace
+from d2_plugin.hooks.reports import OnReport, Report, RunLog, ScalarWriter, Trace
 from d2_plugin.hooks.table import HOOKS
 from d2_plugin.hooks.views import ViewSampler
-from d2_plugin.protocol import Backbone, Edit, Points
+from d2_plugin.protocol import Backbone, Edit, Points, call_optional
 from d2_plugin.reading import said
 from d2_plugin.registry import ADAPTERS, load
 from d2_plugin.values import checked_arguments
@@ -49,10 +49,7 @@ class D2Hooks:
         store: Store | None = None,
         hooks: Mapping[str, Hook] | None = None,
     ) -> None:
-        """`store` is anything with `prior(camera, frame) -> DepthPrior | None`; by default the folder config.prior.
-
-        `hooks` are more of them by name, as objects: somebody's own, or what D2 is compared with.
-        """
+        """The silent form of `from_config`, which documents the arguments."""
         check_backbone(backbone)
         self.config, self.backbone = config, backbone
         self.hooks: dict[str, Hook] = {name: HOOKS[name].hook(getattr(config, name)) for name in config.hooks}
@@ -63,30 +60,52 @@ class D2Hooks:
         self._finite = FiniteCheck(backbone, config.finite_every)
         self._evaluated = False
         self._count = len(backbone)
-        self._warned = self._named = False
+        self._warned = False
         self._inserting = 0  # the step while the backbone inserts for us, else 0
         self.inserted_at = torch.zeros(self._count, dtype=torch.int32)
         """Per Gaussian [N], the step at which D2 inserted it; 0 for the backbone's own."""
-        self._idle = Idle(self.hooks, config.retire_after, config.retire_below)
-        self.telling = Telling(self.hooks)
+        self._idle = Idle(self.hooks, config.retire_after)
+        self.log = RunLog(self.hooks)
+        self.prior: PriorLoader | None = None
+        """Where the hooks look up depth; None where there is no hook."""
         if self.hooks:
-            self._prior = PriorLoader(store if store is not None else _open_store(config))
+            from d2_plugin.store.exported import renamed_by
+
+            opened = store if store is not None else _open_store(config, self.hooks)
+            self.prior = PriorLoader(opened, config.prior_memory_mb, renamed_by)
             backbone.on_resize(self._follow)
 
     @classmethod
+    @checked_arguments
     def from_config(
         cls,
         config: str | Path | Mapping[str, Any] | D2Config,
         backbone: Backbone,
         store: Store | None = None,
         hooks: Mapping[str, Hook] | None = None,
+        *,
+        iterations: int | None = None,
+        on_report: OnReport | None = None,
+        writer: ScalarWriter | None = None,
     ) -> D2Hooks:
-        """From a TOML file, a mapping or a D2Config; `hooks` beside those that it names."""
+        """Attach the configured hooks to a backbone and log what was attached, see `RunLog.start`.
+
+        Args:
+            config: a TOML file, a mapping of its content, or a D2Config, whose schedules stay as they are.
+            backbone: an adapter, or a class of your own, see `d2_plugin.protocol.Backbone`.
+            store: anything with `prior(camera, frame) -> DepthPrior | None`; by default the folder `config.prior`.
+            hooks: more of them by name, as objects: your own, or what D2 is compared with.
+            iterations: length of the run in steps; schedules that the configuration leaves out follow from it.
+            on_report: called with the `Report` of every step.
+            writer: anything with `add_scalar(tag, value, step)`, a TensorBoard SummaryWriter for instance.
+        """
         if isinstance(config, (str, Path)):
-            config = D2Config.from_toml(config)
+            config = D2Config.from_toml(config, iterations)
         elif not isinstance(config, D2Config):
-            config = D2Config.from_dict(config)
-        return cls(config, backbone, store, hooks)
+            config = D2Config.from_dict(config if iterations is None else {"iterations": iterations, **config})
+        d2 = cls(config, backbone, store, hooks)
+        d2.log.start(backbone, d2.prior, config.iterations or iterations, on_report, writer)
+        return d2
 
     @classmethod
     @checked_arguments
@@ -96,14 +115,14 @@ class D2Hooks:
         adapter: str,
         *model: Any,
         iterations: int | None = None,
-        on_report: Listener | None = None,
-        writer: Any = None,
+        on_report: OnReport | None = None,
+        writer: ScalarWriter | None = None,
         **options: Any,
     ) -> D2Hooks:
-        """From a configuration and the name of a registered adapter, which gets the trainer's own objects.
+        """`from_config` with a registered adapter by its name, built from the trainer's own objects and `options`.
 
-        The first of the three lines where there is an adapter: `d2 = D2Hooks.attach("d2.toml", "fudan", gaussians)`.
-        What the configuration leaves out of schedules follows from `iterations`, the length of the run; see `tell`.
+        The first of the three lines where there is an adapter:
+        `d2 = D2Hooks.attach("d2.toml", "fudan", gaussians, iterations=opt.iterations)`.
         """
         build = load(ADAPTERS, adapter)
         try:
@@ -116,17 +135,7 @@ class D2Hooks:
                 f"the adapter '{adapter}' cannot take {given} ({said(failure)}): give the trainer's own objects, as "
                 f"the docstring of {getattr(build, '__name__', adapter)} says"
             ) from failure
-        if isinstance(config, (str, Path)):
-            config = D2Config.from_toml(config, iterations)
-        elif iterations is not None and not isinstance(config, D2Config):
-            config = D2Config.from_dict({"iterations": iterations, **config})
-        attached = cls.from_config(config, backbone)
-        attached.tell(iterations, on_report, writer)
-        return attached
-
-    def tell(self, iterations: int | None = None, on_report: Listener | None = None, writer: Any = None) -> None:
-        """From now on say what happens, see `Telling.start`."""
-        self.telling.start(self.backbone, self._prior.store if self.hooks else None, iterations, on_report, writer)
+        return cls.from_config(config, backbone, iterations=iterations, on_report=on_report, writer=writer)
 
     @property
     def retired(self) -> dict[str, int]:
@@ -138,12 +147,12 @@ class D2Hooks:
 
         `views` is the trainer's own camera object, or a list of them for a batch.
         """
-        if not self.hooks:
+        if self.prior is None:
             return 0.0
         self._begin(step)
         batch = views if isinstance(views, (list, tuple)) else [views]
-        if not self._named and batch and hasattr(self.backbone, "image_name"):
-            self._prior.store, self._named = _renamed(self._prior.store, self.backbone.image_name(batch[0])), True
+        if batch and not self.prior.named:
+            self.prior.name_by(call_optional(self.backbone, "image_name", batch[0]))
         shown = [converted(self.backbone, camera) for camera in batch]
         self._sampler.add(shown)
         context = self._context(step, shown)
@@ -152,9 +161,9 @@ class D2Hooks:
             term = hook.loss(context)
             if term is not None:
                 self.trace.append(Trace(step, name, "loss", 0))
-                self.telling.lost(name, term)
+                self.log.record_loss(name, term)
                 total = total + term if isinstance(total, Tensor) else term
-        self._finite.heard(total, shown)
+        self._finite.remember(total, shown)
         return total
 
     @torch.no_grad()
@@ -164,7 +173,7 @@ class D2Hooks:
             return Report(gaussians=len(self.backbone), step=step)
         self._begin(step)
         due = self._due(step)
-        self._finite.look(step, any(name in HOOKS and HOOKS[name].edits_structure for name, _ in due))
+        self._finite.check(step, any(name in HOOKS and HOOKS[name].edits_structure for name, _ in due))
         context = self._context(step, ())
         proposals = [(name, hook.edit(context)) for name, hook in due]
         edits = [(name, edit) for name, edit in proposals if edit is not None]
@@ -172,7 +181,7 @@ class D2Hooks:
             self._retire_if_idle(step, name, edit, context)
         removed, inserted = self._remove(step, edits), self._insert(step, edits)
         report = Report(inserted, removed, len(self.backbone), step)
-        self.telling.stepped(report)
+        self.log.record_step(report)
         return report
 
     def state_dict(self) -> dict[str, Any]:
@@ -204,13 +213,13 @@ class D2Hooks:
         self.inserted_at = state.get("inserted_at", torch.zeros(self._count, dtype=torch.int32)).cpu()
 
     def _begin(self, step: int) -> None:
-        """Tell the backbone the step, if it has `begin_step`, and notice changes that nobody reported."""
+        """Give the backbone the number of the step, and notice changes that nobody reported."""
         check_step(step)
-        getattr(self.backbone, "begin_step", int)(step)
+        call_optional(self.backbone, "begin_step", step)
         self._check_count()
 
     def _due(self, step: int) -> list[tuple[str, Hook]]:
-        if not getattr(self.backbone, "active", lambda step: True)(step):
+        if not call_optional(self.backbone, "active", step, default=True):
             return []
         return [(name, hook) for name, hook in self.hooks.items() if name not in self.retired and hook.window.due(step)]
 
@@ -220,7 +229,8 @@ class D2Hooks:
             self._evaluated = True
             return self._sampler.sample(max(self.config.views_per_evaluation, first), self.generator)
 
-        return Context(step, self.backbone, views, self._prior, self.generator, sample, self._sampler.instants)
+        assert self.prior is not None, "a step without hooks has no context"
+        return Context(step, self.backbone, views, self.prior, self.generator, sample, self._sampler.instants)
 
     def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
         if name not in HOOKS or not HOOKS[name].edits_structure or not context.evaluation:
@@ -283,15 +293,11 @@ def _of_other_names(hooks: Mapping[str, Hook]) -> dict[str, Hook]:
     return dict(hooks)
 
 
-def _open_store(config: D2Config) -> Store:
+def _open_store(config: D2Config, hooks: Mapping[str, Hook]) -> Store:
     if config.prior is None:
-        raise D2Error(f"{', '.join(HOOKS)} need a depth prior: set `prior` to the folder that `d2 priors` wrote")
+        needing = f"{', '.join(hooks)} need{'s' if len(hooks) == 1 else ''}"
+        raise D2Error(f"{needing} a depth prior: set `prior` to the folder that `d2 priors` wrote")
     from d2_plugin.store.exported import opened
 
-    return opened(config.prior, config.exported)
-
-
-def _renamed(store: Store, image: str | None) -> Store:
-    from d2_plugin.store.exported import renamed_by
-
-    return renamed_by(store, image)
+    store: Store = opened(config.prior, config.exported)
+    return store

@@ -222,10 +222,10 @@ class Backbone(Protocol):
         second render. The views of a batch are told apart by camera and frame.
     ``begin_step(step) -> None``
         called with the number of the training step before anything else is asked in it.
-    ``image(camera) -> str | None``
-        path of the image that a camera of the trainer shows; priors of an exported recording are found by it.
+    ``image_name(camera) -> str | None``
+        path of the image of a trainer's camera; priors of an exported recording are found by it.
     ``active(step) -> bool``
-        False while the hooks must wait (stages, warm-up); a question, which changes nothing.
+        False while the hooks must wait (stages, warm-up); changes nothing.
     ``colors(view, splats) -> Tensor``
         RGB [M, 3], 0 or more, of what `slice_at(view)` returned: the live viewer shows them, and grey without.
     ``trained() -> Mapping[str, Tensor]``
@@ -253,3 +253,9 @@ class Backbone(Protocol):
 
     def on_resize(self, listener: ResizeListener) -> None:
         """Register a listener for every structural change, the backbone's own ones included."""
+
+
+def call_optional(backbone: object, name: str, *arguments: Any, default: Any = None) -> Any:
+    """What an optional member of a backbone returns (see `Backbone`), or `default` where the backbone has none."""
+    method = getattr(backbone, name, None)
+    return default if method is None else method(*arguments)

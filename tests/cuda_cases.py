@@ -13,8 +13,7 @@ from torch import Tensor
 
 from d2_plugin.compiler import load_library
 from d2_plugin.protocol import DepthPrior, Label, RasterSettings, Render, Splats, Survey, View
-from d2_plugin.rasterizer import cuda, cuda_frame, ops, reference
-from d2_plugin.rasterizer.evidence import reliability
+from d2_plugin.rasterizer import autograd, cuda, reference
 
 HERE = Path(__file__).parent / "rasterizer"
 FORWARD_TOLERANCE, GRADIENT_TOLERANCE = 1e-4, 1e-3
@@ -29,7 +28,7 @@ class ShimLauncher:
         self.order = order
         self.launched: list[str] = []
 
-    def launch(self, kernel: str, blocks: int, frame: cuda_frame.Frame, rows: int = 1) -> None:
+    def launch(self, kernel: str, blocks: int, frame: cuda.Frame, rows: int = 1) -> None:
         self.launched.append(kernel)
         run = shim_library(frame.channels or 3).d2_shim_launch
         error = run(kernel.encode(), blocks, rows, self.order, ctypes.byref(frame))
@@ -38,8 +37,8 @@ class ShimLauncher:
 
 @functools.cache
 def shim_library(channels: int) -> ctypes.CDLL:
-    flags = (f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda_frame.Frame)}", "-ffp-contract=off")
-    headers = (HERE / "cuda_shim.h", cuda_frame.SOURCE, *cuda_frame.HEADERS)
+    flags = (f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda.Frame)}", "-ffp-contract=off")
+    headers = (HERE / "cuda_shim.h", cuda.PROGRAM.source, *cuda.PROGRAM.headers)
     library = load_library("cuda-shim", (HERE / "cuda_shim.cpp",), headers, flags)
     library.d2_shim_launch.restype = ctypes.c_char_p
     library.d2_shim_stream.restype = ctypes.c_void_p
@@ -116,7 +115,7 @@ def render_kernels(scene: Scene, device: torch.device) -> tuple[Scene, tuple[Ten
     """The scene in float32 on `device`, and what `cuda.rasterize` says."""
     scene = scene.to(device, torch.float32)
     size = (scene.view.width, scene.view.height)
-    return scene, cuda.rasterize(*inputs_of(scene), *camera_of(scene), *size, ops._constants(scene.settings))
+    return scene, cuda.rasterize(*inputs_of(scene), *camera_of(scene), *size, autograd.constants_of(scene.settings))
 
 
 def gradients_of_kernels(scene: Scene, device: torch.device, upstream: tuple[Tensor | None, ...]) -> tuple[Tensor, ...]:
@@ -124,7 +123,7 @@ def gradients_of_kernels(scene: Scene, device: torch.device, upstream: tuple[Ten
     scene, outputs = render_kernels(scene, device)
     given = [None if part is None else part.to(device, torch.float32) for part in upstream]
     given += [None] * (len(Render._fields) - len(given))
-    return cuda.backward(*given, *inputs_of(scene), *camera_of(scene), ops._constants(scene.settings), *outputs)
+    return cuda.backward(*given, *inputs_of(scene), *camera_of(scene), autograd.constants_of(scene.settings), *outputs)
 
 
 def reference_with_gradients(scene: Scene) -> tuple[Render, tuple[Tensor, ...], tuple]:
@@ -216,6 +215,6 @@ def make_reliable(prior: DepthPrior, seed: int = 4) -> DepthPrior:
 def survey_kernels(scene: Scene, prior: DepthPrior, device: torch.device, eps: float = 1e-8) -> Survey:
     scene = scene.to(device, torch.float32)
     means, covariances, opacities, _ = scene.splats
-    maps = (prior.depth.to(device), reliability(prior).to(device), scene.near_edge)
-    camera = (scene.view.T_camera_world, scene.view.K, ops._constants(scene.settings))
+    maps = (prior.depth.to(device), reference.reliability(prior).to(device), scene.near_edge)
+    camera = (scene.view.T_camera_world, scene.view.K, autograd.constants_of(scene.settings))
     return cuda.survey(means, covariances, opacities, *maps, *camera, eps)

@@ -66,11 +66,11 @@ def test_after_a_resume_the_last_good_step_is_that_of_the_state() -> None:
         resumed.run(20, poisoned(resumed, 7))
 
 
-def test_a_loss_of_d2_that_is_none_is_told() -> None:
+def test_a_loss_of_d2_that_is_not_finite_is_reported() -> None:
     check = FiniteCheck(make_adapter(make_model()), 1)
-    check.heard(torch.tensor(math.nan), [])
+    check.remember(torch.tensor(math.nan), [])
     with pytest.raises(Diverged, match=r"\(D2's loss is nan\)"):
-        check.look(3, now=False)
+        check.check(3, now=False)
 
 
 def test_it_can_be_switched_off() -> None:
@@ -81,20 +81,20 @@ def test_it_can_be_switched_off() -> None:
 
 
 @pytest.mark.parametrize("backbone", BACKBONES)
-def test_every_tensor_that_is_trained_is_looked_at(backbone: str) -> None:
+def test_every_tensor_that_is_trained_is_checked(backbone: str) -> None:
     model = make_model(backbone=backbone)
     check = FiniteCheck(make_adapter(model), 1)
-    check.look(1, now=False)
+    check.check(1, now=False)
     for name, value in make_adapter(model).trained().items():
         kept = value.detach().clone()
         value.data.view(-1)[-1] = math.inf
         with pytest.raises(Diverged, match=name.replace(".", r"\.")):
-            check.look(1, now=False)
+            check.check(1, now=False)
         value.data.copy_(kept)
-    check.look(1, now=False)
+    check.check(1, now=False)
 
 
-def test_a_backbone_that_tells_no_parameters_is_looked_at_through_its_slice() -> None:
+def test_a_backbone_without_trained_is_checked_through_its_slice() -> None:
     model = make_model()
 
     class Bare:
@@ -104,11 +104,11 @@ def test_a_backbone_that_tells_no_parameters_is_looked_at_through_its_slice() ->
 
     bare: Any = Bare()
     check, views = FiniteCheck(bare, 1), make_views()
-    check.look(1, now=True)  # nothing was trained on yet, so nothing can be asked
-    check.heard(0.0, views[:1])
-    check.look(2, now=False)
+    check.check(1, now=True)  # nothing was trained on yet, so nothing can be asked
+    check.remember(0.0, views[:1])
+    check.check(2, now=False)
     model.gaussians["base_colors"].data.fill_(math.nan)
-    check.look(3, now=False)  # what it does not tell cannot be seen
+    check.check(3, now=False)  # what it does not tell cannot be seen
     model.gaussians["opacity_logits"].data.fill_(math.nan)
     with pytest.raises(Diverged, match="of opacities is NaN"):
-        check.look(4, now=False)
+        check.check(4, now=False)

@@ -75,13 +75,16 @@ def make_model(
     )
     growth = DensifySettings(start=0.1, stop=0.9, every=7, gradient=5e-3, budget=150)
     colors, times = torch.rand(count, 3, generator=generator), torch.rand(count, generator=generator) / 2
-    shared = {"temporal": temporal, "initial_opacity": 0.5, "densify": growth} | chosen
+    shared = {"temporal": temporal, "densify": growth} | chosen
     if backbone == "yang4d":
-        settings = Yang4DSettings(**shared)
-        return Yang4D.from_points(positions, colors, times, settings, extent=2.0, duration=0.5)
-    fields = {"mlp": MlpSettings(width=16, depth=3), "hexplane": HexPlaneSettings(features=4, resolutions=(4, 8))}
-    settings = DeformSettings(**shared, field=backbone, **fields)
-    return Deform.from_points(positions, colors, settings, extent=2.0, duration=0.5)
+        model = Yang4D.from_points(positions, colors, times, Yang4DSettings(**shared), extent=2.0, duration=0.5)
+    else:
+        fields = {"mlp": MlpSettings(width=16, depth=3), "hexplane": HexPlaneSettings(features=4, resolutions=(4, 8))}
+        settings = DeformSettings(**shared, field=backbone, **fields)
+        model = Deform.from_points(positions, colors, settings, extent=2.0, duration=0.5)
+    with torch.no_grad():
+        model.gaussians["opacity_logits"].zero_()  # opacity one half: enough to supervise depth from the first step
+    return model
 
 
 def make_adapter(model: SplatModel) -> Yang4DAdapter | DeformAdapter:
@@ -103,7 +106,7 @@ def make_trainer(
     """A trainer of the tiny scene, with D2 attached where a configuration is given."""
 
     def attach(model: SplatModel) -> D2Hooks:
-        return D2Hooks.from_config(config, backbone=make_adapter(model), store=TinyStore())
+        return D2Hooks(config, make_adapter(model), TinyStore())
 
     settings = TrainSettings(iterations=iterations, seed=3)
     return kind(make_model(**model), TinyFrames(), settings, attach if config is not None else None)

@@ -17,7 +17,7 @@ from typing import Any
 from d2_plugin.compiler.nvrtc import Program
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.stereo import patchmatch_cuda as patchmatch
-from d2_plugin.rasterizer import cuda_runtime as rasterizer
+from d2_plugin.rasterizer import cuda as rasterizer
 from d2_plugin.runs.rows import Row, make_row
 
 ARCHITECTURES = ("sm_80", "sm_90", "sm_120")

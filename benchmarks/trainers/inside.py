@@ -49,8 +49,8 @@ def main(words: list[str]) -> int:
     outcome = {"gaussians": count(objects.model), "digest": digest(trained), "cpu_seconds": round(seconds, 1)}
     if session.hooks is not None:
         session.end()
-        telling = session.hooks.telling
-        outcome |= {"inserted": telling.inserted, "removed": telling.removed}
+        log = session.hooks.log
+        outcome |= {"inserted": log.inserted, "removed": log.removed}
     Path(outcome_file).write_text(json_text(outcome, outcome_file), encoding="utf-8")
     if options.repository in SCORERS:
         psnr = SCORERS[options.repository](objects, *map(Path, held_out))

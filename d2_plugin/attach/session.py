@@ -169,7 +169,7 @@ class Session:
     def end(self) -> None:
         """Log what D2 did, at the end of the script."""
         if self.hooks is not None:
-            self.hooks.telling.end()
+            self.hooks.log.end()
         elif self.config is not None:
             log.warning("the trainer never called training_setup: D2 was not attached")
 
@@ -187,10 +187,10 @@ class Session:
 
     def attach(self, iterations: int | None) -> None:
         """Make the adapter and the hooks of the objects seen, for a run of that many iterations."""
-        self.hooks = D2Hooks(self._configured(iterations), self.recipe.backbone(self.objects), self.store)
+        backbone, config = self.recipe.backbone(self.objects), self._configured(iterations)
+        self.hooks = D2Hooks.from_config(config, backbone, self.store, iterations=iterations)
         self._iteration, self._counted, self._drawn, self._batch = 0, False, 0, 0
         self._inserted, self._others = 0, len(self.hooks.backbone)
-        self.hooks.tell(iterations)
 
     def _configured(self, iterations: int | None) -> D2Config:
         assert self.config is not None

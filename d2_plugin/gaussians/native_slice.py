@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from d2_plugin.compiler import NoCompiler, load_library
+from d2_plugin.compiler import load_kernel
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import SMALL_NORM
 
@@ -51,30 +51,19 @@ class _Call(ctypes.Structure):
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """The compiled kernel; None without a compiler, of which the rasterizer has warned already.
+    """The compiled kernel; None without a compiler.
 
     Raises:
-        CompileError: see `d2_plugin.compiler.load_library`.
+        CompileError: see `d2_plugin.compiler.load_kernel`.
     """
-    try:
-        kernel = load_library("slice4d", (KERNELS / "slice4d.cpp",), SHARED_HEADERS, FLAGS)
-    except NoCompiler:
-        return None
-    call = ctypes.POINTER(_Call)
-    for name, result in ("rows", ctypes.c_int64), ("forward", None), ("backward", None):
-        function = getattr(kernel, f"d2_slice_{name}")
-        function.argtypes, function.restype = (call,), result
-    kernel.d2_slice_size.restype = ctypes.c_int64
-    assert kernel.d2_slice_size() == ctypes.sizeof(_Call), "the call differs between native_slice.py and slice4d.cpp"
-    return kernel
+    results = {"d2_slice_rows": ctypes.c_int64, "d2_slice_forward": None, "d2_slice_backward": None}
+    return load_kernel("slice4d", KERNELS / "slice4d.cpp", SHARED_HEADERS, FLAGS, _Call, results)
 
 
 def _kernel() -> ctypes.CDLL:
-    """The kernel, where `can_slice` has found that there is one."""
-    found = library()
-    if found is None:
-        raise NoCompiler("the slice in C++ needs a compiler: use `reference_slice` where `can_slice` is False")
-    return found
+    kernel = library()
+    assert kernel is not None, "native_slice is for where can_slice is True"
+    return kernel
 
 
 def can_slice(raw: Mapping[str, Tensor]) -> bool:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from d2_plugin.compiler import NoCompiler, load_library
+from d2_plugin.compiler import load_kernel
 from d2_plugin.gaussians.native_slice import FLAGS, KERNELS, SHARED_HEADERS
 
 
@@ -30,28 +30,19 @@ class _Call(ctypes.Structure):
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """The compiled kernel; None without a compiler, of which the rasterizer has warned already.
+    """The compiled kernel; None without a compiler.
 
     Raises:
-        CompileError: see `d2_plugin.compiler.load_library`.
+        CompileError: see `d2_plugin.compiler.load_kernel`.
     """
-    try:
-        kernel = load_library("ssim", (KERNELS / "ssim.cpp",), SHARED_HEADERS, FLAGS)
-    except NoCompiler:
-        return None
-    kernel.d2_photometric.argtypes, kernel.d2_photometric.restype = (ctypes.POINTER(_Call),), ctypes.c_double
-    kernel.d2_photometric_size.restype = ctypes.c_int64
-    size = kernel.d2_photometric_size()
-    assert size == ctypes.sizeof(_Call), "the call differs between native_ssim.py and ssim.cpp"
-    return kernel
+    results = {"d2_photometric": ctypes.c_double}
+    return load_kernel("ssim", KERNELS / "ssim.cpp", SHARED_HEADERS, FLAGS, _Call, results)
 
 
 def _kernel() -> ctypes.CDLL:
-    """The kernel, where `can_compare` has found that there is one."""
-    found = library()
-    if found is None:
-        raise NoCompiler("the loss in C++ needs a compiler: use `reference_photometric_loss` without one")
-    return found
+    kernel = library()
+    assert kernel is not None, "native_photometric_loss is for where can_compare is True"
+    return kernel
 
 
 def can_compare(image: Tensor, target: Tensor) -> bool:

@@ -56,7 +56,7 @@ def colors(coefficients: Tensor, directions: Tensor, phase: Tensor | None, degre
     (t - mu_t) / duration, None when time_degree is 0.
     """
     if degree == 0 and not time_degree:
-        return torch.relu(SH_C0 * coefficients[:, 0] + 0.5)
+        return constant_colors(coefficients)
     if degree == 0:
         values = coefficients.new_full((len(coefficients), 1), SH_C0)
     else:
@@ -67,6 +67,11 @@ def colors(coefficients: Tensor, directions: Tensor, phase: Tensor | None, degre
         waves = torch.stack([torch.cos(phase * (2 * math.pi * n)) for n in range(time_degree + 1)], -1)
         values = (waves[:, :, None] * values[:, None]).flatten(1)
     return torch.relu((values[..., None] * coefficients).sum(1) + 0.5)
+
+
+def constant_colors(coefficients: Tensor) -> Tensor:
+    """RGB [M, 3] >= 0 from coefficients [M, 1, 3], which depend on neither direction nor time."""
+    return torch.relu(SH_C0 * coefficients[:, 0] + 0.5)
 
 
 def coefficients_from_rgb(rgb: Tensor, degree: int, time_degree: int) -> Tensor:

@@ -12,9 +12,9 @@ from torch import Tensor
 def trained_tensors(model: Any) -> Iterator[tuple[str, Tensor]]:
     """Of its Gaussians and of each network or background that it holds."""
     for owner, part in vars(model).items():
-        found = getattr(part, "parameters", None)
-        if isinstance(found, dict):
-            yield from found.items()
+        own_parameters = getattr(part, "parameters", None)
+        if isinstance(own_parameters, dict):
+            yield from own_parameters.items()
         elif isinstance(part, torch.nn.Module):
             yield from ((f"{owner}.{name}", value) for name, value in part.named_parameters())
         elif hasattr(part, "__dict__"):

@@ -17,10 +17,13 @@ from d2_plugin.protocol import DepthPrior, Edit, Label, Points, Splats, View
 from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
 
 AT_LEAST = 5
-"""Steps from one evaluation to the next in a short run: an evaluation costs as much as several steps. sear_steak, 10
-CPU seconds, three seeds: 21.6 dB in 32 steps with one at every step, 25.2 in 78 with one every five (backbone 23.9).
-With ten 25.1; but gsplat's trainer, 20 iterations on studio, one seed, is at 20.7 dB with ten and 21.8 with five (bare
-20.9)."""
+"""Steps from one evaluation to the next in a short run: an evaluation costs as much as several steps."""
+
+SIGMAS = 2.5
+"""A pixel also counts as under-reconstructed only beyond this many standard deviations of its depth."""
+
+OCCUPIED = 0.08
+"""An existing Gaussian that is more opaque than this occupies its cell: one that was inserted and has not faded."""
 
 
 @dataclass(frozen=True)
@@ -36,39 +39,24 @@ class DensifyConfig(HookConfig):
     tau_v: Share = 0.5
     """A rendered depth is valid where the accumulated alpha exceeds this."""
     tau_u: Positive = 0.1
-    """Relative depth error above which a pixel counts as under-reconstructed, where its depth is that exact."""
-    tau_u_sigmas: Positive = 2.5
-    """And beyond this many standard deviations of a depth that is less exact."""
+    """Relative depth error above which a pixel counts as under-reconstructed, where its depth is that exact; 2.5 of its
+    standard deviations where it is less exact."""
     tau_u_mono: Annotated[float, Range(0, infinite=True)] = 0.2
     """The threshold of pixels without a finite sigma: they may propose and no more."""
     spacing: Annotated[float, Range(1, unit="pixels")] = 4.0
-    """Distance between samples: one new Gaussian per square of this side where a surface is missing.
-    The first evaluation so covers what the prior knows; later ones repair. 500 steps, seed 0, studio and plaza: 3 px
-    gives 30.4 and 21.9 dB with 23,000 and 31,000 Gaussians, 4 px 30.7 and 21.8 with 14,000 and 18,000, 6 px 30.3 and
-    21.7 with 8,000 and 10,000; SSIM1 on plaza .718, .702, .669."""
+    """Distance between samples: one new Gaussian per square of this side where a surface is missing. The first
+    evaluation so covers what the prior knows; later ones repair."""
     budget_per_view: Count = 20_000
     """No more samples than this in one view and evaluation: they lie further apart instead."""
     max_gaussians: Count = 1_000_000
     """No insertion beyond this number of Gaussians."""
     scale: Positive = 0.7
-    """Standard deviation of a new Gaussian in units of the distance between samples. As above: .5 gives 30.2 and
-    21.9 dB, .7 30.7 and 21.8, 1.0 30.2 and 21.7. Round: flat ones along the surface of D*, a fifth or half as thick or
-    only stretched where it slants, lose .3 to .4 dB on studio and up to .15 on plaza (300 and 1000 steps, seed 0)."""
+    """Standard deviation of a new Gaussian, which is round, in units of the distance between samples."""
     opacity: Annotated[float, Range(0, 1, open_low=True)] = 0.1
-    """Opacity of a new Gaussian. A faint one cannot spoil what stands; training makes it opaque where it is right. As
-    above: .05 gives 30.7 and 21.9 dB with a third more Gaussians, .1 30.7 and 21.8, .3 30.1 and 21.6."""
+    """Opacity of a new Gaussian. A faint one cannot spoil what stands; training makes it opaque where it is right."""
     lifetime: Positive | None = 1.0
     """Standard deviation in time of a new Gaussian where the image moves, in intervals from instant to instant, in a
-    backbone that has one; none: as it begins there. 1000 steps, seed 0, PSNR of what moves: studio 26.0 dB (none 20.4),
-    plaza 20.9 (19.6); a rendered room at 10 and 60 frames a second 21.2 and 20.6, at 6 intervals 20.2 and 20.6, none
-    20.2 and 20.1. New ones stand still: with the velocity that optical flow between two instants gives, what moves
-    gains .1 to .2 dB and the whole image loses as much (studio and plaza, two seeds); twice the lifetime adds
-    nothing."""
-    cell: Positive = 1.0
-    """Side of the frustum cells that keep duplicates out, in units of the distance between samples."""
-    occupied_opacity: Share = 0.08
-    """An existing Gaussian that is more opaque than this occupies its cell: one that was inserted and has not faded.
-    From .05 to .15 scores stay within .2 dB (studio, plaza, 500 steps, three seeds); more means more Gaussians."""
+    backbone that has one; none: as it begins there. New ones stand still."""
 
     @classmethod
     def for_iterations(cls, iterations: int) -> DensifyConfig:
@@ -184,14 +172,13 @@ class Densify(Hook):
         config = self.config
         if prior.sigma is None:
             return torch.where(prior.labels == Label.VERIFIED, config.tau_u, config.tau_u_mono)
-        exact = (config.tau_u_sigmas * prior.sigma).clamp(min=config.tau_u)
+        exact = (SIGMAS * prior.sigma).clamp(min=config.tau_u)
         return torch.where(torch.isfinite(prior.sigma), exact, config.tau_u_mono)
 
     def _free(self, view: View, splats: Splats, positions: Tensor, earlier: list[Points], spacing: float) -> Tensor:
         """Mask of candidates whose frustum cell is empty, the first one of each cell: a stratified sample."""
-        config = self.config
-        opaque = splats.means[splats.opacities > config.occupied_opacity]
+        opaque = splats.means[splats.opacities > OCCUPIED]
         taken = torch.cat([opaque, *(p.positions for p in earlier)])
-        cells = frustum_cells(view, positions, config.cell * spacing, config.tau_u)
-        occupied = frustum_cells(view, taken, config.cell * spacing, config.tau_u)
+        cells = frustum_cells(view, positions, spacing, self.config.tau_u)
+        occupied = frustum_cells(view, taken, spacing, self.config.tau_u)
         return (cells >= 0) & ~torch.isin(cells, occupied) & first_of_each(cells)

@@ -39,12 +39,16 @@ def followed(values: Tensor, index: Tensor, new: int) -> Tensor:
     return torch.where(index < 0, new, before[index.clamp(min=0)] if count else 0).int()
 
 
+NEXT_TO_NOTHING = 1e-3
+"""An evaluation that changes a smaller share of the Gaussians than this has changed next to nothing."""
+
+
 class Idle:
     """Counts each hook's evaluations in a row that changed next to nothing, which cost surveys of several views."""
 
-    def __init__(self, names: Iterable[str], after: int, below: float) -> None:
-        """A hook retires after so many of them (0: never); the share `below` of all Gaussians is next to nothing."""
-        self.after, self.below = after, below
+    def __init__(self, names: Iterable[str], after: int) -> None:
+        """A hook retires after so many of them (0: never)."""
+        self.after = after
         self.evaluations = dict.fromkeys(names, 0)
         self.retired: dict[str, int] = {}
 
@@ -52,7 +56,7 @@ class Idle:
         """Whether the hook retires with this evaluation; `settling` is how many at its start cannot change anything."""
         if not self.after:
             return False
-        changed = changes >= max(self.below * gaussians, 1)
+        changed = changes >= max(NEXT_TO_NOTHING * gaussians, 1)
         self.evaluations[name] = 0 if changed else self.evaluations[name] + 1
         if self.evaluations[name] < self.after + settling:
             return False

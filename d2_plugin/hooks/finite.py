@@ -1,4 +1,4 @@
-"""Training stops where a model or a loss is no number any more, in any trainer, at the cost of a look now and then."""
+"""Training stops where a parameter or the loss is not finite, in any trainer, checked now and then."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.protocol import Backbone, View
+from d2_plugin.protocol import Backbone, View, call_optional
 
 
 class Diverged(D2Error):
@@ -39,26 +39,26 @@ def what_diverged(parameters: Mapping[str, Tensor], loss: Tensor | None = None) 
 
 
 class FiniteCheck:
-    """Looks at a backbone every so many steps, before hooks edit it, and before its state is saved.
+    """Checks a backbone every so many steps, before hooks edit it, and before its state is saved.
 
-    A trainer's loss that is NaN makes parameters NaN in the same step, so these tell of it as well.
+    A trainer's loss that is NaN makes parameters NaN in the same step, so that checking these is enough.
     """
 
     def __init__(self, backbone: Backbone, every: int) -> None:
-        """`every`: steps from look to look; 0 never looks."""
+        """`every`: steps from one check to the next; 0 never checks."""
         self.backbone, self.every = backbone, every
         self.step, self.saved = 0, 0
         """The last step, and the one at which the state was saved last; 0 for none."""
         self._loss: Tensor | None = None
         self._view: View | None = None
 
-    def heard(self, loss: Tensor | float, views: Sequence[View]) -> None:
+    def remember(self, loss: Tensor | float, views: Sequence[View]) -> None:
         """D2's share of the loss in this step, and what was trained on."""
         self._loss = loss.detach() if isinstance(loss, Tensor) else None
         self._view = views[-1] if views else self._view
 
-    def look(self, step: int, now: bool) -> None:
-        """Look where it is time to, or `now`.
+    def check(self, step: int, now: bool) -> None:
+        """Check where it is time to, or `now`.
 
         Raises:
             Diverged: with the step, the parameter, and the last step whose state was saved.
@@ -81,16 +81,15 @@ class FiniteCheck:
         )
 
     def before_saving(self) -> None:
-        """A state that cannot be gone on from is not saved; one that can is the last good one."""
+        """Refuse a state that training cannot continue from; remember the step of one that it can."""
         if self.step:
-            self.look(self.step, now=True)
+            self.check(self.step, now=True)
         self.saved = self.step
 
     def _parameters(self) -> Mapping[str, Tensor]:
-        """The backbone's own, by its names; of one that does not tell them, what it shows in the last view."""
-        tell = getattr(self.backbone, "trained", None)
-        if tell is not None:
-            named: Mapping[str, Tensor] = tell()
+        """The backbone's own, by their names; of one without `trained`, what it draws in the last view."""
+        named: Mapping[str, Tensor] | None = call_optional(self.backbone, "trained")
+        if named is not None:
             return named
         if self._view is None:
             return {}

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import torch
@@ -28,118 +27,68 @@ class Store(Protocol):
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
 
 
+Rename = Callable[[Store, "str | None"], Store]
+"""From a store and the path of a trainer's image to the store under the names that the image's folder gives."""
+
 JUDGES = 0.05
 """Largest sigma of a pixel that may judge a Gaussian: an error of 10 %, at which E_k saturates, is two of these."""
-
 
 OUTLINE = 2
 """Pixels along the outline of a sky that say nothing: a Gaussian a pixel wide, two pixels inside of the surface, would
 else stand in free space."""
-
 
 NEAR, FAR = 1, 2
 """What `KnownMaps.kind` says where something is known."""
 
 
 class KnownMaps(NamedTuple):
-    """What may supervise one view, pixel by pixel, [H * W]; depth and sigma mean nothing where nothing is known."""
+    """What may supervise one view, pixel by pixel: the prior's own maps, not copies of them, and one byte beside them.
+
+    Known are pixels with a finite sigma, and far ones; in a prior without sigma, as in the paper, the trusted ones.
+    Depth and sigma mean nothing where nothing is known.
+    """
 
     kind: Tensor
-    """uint8: 0 where nothing is known, `NEAR`, or `FAR`: there only a depth in front of `depth` is wrong."""
+    """uint8 [H, W]: 0 where nothing is known, `NEAR`, or `FAR`: there only a depth in front of `depth` is wrong."""
     depth: Tensor
-    """World units; at far pixels a lower bound."""
+    """[H, W], world units; at far pixels a lower bound."""
     sigma: Tensor | None
-    """Relative standard deviation of the depth; far pixels count as if it were 0, and all do where there is none."""
+    """[H, W], relative standard deviation; far pixels count as if it were 0, and all do where there is none."""
+    near: int
+    """How many pixels are `NEAR`."""
+    far: int
+    """How many pixels are `FAR`."""
 
-
-@dataclass(frozen=True, eq=False)
-class KnownPixels:
-    """What may supervise one view: where something is known of D*, and how much; all [K]."""
-
-    index: Tensor
-    """int64, row * width + column."""
-    depth: Tensor
-    """float32, world units; at far pixels a lower bound."""
-    sigma: Tensor
-    """float32, relative standard deviation of the depth; 0 at far pixels and, in the paper, at verified ones."""
-    far: Tensor
-    """bool: only a depth in front of `depth` is wrong."""
-
-    @cached_property
-    def near(self) -> int:
-        """How many are not far."""
-        return int((~self.far).sum())
-
-    @cached_property
-    def count(self) -> int:
-        """How many there are."""
-        return len(self.index)
-
-    def maps(self, numel: int) -> KnownMaps:
-        """The same as maps of a view of so many pixels."""
-        kind = torch.zeros(numel, dtype=torch.uint8, device=self.index.device)
-        kind[self.index] = torch.where(self.far, FAR, NEAR).byte()
-        depth, sigma = (part.new_zeros(numel).index_copy_(0, self.index, part) for part in (self.depth, self.sigma))
-        return KnownMaps(kind, depth, sigma)
-
-    @property
-    def bytes(self) -> int:
-        """The memory that they take."""
-        return sum(part.numel() * part.element_size() for part in (self.index, self.depth, self.sigma, self.far))
-
-
-class PriorPixels(KnownPixels):
-    """Those of a prior: its own maps, not copies of them; the list is made where somebody asks for it."""
-
-    def __init__(self, prior: DepthPrior) -> None:
-        """Pixels with a finite sigma, and far ones; without sigma, as in the paper, the trusted ones."""
+    @classmethod
+    def of(cls, prior: DepthPrior) -> KnownMaps:
+        """The maps of a prior; waits for its device to count."""
         known = prior.trusted if prior.sigma is None else prior.support & torch.isfinite(prior.sigma)
-        kind = (known.byte() * NEAR + prior.far.byte() * FAR).flatten()
-        sigma = None if prior.sigma is None else prior.sigma.flatten()
-        self._maps: KnownMaps
-        self.__dict__["_maps"] = KnownMaps(kind, prior.depth.flatten(), sigma)  # frozen, as a list of pixels is
+        kind = known.byte() * NEAR + prior.far.byte() * FAR
         near, far = (int(torch.count_nonzero(kind == which)) for which in (NEAR, FAR))
-        self.__dict__.update(near=near, count=near + far)
-
-    @cached_property
-    def index(self) -> Tensor:
-        """See `KnownPixels`, as all that follows."""
-        return torch.nonzero(self._maps.kind).squeeze(1)
-
-    @cached_property
-    def depth(self) -> Tensor:
-        return self._maps.depth[self.index]
-
-    @cached_property
-    def sigma(self) -> Tensor:
-        sigma = self._maps.sigma
-        return torch.zeros_like(self.depth) if sigma is None else sigma[self.index].masked_fill(self.far, 0)
-
-    @cached_property
-    def far(self) -> Tensor:
-        return self._maps.kind[self.index] == FAR
-
-    def maps(self, numel: int) -> KnownMaps:
-        """See `KnownPixels`; the size is the prior's."""
-        assert numel == self._maps.kind.numel(), "the loader refuses priors of another size than the view's"
-        return self._maps
-
-    @property
-    def bytes(self) -> int:
-        """The memory that they take beside the prior."""
-        made = (self._maps.kind, *(self.__dict__.get(name) for name in ("index", "depth", "sigma", "far")))
-        return sum(part.numel() * part.element_size() for part in made if part is not None)
+        return cls(kind, prior.depth, prior.sigma, near, far)
 
 
 class PriorLoader:
     """Looks up D* by camera and frame, on the view's device; keeps the last few: memory must not grow with frames."""
 
-    def __init__(self, store: Store, keep_bytes: int = 512 << 20) -> None:
-        self.store, self.keep_bytes = store, keep_bytes
+    def __init__(self, store: Store, memory_mb: int = 512, rename: Rename | None = None) -> None:
+        """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes."""
+        self.store, self.keep_bytes, self._rename = store, memory_mb << 20, rename
         self._kept: OrderedDict[tuple[str, int], DepthPrior | None] = OrderedDict()
+        self._known: dict[tuple[str, int], KnownMaps] = {}
         self._cameras = CameraCheck()
         self._without: set[str] = set()
-        self._pixels: dict[tuple[str, int], KnownPixels] = {}
+        self.named = False
+        """Whether `name_by` was called."""
+
+    def name_by(self, image: str | None) -> None:
+        """Learn, once, what the trainer calls cameras and frames, from the path of its first image.
+
+        Where the image lies in an export of the prior's recording, priors are looked up by the export's names.
+        """
+        self.named = True
+        if self._rename is not None:
+            self.store = self._rename(self.store, image)
 
     def __call__(self, view: View) -> DepthPrior | None:
         """D* of the view, or None where the store has none; refuses one made for another size, K or pose."""
@@ -150,30 +99,33 @@ class PriorLoader:
         prior = self.store.prior(*key)
         if prior is None and view.camera not in self._without:
             self._without.add(view.camera)
-            log.info("camera %s has no prior at frame %d: it is trained without D2 there", view.camera, view.frame)
+            log.warning(
+                "camera %s has no prior at frame %d and is trained without D2 there; the prior has cameras %s",
+                view.camera, view.frame, ", ".join(map(str, getattr(self.store, "cameras", ()))) or "unknown",
+            )  # fmt: skip
         if prior is not None:
             self._check(view, prior)
             prior = _usable(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior))
         self._kept[key] = prior
         while len(self._kept) > 1 and self._bytes() > self.keep_bytes:
             dropped, _ = self._kept.popitem(last=False)
-            self._pixels.pop(dropped, None)
+            self._known.pop(dropped, None)
         return prior
 
-    def known(self, view: View) -> KnownPixels | None:
-        """The pixels of the view of whose depth something is known, or None where there is not one."""
+    def known(self, view: View) -> KnownMaps | None:
+        """What is known of the depth of the view's pixels, or None where nothing is of any."""
         key, prior = (view.camera, view.frame), self(view)
         if prior is None:
             return None
-        if key not in self._pixels:
-            self._pixels[key] = PriorPixels(prior)
-        pixels = self._pixels[key]
-        return pixels if pixels.count else None
+        if key not in self._known:
+            self._known[key] = KnownMaps.of(prior)
+        known = self._known[key]
+        return known if known.near + known.far else None
 
     def _bytes(self) -> int:
         tensors = [part for prior in self._kept.values() if prior is not None for part in prior if part is not None]
-        held = sum(part.numel() * part.element_size() for part in tensors)
-        return held + sum(pixels.bytes for pixels in self._pixels.values())
+        tensors += [known.kind for known in self._known.values()]
+        return sum(part.numel() * part.element_size() for part in tensors)
 
     def _check(self, view: View, prior: DepthPrior) -> None:
         height, width = prior.depth.shape

@@ -1,4 +1,4 @@
-"""Signs of life: a line when D2 is attached, one now and then, one at the end; to the log, a callback, TensorBoard."""
+"""What D2 did: a line when it is attached, one now and then, one at the end; to the log, a callback, TensorBoard."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ import time
 import weakref
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
 from d2_plugin.hooks.hook import Hook
+from d2_plugin.hooks.prior import PriorLoader
+from d2_plugin.hooks.table import HOOKS
 from d2_plugin.protocol import Backbone
 
 log = logging.getLogger(__name__)
@@ -44,102 +46,113 @@ class Report(NamedTuple):
     step: int = 0
 
 
-Listener = Callable[[Report], None]
+OnReport = Callable[[Report], None]
 
 
-class Telling:
-    """Counts what D2 does and says it; silent until `start`. Nothing that trains depends on it."""
+class ScalarWriter(Protocol):
+    """A TensorBoard SummaryWriter, or anything with its `add_scalar`."""
+
+    def add_scalar(self, tag: str, value: float, step: int) -> Any: ...
+
+
+class RunLog:
+    """Counts what D2 does and logs it; silent until `start`. Nothing that trains depends on it."""
 
     def __init__(self, hooks: Mapping[str, Hook]) -> None:
         self.hooks = hooks
         self.inserted = self.removed = self.gaussians = self.last_step = 0
-        self._aloud, self._ended = False, False
-        self._on_report: Listener | None = None
-        self._writer: Any = None
-        self._iterations: int | None = None
-        self._said_at = float("-inf")
+        self._started, self._ended = False, False
+        self._on_report: OnReport | None = None
+        self._writer: ScalarWriter | None = None
+        self._logged_at = float("-inf")
         self._terms: dict[str, _Mean] = {}
-        self._lately = [0, 0]
+        self._since = [0, 0]
+        """Insertions and removals since the last line of progress."""
 
     def start(
-        self, backbone: Backbone, store: Any, iterations: int | None, on_report: Listener | None, writer: Any
+        self,
+        backbone: Backbone,
+        prior: PriorLoader | None,
+        iterations: int | None,
+        on_report: OnReport | None,
+        writer: ScalarWriter | None,
     ) -> None:
-        """From now on say what happens, first what was attached, which cameras have priors, and the schedules.
+        """Log from now on; first what was attached, which cameras have priors, and schedules that do not fit the run.
 
         Args:
             backbone: what D2 is attached to.
-            store: the prior's; None where there is no hook.
-            iterations: steps that the trainer announces; schedules that end before a tenth of them are named.
+            prior: where the hooks look up depth; None where there is no hook.
+            iterations: length of the run, if it is known.
             on_report: called with the `Report` of every step.
-            writer: what has `add_scalar(tag, value, step)`, a TensorBoard SummaryWriter for instance.
+            writer: gets the counts of every change and the mean of every loss.
         """
-        self._aloud, self._iterations, self._on_report, self._writer = True, iterations, on_report, writer
-        be_heard()
+        self._started, self._on_report, self._writer = True, on_report, writer
+        add_default_handler()
         if not self.hooks:
             log.info("attached without a hook: the trainer runs as without D2")
             return
-        cameras = ", ".join(map(str, getattr(store, "cameras", ())))
+        cameras = ", ".join(map(str, getattr(None if prior is None else prior.store, "cameras", ())))
         schedules = ", ".join(_schedule(name, hook) for name, hook in self.hooks.items())
         log.info(
             "attached by %s to %d Gaussians; priors of cameras %s; %s",
             type(backbone).__name__, len(backbone), cameras or "unknown", schedules,
         )  # fmt: skip
-        if iterations is not None:
-            self._name_short_schedules(iterations)
+        if iterations is None:
+            self._warn_of_default_schedules()
+        else:
+            self._warn_of_short_schedules(iterations)
         _at_exit(self)
 
-    def lost(self, name: str, term: Tensor) -> None:
+    def record_loss(self, name: str, term: Tensor) -> None:
         """A hook's term of the loss in the present step."""
-        if self._aloud:
+        if self._started:
             self._terms.setdefault(name, _Mean()).add(term.detach())
 
-    def stepped(self, report: Report) -> None:
-        """The end of a step."""
+    def record_step(self, report: Report) -> None:
+        """What a step changed."""
         self.inserted, self.removed = self.inserted + report.inserted, self.removed + report.removed
         self.gaussians, self.last_step = report.gaussians, report.step
-        if not self._aloud:
+        if not self._started:
             return
-        self._lately = [self._lately[0] + report.inserted, self._lately[1] + report.removed]
+        self._since = [self._since[0] + report.inserted, self._since[1] + report.removed]
         if self._on_report is not None:
             self._on_report(report)
         if self._writer is not None:
-            self._write(report)
-        if (report.inserted or report.removed) and time.monotonic() - self._said_at >= PAUSE:
-            self._say_progress(report)
-        if self._iterations is None:
-            self._notice_late(report.step)
+            self._write(report, self._writer)
+        if (report.inserted or report.removed) and time.monotonic() - self._logged_at >= PAUSE:
+            self._log_progress(report)
 
     def summary(self) -> str:
         """What D2 did, in one line."""
         hooks = ", ".join(self.hooks) or "no hook"
         line = f"{hooks}: {self.inserted} inserted, {self.removed} removed, {self.gaussians} Gaussians"
-        told = [f"{name} {mean.first:.3g} at first, {mean.now():.3g} at last" for name, mean in self._terms.items()]
-        return "; ".join([f"{line} after step {self.last_step}", *told])
+        losses = [f"{name} {mean.first:.3g} at first, {mean.now():.3g} at last" for name, mean in self._terms.items()]
+        return "; ".join([f"{line} after step {self.last_step}", *losses])
 
     def end(self) -> None:
-        """Say the summary, once; by itself when the process ends."""
-        if self._aloud and self.last_step and not self._ended:
+        """Log the summary, once; called when the process ends."""
+        if self._started and self.last_step and not self._ended:
             self._ended = True
             log.info("%s", self.summary())
 
-    def _say_progress(self, report: Report) -> None:
+    def _log_progress(self, report: Report) -> None:
         losses = "".join(f", {name} {mean.now():.3g}" for name, mean in self._terms.items())
-        inserted, removed = self._lately
+        inserted, removed = self._since
         log.info(
             "step %d: %d inserted, %d removed, %d Gaussians%s",
             report.step, inserted, removed, report.gaussians, losses,
         )  # fmt: skip
-        self._said_at, self._lately = time.monotonic(), [0, 0]
+        self._logged_at, self._since = time.monotonic(), [0, 0]
 
-    def _write(self, report: Report) -> None:
+    def _write(self, report: Report, writer: ScalarWriter) -> None:
         if report.inserted or report.removed:
             for name, value in zip(Report._fields[:3], report):
-                self._writer.add_scalar(f"d2/{name}", value, report.step)
+                writer.add_scalar(f"d2/{name}", value, report.step)
         if report.step % MEANS_OVER == 0:
             for name, mean in self._terms.items():
-                self._writer.add_scalar(f"d2/{name}", mean.now(), report.step)
+                writer.add_scalar(f"d2/{name}", mean.now(), report.step)
 
-    def _name_short_schedules(self, iterations: int) -> None:
+    def _warn_of_short_schedules(self, iterations: int) -> None:
         short = [name for name, stop in self._stops() if stop < iterations / 10]
         if short:
             log.warning(
@@ -148,13 +161,14 @@ class Telling:
                 " and ".join(short), max(stop for name, stop in self._stops() if name in short), iterations, iterations,
             )  # fmt: skip
 
-    def _notice_late(self, step: int) -> None:
-        stops = [stop for _, stop in self._stops()]
-        if stops and step == 10 * max(stops):
+    def _warn_of_default_schedules(self) -> None:
+        known = [name for name, _ in self._stops() if name in HOOKS]
+        default = [name for name in known if self.hooks[name].window == HOOKS[name].config().window]
+        if default:
             log.warning(
-                "step %d, and the last edit was due before step %d: if the run is that long, say so by `iterations` in "
-                "the configuration or in D2Hooks.attach",
-                step, max(stops),
+                "%s: the length of the run is not known, and the default schedule ends at step %d: give iterations to "
+                "D2Hooks, or write it into the configuration",
+                " and ".join(default), max(stop for name, stop in self._stops() if name in default),
             )  # fmt: skip
 
     def _stops(self) -> Iterable[tuple[str, int]]:
@@ -185,18 +199,18 @@ class _Mean:
         return self._last
 
 
-def be_heard() -> None:
-    """Let lines of this package reach a person where the program has set up no logging of its own."""
+def add_default_handler() -> None:
+    """Show lines of this package on stderr where the program has set up no logging of its own."""
     logger = logging.getLogger("d2_plugin")
     if logger.level == logging.NOTSET:
         logger.setLevel(logging.INFO)
     if not logger.handlers and not logging.getLogger().handlers:
-        handler = _Beside()
+        handler = _StderrHandler()
         handler.setFormatter(logging.Formatter("d2: %(message)s"))
         logger.addHandler(handler)
 
 
-class _Beside(logging.Handler):
+class _StderrHandler(logging.Handler):
     """Writes to stderr, above a progress bar where there is one."""
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -213,13 +227,13 @@ def _schedule(name: str, hook: Hook) -> str:
     return f"{name} {window.start} to {until}" + (f" every {window.every}" if window.every > 1 else "")
 
 
-def _at_exit(telling: Telling) -> None:
-    """Say the summary when the process ends, unless the run is gone by then."""
-    held = weakref.ref(telling)
+def _at_exit(run: RunLog) -> None:
+    """Log the summary when the process ends, unless the run is gone by then."""
+    reference = weakref.ref(run)
 
     def end() -> None:
-        told = held()
-        if told is not None:
-            told.end()
+        alive = reference()
+        if alive is not None:
+            alive.end()
 
     atexit.register(end)

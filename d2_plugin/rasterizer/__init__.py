@@ -17,8 +17,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
-from d2_plugin.rasterizer import cuda, native, ops, reference
-from d2_plugin.rasterizer.evidence import check_maps
+from d2_plugin.rasterizer import autograd, cuda, native, reference
 
 __all__ = ["DepthPrior", "RasterSettings", "Render", "Splats", "Survey", "View", "rasterize", "survey"]
 
@@ -60,8 +59,8 @@ def rasterize(
         D2Error: shapes, dtypes or devices do not fit together.
     """
     _check(splats, view, settings, colors=colors, background=background, screen_offsets=screen_offsets)
-    check_maps(view, None, near_edge)
-    path = ops if _has_kernels(splats.means) else reference
+    _check_maps(view, None, near_edge)
+    path = autograd if _has_kernels(splats.means) else reference
     return path.rasterize(splats, colors, view, settings, background, screen_offsets, near_edge)
 
 
@@ -92,8 +91,8 @@ def survey(
         D2Error: shapes, dtypes or devices do not fit together.
     """
     _check(splats, view, settings)
-    check_maps(view, prior, near_edge)
-    path = ops if _has_kernels(splats.means) else reference
+    _check_maps(view, prior, near_edge)
+    path = autograd if _has_kernels(splats.means) else reference
     return path.survey(splats, view, prior, settings, eps, near_edge)
 
 
@@ -135,3 +134,19 @@ def _check(splats: Splats, view: View, settings: RasterSettings, **extra: Tensor
         raise D2Error(f"T_camera_world has shape {pose} and K {K}, expected (4, 4) and (3, 3)")
     if not (settings.near > 0 and settings.alpha_min > 0 and 0 < settings.alpha_max < 1):
         raise D2Error(f"{settings} needs near > 0, alpha_min > 0 and 0 < alpha_max < 1: a division by zero otherwise")
+
+
+def _check_maps(view: View, prior: DepthPrior | None, near_edge: Tensor | None) -> None:
+    """Refuse maps of another size than the view's, and a near edge that holds no floating-point numbers."""
+    maps = {} if prior is None else {"depth": prior.depth, "labels": prior.labels, "reliability": prior.reliability}
+    size = (view.height, view.width)
+    for name, part in maps.items():
+        if part is not None and part.shape != size:
+            raise D2Error(
+                f"the prior of camera '{view.camera}' has {name} {tuple(part.shape)} but the view is {size}: "
+                "resample it to the view's height and width"
+            )
+    if near_edge is not None and near_edge.shape != size:
+        raise D2Error(f"near_edge has shape {tuple(near_edge.shape)}, expected {size} as the view has pixels")
+    if near_edge is not None and not near_edge.is_floating_point():
+        raise D2Error(f"near_edge is {near_edge.dtype}, expected floating-point depths: convert it")

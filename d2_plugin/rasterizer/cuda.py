@@ -1,8 +1,8 @@
-"""The kernels on the GPU: `kernels/gpu.cu`, what they need in memory, and in which order they run.
+"""The kernels on the GPU: `kernels/gpu.cu`, compiled by NVRTC, launched by the driver, in the order in which they run.
 
-The same functions as in `native`, on float32 tensors of one device; `ops` registers them for CUDA. How a kernel gets to
-run is a `Launcher`'s business: `cuda_runtime` has NVRTC compile and the driver launch them; the tests have a
-launcher that runs the very same kernels on the CPU.
+The same functions as in `native`, on float32 tensors of one device. How a kernel runs is up to a `Launcher`:
+`CudaLauncher` has NVRTC compile and the driver launch them; the tests have one that runs the very same kernels
+on the CPU.
 
 Everything is enqueued on torch's current stream. `rasterize` and `survey` wait for the device once, to learn how many
 pairs of Gaussian and tile there are to allocate (so they cannot be captured in a CUDA graph); `backward` never waits.
@@ -11,21 +11,127 @@ No float is added atomically: the same inputs give the same bits in every run on
 
 from __future__ import annotations
 
+import ctypes
 import functools
+import threading
 import warnings
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from d2_plugin.compiler.nvrtc import NoCuda
+from d2_plugin.compiler.driver import Driver
+from d2_plugin.compiler.nvrtc import Binary, NoCuda, Program, build
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Survey
-from d2_plugin.rasterizer.cuda_frame import GATHERERS, MOMENTS, STATISTICS, THREADS, TILE, WARP, Frame, Launcher
-from d2_plugin.rasterizer.cuda_runtime import CudaLauncher
-from d2_plugin.rasterizer.frame import RECORD
+from d2_plugin.rasterizer.frame import KERNELS, RECORD, PointingFrame
+
+PROGRAM = Program(KERNELS / "gpu.cu", (KERNELS / "splat.h",))
+
+FLAGS = ("--std=c++17", "--fmad=false")
+"""No contraction: the forward and the backward pass must decide alike which fragments count; splat.h asks for fma."""
+
+CACHED_CHANNELS = 3
+"""Number of colors of the kernels that also run the survey, which needs no colors."""
 
 MOST_PAIRS = 2**31 - 1
 """Slots are 32-bit integers."""
+
+
+THREADS, TILE, GATHERERS, WARP, MOMENTS, STATISTICS = 256, 16, 8, 32, 7, 4
+"""As in gpu.cu: threads of a block, pixels along a side of a tile, and the sizes of what is gathered."""
+
+_float, _int, _long, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_int64, ctypes.c_void_p
+
+
+class Frame(PointingFrame):
+    """d2::Frame of kernels/gpu.cu: everything that one call works on; absent pointers stay null."""
+
+    _fields_ = (
+        ("constants", _float * 7),
+        *((name, _int) for name in ("width", "height", "channels", "tiles_x")),
+        ("eps", _float),
+        *((name, _long) for name in ("count", "pairs")),
+        *(
+            (name, _pointer)
+            for name in (
+                *("T_camera_world", "K"),
+                *("means", "covariances", "opacities", "colors", "screen_offsets", "background"),
+                *("prior_depth", "reliability", "near_edge"),
+                *("records", "tile_counts", "depths", "by_depth", "slot_ends"),
+                *("slot_tiles", "slot_ids", "ids", "slots", "tile_starts"),
+                *("color", "depth_sum", "alpha", "front"),
+                *("grad_color", "grad_depth_sum", "grad_alpha", "grad_front"),
+                *("values", "moments"),
+                *("grad_means", "grad_covariances", "grad_opacities", "grad_colors", "grad_screen_offsets"),
+                *("weight", "error", "max_weight", "front_weight", "hits"),
+            )
+        ),
+    )
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles of the image."""
+        return self.tiles_x * -(-self.height // TILE)
+
+
+class Launcher(Protocol):
+    """Runs kernels of gpu.cu on one device."""
+
+    def launch(self, kernel: str, blocks: int, frame: Frame, rows: int = 1) -> None:
+        """Enqueue `kernel` on a grid of `blocks` x `rows` blocks of THREADS threads; `frame` is copied.
+
+        The kernels are those compiled for `frame.channels` colors (any where it is 0).
+        """
+
+
+def flags_for(channels: int) -> tuple[str, ...]:
+    """What NVRTC, or nvcc, is told to compile the kernels for so many colors."""
+    return (*FLAGS, f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(Frame)}")
+
+
+def binary_for(capability: int, channels: int) -> Binary:
+    """The kernels for GPUs of compute capability `capability` (90 is sm_90) and `channels` colors, from the cache
+    where they are there already.
+
+    Raises:
+        NoCuda: no NVRTC, or it does not know the GPU.
+        CompileError: NVRTC refused the source.
+    """
+    return build("rasterizer", PROGRAM, flags_for(channels), capability)
+
+
+class CudaLauncher:
+    """Launches the kernels on one CUDA device, on torch's current stream."""
+
+    def __init__(self, device: torch.device) -> None:
+        """Compile (or find) the kernels for `device` and load them.
+
+        Raises:
+            NoCuda: no driver, no NVRTC, or an architecture that it does not know.
+        """
+        self._driver = Driver(device)
+        self._functions: dict[tuple[str, int], ctypes.c_void_p] = {}
+        self._modules: dict[int, ctypes.c_void_p] = {}
+        self._guard = threading.Lock()
+        self._module(CACHED_CHANNELS)
+
+    def launch(self, kernel: str, blocks: int, frame: Frame, rows: int = 1) -> None:
+        """See `Launcher.launch`; returns before the kernel has run."""
+        function = self._function(kernel, frame.channels or CACHED_CHANNELS)
+        self._driver.launch(function, (blocks, rows), THREADS, frame)
+
+    def _function(self, kernel: str, channels: int) -> ctypes.c_void_p:
+        key = (kernel, channels)
+        if key not in self._functions:
+            self._functions[key] = self._driver.function(self._module(channels), kernel)
+        return self._functions[key]
+
+    def _module(self, channels: int) -> ctypes.c_void_p:
+        with self._guard:
+            if channels not in self._modules:
+                self._modules[channels] = self._driver.module(binary_for(self._driver.capability, channels))
+            return self._modules[channels]
 
 
 @functools.cache
@@ -33,7 +139,7 @@ def launcher(device: torch.device) -> Launcher:
     """The launcher of a CUDA device; `device` has an index.
 
     Raises:
-        d2_plugin.compiler.nvrtc.NoCuda: no driver, no NVRTC, or an architecture that it does not know.
+        NoCuda: no driver, no NVRTC, or an architecture that it does not know.
     """
     return CudaLauncher(device)
 

@@ -1,6 +1,6 @@
 """The kernels on the CPU: `kernels/cpu.cpp` through its C ABI.
 
-Compiled at first use (`d2_plugin.compiler`). Tensors are float32, contiguous and on the CPU; `ops` sees to that.
+Compiled at first use (`d2_plugin.compiler`). Tensors are float32, contiguous and on the CPU: `autograd` sees to that.
 Runs on `torch.get_num_threads()` threads; results are the same bits for any number of them. A thread that calls keeps
 its scratch memory (about 64 bytes per Gaussian and tile for the backward pass) for the next call.
 """
@@ -79,19 +79,9 @@ def library() -> ctypes.CDLL:
     return kernels
 
 
+@functools.cache
 def available() -> bool:
     """Whether the kernels are available; warns once where no compiler is found."""
-    global _available
-    # A plain variable and no functools.cache: torch.compile looks through the one but into the other.
-    if _available is None:
-        _available = _try_library()
-    return _available
-
-
-_available: bool | None = None
-
-
-def _try_library() -> bool:
     try:
         library()
     except NoCompiler as error:

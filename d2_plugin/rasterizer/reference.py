@@ -21,7 +21,6 @@ from torch.utils.checkpoint import checkpoint
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
-from d2_plugin.rasterizer.evidence import reliability
 
 TILE = 16
 """Side of the squares of pixels that are composited at once; limits memory, changes nothing else."""
@@ -113,6 +112,17 @@ def _known(near_edge: Tensor, like: Tensor) -> Tensor:
     """The near edge in the dtype of `like`, 0 where nothing is known."""
     edge = near_edge.detach().to(like)
     return torch.where(edge.isfinite() & (edge > LEAST_EDGE), edge, 0)
+
+
+def reliability(prior: DepthPrior) -> Tensor:
+    """r(p) [H, W]: how much D* counts at each pixel.
+
+    A prior without such a map has 1 where it is trusted and 0 elsewhere. Far pixels always have 0, since their depth is
+    a lower bound and judges nothing.
+    """
+    if prior.reliability is None:
+        return prior.trusted.to(torch.float32)
+    return torch.where(prior.far, 0.0, prior.reliability)
 
 
 @torch.no_grad()

@@ -133,7 +133,7 @@ class Run:
                     bar.update(step, f"loss {loss:.4f}{built}")
                     watching(step, loss)
 
-                while trainer.step < iterations and not getattr(trainer, "stopped", False):
+                while trainer.step < iterations:
                     until = min((trainer.step // chunk + 1) * chunk, iterations)
                     with self._timed("train"), watched(trainer, self._checkpoint) as finite:
                         trainer.run(until, finite(on_step))
@@ -228,7 +228,7 @@ class Run:
         write_text(self.folder / "d2.toml", config.to_toml())
         guidance, priors = self.guidance, self.priors
         others = {} if guidance is None else guidance.hooks(self.scene, self._points(), priors)
-        return D2Hooks.from_config(config, backbone=adapter(model), hooks=others)
+        return D2Hooks(config, adapter(model), hooks=others)
 
     def _identity(self) -> dict[str, Any]:
         """What makes two runs the same run, as run.json has it."""
@@ -318,7 +318,6 @@ def _about(run: Run, trainer: Any) -> dict[str, Any]:
         "retired": run.retired,
         "background": getattr(trainer.model, "background", None) is not None,
         "appearance": getattr(trainer.model, "appearance", None) is not None,
-        "clocks": None if getattr(trainer.model, "clocks", None) is None else trainer.model.clocks.in_frames(),
         "prior": run.prior,
         "plan": scene.plan.as_dict(),
         "recording": scene.recording.name,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from d2_plugin.protocol import RasterSettings, Splats, View
+from d2_plugin.protocol import RasterSettings, Splats, View, call_optional
 from d2_plugin.rasterizer import rasterize
 
 SOLID = 0.5
@@ -53,17 +53,16 @@ def look(backbone: Any, view: View, min_opacity: float = 0.0, marked: Tensor | N
         chosen = marked.to(splats.rows.device)[splats.rows][:, None]
         colors = torch.where(chosen, colors.new_tensor(MARKED), FADED * colors.mean(-1, keepdim=True))
     render = rasterize(splats, colors.contiguous(), view, backbone.settings)
-    behind = getattr(backbone, "behind", None)
-    if behind is not None and marked is None:
-        render = behind(render, view)
+    if marked is None:
+        render = call_optional(backbone, "behind", render, view, default=render)
     color, depth_sum, alpha = (part.cpu() for part in render[:3])
     depth = torch.where(alpha > SOLID, depth_sum / alpha.clamp(min=SOLID), torch.zeros_like(alpha))
     return Look(color.clamp(0, 1), depth, alpha, splats)
 
 
 def _colors(backbone: Any, view: View, splats: Splats) -> Tensor:
-    colors = getattr(backbone, "colors", None)
-    return splats.means.new_full((len(splats.means), 3), GREY) if colors is None else colors(view, splats)
+    colors: Tensor | None = call_optional(backbone, "colors", view, splats)
+    return splats.means.new_full((len(splats.means), 3), GREY) if colors is None else colors
 
 
 @torch.no_grad()

@@ -144,8 +144,8 @@ def test_hooks_insert_remove_and_pull_on_depth() -> None:
     bare, _ = trained(None)
     del sys.modules["simple_trainer"]
     attached, session = trained(HOOKS)
-    telling = session.hooks.telling
-    assert telling.inserted > 0
+    log = session.hooks.log
+    assert log.inserted > 0
     assert len(attached["means"]) == len(session.hooks.backbone) != len(bare["means"])
     assert {entry.hook for entry in session.hooks.trace} == {"densify", "prune", "depth_loss"}
     assert session.objects.options.max_steps == 40

@@ -102,7 +102,7 @@ class TestSession:
 
     def test_edits_happen_after_zero_grad_and_are_counted(self, monkeypatch: pytest.MonkeyPatch) -> None:
         positions, session = run_wrapped(EDITS, monkeypatch)
-        assert session.hooks.telling.inserted > 0
+        assert session.hooks.log.inserted > 0
         assert len(positions) == len(session.hooks.backbone)
 
     def test_growth_beyond_what_was_inserted_is_logged_once(self, caplog: pytest.LogCaptureFixture) -> None:

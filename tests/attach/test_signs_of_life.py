@@ -1,4 +1,4 @@
-"""Three lines are not silent: who is attached, what happens now and then, what came of it; and to whom it is told."""
+"""Three lines are not silent: what is attached, progress now and then, a summary; to log, callback and writer."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import pytest
 from mimics import fudan
 from mimics.page import attached
 from mimics.workplace import furnish
-from tiny import ALL_HOOKS, TinyStore, make_trainer
+from tiny import ALL_HOOKS, TinyFrames, TinyStore, make_adapter, make_model
 
 from d2_plugin import D2Config, D2Hooks
+from d2_plugin.backbones.trainer import Trainer, TrainSettings
 from d2_plugin.hooks import reports
 from d2_plugin.hooks.reports import Report
 
@@ -27,11 +28,20 @@ def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.name.startswith("d2_plugin")]
 
 
+def logged(config: D2Config, store: TinyStore | None = None, **how: object) -> Trainer:
+    """A trainer of the tiny scene whose hooks log."""
+
+    def attach(model: object) -> D2Hooks:
+        return D2Hooks.from_config(config, make_adapter(model), store or TinyStore(), **how)
+
+    return Trainer(make_model(), TinyFrames(), TrainSettings(iterations=30, seed=3), attach)
+
+
 def test_the_printed_lines_say_what_happens(workplace: Path, caplog, monkeypatch) -> None:
     monkeypatch.setattr(reports, "PAUSE", 0.0)
     with caplog.at_level(logging.INFO):
         run = attached(fudan, "fudan").training(*fudan.make())
-        run.d2.telling.end()
+        run.d2.log.end()
     said = lines(caplog)
     first = next(line for line in said if line.startswith("attached by FudanAdapter to "))
     assert "priors of cameras cam0, cam1, cam2; densify 5 to 95 every 10, prune 5 to 90 every 10" in first
@@ -40,7 +50,7 @@ def test_the_printed_lines_say_what_happens(workplace: Path, caplog, monkeypatch
     assert steps
     assert " inserted, " in steps[0]
     assert "depth_loss " in steps[0]
-    assert said[-1] == run.d2.telling.summary()
+    assert said[-1] == run.d2.log.summary()
     inserted = sum(entry.count for entry in run.d2.trace if entry.action == "insert")
     assert said[-1].startswith(f"densify, prune, depth_loss: {inserted} inserted, ")
 
@@ -51,7 +61,7 @@ def test_lines_of_progress_keep_their_distance(workplace: Path, caplog) -> None:
     assert len([line for line in lines(caplog) if line.startswith("step ")]) == 1
 
 
-def test_a_callback_and_a_writer_hear_of_every_change() -> None:
+def test_a_callback_and_a_writer_get_every_change() -> None:
     class Writer:
         def __init__(self) -> None:
             self.scalars: dict[str, list[tuple[int, float]]] = {}
@@ -59,21 +69,23 @@ def test_a_callback_and_a_writer_hear_of_every_change() -> None:
         def add_scalar(self, tag: str, value: float, step: int) -> None:
             self.scalars.setdefault(tag, []).append((step, value))
 
-    heard: list[Report] = []
-    writer, trainer = Writer(), make_trainer(ALL_HOOKS)
-    trainer.d2.tell(on_report=heard.append, writer=writer)
+    reports: list[Report] = []
+    writer = Writer()
+    trainer = logged(ALL_HOOKS, on_report=reports.append, writer=writer)
     trainer.run()
-    assert [report.step for report in heard] == list(range(1, 31))
-    assert sum(report.inserted for report in heard) == trainer.d2.telling.inserted > 0
+    assert [report.step for report in reports] == list(range(1, 31))
+    assert sum(report.inserted for report in reports) == trainer.d2.log.inserted > 0
     assert writer.scalars["d2/gaussians"][-1][1] == len(trainer.model)
     assert [step for step, _ in writer.scalars["d2/depth_loss"]] == [10, 20, 30]
     assert all(value > 0 for _, value in writer.scalars["d2/depth_loss"])
 
 
-def test_a_program_without_logging_hears_them_and_one_that_ends_gets_the_summary() -> None:
+def test_a_program_without_logging_shows_them_and_one_that_ends_gets_the_summary() -> None:
     """In a process of its own: under pytest the root logger has handlers."""
     code = (
-        "from tiny import *\ntrainer = make_trainer(ALL_HOOKS)\ntrainer.d2.tell(iterations=30)\ntrainer.run()\n"
+        "from tiny import *\n"
+        "attach = lambda model: D2Hooks.from_config(ALL_HOOKS, make_adapter(model), TinyStore(), iterations=30)\n"
+        "Trainer(make_model(), TinyFrames(), TrainSettings(iterations=30), attach).run()\n"
         "import sys; sys.stderr.write('end of the script\\n')"
     )
     tests = str(Path(__file__).parents[1])
@@ -85,17 +97,19 @@ def test_a_program_without_logging_hears_them_and_one_that_ends_gets_the_summary
     assert said[-1].startswith("d2: densify, prune, depth_loss: ")
 
 
-def test_a_camera_without_prior_is_named_once(caplog) -> None:
+def test_a_camera_without_prior_is_warned_of_once_with_those_that_have_one(caplog) -> None:
     class OneCamera(TinyStore):
+        cameras = ("cam0",)
+
         def prior(self, camera: str, frame: int):
             return super().prior(camera, frame) if camera == "cam0" else None
 
-    trainer = make_trainer(D2Config(depth_loss=ALL_HOOKS.depth_loss))
-    trainer.d2._prior.store = OneCamera()
-    with caplog.at_level(logging.INFO):
-        trainer.run()
-    said = [line.split(" at ")[0] for line in lines(caplog) if "trained without D2" in line]
-    assert sorted(said) == ["camera cam1 has no prior", "camera cam2 has no prior"]
+    logged(D2Config(depth_loss=ALL_HOOKS.depth_loss), OneCamera()).run()
+    warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert len(warned) == 2
+    for camera, line in zip(("cam1", "cam2"), sorted(warned), strict=True):
+        assert line.startswith(f"camera {camera} has no prior at frame ")
+        assert line.endswith("trained without D2 there; the prior has cameras cam0")
 
 
 class TestSchedules:
@@ -112,22 +126,32 @@ class TestSchedules:
         d2 = D2Hooks.attach("d2.toml", "fudan", gaussians, scene, iterations=400)
         assert d2.config.densify.stop == 200
 
-    def test_a_schedule_that_ends_early_is_said(self, caplog) -> None:
-        trainer = make_trainer(ALL_HOOKS)
-        trainer.d2.tell(iterations=30000)
-        (said,) = [line for line in lines(caplog) if "before a tenth of the run" in line]
-        assert said.startswith("densify and prune: over at step 30 of 30000")
-        assert "write iterations = 30000 into the configuration" in said
+    def test_a_schedule_that_ends_early_is_warned_of(self, caplog) -> None:
+        logged(ALL_HOOKS, iterations=30000)
+        (warned,) = [line for line in lines(caplog) if "before a tenth of the run" in line]
+        assert warned.startswith("densify and prune: over at step 30 of 30000")
+        assert "write iterations = 30000 into the configuration" in warned
         caplog.clear()
-        make_trainer(ALL_HOOKS).d2.tell(iterations=100)
+        logged(ALL_HOOKS, iterations=100)
         assert not [line for line in lines(caplog) if "before a tenth" in line]
 
-    def test_a_run_that_outlasts_its_schedule_without_a_word_is_said_once(self, caplog) -> None:
-        trainer = make_trainer(ALL_HOOKS)
-        trainer.d2.tell()
-        for step in (299, 300, 301, 600):
-            trainer.d2.telling.stepped(Report(step=step))
-        assert len([line for line in lines(caplog) if "the last edit was due before step 30" in line]) == 1
+    @pytest.mark.parametrize(
+        ("table", "iterations", "warned"),
+        [
+            ({"densify": {}, "depth_loss": {}}, None, ["densify: the length of the run is not known"]),
+            ({"densify": {}}, 900, []),
+            ({"densify": {}, "iterations": 900}, None, []),
+            ({"densify": {"stop": 200}}, None, []),
+            ({"depth_loss": {}}, None, []),
+        ],
+    )
+    def test_a_default_schedule_without_the_length_of_the_run_is_warned_of(
+        self, table: dict, iterations: int | None, warned: list[str], caplog
+    ) -> None:
+        d2 = D2Hooks.from_config(table, make_adapter(make_model()), TinyStore(), iterations=iterations)
+        assert [line.partition(",")[0] for line in lines(caplog) if "default schedule" in line] == warned
+        if iterations:
+            assert d2.config.densify.stop == 450
 
 
 def config_as_read(config: D2Config) -> dict:

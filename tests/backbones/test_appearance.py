@@ -1,4 +1,4 @@
-"""Cameras of different exposure: the gains are found, the Gaussians keep the mean camera's colours."""
+"""Cameras of different exposure: gains are learnt or begin as measured, the Gaussians keep the mean colours."""
 
 from __future__ import annotations
 
@@ -70,3 +70,49 @@ def test_a_resumed_run_is_bitwise_the_uninterrupted_one(backbone: str) -> None:
     for camera in ("cam0", "cam1", "cam2"):
         assert torch.equal(whole.model.appearance.change(camera), second.model.appearance.change(camera))
     assert whole.model.appearance.change("cam0").abs().max() > 0
+
+
+MEASURED = {"a": (1.2, 1.1, 1.0), "b": (0.8, 0.9, 1.0), "held": (1.4, 1.0, 0.7)}
+
+
+def grey() -> Render:
+    return Render(torch.full((2, 2, 3), 0.5), torch.ones(2, 2), torch.ones(2, 2))
+
+
+def started() -> Appearance:
+    appearance = Appearance(torch.device("cpu"))
+    appearance.start_from(MEASURED, ("a", "b"))
+    return appearance
+
+
+@pytest.mark.parametrize("camera", MEASURED)
+def test_each_camera_sees_its_gain_before_the_first_step(camera: str) -> None:
+    with torch.no_grad():
+        seen = started().seen_by(camera, grey()).color
+    torch.testing.assert_close(seen[0, 0], 0.5 * torch.tensor(MEASURED[camera]))
+
+
+def test_only_training_cameras_learn() -> None:
+    appearance = started()
+    for camera in MEASURED:
+        appearance.seen_by(camera, grey()).color.sum().backward() if camera != "held" else None
+    assert set(appearance.changes) == {"a", "b"}
+    appearance.seen_by("held", grey())
+    assert set(appearance.changes) == {"a", "b"}
+
+
+def test_nothing_begins_where_a_training_camera_has_no_gain() -> None:
+    appearance = Appearance(torch.device("cpu"))
+    appearance.start_from({"a": (1.2, 1.0, 1.0)}, ("a", "b"))
+    assert not appearance.changes
+    assert not appearance.measured
+
+
+def test_measured_changes_are_saved_with_those_that_learn() -> None:
+    appearance, again = started(), Appearance(torch.device("cpu"))
+    appearance.seen_by("a", grey()).color.sum().backward()
+    appearance.optimize()
+    again.load_state_dict(appearance.state_dict())
+    for camera in MEASURED:
+        with torch.no_grad():
+            assert torch.equal(again.seen_by(camera, grey()).color, appearance.seen_by(camera, grey()).color)

@@ -143,7 +143,7 @@ class TestDensityControl:
         model.gaussians.statistics["screen_gradient"][[0, 40]] = 1.0
         model.gaussians.statistics["seen"].fill_(1)
         before = parameters_of(model)
-        grow(model, DensifySettings(gradient=0.5, dense_fraction=0.01), torch.Generator().manual_seed(0))
+        grow(model, DensifySettings(gradient=0.5), torch.Generator().manual_seed(0))
         after = parameters_of(model)
         assert len(model) == 62, "one clone; one parent replaced by two children"
         assert torch.equal(after["positions"][-3], before["positions"][0])
@@ -162,7 +162,7 @@ class TestDensityControl:
         with torch.no_grad():
             model.gaussians["opacity_logits"][3] = -10
             model.gaussians["log_scales"][5, 1] = 10
-        prune(model, DensifySettings())
+        prune(model)
         assert len(model) == 58
 
     def test_a_run_survives_losing_every_gaussian(self) -> None:
@@ -213,7 +213,7 @@ def test_every_training_view_is_used_once_per_round() -> None:
 @pytest.mark.parametrize("temporal", [True, False])
 def test_every_variant_trains_and_grows(settings: dict[str, object], temporal: bool) -> None:
     points = torch.rand(3, 60, 3, generator=torch.Generator().manual_seed(0))
-    growth = {"start": 0.0, "stop": 1.0, "every": 7, "gradient": 1e-3, "dense_fraction": 0.1}
+    growth = {"start": 0.0, "stop": 1.0, "every": 7, "gradient": 1e-3}
     model = create(
         points[0] + torch.tensor([-0.5, -0.5, 2.5]), points[1], points[2, :, 0] / 2, extent=2.0, duration=0.5,
         temporal=temporal, settings=settings | {"densify": growth},

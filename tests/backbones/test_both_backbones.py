@@ -100,7 +100,7 @@ def apply(action: str, seed: int, adapter: Backbone, model: SplatModel) -> None:
     elif action == "grow":
         grow(model, replace(model.settings.densify, gradient=seed % (COUNT + 1)), generator(seed))
     elif action == "prune":
-        prune(model, replace(model.settings.densify, opacity=0.5 + 0.23 * (seed % 8) / 8))
+        prune(model, faint=0.5 + 0.23 * (seed % 8) / 8)
     else:
         model.select(torch.randperm(count, generator=generator(seed))[: max(count - 2, 0)])
 

@@ -27,7 +27,7 @@ def random_words(rng: random.Random, recording: Path, output: Path) -> list[str]
     command = rng.choice([name for name in COMMANDS if name not in ("demo", "bench", "doctor", "ablate")])
     words = [command, str(recording), "--train-cameras", "cam00,cam01", "--output", str(output), "--iterations", "1"]
     flags = ("seed", "frames", "downscale", "hooks", "config", "mono-onnx", "mono-kind", "test-cameras", "shard")
-    tables = ("densify.cell", "prune.tau-p", "priors.stereo.min-angle", "plan.temporal", "backbone.sh-degree")
+    tables = ("densify.spacing", "prune.tau-p", "priors.stereo.min-angle", "plan.temporal", "backbone.sh-degree")
     odd = [str(value) for value in ODD_VALUES] + list(ODD_TEXTS) + ["preset:4", "1/0", "cam00", "none", "all", "true"]
     for _ in range(rng.choice((0, 1, 1, 2, 3))):
         words += [f"--{rng.choice(flags + tables)}", rng.choice(odd)]
@@ -79,7 +79,7 @@ def fuzz_configurations(
     path = tmp_path / "d2.toml"
     tables = for_iterations(("densify", "prune", "depth_loss"), 100).to_toml().splitlines()
     whole = "\n".join(
-        line for line in tables if line.startswith(("[", "cell", "tau", "lambda", "every", "scale", "weight"))
+        line for line in tables if line.startswith(("[", "spacing", "tau", "lambda", "every", "scale", "weight"))
     )
     whole += "\n[plan]\ntemporal = true\n[priors]\ndepth_range = [1.0, 9.0]\n[priors.stereo]\nmin_angle = 1.0\n"
     whole += "[backbone]\nsh_degree = 1\n[d2]\nretire_after = 3\n"

@@ -1,57 +1,39 @@
-"""Verified-depth supervision: the penalty, the loss of full maps, and the fast form that the hook uses."""
+"""Verified-depth supervision: the penalty, the paper's loss, and the loss of a render by torch and by the kernel."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from torch import Tensor
 
-from d2_plugin.hooks.depth_loss import DepthLossConfig, charbonnier, depth_loss, pixel_depth_loss
-from d2_plugin.hooks.prior import KnownPixels
-from d2_plugin.hooks.rendered_depth import rendered_depth
+from d2_plugin.hooks import depth_loss as module
+from d2_plugin.hooks import native_depth_loss
+from d2_plugin.hooks.depth_loss import DepthLossConfig, charbonnier, depth_loss, supervision
+from d2_plugin.hooks.prior import KnownMaps, PriorLoader
+from d2_plugin.protocol import DepthPrior, Label, View
 
 PAPER = DepthLossConfig(tau_v=0.5, epsilon=0.01, opaque=0)
+LABELS = (Label.EMPTY, Label.MONO, Label.VERIFIED, Label.CONFLICT, Label.AGREED, Label.FAR)
 
 
-def tensor(*values: float) -> torch.Tensor:
+def tensor(*values: float) -> Tensor:
     return torch.tensor(values)
 
 
-def known(depth: torch.Tensor, verified: torch.Tensor) -> KnownPixels:
-    """The verified pixels of a map, as the paper knows them: exactly."""
-    depths = depth[verified]
-    return KnownPixels(
-        torch.nonzero(verified.flatten()).squeeze(1), depths, torch.zeros_like(depths), torch.zeros_like(depths) > 0
-    )
-
-
 class TestCharbonnier:
-    def test_equals_the_formula(self) -> None:
-        r = torch.linspace(-3, 3, 31, dtype=torch.float64)
-        torch.testing.assert_close(charbonnier(r, 0.1), torch.sqrt(r**2 + 0.01) - 0.1)
-
-    def test_equals_kornia_rescaled(self) -> None:
+    def test_equals_the_formula_and_kornia_rescaled(self) -> None:
         kornia = pytest.importorskip("kornia", reason="kornia is in the `test` extra")
         r = torch.linspace(-3, 3, 31, dtype=torch.float64)
+        torch.testing.assert_close(charbonnier(r, 0.1), torch.sqrt(r**2 + 0.01) - 0.1)
         expected = 0.1 * kornia.losses.charbonnier_loss(r / 0.1, torch.zeros_like(r))
         torch.testing.assert_close(charbonnier(r, 0.1), expected)
 
-    @pytest.mark.parametrize("value", [0.0, 1e-30, 1e20])
-    def test_is_finite_with_finite_gradient_at_extremes_in_float32(self, value: float) -> None:
-        r = torch.tensor([value], requires_grad=True)
-        loss = charbonnier(r, 0.01)
-        loss.sum().backward()
-        assert torch.isfinite(loss).all()
-        assert torch.isfinite(r.grad).all()
-        assert loss.item() == pytest.approx(value if value > 1 else 0.0, rel=1e-6, abs=1e-12)
-        if value == 0:
-            assert r.grad.item() == 0
 
-
-class TestDepthLoss:
+class TestThePapersLoss:
     def test_counts_only_pixels_that_are_trusted_and_validly_rendered(self) -> None:
         depth, prior = tensor(2.0, 2.0, 2.0), tensor(1.0, 4.0, 8.0)
         valid, verified = torch.tensor([True, True, False]), torch.tensor([True, False, True])
@@ -87,68 +69,181 @@ class TestDepthLoss:
         torch.testing.assert_close(loss, charbonnier(tensor(0.1), 0.01).squeeze(), rtol=1e-4, atol=0)
 
 
-class TestPixelDepthLoss:
-    """The fast form that the hook uses is the paper's formula, value and gradient."""
+def prior_of(seed: int, height: int, width: int, labels: tuple[Label, ...] = LABELS, paper: bool = False) -> DepthPrior:
+    """A prior as a store gives it: numbers that mean nothing wherever nothing is known."""
+    g = torch.Generator().manual_seed(seed)
+    kinds = torch.tensor(labels, dtype=torch.uint8)[torch.randint(len(labels), (height, width), generator=g)]
+    depth = 1 + 9 * torch.rand(height, width, generator=g)
+    depth[(kinds == Label.EMPTY) | (kinds == Label.CONFLICT)] = math.nan
+    sigma = 0.2 * torch.rand(height, width, generator=g)
+    sigma[torch.rand(height, width, generator=g) < 0.1] = math.inf
+    sigma[torch.rand(height, width, generator=g) < 0.1] = 0
+    return DepthPrior(depth, kinds, sigma=None if paper else sigma)
 
-    @staticmethod
-    def maps(
-        seed: int, shape: tuple[int, int] = (7, 9)
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        generator = torch.Generator().manual_seed(seed)
-        depth_sum, alpha, prior, chance = torch.rand(4, *shape, generator=generator, dtype=torch.float64)
-        return depth_sum * 3, alpha, prior + 0.5, chance < 0.4
 
-    @given(st.integers(0, 10_000))
-    @settings(max_examples=50, deadline=None)
-    def test_equals_the_composed_formula_with_its_gradient(self, seed: int) -> None:
-        depth_sum, alpha, prior, verified = self.maps(seed)
-        pixels = known(prior, verified)
-        gradients = []
-        for fast in (False, True):
-            z, a = depth_sum.clone().requires_grad_(), alpha.clone().requires_grad_()
-            if fast:
-                loss = pixel_depth_loss(z, a, pixels, PAPER)
-            else:
-                depth, valid = rendered_depth(z, a, 0.5)
-                loss = depth_loss(depth, valid, prior, verified, 0.01)
-            (3 * loss).backward()
-            gradients.append((loss.detach(), z.grad, a.grad))
-        for composed, closed in zip(*gradients, strict=True):
-            torch.testing.assert_close(closed, composed, rtol=1e-7, atol=1e-12)
+def render_of(height: int, width: int, seed: int = 10) -> tuple[Tensor, Tensor]:
+    """Depth sum and alpha of a render; no alpha lies within rounding of tau_v."""
+    g = torch.Generator().manual_seed(seed)
+    alpha = torch.rand(height, width, generator=g)
+    alpha = torch.where((alpha - 0.5).abs() < 0.01, 0.6, alpha)
+    return alpha * (1 + 9 * torch.rand(height, width, generator=g)), alpha
 
-    @pytest.mark.parametrize("opaque", [0.05, 3.0])
-    def test_what_near_pixels_let_through_is_added_with_its_gradient(self, opaque: float) -> None:
-        depth_sum, alpha, prior, verified = self.maps(2)
-        alpha = torch.where((alpha - 0.5).abs() < 0.01, 0.6, alpha)
-        pixels = known(prior, verified)
-        far = torch.arange(len(pixels.index)) % 3 == 0
-        pixels = replace(pixels, far=far)
-        config = replace(PAPER, opaque=opaque)
-        through = 1 - alpha.flatten()[pixels.index[~far]]
-        added = pixel_depth_loss(depth_sum, alpha, pixels, config) - pixel_depth_loss(depth_sum, alpha, pixels, PAPER)
-        torch.testing.assert_close(added, opaque * through.mean())
-        inputs = (depth_sum.requires_grad_(), alpha.requires_grad_())
-        assert torch.autograd.gradcheck(lambda z, a: pixel_depth_loss(z, a, pixels, config), inputs)
 
-    def test_where_all_is_far_nothing_is_let_through_wrongly(self) -> None:
-        depth_sum, alpha, prior, verified = self.maps(3)
-        pixels = known(prior, verified)
-        pixels = replace(pixels, far=torch.ones_like(pixels.far))
-        losses = [pixel_depth_loss(depth_sum, alpha, pixels, replace(PAPER, opaque=o)) for o in (0.0, 1.0)]
+def loss_and_gradients(
+    render: tuple[Tensor, Tensor],
+    prior: DepthPrior,
+    dtype: torch.dtype = torch.float32,
+    config: DepthLossConfig = DepthLossConfig(),  # noqa: B008  a frozen value
+    factor: float = 1.0,
+) -> list[Tensor]:
+    """In float32 by the kernel where there is a compiler, in float64 by torch."""
+    leaves = [part.to(dtype, copy=True).requires_grad_() for part in render]
+    sigma = None if prior.sigma is None else prior.sigma.to(dtype)
+    known = KnownMaps.of(prior._replace(depth=prior.depth.to(dtype), sigma=sigma))
+    loss = supervision(*leaves, known, config, factor)
+    return [loss.detach(), *torch.autograd.grad(loss, leaves)]
+
+
+class TestSupervision:
+    """What a render costs: the paper's formula over all maps, and what lets light through."""
+
+    @pytest.mark.parametrize("opaque", [0.0, 3.0])
+    def test_gradcheck(self, opaque: float) -> None:
+        prior, config = prior_of(1, 7, 9), replace(PAPER, opaque=opaque)
+        known = KnownMaps.of(prior._replace(depth=prior.depth.double(), sigma=prior.sigma.double()))
+        inputs = [part.double().requires_grad_() for part in render_of(7, 9)]
+        assert torch.autograd.gradcheck(lambda z, a: supervision(z, a, known, config), inputs)
+
+    def test_what_near_pixels_let_through_is_added_and_far_ones_let_through_nothing_wrongly(self) -> None:
+        prior, render = prior_of(2, 7, 9), render_of(7, 9)
+        near = KnownMaps.of(prior).kind == 1
+        with_term, without = (loss_and_gradients(render, prior, config=replace(PAPER, opaque=o))[0] for o in (3.0, 0.0))
+        torch.testing.assert_close(with_term - without, 3 * (1 - render[1][near]).mean())
+        far = prior_of(2, 7, 9, (Label.FAR,))
+        losses = [loss_and_gradients(render, far, config=replace(PAPER, opaque=o))[0] for o in (3.0, 0.0)]
         assert torch.equal(*losses)
 
-    def test_gradcheck(self) -> None:
-        depth_sum, alpha, prior, verified = self.maps(1)
-        alpha = torch.where((alpha - 0.5).abs() < 0.01, 0.6, alpha)  # away from the step at tau_v
-        pixels = known(prior, verified)
-        inputs = (depth_sum.requires_grad_(), alpha.requires_grad_())
-        assert torch.autograd.gradcheck(lambda z, a: pixel_depth_loss(z, a, pixels, PAPER), inputs)
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    def test_a_render_that_covers_nothing_has_the_opaque_term_alone(self, dtype: torch.dtype) -> None:
+        prior, nothing = prior_of(0, 20, 30), torch.zeros(20, 30)
+        loss, by_depth, by_alpha = loss_and_gradients((nothing, nothing), prior, dtype)
+        near = KnownMaps.of(prior).kind == 1
+        assert loss.item() == pytest.approx(DepthLossConfig().opaque)
+        assert not by_depth.any()
+        torch.testing.assert_close(by_alpha.float(), torch.where(near, -DepthLossConfig().opaque / near.sum(), 0.0))
 
-    def test_is_finite_where_nothing_is_rendered(self) -> None:
-        z, a = torch.zeros(1, 2, requires_grad=True), torch.zeros(1, 2, requires_grad=True)
-        pixels = known(tensor(1e-3, 1e6)[None], torch.ones(1, 2, dtype=torch.bool))
-        loss = pixel_depth_loss(z, a, pixels, PAPER)
-        loss.backward()
-        assert loss == 0
-        assert not z.grad.any()
-        assert not a.grad.any()
+
+@pytest.fixture
+def compiled() -> None:
+    if native_depth_loss.library() is None:
+        pytest.skip("there is no C++ compiler")
+
+
+@pytest.mark.usefixtures("compiled")
+class TestKernel:
+    @pytest.mark.parametrize("size", [(1, 1), (1, 17), (3, 5), (61, 67), (90, 130)])
+    @pytest.mark.parametrize("paper", [False, True])
+    def test_equals_torch_in_float64(self, size: tuple[int, int], paper: bool) -> None:
+        for seed in range(4):
+            prior, render = prior_of(seed, *size, paper=paper), render_of(*size, seed + 10)
+            known = KnownMaps.of(prior)
+            if known.near + known.far:
+                found, exact = (
+                    loss_and_gradients(render, prior, t, factor=0.2) for t in (torch.float32, torch.float64)
+                )
+                for one, other in zip(found, exact, strict=True):
+                    assert one.dtype == torch.float32
+                    assert (one - other).norm() <= 3e-6 * other.norm(), f"seed {seed}"
+                for slope in found[1:]:
+                    assert not slope[known.kind == 0].any()
+
+    @pytest.mark.parametrize("scale", [1e-20, 1e20, 1e30])
+    def test_depths_beyond_the_range_of_squares_are_as_in_torch(
+        self, scale: float, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        prior, (depth_sum, alpha) = prior_of(5, 20, 30), render_of(20, 30)
+        native = loss_and_gradients((scale * depth_sum, alpha), prior)
+        monkeypatch.setattr(module, "can_compare", lambda *parts: False)
+        plain = loss_and_gradients((scale * depth_sum, alpha), prior)
+        torch.testing.assert_close(native, plain, rtol=1e-4, atol=1e-30)
+        assert all(part.isfinite().all() for part in native)
+
+    @pytest.mark.parametrize("epsilon", [1e-30, 1e-12, 1e20])
+    @pytest.mark.parametrize("sigma", [0.0, 1e-30, 1e30])
+    def test_spreads_beyond_the_range_of_squares_are_as_in_float64(self, epsilon: float, sigma: float) -> None:
+        prior = prior_of(3, 20, 30, (Label.VERIFIED, Label.MONO))._replace(sigma=torch.full((20, 30), sigma))
+        config = DepthLossConfig(epsilon=epsilon)
+        found, exact = (loss_and_gradients(render_of(20, 30), prior, t, config) for t in (torch.float32, torch.float64))
+        for one, other in zip(found, exact, strict=True):
+            torch.testing.assert_close(one.double(), other, rtol=1e-4, atol=1e-12)
+
+    @pytest.mark.usefixtures("threads")
+    def test_any_number_of_threads_gives_the_same_bits(self) -> None:
+        results = []
+        for count in (1, 2, 4):
+            torch.set_num_threads(count)
+            results.append(loss_and_gradients(render_of(90, 400), prior_of(0, 90, 400)))
+        assert all(torch.equal(*pair) for result in results[1:] for pair in zip(results[0], result, strict=True))
+
+    def test_nan_in_a_known_pixel_shows_in_the_loss(self) -> None:
+        prior, (depth_sum, alpha) = prior_of(0, 20, 30), render_of(20, 30)
+        alpha[tuple(torch.nonzero(KnownMaps.of(prior).kind == 1)[3])] = math.nan
+        assert loss_and_gradients((depth_sum, alpha), prior)[0].isnan()
+
+    def test_backward_twice_adds_the_same_again_and_second_derivatives_are_refused(self) -> None:
+        leaves, known = [part.requires_grad_() for part in render_of(20, 30)], KnownMaps.of(prior_of(0, 20, 30))
+        loss = supervision(*leaves, known, DepthLossConfig())
+        loss.backward(retain_graph=True)
+        once = [leaf.grad.clone() for leaf in leaves]
+        (loss + leaves[1].sum()).backward(retain_graph=True)
+        (2 * loss).backward()
+        torch.testing.assert_close(leaves[0].grad, 4 * once[0])
+        torch.testing.assert_close(leaves[1].grad, 4 * once[1] + 1)
+        loss = supervision(*leaves, known, DepthLossConfig())
+        (slope,) = torch.autograd.grad(loss, leaves[:1], create_graph=True)
+        with pytest.raises(RuntimeError, match="once_differentiable|does not require grad"):
+            slope.sum().backward()
+
+    def test_without_gradients_the_value_is_the_same(self) -> None:
+        prior, render = prior_of(0, 20, 30), render_of(20, 30)
+        with torch.no_grad():
+            alone = supervision(
+                *(part.clone().requires_grad_() for part in render), KnownMaps.of(prior), DepthLossConfig()
+            )
+        assert not alone.requires_grad
+        assert alone == loss_and_gradients(render, prior)[0]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_hook_adds_the_weighted_mean_of_a_batch(count: int) -> None:
+    priors = [prior_of(seed, 20, 30) for seed in range(count)]
+    renders = [[part.requires_grad_() for part in render_of(20, 30, seed)] for seed in range(count)]
+    backbone = SimpleNamespace(rendered_depth=lambda view: renders[view])
+    prior = SimpleNamespace(known=lambda view: KnownMaps.of(priors[view]) if view < count else None)
+    hook = module.DepthLoss(DepthLossConfig(weight=0.7))
+    term = hook.loss(SimpleNamespace(backbone=backbone, prior=prior, views=range(count + 1)))
+    alone = [loss_and_gradients((z.detach(), a.detach()), prior) for (z, a), prior in zip(renders, priors, strict=True)]
+    torch.testing.assert_close(term.detach(), 0.7 * torch.stack([loss for loss, *_ in alone]).mean())
+    for render, (_, *slopes) in zip(renders, alone, strict=True):
+        for one, other in zip(torch.autograd.grad(term, render, retain_graph=True), slopes, strict=True):
+            torch.testing.assert_close(one, 0.7 / count * other)
+
+
+class TestLoader:
+    def test_priors_stay_in_memory_as_long_as_they_fit(self) -> None:
+        prior, reads = prior_of(0, 360, 640), []
+        store = SimpleNamespace(prior=lambda camera, frame: reads.append(frame) or prior)
+        views = [View("a", frame, 0.0, torch.eye(4), torch.eye(3), 640, 360) for frame in range(8)]
+        for memory, expected in ((32, 8), (16, 16)):  # a view takes 3.2 MB
+            reads.clear()
+            loader = PriorLoader(store, memory)
+            for view in (*views, *views):
+                assert loader.known(view).near > 0
+            assert len(reads) == expected
+
+    def test_the_maps_are_the_priors_own(self) -> None:
+        prior = prior_of(0, 20, 30)
+        known = KnownMaps.of(prior)
+        assert known.depth is prior.depth
+        assert known.sigma is prior.sigma
+        assert known.kind.dtype == torch.uint8

@@ -96,7 +96,7 @@ class TestPruning:
     @settings(deadline=None)
     @given(st.floats(0, 1), st.floats(0, 1), st.floats(0, 1))
     def test_score_stays_in_the_unit_interval(self, e: float, o: float, lambda_e: float) -> None:
-        score = pruning_score(tensor(e), tensor(o), lambda_e, 1 - lambda_e).item()
+        score = pruning_score(tensor(e), tensor(o), lambda_e).item()
         assert -1e-6 <= score <= 1 + 1e-6
 
 

@@ -91,7 +91,7 @@ def test_the_scores_are_the_papers(seed: int, with_sigma: bool) -> None:
     inconsistency = torch.where(total > 0, (error / (total + 1e-8) / 0.1).clamp(max=1), 0)
     contribution = torch.where(seen > 0, maxima / seen.clamp(min=1), 0)
     score = 0.5 * inconsistency + 0.5 * (1 - contribution)
-    torch.testing.assert_close(pruning_score(inconsistency, contribution, 0.5, 0.5), score, rtol=0, atol=0)
+    torch.testing.assert_close(pruning_score(inconsistency, contribution, 0.5), score, rtol=0, atol=0)
     prior = papers_sigma(prior) if with_sigma else prior
     config = replace(EVERY_ONE, free_space=not with_sigma)  # without sigma no space is known to be free
     found = context(splats, views, prior)

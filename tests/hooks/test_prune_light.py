@@ -36,7 +36,7 @@ def test_the_hook_removes_little_by_little() -> None:
         prune = PruneConfig(start=1, every=1, patience=1, tau_p=0.0, light=light)
         trainer = make_trainer(D2Config(prune=prune, views_per_evaluation=3))
         trainer.run(until=3)
-        return trainer.d2.telling.removed
+        return trainer.d2.log.removed
 
     assert 0 < after_three(0.05) < after_three(1.0)
 

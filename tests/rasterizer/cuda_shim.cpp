@@ -52,7 +52,7 @@ extern "C" const char* d2_shim_launch(const char* name, int blocks, int rows, un
 
 // ---------------------------------------------------------------------------------------------------- the driver
 
-// The part of the CUDA driver that cuda_runtime.py calls, with the types of cuda.h: one device, one context, and
+// The part of the CUDA driver that cuda.py calls, with the types of cuda.h: one device, one context, and
 // modules that know the kernels above. Strict where the real one is: no call without a current context.
 extern "C" {
 typedef int CUresult, CUdevice;

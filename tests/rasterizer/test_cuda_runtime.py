@@ -25,7 +25,6 @@ from cuda_cases import (
 from d2_plugin import D2Error
 from d2_plugin.compiler import NoCompiler, driver, nvrtc
 from d2_plugin.rasterizer import cuda
-from d2_plugin.rasterizer import cuda_runtime as runtime
 
 
 @pytest.fixture
@@ -41,7 +40,7 @@ def test_nvrtc_compiles_the_kernels_without_a_toolkit(
     compiler: nvrtc.Nvrtc, capability: int, channels: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("D2_CACHE", str(tmp_path))
-    code, architecture = runtime.binary_for(capability, channels)
+    code, architecture = cuda.binary_for(capability, channels)
     assert architecture == f"sm_{capability}"
     assert code.startswith(b"\x7fELF")
     twice = ("render", "backward", "survey")
@@ -61,18 +60,18 @@ def test_the_cache_serves_what_it_has_and_rebuilds_what_is_damaged(
     compiler: nvrtc.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("D2_CACHE", str(tmp_path))
-    first = runtime.binary_for(90, 3)
+    first = cuda.binary_for(90, 3)
     (entry,) = tmp_path.iterdir()
     compiled = []
     compile_kernels = nvrtc.Nvrtc.compile
     monkeypatch.setattr(nvrtc.Nvrtc, "compile", lambda *a: compiled.append(1) or compile_kernels(*a))
-    assert runtime.binary_for(90, 3) == first
+    assert cuda.binary_for(90, 3) == first
     assert not compiled
     entry.write_bytes(entry.read_bytes()[:1000])
-    assert runtime.binary_for(90, 3) == first
+    assert cuda.binary_for(90, 3) == first
     assert compiled
-    runtime.binary_for(90, 2)
-    runtime.binary_for(80, 3)
+    cuda.binary_for(90, 2)
+    cuda.binary_for(80, 3)
     assert len(list(tmp_path.iterdir())) == 3
 
 
@@ -81,21 +80,21 @@ def test_a_cache_that_cannot_be_written_only_costs_time(
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("D2_CACHE", str(tmp_path / "file" / "below"))
-    assert runtime.binary_for(90, 3).code.startswith(b"\x7fELF")
+    assert cuda.binary_for(90, 3).code.startswith(b"\x7fELF")
     assert "cannot use the cache" in caplog.text
 
 
 def test_a_gpu_newer_than_nvrtc_gets_ptx_and_an_older_one_a_sentence(compiler: nvrtc.Nvrtc) -> None:
     known = compiler.architectures()
     assert compiler.architecture_for(999) == f"compute_{known[-1]}"
-    assert b".target" in compiler.compile(runtime.PROGRAM, "compute_80", runtime.flags_for(3))
+    assert b".target" in compiler.compile(cuda.PROGRAM, "compute_80", cuda.flags_for(3))
     with pytest.raises(nvrtc.NoCuda, match=rf"the GPU is sm_35, but NVRTC \d+\.\d+ compiles for sm_{known[0]}"):
         compiler.architecture_for(35)
 
 
 def test_nvrtcs_own_words_are_in_the_error(compiler: nvrtc.Nvrtc) -> None:
     with pytest.raises(D2Error, match="Frame differs between"):
-        compiler.compile(runtime.PROGRAM, "sm_90", (*runtime.FLAGS, "-DD2_CHANNELS=3", "-DD2_FRAME_SIZE=1"))
+        compiler.compile(cuda.PROGRAM, "sm_90", (*cuda.FLAGS, "-DD2_CHANNELS=3", "-DD2_FRAME_SIZE=1"))
 
 
 def test_without_nvrtc_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,7 +137,7 @@ def shim_driver(compiler: nvrtc.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path
 
 def test_the_launcher_talks_to_the_driver(shim_driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
     """Context, module, functions, frame and stream arrive; the kernels themselves run in the shim."""
-    launcher = runtime.CudaLauncher(torch.device("cuda", 0))
+    launcher = cuda.CudaLauncher(torch.device("cuda", 0))
     monkeypatch.setattr(cuda, "launcher", lambda device: launcher)
     scene = make_scene(100, 32, 32)
     render, upstream, expected = reference_with_gradients(scene)
@@ -151,15 +150,15 @@ def test_the_launcher_talks_to_the_driver(shim_driver: ctypes.CDLL, monkeypatch:
 
 
 def test_a_driver_that_refuses_the_kernels_is_named(shim_driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runtime, "binary_for", lambda *_: nvrtc.Binary(b"no cubin", "sm_90"))
+    monkeypatch.setattr(cuda, "binary_for", lambda *_: nvrtc.Binary(b"no cubin", "sm_90"))
     with pytest.raises(nvrtc.NoCuda, match=r"refuses kernels for sm_90 .*NO_BINARY.*: update the NVIDIA driver"):
-        runtime.CudaLauncher(torch.device("cuda", 0))
+        cuda.CudaLauncher(torch.device("cuda", 0))
     assert shim_driver.d2_shim_contexts() == 0
 
 
 @pytest.mark.parametrize("grid", [(2**31, 1), (1, 65536)])
 def test_a_grid_that_no_device_launches_is_one_sentence(shim_driver: ctypes.CDLL, grid: tuple[int, int]) -> None:
-    launcher = runtime.CudaLauncher(torch.device("cuda", 0))
+    launcher = cuda.CudaLauncher(torch.device("cuda", 0))
     with pytest.raises(D2Error, match=rf"a grid of {grid[0]} x {grid[1]} blocks, at most 2147483647 x 65535"):
         launcher.launch("d2_project", grid[0], cuda._frame(*empty_scene()), rows=grid[1])
     assert shim_driver.d2_shim_contexts() == 0
@@ -167,7 +166,7 @@ def test_a_grid_that_no_device_launches_is_one_sentence(shim_driver: ctypes.CDLL
 
 def test_a_launch_of_nothing_never_reaches_the_driver(shim_driver: ctypes.CDLL) -> None:
     """Which refuses an empty grid, as the real one does."""
-    runtime.CudaLauncher(torch.device("cuda", 0)).launch("d2_project", 0, cuda._frame(*empty_scene()))
+    cuda.CudaLauncher(torch.device("cuda", 0)).launch("d2_project", 0, cuda._frame(*empty_scene()))
 
 
 def empty_scene() -> tuple:

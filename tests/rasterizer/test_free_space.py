@@ -15,7 +15,6 @@ from splat_scenes import (
     brute_force,
     brute_force_front,
     near_edge_of,
-    near_threshold,
     random_scene,
     single,
 )
@@ -30,10 +29,6 @@ both_paths = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], id
 
 def everywhere(scene: Scene, value: float) -> torch.Tensor:
     return torch.full((scene.view.height, scene.view.width), value, dtype=torch.float64)
-
-
-def stack(*layers: Scene) -> Scene:
-    return Scene(*(torch.cat(parts) for parts in zip(*(layer[:4] for layer in layers))), layers[0].view)
 
 
 def prior_with(scene: Scene, label: Label = Label.VERIFIED, depth: float = 3.0, **maps: torch.Tensor) -> DepthPrior:
@@ -74,15 +69,6 @@ def test_gradients_of_front_are_exact(seed):
         ).front
 
     assert gradcheck(front, scene[:3], fast_mode=seed >= 5), f"seed {seed}"
-
-
-@both_paths
-def test_a_gradient_of_front_pushes_behind_the_edge_and_fades(dtype):
-    scene = single(depth=2.0, opacity=0.5, dtype=dtype).requires_grad()
-    front = scene.render(near_edge=everywhere(scene, 4.0)).front.sum()
-    on_means, on_opacities = torch.autograd.grad(front, (scene.means, scene.opacities))
-    assert on_means[0, 2] < 0, "farther is better"
-    assert on_opacities[0] > 0, "fainter is better"
 
 
 # ---------------------------------------------------------------- the edge itself
@@ -134,17 +120,6 @@ def test_a_loss_that_sends_nan_where_nothing_is_known_spoils_no_gradient(dtype):
 
 
 @both_paths
-def test_the_share_of_alpha_that_stands_in_front_has_gradients_though_it_is_0_by_0_beside_the_gaussian(dtype):
-    scene = single(depth=2.0, size=41, dtype=dtype).requires_grad()
-    render = scene.render(near_edge=everywhere(scene, 4.0))
-    drawn = render.alpha > 0
-    assert not drawn.all()
-    (render.front / render.alpha)[drawn].sum().backward()
-    assert scene.means.grad[0, 2].item() == pytest.approx(-drawn.sum().item() / 4, rel=1e-4)
-    assert all(part.grad.isfinite().all() for part in scene[:3])
-
-
-@both_paths
 def test_edges_of_nine_decades_in_one_image(dtype):
     scene = random_scene(4, 200, 40, 30).to(dtype).requires_grad()
     edge = everywhere(scene, 1e-3)
@@ -154,45 +129,6 @@ def test_edges_of_nine_decades_in_one_image(dtype):
     torch.testing.assert_close(render.front[:, 20:], render.alpha[:, 20:], atol=1e-5, rtol=0)
     for part in torch.autograd.grad(render.front.sum(), scene[:3]):
         assert part.isfinite().all()
-
-
-@both_paths
-def test_of_opaque_layers_only_the_seen_ones_are_in_front(dtype):
-    layers = [single(depth=1 + 0.01 * i, opacity=0.8, variance=1e4, dtype=dtype) for i in range(50)]
-    scene = stack(*layers).requires_grad()
-    edge = everywhere(scene, 2.0)
-    render = scene.render(near_edge=edge)
-    expected = sum(0.8 * 0.2**i * (1 - (1 + 0.01 * i) / 2) for i in range(5))
-    assert render.front[7, 7].item() == pytest.approx(expected, abs=1e-5)
-    gradients = torch.autograd.grad(render.front.sum(), scene[:3])
-    assert all((part[5:] == 0).all() for part in gradients)
-    assert not survey(scene.to(dtype).splats, scene.view, prior_with(scene), near_edge=edge).front[5:].any()
-
-
-@both_paths
-@pytest.mark.parametrize("factor", [1 - 1e-5, 1 + 1e-5])
-def test_the_smallest_alpha_is_cut_in_front_as_in_the_image(dtype, factor):
-    scene = single(opacity=factor / 255, variance=0.05, dtype=dtype)
-    render = scene.render(near_edge=everywhere(scene, 8.0))
-    torch.testing.assert_close(render.front, render.alpha / 2)
-    assert (render.front > 0).sum().item() == (factor > 1)
-
-
-@both_paths
-def test_no_gradient_of_front_flows_through_a_clamped_alpha_but_the_depth_has_one(dtype):
-    scene = single(opacity=1.0, variance=1e6, size=5, dtype=dtype).requires_grad()
-    front = scene.render(near_edge=everywhere(scene, 8.0)).front
-    on_means, on_opacities = torch.autograd.grad(front.sum(), (scene.means, scene.opacities))
-    assert not on_opacities.any()
-    assert on_means[0, 2].item() == pytest.approx(-25 * 0.99 / 8, rel=1e-4)
-
-
-@both_paths
-def test_without_gaussians_front_is_zero(dtype):
-    scene = Scene(*(part[:0].to(dtype) for part in random_scene(0, 3, 9, 8)[:4]), random_scene(0, 3, 9, 8).view)
-    edge = everywhere(scene, 2.0)
-    assert torch.equal(scene.render(near_edge=edge).front, torch.zeros(8, 9, dtype=dtype))
-    assert survey(scene.splats, scene.view, prior_with(scene), near_edge=edge).front.shape == (0,)
 
 
 # ---------------------------------------------------------------- what it must not change
@@ -212,16 +148,6 @@ def test_a_near_edge_changes_no_bit_of_anything_else(dtype):
     assert all(torch.equal(part, other) for part, other in zip(*results))
 
 
-def test_both_paths_agree_about_the_survey_in_front():
-    scene = random_scene(7, 200, 50, 40)
-    edge = near_edge_of(scene.view)
-    edge[torch.from_numpy(near_threshold(brute_force(scene)))] = 0
-    fast, exact = (
-        survey(s.splats, s.view, prior_with(s), near_edge=edge).front for s in (scene.to(torch.float32), scene)
-    )
-    assert (fast.double() - exact).norm() < 1e-5 * exact.norm()
-
-
 def test_maps_that_do_not_fit_are_named():
     scene = single()
     with pytest.raises(D2Error, match=r"near_edge has shape \(15, 14\), expected \(15, 15\)"):
@@ -233,28 +159,6 @@ def test_maps_that_do_not_fit_are_named():
 
 
 # ---------------------------------------------------------------- reliability
-
-
-def test_the_survey_weighs_by_reliability_as_defined():
-    scene = random_scene(3, 120, 36, 34)
-    random = np.random.default_rng(0)
-    depth = torch.from_numpy(random.uniform(0.5, 6, (34, 36)))
-    depth[0, :3] = torch.tensor([0.0, torch.nan, -1.0])
-    r = torch.from_numpy(random.uniform(0, 1, (34, 36)))
-    r[1, :5] = torch.tensor([0.0, torch.nan, torch.inf, -1.0, 1.0])
-    labels = torch.from_numpy(random.integers(0, len(Label), (34, 36)).astype(np.uint8))
-    statistics = survey(scene.splats, scene.view, DepthPrior(depth, labels, reliability=r), eps=1e-3)
-
-    found = brute_force(scene)
-    counts = np.isfinite(r.numpy()) & (np.nan_to_num(r.numpy()) > 0) & (np.nan_to_num(depth.numpy()) > 0)
-    counts &= labels.numpy() != Label.FAR
-    w = found.weights * np.where(counts, r.numpy(), 0)
-    safe = np.where(counts, depth.numpy(), 1)
-    error = np.abs(found.depths[:, None, None] - safe) / (safe + 1e-3)
-    np.testing.assert_allclose(statistics.weight.numpy(), w.sum((1, 2)), atol=1e-12)
-    np.testing.assert_allclose(statistics.error.numpy(), (w * error).sum((1, 2)), atol=1e-11)
-    np.testing.assert_array_equal(statistics.hits.numpy(), (w > 0).sum((1, 2)))
-    np.testing.assert_allclose(statistics.max_weight.numpy(), found.weights.max((1, 2)), atol=1e-12)
 
 
 @both_paths

@@ -111,19 +111,20 @@ def test_gradient_of_screen_offsets_is_that_of_the_screen_mean():
         assert grad[i, 1].item() == pytest.approx(((ahead - behind) * weight).sum().item() / (2 * step), abs=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(50))
-def test_gradients_are_those_of_the_image(seed):
-    scene = random_scene(seed, 4, 7, 5, channels=2, radius=2.0).requires_grad()
+@pytest.mark.parametrize("settings", [SETTINGS, RasterSettings(antialiased=True)], ids=["", "antialiased"])
+@pytest.mark.parametrize("seed", range(25))
+def test_gradients_are_those_of_the_image(seed, settings):
+    scene = random_scene(seed, 4, 7, 5, channels=2, radius=0.5 if seed % 3 == 2 else 2.0).requires_grad()
     background = torch.rand(2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)).requires_grad_()
     offsets = torch.zeros(4, 2, dtype=torch.float64, requires_grad=True)
 
     def render(means, covariances, opacities, colors, background, offsets):
         splats = Splats(means, covariances, opacities, torch.arange(4))
         options = {"background": background, "screen_offsets": offsets, "near_edge": near_edge_of(scene.view, seed)}
-        return tuple(rasterize(splats, colors, scene.view, **options))
+        return tuple(rasterize(splats, colors, scene.view, settings, **options))
 
     # Every entry of the Jacobian for some seeds, a random projection of it (a tenth of the time) for the others.
-    assert gradcheck(render, (*scene[:4], background, offsets), fast_mode=seed >= 5), f"seed {seed}"
+    assert gradcheck(render, (*scene[:4], background, offsets), fast_mode=seed >= 3), f"seed {seed}"
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (33, 31), (64, 1)])
@@ -132,18 +133,23 @@ def test_any_image_size_works(size):
     np.testing.assert_allclose(scene.render().alpha.numpy(), brute_force(scene).weights.sum(0), atol=1e-12)
 
 
-def test_survey_sums_the_weights_of_the_definition():
+@pytest.mark.parametrize("weighed", [False, True], ids=["", "reliability"])
+def test_survey_sums_the_weights_of_the_definition(weighed):
     scene = random_scene(3, 120, 36, 34)
     random = np.random.default_rng(0)
     labels = torch.from_numpy(random.integers(0, len(Label), (34, 36)).astype(np.uint8))
     depth = torch.from_numpy(random.uniform(0.5, 6, (34, 36)))
     depth[0, :3] = torch.tensor([0.0, torch.nan, -1.0])  # labelled or not, these are no depths
-    statistics = survey(scene.splats, scene.view, DepthPrior(depth, labels), eps=1e-3)
+    r = torch.from_numpy(random.uniform(0, 1, (34, 36)))
+    r[1, :5] = torch.tensor([0.0, torch.nan, torch.inf, -1.0, 1.0])
+    prior = DepthPrior(depth, labels, reliability=r if weighed else None)
+    statistics = survey(scene.splats, scene.view, prior, eps=1e-3)
 
     found = brute_force(scene)
-    trusted = np.isin(labels.numpy(), TRUSTED) & (np.nan_to_num(depth.numpy()) > 0)
-    w = found.weights * trusted
-    safe = np.where(trusted, depth.numpy(), 1)
+    r = np.where(labels.numpy() == Label.FAR, 0, r.numpy()) if weighed else np.isin(labels.numpy(), TRUSTED)
+    counts = np.isfinite(r) & (np.nan_to_num(r) > 0) & (np.nan_to_num(depth.numpy()) > 0)
+    w = found.weights * np.where(counts, r, 0)
+    safe = np.where(counts, depth.numpy(), 1)
     error = np.abs(found.depths[:, None, None] - safe) / (safe + 1e-3)
     np.testing.assert_allclose(statistics.weight.numpy(), w.sum((1, 2)), atol=1e-12)
     np.testing.assert_allclose(statistics.error.numpy(), (w * error).sum((1, 2)), atol=1e-11)

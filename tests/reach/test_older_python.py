@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ast
 import functools
-import importlib.util
 import os
 import subprocess
 import sys
@@ -16,14 +15,11 @@ from pathlib import Path
 from typing import Annotated, Optional
 
 import pytest
-import torch
-from splat_scenes import random_scene
 
 from d2_plugin import older, registry
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.table import HOOKS
-from d2_plugin.rasterizer import RasterSettings, ops
 from d2_plugin.settings import Range, Settings, declared
 
 OLDEST = "3.9"
@@ -123,45 +119,6 @@ def test_entry_points_are_found_in_the_shape_of_python_3_9(monkeypatch: pytest.M
     monkeypatch.setattr(registry, "entry_points", lambda: {registry.ADAPTERS: tuple(found.values())})
     assert registry.names(registry.ADAPTERS) == sorted(found)
     assert registry.names("d2_plugin.no_such_group") == []
-
-
-class TestTorchWithoutOperators:
-    """Before 2.4 torch cannot define operators: then kernels run in plain autograd functions, the same bits."""
-
-    @pytest.fixture
-    def plain(self, monkeypatch: pytest.MonkeyPatch):
-        """The module `ops`, loaded anew by a torch in which the feature is hidden."""
-        spec = importlib.util.spec_from_file_location("d2_plugin.rasterizer.plain_ops", ops.__file__)
-        module = importlib.util.module_from_spec(spec)
-        monkeypatch.setitem(sys.modules, spec.name, module)
-        with monkeypatch.context() as hiding:  # torch itself needs it later, when the other module runs
-            hiding.delattr(torch.library, "custom_op")
-            spec.loader.exec_module(module)
-        return module
-
-    def test_images_and_gradients_are_the_same_bits(self, plain) -> None:
-        outcomes = []
-        for module in (ops, plain):
-            scene = random_scene(1, 40, 32, 24).to(torch.float32).requires_grad()
-            offsets, edge = torch.zeros(40, 2, requires_grad=True), torch.full((24, 32), 3.0)
-            drawn = scene.splats, scene.colors, scene.view, RasterSettings()
-            render = module.rasterize(*drawn, torch.ones(3), offsets, edge)
-            (render.color.square().sum() + render.depth_sum.sum() + render.front.sum()).backward()
-            outcomes.append([*render, *(part.grad for part in (*scene[:4], offsets))])
-        for ours, theirs in zip(*outcomes):
-            assert torch.equal(ours, theirs)
-        assert all(bool(value.any()) for value in outcomes[0])
-
-    def test_there_is_no_second_derivative_and_it_says_so(self, plain) -> None:
-        scene = random_scene(1, 40, 32, 24).to(torch.float32).requires_grad()
-        render = plain.rasterize(scene.splats, scene.colors, scene.view, RasterSettings(), None, None)
-        (gradient,) = torch.autograd.grad(render.color.square().sum(), scene.colors, create_graph=True)
-        with pytest.raises(RuntimeError, match="once_differentiable"):
-            gradient.sum().backward()
-
-    def test_a_device_without_kernels_is_named(self, plain) -> None:
-        with pytest.raises(NotImplementedError, match="d2::survey has no kernel for meta: have cpu, cuda"):
-            plain._survey(torch.empty(1, 3, device="meta"))
 
 
 def test_the_command_line_says_which_python_it_needs() -> None:

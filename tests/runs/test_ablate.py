@@ -45,16 +45,16 @@ class TestPresets:
 
     def test_single_signals_put_all_weight_on_one_term(self) -> None:
         weights = [
-            (config.lambda_e, config.lambda_o)
+            config.lambda_e
             for name in ("opacity_only", "depth_only", "full")
             if (config := hook_config(settings_of(name), Path("prior")).prune)
         ]
-        assert weights == [(0, 1), (1, 0), (0.5, 0.5)]
+        assert weights == [0, 1, 0.5]
 
     def test_the_users_tables_stay_below_the_presets(self) -> None:
-        mine = {"prune": {"tau_p": 0.9, "lambda_e": 0.4, "lambda_o": 0.6}, "backbone": {"densify": {"every": 50}}}
+        mine = {"prune": {"tau_p": 0.9, "lambda_e": 0.4}, "backbone": {"densify": {"every": 50}}}
         merged = PRESETS["depth_only"].merged(mine)
-        assert merged["prune"] == {"tau_p": 0.9, "lambda_e": 1.0, "lambda_o": 0.0}
+        assert merged["prune"] == {"tau_p": 0.9, "lambda_e": 1.0}
         assert PRESETS["full_d2_densification_only"].merged(mine)["backbone"] == {
             "densify": {"every": 50, "enabled": False}
         }

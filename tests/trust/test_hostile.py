@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow
 Change = Callable[[Path], object]
 
 FLAGS = """
---densify.scale -1 | --densify.opacity 2 | --densify.cell 0 | --densify.budget-per-view -5 | --densify.budget -5
+--densify.scale -1 | --densify.opacity 2 | --densify.budget-per-view -5 | --densify.budget -5
 --depth-loss.tau-v nan | --depth-loss.weight 1e308 | --prune.patience 0 | --d2.views-per-evaluation -3
 --d2.finite-every -1 | --d2.finite-every 1.5 | --plan.temporal maybe | --seed -1 | --seed 99999999999999999999999
 --frames 0:3000000000 | --frames x | --frames 3:1 | --iterations 0 | --iterations 1e400 | --iterations nan

@@ -507,7 +507,7 @@ using d2::Slice;
 
 extern "C" {
 
-int64_t d2_slice_size() { return sizeof(Slice); }
+int64_t d2_slice4d_size() { return sizeof(Slice); }
 
 // Step 1: the rows that are drawn, in order; returns M.
 int64_t d2_slice_rows(const Slice* s) {

@@ -317,7 +317,7 @@ using d2::Photometric;
 
 extern "C" {
 
-int64_t d2_photometric_size() { return sizeof(Photometric); }
+int64_t d2_ssim_size() { return sizeof(Photometric); }
 
 // Fills in the gradient; returns the loss.
 double d2_photometric(const Photometric* p) {

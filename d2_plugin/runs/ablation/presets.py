@@ -57,8 +57,8 @@ PRESETS: dict[str, Preset] = {
         Preset("no_pruning", "w/o Pruning", _without("prune")),
         Preset("no_rgbd", "w/o RGB-D", _without("depth_loss")),
         Preset("full", "D²-4DGS"),
-        Preset("opacity_only", "Opacity only", overrides={"prune": {"lambda_e": 0.0, "lambda_o": 1.0}}),
-        Preset("depth_only", "Depth only", overrides={"prune": {"lambda_e": 1.0, "lambda_o": 0.0}}),
+        Preset("opacity_only", "Opacity only", overrides={"prune": {"lambda_e": 0.0}}),
+        Preset("depth_only", "Depth only", overrides={"prune": {"lambda_e": 1.0}}),
         Preset(
             "full_d2_densification_only",
             "D²-4DGS, own densification off",

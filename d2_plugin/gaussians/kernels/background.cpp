@@ -1,8 +1,6 @@
-// What lies between Gaussians and image beside the rasterizer, forward and backward: colours that do not depend on the
-// direction, the background behind all Gaussians, and the screen-space gradients that density control adds up.
+// The background behind all Gaussians, forward and backward.
 // Sums are taken in an order that does not depend on the number of threads.
 #include <algorithm>
-#include <cmath>
 #include <cstdint>
 #include <vector>
 
@@ -11,25 +9,16 @@
 
 namespace d2 {
 
-constexpr int64_t ROWS_CHUNK = 4096;  // Gaussians of one task
 constexpr int SEGMENT = 64;           // pixels of a row whose sums stay near while the rows of a strip go by
-constexpr float SH_C0 = 0.28209479177387814f;
-
-template <class Body>
-static void for_each_chunk(int threads, int64_t count, Body body) {
-  parallel_for(threads, (count + ROWS_CHUNK - 1) / ROWS_CHUNK, [&](int64_t chunk) {
-    body(chunk * ROWS_CHUNK, std::min(count, (chunk + 1) * ROWS_CHUNK));
-  });
-}
 
 // The background of an image [height, width, 3], as native_background.py fills it in: colours at nodes that lie `stride`
 // pixels apart, spherical harmonics times coefficients, bilinear in between.
-struct Behind {
+struct Background {
   int32_t height, width, rows, columns, stride, terms, threads;
   const float *basis, *constant, *harmonics;             // [rows * columns, terms], [1, 3], [terms - 1, 3]
   const float *color, *alpha;                            // [height, width, 3], [height, width]
   float* out;                                            // [height, width, 3]
-  const float *grad_out, *more_alpha;                    // null going forward; what else came to alpha, or null
+  const float* grad_out;                                 // as the gradients below null going forward
   float *grad_alpha, *grad_constant, *grad_harmonics;
 
   int64_t nodes() const { return int64_t(rows) * columns; }
@@ -37,7 +26,7 @@ struct Behind {
 };
 
 // Colours of the nodes before they are limited to 0..1.
-static void node_colors(const Behind& b, float* raw) {
+static void node_colors(const Background& b, float* raw) {
   for (int64_t n = 0; n < b.nodes(); n++) {
     const float* y = b.basis + n * b.terms;
     for (int c = 0; c < 3; c++) {
@@ -49,7 +38,7 @@ static void node_colors(const Behind& b, float* raw) {
 }
 
 // A row of nodes, limited to 0..1 and interpolated at each pixel of the image's width.
-static void spread_row(const Behind& b, const float* raw, float* line) {
+static void spread_row(const Background& b, const float* raw, float* line) {
   const float step = 1.f / float(b.stride);
   for (int column = 0, x = 0; x < b.width; column++) {
     float from[3], slope[3];
@@ -63,7 +52,7 @@ static void spread_row(const Behind& b, const float* raw, float* line) {
 }
 
 // The transpose: what came to the pixels of a line, gathered at its nodes.
-static void gather_row(const Behind& b, const float* line, float* nodes) {
+static void gather_row(const Background& b, const float* line, float* nodes) {
   const float step = 1.f / float(b.stride);
   for (int column = 0, x = 0; x < b.width; column++) {
     float all[3] = {0, 0, 0}, right[3] = {0, 0, 0};
@@ -99,10 +88,9 @@ static void composite(const float* upper, const float* lower, float low, const f
     out[i] = in[i] + (1 - alpha[i / 3]) * (upper[i] + low * (lower[i] - upper[i]));
 }
 
-// The transpose, pixels begin..end-1 of the row: adds what goes to both rows of nodes, and gives the gradient of alpha
-// with what else came to it, `more` or null.
+// The transpose, pixels begin..end-1 of the row: adds what goes to both rows of nodes, and gives the gradient of alpha.
 static void split(const float* upper, const float* lower, float low, const float* alpha, const float* gradient,
-                  const float* more, int begin, int end, float* to_upper, float* to_lower, float* on_alpha) {
+                  int begin, int end, float* to_upper, float* to_lower, float* on_alpha) {
   int x = begin;
   for (; x + LANES <= end; x += LANES) {
     Floats rest[3], products[3], colors[3];
@@ -117,7 +105,7 @@ static void split(const float* upper, const float* lower, float low, const float
     }
     unweave<LANES>(products, colors);
     const Floats through = colors[0] + colors[1] + colors[2];
-    ((more ? Floats::load(more + x) : Floats(0.f)) - through).store(on_alpha + x);
+    (-through).store(on_alpha + x);
   }
   for (; x < end; x++) {
     float product = 0;
@@ -127,14 +115,14 @@ static void split(const float* upper, const float* lower, float low, const float
       to_lower[i] += down;
       to_upper[i] += part - down;
     }
-    on_alpha[x] = (more ? more[x] : 0.f) - product;
+    on_alpha[x] = -product;
   }
 }
 
 // The pixels between two rows of nodes, whose colours are spread along them.
 class Strip {
  public:
-  Strip(const Behind& b, const std::vector<float>& raw, int row)
+  Strip(const Background& b, const std::vector<float>& raw, int row)
       : b_(b), begin_(row * b.stride), end_(std::min(b.height, (row + 1) * b.stride)), upper_(b.length()),
         lower_(b.length()) {
     spread_row(b, raw.data() + int64_t(3) * b.columns * row, upper_.data());
@@ -155,8 +143,7 @@ class Strip {
     for (int begin = 0; begin < b_.width; begin += SEGMENT)
       for (int y = begin_; y < end_; y++) {
         const int64_t at = int64_t(y) * b_.width;
-        const float* const more = b_.more_alpha ? b_.more_alpha + at : nullptr;
-        split(upper_.data(), lower_.data(), low(y), b_.alpha + at, b_.grad_out + 3 * at, more, begin,
+        split(upper_.data(), lower_.data(), low(y), b_.alpha + at, b_.grad_out + 3 * at, begin,
               std::min(b_.width, begin + SEGMENT), to_upper.data(), to_lower.data(), b_.grad_alpha + at);
       }
     gather_row(b_, to_upper.data(), on_upper);
@@ -167,13 +154,13 @@ class Strip {
   // How far row y lies from the upper towards the lower nodes.
   float low(int y) const { return float(y - begin_) / float(b_.stride); }
 
-  const Behind& b_;
+  const Background& b_;
   const int begin_, end_;
   std::vector<float> upper_, lower_;
 };
 
 // Gradients of the coefficients from those of the nodes, given for the upper and the lower row of each strip.
-static void coefficient_gradients(const Behind& b, const std::vector<float>& raw, const std::vector<float>& strips) {
+static void coefficient_gradients(const Background& b, const std::vector<float>& raw, const std::vector<float>& strips) {
   std::vector<double> sums(size_t(3) * b.terms, 0.0);
   const int64_t row_length = int64_t(3) * b.columns;
   for (int64_t node = 0; node < b.nodes(); node++) {
@@ -197,58 +184,19 @@ static void coefficient_gradients(const Behind& b, const std::vector<float>& raw
 
 }  // namespace d2
 
-using d2::Behind;
+using d2::Background;
 
 extern "C" {
 
-// colors[m] = max(0, C0 base[rows[m]] + 1/2), three numbers each; rows may be null for all of them.
-void d2_colors(const float* base, const int64_t* rows, int64_t drawn, float* colors, int32_t threads) {
-  d2::for_each_chunk(threads, drawn, [&](int64_t begin, int64_t end) {
-    for (int64_t m = begin; m < end; m++) {
-      const float* from = base + 3 * (rows ? rows[m] : m);
-      for (int c = 0; c < 3; c++) colors[3 * m + c] = std::max(d2::SH_C0 * from[c] + 0.5f, 0.f);
-    }
-  });
-}
+int64_t d2_background_size() { return sizeof(Background); }
 
-// The gradient of base [count, 3]: zero for rows that are not drawn, and where a colour is 0. Rows only ever increase.
-void d2_colors_backward(const float* colors, const float* gradient, const int64_t* rows, int64_t drawn, int64_t count,
-                        float* grad_base, int32_t threads) {
-  if (drawn == 0) std::fill(grad_base, grad_base + 3 * count, 0.f);
-  d2::for_each_chunk(threads, drawn, [&](int64_t begin, int64_t end) {
-    if (rows && drawn < count) {
-      float* const from = grad_base + 3 * (begin ? rows[begin] : 0);
-      std::fill(from, grad_base + 3 * (end < drawn ? rows[end] : count), 0.f);
-    }
-    for (int64_t m = begin; m < end; m++) {
-      float* to = grad_base + 3 * (rows ? rows[m] : m);
-      for (int c = 0; c < 3; c++) to[c] = colors[3 * m + c] > 0 ? d2::SH_C0 * gradient[3 * m + c] : 0.f;
-    }
-  });
-}
-
-// Adds the length of each screen-space gradient [drawn, 2], in units of half the image, to the sums of its Gaussian.
-void d2_screen(const float* gradient, const int64_t* rows, int64_t drawn, float half_width, float half_height,
-               float* sums, float* seen, int32_t threads) {
-  d2::for_each_chunk(threads, drawn, [&](int64_t begin, int64_t end) {
-    for (int64_t m = begin; m < end; m++) {
-      const float x = gradient[2 * m] * half_width, y = gradient[2 * m + 1] * half_height;
-      const float length = std::sqrt(x * x + y * y);
-      sums[rows[m]] += length;
-      seen[rows[m]] += length > 0 ? 1.f : 0.f;
-    }
-  });
-}
-
-int64_t d2_behind_size() { return sizeof(Behind); }
-
-void d2_behind(const Behind* b) {
+void d2_background(const Background* b) {
   std::vector<float> raw(size_t(3) * b->nodes());
   d2::node_colors(*b, raw.data());
   d2::parallel_for(b->threads, b->rows - 1, [&](int64_t row) { d2::Strip(*b, raw, int(row)).forward(); });
 }
 
-void d2_behind_backward(const Behind* b) {
+void d2_background_backward(const Background* b) {
   const int64_t row_length = int64_t(3) * b->columns;
   std::vector<float> raw(size_t(3) * b->nodes()), strips(size_t(2) * (b->rows - 1) * row_length, 0.f);
   d2::node_colors(*b, raw.data());

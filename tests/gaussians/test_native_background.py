@@ -1,4 +1,4 @@
-"""Background, colours and screen gradients in the kernel are those of torch: values, gradients, threads."""
+"""The background in the kernel is that of torch: value, gradients, threads."""
 
 from __future__ import annotations
 
@@ -10,10 +10,8 @@ from tiny import make_model, make_views
 from torch import Tensor
 
 from d2_plugin.backbones import background as module
-from d2_plugin.backbones import model as model_module
 from d2_plugin.backbones.background import Background
-from d2_plugin.gaussians import native_image as kernel
-from d2_plugin.gaussians import spherical_harmonics as sh
+from d2_plugin.gaussians import native_background as kernel
 from d2_plugin.protocol import Render, View
 
 SIZES = [(32, 24), (1, 1), (40, 40), (81, 7), (100, 33), (320, 45)]
@@ -62,7 +60,7 @@ def test_the_background_has_the_same_bits_for_any_number_of_threads() -> None:
     results = []
     for count in (1, 2, 4):
         torch.set_num_threads(count)
-        results.append(behind(100, 70, torch.float32))
+        results.append([part for size in ((100, 70), (320, 180), (41, 23)) for part in behind(*size, torch.float32)])
     assert all(torch.equal(*pair) for result in results[1:] for pair in zip(results[0], result, strict=True))
 
 
@@ -76,46 +74,8 @@ def test_a_background_that_is_nan_is_seen() -> None:
     assert out[..., 0].isfinite().all()
 
 
-@pytest.mark.parametrize("rows", [None, [], [0, 3, 4, 9], list(range(10))])
-def test_colours_and_their_gradient_are_those_of_the_harmonics(rows: list[int] | None) -> None:
-    base = torch.randn(10, 1, 3, generator=torch.Generator().manual_seed(0)).mul_(3).requires_grad_()
-    index = None if rows is None else torch.tensor(rows, dtype=torch.int64)
-    drawn = base if index is None else base[index]
-    exact = sh.colors(drawn, torch.zeros(len(drawn), 3), None, 0, 0)
-    found = kernel.constant_colors(base, index)
-    torch.testing.assert_close(found, exact)
-    upstream = torch.randn(exact.shape)
-    gradients = [torch.autograd.grad(colors, base, upstream, retain_graph=True)[0] for colors in (found, exact)]
-    torch.testing.assert_close(*gradients)
-
-
-def test_many_gaussians_have_their_colours_and_gradients_too() -> None:
-    base = torch.randn(20_000, 1, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    rows = (torch.rand(20_000, generator=torch.Generator().manual_seed(1)) < 0.7).nonzero()[:, 0]
-    exact = sh.colors(base[rows], torch.zeros(len(rows), 3), None, 0, 0)
-    found = kernel.constant_colors(base, rows)
-    torch.testing.assert_close(found, exact)
-    gradients = [torch.autograd.grad(colors.square().sum(), base)[0] for colors in (found, exact)]
-    torch.testing.assert_close(*gradients)
-
-
-def test_screen_gradients_add_up_as_in_torch(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = []
-    for native in (True, False):
-        if not native:
-            monkeypatch.setattr(model_module, "can_draw", lambda *parts: False)
-        model, view = make_model(), make_views()[0]
-        for _ in range(2):
-            model.render(view).color.square().sum().backward()
-            model.accumulate(view)
-        found.append(model.gaussians.statistics)
-    torch.testing.assert_close(*found)
-    assert found[0]["seen"].max() == 2
-
-
 def test_without_a_compiler_the_image_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     model, view = make_model(background=True), make_views()[0]
     native = model.render(view).color
-    for place in (module, model_module):
-        monkeypatch.setattr(place, "can_draw", lambda *parts: False)
+    monkeypatch.setattr(module, "can_composite", lambda *parts: False)
     torch.testing.assert_close(model.render(view).color, native)
