@@ -18,8 +18,8 @@ import pytest
 from tiny import ALL_HOOKS, make_trainer
 
 from d2_plugin.viewing.live import Viewer
-from d2_plugin.viewing.stand_in import subject_of_store
-from d2_plugin.viewing.subject import Subject, subject_of_recording
+from d2_plugin.viewing.viewed import viewed_store
+from d2_plugin.viewing.viewed import ViewedRun, viewed_recording
 
 pytest.importorskip("viser", reason="viser is in the `view` extra")
 api = pytest.importorskip("playwright.sync_api", reason="playwright is in the `test` extra")
@@ -44,9 +44,9 @@ def browser() -> Iterator[Any]:
 
 
 @contextmanager
-def showing(subject: Subject) -> Iterator[Viewer]:
+def showing(viewed: ViewedRun) -> Iterator[Viewer]:
     """A viewer whose images are drawn by a thread of its own, as `d2 view` draws them in its only one."""
-    viewer, stop = Viewer(subject=subject, port=18080, height=180), threading.Event()
+    viewer, stop = Viewer(viewed=viewed, port=18080, height=180), threading.Event()
     thread = threading.Thread(target=viewer.stay, args=(stop.is_set,))
     thread.start()
     try:
@@ -125,8 +125,8 @@ def choose(page: Any, label: str, option: str) -> None:
     page.get_by_role("option", name=option, exact=True).click()
 
 
-def test_a_person_moves_camera_and_time_while_another_only_looks(browser: Any, subject: Subject) -> None:
-    with showing(subject) as viewer:
+def test_a_person_moves_camera_and_time_while_another_only_looks(browser: Any, viewed: ViewedRun) -> None:
+    with showing(viewed) as viewer:
         one, two = opened(browser, viewer), opened(browser, viewer)
         first, other = settled(one), settled(two)
         assert viewer.clients == 2
@@ -147,8 +147,8 @@ def test_a_person_moves_camera_and_time_while_another_only_looks(browser: Any, s
         two.close()
 
 
-def test_depth_opacity_number_and_the_prior_as_points(browser: Any, subject: Subject) -> None:
-    with showing(subject) as viewer:
+def test_depth_opacity_number_and_the_prior_as_points(browser: Any, viewed: ViewedRun) -> None:
+    with showing(viewed) as viewer:
         page = opened(browser, viewer)
         before = settled(page)
         for show in ("depth", "opacity", "number of Gaussians"):
@@ -165,10 +165,10 @@ def test_depth_opacity_number_and_the_prior_as_points(browser: Any, subject: Sub
         page.close()
 
 
-def test_names_stay_text_and_only_this_machine_may_look(browser: Any, subject: Subject) -> None:
-    cameras = {EVIL if name == "train0" else name: camera for name, camera in subject.recording.cameras.items()}
-    recording = replace(subject.recording, cameras=cameras, source=Plain())
-    named = replace(subject, name=EVIL, recording=recording, train_cameras=tuple(cameras), store=None, test_cameras=())
+def test_names_stay_text_and_only_this_machine_may_look(browser: Any, viewed: ViewedRun) -> None:
+    cameras = {EVIL if name == "train0" else name: camera for name, camera in viewed.recording.cameras.items()}
+    recording = replace(viewed.recording, cameras=cameras, source=Plain())
+    named = replace(viewed, name=EVIL, recording=recording, train_cameras=tuple(cameras), store=None, test_cameras=())
     with showing(named) as viewer:
         page = opened(browser, viewer)
         settled(page)
@@ -219,13 +219,13 @@ def test_a_training_is_watched_paused_and_goes_on(browser: Any) -> None:
         viewer.close()
 
 
-def test_a_recording_and_a_prior_are_shown_without_gaussians(browser: Any, subject: Subject) -> None:
-    with showing(subject_of_recording(subject.recording)) as viewer:
+def test_a_recording_and_a_prior_are_shown_without_gaussians(browser: Any, viewed: ViewedRun) -> None:
+    with showing(viewed_recording(viewed.recording)) as viewer:
         page = opened(browser, viewer)
         until(page, lambda now: now.std() > 4, "recording")
         assert not page.get_by_text("Image", exact=True).count()
         page.close()
-    with showing(subject_of_store(subject.store)) as viewer:
+    with showing(viewed_store(viewed.store)) as viewer:
         page = opened(browser, viewer)
         until(page, is_drawn, "priors")
         assert page.problems == []

@@ -16,7 +16,8 @@ from viewing.export.scenes import DURATION, NASTY, make_scene, psnr, rasterized,
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
 from d2_plugin.runs.drawing import color_scale, colorize
-from d2_plugin.viewing.export.page import read_page, write_page
+from oracles.export_files import ReadPage
+from d2_plugin.viewing.export.page import write_page
 
 pytestmark = pytest.mark.browser
 
@@ -124,7 +125,7 @@ def test_the_depth_view_is_the_expected_depth_on_its_scale(new_page: Any, tmp_pa
     model = sharp_model("yang4d")
     page = opened(new_page, model, tmp_path / "scene.html")
     true = rasterized(model, 1, TIMES[1])
-    low, high = read_page(tmp_path / "scene.html").header["depth_range"]
+    low, high = ReadPage(tmp_path / "scene.html").header["depth_range"]
     colors = colorize(true["depth"], low, high, color_scale("viridis")) * true["opacity"][..., None]
     assert psnr(shown(page, 1, TIMES[1], "depth"), colors / 255) > 30
 
