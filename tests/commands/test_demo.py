@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from oracles.export_files import ReadPage
 
 from d2_plugin.commands.cli import main
 from d2_plugin.gaussians import native_slice, native_ssim
@@ -13,7 +14,6 @@ from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export import folder as folder_layout
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.viewing import demo
-from oracles.export_files import ReadPage
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from mimics import fudan, spacetime
+from oracles.export_files import ReadPage
 from torch import Tensor
 from viewing import official
 
@@ -18,14 +19,13 @@ from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import View
 from d2_plugin.runs.run import Run
+from d2_plugin.viewing.camera_paths import pose_of
 from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.checkpoints.files import read_options, read_ply
-from d2_plugin.viewing.checkpoints.networks import MotionNetwork, PlaneField
 from d2_plugin.viewing.checkpoints.models import FOUR_C, FOUR_C_STATIC, FUDAN, PLANES, STATIC
-from oracles.export_files import ReadPage
+from d2_plugin.viewing.checkpoints.networks import MotionNetwork, PlaneField
 from d2_plugin.viewing.live.show import ViewSettings, viewed_at
 from d2_plugin.viewing.rendering import render_view
-from d2_plugin.viewing.camera_paths import pose_of
 from d2_plugin.viewing.viewed import ViewedRun
 
 SIZE = (96, 54)

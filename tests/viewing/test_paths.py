@@ -13,9 +13,19 @@ from hypothesis import strategies as st
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Camera
-from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.viewing.camera_paths import Lens, Pose, focus_of, look_at, orbit, pose_of, read_camera_path, spiral, through
 from d2_plugin.recordings.cameras.calibration import OPENGL_TO_OPENCV
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.viewing.camera_paths import (
+    Lens,
+    Pose,
+    focus_of,
+    look_at,
+    orbit,
+    pose_of,
+    read_camera_path,
+    spiral,
+    through,
+)
 
 ARC = list(synthetic_recording(cameras=4, held_out=0, frames=1, width=96, height=54).cameras.values())
 

@@ -19,11 +19,11 @@ from d2_plugin.recordings.images import read_image
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import make_view
-from d2_plugin.viewing.panels import KINDS, Shot
 from d2_plugin.viewing.camera_paths import pose_of
-from d2_plugin.viewing.viewed import ViewedRun
+from d2_plugin.viewing.panels import KINDS, Shot
 from d2_plugin.viewing.videos.plan import RenderSettings, plan_video
 from d2_plugin.viewing.videos.render import run
+from d2_plugin.viewing.viewed import ViewedRun
 
 av = pytest.importorskip("av", reason="PyAV is in the `video` extra")
 

@@ -18,8 +18,7 @@ import pytest
 from tiny import ALL_HOOKS, make_trainer
 
 from d2_plugin.viewing.live import Viewer
-from d2_plugin.viewing.viewed import viewed_store
-from d2_plugin.viewing.viewed import ViewedRun, viewed_recording
+from d2_plugin.viewing.viewed import ViewedRun, viewed_recording, viewed_store
 
 pytest.importorskip("viser", reason="viser is in the `view` extra")
 api = pytest.importorskip("playwright.sync_api", reason="playwright is in the `test` extra")

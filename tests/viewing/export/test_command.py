@@ -8,6 +8,7 @@ from typing import get_args, get_type_hints
 
 import pytest
 import torch
+from oracles.export_files import ReadPage
 from viewing.hostile import emptied, of_another_version, still_training
 
 from d2_plugin.commands.cli import main
@@ -15,7 +16,6 @@ from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.viewing.export.export import FORMATS, Export
-from oracles.export_files import ReadPage
 
 
 @pytest.fixture(scope="module")

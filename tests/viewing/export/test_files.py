@@ -10,7 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from oracles.export_files import ReadPage, covariances_from, pixels_apart, read_spz, read_splatv, read_still_ply, state_of
+from oracles.export_files import (
+    ReadPage,
+    covariances_from,
+    pixels_apart,
+    read_splatv,
+    read_spz,
+    read_still_ply,
+    state_of,
+)
 from viewing.export.scenes import DURATION, make_scene, sharp_model
 
 from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings

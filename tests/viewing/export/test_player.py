@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from oracles.export_files import ReadPage
 from viewing.chromium import Page, browser, executable, image
 from viewing.export.scenes import DURATION, NASTY, make_scene, psnr, rasterized, sharp_model
 
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
 from d2_plugin.runs.drawing import color_scale, colorize
-from oracles.export_files import ReadPage
 from d2_plugin.viewing.export.page import write_page
 
 pytestmark = pytest.mark.browser
