@@ -107,7 +107,7 @@ def test_images_of_other_times_and_cameras_would_not_pass(new_page: Any, tmp_pat
 def test_harmonics_and_cosines_in_time_and_a_sky_are_drawn(
     new_page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bits: int
 ) -> None:
-    monkeypatch.setattr("d2_plugin.viewing.export.coded_scene.HARMONIC_BITS", (bits,))
+    monkeypatch.setattr("d2_plugin.viewing.export.coded.HARMONIC_BITS", (bits,))
     plain = sharp_model("yang4d")
     rows = {name: value.detach() for name, value in plain.gaussians.parameters.items()}
     generator = torch.Generator().manual_seed(3)
