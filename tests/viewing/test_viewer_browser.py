@@ -15,7 +15,7 @@ from tiny import ALL_HOOKS, make_trainer
 from viewing.chromium import Page, browser, executable
 
 from d2_plugin.viewing.live import Viewer
-from d2_plugin.viewing.viewed import ViewedRun, viewed_recording, viewed_store
+from d2_plugin.viewing.viewed import KeptImages, ViewedRun
 
 pytest.importorskip("viser", reason="viser is in the `view` extra")
 pytestmark = pytest.mark.browser
@@ -71,10 +71,6 @@ def changed(before: np.ndarray) -> Callable[[np.ndarray], bool]:
     return lambda now: np.abs(now - before).mean() > 2
 
 
-def is_drawn(now: np.ndarray) -> bool:
-    return now.std() > 20
-
-
 def settled(page: Page) -> np.ndarray:
     """The image once it no longer changes."""
     before = until(page, lambda now: now.std() > 5)
@@ -104,6 +100,7 @@ def choose(page: Page, label: str, option: str) -> None:
     page.page.get_by_role("option", name=option, exact=True).click()
 
 
+@pytest.mark.slow
 def test_a_person_moves_camera_and_time_while_another_only_looks(
     new_page: Callable[[], Page], viewed: ViewedRun
 ) -> None:
@@ -130,6 +127,7 @@ def test_a_person_moves_camera_and_time_while_another_only_looks(
         two.page.close()
 
 
+@pytest.mark.slow
 def test_depth_opacity_number_and_the_prior_as_points(new_page: Callable[[], Page], viewed: ViewedRun) -> None:
     with showing(viewed) as viewer:
         page = opened(new_page, viewer)
@@ -150,7 +148,7 @@ def test_depth_opacity_number_and_the_prior_as_points(new_page: Callable[[], Pag
 
 def test_names_stay_text_and_only_this_machine_may_look(new_page: Callable[[], Page], viewed: ViewedRun) -> None:
     cameras = {EVIL if name == "train0" else name: camera for name, camera in viewed.recording.cameras.items()}
-    recording = replace(viewed.recording, cameras=cameras, source=Plain())
+    recording = replace(viewed.recording, cameras=cameras, source=KeptImages(cameras))
     named = replace(viewed, name=EVIL, recording=recording, train_cameras=tuple(cameras), store=None, test_cameras=())
     with showing(named) as viewer:
         page = opened(new_page, viewer)
@@ -200,29 +198,3 @@ def test_a_training_is_watched_paused_and_goes_on(new_page: Callable[[], Page]) 
         viewer.training.paused = False
         thread.join()
         viewer.close()
-
-
-def test_a_recording_and_a_prior_are_shown_without_gaussians(new_page: Callable[[], Page], viewed: ViewedRun) -> None:
-    with showing(viewed_recording(viewed.recording)) as viewer:
-        page = opened(new_page, viewer)
-        until(page, lambda now: now.std() > 4)
-        assert not page.page.get_by_text("Image", exact=True).count()
-        page.page.close()
-    with showing(viewed_store(viewed.store)) as viewer:
-        page = opened(new_page, viewer)
-        until(page, is_drawn)
-        assert page.errors == []
-        page.page.close()
-
-
-class Plain:
-    """Grey images for cameras of any name."""
-
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        return np.full((54, 96, 3), 99, np.uint8)
-
-    def depth(self, camera: str, frame: int) -> None:
-        return None
-
-    def mono(self, camera: str, frame: int) -> None:
-        return None

@@ -22,7 +22,6 @@ from d2_plugin.viewing.export.keys import ALPHA_MIN
 MAGIC, VERSION = 0x5053474E, 3
 MOST_FRACTION_BITS = 12
 COMPRESSION = 6
-"""The default of 9 takes three times as long and saves one byte in a hundred."""
 FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
 """Signs of the harmonics above the constant one when y and z change theirs."""
 HEADER = np.dtype([("magic", "<u4"), ("version", "<u4"), ("count", "<u4"), ("rest", "u1", 4)])
