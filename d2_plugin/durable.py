@@ -84,7 +84,7 @@ def make_folder(path: Path) -> Path:
 def write(path: Path, *parts: bytes | memoryview, synced: bool = True) -> None:
     """Make `path` hold the parts one after the other; its folder is made where it is missing.
 
-    `synced` waits for the disk, so that a power cut leaves the old file or the new one as well; what nobody reads back,
+    `synced` waits for the disk, so that a power cut leaves the old file or the new one as well; what is not read back,
     or whoever finds it damaged makes again, need not wait.
 
     Raises:

@@ -141,7 +141,7 @@ def _as_number(kind: type, limits: Range, value: Any, name: str) -> int | float:
     if not limits.holds(number):
         unit = f" {limits.unit}" if limits.unit else ""
         if limits.high is not None and FAR[0] <= limits.high <= FAR[1] and number <= limits.high:
-            limits = replace(limits, high=None)  # a bound that nobody came near is no news
+            limits = replace(limits, high=None)  # a bound far away is not worth a word
         raise OutOfRange(str(_wrong(name, f"must be {limits}{unit}", value)))
     return number
 

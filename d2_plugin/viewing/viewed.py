@@ -25,7 +25,7 @@ from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.camera_paths import Pose
 
 UNKNOWN_IMAGE = 60
-"""Grey of an image that nobody kept."""
+"""Grey of an image that was not kept."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -184,40 +184,35 @@ def test_panels_show_what_they_say(viewed: ViewedRun) -> None:
     assert KINDS["labels"](half).image.shape == (27, 48, 3)
 
 
-class TestSentences:
-    def test_what_is_no_run(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "holds no run" in refused(capsys, tmp_path)
-        assert "no run at" in refused(capsys, tmp_path / "none")
-        assert "d2 render needs RUN" in refused(capsys)
+def test_what_cannot_be_shown_is_one_sentence(
+    trained: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "holds no run" in refused(capsys, tmp_path)
+    assert "no run at" in refused(capsys, tmp_path / "none")
+    assert "d2 render needs RUN" in refused(capsys)
+    assert "has no Gaussian left at step 40" in refused(capsys, emptied(trained, tmp_path / "empty"))
+    assert "version 99" in refused(capsys, of_another_version(trained, tmp_path / "later"))
+    for more in (["--recording", room], ["--train-cameras", "train0"], ["--downscale", "2"]):
+        assert "is a folder of a run, which knows its recording" in refused(capsys, trained, *more)
+    assert "did you mean 'orbit'?" in refused(capsys, trained, "--path", "orbti")
+    assert "did you mean 'depth'?" in refused(capsys, trained, "--show", "rgb,deph")
+    assert "did you mean 'test0'?" in refused(capsys, trained, "--cameras", "test")
+    assert "at the recording's cameras only" in refused(capsys, trained, "--path", "orbit", "--show", "error")
+    assert "there is no depth prior of camera test0" in refused(capsys, trained, "--show", "sigma")
 
-    def test_a_run_knows_its_recording(self, trained: Path, room: Path, tmp_path: Path, capsys) -> None:
-        for more in (["--recording", str(room)], ["--train-cameras", "train0"], ["--downscale", "2"]):
-            words = ["render", str(trained), "--output", str(tmp_path / "a.mp4"), *more]
-            assert main(words) == 2
-            assert "is a folder of a run, which knows its recording" in capsys.readouterr().err
 
-    def test_an_unknown_path_image_or_camera(self, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "did you mean 'orbit'?" in refused(capsys, trained, "--path", "orbti")
-        assert "did you mean 'depth'?" in refused(capsys, trained, "--show", "rgb,deph")
-        assert "did you mean 'test0'?" in refused(capsys, trained, "--cameras", "test")
-        assert "at the recording's cameras only" in refused(capsys, trained, "--path", "orbit", "--show", "error")
-        assert "there is no depth prior of camera test0" in refused(capsys, trained, "--show", "sigma")
+def test_a_run_that_still_trains_is_shown_with_a_note(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = still_training(trained, tmp_path / "<script>alert(1)<", 33)
+    assert main(["render", str(copy), "--output", str(tmp_path / "a.mp4")]) == 0
+    assert f"{copy.name} still trains: this is step 33 of 40" in capsys.readouterr().out
+    (copy / "checkpoint.pt").unlink()
+    assert "holds no checkpoint yet" in refused(capsys, copy)
 
-    def test_a_run_that_still_trains(self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        copy = still_training(trained, tmp_path / "<script>alert(1)</script>".replace("/", "_"), 33)
-        assert main(["render", str(copy), "--output", str(tmp_path / "a.mp4")]) == 0
-        assert f"{copy.name} still trains: this is step 33 of 40" in capsys.readouterr().out
-        (copy / "checkpoint.pt").unlink()
-        assert "holds no checkpoint yet" in refused(capsys, copy)
 
-    def test_a_run_without_a_prior(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        folder = tmp_path / "bare"
-        Run(RunSettings(str(room), ("train0", "train1"), iterations=2, hooks=()), folder).train()
-        assert main(["render", str(folder), "--output", str(tmp_path / "a.gif"), "--format", "gif"]) == 0
-        assert "no depth prior" in refused(capsys, folder, "--path", "training", "--show", "rgb,labels")
-
-    def test_an_empty_run_and_one_of_another_version(
-        self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        assert "has no Gaussian left at step 40" in refused(capsys, emptied(trained, tmp_path / "empty"))
-        assert "version 99" in refused(capsys, of_another_version(trained, tmp_path / "later"))
+def test_a_run_without_a_prior_shows_all_but_it(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "bare"
+    Run(RunSettings(str(room), ("train0", "train1"), iterations=2, hooks=()), folder).train()
+    assert main(["render", str(folder), "--output", str(tmp_path / "a.gif"), "--format", "gif"]) == 0
+    assert "no depth prior" in refused(capsys, folder, "--path", "training", "--show", "rgb,labels")

@@ -20,7 +20,7 @@ from torch import Tensor
 from d2_plugin.viewing.export.scene import ExportScene
 
 STILL = 0.05
-"""Pixels of a training image below which nobody sees that something moves."""
+"""Pixels of a training image; what moves less counts as standing still."""
 GOOD = 0.1
 """Pixels that one Gaussian in a hundred may be off between keys where the size allows it."""
 SAMPLE = 20_000

@@ -67,9 +67,9 @@ class Viewer:
         if d2 is None and viewed is None:
             raise D2Error("a viewer needs something to show: Viewer(d2), or viewed=")
         self.viewed = viewed
-        """What is shown; None until a trainer's first step says it."""
+        """What is shown; None until a trainer's first step."""
         self.marks: Callable[[], Tensor | None] = lambda: None if self.viewed is None else self.viewed.inserted_at
-        """Per Gaussian [N], the step at which D2 inserted it; None where nobody knows."""
+        """Per Gaussian [N], the step at which D2 inserted it; None where that is not known."""
         self.training = Training(iterations) if d2 is not None or iterations is not None else None
         self.height, self.step = height, 0
         self._waiting: list[Any] = []

@@ -52,7 +52,7 @@ class RenderSettings(Settings):
     fps: Annotated[float, Range(*RATES, unit="images per second")] | None = None
     """Of the video; by default those of the recording."""
     degrees: Annotated[float, Range(0, 360, unit="degrees", open_low=True)] | None = None
-    """Angle that an orbit swings; by default what the training cameras span, since nobody saw the rest."""
+    """Angle that an orbit swings; by default what the training cameras span: the rest was not recorded."""
     width: Annotated[int, Range(1, 16384, unit="pixels")] | None = None
     """Width of each image; by default the camera's."""
     height: Annotated[int, Range(1, 16384, unit="pixels")] | None = None
