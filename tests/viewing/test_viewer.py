@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -90,16 +91,14 @@ def port() -> int:
 def test_one_line_shows_any_trainer_and_training_stays_bitwise_the_same(config: D2Config, port: int) -> None:
     alone, watched = make_trainer(config), make_trainer(config)
     alone.run()
-    viewer, client = Viewer(watched.d2, port=port, height=48), looker()
-    try:
+    client = looker()
+    with closing(Viewer(watched.d2, port=port, height=48)) as viewer:
         viewer._connected(client)
         watched.run()
         assert len(client.scene.images) >= 1
         assert client.scene.images[-1].std() > 5
         assert set(viewer.viewed.recording.cameras) == {"cam0", "cam1", "cam2"}
         assert viewer.viewed.duration == 0.5
-    finally:
-        viewer.close()
     assert same(parameters(alone), parameters(watched))
     step = watched.d2.step
     assert step.__func__ is type(watched.d2).step, "closed, it lets go of the trainer"
@@ -124,21 +123,19 @@ class TestWhoOnlyLooks:
         """Share of the whole time that images of `seconds` each take."""
         clock, drawn = Clock(), []
         patch.setattr("d2_plugin.viewing.live.viewer.time", clock)
-        viewer, client = Viewer(viewed=viewed, port=18190, height=48, iterations=self.STEPS), looker()
+        client = looker()
+        with closing(Viewer(viewed=viewed, port=18190, height=48, iterations=self.STEPS)) as viewer:
 
-        def draw(*_: object) -> None:
-            clock.now += seconds
-            drawn.append(seconds)
+            def draw(*_: object) -> None:
+                clock.now += seconds
+                drawn.append(seconds)
 
-        patch.setattr(viewer._drawer, "draw", draw)
-        try:
+            patch.setattr(viewer._drawer, "draw", draw)
             viewer._connected(client)
             for step in range(self.STEPS):
                 clock.now += self.SECONDS_OF_A_STEP
                 client.camera.position = np.full(3, step * moves)
                 viewer.after_step(step)
-        finally:
-            viewer.close()
         assert len(drawn) > 1
         return sum(drawn) / clock.now
 
@@ -358,8 +355,7 @@ class TestAccess:
         from websockets.exceptions import InvalidStatus
         from websockets.sync.client import connect
 
-        viewer = Viewer(viewed=viewed, port=port)
-        try:
+        with closing(Viewer(viewed=viewed, port=port)) as viewer:
             address, _, token = viewer.url.partition("/?token=")
             with pytest.raises(HTTPError, match="403") as refused:
                 urlopen(address)
@@ -372,8 +368,6 @@ class TestAccess:
             with pytest.raises(InvalidStatus, match="403"):
                 connect(socket, origin="http://evil.example", additional_headers={"Cookie": f"{COOKIE}={token}"})
             connect(socket, origin=address, additional_headers={"Cookie": f"{COOKIE}={token}"}).close()
-        finally:
-            viewer.close()
 
 
 class TestSentences:
@@ -421,13 +415,10 @@ class TestSentences:
             Viewer(viewed=viewed, host=host)
 
     def test_who_may_look_is_said(self, viewed: ViewedRun, port: int) -> None:
-        viewer = Viewer(viewed=viewed, port=port)
-        try:
+        with closing(Viewer(viewed=viewed, port=port)) as viewer:
             assert viewer._server.get_host() == "127.0.0.1"
             assert address_line(viewer, "127.0.0.1").endswith("(Ctrl-C ends)")
             assert "everybody who has this address" in address_line(viewer, "0.0.0.0")
-        finally:
-            viewer.close()
 
     def test_nothing_to_show_and_no_viser(self, viewed: ViewedRun, monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(D2Error, match="needs something to show"):
