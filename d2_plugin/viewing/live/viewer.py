@@ -59,9 +59,9 @@ class Viewer:
         Args:
             d2: of a trainer; from here on the page follows its steps.
             viewed: what is shown; of a trainer, its cameras are learnt from the views that it trains on.
-            host: address to listen at; the default is this machine alone, and "0.0.0.0" lets everybody in.
+            host: address to listen at; the default is this machine alone, and "0.0.0.0" is every network that it is in.
             port: the next free one is taken where this one is in use.
-            height: of an image at rest, pixels; half-open menus let each client choose another.
+            height: of an image at rest, pixels; a slider of each page chooses another.
             iterations: how long the training lasts, where that is known.
         """
         if d2 is None and viewed is None:
