@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.recordings.images import opencv
-
 _VIRIDIS = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
 _INFERNO = "000004 1b0c41 4a0c6b 781c6d a52c60 cf4446 ed6925 fb9b06 f7d13d fcffa4"
 
@@ -39,24 +37,36 @@ def color_scale(name: str, steps: int = 256) -> np.ndarray:
     return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
 
 
-def captioned(caption: str, image: np.ndarray, bar: np.ndarray | None = None, size: int = 1) -> np.ndarray:
-    """The image below a line of text, white on dark, and below the colours [N, 3] of a scale.
+def text(line: str, size: int = 1) -> np.ndarray:
+    """Light letters on the background, uint8 [10 size, W, 3].
 
-    `size` multiplies the height of the text, 20 pixels; what is too long is cut, what is not ASCII shows as '?'.
+    Without OpenCV, which draws the letters, an empty strip of one pixel.
     """
-    cv2 = opencv("the captions of images")
-    header = np.full((20 * size, image.shape[1], 3), BACKGROUND, np.uint8)
-    font = cv2.FONT_HERSHEY_SIMPLEX, 0.33 * size, (INK,) * 3, size, cv2.LINE_AA
-    cv2.putText(header, caption, (2 * size, 10 * size), *font)
-    if bar is not None:
-        header[13 * size : 18 * size] = bar[np.linspace(0, len(bar) - 1, image.shape[1]).astype(int)]
-    return np.concatenate([header, image])
+    try:
+        import cv2
+    except ImportError:
+        return np.full((10 * size, 1, 3), BACKGROUND, np.uint8)
+    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.3 * size
+    (width, _), _ = cv2.getTextSize(line, font, scale, size)
+    strip = np.full((10 * size, max(width, 1), 3), BACKGROUND, np.uint8)
+    cv2.putText(strip, line, (0, 8 * size), font, scale, (INK,) * 3, size, cv2.LINE_AA)
+    return strip
 
 
 def side_by_side(panels: Sequence[Panel]) -> np.ndarray:
-    """All panels in one row, each with its caption and colour scale above."""
-    size = int(np.clip(max(panel.image.shape[1] for panel in panels) // 300, 1, 4))
-    drawn = [captioned(panel.caption, panel.image, panel.bar, size) for panel in panels]
-    height = max(image.shape[0] for image in drawn)
-    row = [np.pad(image, ((0, height - len(image)), (0, GAP), (0, 0)), constant_values=BACKGROUND) for image in drawn]
-    return np.concatenate(row, axis=1)[:, :-GAP]
+    """All panels in one row, each with its caption and colour scale above; a caption too long for its panel is cut."""
+    size = int(np.clip(max(panel.image.shape[1] for panel in panels) // 300, 1, 4))  # of the letters, in pixels
+    header = 20 * size
+    height = header + max(panel.image.shape[0] for panel in panels)
+    row: list[np.ndarray] = []
+    for panel in panels:
+        width = panel.image.shape[1]
+        canvas = np.full((height, width, 3), BACKGROUND, np.uint8)
+        letters = text(panel.caption, size)[:, : width - 2 * size]
+        canvas[size : size + letters.shape[0], 2 * size : 2 * size + letters.shape[1]] = letters
+        if panel.bar is not None:
+            place = np.linspace(0, len(panel.bar) - 1, width).astype(int)
+            canvas[13 * size : 18 * size] = panel.bar[place]
+        canvas[header : header + panel.image.shape[0]] = panel.image
+        row += [canvas, np.full((height, GAP, 3), BACKGROUND, np.uint8)]
+    return np.concatenate(row[:-1], axis=1)

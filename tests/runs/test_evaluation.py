@@ -188,8 +188,6 @@ def test_colour_scales_run_from_dark_to_bright() -> None:
 
 
 def test_captions_of_large_images_are_larger() -> None:
-    pytest.importorskip("cv2")
-    assert drawing.captioned("caption", np.zeros((30, 240, 3), np.uint8))[:20].max() > 200, "there are letters"
     small, large = (drawing.Panel("caption", np.zeros((30, width, 3), np.uint8)) for width in (240, 1352))
     assert drawing.side_by_side([small]).shape == (30 + 20, 240, 3)
     assert drawing.side_by_side([large, large]).shape == (30 + 80, 2 * 1352 + drawing.GAP, 3)
