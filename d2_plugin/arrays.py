@@ -62,18 +62,6 @@ def read_array(
             return found
 
 
-def map_array(path: Path | str, remedy: str = RESTORE, *, ndim: int | None = None, kinds: str = NUMBERS) -> np.ndarray:
-    """A .npy file mapped into memory, read only, after its header was held against its size; see `read_array`."""
-    name = shown_path(path)
-    with opened(path, remedy) as file, parsing(name, remedy):
-        size = os.fstat(file.fileno()).st_size
-        shape, columns_first, dtype = _header(file, size, name, remedy, ndim, kinds)
-        order = "F" if columns_first else "C"
-        if math.prod(shape) == 0:  # nothing to map
-            return np.zeros(shape, dtype)
-        return np.memmap(file, dtype, "r", file.tell(), shape, order)  # type: ignore[call-overload]
-
-
 def _array(file: IO[bytes], size: int, name: str, remedy: str, ndim: int | None, kinds: str, most: int) -> np.ndarray:
     """The array that begins where `file` stands, whose file has `size` bytes."""
     shape, columns_first, dtype = _header(file, size, name, remedy, ndim, kinds)

@@ -27,9 +27,6 @@ from d2_plugin.reading import MOST_TEXT, json_text
 LEFTOVER = ".part"
 """How the temporary names end; what a killed process left behind is found by it."""
 
-SEALED = "\n"
-"""How sealed tables begin: one whose seal was overwritten is not taken for one from before there were seals."""
-
 FULL = (errno.ENOSPC, errno.EDQUOT)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
 NO_PLACE = (errno.ENOENT, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP)
@@ -53,8 +50,6 @@ class Kind(NamedTuple):
     name: str
     format: int
     remedy: str
-    since_seals: bool = True
-    """Whether every table of this kind was ever written with a checksum; if not, those without one are read as well."""
 
 
 def cannot_write(path: Path, error: OSError) -> CannotWrite:
@@ -89,7 +84,7 @@ def make_folder(path: Path) -> Path:
 def write(path: Path, *parts: bytes | memoryview, synced: bool = True) -> None:
     """Make `path` hold the parts one after the other; its folder is made where it is missing.
 
-    `synced` waits for the disk, so that a power cut leaves the old file or the new one as well; what nobody reads back,
+    `synced` waits for the disk, so that a power cut leaves the old file or the new one as well; what is not read back,
     or whoever finds it damaged makes again, need not wait.
 
     Raises:
@@ -162,7 +157,7 @@ def write_table(path: Path, values: Mapping[str, Any], kind: Kind, synced: bool 
     """
     sealed = {**values, "format": kind.format}
     sealed["seal"] = _seal(sealed)
-    write_text(path, SEALED + json_text(sealed, str(path), indent=1, sort_keys=True), synced)
+    write_text(path, json_text(sealed, str(path), indent=1, sort_keys=True), synced)
 
 
 def read_table(path: Path, kind: Kind) -> dict[str, Any]:
@@ -173,17 +168,24 @@ def read_table(path: Path, kind: Kind) -> dict[str, Any]:
         OtherFormat: another version wrote it.
         Damaged: it cannot be read, is no table, or its content is not what was written.
     """
-    table, marked = _parsed(path, kind)
-    if not kind.since_seals and not marked and "format" not in table and "seal" not in table:
-        return table
-    found = table.get("format")
-    if found != kind.format:
+    try:
+        refuse_no_file(path)
+        if path.stat().st_size > MOST_TEXT:
+            raise ValueError(f"it has more than {MOST_TEXT} bytes")
+        table = json.loads(path.read_bytes())
+        if not isinstance(table, dict):
+            raise ValueError("it is no table")
+    except (FileNotFoundError, NotADirectoryError):
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise Damaged(f"the {kind.name} {path} is damaged ({error}): {kind.remedy}") from None
+    if table.get("format") != kind.format:
         raise OtherFormat(
-            f"the {kind.name} {path} has format {found} but this version reads format {kind.format}: {kind.remedy}"
+            f"the {kind.name} {path} has format {table.get('format')} but this version reads format {kind.format}: "
+            f"{kind.remedy}"
         )
-    seal = table.pop("seal", None)
-    if seal != _seal(table):
-        raise _damaged(path, kind, "its content differs from its checksum")
+    if table.pop("seal", None) != _seal(table):
+        raise Damaged(f"the {kind.name} {path} is damaged (its content differs from its checksum): {kind.remedy}")
     del table["format"]
     return table
 
@@ -192,27 +194,6 @@ def refuse_no_file(path: Path) -> None:
     """Raise `OSError` where something else than a plain file lies: opening a pipe would wait for ever."""
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError(errno.EINVAL, "it is no plain file")
-
-
-def _parsed(path: Path, kind: Kind) -> tuple[dict[str, Any], bool]:
-    """The table, and whether its file begins as sealed ones do."""
-    try:
-        refuse_no_file(path)
-        if path.stat().st_size > MOST_TEXT:
-            raise ValueError(f"it has more than {MOST_TEXT} bytes")
-        content = path.read_bytes()
-        table = json.loads(content)
-    except (FileNotFoundError, NotADirectoryError):
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise _damaged(path, kind, str(error)) from None
-    if not isinstance(table, dict):
-        raise _damaged(path, kind, "it is no table")
-    return table, content.startswith(SEALED.encode())
-
-
-def _damaged(path: Path, kind: Kind, reason: str) -> Damaged:
-    return Damaged(f"the {kind.name} {path} is damaged ({reason}): {kind.remedy}")
 
 
 def _seal(table: Mapping[str, Any]) -> str:

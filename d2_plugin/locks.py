@@ -41,7 +41,7 @@ def only_writer(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def in_turn(folder: Path) -> Iterator[None]:
-    """Wait until nobody else is within `in_turn` of this folder; for changes that take no time."""
+    """Wait until no other process is within `in_turn` of this folder; for changes that take no time."""
     with _opened(folder) as descriptor:
         _lock(descriptor, folder, exclusive=True, wait=True)
         yield
@@ -49,7 +49,7 @@ def in_turn(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def one_of_many(folder: Path, tidy: Callable[[], None]) -> Iterator[None]:
-    """Write into a folder beside others who do; whoever finds nobody there calls `tidy` first."""
+    """Write into a folder beside other processes that do; the only one there calls `tidy` first."""
     with _opened(folder) as descriptor:
         if _lock(descriptor, folder, exclusive=True, wait=False):
             tidy()

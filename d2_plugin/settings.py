@@ -19,53 +19,41 @@ import inspect
 import textwrap
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
-from typing import Any, NamedTuple, TypeVar, cast, get_args
+from typing import Annotated, Any, NamedTuple, TypeVar, cast, get_args
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.older import hints_of
-from d2_plugin.values import (
-    Angle,
-    AtATime,
-    AtLeastOne,
-    Count,
-    Every,
-    NotNegative,
-    OutOfRange,
-    Positional,
-    Positive,
-    Range,
-    Seed,
-    Share,
-    Steps,
-    bare_and_range,
-    checked,
-    options_of,
-    shown,
-)
+from d2_plugin.values import OutOfRange as OutOfRange
+from d2_plugin.values import Range as Range
+from d2_plugin.values import bare_and_range, options_of, shown
+from d2_plugin.values import checked as checked
 
-__all__ = [
-    "FORMAT",
-    "NONE",
-    "Angle",
-    "AtATime",
-    "AtLeastOne",
-    "Count",
-    "Declared",
-    "Every",
-    "NotNegative",
-    "OutOfRange",
-    "Positional",
-    "Positive",
-    "Range",
-    "Seed",
-    "Settings",
-    "Share",
-    "Steps",
-    "checked",
-    "declared",
-    "of_this_format",
-    "table_of",
-]
+
+@dataclass(frozen=True)
+class Positional:
+    """Marks a setting that the command line takes by its place, not behind a flag: `Annotated[str, Positional()]`."""
+
+
+Count = Annotated[int, Range(0)]
+"""A whole number, 0 or more."""
+Steps = Annotated[int, Range(0, unit="steps")]
+"""Optimizer steps, 0 or more."""
+Every = Annotated[int, Range(1, unit="steps")]
+"""Optimizer steps from one time to the next, 1 or more."""
+AtLeastOne = Annotated[int, Range(1)]
+"""A whole number, 1 or more."""
+AtATime = Annotated[int, Range(1, 1024)]
+"""How many threads or processes work at a time, 1 or more."""
+Seed = Annotated[int, Range(0, 2**63 - 1)]
+"""Seed of a random generator."""
+Positive = Annotated[float, Range(0, open_low=True)]
+"""A number above 0."""
+NotNegative = Annotated[float, Range(0)]
+"""A number, 0 or more."""
+Share = Annotated[float, Range(0, 1)]
+"""A part of a whole, 0..1."""
+Angle = Annotated[float, Range(0, 180, unit="degrees")]
+"""An angle, 0 to 180 degrees."""
 
 FORMAT = 1
 """Version of the settings in files (d2.toml, run.json); it rises when a name gets another meaning."""

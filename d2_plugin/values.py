@@ -51,33 +51,6 @@ class Range:
         return " and ".join(part for part in (low, high) if part) or "finite"
 
 
-@dataclass(frozen=True)
-class Positional:
-    """Marks a setting that the command line takes by its place, not behind a flag: `Annotated[str, Positional()]`."""
-
-
-Count = Annotated[int, Range(0)]
-"""A whole number, 0 or more."""
-Steps = Annotated[int, Range(0, unit="steps")]
-"""Optimizer steps, 0 or more."""
-Every = Annotated[int, Range(1, unit="steps")]
-"""Optimizer steps from one time to the next, 1 or more."""
-AtLeastOne = Annotated[int, Range(1)]
-"""A whole number, 1 or more."""
-AtATime = Annotated[int, Range(1, 1024)]
-"""How many threads or processes work at a time, 1 or more."""
-Seed = Annotated[int, Range(0, 2**63 - 1)]
-"""Seed of a random generator."""
-Positive = Annotated[float, Range(0, open_low=True)]
-"""A number above 0."""
-NotNegative = Annotated[float, Range(0)]
-"""A number, 0 or more."""
-Share = Annotated[float, Range(0, 1)]
-"""A part of a whole, 0..1."""
-Angle = Annotated[float, Range(0, 180, unit="degrees")]
-"""An angle, 0 to 180 degrees."""
-
-
 class OutOfRange(D2Error):
     """A value of the right type that lies outside its declared range."""
 
@@ -119,27 +92,29 @@ def _checked(kind: Any, limits: Range, value: Any, name: str) -> Any:
 
 def _as_kind(kind: Any, limits: Range, value: Any, name: str) -> Any:
     """`value` as one kind that is no union; a number of numpy or torch is the Python number that it holds."""
+    origin = get_origin(kind) or kind
     value = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value
-    if kind is Any:
-        return value
     if _is_choice(kind):
         return _as_choice(kind, value, name)
-    if get_origin(kind) is tuple:
+    if origin is tuple:
         return _as_tuple(get_args(kind), limits, value, name)
+    if origin in LISTS and isinstance(value, Iterable) and not isinstance(value, (str, bytes)):
+        item = (*get_args(kind), Any)[0]
+        return tuple(_checked(*_inner(item, limits), one, f"an item of {name}") for one in value)
     if kind in (int, float):
         return _as_number(kind, limits, value, name)
-    if kind is Path and isinstance(value, (str, Path)) and _names_a_file(value):
-        return Path(value)
-    if kind is Path:
-        raise _wrong(name, "must be a path", value)
-    if isinstance(value, get_origin(kind) or kind):
-        return value
-    raise _wrong(name, f"must be {_noun(kind)}", value)
-
-
-def _names_a_file(path: str | Path) -> bool:
-    """Whether it may be a path; no text at all would be the current folder, and a zero byte ends a name."""
-    return str(path) != "" and "\0" not in str(path)
+    if kind is Path and isinstance(value, (str, Path)) and str(value) != "" and "\0" not in str(value):
+        return Path(value)  # no text at all would be the current folder, and a zero byte ends a name
+    if kind is Path or origin in LISTS:
+        raise _wrong(name, f"must be {_noun(kind)}", value)
+    if origin is Any or not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
+        return value  # what cannot be told apart
+    if not isinstance(value, origin):
+        raise _wrong(name, f"must be {_noun(kind)}", value)
+    if isinstance(value, Mapping) and len(get_args(kind)) == 2:
+        for key, one in value.items():
+            _checked(*_inner(get_args(kind)[1], Range()), one, f"{shown(key)} in {name}")
+    return value
 
 
 def _is_choice(kind: Any) -> bool:
@@ -166,7 +141,7 @@ def _as_number(kind: type, limits: Range, value: Any, name: str) -> int | float:
     if not limits.holds(number):
         unit = f" {limits.unit}" if limits.unit else ""
         if limits.high is not None and FAR[0] <= limits.high <= FAR[1] and number <= limits.high:
-            limits = replace(limits, high=None)  # a bound that nobody came near is no news
+            limits = replace(limits, high=None)  # a bound far away is not worth a word
         raise OutOfRange(str(_wrong(name, f"must be {limits}{unit}", value)))
     return number
 
@@ -200,7 +175,7 @@ def checked_arguments(function: Called) -> Called:
         kinds = _kinds_of(function)
         for name in (kinds.keys() & bound.arguments.keys()) - many:
             where = f"{name} of {getattr(function, '__qualname__', function)}"
-            bound.arguments[name] = _as_argument(kinds[name], bound.arguments[name], where)
+            bound.arguments[name] = fitting(kinds[name], bound.arguments[name], where)
         return function(*bound.args, **bound.kwargs)
 
     return cast(Called, guarded)
@@ -213,36 +188,6 @@ def _kinds_of(function: Any) -> dict[str, Any]:
         return {name: kind for name, kind in hints_of(function).items() if name != "return"}
     except NameError:
         return {}
-
-
-def _as_argument(kind: Any, value: Any, name: str) -> Any:
-    options = options_of(kind)
-    if value is None and type(None) in options:
-        return None
-    options = tuple(option for option in options if option is not type(None))
-    for option in options:
-        bare, limits = bare_and_range(option)
-        origin = get_origin(bare) or bare
-        if origin in LISTS:
-            items = get_args(bare)[:1] or (Any,)
-            if isinstance(value, Iterable) and not isinstance(value, (str, bytes)):
-                return tuple(_as_argument(items[0], item, f"an item of {name}") for item in value)
-        elif origin is Any or not isinstance(origin, type) or getattr(origin, "_is_protocol", False):
-            if not _is_choice(bare) or any(value == choice for choice in get_args(bare)):
-                return value
-        elif origin in (int, float, str, bool, Path):
-            if len(options) == 1:
-                return _as_kind(bare, limits, value, name)
-            if isinstance(value, origin) and (Path not in options or _names_a_file(str(value))):
-                return value
-        elif origin is tuple:
-            return _as_kind(bare, limits, value, name)
-        elif isinstance(value, origin):
-            entries = value.items() if isinstance(value, Mapping) and len(get_args(bare)) == 2 else ()
-            for key, item in entries:
-                _as_argument(get_args(bare)[1], item, f"{shown(key)} in {name}")
-            return value
-    raise _wrong(name, "must be " + " or ".join(_noun(bare_and_range(option)[0]) for option in options), value)
 
 
 def _inner(kind: Any, limits: Range) -> tuple[Any, Range]:

@@ -16,7 +16,7 @@ from small_layouts import small_recording
 from tiny_onnx import mean_network
 
 from benchmarks.report import EVERY
-from d2_plugin.arrays import map_array, read_array
+from d2_plugin.arrays import read_array
 from d2_plugin.config import D2Config, for_iterations
 from d2_plugin.priors.colmap.dense_arrays import read_dense_array
 from d2_plugin.priors.depth_on_disk import SensorDepth
@@ -29,8 +29,8 @@ from d2_plugin.recordings.importing.video import VideoFrames, video_header
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.runs.report.report import collect, make_report
 from d2_plugin.store.exported import RenamedStore
+from d2_plugin.viewing.camera_paths import read_camera_path
 from d2_plugin.viewing.checkpoints import read_ply
-from d2_plugin.viewing.videos.path_file import read_camera_path
 
 cv2 = pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
@@ -113,7 +113,6 @@ CASES = {
         D2Config.from_toml,
     ),
     "npy": Case("a.npy", lambda p: np.save(p, MAP), read_array),
-    "npy mapped": Case("a.npy", lambda p: np.save(p, MAP), map_array),
     "npz": Case("a.npz", lambda p: np.savez_compressed(p, depth=MAP), lambda p: read_array(p, key="depth", ndim=2)),
     "png": Case("a.png", lambda p: write_png(p, IMAGE), lambda p: (image_size(p), read_image(p))),
     "jpeg": Case("a.jpg", lambda p: cv2.imwrite(str(p), IMAGE), lambda p: (image_size(p), read_image(p))),

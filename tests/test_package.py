@@ -44,7 +44,8 @@ def extras_in(text: str) -> set[str]:
 def calls(function: str) -> Iterator[tuple[str, ast.Call]]:
     """Every call of `function` in the code, with its place."""
     for path in sorted(path for folder in CODE for path in (ROOT / folder).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        text = path.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(text)) if f"{function}(" in text else ():
             if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] == function:
                 yield f"{path.relative_to(ROOT)}, line {node.lineno}", node
 
@@ -52,7 +53,8 @@ def calls(function: str) -> Iterator[tuple[str, ast.Call]]:
 def tables(name: str) -> Iterator[dict]:
     """Every dictionary of that name that a module of the plugin holds, read from its text."""
     for path in sorted((ROOT / "d2_plugin").rglob("*.py")):
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        text = path.read_text(encoding="utf-8")
+        for node in ast.parse(text).body if f"{name} = " in text else ():
             if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name:
                 yield ast.literal_eval(node.value)
 

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from d2_plugin.arrays import map_array, read_array
+from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import (
     NoSuchFile,
-    Unreadable,
     field,
     json_text,
     parse_json,
@@ -26,7 +25,7 @@ from d2_plugin.reading import (
     read_toml,
     shown_path,
 )
-from d2_plugin.values import Positive
+from d2_plugin.settings import Positive
 
 
 def refusal(call: Any, *given: Any, **more: Any) -> str:
@@ -161,17 +160,13 @@ class TestArrays:
         array = np.asarray(np.arange(6).reshape(2, 3), dtype, order)
         np.save(tmp_path / "a.npy", array)
         np.savez_compressed(tmp_path / "a.npz", depth=array)
-        for found in (
-            read_array(tmp_path / "a.npy", ndim=2),
-            read_array(tmp_path / "a.npz", key="depth"),
-            map_array(tmp_path / "a.npy"),
-        ):
+        for found in (read_array(tmp_path / "a.npy", ndim=2), read_array(tmp_path / "a.npz", key="depth")):
             assert found.dtype == array.dtype
             assert np.array_equal(found, array)
 
     def test_an_empty_array_has_its_shape(self, tmp_path: Path) -> None:
         np.save(tmp_path / "a.npy", np.zeros((0, 3)))
-        assert read_array(tmp_path / "a.npy").shape == map_array(tmp_path / "a.npy").shape == (0, 3)
+        assert read_array(tmp_path / "a.npy").shape == (0, 3)
 
     @pytest.mark.parametrize(
         ("content", "says"),
@@ -194,7 +189,6 @@ class TestArrays:
     def test_what_is_not_what_it_says(self, tmp_path: Path, content: bytes, says: str) -> None:
         (tmp_path / "a.npy").write_bytes(content)
         assert says in refusal(read_array, tmp_path / "a.npy")
-        assert says in refusal(map_array, tmp_path / "a.npy")
 
     def test_another_number_of_axes_or_too_many_bytes(self, tmp_path: Path) -> None:
         np.save(tmp_path / "a.npy", np.zeros((2, 3)))
@@ -225,7 +219,3 @@ def test_an_unknown_name_is_repeated_up_to_a_hundred_letters_on_one_line() -> No
     text = str(unknown_name("setting", "a\nb" + "1" * 5000, ["ab"]))
     assert len(text) < 200
     assert "\n" not in text
-
-
-def test_an_unreadable_file_is_an_error_of_ours() -> None:
-    assert issubclass(Unreadable, D2Error)

@@ -20,7 +20,7 @@ from d2_plugin.errors import D2Error
 
 if TYPE_CHECKING:
     from d2_plugin.runs.run import Run
-    from d2_plugin.viewing.live.run import LiveRun
+    from d2_plugin.viewing.live.show import LiveRun
 
 OF_THE_RUN = (
     *("test_cameras", "backbone", "iterations", "hooks", "priors", "priors_in_step", "accept_empty_prior"),
@@ -104,8 +104,8 @@ def _refuse_videos(path: Path) -> None:
 
 def _live(run: Run) -> LiveRun:
     """The page of a run; its package is asked for before anything is computed."""
-    from d2_plugin.viewing.live.run import LiveRun
-    from d2_plugin.viewing.live.viewer import viser
+    from d2_plugin.viewing.live.server import viser
+    from d2_plugin.viewing.live.show import LiveRun
 
     viser()
     return LiveRun(run)

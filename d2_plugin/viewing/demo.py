@@ -14,13 +14,14 @@ from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.images import read_image, write_png
 from d2_plugin.recordings.synthetic.room import split, synthetic_recording
-from d2_plugin.runs.drawing import BACKGROUND, text
+from d2_plugin.runs.drawing import Panel, side_by_side
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings
 from d2_plugin.runs.tables import metrics_table
 from d2_plugin.settings import Range, Settings
 from d2_plugin.viewing.export.page import write_page
-from d2_plugin.viewing.export.scene import scene_of
+from d2_plugin.viewing.export.scene import export_scene
+from d2_plugin.viewing.viewed import viewed_run
 
 VARIANTS = {"backbone": (), "backbone + D2": HOOK_NAMES}
 """Name -> hooks."""
@@ -45,10 +46,12 @@ def run(settings: Demo) -> str:
     All runs start from the same points and take the same number of iterations; a demo that was cut off goes on.
     """
     folder = settings.output
-    path = _recording(folder / "recording")
+    path = folder / "recording"
+    if not path.is_dir():  # one that is there is whole, because it is written beside and renamed
+        save_recording(synthetic_recording(), path)
     _compile_kernels()
     train, held_out = split(open_recording(path))
-    runs = {}
+    runs, scores = {}, {}
     for name, hooks in VARIANTS.items():
         chosen = RunSettings(
             *(str(path), tuple(train)),
@@ -56,25 +59,18 @@ def run(settings: Demo) -> str:
             hooks=hooks,
             priors=str(folder / "priors") if hooks else None,
         )
-        run = Run(chosen, folder / name.replace(" + ", "_").lower())
-        run.train()
-        runs[name] = (run, run.evaluate())
+        runs[name] = Run(chosen, folder / name.replace(" + ", "_").lower())
+        runs[name].train()
+        scores[name] = runs[name].evaluate()
     image = folder / "comparison.png"
-    _compare({name: run.folder for name, (run, _) in runs.items()}, held_out[len(held_out) // 2], image)
-    table = metrics_table({name: metrics for name, (_, metrics) in runs.items()})
+    _compare({name: run.folder for name, run in runs.items()}, held_out[len(held_out) // 2], image)
+    table = metrics_table(scores)
     page = folder / "player.html"
-    write_page(scene_of(runs[PLAYED][0]), page)
+    write_page(export_scene(viewed_run(runs[PLAYED].folder)), page)
     return (
         f"{table}\nThe recording is rendered and its monocular depth is emulated.\nImage: {image}\n"
         f"Player: {page} (open it in a browser; it plays '{PLAYED}' without a network)"
     )
-
-
-def _recording(path: Path) -> Path:
-    """The recording at `path`: what stands there is whole, because it is written beside and renamed."""
-    if not path.is_dir():
-        save_recording(synthetic_recording(), path)
-    return path
 
 
 def _compile_kernels() -> None:
@@ -86,12 +82,8 @@ def _compile_kernels() -> None:
 
 def _compare(folders: dict[str, Path], camera: str, image: Path) -> None:
     """The same held-out view of every run, one row of panels per run."""
-    rows: list[np.ndarray] = []
+    rows = []
     for name, folder in folders.items():
-        found = sorted((folder / "images").glob(f"{camera}_*.png"))
-        panels = read_image(found[len(found) // 2])
-        title = np.full((14, panels.shape[1], 3), BACKGROUND, np.uint8)
-        letters = text(name)
-        title[2 : 2 + len(letters), 2 : 2 + letters.shape[1]] = letters
-        rows += [title, panels]
+        images = sorted((folder / "images").glob(f"{camera}_*.png"))
+        rows.append(side_by_side([Panel(name, read_image(images[len(images) // 2]))]))
     write_png(image, np.concatenate(rows))

@@ -1,22 +1,22 @@
-"""The kinds of image that can be shown of one view, in one table: what each needs, and how it is drawn."""
+"""The kinds of image that can be shown of one view, by the names that --show takes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
+from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.sheet import LABEL_COLORS, SURE, UNKNOWN, UNSURE, label_colors, sigma_colors
+from d2_plugin.priors.sheet import LABEL_COLORS, SURE, UNSURE, label_colors, sigma_colors
 from d2_plugin.protocol import DepthPrior, Label, View
 from d2_plugin.recordings.images import opencv
 from d2_plugin.runs.drawing import Panel, color_scale, colorize
-from d2_plugin.viewing.look import Look, gaussians_per_pixel, look
-from d2_plugin.viewing.paths import Lens
-from d2_plugin.viewing.subject import Subject
+from d2_plugin.viewing.camera_paths import Lens
+from d2_plugin.viewing.rendering import RenderedView, gaussians_per_pixel, render_view
+from d2_plugin.viewing.viewed import ViewedRun
 
 ERROR_SHOWN = 0.25
 """Absolute colour error, mean over channels, at the bright end of its scale."""
@@ -28,44 +28,39 @@ Scale = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One view of one subject, with everything that a panel may ask for, computed when asked for."""
+    """One view of one run, with everything that a panel may need, computed at first use."""
 
-    subject: Subject
+    viewed: ViewedRun
     view: View
-    depths: Scale
-    """Depths at both ends of the colours: the same for all images of a video, or it would flicker."""
+    depths: Scale | None = None
+    """Depths at both ends of the colours, the same for all images of a video, or it would flicker; by default those of
+    this image."""
+    min_opacity: float = 0.0
+    marked: Tensor | None = None
+    """See `render_view`."""
 
     @cached_property
-    def look(self) -> Look:
+    def rendered(self) -> RenderedView:
         """What the backbone shows."""
-        return look(self.subject.backbone, self.view)
+        return render_view(self.viewed.backbone, self.view, self.min_opacity, self.marked)
 
     @cached_property
     def truth(self) -> np.ndarray:
         """The recorded image, RGB uint8 [H, W, 3] at the view's size."""
-        image = self.subject.recording.image(self.view.camera, self.view.frame)
+        image = self.viewed.recording.image(self.view.camera, self.view.frame)
         return fitted(image, self.view.width, self.view.height)
 
     @cached_property
     def prior(self) -> DepthPrior | None:
         """The depth prior of this view at its own size; None where the store has none."""
-        store = self.subject.store
+        store = self.viewed.store
         known = store is not None and self.view.camera in store.cameras
         return store.prior(self.view.camera, self.view.frame) if known and store is not None else None
 
 
-class Kind(NamedTuple):
-    """One kind of image."""
-
-    draw: Callable[[Shot], Panel]
-    about: str
-    needs: str = "gaussians"
-    """`gaussians`; or `truth`, `prior`: also a camera and a frame of the recording."""
-
-
 def rgb(shot: Shot) -> Panel:
     """The render."""
-    return Panel("render", as_bytes(shot.look.color.numpy()))
+    return Panel("render", as_bytes(shot.rendered.color.numpy()))
 
 
 def truth(shot: Shot) -> Panel:
@@ -75,20 +70,20 @@ def truth(shot: Shot) -> Panel:
 
 def depth(shot: Shot) -> Panel:
     """Rendered depth."""
-    return _depth_panel("depth", shot.look.depth.numpy(), shot.depths)
+    return _depth_panel("depth", shot.rendered.depth.numpy(), shot.depths)
 
 
 def true_depth(shot: Shot) -> Panel:
     """The recording's true depth; black where it is unknown."""
-    found = shot.subject.recording.depth(shot.view.camera, shot.view.frame)
+    recorded = shot.viewed.recording.depth(shot.view.camera, shot.view.frame)
     size = shot.view.width, shot.view.height
-    exact = np.zeros(size[::-1], np.float32) if found is None else fitted(found, *size, nearest=True)
+    exact = np.zeros(size[::-1], np.float32) if recorded is None else fitted(recorded, *size, nearest=True)
     return _depth_panel("true depth", exact, shot.depths)
 
 
 def error(shot: Shot) -> Panel:
     """Absolute error of the render against the recorded image."""
-    difference = np.abs(shot.look.color.numpy() - shot.truth / np.float32(255))
+    difference = np.abs(shot.rendered.color.numpy() - shot.truth / np.float32(255))
     scale = color_scale("inferno")
     noise = float(np.mean(difference**2))
     score = f"  {-10 * np.log10(noise):.1f} dB" if noise > 0 else ""
@@ -98,24 +93,24 @@ def error(shot: Shot) -> Panel:
 def alpha(shot: Shot) -> Panel:
     """Accumulated alpha."""
     scale = np.arange(256, dtype=np.uint8)[:, None].repeat(3, 1)
-    return Panel("alpha 0..1", colorize(shot.look.alpha.numpy(), 0, 1, scale), scale)
+    return Panel("alpha 0..1", colorize(shot.rendered.alpha.numpy(), 0, 1, scale), scale)
 
 
 def count(shot: Shot) -> Panel:
     """Gaussians per pixel."""
-    found = gaussians_per_pixel(shot.look.splats, shot.view, shot.subject.backbone.settings).numpy()
-    scale, most = color_scale("inferno"), np.log1p(MOST_GAUSSIANS)
-    return Panel(f"Gaussians 0..{MOST_GAUSSIANS:g} (log)", colorize(np.log1p(found), 0, most, scale), scale)
+    number = gaussians_per_pixel(shot.rendered.splats, shot.view, shot.viewed.backbone.settings).numpy()
+    scale, most = color_scale("inferno"), float(np.log1p(MOST_GAUSSIANS))
+    return Panel(f"Gaussians 0..{MOST_GAUSSIANS:g} (log)", colorize(np.log1p(number), 0, most, scale), scale)
 
 
 def prior(shot: Shot) -> Panel:
     """The depth prior D*."""
-    return _depth_panel("prior", _of_prior(shot, lambda found: found.depth.numpy()), shot.depths)
+    return _depth_panel("prior", _of_prior(shot, lambda prior: prior.depth.numpy()), shot.depths)
 
 
 def sigma(shot: Shot) -> Panel:
     """How wrong the prior says it may be."""
-    image = _of_prior(shot, lambda found: sigma_colors(_sigma_of(found), found.depth.numpy()))
+    image = _of_prior(shot, prior_sigma_colors)
     rows = np.geomspace(SURE, UNSURE, 256, dtype=np.float32)[None]
     bar = sigma_colors(rows, np.ones_like(rows))[0]
     return Panel(f"sigma {SURE:.1%}..{UNSURE:.0%}", image, bar)
@@ -123,25 +118,27 @@ def sigma(shot: Shot) -> Panel:
 
 def labels(shot: Shot) -> Panel:
     """What the prior knows about each pixel."""
-    image = _of_prior(shot, lambda found: label_colors(found.labels.numpy()))
+    image = _of_prior(shot, lambda prior: label_colors(prior.labels.numpy()))
     shown = (Label.VERIFIED, Label.AGREED, Label.MONO, Label.FAR, Label.CONFLICT, Label.EMPTY)
     bar = np.array([LABEL_COLORS[label] for label in shown], np.uint8).repeat(64, axis=0)
     return Panel("verified agreed mono far conflict empty", image, bar)
 
 
-KINDS = {
-    "rgb": Kind(rgb, "the render"),
-    "depth": Kind(depth, "rendered depth"),
-    "alpha": Kind(alpha, "accumulated opacity"),
-    "count": Kind(count, "Gaussians per pixel"),
-    "truth": Kind(truth, "the recorded image", "truth"),
-    "error": Kind(error, "absolute error against it", "truth"),
-    "true-depth": Kind(true_depth, "the recording's own depth", "truth"),
-    "prior": Kind(prior, "the depth prior", "prior"),
-    "sigma": Kind(sigma, "how wrong the prior may be", "prior"),
-    "labels": Kind(labels, "what the prior knows", "prior"),
+KINDS: dict[str, Callable[[Shot], Panel]] = {
+    "rgb": rgb,
+    "depth": depth,
+    "alpha": alpha,
+    "count": count,
+    "truth": truth,
+    "error": error,
+    "true-depth": true_depth,
+    "prior": prior,
+    "sigma": sigma,
+    "labels": labels,
 }
 """By the name that --show takes."""
+RECORDED = ("truth", "error", "true-depth", "prior", "sigma", "labels")
+"""Those that exist at the recording's own cameras and frames only."""
 
 
 def fitted(array: np.ndarray, width: int, height: int, nearest: bool = False) -> np.ndarray:
@@ -169,21 +166,17 @@ def depth_scale(depths: Sequence[np.ndarray]) -> Scale:
     return float(low), float(high)
 
 
-def depth_image(depth: np.ndarray, depths: Scale) -> np.ndarray:
-    """RGB uint8 [H, W, 3], near is dark; black where nothing is known."""
-    known = np.isfinite(depth) & (depth > 0)
-    image = colorize(np.where(known, depth, 0), *depths, color_scale("viridis"))
-    return np.where(known[..., None], image, np.uint8(0))
-
-
 def as_bytes(image: np.ndarray) -> np.ndarray:
     """RGB uint8 of an image in 0..1."""
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
-def _depth_panel(title: str, depth: np.ndarray, depths: Scale) -> Panel:
-    low, high = depths
-    return Panel(f"{title} {low:.3g}..{high:.3g}", depth_image(depth, depths), color_scale("viridis"))
+def _depth_panel(title: str, depth: np.ndarray, depths: Scale | None) -> Panel:
+    """Near is dark; black where nothing is known."""
+    low, high = depths or depth_scale([depth])
+    known, scale = np.isfinite(depth) & (depth > 0), color_scale("viridis")
+    image = colorize(np.where(known, depth, 0), low, high, scale)
+    return Panel(f"{title} {low:.3g}..{high:.3g}", np.where(known[..., None], image, np.uint8(0)), scale)
 
 
 def _of_prior(shot: Shot, draw: Callable[[DepthPrior], np.ndarray]) -> np.ndarray:
@@ -196,8 +189,7 @@ def _of_prior(shot: Shot, draw: Callable[[DepthPrior], np.ndarray]) -> np.ndarra
     return fitted(draw(shot.prior), shot.view.width, shot.view.height, nearest=True)
 
 
-def _sigma_of(found: DepthPrior) -> np.ndarray:
-    return np.full(found.depth.shape, np.inf, np.float32) if found.sigma is None else found.sigma.numpy()
-
-
-__all__ = ["KINDS", "UNKNOWN", "Kind", "Scale", "Shot", "as_bytes", "depth_image", "depth_scale", "fitted"]
+def prior_sigma_colors(prior: DepthPrior) -> np.ndarray:
+    """RGB uint8 [h, w, 3] of the relative standard deviation that a prior declares, grey where it declares none."""
+    sigma = np.full(prior.depth.shape, np.inf, np.float32) if prior.sigma is None else prior.sigma.numpy()
+    return sigma_colors(sigma, prior.depth.numpy())

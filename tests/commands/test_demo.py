@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from oracles.export_files import ReadPage
 
 from d2_plugin.commands.cli import main
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export import folder as folder_layout
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.viewing import demo
-from d2_plugin.viewing.export.page import read_page
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
@@ -49,6 +49,6 @@ def test_a_demo_cut_off_while_it_writes_its_recording_goes_on(
     assert all(f"| {name}" in out for name in demo.VARIANTS)
     assert (tmp_path / "demo" / "comparison.png").is_file()
     assert f"Player: {tmp_path / 'demo' / 'player.html'}" in out
-    assert read_page(tmp_path / "demo" / "player.html").header["name"] == "recording"
+    assert ReadPage(tmp_path / "demo" / "player.html").header["name"] == "recording"
     assert len(open_recording(tmp_path / "demo" / "recording").frames) == 2
     assert not list((tmp_path / "demo").glob("*unfinished*"))

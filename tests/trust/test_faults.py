@@ -1,14 +1,17 @@
-"""A disk that fails: one sentence, nothing lost, and the same command again gives bitwise what it would have given."""
+"""A disk that fails, kill -9 at any moment: nothing is lost, and the same command again ends bitwise as undisturbed."""
 
 from __future__ import annotations
 
 import errno
+import logging
+import random
 from typing import Any
 
 import pytest
 from trust_commands import FAIL_FROM, FAIL_ONCE, KILL_AFTER_RENAME, KILL_BEFORE_RENAME, Fault, contents, killed
 
 WORK = ("import", "priors", "train", "eval", "export", "page", "report")
+KILLS = 20
 ERRORS = {errno.ENOSPC: "No space left on device", errno.EIO: "Input/output error"}
 
 
@@ -85,3 +88,31 @@ def test_every_write_may_fail_once(workplace: Any, name: str) -> None:
 def test_every_rename_may_be_the_last_thing_that_happens(workplace: Any, name: str) -> None:
     for at in range(workplace.renames[name]):
         is_killed_and_goes_on(workplace, name, at, KILL_BEFORE_RENAME if at % 2 else KILL_AFTER_RENAME)
+
+
+def killed_at_random(place: Any, name: str, draw: random.Random, times: int) -> int:
+    """Kill the command at moments drawn from its CPU time, so many times in a row; then it is run to its end.
+
+    Returns how many kills came before its end: what was killed before has less left to do.
+    """
+    work, hits = place.work[name], 0
+    work.anew()
+    for _ in range(times):
+        hits += killed(place.commands.kill_after(work.words, draw.uniform(0, place.cpu[name])))
+    goes_on(place, name)
+    return hits
+
+
+@pytest.mark.parametrize("name", ["priors", "train", "export"])
+def test_a_killed_command_goes_on_to_the_same_end(workplace: Any, name: str) -> None:
+    killed_at_random(workplace, name, random.Random(f"{name} 1"), 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WORK)
+def test_twenty_kills_at_random_moments(workplace: Any, name: str) -> None:
+    draw, hits, ends = random.Random(f"{name} 20"), 0, 0
+    while hits < KILLS and ends < 3 * KILLS:
+        hits, ends = hits + killed_at_random(workplace, name, draw, draw.choice((1, 1, 2, 3))), ends + 1
+    logging.getLogger(__name__).info("%s: %d kills, %d times to the same end", name, hits, ends)
+    assert hits >= KILLS

@@ -25,8 +25,7 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.store.store import PriorStore
 from d2_plugin.values import checked_arguments
-from d2_plugin.viewing.checkpoints import open_subject, read_ply
-from d2_plugin.viewing.export.page import read_page
+from d2_plugin.viewing.checkpoints import open_viewed, read_ply
 from d2_plugin.viewing.videos.video import write_video
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
@@ -53,9 +52,8 @@ def as_a_path(path: Path) -> dict[str, Call]:
         "PriorStore.open": PriorStore.open,
         "D2Config.from_toml": D2Config.from_toml,
         "Run.load": Run.load,
-        "open_subject": open_subject,
+        "open_viewed": open_viewed,
         "read_ply": read_ply,
-        "read_page": read_page,
     }
 
 

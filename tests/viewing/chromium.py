@@ -42,9 +42,10 @@ class Page:
     def __init__(self, page: Any) -> None:
         self.page = page
         self.complaints: list[str] = []
+        self.errors: list[str] = []
         self.requests: list[str] = []
         page.on("console", lambda message: self._heard(message.type, message.text))
-        page.on("pageerror", lambda error: self.complaints.append(f"error: {error}"))
+        page.on("pageerror", lambda error: (self.complaints.append(f"error: {error}"), self.errors.append(str(error))))
         page.on("request", lambda request: self._asked(request.url))
 
     def _heard(self, kind: str, text: str) -> None:

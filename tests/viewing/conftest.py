@@ -10,7 +10,7 @@ from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
-from d2_plugin.viewing.subject import Subject, subject_of_run
+from d2_plugin.viewing.viewed import ViewedRun, viewed_run
 
 CAMERAS = ("train0", "train1", "train2")
 
@@ -33,6 +33,6 @@ def trained(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def subject(trained: Path) -> Subject:
+def viewed(trained: Path) -> ViewedRun:
     """The same run, opened."""
-    return subject_of_run(trained)
+    return viewed_run(trained)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
 import torch
+
+from d2_plugin.durable import write_table
+from d2_plugin.runs.saved.kinds import RUN, read_run
 
 
 def still_training(trained: Path, copy: Path, step: int) -> Path:
@@ -33,7 +35,5 @@ def emptied(trained: Path, copy: Path) -> Path:
 def of_another_version(trained: Path, copy: Path) -> Path:
     """A copy of a run that a later program wrote."""
     shutil.copytree(trained, copy)
-    table = json.loads((copy / "run.json").read_text())
-    plain = {name: value for name, value in table.items() if name not in ("format", "seal")}
-    (copy / "run.json").write_text(json.dumps(plain | {"version": 99}))
+    write_table(copy / "run.json", read_run(copy) | {"version": 99}, RUN)
     return copy

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from mimics import fudan, spacetime
+from oracles.export_files import ReadPage
 from torch import Tensor
 from viewing import official
 
@@ -18,23 +19,21 @@ from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import View
 from d2_plugin.runs.run import Run
-from d2_plugin.viewing.checkpoints import open_subject
+from d2_plugin.viewing.camera_paths import pose_of
+from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.checkpoints.files import read_options, read_ply
-from d2_plugin.viewing.checkpoints.hexplanes import PlaneField
-from d2_plugin.viewing.checkpoints.networks import MotionNetwork
-from d2_plugin.viewing.checkpoints.tuples import FOUR_C, FOUR_C_STATIC, FUDAN, PLANES, STATIC
-from d2_plugin.viewing.export.page import read_page
-from d2_plugin.viewing.live.show import ViewSettings, subject_at
-from d2_plugin.viewing.look import look
-from d2_plugin.viewing.paths import pose_of
-from d2_plugin.viewing.subject import Subject
+from d2_plugin.viewing.checkpoints.models import FOUR_C, FOUR_C_STATIC, FUDAN, PLANES, STATIC
+from d2_plugin.viewing.checkpoints.networks import MotionNetwork, PlaneField
+from d2_plugin.viewing.live.show import ViewSettings, viewed_at
+from d2_plugin.viewing.rendering import render_view
+from d2_plugin.viewing.viewed import ViewedRun
 
 SIZE = (96, 54)
 
 
-def seen(subject: Subject, time: float, camera: str = "train0") -> Any:
-    """The subject's view of a camera of the recording."""
-    return subject.view(pose_of(subject.recording.cameras[camera]), time, SIZE)
+def seen(viewed: ViewedRun, time: float, camera: str = "train0") -> Any:
+    """The viewed's view of a camera of the recording."""
+    return viewed.view(pose_of(viewed.recording.cameras[camera]), time, SIZE)
 
 
 def close(a: Tensor, b: Any, within: float = 2e-5) -> bool:
@@ -62,18 +61,18 @@ class TestTuples:
         from d2_plugin.adapters.fudan import FudanAdapter
 
         model = self.checkpoint(tmp_path / "chkpnt30000.pth", layout)
-        found = open_subject(tmp_path / "chkpnt30000.pth", room, ["train0", "train1"])
+        found = open_viewed(tmp_path / "chkpnt30000.pth", room, ["train0", "train1"])
         assert found.test_cameras == ("train2", "test0")
         view = seen(found, 0.1)
-        assert torch.equal(look(found.backbone, view).color, look(FudanAdapter(model), view).color)
+        assert torch.equal(render_view(found.backbone, view).color, render_view(FudanAdapter(model), view).color)
         assert found.note == "times are taken to be seconds since the first frame"
         with pytest.raises(D2Error, match="name its recording with --recording"):
-            open_subject(tmp_path / "chkpnt30000.pth")
+            open_viewed(tmp_path / "chkpnt30000.pth")
 
     @pytest.mark.parametrize("layout", [STATIC, FOUR_C_STATIC], ids=["3DGS", "4C4D without time"])
     def test_without_time_they_stand_still(self, room: Path, tmp_path: Path, layout: tuple[str, ...]) -> None:
         self.checkpoint(tmp_path / "chkpnt7000.pth", layout)
-        found = open_subject(tmp_path / "chkpnt7000.pth", room)
+        found = open_viewed(tmp_path / "chkpnt7000.pth", room)
         assert found.note == "3D Gaussians stand still"
         early, late = (found.backbone.slice_at(seen(found, time)) for time in (0.0, 0.2))
         assert torch.equal(early.means, late.means)
@@ -85,12 +84,12 @@ class TestTuples:
         self.checkpoint(path)
         with_own = np.float32(0).__reduce__()[0].__module__.encode()
         rewritten(path, with_own + b"\n", core + b".multiarray\n")
-        assert len(open_subject(path, room).backbone)
+        assert len(open_viewed(path, room).backbone)
 
     def test_another_number_of_entries_is_refused_by_name(self, room: Path, tmp_path: Path) -> None:
         torch.save((tuple(range(40)), 1), tmp_path / "chkpnt1.pth")
         with pytest.raises(D2Error, match=r"has 40 entries, expected 19 \(fudan\), 21 \(4C4D\).*Viewer\(d2\)"):
-            open_subject(tmp_path / "chkpnt1.pth", room)
+            open_viewed(tmp_path / "chkpnt1.pth", room)
 
 
 def rewritten(path: Path, old: bytes, new: bytes) -> None:
@@ -131,7 +130,7 @@ class TestDeformable3D:
 
     def test_its_output_folder_is_shown_at_the_last_iteration(self, room: Path, tmp_path: Path) -> None:
         model = self.output(tmp_path)
-        found = open_subject(tmp_path, room)
+        found = open_viewed(tmp_path, room)
         half = found.duration / 2
         assert seen(found, half).time == pytest.approx(0.5)
         drawn = found.backbone.slice_at(seen(found, official.TIME * found.duration))
@@ -149,25 +148,23 @@ class TestDeformable3D:
         assert close(trace, (torch.stack([first, second, third], -1) * scales**2).sum(1), 1e-2)
         assert found.backbone.colors(seen(found, half), drawn).shape == (40, 3)
 
-    def test_a_point_cloud_without_its_network_is_refused(self, room: Path, tmp_path: Path) -> None:
+    def test_a_point_cloud_without_its_network_or_with_another_is_refused(self, room: Path, tmp_path: Path) -> None:
         self.output(tmp_path)
-        (tmp_path / "deform" / "iteration_40000" / "deform.pth").unlink()
-        with pytest.raises(D2Error, match="a point cloud of Deformable-3D-Gaussians moves by it, copy both"):
-            open_subject(tmp_path, room)
-
-    def test_another_network_is_refused(self, room: Path, tmp_path: Path) -> None:
-        self.output(tmp_path)
-        torch.save({"layer.weight": torch.zeros(3)}, tmp_path / "deform" / "iteration_40000" / "deform.pth")
+        weights = tmp_path / "deform" / "iteration_40000" / "deform.pth"
+        torch.save({"layer.weight": torch.zeros(3)}, weights)
         with pytest.raises(D2Error, match=r"has no linear\.0\.weight: it is no network of Deformable-3D-Gaussians"):
-            open_subject(tmp_path, room)
+            open_viewed(tmp_path, room)
+        weights.unlink()
+        with pytest.raises(D2Error, match="a point cloud of Deformable-3D-Gaussians moves by it, copy both"):
+            open_viewed(tmp_path, room)
 
     def test_d2_view_takes_the_folder_for_a_checkpoint_and_not_for_a_recording(
         self, room: Path, tmp_path: Path
     ) -> None:
         self.output(tmp_path)
-        assert len(subject_at(ViewSettings(tmp_path, recording=room)).backbone) == 40
+        assert len(viewed_at(ViewSettings(tmp_path, recording=room)).backbone) == 40
         with pytest.raises(D2Error, match=r"point_cloud\.ply does not say where its cameras stood"):
-            subject_at(ViewSettings(tmp_path))
+            viewed_at(ViewSettings(tmp_path))
 
 
 class Test4DGaussians:
@@ -197,7 +194,7 @@ class Test4DGaussians:
 
     def test_its_output_folder_is_shown_as_the_field_moves_it(self, room: Path, tmp_path: Path) -> None:
         model = self.output(tmp_path)
-        found = open_subject(tmp_path, room)
+        found = open_viewed(tmp_path, room)
         # Frame 2 of 4 is at its time 2 / 4: readers of several cameras divide by the number of frames.
         assert seen(found, found.recording.seconds(2)).time == pytest.approx(0.5)
         at = seen(found, official.TIME * 4 / found.recording.fps)
@@ -209,7 +206,7 @@ class Test4DGaussians:
         colors = {}
         for name, still in (("still", True), ("deformed", False)):
             self.output(tmp_path / name, no_dshs=still)
-            found = open_subject(tmp_path / name, room)
+            found = open_viewed(tmp_path / name, room)
             early, late = (seen(found, time) for time in (0.0, found.duration))
             means = found.backbone.slice_at(early)  # the same directions for both
             colors[name] = [found.backbone.colors(view, means) for view in (early, late)]
@@ -220,24 +217,21 @@ class Test4DGaussians:
         model = self.output(tmp_path) | {"deformation": official.plane_field(), "active_sh_degree": 3}
         values = [model.get(name, torch.zeros(1)) for name in PLANES]
         torch.save((tuple(values), 14000), tmp_path / "chkpnt_fine_14000.pth")
-        both = [open_subject(path, room) for path in (tmp_path, tmp_path / "chkpnt_fine_14000.pth")]
+        both = [open_viewed(path, room) for path in (tmp_path, tmp_path / "chkpnt_fine_14000.pth")]
         views = [seen(found, 0.1) for found in both]
-        images = [look(found.backbone, view) for found, view in zip(both, views, strict=True)]
+        images = [render_view(found.backbone, view) for found, view in zip(both, views, strict=True)]
         assert torch.equal(images[0].color, images[1].color)
         torch.save((tuple(values), 3000), tmp_path / "chkpnt_coarse_3000.pth")
-        still = open_subject(tmp_path / "chkpnt_coarse_3000.pth", room)
+        still = open_viewed(tmp_path / "chkpnt_coarse_3000.pth", room)
         assert close(still.backbone.slice_at(seen(still, 0.1)).means, model["_xyz"])
 
-    def test_without_its_options_it_is_refused(self, room: Path, tmp_path: Path) -> None:
-        self.output(tmp_path)
-        (tmp_path / "cfg_args").unlink()
-        with pytest.raises(D2Error, match="cfg_args is not there: it says how the trainer was set"):
-            open_subject(tmp_path, room)
-
-    def test_options_that_are_not_known_are_refused(self, room: Path, tmp_path: Path) -> None:
+    def test_without_its_options_or_with_unknown_ones_it_is_refused(self, room: Path, tmp_path: Path) -> None:
         self.output(tmp_path, static_mlp=True)
         with pytest.raises(D2Error, match=r"was trained with static_mlp.*Viewer\(d2\)"):
-            open_subject(tmp_path, room)
+            open_viewed(tmp_path, room)
+        (tmp_path / "cfg_args").unlink()
+        with pytest.raises(D2Error, match="cfg_args is not there: it says how the trainer was set"):
+            open_viewed(tmp_path, room)
 
     def test_options_are_read_and_not_run(self, tmp_path: Path) -> None:
         path = tmp_path / "cfg_args"
@@ -263,7 +257,7 @@ class TestClouds:
         kept = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in splats.items()}).state_dict()
         path = tmp_path / "ckpt_6999_rank0.pt"
         torch.save({"step": 6999, "scene_id": "garden", "splats": kept}, path)
-        found = open_subject(path, room)
+        found = open_viewed(path, room)
         view = seen(found, 0.1)
         drawn = found.backbone.slice_at(view)
         assert torch.equal(drawn.means, splats["means"])
@@ -285,7 +279,7 @@ class TestClouds:
         for name, values in (many | {"scale": gaussians._scaling, "rot": gaussians._rotation}).items():
             columns |= {f"{name}_{i}": values[:, i] for i in range(values.shape[1])}
         official.write_ply(tmp_path / "point_cloud.ply", columns)
-        found = open_subject(tmp_path / "point_cloud.ply", room)
+        found = open_viewed(tmp_path / "point_cloud.ply", room)
         # Frame 2 of 4 is at the trainer's time 0.5.
         view = seen(found, found.recording.seconds(2))
         assert view.time == pytest.approx(0.5)
@@ -294,13 +288,13 @@ class TestClouds:
         assert torch.allclose(found.backbone.slice_at(view).opacities, expected.opacities, atol=1e-6)
 
     def test_a_point_cloud_is_shown_as_the_run_that_wrote_it(
-        self, trained: Path, room: Path, subject: Subject, monkeypatch: pytest.MonkeyPatch
+        self, trained: Path, room: Path, viewed: ViewedRun, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(subject.backbone.model, "background", None)  # a point cloud has none
+        monkeypatch.setattr(viewed.backbone.model, "background", None)  # a point cloud has none
         [first, *_] = Run.load(trained).export_ply()
-        found = open_subject(first, room)
-        view = seen(subject, 0.0, "train1")
-        difference = (look(found.backbone, view).color - look(subject.backbone, view).color).abs()
+        found = open_viewed(first, room)
+        view = seen(viewed, 0.0, "train1")
+        difference = (render_view(found.backbone, view).color - render_view(viewed.backbone, view).color).abs()
         assert difference.max() < 0.02
         assert {"x", "opacity", "rot_3"} <= set(read_ply(first))
 
@@ -314,7 +308,7 @@ class TestClouds:
         columns |= {"t": model._t[:, 0], "scale_t": model._scaling_t[:, 0]}
         columns |= {f"{name}_{i}": part[:, i] for name, part in parts.items() for i in range(part.shape[1])}
         official.write_ply(tmp_path / "point_cloud.ply", columns)
-        found = open_subject(tmp_path / "point_cloud.ply", room)
+        found = open_viewed(tmp_path / "point_cloud.ply", room)
         for time in (0.0, 0.2):
             true, told = FudanAdapter(model).slice_at(seen(found, time)), found.backbone.slice_at(seen(found, time))
             assert close(told.means, true.means)
@@ -324,11 +318,11 @@ class TestClouds:
         for iteration, seed in ((7000, 1), (30000, 2)):
             place = tmp_path / "point_cloud" / f"iteration_{iteration}"
             official.write_inria_ply(place / "point_cloud.ply", official.inria_columns(9, seed))
-        found = open_subject(tmp_path, room)
+        found = open_viewed(tmp_path, room)
         assert close(found.backbone.slice_at(seen(found, 0.1)).means, official.inria_columns(9, 2)["_xyz"])
         (tmp_path / "empty" / "point_cloud").mkdir(parents=True)
         with pytest.raises(D2Error, match="has no iteration_N/point_cloud"):
-            open_subject(tmp_path / "empty", room)
+            open_viewed(tmp_path / "empty", room)
 
 
 class Harm:
@@ -352,7 +346,7 @@ class TestRefused:
         official.write_inria_ply(place / "point_cloud.ply", official.inria_columns(9))
         (place / name).write_bytes(b"")
         with pytest.raises(D2Error, match=rf"is of {trainer}, whose motion lies in {name}.*Viewer\(d2\)"):
-            open_subject(tmp_path, room)
+            open_viewed(tmp_path, room)
 
     def test_no_code_in_a_file_is_run(self, room: Path, tmp_path: Path) -> None:
         torch.save(((Harm(tmp_path / "made"),), 1), tmp_path / "chkpnt1.pth")
@@ -361,27 +355,27 @@ class TestRefused:
         torch.save(Harm(tmp_path / "made"), tmp_path / "def" / "deform" / "iteration_40000" / "deform.pth")
         for path in (tmp_path / "chkpnt1.pth", tmp_path / "ckpt_1.pt", tmp_path / "def"):
             with pytest.raises(D2Error, match="cannot be read as a checkpoint of tensors"):
-                open_subject(path, room)
+                open_viewed(path, room)
         assert not (tmp_path / "made").exists()
 
     def test_a_file_that_is_no_checkpoint(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         path = tmp_path / "a.pth"
         path.write_bytes(b"nothing")
         with pytest.raises(D2Error, match="cannot be read as a checkpoint"):
-            open_subject(path, room)
+            open_viewed(path, room)
         torch.save({"weights": torch.zeros(3)}, path)
         with pytest.raises(D2Error, match="is no checkpoint that can be shown"):
-            open_subject(path, room)
+            open_viewed(path, room)
         (tmp_path / "a.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex -1\nend_header\n")
         with pytest.raises(D2Error, match="it says -1 vertices"):
-            open_subject(tmp_path / "a.ply", room)
+            open_viewed(tmp_path / "a.ply", room)
         (tmp_path / "a.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
         with pytest.raises(D2Error, match="no readable point cloud"):
-            open_subject(tmp_path / "a.ply", room)
+            open_viewed(tmp_path / "a.ply", room)
         head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty " + b"f" * 5000 + b" x\nend_header\n"
         (tmp_path / "a.ply").write_bytes(head)
         with pytest.raises(D2Error) as refusal:
-            open_subject(tmp_path / "a.ply", room)
+            open_viewed(tmp_path / "a.ply", room)
         assert len(str(refusal.value)) < 1000
         assert main(["render", str(path), "--recording", str(room)]) == 2
         assert capsys.readouterr().err.count("\n") == 1
@@ -410,7 +404,7 @@ class TestRefused:
         }
         torch.save({"step": 1, "splats": splats | {name: value}}, tmp_path / "a.pt")
         with pytest.raises(D2Error, match=said) as caught:
-            open_subject(tmp_path / "a.pt", room)
+            open_viewed(tmp_path / "a.pt", room)
         assert "\n" not in str(caught.value)
 
 
@@ -428,10 +422,10 @@ class TestExport:
         said = capsys.readouterr().out
         assert "times are taken to be seconds since the first frame" in said
         assert "moves on a straight line and fades in time, exactly as it was trained" in said
-        page = read_page(tmp_path / "export" / "scene.html")
+        page = ReadPage(tmp_path / "export" / "scene.html")
         assert [camera["held_out"] for camera in page.header["cameras"]] == [False, False, True, True]
         for time in (0.0, 0.1, 0.25):
-            true = FudanAdapter(model).slice_at(seen(open_subject(path, room), time))
+            true = FudanAdapter(model).slice_at(seen(open_viewed(path, room), time))
             told = page.at(time)
             drawn = told.positions[told.opacities >= 1 / 255]
             assert torch.cdist(true.means[true.opacities >= 1 / 255].double(), drawn).amin(1).max() < 1e-3
@@ -440,8 +434,8 @@ class TestExport:
         Test4DGaussians.output(tmp_path)
         assert main(["export", str(tmp_path), "--recording", str(room)]) == 0
         assert "a deformation field at" in capsys.readouterr().out
-        found = open_subject(tmp_path, room)
-        page = read_page(tmp_path / "export" / "scene.html")
+        found = open_viewed(tmp_path, room)
+        page = ReadPage(tmp_path / "export" / "scene.html")
         assert page.coefficients.shape[1:] == (16, 3)
         at = found.recording.seconds(found.recording.frames[-1])
         true, told = found.backbone.slice_at(seen(found, at)), page.at(at)

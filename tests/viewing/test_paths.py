@@ -13,9 +13,19 @@ from hypothesis import strategies as st
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Camera
+from d2_plugin.recordings.cameras.calibration import OPENGL_TO_OPENCV
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.viewing.paths import Lens, Pose, focus_of, look_at, orbit, pose_of, spiral, through
-from d2_plugin.viewing.videos.path_file import OPENGL, read_camera_path
+from d2_plugin.viewing.camera_paths import (
+    Lens,
+    Pose,
+    focus_of,
+    look_at,
+    orbit,
+    pose_of,
+    read_camera_path,
+    spiral,
+    through,
+)
 
 ARC = list(synthetic_recording(cameras=4, held_out=0, frames=1, width=96, height=54).cameras.values())
 
@@ -116,7 +126,7 @@ SOMEWHERE = np.eye(4).flatten().tolist()
 
 class TestCameraPathFiles:
     def write(self, folder: Path, camera: Camera, **more: object) -> Path:
-        opengl = np.linalg.inv(camera.T_camera_world) @ OPENGL
+        opengl = np.linalg.inv(camera.T_camera_world) @ OPENGL_TO_OPENCV
         fov = float(np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1])))
         entry = {"camera_to_world": opengl.flatten().tolist(), "fov": fov, "aspect": 1.0}
         table = {"render_width": 96, "render_height": 54, "fps": 24, "camera_path": [entry, entry]} | more
@@ -161,8 +171,11 @@ class TestCameraPathFiles:
             ({"camera_path": [{"fov": 50}]}, "camera 0 of .* has no camera_to_world"),
             ({"camera_path": [{"fov": 0, "camera_to_world": SOMEWHERE}]}, "fov of camera 0 of .* must be above 0"),
             ({"camera_path": [{"fov": 50, "camera_to_world": SOMEWHERE[:3]}]}, "no matrix of 4 x 4 numbers"),
-            ({"camera_path": [{"fov": 50, "camera_to_world": [0.0] * 16}]}, "turns by no rotation"),
+            ({"camera_path": [{"fov": 50, "camera_to_world": [0.0] * 15 + [1]}]}, "an R that is no rotation"),
+            ({"camera_path": [{"fov": 50, "camera_to_world": [*SOMEWHERE[:15], 0]}]}, "ends in .*expected 0, 0, 0, 1"),
             ({"camera_path": [{"fov": 50, "camera_to_world": [1e300] * 16}]}, "not finite or too large"),
+            ({"camera_path": [{"fov": 1e-300, "camera_to_world": SOMEWHERE}]}, "camera 0 .* has the number .*at most"),
+            ({"camera_path": [{"fov": 0.01, "camera_to_world": SOMEWHERE}]}, "degrees, expected 0.5 to 178"),
             ({"camera_path": [None]}, "camera 0 of .* is no object"),
             ({"render_width": 10**9}, "render_width of .* must be at least 1 and at most 65535"),
             ({"fps": -1}, "fps of .* must be above 0"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,15 @@ from viewing.hostile import emptied, of_another_version, still_training
 
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.images import read_image
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import make_view
+from d2_plugin.viewing.camera_paths import pose_of
 from d2_plugin.viewing.panels import KINDS, Shot
-from d2_plugin.viewing.paths import pose_of
-from d2_plugin.viewing.subject import Subject
-from d2_plugin.viewing.videos.plan import Wishes, plan_video
-from d2_plugin.viewing.videos.render import RenderSettings, run
+from d2_plugin.viewing.videos.plan import RenderSettings, plan_video
+from d2_plugin.viewing.videos.render import run
+from d2_plugin.viewing.viewed import ViewedRun
 
 av = pytest.importorskip("av", reason="PyAV is in the `video` extra")
 
@@ -70,14 +72,14 @@ def test_a_held_out_camera_plays_the_whole_recording_as_the_rasterizer_draws_it(
 
 
 def test_a_path_through_the_training_cameras_begins_and_ends_as_the_rasterizer_draws_them(
-    trained: Path, tmp_path: Path, rendered: Callable[[str, int], np.ndarray], subject: Subject
+    trained: Path, tmp_path: Path, rendered: Callable[[str, int], np.ndarray], viewed: ViewedRun
 ) -> None:
     words = ["render", str(trained), "--path", "through", "--at", "0", "--seconds", "1", "--quality", "10"]
     assert main([*words, "--output", str(tmp_path / "a.mp4")]) == 0
     found = video_of(tmp_path / "a.mp4")
     assert len(found) == 12
-    stops = plan_video(subject, Wishes("through", at=0.0, seconds=1.0)).stops
-    cameras = subject.recording.cameras
+    stops = plan_video(viewed, RenderSettings((), path="through", at=0.0, seconds=1.0)).stops
+    cameras = viewed.recording.cameras
     ends = [next(n for n in cameras if cameras[n].T_camera_world is stop.pose.T_camera_world) for stop in stops[::11]]
     assert decibels(found[0], rendered(ends[0], 0)) >= 35
     assert decibels(found[-1], rendered(ends[1], 0)) >= 35
@@ -95,9 +97,9 @@ def test_moving_paths_have_the_asked_length_rate_and_odd_size(trained: Path, tmp
 
 
 def test_a_camera_path_of_nerfstudio_is_followed(
-    trained: Path, tmp_path: Path, subject: Subject, rendered: Callable[[str, int], np.ndarray]
+    trained: Path, tmp_path: Path, viewed: ViewedRun, rendered: Callable[[str, int], np.ndarray]
 ) -> None:
-    camera = subject.recording.cameras["train1"]
+    camera = viewed.recording.cameras["train1"]
     opengl = np.linalg.inv(camera.T_camera_world) @ np.diag([1.0, -1, -1, 1])
     fov = float(np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1])))
     entry = {"camera_to_world": opengl.flatten().tolist(), "fov": fov, "aspect": 16 / 9}
@@ -105,42 +107,44 @@ def test_a_camera_path_of_nerfstudio_is_followed(
     entries = [entry | {"render_time": 0.0}, entry | {"render_time": 1.0}]
     path.write_text(json.dumps({"render_width": 96, "render_height": 54, "fps": 5, "camera_path": entries}))
     run(RenderSettings((trained,), output=tmp_path / "png", path=str(path), format="png"))
-    from d2_plugin.recordings.images import read_image
-
     found = [read_image(tmp_path / "png" / name) for name in ("00000.png", "00001.png")]
     assert decibels(found[0], rendered("train1", 0)) > 45
     assert decibels(found[1], rendered("train1", 3)) > 45
 
 
-def test_time_plays_bounces_slows_and_freezes(subject: Subject) -> None:
-    def times(**wishes: object) -> list[float]:
-        return [round(12 * stop.time, 6) for stop in plan_video(subject, Wishes(**wishes)).stops]
+def test_time_plays_bounces_slows_and_freezes(viewed: ViewedRun) -> None:
+    def times(**settings: object) -> list[float]:
+        return [round(12 * stop.time, 6) for stop in plan_video(viewed, RenderSettings((), **settings)).stops]
 
     assert times() == [0, 1, 2, 3]
     assert times(speed=0.5) == [0, 0.5, 1, 1.5, 2, 2.5, 3]
     assert times(seconds=8 / 12) == [0, 1, 2, 3, 2, 1, 0, 1]
     assert times(path="orbit", at=0.1, seconds=0.5) == [1.2] * 6
-    nearest = times(speed=0.5, recorded_instants=True)
+    nearest = times(speed=0.5, show=("truth",))
     assert {*nearest} == {0, 1, 2, 3}
     assert max(abs(time - 0.5 * i) for i, time in enumerate(nearest)) <= 0.5
     assert len(times(path="training")) == 3 * 4
     with pytest.raises(D2Error, match="lies outside the recording, which lasts 0.25 s"):
-        plan_video(subject, Wishes(at=3.0))
+        plan_video(viewed, RenderSettings((), at=3.0))
 
 
 @pytest.mark.parametrize(
-    ("wishes", "said"),
+    ("settings", "says"),
     [
         ({"seconds": 1e300}, "would have 1.2e.301 images, at most 1000000"),
         ({"speed": 1e-6}, "images, at most 1000000: choose fewer --seconds"),
         ({"path": "orbit", "seconds": 1e300}, "images, at most 1000000"),
-        ({"fps": 1e300}, "a video of 1e.300 images per second cannot be written"),
-        ({"fps": 1e-5}, "give --fps from 0.001 to 1000"),
     ],
 )
-def test_a_video_without_end_is_refused_before_it_is_laid_out(subject: Subject, wishes: dict, said: str) -> None:
-    with pytest.raises(D2Error, match=said):
-        plan_video(subject, Wishes(**wishes))
+def test_a_video_without_end_is_refused_before_it_is_laid_out(viewed: ViewedRun, settings: dict, says: str) -> None:
+    with pytest.raises(D2Error, match=says):
+        plan_video(viewed, RenderSettings((), **settings))
+
+
+def test_a_recording_of_a_rate_that_no_file_can_say_needs_another(viewed: ViewedRun) -> None:
+    quick = replace(viewed, recording=replace(viewed.recording, fps=1e5))
+    with pytest.raises(D2Error, match=r"a video of 100000 images per second .* give --fps from 0.001 to 1000"):
+        plan_video(quick, RenderSettings(()))
 
 
 def test_images_that_memory_does_not_hold_are_refused(
@@ -166,54 +170,49 @@ def test_every_kind_of_image_stands_beside_the_others_and_runs_below(trained: Pa
     assert min(panel.std() for panel in np.array_split(image[24:74], len(show), axis=1)) > 3, "no panel is empty"
 
 
-def test_panels_show_what_they_say(subject: Subject) -> None:
-    camera = subject.recording.cameras["train1"]
-    shot = Shot(subject, subject.view(pose_of(camera), 0.0, (96, 54), "train1"), (1.0, 9.0))
-    assert np.array_equal(KINDS["truth"].draw(shot).image, subject.recording.image("train1", 0))
-    difference = np.abs(shot.look.color.numpy() - subject.recording.image("train1", 0) / np.float32(255))
+def test_panels_show_what_they_say(viewed: ViewedRun) -> None:
+    camera = viewed.recording.cameras["train1"]
+    shot = Shot(viewed, viewed.view(pose_of(camera), 0.0, (96, 54), "train1"), (1.0, 9.0))
+    assert np.array_equal(KINDS["truth"](shot).image, viewed.recording.image("train1", 0))
+    difference = np.abs(shot.rendered.color.numpy() - viewed.recording.image("train1", 0) / np.float32(255))
     expected = -10 * np.log10(np.mean(difference**2))
-    assert f"{expected:.1f} dB" in KINDS["error"].draw(shot).caption
-    depth = KINDS["true-depth"].draw(shot)
+    assert f"{expected:.1f} dB" in KINDS["error"](shot).caption
+    depth = KINDS["true-depth"](shot)
     assert "1..9" in depth.caption
     assert depth.bar is not None
-    half = Shot(subject, subject.view(pose_of(camera), 0.0, (48, 27), "train1"), (1.0, 9.0))
-    assert KINDS["labels"].draw(half).image.shape == (27, 48, 3)
+    half = Shot(viewed, viewed.view(pose_of(camera), 0.0, (48, 27), "train1"), (1.0, 9.0))
+    assert KINDS["labels"](half).image.shape == (27, 48, 3)
 
 
-class TestSentences:
-    def test_what_is_no_run(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "holds no run" in refused(capsys, tmp_path)
-        assert "no run at" in refused(capsys, tmp_path / "none")
-        assert "d2 render needs RUN" in refused(capsys)
+def test_what_cannot_be_shown_is_one_sentence(
+    trained: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "holds no run" in refused(capsys, tmp_path)
+    assert "no run at" in refused(capsys, tmp_path / "none")
+    assert "d2 render needs RUN" in refused(capsys)
+    assert "has no Gaussian left at step 40" in refused(capsys, emptied(trained, tmp_path / "empty"))
+    assert "version 99" in refused(capsys, of_another_version(trained, tmp_path / "later"))
+    for more in (["--recording", room], ["--train-cameras", "train0"], ["--downscale", "2"]):
+        assert "is a folder of a run, which knows its recording" in refused(capsys, trained, *more)
+    assert "did you mean 'orbit'?" in refused(capsys, trained, "--path", "orbti")
+    assert "did you mean 'depth'?" in refused(capsys, trained, "--show", "rgb,deph")
+    assert "did you mean 'test0'?" in refused(capsys, trained, "--cameras", "test")
+    assert "at the recording's cameras only" in refused(capsys, trained, "--path", "orbit", "--show", "error")
+    assert "there is no depth prior of camera test0" in refused(capsys, trained, "--show", "sigma")
 
-    def test_a_run_knows_its_recording(self, trained: Path, room: Path, tmp_path: Path, capsys) -> None:
-        for more in (["--recording", str(room)], ["--train-cameras", "train0"], ["--downscale", "2"]):
-            words = ["render", str(trained), "--output", str(tmp_path / "a.mp4"), *more]
-            assert main(words) == 2
-            assert "is a folder of a run, which knows its recording" in capsys.readouterr().err
 
-    def test_an_unknown_path_image_or_camera(self, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "did you mean 'orbit'?" in refused(capsys, trained, "--path", "orbti")
-        assert "did you mean 'depth'?" in refused(capsys, trained, "--show", "rgb,deph")
-        assert "did you mean 'test0'?" in refused(capsys, trained, "--cameras", "test")
-        assert "at the recording's cameras only" in refused(capsys, trained, "--path", "orbit", "--show", "error")
-        assert "there is no depth prior of camera test0" in refused(capsys, trained, "--show", "sigma")
+def test_a_run_that_still_trains_is_shown_with_a_note(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = still_training(trained, tmp_path / "<script>alert(1)<", 33)
+    assert main(["render", str(copy), "--output", str(tmp_path / "a.mp4")]) == 0
+    assert f"{copy.name} still trains: this is step 33 of 40" in capsys.readouterr().out
+    (copy / "checkpoint.pt").unlink()
+    assert "holds no checkpoint yet" in refused(capsys, copy)
 
-    def test_a_run_that_still_trains(self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        copy = still_training(trained, tmp_path / "<script>alert(1)</script>".replace("/", "_"), 33)
-        assert main(["render", str(copy), "--output", str(tmp_path / "a.mp4")]) == 0
-        assert f"{copy.name} still trains: this is step 33 of 40" in capsys.readouterr().out
-        (copy / "checkpoint.pt").unlink()
-        assert "holds no checkpoint yet" in refused(capsys, copy)
 
-    def test_a_run_without_a_prior(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        folder = tmp_path / "bare"
-        Run(RunSettings(str(room), ("train0", "train1"), iterations=2, hooks=()), folder).train()
-        assert main(["render", str(folder), "--output", str(tmp_path / "a.gif"), "--format", "gif"]) == 0
-        assert "no depth prior" in refused(capsys, folder, "--path", "training", "--show", "rgb,labels")
-
-    def test_an_empty_run_and_one_of_another_version(
-        self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        assert "has no Gaussian left at step 40" in refused(capsys, emptied(trained, tmp_path / "empty"))
-        assert "version 99" in refused(capsys, of_another_version(trained, tmp_path / "later"))
+def test_a_run_without_a_prior_shows_all_but_it(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "bare"
+    Run(RunSettings(str(room), ("train0", "train1"), iterations=2, hooks=()), folder).train()
+    assert main(["render", str(folder), "--output", str(tmp_path / "a.gif"), "--format", "gif"]) == 0
+    assert "no depth prior" in refused(capsys, folder, "--path", "training", "--show", "rgb,labels")

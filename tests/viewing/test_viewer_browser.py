@@ -2,51 +2,39 @@
 
 from __future__ import annotations
 
-import io
-import os
-import shutil
 import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from tiny import ALL_HOOKS, make_trainer
+from viewing.chromium import Page, browser, executable
 
 from d2_plugin.viewing.live import Viewer
-from d2_plugin.viewing.stand_in import subject_of_store
-from d2_plugin.viewing.subject import Subject, subject_of_recording
+from d2_plugin.viewing.viewed import KeptImages, ViewedRun
 
 pytest.importorskip("viser", reason="viser is in the `view` extra")
-api = pytest.importorskip("playwright.sync_api", reason="playwright is in the `test` extra")
 pytestmark = pytest.mark.browser
 
-NAMES = ("chromium", "chromium-browser", "google-chrome")
-CHROMIUM = next((found for name in NAMES if (found := shutil.which(name))), "")
-SOFTWARE_WEBGL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-SIZE = {"width": 640, "height": 400}
 FREE = {"x": 0, "y": 170, "width": 300, "height": 230}  # of the page, beside controls and notices
 EVIL = "<script>window.hacked=1</script>"
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    if not CHROMIUM:
-        pytest.skip("no chromium on this machine: apt-get install chromium")
-    with api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE_WEBGL)
-        yield started
-        started.close()
+def new_page() -> Iterator[Callable[[], Page]]:
+    executable()
+    with browser(640, 400) as new:
+        yield new
 
 
 @contextmanager
-def showing(subject: Subject) -> Iterator[Viewer]:
+def showing(viewed: ViewedRun) -> Iterator[Viewer]:
     """A viewer whose images are drawn by a thread of its own, as `d2 view` draws them in its only one."""
-    viewer, stop = Viewer(subject=subject, port=18080, height=180), threading.Event()
+    viewer, stop = Viewer(viewed=viewed, port=18080, height=180), threading.Event()
     thread = threading.Thread(target=viewer.stay, args=(stop.is_set,))
     thread.start()
     try:
@@ -57,50 +45,37 @@ def showing(subject: Subject) -> Iterator[Viewer]:
         viewer.close()
 
 
-def opened(browser: Any, viewer: Viewer) -> Any:
-    page = browser.new_page(viewport=SIZE)
-    page.problems = []
-    page.on("pageerror", lambda error: page.problems.append(str(error)))
-    page.asked = []
-    page.on("request", lambda request: page.asked.append(request.url))
-    page.goto(viewer.url, timeout=60_000)
-    page.get_by_text("Recording", exact=True).wait_for(timeout=60_000)
+def opened(new_page: Callable[[], Page], viewer: Viewer) -> Page:
+    page = new_page().open(viewer.url)
+    page.page.get_by_text("Recording", exact=True).wait_for(timeout=60_000)
     return page
 
 
-def image(page: Any, name: str = "") -> np.ndarray:
-    """What the page shows, RGB [H, W, 3]; kept where D2_SCREENSHOTS names a folder."""
+def image(page: Page) -> np.ndarray:
+    """What the page shows, RGB [H, W, 3]."""
     cv2 = pytest.importorskip("cv2")
-    data = page.screenshot(clip=FREE)
-    if name and (folder := os.environ.get("D2_SCREENSHOTS")):
-        page.screenshot(path=str(Path(folder) / f"{name}.png"))
-    return cv2.imdecode(np.frombuffer(io.BytesIO(data).getvalue(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(float)
+    data = np.frombuffer(page.page.screenshot(clip=FREE), np.uint8)
+    return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1].astype(float)
 
 
-def until(page: Any, condition: Callable[[np.ndarray], bool], name: str = "", seconds: float = 30) -> np.ndarray:
+def until(page: Page, condition: Callable[[np.ndarray], bool], seconds: float = 30) -> np.ndarray:
     """The first image that fulfils a condition."""
     for _ in range(int(seconds / 0.25)):
-        page.wait_for_timeout(250)
+        page.page.wait_for_timeout(250)
         if condition(found := image(page)):
-            image(page, name)
             return found
-    image(page, name)
-    raise AssertionError(f"the page never showed it: {name}")
+    raise AssertionError("the page never showed it")
 
 
 def changed(before: np.ndarray) -> Callable[[np.ndarray], bool]:
     return lambda now: np.abs(now - before).mean() > 2
 
 
-def is_drawn(now: np.ndarray) -> bool:
-    return now.std() > 20
-
-
-def settled(page: Any) -> np.ndarray:
+def settled(page: Page) -> np.ndarray:
     """The image once it no longer changes."""
     before = until(page, lambda now: now.std() > 5)
     for _ in range(40):
-        page.wait_for_timeout(500)
+        page.page.wait_for_timeout(500)
         now = image(page)
         if np.abs(now - before).mean() < 0.05:
             return now
@@ -108,85 +83,91 @@ def settled(page: Any) -> np.ndarray:
     raise AssertionError("the image never came to rest")
 
 
-def drag(page: Any, dx: int, dy: int) -> None:
-    page.mouse.move(150, 250)
-    page.mouse.down()
-    page.mouse.move(150 + dx, 250 + dy, steps=4)
-    page.mouse.up()
+def drag(page: Page, dx: int, dy: int) -> None:
+    page.page.mouse.move(150, 250)
+    page.page.mouse.down()
+    page.page.mouse.move(150 + dx, 250 + dy, steps=4)
+    page.page.mouse.up()
 
 
-def control(page: Any, label: str) -> Any:
+def control(page: Page, label: str) -> Any:
     """The input in the row of a label."""
-    return page.locator(f'xpath=//label[text()="{label}"]/../../..').locator("input").first
+    return page.page.locator(f'xpath=//label[text()="{label}"]/../../..').locator("input").first
 
 
-def choose(page: Any, label: str, option: str) -> None:
+def choose(page: Page, label: str, option: str) -> None:
     control(page, label).click()
-    page.get_by_role("option", name=option, exact=True).click()
+    page.page.get_by_role("option", name=option, exact=True).click()
 
 
-def test_a_person_moves_camera_and_time_while_another_only_looks(browser: Any, subject: Subject) -> None:
-    with showing(subject) as viewer:
-        one, two = opened(browser, viewer), opened(browser, viewer)
+@pytest.mark.slow
+def test_a_person_moves_camera_and_time_while_another_only_looks(
+    new_page: Callable[[], Page], viewed: ViewedRun
+) -> None:
+    with showing(viewed) as viewer:
+        one, two = opened(new_page, viewer), opened(new_page, viewer)
         first, other = settled(one), settled(two)
         assert viewer.clients == 2
         drag(one, 12, 4)
-        turned = until(one, changed(first), "turned")
+        turned = until(one, changed(first))
         assert np.abs(image(two) - other).mean() < 0.5, "the other one's camera stays"
         turned = settled(one)
         assert np.abs(turned - first).mean() > 2
-        slider = one.get_by_role("slider").first
+        slider = one.page.get_by_role("slider").first
         slider.focus()
         slider.press("End")
-        until(one, lambda now: np.abs(now - turned).mean() > 0.3, "later")
+        until(one, lambda now: np.abs(now - turned).mean() > 0.3)
         assert control(one, "frame").input_value() == "3"
         assert control(two, "frame").input_value() == "0"
-        assert one.problems == two.problems == []
-        assert all(url.startswith((viewer.url, "data:", "blob:")) for url in one.asked), "nothing comes from elsewhere"
-        one.close()
-        two.close()
+        assert one.errors == two.errors == []
+        assert all(url.startswith(("http://localhost:", "ws://localhost:")) for url in one.requests), (
+            "nothing comes from elsewhere"
+        )
+        one.page.close()
+        two.page.close()
 
 
-def test_depth_opacity_number_and_the_prior_as_points(browser: Any, subject: Subject) -> None:
-    with showing(subject) as viewer:
-        page = opened(browser, viewer)
+@pytest.mark.slow
+def test_depth_opacity_number_and_the_prior_as_points(new_page: Callable[[], Page], viewed: ViewedRun) -> None:
+    with showing(viewed) as viewer:
+        page = opened(new_page, viewer)
         before = settled(page)
         for show in ("depth", "opacity", "number of Gaussians"):
             choose(page, "show", show)
-            before = until(page, changed(before), show)
+            before = until(page, changed(before))
         choose(page, "show", "image")
-        before = until(page, changed(before), "image")
+        before = until(page, changed(before))
         control(page, "inserted by D2 in orange").click()
-        orange = until(page, changed(before), "inserted")
+        orange = until(page, changed(before))
         assert orange[..., 0].mean() > orange[..., 2].mean()
         choose(page, "prior as points, by", "label")
-        until(page, changed(orange), "points")
-        assert page.problems == []
-        page.close()
+        until(page, changed(orange))
+        assert page.errors == []
+        page.page.close()
 
 
-def test_names_stay_text_and_only_this_machine_may_look(browser: Any, subject: Subject) -> None:
-    cameras = {EVIL if name == "train0" else name: camera for name, camera in subject.recording.cameras.items()}
-    recording = replace(subject.recording, cameras=cameras, source=Plain())
-    named = replace(subject, name=EVIL, recording=recording, train_cameras=tuple(cameras), store=None, test_cameras=())
+def test_names_stay_text_and_only_this_machine_may_look(new_page: Callable[[], Page], viewed: ViewedRun) -> None:
+    cameras = {EVIL if name == "train0" else name: camera for name, camera in viewed.recording.cameras.items()}
+    recording = replace(viewed.recording, cameras=cameras, source=KeptImages(cameras))
+    named = replace(viewed, name=EVIL, recording=recording, train_cameras=tuple(cameras), store=None, test_cameras=())
     with showing(named) as viewer:
-        page = opened(browser, viewer)
+        page = opened(new_page, viewer)
         settled(page)
         assert control(page, "shown").input_value() == EVIL
         control(page, "stand at").click()
-        page.get_by_role("option", name=EVIL, exact=True).wait_for()
-        assert page.evaluate("window.hacked") is None
-        assert page.problems == []
+        page.page.get_by_role("option", name=EVIL, exact=True).wait_for()
+        assert page.page.evaluate("window.hacked") is None
+        assert page.errors == []
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as way:
             way.connect(("192.0.2.1", 9))  # sends nothing; says which address this machine has towards others
             address = way.getsockname()[0]
         if not address.startswith("127."):
             with pytest.raises(OSError, match="refused"):
-                socket.create_connection((address, int(viewer.url.rsplit(":", 1)[1])), timeout=5)
-        page.close()
+                socket.create_connection((address, viewer._server.get_port()), timeout=5)
+        page.page.close()
 
 
-def test_a_training_is_watched_paused_and_goes_on(browser: Any) -> None:
+def test_a_training_is_watched_paused_and_goes_on(new_page: Callable[[], Page]) -> None:
     trainer = make_trainer(ALL_HOOKS, iterations=10**6)
     viewer, stop = Viewer(trainer.d2, port=18080, height=90), threading.Event()
 
@@ -200,46 +181,20 @@ def test_a_training_is_watched_paused_and_goes_on(browser: Any) -> None:
     thread = threading.Thread(target=train)
     thread.start()
     try:
-        page = opened(browser, viewer)
-        until(page, lambda now: now.std() > 2, "training")
+        page = opened(new_page, viewer)
+        until(page, lambda now: now.std() > 2)
         assert "Gaussians" in control(page, "step").input_value()
         assert "inserted" in control(page, "score").input_value()
-        page.get_by_role("button", name="Pause", exact=True).click()
-        page.get_by_role("button", name="Go on", exact=True).wait_for()
+        page.page.get_by_role("button", name="Pause", exact=True).click()
+        page.page.get_by_role("button", name="Go on", exact=True).wait_for()
         assert viewer.training.paused
-        page.get_by_role("button", name="Go on", exact=True).click()
-        page.get_by_role("button", name="Pause", exact=True).wait_for()
+        page.page.get_by_role("button", name="Go on", exact=True).click()
+        page.page.get_by_role("button", name="Pause", exact=True).wait_for()
         assert not viewer.training.paused
-        assert page.problems == []
-        page.close()
+        assert page.errors == []
+        page.page.close()
     finally:
         stop.set()
         viewer.training.paused = False
         thread.join()
         viewer.close()
-
-
-def test_a_recording_and_a_prior_are_shown_without_gaussians(browser: Any, subject: Subject) -> None:
-    with showing(subject_of_recording(subject.recording)) as viewer:
-        page = opened(browser, viewer)
-        until(page, lambda now: now.std() > 4, "recording")
-        assert not page.get_by_text("Image", exact=True).count()
-        page.close()
-    with showing(subject_of_store(subject.store)) as viewer:
-        page = opened(browser, viewer)
-        until(page, is_drawn, "priors")
-        assert page.problems == []
-        page.close()
-
-
-class Plain:
-    """Grey images for cameras of any name."""
-
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        return np.full((54, 96, 3), 99, np.uint8)
-
-    def depth(self, camera: str, frame: int) -> None:
-        return None
-
-    def mono(self, camera: str, frame: int) -> None:
-        return None

@@ -44,10 +44,10 @@ def read_state(path: Path) -> dict[str, Tensor]:
     Raises:
         D2Error: the file holds something else.
     """
-    found = read_tensors(path)
-    if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
+    state = read_tensors(path)
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise D2Error(f"{path} holds no weights of a network: give the trainer's own file")
-    return {name: value.detach().float() for name, value in found.items()}
+    return {name: value.detach().float() for name, value in state.items()}
 
 
 def read_options(path: Path) -> dict[str, Any]:

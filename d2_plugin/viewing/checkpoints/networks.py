@@ -1,15 +1,22 @@
-"""The network of Deformable-3D-Gaussians, rebuilt from its weights: where a Gaussian is at a time.
+"""The networks that move the Gaussians of other trainers, rebuilt from the names and shapes of their weights.
 
-With e(x) = (x, sin 2^k x, cos 2^k x) for k = 0, 1, ..., position and time go encoded through layers with ReLU; the
-layer after the middle one sees them a second time. Three linear heads then tell the offset of the centre, of the
-quaternion and of the scales. In a variant for synthetic scenes two layers encode time first; in another the head of the
-centre is a screw motion. Widths, depth and variant follow from the names and shapes of the weights.
+Deformable-3D-Gaussians: with e(x) = (x, sin 2^k x, cos 2^k x) for k = 0, 1, ..., position and time go encoded through
+layers with ReLU; the layer after the middle one sees them a second time. Three linear heads then give the offset of the
+centre, of the quaternion and of the scales. In a variant for synthetic scenes two layers encode time first; in another
+the head of the centre is a screw motion.
+
+4DGaussians: a point (x, y, z, t) looks into six planes, one for each pair of its coordinates, on several levels; on a
+level the six features are multiplied, the levels stand beside each other. One hidden layer or more follows, and a head
+of two layers for each attribute that is deformed: offsets of raw positions, log scales, quaternions, opacity logits and
+harmonics.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,6 +28,18 @@ TIME_FREQUENCIES = 10
 """Of the variant that does not encode time by layers, which alone says it by their widths."""
 AXIS_SHIFT = 1e-5
 """Added to the entries of a screw axis by the repository, after the division by its length."""
+PAIRS = tuple(itertools.combinations(range(4), 2))
+"""Of x, y, z, t: which two coordinates each plane of a level has."""
+HEADS = {
+    "no_dx": "pos_deform",
+    "no_ds": "scales_deform",
+    "no_dr": "rotations_deform",
+    "no_do": "opacity_deform",
+    "no_dshs": "shs_deform",
+}
+"""The option that leaves an attribute as it is, and the head that else deforms it, in the order of the attributes."""
+UNUSED = ("no_grid", "grid_pe", "static_mlp", "empty_voxel", "apply_rotation")
+"""Options that no configuration of the repository uses."""
 
 
 class MotionNetwork:
@@ -57,19 +76,23 @@ class MotionNetwork:
         """Offsets of centres [N, 3] (or motions [N, 4, 4]), quaternions [N, 4] and scales [N, 3]."""
         time = encoded(times, self.times)
         if "timenet.0.weight" in self.state:
-            time = self._through("timenet.2", self._through("timenet.0", time).relu())
+            time = _linear(self.state, "timenet.2", _linear(self.state, "timenet.0", time).relu())
         seen = torch.cat([encoded(positions, self.positions), time], -1)
         hidden = seen
         for name in self.layers:
             again = self.state[f"{name}.weight"].shape[1] > hidden.shape[1]
-            hidden = self._through(name, torch.cat([seen, hidden], -1) if again else hidden).relu()
-        turned, scaled = self._through("gaussian_rotation", hidden), self._through("gaussian_scaling", hidden)
+            hidden = _linear(self.state, name, torch.cat([seen, hidden], -1) if again else hidden).relu()
+        turned, scaled = (
+            _linear(self.state, "gaussian_rotation", hidden),
+            _linear(self.state, "gaussian_scaling", hidden),
+        )
         if not self.is_6dof:
-            return self._through("gaussian_warp", hidden), turned, scaled
-        return screw_motions(self._through("branch_w", hidden), self._through("branch_v", hidden)), turned, scaled
-
-    def _through(self, name: str, values: Tensor) -> Tensor:
-        return functional.linear(values, self.state[f"{name}.weight"], self.state[f"{name}.bias"])
+            return _linear(self.state, "gaussian_warp", hidden), turned, scaled
+        return (
+            screw_motions(_linear(self.state, "branch_w", hidden), _linear(self.state, "branch_v", hidden)),
+            turned,
+            scaled,
+        )
 
 
 def encoded(values: Tensor, frequencies: int) -> Tensor:
@@ -90,3 +113,74 @@ def screw_motions(turn: Tensor, shift: Tensor) -> Tensor:
     motion = torch.eye(4).to(axis).repeat(len(axis), 1, 1)
     motion[:, :3, :3], motion[:, :3, 3:] = rotation, reach @ along[..., None]
     return motion
+
+
+class PlaneField:
+    """What the adapter `hust4d` calls as `_deformation`."""
+
+    def __init__(self, state: Mapping[str, Tensor], options: Mapping[str, Any], path: Path) -> None:
+        """Take the weights and the options that say which attributes they deform.
+
+        Raises:
+            D2Error: other weights, an option that is not known here, or one that is missing.
+        """
+        chosen = [name for name in UNUSED if options.get(name)]
+        if chosen:
+            raise D2Error(
+                f"{path} was trained with {chosen[0]}, which cannot be shown here: use Viewer(d2) in its train.py"
+            )
+        missing_options = [name for name in HEADS if not isinstance(options.get(name), bool)]
+        if missing_options:
+            raise D2Error(
+                f"the options of {path} do not say {missing_options[0]}: expected the cfg_args that its train.py wrote"
+            )
+        prefix = "deformation_net."
+        self.state = {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
+        self.heads = {name: head for name, head in HEADS.items() if not options[name]}
+        needed = ["grid.aabb", "grid.grids.0.5", "feature_out.0.weight", *(f"{head}.3.bias" for head in HEADS.values())]
+        missing = [name for name in needed if name not in self.state]
+        if missing:
+            raise D2Error(f"{path} has no {prefix}{missing[0]}: it is no deformation field of 4DGaussians")
+
+    @property
+    def get_aabb(self) -> tuple[Tensor, Tensor]:
+        """The corners of the box that the planes span."""
+        return self.state["grid.aabb"][0], self.state["grid.aabb"][1]
+
+    @torch.no_grad()
+    def __call__(self, *attributes: Tensor) -> tuple[Tensor, ...]:
+        """Positions [N, 3], log scales, quaternions, opacity logits [N, 1], harmonics [N, C, 3] and times [N, 1], all
+        raw -> the first five at those times."""
+        *raw, times = attributes
+        hidden = self._hidden(raw[0], times)
+        return tuple(
+            values + self._head(self.heads[option], hidden).view_as(values) if option in self.heads else values
+            for option, values in zip(HEADS, raw, strict=True)
+        )
+
+    def _hidden(self, positions: Tensor, times: Tensor) -> Tensor:
+        first, last = self.get_aabb
+        point = torch.cat([(positions - first) * (2 / (last - first)) - 1, times], -1)
+        levels = sum(name.startswith("grid.grids.") and name.endswith(".0") for name in self.state)
+        hidden = torch.cat([self._level(level, point) for level in range(levels)], -1)
+        layers = sorted(int(name.split(".")[1]) for name in self.state if name.startswith("feature_out."))
+        for layer in sorted(set(layers)):
+            hidden = _linear(self.state, f"feature_out.{layer}", hidden.relu() if layer else hidden)
+        return hidden
+
+    def _level(self, level: int, point: Tensor) -> Tensor:
+        """The product of the six planes of one level at points [N, 4]: [N, features]."""
+        product = torch.ones(())
+        for i, pair in enumerate(PAIRS):
+            plane, places = self.state[f"grid.grids.{level}.{i}"], point[None, None, :, list(pair)]
+            seen = functional.grid_sample(plane, places, align_corners=True, padding_mode="border")
+            product = product * seen[0, :, 0].T
+        return product
+
+    def _head(self, name: str, hidden: Tensor) -> Tensor:
+        return _linear(self.state, f"{name}.3", _linear(self.state, f"{name}.1", hidden.relu()).relu())
+
+
+def _linear(state: Mapping[str, Tensor], name: str, values: Tensor) -> Tensor:
+    """The linear layer of that name."""
+    return functional.linear(values, state[f"{name}.weight"], state[f"{name}.bias"])

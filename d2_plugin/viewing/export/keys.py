@@ -17,15 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from d2_plugin.protocol import Splats
-from d2_plugin.viewing.export.codes import morton_order
+from d2_plugin.viewing.export.scene import ExportScene
 
 STILL = 0.05
-"""Pixels of a training image below which nobody sees that something moves."""
+"""Pixels of a training image; what moves less counts as standing still."""
 GOOD = 0.1
 """Pixels that one Gaussian in a hundred may be off between keys where the size allows it."""
 SAMPLE = 20_000
-"""Gaussians by which keys are chosen; the error that is told is that of all."""
+"""Gaussians by which keys are chosen; the error that is reported is that of all."""
 MANY = 10
 """Frames of which each one may be a key, and nothing between them."""
 MOST_CHECKS = 8
@@ -34,8 +33,6 @@ MOST_STATES = 8_000_000
 """Gaussians times instants that are evaluated and kept, 40 bytes each: of 300,000 Gaussians, 26 instants."""
 ALPHA_MIN = 1 / 255
 """Gaussians that stay below this are never drawn."""
-
-SplatsAt = Callable[[float], Splats]
 
 
 class State(NamedTuple):
@@ -114,9 +111,9 @@ def covariances_of(factors: Tensor) -> Tensor:
     return torch.stack([a * a, a * b, a * c, b * b + d * d, b * c + d * e, c * c + e * e + f * f], -1)
 
 
-def state_at(splats_at: SplatsAt, count: int, time: float, before: State | None = None) -> State:
+def state_at(scene: ExportScene, time: float, before: State | None = None) -> State:
     """All Gaussians at `time`; one that does not exist then stays where it was `before`, with opacity 0."""
-    splats = splats_at(time)
+    splats, count = scene.splats_at(time), len(scene.harmonics.coefficients)
     positions = torch.zeros(count, 3).double() if before is None else before.positions.clone()
     factors = torch.zeros(count, 6).double() if before is None else before.factors.clone()
     finite = torch.isfinite(torch.cat([splats.means, splats.covariances, splats.opacities[:, None]], 1)).all(1)
@@ -128,26 +125,18 @@ def state_at(splats_at: SplatsAt, count: int, time: float, before: State | None 
     return State(positions, factors, opacities)
 
 
-def bake(
-    splats_at: SplatsAt,
-    count: int,
-    frames: Sequence[float],
-    pixels_per_unit: Callable[[Tensor], Tensor],
-    most_keys: Callable[[int, int], int],
-) -> Keys:
+def bake(scene: ExportScene, most_keys: Callable[[int, int], int]) -> Keys:
     """The scene at key times, which are frames or, where these are few, also halfway between them.
 
     Args:
-        splats_at: the Gaussians at a time.
-        count: N, the number of Gaussians of the model.
-        frames: times of the frames, ascending; the first and the last one are keys.
-        pixels_per_unit: see `ExportScene.pixels_per_unit`.
+        scene: the first and the last of its frames are keys.
         most_keys: how many keys there may be, from the numbers of Gaussians that move and that change their shape.
     """
+    frames, count = scene.seconds, len(scene.harmonics.coefficients)
     times = list(frames) if len(frames) > MANY else sorted({*frames, *_middles(frames)})
     most = int(np.clip(MOST_STATES // max(count, 1), 12, len(times)))
     times = [times[i] for i in np.unique(np.linspace(0, len(times) - 1, most).round().astype(int))]
-    travel = _travel(splats_at, count, times, pixels_per_unit)
+    travel = _travel(scene, times)
     first, scale = travel.first, travel.scale
     rank = torch.where(travel.changes, 0, torch.where(travel.moves, 1, 2))
     order = torch.from_numpy(morton_order(first.positions.numpy()))
@@ -161,12 +150,12 @@ def bake(
         states.append(State(now.positions[:moving], now.factors[:changing], now.opacities[:changing]))
     keys = Keys(tuple(chosen), first.select(rows), rows, moving, changing, tuple(states), Offset(0, 0, 0))
     between = [time for time in sorted({*times, *_middles(chosen)}) if time not in set(chosen)]
-    off = _offset(keys, splats_at, count, between[:: -(-len(between) // MOST_CHECKS) or 1], scale)
+    off = _offset(keys, scene, between[:: -(-len(between) // MOST_CHECKS) or 1], scale)
     return replace(keys, offset=off)
 
 
 class _Travel(NamedTuple):
-    """What a walk through all times has found, per Gaussian."""
+    """What is known of each Gaussian after all times were visited."""
 
     first: State
     scale: Tensor  # [N] pixels per world unit, in the nearest training camera
@@ -181,16 +170,15 @@ def _middles(times: Sequence[float]) -> list[float]:
     return [(a + b) / 2 for a, b in itertools.pairwise(times)]
 
 
-def _travel(
-    splats_at: SplatsAt, count: int, times: Sequence[float], pixels_per_unit: Callable[[Tensor], Tensor]
-) -> _Travel:
-    state = first = state_at(splats_at, count, times[0])
+def _travel(scene: ExportScene, times: Sequence[float]) -> _Travel:
+    state = first = state_at(scene, times[0])
+    count = len(first.positions)
     far, changed, faded = (torch.zeros(count).double() for _ in range(3))
     scale, strongest = torch.zeros(count).double(), first.opacities
     sample, states = torch.arange(0, count, 1 + count // SAMPLE), []
     for time in times:
-        state = state_at(splats_at, count, time, state)
-        scale = torch.maximum(scale, pixels_per_unit(state.positions))
+        state = state_at(scene, time, state)
+        scale = torch.maximum(scale, scene.pixels_per_unit(state.positions))
         far = torch.maximum(far, (state.positions - first.positions).norm(dim=-1))
         changed = torch.maximum(changed, (state.factors - first.factors).norm(dim=-1))
         faded = torch.maximum(faded, (state.opacities - first.opacities).abs())
@@ -231,14 +219,28 @@ def distance(a: Tensor, b: Tensor) -> Tensor:
     return (a[:, :3] - b[:, :3]).norm(dim=-1) + (a[:, 3:] - b[:, 3:]).norm(dim=-1)
 
 
-def _offset(keys: Keys, splats_at: SplatsAt, count: int, times: Sequence[float], scale: Tensor) -> Offset:
+def _offset(keys: Keys, scene: ExportScene, times: Sequence[float], scale: Tensor) -> Offset:
     """The distance between `keys` and the model at `times`, of all Gaussians that keys have, largest over time."""
     if not times:
         return Offset(0.0, 0.0, 0.0)
     worst, state, sizes = torch.zeros(len(keys.rows)).double(), None, scale[keys.rows]
     for time in times:
-        state = state_at(splats_at, count, time, state)
-        true, told = state.select(keys.rows), keys.at(time)
-        off = distance(torch.cat(true[:2], 1), torch.cat(told[:2], 1)) * sizes
+        state = state_at(scene, time, state)
+        true, baked = state.select(keys.rows), keys.at(time)
+        off = distance(torch.cat(true[:2], 1), torch.cat(baked[:2], 1)) * sizes
         worst = torch.maximum(worst, torch.where(true.opacities >= ALPHA_MIN, off, 0))
     return Offset.of(worst)
+
+
+def morton_order(positions: np.ndarray) -> np.ndarray:
+    """An order of rows [N] in which neighbours in space stand beside each other (Morton's curve, 10 bits an axis)."""
+    if not len(positions):
+        return np.zeros(0, np.int64)
+    low, high = np.quantile(positions, [0.005, 0.995], axis=0)
+    cells = np.clip((positions - low) / np.maximum(high - low, 1e-30), 0, 1) * 1023
+    key = np.zeros(len(positions), np.int64)
+    for axis in range(3):
+        cell = cells[:, axis].astype(np.int64)
+        for bit in range(10):
+            key |= ((cell >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(key, kind="stable")

@@ -1,39 +1,33 @@
-"""A trained run as plain data for export: Gaussians at any instant, cameras, clip, and how large things look."""
+"""A trained run as plain data for export: Gaussians at any instant, cameras, frames, and how large things look."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import RasterSettings, Splats, View
 from d2_plugin.recordings import Camera
 from d2_plugin.runs.gaussian_ply import scales_and_rotations
-from d2_plugin.runs.run import Run
-from d2_plugin.runs.start import make_view
+from d2_plugin.viewing.camera_paths import focus_of, pose_of
+from d2_plugin.viewing.viewed import ViewedRun
 
 
-@dataclass(frozen=True, eq=False)
-class Clip:
-    """The instants of a scene."""
+class Outlook(NamedTuple):
+    """Where a player may start, in world units."""
 
-    frames: tuple[int, ...]
-    """Numbers of the frames, as the recording has them."""
-    seconds: tuple[float, ...]
-    """Time of each frame since the first one."""
-    fps: float
-
-    @property
-    def duration(self) -> float:
-        """From the first frame to the last, seconds; 0 for one frame."""
-        return self.seconds[-1]
+    focus: list[float]
+    """What the training cameras look at."""
+    up: list[float]
+    depth_range: tuple[float, float]
+    """From the hundredth-nearest to the hundredth-farthest opaque Gaussian that a training camera sees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +35,11 @@ class ExportScene:
     """What the formats write."""
 
     name: str
-    clip: Clip
+    frames: tuple[int, ...]
+    """Numbers of the frames, as the recording has them."""
+    seconds: tuple[float, ...]
+    """Time of each frame since the first one."""
+    fps: float
     train_cameras: tuple[Camera, ...]
     test_cameras: tuple[Camera, ...]
     raster: RasterSettings
@@ -53,122 +51,109 @@ class ExportScene:
     background: Tensor | None = None
     """Spherical harmonics [16, 3] of what lies behind all Gaussians."""
 
+    @property
+    def duration(self) -> float:
+        """From the first frame to the last, seconds; 0 for one frame."""
+        return self.seconds[-1]
+
     def pixels_per_unit(self, positions: Tensor) -> Tensor:
         """Length [M] in pixels of one world unit across the line of sight, in the training camera that sees a position
         [M, 3] largest; 0 where none does."""
         largest = positions.new_zeros(len(positions))
         for camera in self.train_cameras:
-            pose = torch.as_tensor(camera.T_camera_world).to(positions)
-            intrinsics = torch.as_tensor(camera.K).to(positions)
-            points = positions @ pose[:3, :3].T + pose[:3, 3]
-            depth = points[:, 2].clamp(min=self.raster.near)
-            pixels = (points[:, :2] * intrinsics.diagonal()[:2]) / depth[:, None] + intrinsics[:2, 2]
-            size = pixels.new_tensor([camera.width, camera.height])
-            seen = (points[:, 2] > self.raster.near) & ((pixels > 0) & (pixels < size)).all(1)
-            largest = torch.maximum(largest, torch.where(seen, intrinsics[0, 0] / depth, 0))
+            depth = self._seen_depth(camera, positions)
+            largest = torch.maximum(largest, torch.where(depth > 0, camera.K[0, 0] / depth.clamp(min=1e-30), 0))
         return largest
 
-    def still_at(self, time: float) -> MovingGaussians:
-        """The Gaussians of one instant, with the colours of that instant."""
-        return self.still(self.splats_at(time), time)
+    def _seen_depth(self, camera: Camera, positions: Tensor) -> Tensor:
+        """Depth [M] of positions [M, 3] in a camera; 0 for those outside of its image."""
+        pose, K = (torch.as_tensor(matrix).to(positions) for matrix in (camera.T_camera_world, camera.K))
+        points = positions @ pose[:3, :3].T + pose[:3, 3]
+        depth = points[:, 2]
+        pixels = (points[:, :2] * K.diagonal()[:2]) / depth.clamp(min=self.raster.near)[:, None] + K[:2, 2]
+        inside = ((pixels > 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(1)
+        return torch.where((depth > self.raster.near) & inside, depth, 0)
 
-    def still(self, splats: Splats, time: float) -> MovingGaussians:
-        """See `still_at`, of the Gaussians of that instant."""
-        rows = splats.rows.cpu()
-        own = self.harmonics._replace(coefficients=self.harmonics.coefficients[rows])
+    def outlook(self) -> Outlook:
+        """From the Gaussians of the first, the middle and the last frame."""
+        cameras, depths = self.train_cameras, []
+        for time in sorted({self.seconds[0], self.seconds[len(self.seconds) // 2], self.seconds[-1]}):
+            splats = self.splats_at(time)
+            opaque = splats.means[splats.opacities > 0.5].double()
+            depths += [self._seen_depth(camera, opaque) for camera in cameras]
+        seen = torch.cat(depths)
+        known = seen[seen > 0].numpy()
+        near, middle, far = np.quantile(known, [0.01, 0.5, 0.99]) if len(known) else (1.0, 1.5, 2.0)
+        axes = np.stack([camera.T_camera_world[:3, :3] for camera in cameras])
+        focus = focus_of(np.stack([camera.centre for camera in cameras]), axes[:, 2], float(middle))
+        up = -axes[:, 1].mean(axis=0)
+        up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else -axes[0, 1]
+        return Outlook(focus.tolist(), up.tolist(), (float(near), float(max(far, near * (1 + 1e-6)))))
+
+    def still_at(self, time: float) -> tuple[MovingGaussians, tuple[Tensor, Tensor]]:
+        """The Gaussians of one instant with its colours, and their scales [M, 3] and quaternions [M, 4]."""
+        splats = self.splats_at(time)
+        own = self.harmonics._replace(coefficients=self.harmonics.coefficients[splats.rows])
         phase = None
         if self.moving is not None and self.moving.motion is not None and own.time_degree:
-            phase = (time - self.moving.motion.times[rows]) / max(self.clip.duration, 1e-12)
-        still = Harmonics(own.without_time(phase), own.degree)
+            phase = (time - self.moving.motion.times[splats.rows]) / max(self.duration, 1e-12)
         means, covariances, opacities = (part.double() for part in splats[:3])
-        return MovingGaussians(means, covariances, opacities, still)
-
-    def shapes(self, splats: Splats) -> tuple[Tensor, Tensor]:
-        """Scales [M, 3] and quaternions [M, 4] of the Gaussians of one instant."""
+        still = MovingGaussians(means, covariances, opacities, Harmonics(own.without_time(phase), own.degree))
         if self._lasting_shapes is None:
-            return scales_and_rotations(splats.covariances.double())
+            return still, scales_and_rotations(covariances)
         scales, rotations = self._lasting_shapes
-        return scales[splats.rows], rotations[splats.rows]
+        return still, (scales[splats.rows], rotations[splats.rows])
 
     @cached_property
     def _lasting_shapes(self) -> tuple[Tensor, Tensor] | None:
         """Those of all Gaussians where they are the same at all times: finding them takes as long as all else."""
         return None if self.moving is None else scales_and_rotations(self.moving.covariances)
 
-    def restricted(self, frames: Sequence[int]) -> Clip:
-        """The clip's frames with these numbers."""
-        for frame in frames:
-            if frame not in self.clip.frames:
-                first, last = self.clip.frames[0], self.clip.frames[-1]
-                raise D2Error(f"the run has no frame {frame}: it has {first} to {last}; name some of those in --frames")
-        chosen = [i for i, frame in enumerate(self.clip.frames) if frame in set(frames)]
-        return Clip(
-            tuple(self.clip.frames[i] for i in chosen), tuple(self.clip.seconds[i] for i in chosen), self.clip.fps
-        )
 
-
-def scene_of(run: Run, unfinished: bool = False) -> ExportScene:
-    """The trained scene of a run.
-
-    Raises:
-        D2Error: nothing is trained yet; it is not trained to the end, unless `unfinished`; no Gaussian is left.
-    """
-    trainer, settings = run.trained(), run.settings
-    if trainer.step < settings.iterations and not unfinished:
-        raise D2Error(
-            f"{run.folder} is at step {trainer.step} of {settings.iterations}: wait for `d2 train` to end, or add "
-            "--unfinished to export what is there"
-        )
-    if not len(trainer.model):
-        raise D2Error(f"{run.folder} has no Gaussians: nothing is left to export, train with other settings")
-    return scene_of_model(trainer.model, run)
-
-
-def scene_of_model(model: Any, run: Run) -> ExportScene:
-    """A model of the run's backbone with the cameras and the clip of the run."""
-    recording = run.scene.recording
-    train, test = (
-        [recording.cameras[name] for name in names] for names in (run.scene.train_cameras, run.scene.test_cameras)
-    )
-    clip = Clip(recording.frames, tuple(recording.seconds(frame) for frame in recording.frames), recording.fps)
-    view = make_view(recording, train[0].name, recording.frames[0], run.settings.device)
-    raster = getattr(getattr(model, "settings", None), "raster", RasterSettings())
-    moving = model.moving() if hasattr(model, "moving") else None
-    slice_at = slicer(model, view)
-    harmonics = _harmonics(model, view)
-    return ExportScene(
-        recording.name, clip, tuple(train), tuple(test), raster, harmonics, slice_at, moving, background_of(model)
-    )
-
-
-def slicer(model: Any, view: View) -> Callable[[float], Splats]:
-    """The model's `slice_at` by time alone."""
+def export_scene(viewed: ViewedRun) -> ExportScene:
+    """What is exported of a run or a checkpoint."""
+    recording, backbone = viewed.recording, viewed.backbone
+    first = viewed.training[0]
+    view = viewed.view(pose_of(first), 0.0, (first.width, first.height), first.name)
+    model: Any = getattr(backbone, "model", None)  # of the bundled backbones
 
     @torch.no_grad()
     def splats_at(time: float) -> Splats:
-        return Splats(*(part.detach().cpu() for part in model.slice_at(replace(view, time=time))))
+        at = replace(view, time=viewed.time_offset + time * viewed.time_scale)
+        return Splats(*(part.detach().cpu() for part in backbone.slice_at(at)))
 
-    return splats_at
-
-
-def _harmonics(model: Any, view: View) -> Harmonics:
-    if not hasattr(model, "harmonics"):
-        return harmonics_as_seen(model, view)
-    own: Harmonics = model.harmonics()
-    return own._replace(coefficients=own.coefficients.detach().double().cpu())
+    harmonics, moving = viewed.harmonics, viewed.moving
+    if harmonics is None and hasattr(model, "harmonics"):
+        own: Harmonics = model.harmonics()
+        harmonics = own._replace(coefficients=own.coefficients.detach().double().cpu())
+    if moving is None and hasattr(model, "moving"):
+        moving = model.moving()
+    return ExportScene(
+        recording.name,
+        recording.frames,
+        tuple(recording.seconds(frame) for frame in recording.frames),
+        recording.fps,
+        tuple(viewed.training),
+        tuple(recording.cameras[name] for name in viewed.test_cameras),
+        backbone.settings,
+        _colors_as_seen(backbone, view) if harmonics is None else harmonics,
+        splats_at,
+        moving,
+        _background(model),
+    )
 
 
 @torch.no_grad()
-def harmonics_as_seen(model: Any, view: View) -> Harmonics:
-    """Of a model that tells none: the colours that one camera sees, for every direction."""
-    splats = model.slice_at(view)
-    colors = torch.zeros(len(model), 3)
-    colors[splats.rows.cpu()] = model.colors(view, splats).detach().cpu()
+def _colors_as_seen(backbone: Any, view: View) -> Harmonics:
+    """Of a model without harmonics: the colours that one camera sees, for every direction."""
+    splats = backbone.slice_at(view)
+    colors = torch.zeros(len(backbone), 3)
+    colors[splats.rows.cpu()] = backbone.colors(view, splats).detach().cpu()
     return Harmonics(coefficients_from_rgb(colors, 0, 0).double(), 0)
 
 
-def background_of(model: Any) -> Tensor | None:
-    """Spherical harmonics [16, 3] of what lies behind all Gaussians of the model; None where it has none."""
+def _background(model: Any) -> Tensor | None:
+    """Spherical harmonics [16, 3] of what lies behind all Gaussians of a bundled backbone; None where it has none."""
     background = getattr(model, "background", None)
     if background is None:
         return None

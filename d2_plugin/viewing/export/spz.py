@@ -13,36 +13,31 @@ import gzip
 from pathlib import Path
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from d2_plugin.durable import write
-from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
-from d2_plugin.runs.gaussian_ply import scales_and_rotations
-from d2_plugin.viewing.export.ply_files import covariances_from
+from d2_plugin.gaussians.moving import MovingGaussians
+from d2_plugin.viewing.export.keys import ALPHA_MIN
 
 MAGIC, VERSION = 0x5053474E, 3
 MOST_FRACTION_BITS = 12
 COMPRESSION = 6
-"""The default of 9 takes three times as long and saves one byte in a hundred."""
 FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
 """Signs of the harmonics above the constant one when y and z change theirs."""
 HEADER = np.dtype([("magic", "<u4"), ("version", "<u4"), ("count", "<u4"), ("rest", "u1", 4)])
 
 
-def write_spz(path: Path, gaussians: MovingGaussians, shapes: tuple[Tensor, Tensor] | None = None) -> int:
-    """Write what does not move of the Gaussians; returns how many were written. Those below 1/255 are left out.
+def write_spz(path: Path, gaussians: MovingGaussians, shapes: tuple[Tensor, Tensor]) -> None:
+    """Write Gaussians that stand still; those below an opacity of 1/255 are left out.
 
-    `shapes` are scales and quaternions of all of them, where they are known already."""
-    kept = (gaussians.opacities >= 1 / 255).nonzero()[:, 0]
+    `shapes` are the scales [M, 3] and quaternions [M, 4] of all of them."""
+    kept = (gaussians.opacities >= ALPHA_MIN).nonzero()[:, 0]
     shown = gaussians.select(kept)
     positions = shown.positions.numpy() * (1, -1, -1)
     largest = float(np.abs(positions).max(initial=1e-6))
     bits = int(np.clip(np.floor(np.log2((2**23 - 1) / largest)), 0, MOST_FRACTION_BITS))
     fixed = np.clip(np.rint(positions * 2**bits), -(2**23), 2**23 - 1).astype(np.int64) & 0xFFFFFF
-    found = scales_and_rotations(shown.covariances) if shapes is None else (shapes[0][kept], shapes[1][kept])
-    scales, quaternions = found
+    scales, quaternions = (part[kept] for part in shapes)
     coefficients, degree = shown.harmonics.without_time().numpy(), shown.harmonics.degree
     planes = [
         np.stack([fixed & 255, fixed >> 8 & 255, fixed >> 16], -1),
@@ -54,38 +49,6 @@ def write_spz(path: Path, gaussians: MovingGaussians, shapes: tuple[Tensor, Tens
     body += [_rotation_words(quaternions.numpy()).tobytes(), _harmonic_bytes(coefficients[:, 1:]).tobytes()]
     header = np.array([(MAGIC, VERSION, len(shown), (degree, bits, 0, 0))], HEADER)
     write(path, gzip.compress(header.tobytes() + b"".join(body), COMPRESSION, mtime=0), synced=False)
-    return len(shown)
-
-
-def read_spz(path: Path) -> MovingGaussians:
-    """Read what `write_spz` wrote.
-
-    Raises:
-        D2Error: the file is no SPZ of version 3.
-    """
-    data = path.read_bytes()
-    raw = gzip.decompress(data) if data[:2] == b"\x1f\x8b" else b""
-    header = np.frombuffer(raw[: HEADER.itemsize], HEADER)
-    if not len(header) or header["magic"][0] != MAGIC or header["version"][0] != VERSION:
-        raise D2Error(f"{path} is no SPZ file of version {VERSION}: export it anew")
-    count, (degree, bits, _, _) = int(header["count"][0]), header["rest"][0].tolist()
-    terms = (degree + 1) ** 2 - 1
-    sizes = {"position": 9, "opacity": 1, "color": 3, "scale": 3, "rotation": 4, "harmonics": 3 * terms}
-    columns, offset = {}, HEADER.itemsize
-    for name, size in sizes.items():
-        columns[name] = (
-            np.frombuffer(raw[offset : offset + size * count], np.uint8).reshape(count, size).astype(np.int64)
-        )
-        offset += size * count
-    low, middle, high = columns["position"].reshape(count, 3, 3).transpose(2, 0, 1)
-    fixed = low | middle << 8 | high << 16
-    positions = (fixed - ((fixed >> 23) << 24)) / 2**bits * (1, -1, -1)
-    rotations = _quaternions(columns["rotation"].astype(np.uint8).reshape(-1).view("<u4"))
-    more = (columns["harmonics"].reshape(count, terms, 3) - 128) / 128 * FLIPS[:terms, None]
-    coefficients = np.concatenate([((columns["color"] / 255 - 0.5) / 0.15)[:, None], more], 1)
-    covariances = covariances_from(_wide(np.exp(columns["scale"] / 16 - 10)), _wide(rotations))
-    opacities = _wide(columns["opacity"][:, 0] / 255)
-    return MovingGaussians(_wide(positions), covariances, opacities, Harmonics(_wide(coefficients), degree))
 
 
 def _rotation_words(quaternions: np.ndarray) -> np.ndarray:
@@ -101,26 +64,9 @@ def _rotation_words(quaternions: np.ndarray) -> np.ndarray:
     return words.astype("<u4")
 
 
-def _quaternions(words: np.ndarray) -> np.ndarray:
-    """Unit quaternions [M, 4], w first, in our axes."""
-    words, xyzw = words.copy(), np.zeros((len(words), 4))
-    largest = words >> 30
-    for axis in range(3, -1, -1):
-        other = largest != axis
-        size = (words & 511) / 511 / np.sqrt(2) * np.where(words >> 9 & 1, -1, 1)
-        xyzw[:, axis] = np.where(other, size, 0)
-        words = np.where(other, words >> 10, words)
-    xyzw[np.arange(len(xyzw)), largest] = np.sqrt(np.maximum(1 - (xyzw**2).sum(1), 0))
-    return (xyzw * (1, -1, -1, 1))[:, [3, 0, 1, 2]]
-
-
 def _harmonic_bytes(coefficients: np.ndarray) -> np.ndarray:
     """Bytes [M, C, 3] of the coefficients above the constant one; coarser codes compress better."""
     terms = coefficients.shape[1]
     codes = np.rint(coefficients * FLIPS[:terms, None] * 128) + 128
     step = np.where(np.arange(terms) < 3, 8, 16)[:, None]
     return np.clip(np.floor((codes + step // 2) / step) * step, 0, 255).astype(np.uint8)
-
-
-def _wide(values: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, np.float64))

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
+from d2_plugin.priors.sheet import label_colors
+from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings import Camera
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
-from d2_plugin.viewing.live.cloud import cloud_of
-from d2_plugin.viewing.live.page import Page
-from d2_plugin.viewing.panels import fitted
-from d2_plugin.viewing.subject import Subject
+from d2_plugin.viewing.live.page import Page, vertical_angle
+from d2_plugin.viewing.panels import fitted, prior_sigma_colors
+from d2_plugin.viewing.viewed import ViewedRun
 
 THUMBNAIL = 128
 """Width of an image in a frustum, pixels."""
 TRAINING, HELD_OUT = (70, 160, 255), (255, 150, 40)
 """RGB of cameras that train and of those that are held out."""
+MOST_POINTS = 60_000
+"""Of all cameras together: a browser draws them at every frame."""
 
 
 @dataclass
@@ -33,23 +37,23 @@ class Overlay:
     _images_of: int | None = None
     _cloud_of: tuple[int, str] | None = None
 
-    def refresh(self, subject: Subject, time: float, moving: bool) -> None:
+    def refresh(self, viewed: ViewedRun, time: float, moving: bool) -> None:
         """Bring everything up to date; images and points wait while something moves."""
-        frame = subject.frame_at(time)
-        self.page.say("frame", str(frame))
-        self._show_frusta(subject, frame, moving)
-        if subject.store is not None:
-            self._show_cloud(subject, frame, moving)
+        frame = viewed.frame_at(time)
+        self.page.set_text("frame", str(frame))
+        self._show_frusta(viewed, frame, moving)
+        if viewed.store is not None:
+            self._show_cloud(viewed, frame, moving)
 
-    def _show_frusta(self, subject: Subject, frame: int, moving: bool) -> None:
-        visible = bool(self.page.value("frusta", True))
-        if visible and (set(self.frusta) != set(subject.recording.cameras)):
-            self._add_frusta(subject)
-        scale = self.unit * float(self.page.value("size_of_frusta", 1.0))
-        eye = np.asarray(self.page.client.camera.position)
+    def _show_frusta(self, viewed: ViewedRun, frame: int, moving: bool) -> None:
+        visible = self.page.ticked("frusta", True)
+        if visible and (set(self.frusta) != set(viewed.recording.cameras)):
+            self._add_frusta(viewed)
+        scale = self.unit * self.page.number("size_of_frusta", 1.0)
+        eye = np.array(self.page.eye)
         for name, handle in self.frusta.items():
             # One that stands where we do would fill the screen with its small image.
-            near = np.linalg.norm(subject.recording.cameras[name].centre - eye) < 1.5 * scale
+            near = np.linalg.norm(viewed.recording.cameras[name].centre - eye) < 1.5 * scale
             if handle.visible != (visible and not near):
                 handle.visible = visible and not near
             if handle.scale != scale:
@@ -57,19 +61,19 @@ class Overlay:
         if visible and not moving and frame != self._images_of:
             self._images_of = frame
             for name, handle in self.frusta.items():
-                handle.image = _thumbnail(subject, name, frame)
+                handle.image = _thumbnail(viewed, name, frame)
 
-    def _add_frusta(self, subject: Subject) -> None:
-        for number, (name, camera) in enumerate(subject.recording.cameras.items()):
+    def _add_frusta(self, viewed: ViewedRun) -> None:
+        for number, (name, camera) in enumerate(viewed.recording.cameras.items()):
             if name not in self.frusta:
-                self.frusta[name] = self._frustum(number, camera, name in subject.train_cameras)
+                self.frusta[name] = self._frustum(number, camera, name in viewed.train_cameras)
         self._images_of = None
 
     def _frustum(self, number: int, camera: Camera, trains: bool) -> Any:
         # Numbered: a name with a slash would be a path in the scene.
         handle = self.page.client.scene.add_camera_frustum(
             f"/cameras/{number}",
-            2 * math.atan(camera.height / 2 / camera.K[1, 1]),
+            vertical_angle(camera),
             camera.width / camera.height,
             scale=self.unit,
             thickness=0.04 * self.unit,
@@ -80,9 +84,9 @@ class Overlay:
         handle.on_click(lambda _: self.page.stand_at(camera.name))
         return handle
 
-    def _show_cloud(self, subject: Subject, frame: int, moving: bool) -> None:
-        by = self.page.value("cloud", "none")
-        size = self.unit * 0.03 * float(self.page.value("point_size", 1.0))
+    def _show_cloud(self, viewed: ViewedRun, frame: int, moving: bool) -> None:
+        by = self.page.word("cloud", "none")
+        size = self.unit * 0.03 * self.page.number("point_size", 1.0)
         if by == "none":
             if self.cloud is not None:
                 self.cloud.remove()
@@ -90,7 +94,7 @@ class Overlay:
             return
         if (frame, by) != self._cloud_of and (not moving or self.cloud is None):
             self._cloud_of = frame, by
-            positions, colors = cloud_of(subject, frame, by)
+            positions, colors = cloud_of(viewed, frame, by)
             self.cloud = self.page.client.scene.add_point_cloud(
                 "/prior", positions, colors, point_size=size, point_shape="circle", precision="float32"
             )
@@ -98,27 +102,69 @@ class Overlay:
             self.cloud.point_size = size
 
 
-def frustum_size(subject: Subject) -> float:
+def frustum_size(viewed: ViewedRun) -> float:
     """A tenth of the way from the cameras to what they look at, or less where cameras stand close together."""
-    centres = np.stack([camera.centre for camera in subject.recording.cameras.values()])
+    centres = np.stack([camera.centre for camera in viewed.recording.cameras.values()])
     gaps = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     gaps[gaps == 0] = math.inf
     # The usual gap: a held-out camera that nearly touches another must not make all of them too small to see.
     usual = float(np.median(gaps.min(axis=1)))
-    size = min((subject.depth or math.inf) / 10, 0.5 * usual)
+    size = min((viewed.depth or math.inf) / 10, 0.5 * usual)
     return size if math.isfinite(size) else 0.2
 
 
-def rig_of(subject: Subject) -> tuple[np.ndarray, float]:
+def rig_of(viewed: ViewedRun) -> tuple[np.ndarray, float]:
     """Where the cameras' middle is, [3], and how far one has to be from it to see all of them."""
-    centres = np.stack([camera.centre for camera in subject.recording.cameras.values()])
+    centres = np.stack([camera.centre for camera in viewed.recording.cameras.values()])
     middle = centres.mean(axis=0)
-    return middle, max(float(np.linalg.norm(centres - middle, axis=1).max()), 3 * frustum_size(subject))
+    return middle, max(float(np.linalg.norm(centres - middle, axis=1).max()), 3 * frustum_size(viewed))
 
 
-def _thumbnail(subject: Subject, name: str, frame: int) -> np.ndarray:
-    image = subject.recording.image(name, frame)
+def _thumbnail(viewed: ViewedRun, name: str, frame: int) -> np.ndarray:
+    image = viewed.recording.image(name, frame)
     height, width = image.shape[:2]
     if width <= THUMBNAIL:
         return image
     return fitted(image, THUMBNAIL, max(round(height * THUMBNAIL / width), 1))
+
+
+class Cloud(NamedTuple):
+    """Points with colours."""
+
+    positions: np.ndarray  # [P, 3] float32, world
+    colors: np.ndarray  # [P, 3] uint8
+
+
+def cloud_of(viewed: ViewedRun, frame: int, by: str, most: int = MOST_POINTS) -> Cloud:
+    """The prior of all cameras at one frame, thinned evenly; sky has no place and is left out."""
+    store = viewed.store
+    cameras = [] if store is None else [name for name in store.cameras if name in viewed.recording.cameras]
+    priors = {name: prior for name in cameras if store is not None and (prior := store.prior(name, frame))}
+    pixels = sum(prior.depth.numel() for prior in priors.values())
+    stride = max(int(np.ceil(np.sqrt(pixels / most))), 1)
+    parts = [_points(viewed.recording.cameras[name], prior, by, stride) for name, prior in priors.items()]
+    if not parts:
+        return Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    return Cloud(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def _points(camera: Camera, prior: DepthPrior, by: str, stride: int) -> Cloud:
+    """One pixel of every `stride` by `stride`, where there is a depth."""
+    rows, columns = (torch.arange(stride // 2, side, stride) for side in prior.depth.shape)
+    thin = DepthPrior._make(None if map_ is None else map_[rows][:, columns] for map_ in prior)
+    depth = thin.depth.numpy()
+    shown = (depth > 0) & (thin.labels != Label.FAR).numpy()
+    y, x = np.meshgrid(rows.numpy() + 0.5, columns.numpy() + 0.5, indexing="ij")
+    rays = np.stack([x, y, np.ones_like(x)], -1)[shown] @ np.linalg.inv(camera.K).T
+    R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
+    return Cloud(((rays * depth[shown][:, None] - t) @ R).astype(np.float32), _painted(thin, by)[shown])
+
+
+def _painted(prior: DepthPrior, by: str) -> np.ndarray:
+    """RGB uint8 [h, w, 3] of every pixel."""
+    if by == "label":
+        return label_colors(prior.labels.numpy())
+    if by == "sigma":
+        return prior_sigma_colors(prior)
+    grey = torch.full((*prior.depth.shape, 3), 160, dtype=torch.uint8)
+    return (grey if prior.colors is None else prior.colors).numpy()

@@ -3,8 +3,9 @@
 viser calls back from threads of its own; they only set plain values here. Everything is drawn by the thread that calls
 `Viewer`, so that no image is taken of Gaussians that change.
 
-Names come from folders and files of others. They go into text fields and menus only, which show any text as it is;
-never into Markdown or HTML.
+A client may send anything: `Page` takes numbers within the ends of their sliders, words that stand in their menus and a
+camera that can be one, and keeps what it had where a message is none of these. Names come from folders and files of
+others; they go into text fields and menus only, which show any text as it is, never into Markdown or HTML.
 """
 
 from __future__ import annotations
@@ -16,13 +17,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from d2_plugin.recordings import Camera
+from d2_plugin.recordings.cameras.calibration import FIELD_OF_VIEW, LARGEST_NUMBER, pinhole, rigid
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation, rotation_of_quaternion
-from d2_plugin.viewing.paths import Lens, Pose
-from d2_plugin.viewing.subject import Subject
+from d2_plugin.viewing.camera_paths import Lens, Pose
+from d2_plugin.viewing.viewed import ViewedRun
 
 REST = 0.3
 """Seconds without a change after which an image is drawn at its full size."""
-SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0)
+WIDEST = 10.0
+"""Of an image, relative to its height, or the other way round."""
+SPEEDS = {f"{speed:g}": speed for speed in (0.1, 0.25, 0.5, 1.0, 2.0)}
 IMAGES = {"image": "rgb", "depth": "depth", "opacity": "alpha", "number of Gaussians": "count"}
 """What the menu says -> the kind of image."""
 NO_IMAGE = "nothing"
@@ -44,11 +49,9 @@ class Wanted(NamedTuple):
     def camera(self, width: int, height: int) -> Pose:
         """Where the browser's camera stands, with the lens of an image of this size."""
         R = rotation_of_quaternion(np.array(self.pose[3:7])).T
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R, -R @ np.array(self.pose[:3])
         focal = 0.5 * height / math.tan(self.pose[7] / 2)
-        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-        return Pose(T, Lens(K, width, height))
+        K = pinhole(focal, focal, width / 2, height / 2)
+        return Pose(rigid(R, -R @ np.array(self.pose[:3])), Lens(K, width, height))
 
 
 @dataclass
@@ -56,7 +59,7 @@ class Training:
     """What all pages show of a training."""
 
     total: int | None = None
-    said: str = "starting"
+    progress: str = "starting"
     scores: str = ""
     paused: bool = False
 
@@ -66,7 +69,7 @@ class Page:
     """The controls of one client."""
 
     client: Any
-    subject: Subject
+    viewed: ViewedRun
     training: Training | None
     most_height: int
     wake: Callable[[], None]
@@ -77,48 +80,43 @@ class Page:
     _played_at: float | None = None
 
     def build(self) -> None:
-        """Lay out the controls; what the subject does not have is left out."""
-        gui, subject = self.client.gui, self.subject
-        self._text("shown", "shown", subject.name)
-        if subject.note:
-            self._text("note", "note", subject.note)
+        """Lay out the controls; what the run does not have is left out."""
+        gui, viewed = self.client.gui, self.viewed
+        self._text("shown", "shown", viewed.name)
+        if viewed.note:
+            self._text("note", "note", viewed.note)
         if self.training is not None:
-            self._training_controls()
-        if subject.duration > 0:
+            with gui.add_folder("Training"):
+                self._text("progress", "step", "")
+                self._text("scores", "score", "")
+                self.controls["pause"] = gui.add_button("Go on" if self.training.paused else "Pause")
+                self.controls["pause"].on_click(lambda _: self._toggle_pause())
+        if viewed.duration > 0:
             with gui.add_folder("Time"):
                 self._time_controls()
-        if subject.backbone is not None:
+        if viewed.backbone is not None:
             with gui.add_folder("Image"):
                 self._image_controls()
         with gui.add_folder("Recording"):
             self._recording_controls()
-        if subject.backbone is not None:
+        if viewed.backbone is not None:
             self._text("size", "image size", "")
         for control in self.controls.values():
             if hasattr(control, "on_update"):
                 control.on_update(lambda _: self.wake())
         self.client.camera.on_update(lambda _: self.wake())
 
-    def _training_controls(self) -> None:
-        gui = self.client.gui
-        with gui.add_folder("Training"):
-            self._text("progress", "step", "")
-            self._text("scores", "score", "")
-            button = gui.add_button("Pause" if not self._paused else "Go on")
-            button.on_click(lambda _: self._toggle_pause())
-            self.controls["pause"] = button
-
     def _time_controls(self) -> None:
-        gui, subject = self.client.gui, self.subject
-        step = 10.0 ** math.floor(math.log10(subject.duration / 100))
-        most = round(math.floor(subject.duration / step + 1e-6) * step, 9)
+        gui, viewed = self.client.gui, self.viewed
+        step = 10.0 ** math.floor(math.log10(viewed.duration / 100))
+        most = round(math.floor(viewed.duration / step + 1e-6) * step, 9)
         self.controls["time"] = gui.add_slider("seconds", 0.0, most, step, 0.0)
-        self._text("frame", "frame", str(subject.recording.frames[0]))
+        self._text("frame", "frame", str(viewed.recording.frames[0]))
         self.controls["play"] = gui.add_checkbox("play", False)
-        self.controls["speed"] = gui.add_dropdown("speed", [f"{speed:g}" for speed in SPEEDS], initial_value="1")
+        self.controls["speed"] = gui.add_dropdown("speed", list(SPEEDS), initial_value="1")
 
     def _image_controls(self) -> None:
-        gui, known = self.client.gui, self.subject.inserted_at is not None
+        gui, known = self.client.gui, self.viewed.inserted_at is not None
         self.controls["show"] = gui.add_dropdown("show", [*IMAGES, NO_IMAGE], initial_value="image")
         self.controls["opacity"] = gui.add_slider("opacity from", 0.0, 0.95, 0.05, 0.0)
         self.controls["marked"] = gui.add_checkbox("inserted by D2 in orange", False, disabled=not known)
@@ -126,91 +124,99 @@ class Page:
         self.controls["height"] = gui.add_slider("height", low, max(self.most_height * 2, 720), 1, self.most_height)
 
     def _recording_controls(self) -> None:
-        gui, names = self.client.gui, tuple(self.subject.recording.cameras)
+        gui, names = self.client.gui, tuple(self.viewed.recording.cameras)
         self.controls["camera"] = gui.add_dropdown("stand at", [FREE, *names], initial_value=FREE)
         self.controls["camera"].on_update(lambda _: self.stand_at(self.controls["camera"].value))
         self.controls["frusta"] = gui.add_checkbox("cameras", True)
         self.controls["size_of_frusta"] = gui.add_slider("camera size", 0.1, 3.0, 0.1, 1.0)
-        if self.subject.store is not None:
-            self.controls["cloud"] = gui.add_dropdown("prior as points, by", CLOUDS, initial_value=self._first_cloud())
+        if self.viewed.store is not None:
+            first = "none" if self.viewed.backbone is not None else "image"
+            self.controls["cloud"] = gui.add_dropdown("prior as points, by", CLOUDS, initial_value=first)
             self.controls["point_size"] = gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
-
-    def _first_cloud(self) -> str:
-        return "none" if self.subject.backbone is not None else "image"
 
     def _text(self, name: str, label: str, value: str) -> None:
         self.controls[name] = self.client.gui.add_text(label, value, disabled=True)
 
-    def value(self, name: str, default: Any = None) -> Any:
-        """The value of a control, or the default where the page has none of that name."""
-        return self.controls[name].value if name in self.controls else default
+    def number(self, name: str, default: float) -> float:
+        """The number of a slider, within its ends; the default where there is no such slider or no number."""
+        slider = self.controls.get(name)
+        if slider is None or not _is_number(slider.value):
+            return default
+        return float(min(max(slider.value, slider.min), slider.max))
 
-    def say(self, name: str, text: str) -> None:
+    def word(self, name: str, default: str) -> str:
+        """The word of a menu; the default where there is no such menu, or another word was sent."""
+        menu = self.controls.get(name)
+        return default if menu is None or menu.value not in tuple(menu.options) else str(menu.value)
+
+    def ticked(self, name: str, default: bool = False) -> bool:
+        """Whether a box is ticked; the default where there is none."""
+        return self.controls[name].value is True if name in self.controls else default
+
+    @property
+    def eye(self) -> tuple[float, ...]:
+        """Where the browser's camera stands, [3]."""
+        return (0.0, 0.0, 0.0) if self._last is None else self._last.pose[:3]
+
+    def set_text(self, name: str, text: str) -> None:
         """Change a line of text."""
         if name in self.controls and self.controls[name].value != text:
             self.controls[name].value = text
-
-    @property
-    def _paused(self) -> bool:
-        return self.training is not None and self.training.paused
 
     def _toggle_pause(self) -> None:
         if self.training is not None:
             self.training.paused = not self.training.paused
         self.wake()
 
-    def tell_training(self) -> None:
+    def show_training(self) -> None:
         """Step, loss and score of a training, and what the button would do."""
         if self.training is None or "pause" not in self.controls:
             return
-        self.say("progress", self.training.said)
-        self.say("scores", self.training.scores)
+        self.set_text("progress", self.training.progress)
+        self.set_text("scores", self.training.scores)
         label = "Go on" if self.training.paused else "Pause"
         if self.controls["pause"].label != label:
             self.controls["pause"].label = label
 
-    def stand_at(self, name: str) -> None:
+    def stand_at(self, name: object) -> None:
         """Bring the browser's camera to one of the recording's."""
-        camera = self.subject.recording.cameras.get(name)
+        camera = self.viewed.recording.cameras.get(name) if isinstance(name, str) else None
         if camera is None:
             return
-        T_world_camera = np.linalg.inv(camera.T_camera_world)
+        R = camera.T_camera_world[:3, :3]
         with self.client.atomic():
             handle = self.client.camera
-            handle.up_direction = -T_world_camera[:3, 1]
-            handle.position = T_world_camera[:3, 3]
-            handle.wxyz = quaternion_of_rotation(T_world_camera[:3, :3])
-            handle.fov = 2 * math.atan(camera.height / 2 / camera.K[1, 1])
+            handle.up_direction = -R[1]
+            handle.position = camera.centre
+            handle.wxyz = quaternion_of_rotation(R.T)
+            handle.fov = vertical_angle(camera)
         self.wake()
 
     def play(self, now: float) -> None:
         """Move the slider on where the page plays; at the end it begins again."""
-        if not self.value("play", False):
+        if not self.ticked("play"):
             self._played_at = None
             return
         if self._played_at is not None:
-            passed = (now - self._played_at) * float(self.value("speed"))
+            passed = (now - self._played_at) * SPEEDS[self.word("speed", "1")]
             slider = self.controls["time"]
-            end = self.subject.duration + 1 / self.subject.recording.fps
-            time = (slider.value + passed) % end
+            end = self.viewed.duration + 1 / self.viewed.recording.fps
+            time = (self.number("time", 0.0) + passed) % end
             slider.value = float(min(time, slider.max))
         self._played_at = now
 
     def wanted(self, now: float) -> tuple[Wanted, bool] | None:
-        """What the page wants, and whether something moves; None before the browser has said where its camera is."""
-        camera = self.client.camera
-        if camera.update_timestamp == 0.0 or camera.image_height == 0:
+        """What the page wants, and whether something moves; None before the browser has a camera that can be one."""
+        seen = _seen_through(self.client.camera) or (self._last[:2] if self._last is not None else None)
+        if seen is None:
             return None
-        pose = (*camera.position, *camera.wxyz, camera.fov)
-        show = IMAGES.get(self.value("show", NO_IMAGE), "")
         wanted = Wanted(
-            tuple(float(number) for number in pose),
-            float(camera.aspect),
-            float(self.value("time", 0.0)),
-            show,
-            float(self.value("opacity", 0.0)),
-            bool(self.value("marked", False)),
-            int(self.value("height", self.most_height)),
+            *seen,
+            self.number("time", 0.0),
+            IMAGES.get(self.word("show", NO_IMAGE), ""),
+            self.number("opacity", 0.0),
+            self.ticked("marked"),
+            int(self.number("height", self.most_height)),
         )
         if wanted != self._last:
             self._last = wanted
@@ -218,3 +224,29 @@ class Page:
                 self.changed_at = now
         moving = self._played_at is not None or now - self.changed_at < REST
         return wanted, moving
+
+
+def vertical_angle(camera: Camera) -> float:
+    """The vertical field of view of a camera, radians, as if its principal point were in the middle."""
+    return 2 * math.atan(camera.height / 2 / camera.K[1, 1])
+
+
+def _seen_through(camera: Any) -> tuple[tuple[float, ...], float] | None:
+    """Pose (see `Wanted`) and aspect of the browser's camera; None where it has sent none, or one that cannot be."""
+    if camera.update_timestamp == 0.0:
+        return None
+    try:
+        pose = tuple(float(number) for number in (*camera.position, *camera.wxyz, camera.fov))
+        aspect = float(camera.aspect)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    fits = len(pose) == 8 and all(abs(number) <= LARGEST_NUMBER for number in pose)  # NaN is not
+    if not fits or not 1 / WIDEST <= aspect <= WIDEST:
+        return None
+    turns = abs(math.hypot(*pose[3:7]) - 1) < 0.1
+    sees = FIELD_OF_VIEW[0] <= math.degrees(pose[7]) <= FIELD_OF_VIEW[1]
+    return (pose, aspect) if turns and sees else None
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

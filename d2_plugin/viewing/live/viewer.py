@@ -1,34 +1,38 @@
 """A page in the browser that shows Gaussians while they train, or afterwards: one line in any trainer.
 
-    viewer = Viewer(d2)              # after D2Hooks: http://localhost:8080 shows the model as it trains
+    viewer = Viewer(d2)              # after D2Hooks: the page at viewer.url shows the model as it trains
 
 Images are drawn by the thread that trains, between two steps: nothing is locked, and no half-edited model is shown.
-Training is the same with and without: the viewer reads, draws nothing at random, and waits where somebody pauses.
+Training is the same with and without: the viewer reads, draws nothing at random, and waits where somebody pauses. What
+goes wrong with one browser's page closes that page; the training goes on.
 """
 
 from __future__ import annotations
 
 import io
-import math
-import socket
+import logging
 import threading
 import time
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from types import ModuleType
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from torch import Tensor
 
-from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.errors import D2Error
+from d2_plugin.hooks.reports import Report
 from d2_plugin.plugin import D2Hooks
+from d2_plugin.protocol import View
 from d2_plugin.values import checked_arguments
-from d2_plugin.viewing.live.draw import Drawer
-from d2_plugin.viewing.live.follow import Follower
+from d2_plugin.viewing.live.images import Drawer, Share
 from d2_plugin.viewing.live.overlay import Overlay, frustum_size, rig_of
-from d2_plugin.viewing.live.pace import Share
-from d2_plugin.viewing.live.page import Page, Training
-from d2_plugin.viewing.subject import Subject
+from d2_plugin.viewing.live.page import Page, Training, vertical_angle
+from d2_plugin.viewing.live.server import serve
+from d2_plugin.viewing.viewed import ViewedRun, viewed_views
+
+log = logging.getLogger(__name__)
 
 WATCHED, MOVED = 0.05, 0.5
 """Share of a training's time that images may take: for somebody who only looks, and while somebody moves."""
@@ -37,13 +41,13 @@ MOVING_SECONDS = 0.06
 
 
 class Viewer:
-    """The page, its clients, and what they look at."""
+    """The page, its clients, and what they see."""
 
     @checked_arguments
     def __init__(
         self,
         d2: D2Hooks | None = None,
-        subject: Subject | None = None,
+        viewed: ViewedRun | None = None,
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
@@ -54,18 +58,18 @@ class Viewer:
 
         Args:
             d2: of a trainer; from here on the page follows its steps.
-            subject: what is shown; of a trainer, its cameras are learnt from the views that it trains on.
-            host: address to listen at; the default is this machine alone, and "0.0.0.0" lets everybody in.
+            viewed: what is shown; of a trainer, its cameras are learnt from the views that it trains on.
+            host: address to listen at; the default is this machine alone, and "0.0.0.0" is every network that it is in.
             port: the next free one is taken where this one is in use.
-            height: of an image at rest, pixels; half-open menus let each client choose another.
+            height: of an image at rest, pixels; a slider of each page chooses another.
             iterations: how long the training lasts, where that is known.
         """
-        if d2 is None and subject is None:
-            raise D2Error("a viewer needs something to show: Viewer(d2), or a subject")
-        self.subject = subject
-        """What is shown; None until a trainer's first step says it."""
-        self.marks: Callable[[], Tensor | None] = lambda: None if self.subject is None else self.subject.inserted_at
-        """Per Gaussian [N], the step at which D2 inserted it; None where nobody knows."""
+        if d2 is None and viewed is None:
+            raise D2Error("a viewer needs something to show: Viewer(d2), or viewed=")
+        self.viewed = viewed
+        """What is shown; None until a trainer's first step."""
+        self.marks: Callable[[], Tensor | None] = lambda: None if self.viewed is None else self.viewed.inserted_at
+        """Per Gaussian [N], the step at which D2 inserted it; None where that is not known."""
         self.training = Training(iterations) if d2 is not None or iterations is not None else None
         self.height, self.step = height, 0
         self._waiting: list[Any] = []
@@ -74,17 +78,11 @@ class Viewer:
         self._drawer = Drawer()
         self._watched, self._moved, self._last = Share(WATCHED), Share(MOVED), time.monotonic()
         self._followed = None if d2 is None else Follower(d2, self)
-        self._server = _serve(host, port)
+        self._server, self.url = serve(host, port)
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._disconnected)
-        if subject is not None:
+        if viewed is not None:
             self.aim()
-
-    @property
-    def url(self) -> str:
-        """Where the page is."""
-        host = self._server.get_host()
-        return f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{self._server.get_port()}"
 
     @property
     def clients(self) -> int:
@@ -98,17 +96,17 @@ class Viewer:
         """
         self.step = step
         self._pass_time()
-        if not self.clients or self.subject is None:
+        if not self.clients or self.viewed is None:
             return
-        self._tell(step, loss)
+        self._note_progress(step, loss)
         self._draw_all(within_share=True)
         while self.training is not None and self.training.paused and self._pages:
-            self._tell(step, loss)
+            self._note_progress(step, loss)
             self._draw_all()
             self._wait()
         self._last = time.monotonic()  # a pause is not time in which images could have been drawn
 
-    def score(self, text: str) -> None:
+    def set_score(self, text: str) -> None:
         """Show a score beside the step."""
         if self.training is not None:
             self.training.scores = text
@@ -128,18 +126,18 @@ class Viewer:
 
     def aim(self) -> None:
         """Let new clients begin where the first training camera stands; behind all cameras where they are the show."""
-        subject = self.subject
-        if subject is None:
+        viewed = self.viewed
+        if viewed is None:
             return
-        camera = subject.training[0] if subject.train_cameras else next(iter(subject.recording.cameras.values()))
+        camera = viewed.training[0] if viewed.train_cameras else next(iter(viewed.recording.cameras.values()))
         T, initial = camera.T_camera_world, self._server.initial_camera
         eye, up, ahead = camera.centre, -T[1, :3], T[2, :3]
-        target = eye + (subject.depth or 3.0) * ahead
-        if subject.backbone is None:
-            middle, reach = rig_of(subject)
+        target = eye + (viewed.depth or 3.0) * ahead
+        if viewed.backbone is None:
+            middle, reach = rig_of(viewed)
             target, eye = middle + reach * ahead, middle - 1.1 * reach * ahead + 0.5 * reach * up
         initial.position, initial.look_at, initial.up = eye, target, up
-        initial.fov = 2 * math.atan(camera.height / 2 / camera.K[1, 1])
+        initial.fov = vertical_angle(camera)
 
     def _connected(self, client: Any) -> None:
         with self._guard:
@@ -154,57 +152,65 @@ class Viewer:
 
     def _open_pages(self) -> list[tuple[Page, Overlay]]:
         """The pages of all clients; those that came since the last look are laid out."""
-        subject = self.subject
-        if subject is None:
+        viewed = self.viewed
+        if viewed is None:
             return []
         with self._guard:
             waiting, self._waiting = self._waiting, []
         for client in waiting:
-            page = Page(client, subject, self.training, self.height, self._wake.set)
-            page.build()
+            page = Page(client, viewed, self.training, self.height, self._wake.set)
             with self._guard:
-                self._pages[client.client_id] = page, Overlay(page, frustum_size(subject))
+                self._pages[client.client_id] = page, Overlay(page, frustum_size(viewed))
+            self._attempt(page, page.build)
         with self._guard:
             pages = list(self._pages.values())
         for page, _ in pages:
-            page.subject = subject
+            page.viewed = viewed
         return pages
 
     def _draw_all(self, within_share: bool = False) -> None:
         for page, overlay in self._open_pages():
-            self._draw(page, overlay, within_share)
+            self._attempt(page, partial(self._draw, page, overlay, within_share))
+
+    def _attempt(self, page: Page, act: Callable[[], None]) -> None:
+        """Do something for a page; where that fails the page is given up, and nothing else."""
+        try:
+            act()
+        except Exception as failure:
+            log.warning("a page of the live viewer is not drawn any more: %r", failure, exc_info=failure)
+            self._disconnected(page.client)
 
     def _draw(self, page: Page, overlay: Overlay, within_share: bool) -> None:
         """Draw what one page wants if it has not got it; `within_share` keeps to what a training leaves for it."""
         now = time.monotonic()
         page.play(now)
-        found = page.wanted(now)
-        if found is None:
+        wish = page.wanted(now)
+        if wish is None:
             return
-        wanted, moving = found
+        wanted, moving = wish
         share = self._moved if moving else self._watched
         if within_share and not share.due and page.drawn is not None:
             return
-        page.tell_training()
+        page.show_training()
         if page.drawn != (wanted, self.step, moving):
-            if page.subject.backbone is not None:
+            if page.viewed.backbone is not None:
                 marks = self.marks()
                 marked = None if marks is None else marks > 0
                 self._drawer.draw(page, wanted, marked, MOVING_SECONDS if moving else None)
             page.drawn = wanted, self.step, moving
-        overlay.refresh(page.subject, wanted.time, moving)
+        overlay.refresh(page.viewed, wanted.time, moving)
         taken = time.monotonic() - now
         self._watched.spend(taken)
         self._moved.spend(taken)
 
-    def _tell(self, step: int, loss: float | None) -> None:
-        training, subject = self.training, self.subject
-        if training is None or subject is None:
+    def _note_progress(self, step: int, loss: float | None) -> None:
+        training, viewed = self.training, self.viewed
+        if training is None or viewed is None:
             return
         of = f" of {training.total}" if training.total else ""
-        count = f", {len(subject.backbone)} Gaussians" if subject.backbone is not None else ""
-        said = f"{step}{of}{count}" + ("" if loss is None else f", loss {loss:.4f}")
-        training.said = f"{said} (paused)" if training.paused else said
+        count = f", {len(viewed.backbone)} Gaussians" if viewed.backbone is not None else ""
+        progress = f"{step}{of}{count}" + ("" if loss is None else f", loss {loss:.4f}")
+        training.progress = f"{progress} (paused)" if training.paused else progress
 
     def _pass_time(self) -> None:
         now = time.monotonic()
@@ -215,40 +221,54 @@ class Viewer:
     def _wait(self) -> None:
         """Until something changes; at rest a look now and then is enough to see that nothing did."""
         with self._guard:
-            playing = any(page.value("play", False) for page, _ in self._pages.values())
+            playing = any(page.ticked("play") for page, _ in self._pages.values())
         self._wake.wait(0.02 if playing else 0.1)
         self._wake.clear()
 
 
-def viser() -> ModuleType:
-    """The module viser.
+class Follower:
+    """Wraps `loss` and `step` of one `D2Hooks`. The cameras are learnt from the views that are trained on."""
 
-    Raises:
-        MissingExtra: where it is not installed.
-    """
-    try:
-        import viser
-    except ImportError:
-        raise missing_extra("viser", "view", "the live viewer") from None
-    return viser
+    def __init__(self, d2: D2Hooks, viewer: Viewer) -> None:
+        self.d2, self.viewer = d2, viewer
+        self.views: dict[tuple[str, int], View] = {}
+        self.inserted = self.removed = 0
+        self._cameras: list[Any] = []
+        self._shown = 0
+        viewer.marks = lambda: d2.inserted_at
+        self._plain_loss, self._plain_step = d2.loss, d2.step
+        d2.loss, d2.step = self._loss, self._step  # type: ignore[method-assign]
 
+    def let_go(self) -> None:
+        """The trainer's own methods again."""
+        for name in ("loss", "step"):
+            vars(self.d2).pop(name, None)
 
-def _refuse_foreign(host: str) -> None:
-    """Raise where nothing can listen at an address: viser would try one port after the other, for ever."""
-    try:
-        family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind) as probe:
-            probe.bind(address)
-    except (OSError, UnicodeError) as failure:
-        reason = getattr(failure, "strerror", None) or failure
-        raise D2Error(
-            f"nothing can listen at {host!r} ({reason}): give an address of this machine, or leave --host out"
-        ) from None
+    def _loss(self, step: int, views: object) -> Any:
+        result = self._plain_loss(step, views)
+        self._cameras += views if isinstance(views, (list, tuple)) else [views]
+        return result
 
+    def _step(self, step: int) -> Report:
+        report = self._plain_step(step)
+        self.inserted, self.removed = self.inserted + report.inserted, self.removed + report.removed
+        self.viewer.set_score(f"D2: {self.inserted} inserted, {self.removed} removed")
+        self._note_views()
+        self.viewer.after_step(step)
+        return report
 
-def _serve(host: str, port: int) -> Any:
-    _refuse_foreign(host)
-    with redirect_stdout(io.StringIO()):  # it prints a table with addresses; we say ours in one line
-        server = viser().ViserServer(host=host, port=port, label="D2-4DGS", verbose=False)
-    server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="medium")
-    return server
+    def _note_views(self) -> None:
+        """Note the views of this step; each new camera or frame changes what is shown."""
+        for camera in self._cameras:
+            # A camera that came with its render is asked without it: the render must not be handed out again.
+            view = self.d2.backbone.view(camera.camera if hasattr(camera, "package") else camera)
+            self.views.setdefault((view.camera, view.frame), view)
+        self._cameras.clear()
+        if len(self.views) == self._shown:
+            return
+        first, self._shown = not self._shown, len(self.views)
+        store = getattr(getattr(self.d2, "_prior", None), "store", None)
+        viewed = viewed_views(list(self.views.values()), self.d2.backbone, store, type(self.d2.backbone).__name__)
+        self.viewer.viewed = replace(viewed, inserted_at=self.d2.inserted_at if self.d2.hooks else None)
+        if first:
+            self.viewer.aim()

@@ -1,4 +1,4 @@
-"""A video before it is drawn: where the camera stands at each image, and which instant it shows."""
+"""What `d2 render` takes, and a video before it is drawn: where the camera stands at each image, and which instant."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.viewing.paths import Pose, orbit, pose_of, spiral, through
-from d2_plugin.viewing.subject import Subject
-from d2_plugin.viewing.videos.path_file import read_camera_path
-from d2_plugin.viewing.videos.video import RATES
+from d2_plugin.settings import AtLeastOne, Positional, Range, Settings
+from d2_plugin.viewing.camera_paths import Pose, orbit, pose_of, read_camera_path, spiral, through
+from d2_plugin.viewing.panels import RECORDED
+from d2_plugin.viewing.videos.video import RATES, Format
+from d2_plugin.viewing.viewed import ViewedRun
 
 STANDING = ("held-out", "training")
 MOVING = ("orbit", "spiral", "through")
@@ -23,6 +24,56 @@ MOVING_SECONDS = 6.0
 """Length of a video whose camera moves, where the recording is shorter."""
 MOST_IMAGES = 1_000_000
 """Of a video: nine hours at 30 per second."""
+
+
+@dataclass(frozen=True)
+class RenderSettings(Settings):
+    """What is shown, from where, when, and how it is written."""
+
+    runs: Annotated[tuple[Path, ...], Positional()]
+    """Folders of `d2 train`, shown beside each other; or checkpoints of official trainers, with --recording."""
+    output: Path | None = None
+    """File of the video, or folder of its PNGs; by default in videos/ of the first run."""
+    path: str = "held-out"
+    """Where the camera stands: held-out (each held-out camera in turn), training (each training camera), or where it
+    moves: orbit, spiral, through (the training cameras), or a nerfstudio camera_path.json."""
+    show: tuple[str, ...] = ("rgb",)
+    """Images beside each other, joined by commas: rgb, depth, alpha, count (Gaussians per pixel); at the recording's
+    cameras also truth, error, true-depth, and from the depth prior: prior, sigma, labels."""
+    cameras: tuple[str, ...] | None = None
+    """Cameras of the path; by default all held-out or all training cameras."""
+    at: Annotated[float, Range(0, unit="seconds")] | None = None
+    """Freeze time at this instant while the camera moves."""
+    speed: Annotated[float, Range(1e-6, 1e6)] = 1.0
+    """Of time in the recording: 0.25 is slow motion, with images between the recorded frames."""
+    seconds: Annotated[float, Range(0, unit="seconds", open_low=True)] | None = None
+    """Length of the video, for each camera where it stands; by default that of the recording, and at least 6 where the
+    camera moves. Time runs back and forth in a video that is longer than the recording."""
+    fps: Annotated[float, Range(*RATES, unit="images per second")] | None = None
+    """Of the video; by default those of the recording."""
+    degrees: Annotated[float, Range(0, 360, unit="degrees", open_low=True)] | None = None
+    """Angle that an orbit swings; by default what the training cameras span: the rest was not recorded."""
+    width: Annotated[int, Range(1, 16384, unit="pixels")] | None = None
+    """Width of each image; by default the camera's."""
+    height: Annotated[int, Range(1, 16384, unit="pixels")] | None = None
+    """Height of each image; by default the camera's, or in proportion to the width."""
+    format: Format = "mp4"
+    """mp4 (H.264 that browsers play), webp or gif (animated, in loops), png (one file per image)."""
+    quality: Annotated[int, Range(0, 51)] = 18
+    """Constant rate factor of mp4, 0 is lossless; the quality of webp is 100 less twice this."""
+    no_captions: bool = False
+    """Leave out the line above images that says what they are."""
+    recording: Path | None = None
+    """The recording of a checkpoint of an official trainer."""
+    train_cameras: tuple[str, ...] | None = None
+    """Cameras that such a checkpoint was trained with; all but these are held out."""
+    downscale: AtLeastOne = 1
+    """For such a checkpoint: make the recording's images this many times smaller."""
+
+    @property
+    def recorded(self) -> list[str]:
+        """The images among `show` that exist at the recording's cameras and instants only."""
+        return [name for name in self.show if name in RECORDED]
 
 
 class Stop(NamedTuple):
@@ -35,21 +86,6 @@ class Stop(NamedTuple):
     """The camera of the recording that stands there, if one does."""
 
 
-@dataclass(frozen=True)
-class Wishes:
-    """What a video should show; None is the default of the path."""
-
-    path: str = "held-out"
-    cameras: tuple[str, ...] | None = None
-    at: float | None = None
-    speed: float = 1.0
-    seconds: float | None = None
-    fps: float | None = None
-    degrees: float | None = None
-    recorded_instants: bool = False
-    """Show the recorded instant that is nearest to each: where images are held against the truth."""
-
-
 class Plan(NamedTuple):
     """All images of a video, in order."""
 
@@ -57,83 +93,82 @@ class Plan(NamedTuple):
     fps: float
 
 
-def plan_video(subject: Subject, wishes: Wishes) -> Plan:
+def plan_video(viewed: ViewedRun, settings: RenderSettings) -> Plan:
     """Lay out a video.
 
     Time runs forward at `speed` and bounces at the ends of the recording where the video is longer; `at` freezes it.
+    Where images are compared with the recording, each shows the recorded instant that is nearest.
 
     Raises:
         D2Error: an unknown path or camera, no camera to stand at, or an instant outside the recording.
     """
-    if wishes.at is not None and not 0 <= wishes.at <= subject.duration + 1e-9:
-        raise D2Error(f"--at {wishes.at:g} s lies outside the recording, which lasts {subject.duration:g} s")
-    fps = _checked_rate(wishes.fps or subject.recording.fps)
-    if wishes.path in STANDING:
-        stops = _standing(subject, wishes, fps)
-    elif wishes.path in MOVING:
-        stops = _moving(subject, wishes, fps)
+    if settings.at is not None and not 0 <= settings.at <= viewed.duration + 1e-9:
+        raise D2Error(f"--at {settings.at:g} s lies outside the recording, which lasts {viewed.duration:g} s")
+    fps = _checked_rate(settings.fps or viewed.recording.fps)
+    if settings.path in STANDING:
+        stops = _standing(viewed, settings, fps)
+    elif settings.path in MOVING:
+        stops = _moving(viewed, settings, fps)
     else:
-        stops, fps = _from_file(subject, wishes)
-    if wishes.recorded_instants:
-        recording = subject.recording
-        stops = [stop._replace(time=recording.seconds(subject.frame_at(stop.time))) for stop in stops]
+        stops, fps = _from_file(viewed, settings)
+    if settings.recorded:
+        stops = [stop._replace(time=viewed.recording.seconds(viewed.frame_at(stop.time))) for stop in stops]
     return Plan(stops, fps)
 
 
-def instants(subject: Subject, wishes: Wishes, count: int, fps: float) -> list[float]:
+def _instants(viewed: ViewedRun, settings: RenderSettings, count: int, fps: float) -> list[float]:
     """Seconds of `count` images: frozen, or forward and back again."""
-    if wishes.at is not None:
-        return [wishes.at] * count
-    duration = subject.duration
+    if settings.at is not None:
+        return [settings.at] * count
+    duration = viewed.duration
     if duration == 0:
         return [0.0] * count
-    run = np.arange(count) * wishes.speed / fps
+    run = np.arange(count) * settings.speed / fps
     bounced = duration - np.abs(np.mod(run, 2 * duration) - duration)
     # The last image of a video as long as the recording shows its last frame, not a rounding error after it.
     return [float(np.clip(time, 0, duration)) for time in bounced]
 
 
-def _standing(subject: Subject, wishes: Wishes, fps: float) -> list[Stop]:
+def _standing(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[Stop]:
     """Each of the cameras in turn, the whole recording at each."""
-    of_path = subject.test_cameras if wishes.path == "held-out" else subject.train_cameras
-    names = wishes.cameras or of_path
+    of_path = viewed.test_cameras if settings.path == "held-out" else viewed.train_cameras
+    names = _known(viewed, settings.cameras or of_path)
     if not names:
-        raise D2Error(f"{subject.name} has no held-out camera: choose --path training, through, orbit or spiral")
-    known = _known(subject, names)
-    seconds = wishes.seconds
-    if seconds is None:
-        moves = wishes.at is None and subject.duration > 0
-        count = math.floor(_bounded(subject.duration / wishes.speed * fps) + 1e-6) + 1 if moves else max(round(fps), 1)
+        raise D2Error(f"{viewed.name} has no held-out camera: choose --path training, through, orbit or spiral")
+    if settings.seconds is not None:
+        count = max(round(_bounded(settings.seconds * fps)), 1)
+    elif settings.at is None and viewed.duration > 0:
+        count = math.floor(_bounded(viewed.duration / settings.speed * fps) + 1e-6) + 1
     else:
-        count = max(round(_bounded(seconds * fps)), 1)
-    times = instants(subject, wishes, count, fps)
-    return [Stop(pose_of(subject.recording.cameras[name]), time, name) for name in known for time in times]
+        count = max(round(fps), 1)
+    times = _instants(viewed, settings, count, fps)
+    return [Stop(pose_of(viewed.recording.cameras[name]), time, name) for name in names for time in times]
 
 
-def _moving(subject: Subject, wishes: Wishes, fps: float) -> list[Stop]:
-    names = _known(subject, wishes.cameras or subject.train_cameras)
-    cameras = [subject.recording.cameras[name] for name in names]
-    seconds = wishes.seconds or max(MOVING_SECONDS, 0 if wishes.at is not None else subject.duration / wishes.speed)
-    count = max(round(_bounded(seconds * fps)), 2)
-    if wishes.path == "orbit":
-        poses = orbit(cameras, count, wishes.degrees, subject.depth)
-    elif wishes.path == "spiral":
-        poses = spiral(cameras, count, subject.depth)
+def _moving(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[Stop]:
+    names = _known(viewed, settings.cameras or viewed.train_cameras)
+    cameras = [viewed.recording.cameras[name] for name in names]
+    played = 0 if settings.at is not None else viewed.duration / settings.speed
+    count = max(round(_bounded((settings.seconds or max(MOVING_SECONDS, played)) * fps)), 2)
+    if settings.path == "orbit":
+        poses = orbit(cameras, count, settings.degrees, viewed.depth)
+    elif settings.path == "spiral":
+        poses = spiral(cameras, count, viewed.depth)
     else:
         poses = through(cameras, count)
-    return [Stop(pose, time) for pose, time in zip(poses, instants(subject, wishes, count, fps), strict=True)]
+    return [Stop(pose, time) for pose, time in zip(poses, _instants(viewed, settings, count, fps), strict=True)]
 
 
-def _from_file(subject: Subject, wishes: Wishes) -> tuple[list[Stop], float]:
-    if not wishes.path.endswith(".json"):
-        raise unknown_name("camera path", wishes.path, [*STANDING, *MOVING, "FILE.json"])
-    found = read_camera_path(Path(wishes.path))
-    fps = _checked_rate(wishes.fps or found.fps)
-    if found.shares is not None and wishes.at is None:
-        times = [share * subject.duration for share in found.shares]
+def _from_file(viewed: ViewedRun, settings: RenderSettings) -> tuple[list[Stop], float]:
+    if not settings.path.endswith(".json"):
+        raise unknown_name("camera path", settings.path, [*STANDING, *MOVING, "FILE.json"])
+    path = read_camera_path(Path(settings.path))
+    fps = _checked_rate(settings.fps or path.fps)
+    if path.shares is not None and settings.at is None:
+        times = [share * viewed.duration for share in path.shares]
     else:
-        times = instants(subject, wishes, len(found.poses), fps)
-    return [Stop(pose, time) for pose, time in zip(found.poses, times, strict=True)], fps
+        times = _instants(viewed, settings, len(path.poses), fps)
+    return [Stop(pose, time) for pose, time in zip(path.poses, times, strict=True)], fps
 
 
 def _checked_rate(fps: float) -> float:
@@ -154,8 +189,8 @@ def _bounded(images: float) -> float:
     return images
 
 
-def _known(subject: Subject, names: Sequence[str]) -> Sequence[str]:
+def _known(viewed: ViewedRun, names: Sequence[str]) -> Sequence[str]:
     for name in names:
-        if name not in subject.recording.cameras:
-            raise unknown_name("camera", name, subject.recording.cameras)
+        if name not in viewed.recording.cameras:
+            raise unknown_name("camera", name, viewed.recording.cameras)
     return names

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.extras import import_av
 from d2_plugin.progress import progress_bar
 from d2_plugin.recordings.checks.memory import check_bytes
 from d2_plugin.runs.drawing import GAP, Panel, side_by_side
-from d2_plugin.settings import AtLeastOne, Positional, Range, Settings
-from d2_plugin.viewing.checkpoints import open_subject
-from d2_plugin.viewing.look import look
+from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.panels import KINDS, Scale, Shot, depth_scale
-from d2_plugin.viewing.subject import Subject, size_of
-from d2_plugin.viewing.videos.plan import Plan, Stop, Wishes, plan_video
-from d2_plugin.viewing.videos.video import RATES, Format, pyav, write_video
+from d2_plugin.viewing.rendering import render_view
+from d2_plugin.viewing.videos.plan import Plan, RenderSettings, Stop, plan_video
+from d2_plugin.viewing.videos.video import write_video
+from d2_plugin.viewing.viewed import ViewedRun
 
 BYTES_PER_PIXEL, BYTES_PER_PANEL = 60, 40
 """Of a video at its peak: of drawing one panel, and of each panel that is kept until the image is whole."""
@@ -28,76 +26,33 @@ SAMPLED = 5
 """Images of a video from which the range of depths is taken."""
 
 
-@dataclass(frozen=True)
-class RenderSettings(Settings):
-    """What is shown, from where, when, and how it is written."""
-
-    runs: Annotated[tuple[Path, ...], Positional()]
-    """Folders of `d2 train`, shown beside each other; or checkpoints of official trainers, with --recording."""
-    output: Path | None = None
-    """File of the video, or folder of its PNGs; by default in videos/ of the first run."""
-    path: str = "held-out"
-    """Where the camera stands: held-out (each held-out camera in turn), training (each training camera), or where it
-    moves: orbit, spiral, through (the training cameras), or a nerfstudio camera_path.json."""
-    show: tuple[str, ...] = ("rgb",)
-    """Images beside each other, joined by commas: rgb, depth, alpha, count (Gaussians per pixel); at the recording's
-    cameras also truth, error, true-depth, and from the depth prior: prior, sigma, labels."""
-    cameras: tuple[str, ...] | None = None
-    """Cameras of the path; by default all held-out or all training cameras."""
-    at: Annotated[float, Range(0, unit="seconds")] | None = None
-    """Freeze time at this instant while the camera moves."""
-    speed: Annotated[float, Range(1e-6, 1e6)] = 1.0
-    """Of time in the recording: 0.25 is slow motion, with images between the recorded frames."""
-    seconds: Annotated[float, Range(0, unit="seconds", open_low=True)] | None = None
-    """Length of the video, for each camera where it stands; by default that of the recording, and at least 6 where the
-    camera moves. Time runs back and forth in a video that is longer than the recording."""
-    fps: Annotated[float, Range(*RATES, unit="images per second")] | None = None
-    """Of the video; by default those of the recording."""
-    degrees: Annotated[float, Range(0, 360, unit="degrees", open_low=True)] | None = None
-    """Angle that an orbit swings; by default what the training cameras span, since nobody saw the rest."""
-    width: Annotated[int, Range(1, 16384, unit="pixels")] | None = None
-    """Width of each image; by default the camera's."""
-    height: Annotated[int, Range(1, 16384, unit="pixels")] | None = None
-    """Height of each image; by default the camera's, or in proportion to the width."""
-    format: Format = "mp4"
-    """mp4 (H.264 that browsers play), webp or gif (animated, in loops), png (one file per image)."""
-    quality: Annotated[int, Range(0, 51)] = 18
-    """Constant rate factor of mp4, 0 is lossless; the quality of webp is 100 less twice this."""
-    no_captions: bool = False
-    """Leave out the line above images that says what they are."""
-    recording: Path | None = None
-    """The recording of a checkpoint of an official trainer."""
-    train_cameras: tuple[str, ...] | None = None
-    """Cameras that such a checkpoint was trained with; all but these are held out."""
-    downscale: AtLeastOne = 1
-    """For such a checkpoint: make the recording's images this many times smaller."""
-
-
 def run(settings: RenderSettings) -> str:
-    """Draw and write the video; returns where it is and what it shows."""
+    """Write the video; returns where it is and what it holds."""
     _check(settings)
-    subjects = [
-        open_subject(path, settings.recording, settings.train_cameras, settings.downscale) for path in settings.runs
-    ]
-    plan = plan_video(subjects[0], _wishes(settings))
-    size = size_of(plan.stops[0].pose.lens, settings.width, settings.height)
-    _check_memory(size, len(settings.show) * len(subjects))
+    checkpoint = settings.recording, settings.train_cameras, settings.downscale
+    runs = [open_viewed(path, *checkpoint) for path in settings.runs]
+    plan = plan_video(runs[0], settings)
+    size = _size(plan.stops[0], settings.width, settings.height)
+    needed = size[0] * size[1] * (BYTES_PER_PIXEL + BYTES_PER_PANEL * len(settings.show) * len(runs))
+    check_bytes(needed, f"images of {size[0]}x{size[1]} pixels", "choose a smaller --width and --height")
     path = settings.output or _default_output(settings)
-    depths = _depths(subjects, plan, size, settings.show)
-    captions = not settings.no_captions
-    with write_video(path, settings.format, plan.fps, settings.quality) as video:
-        whole = (0, 0)
-        with progress_bar("render", len(plan.stops)) as bar:
-            for done, image in enumerate(_images(subjects, plan, size, settings.show, depths, captions), start=1):
-                video.add(image)
-                whole = image.shape[1], image.shape[0]
-                bar.update(done)
-    notes = [f"note  {subject.note}" for subject in subjects if subject.note]
+    depths = _depths(runs, plan, size, settings.show)
+    with (
+        write_video(path, settings.format, plan.fps, settings.quality) as video,
+        progress_bar("render", len(plan.stops)) as bar,
+    ):
+        for done, stop in enumerate(plan.stops, start=1):
+            rows = [_panels(viewed, stop, size, settings.show, depths, len(runs) > 1) for viewed in runs]
+            image = arranged(rows, not settings.no_captions)
+            video.add(image)
+            bar.update(done)
+    height, width = image.shape[:2]
+    notes = [f"note  {viewed.note}" for viewed in runs if viewed.note]
     seconds = len(plan.stops) / plan.fps
-    said = f"{path}: {len(plan.stops)} images of {whole[0]}x{whole[1]}, {plan.fps:g} per second, {seconds:.3g} s"
-    if settings.format == "mp4" and (whole[0] % 2 or whole[1] % 2):
-        said += f"; the file has {whole[0] + whole[0] % 2}x{whole[1] + whole[1] % 2}, since H.264 needs even sides"
-    return "\n".join([*notes, said])
+    summary = f"{path}: {len(plan.stops)} images of {width}x{height}, {plan.fps:g} per second, {seconds:.3g} s"
+    if settings.format == "mp4" and (width % 2 or height % 2):
+        summary += f"; the file has {width + width % 2}x{height + height % 2}, since H.264 needs even sides"
+    return "\n".join([*notes, summary])
 
 
 def _check(settings: RenderSettings) -> None:
@@ -109,25 +64,23 @@ def _check(settings: RenderSettings) -> None:
     for name in settings.show:
         if name not in KINDS:
             raise unknown_name("image", name, KINDS)
-    recorded = [name for name in settings.show if KINDS[name].needs != "gaussians"]
-    if recorded and settings.path not in ("held-out", "training"):
+    if settings.recorded and settings.path not in ("held-out", "training"):
         raise D2Error(
-            f"--show {recorded[0]} is known at the recording's cameras only: choose --path held-out or training"
+            f"--show {settings.recorded[0]} is known at the recording's cameras only: choose --path held-out or "
+            "training"
         )
     if settings.format != "png":
-        pyav()
+        import_av("writing videos")
 
 
-def _check_memory(size: tuple[int, int], panels: int) -> None:
-    """Refuse images that this machine has too little memory for."""
-    needed = size[0] * size[1] * (BYTES_PER_PIXEL + BYTES_PER_PANEL * panels)
-    check_bytes(needed, f"images of {size[0]}x{size[1]} pixels", "choose a smaller --width and --height")
-
-
-def _wishes(settings: RenderSettings) -> Wishes:
-    recorded = any(KINDS[name].needs != "gaussians" for name in settings.show)
-    names = ("path", "cameras", "at", "speed", "seconds", "fps", "degrees")
-    return Wishes(**{name: getattr(settings, name) for name in names}, recorded_instants=recorded)
+def _size(first: Stop, width: int | None, height: int | None) -> tuple[int, int]:
+    """Width and height of an image: as given, the other side in proportion, by default the camera's own."""
+    lens = first.pose.lens
+    if width is None and height is None:
+        return lens.width, lens.height
+    if height is None:
+        return int(width or 1), max(round(lens.height * (width or 1) / lens.width), 1)
+    return (max(round(lens.width * height / lens.height), 1) if width is None else width), height
 
 
 def _default_output(settings: RenderSettings) -> Path:
@@ -140,34 +93,17 @@ def _default_output(settings: RenderSettings) -> Path:
     return folder / (name if settings.format == "png" else f"{name}.{settings.format}")
 
 
-def _images(
-    subjects: Sequence[Subject],
-    plan: Plan,
-    size: tuple[int, int],
-    show: Sequence[str],
-    depths: Scale,
-    captions: bool,
-) -> Iterator[np.ndarray]:
-    for stop in plan.stops:
-        named = len(subjects) > 1
-        yield arranged([_panels(subject, stop, size, show, depths, named) for subject in subjects], captions)
-
-
 def _panels(
-    subject: Subject, stop: Stop, size: tuple[int, int], show: Sequence[str], depths: Scale, named: bool
+    viewed: ViewedRun, stop: Stop, size: tuple[int, int], show: Sequence[str], depths: Scale, named: bool
 ) -> list[Panel]:
-    shot = Shot(subject, subject.view(stop.pose, stop.time, size, stop.camera), depths)
-    panels = [KINDS[name].draw(shot) for name in show]
+    """The panels of one run at one image; `named` puts the run's name into captions that differ from run to run."""
+    shot = Shot(viewed, viewed.view(stop.pose, stop.time, size, stop.camera), depths)
+    panels = [KINDS[name](shot) for name in show]
     if not named:
         return panels
-    return [panel._replace(caption=_named(subject.name, panel.caption)) for panel in panels]
-
-
-def _named(name: str, caption: str) -> str:
-    """The caption with the name of its run, except where every run has the same image."""
-    if caption.startswith(("recorded", "true depth")):
-        return caption
-    return name if caption == "render" else f"{name}: {caption}"
+    own = [name not in ("truth", "true-depth") for name in show]
+    captions = [viewed.name if panel.caption == "render" else f"{viewed.name}: {panel.caption}" for panel in panels]
+    return [p._replace(caption=c) if is_own else p for p, c, is_own in zip(panels, captions, own, strict=True)]
 
 
 def arranged(rows: Sequence[Sequence[Panel]], captions: bool = True) -> np.ndarray:
@@ -194,14 +130,12 @@ def _joined(images: Sequence[np.ndarray], axis: int) -> np.ndarray:
     return np.concatenate(parts[1:], axis=axis)
 
 
-def _depths(subjects: Sequence[Subject], plan: Plan, size: tuple[int, int], show: Sequence[str]) -> Scale:
+def _depths(runs: Sequence[ViewedRun], plan: Plan, size: tuple[int, int], show: Sequence[str]) -> Scale:
     """The range of depths of a video, from a few of its images; not computed where none is shown."""
     if not {"depth", "true-depth", "prior"} & set(show):
         return 0.0, 1.0
     chosen = np.unique(np.linspace(0, len(plan.stops) - 1, SAMPLED).round().astype(int))
     small = max(size[0] // 2, 1), max(size[1] // 2, 1)
-    found = []
-    for subject in subjects:
-        views = [subject.view(plan.stops[i].pose, plan.stops[i].time, small) for i in chosen]
-        found += [look(subject.backbone, view).depth.numpy() for view in views]
-    return depth_scale(found)
+    stops = [plan.stops[i] for i in chosen]
+    views = [(viewed, viewed.view(stop.pose, stop.time, small)) for viewed in runs for stop in stops]
+    return depth_scale([render_view(viewed.backbone, view).depth.numpy() for viewed, view in views])

@@ -12,8 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -30,15 +29,27 @@ RATES = (0.001, 1000.0)
 """Images per second that files of videos can say."""
 
 
+class Encoding(NamedTuple):
+    """FFmpeg's names for one format."""
+
+    muxer: str
+    codec: str
+    pixels: str
+    options: dict[str, str]
+    """Of the container."""
+
+
+ENCODINGS = {
+    "mp4": Encoding("mp4", "libx264", "yuv420p", {"movflags": "+faststart"}),
+    "webp": Encoding("webp", "libwebp_anim", "yuv420p", {"loop": "0"}),
+    "gif": Encoding("gif", "gif", "pal8", {"loop": "0"}),
+}
+
+
 class Video(Protocol):
     """A video that is being written."""
 
     def add(self, image: np.ndarray) -> None: ...
-
-
-def pyav() -> ModuleType:
-    """The module av."""
-    return import_av("writing videos")
 
 
 @checked_arguments
@@ -58,14 +69,14 @@ def write_video(path: Path, form: Format, fps: float, quality: int = 18) -> Iter
     if form == "png":
         yield _Pngs(make_folder(path))
         return
-    if path.suffix.lower() != f".{form}":  # a slip of the hand must not replace another kind of file
+    if path.suffix.lower() != f".{form}":  # a typing error must not replace another kind of file
         raise D2Error(f"a video of format {form} needs a name that ends so, got {path.name}: mend the name or --format")
     folder = make_folder(path.parent)
     with one_of_many(folder, lambda: remove_leftovers(folder, below=False)):
         unfinished = path.with_name(f".{secrets.token_hex(8)}{LEFTOVER}")
         try:
             with _encoding(path):
-                video = {"mp4": _Mp4, "webp": _WebP, "gif": _Gif}[form](unfinished, _rate(fps), quality)
+                video = _Encoded(unfinished, form, _rate(fps), quality)
                 try:
                     yield video
                     video.close()
@@ -85,7 +96,7 @@ def _encoding(path: Path) -> Iterator[None]:
             yield
         except (D2Error, OSError):
             raise
-        except (pyav().error.FFmpegError, OverflowError) as error:
+        except (import_av("writing videos").error.FFmpegError, OverflowError) as error:
             raise D2Error(
                 f"cannot write the video {path} ({said(error)}): choose other --width, --height or --fps, or another "
                 "--format"
@@ -105,76 +116,67 @@ class _Pngs:
 class _Encoded:
     """One stream in one container."""
 
-    muxer, codec, pixels = "", "", "yuv420p"
-    container_options: ClassVar[dict[str, str]] = {}
-
-    def __init__(self, path: Path, rate: Fraction, quality: int) -> None:
-        self.av, self.rate, self.quality, self.count = pyav(), rate, quality, 0
-        self.container: Any = self.av.open(str(path), "w", format=self.muxer, options=self.container_options)
+    def __init__(self, path: Path, form: str, rate: Fraction, quality: int) -> None:
+        self.av, self.form, self.rate, self.quality, self.count = import_av("writing videos"), form, rate, quality, 0
+        encoding = ENCODINGS[form]
+        self.container: Any = self.av.open(str(path), "w", format=encoding.muxer, options=encoding.options)
         self.stream: Any = None
+        self.palette: Any = None
 
     def add(self, image: np.ndarray) -> None:
         """Encode one image, RGB uint8 [H, W, 3]; all have the size of the first."""
-        image = self._shaped(checked_image(image, "an image of a video"))
+        image = checked_image(image, "an image of a video")
+        if self.form == "mp4":
+            image = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge")
+        height, width = image.shape[:2]
         if self.stream is None:
-            self._begin(image.shape[1], image.shape[0])
-        if (self.stream.width, self.stream.height) != (image.shape[1], image.shape[0]):
-            raise D2Error(f"a video of {self.stream.width}x{self.stream.height} pixels got {image.shape[1::-1]}")
+            self._begin(width, height)
+        if (self.stream.width, self.stream.height) != (width, height):
+            raise D2Error(f"a video of {self.stream.width}x{self.stream.height} pixels got {(width, height)}")
         frame = self.av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
         frame.pts, frame.time_base = self.count, 1 / self.rate
         self.count += 1
-        self._take(frame)
+        if self.form == "gif":  # kept until the end: the palette is that of all images
+            self.palette = self.palette or self._palette(frame)
+            self.palette[0].push(frame)
+        else:
+            self._mux(self.stream.encode(self._bt709(frame) if self.form == "mp4" else frame))
 
     def close(self) -> None:
         """Write what is still inside."""
         if self.stream is None:
             raise D2Error("a video without an image: choose a longer path or more frames")
+        if self.palette is not None:
+            source, sink = self.palette
+            source.push(None)
+            with suppress(self.av.error.EOFError, self.av.error.BlockingIOError):
+                while True:
+                    self._mux(self.stream.encode(sink.pull()))
         self._mux(self.stream.encode())
         self.container.close()
         self.container = None
 
     def abandon(self) -> None:
-        """Let go of the file where `close` was not reached."""
+        """Release the file where `close` was not reached."""
         if self.container is not None:
-            with suppress(self.av.error.FFmpegError, OSError):  # what went wrong before is what is said
+            with suppress(self.av.error.FFmpegError, OSError):  # the earlier error is the one that is reported
                 self.container.close()
             self.container = None
 
-    def _shaped(self, image: np.ndarray) -> np.ndarray:
-        return image
-
     def _begin(self, width: int, height: int) -> None:
-        self.stream = self.container.add_stream(self.codec, rate=self.rate)
-        self.stream.width, self.stream.height, self.stream.pix_fmt = width, height, self.pixels
-        self._tune()
+        encoding = ENCODINGS[self.form]
+        self.stream = self.container.add_stream(encoding.codec, rate=self.rate)
+        self.stream.width, self.stream.height, self.stream.pix_fmt = width, height, encoding.pixels
+        if self.form == "webp":
+            self.stream.options = {"quality": str(max(100 - 2 * self.quality, 0)), "compression_level": "6"}
+        if self.form == "mp4":
+            self.stream.options = {"crf": str(self.quality), "preset": "medium", "profile": "high"}
+            self.stream.gop_size = max(round(self.rate), 1)
+            context, colors = self.stream.codec_context, self.av.video.reformatter
+            context.colorspace, context.color_range = colors.Colorspace.ITU709, colors.ColorRange.MPEG
+            context.color_primaries, context.color_trc = colors.ColorPrimaries.BT709, colors.ColorTrc.BT709
 
-    def _tune(self) -> None:
-        """Options of the encoder."""
-
-    def _take(self, frame: Any) -> None:
-        self._mux(self.stream.encode(frame))
-
-    def _mux(self, packets: Any) -> None:
-        for packet in packets:
-            self.container.mux(packet)
-
-
-class _Mp4(_Encoded):
-    muxer, codec = "mp4", "libx264"
-    container_options: ClassVar = {"movflags": "+faststart"}
-
-    def _shaped(self, image: np.ndarray) -> np.ndarray:
-        rows, columns = image.shape[0] % 2, image.shape[1] % 2
-        return np.pad(image, ((0, rows), (0, columns), (0, 0)), mode="edge")
-
-    def _tune(self) -> None:
-        self.stream.options = {"crf": str(self.quality), "preset": "medium", "profile": "high"}
-        self.stream.gop_size = max(round(self.rate), 1)
-        context, colors = self.stream.codec_context, self.av.video.reformatter
-        context.colorspace, context.color_range = colors.Colorspace.ITU709, colors.ColorRange.MPEG
-        context.color_primaries, context.color_trc = colors.ColorPrimaries.BT709, colors.ColorTrc.BT709
-
-    def _take(self, frame: Any) -> None:
+    def _bt709(self, frame: Any) -> Any:
         colors = self.av.video.reformatter
         converted = frame.reformat(
             format="yuv420p",
@@ -183,52 +185,27 @@ class _Mp4(_Encoded):
             interpolation=colors.Interpolation.AREA,
         )
         converted.pts, converted.time_base = frame.pts, frame.time_base
-        super()._take(converted)
+        return converted
 
-
-class _WebP(_Encoded):
-    muxer, codec = "webp", "libwebp_anim"
-    container_options: ClassVar = {"loop": "0"}
-
-    def _tune(self) -> None:
-        self.stream.options = {"quality": str(max(100 - 2 * self.quality, 0)), "compression_level": "6"}
-
-
-class _Gif(_Encoded):
-    muxer, codec, pixels = "gif", "gif", "pal8"
-    container_options: ClassVar = {"loop": "0"}
-    graph: Any = None
-
-    def _take(self, frame: Any) -> None:
-        """Kept until the end: the palette is that of all images."""
-        if self.graph is None:
-            self._plan(frame)
-        self.source.push(frame)
-
-    def _plan(self, frame: Any) -> None:
-        self.graph = graph = self.av.filter.Graph()
+    def _palette(self, frame: Any) -> tuple[Any, Any]:
+        """Where images go in, and where they come out with the one palette of all of them."""
+        graph = self.av.filter.Graph()
         size = {"width": frame.width, "height": frame.height}
-        self.source = graph.add_buffer(**size, format=frame.format, time_base=frame.time_base)
+        source = graph.add_buffer(**size, format=frame.format, time_base=frame.time_base)
         split, palette, use = graph.add("split"), graph.add("palettegen"), graph.add("paletteuse", "dither=bayer")
-        self.sink = graph.add("buffersink")
-        self.source.link_to(split)
+        sink = graph.add("buffersink")
+        source.link_to(split)
         split.link_to(palette, 0, 0)
         split.link_to(use, 1, 0)
         palette.link_to(use, 0, 1)
-        use.link_to(self.sink)
+        use.link_to(sink)
         graph.configure()
+        self.graph = graph  # kept alive: it owns both ends
+        return source, sink
 
-    def close(self) -> None:
-        """Choose the palette, write all images."""
-        if self.stream is not None:
-            self.source.push(None)
-            while True:
-                try:
-                    frame = self.sink.pull()
-                except (self.av.error.EOFError, self.av.error.BlockingIOError):
-                    break
-                self._mux(self.stream.encode(frame))
-        super().close()
+    def _mux(self, packets: Any) -> None:
+        for packet in packets:
+            self.container.mux(packet)
 
 
 def _rate(fps: float) -> Fraction:

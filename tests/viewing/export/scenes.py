@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from tiny import make_model, make_views
+from tiny import make_adapter, make_model, make_views
 
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.protocol import View
-from d2_plugin.recordings import Camera
-from d2_plugin.viewing.export.scene import Clip, ExportScene, background_of, slicer
+from d2_plugin.recordings import Camera, Recording
+from d2_plugin.viewing.export.scene import ExportScene, export_scene
+from d2_plugin.viewing.viewed import KeptImages, ViewedRun
 
 NASTY = '</script><script>alert(1)</script> & "tiny"'
 WIDTH, HEIGHT = 160, 120
@@ -61,20 +62,10 @@ def make_scene(
         Camera(name, WIDTH, HEIGHT, np.asarray(view.K.double()), np.asarray(view.T_camera_world.double()))
         for name, view in zip(cameras, views, strict=True)
     ]
-    seconds = tuple(DURATION * i / (FRAMES - 1) for i in range(FRAMES))
-    clip = Clip(tuple(range(FRAMES)), seconds, (FRAMES - 1) / DURATION)
-    harmonics = model.harmonics()
-    return ExportScene(
-        name,
-        clip,
-        tuple(made[:2]),
-        tuple(made[2:]),
-        model.settings.raster,
-        harmonics._replace(coefficients=harmonics.coefficients.detach().double()),
-        slicer(model, views[0]),
-        model.moving(),
-        background_of(model),
-    )
+    cameras = {camera.name: camera for camera in made}
+    recording = Recording(name, cameras, tuple(range(FRAMES)), (FRAMES - 1) / DURATION, KeptImages(cameras))
+    *train, held_out = cameras
+    return export_scene(ViewedRun(name, recording, tuple(train), (held_out,), make_adapter(model)))
 
 
 def rasterized(

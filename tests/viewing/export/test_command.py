@@ -8,6 +8,7 @@ from typing import get_args, get_type_hints
 
 import pytest
 import torch
+from oracles.export_files import ReadPage
 from viewing.hostile import emptied, of_another_version, still_training
 
 from d2_plugin.commands.cli import main
@@ -15,7 +16,6 @@ from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.viewing.export.export import FORMATS, Export
-from d2_plugin.viewing.export.page import read_page
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +49,7 @@ def test_a_run_becomes_a_page_of_a_stated_size(
     path = trained / backbone / "export" / "scene.html"
     said = capsys.readouterr().out
     assert f"{path} ({path.stat().st_size / 1e6:.1f} MB)" in said
-    assert "16-bit codes: off by median" in said
-    header = read_page(path).header
+    header = ReadPage(path).header
     assert header["frames"] == [0, 1, 2]
     assert [camera["held_out"] for camera in header["cameras"]] == [False, False, False, True]
     assert "the learnt background, in every direction" in said
@@ -59,61 +58,39 @@ def test_a_run_becomes_a_page_of_a_stated_size(
 
 
 def test_frames_are_chosen_by_number(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", str(trained / "yang4d"), "--format", "spz", "--frames", "0:2:2"]) == 0
+    run = str(trained / "yang4d")
+    assert main(["export", run, "--format", "spz", "--frames", "0:2:2"]) == 0
     folder = trained / "yang4d" / "export" / "spz"
     assert sorted(path.name for path in folder.iterdir()) == ["frame_00000.spz", "frame_00002.spz"]
     said = capsys.readouterr().out
     assert f"2 files in {folder}" in said
     assert "the background behind the Gaussians is left out" in said
+    assert "no frame 7: it has 0 to 2" in complaint(capsys, run, "--format", "ply", "--frames", "7")
+    assert "--frames is for ply and spz" in complaint(capsys, run, "--frames", "1")
+    assert "--frames" in complaint(capsys, run, "--format", "ply", "--frames", "")
 
 
-class TestOneSentence:
-    def test_a_wrong_format(self, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "splatv" in complaint(capsys, str(trained / "yang4d"), "--format", "splat")
+def test_a_run_that_still_trains_is_exported_as_far_as_it_is(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = still_training(trained / "yang4d", tmp_path / "<script>alert(1)<", 3)
+    assert main(["export", str(copy)]) == 0
+    assert "still trains: this is step 3 of 4" in capsys.readouterr().out
 
-    def test_no_run(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "holds no run" in complaint(capsys, str(tmp_path))
 
-    def test_a_run_without_a_checkpoint(
-        self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        copy = Path(shutil.copytree(trained / "yang4d", tmp_path / "run"))
-        (copy / "checkpoint.pt").unlink()
-        assert "holds no checkpoint yet" in complaint(capsys, str(copy))
-
-    def test_a_run_that_still_trains(self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        copy = still_training(trained / "yang4d", tmp_path / "run", 3)
-        assert "is at step 3 of 4: wait for `d2 train` to end, or add --unfinished" in complaint(capsys, str(copy))
-        assert main(["export", str(copy), "--unfinished"]) == 0
-
-    def test_a_damaged_checkpoint(self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        copy = Path(shutil.copytree(trained / "yang4d", tmp_path / "run"))
-        (copy / "checkpoint.pt").write_bytes((copy / "checkpoint.pt").read_bytes()[:1000])
-        assert "is damaged" in complaint(capsys, str(copy))
-
-    def test_a_run_of_another_version_and_one_without_gaussians(
-        self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        assert "version 99" in complaint(capsys, str(of_another_version(trained / "yang4d", tmp_path / "later")))
-        said = complaint(capsys, str(emptied(trained / "yang4d", tmp_path / "empty")))
-        assert "has no Gaussians: nothing is left to export" in said
-
-    def test_a_run_without_a_prior_and_with_a_name_of_markup(self, trained: Path, tmp_path: Path) -> None:
-        """No hook ran, so there is no prior; the page needs none."""
-        copy = Path(shutil.copytree(trained / "yang4d", tmp_path / "<script>alert(1)<"))
-        assert not (copy / "priors").exists()
-        assert main(["export", str(copy)]) == 0
-        assert (copy / "export" / "scene.html").is_file()
-
-    def test_frames_that_are_not_there(self, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        run = str(trained / "yang4d")
-        assert "no frame 7: it has 0 to 2" in complaint(capsys, run, "--format", "ply", "--frames", "7")
-        assert "--frames is for ply and spz" in complaint(capsys, run, "--frames", "1")
-
-    def test_a_field_in_a_format_of_straight_lines(self, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        model = Run.load(trained / "deform").trained().model
-        said = complaint(capsys, str(trained / "deform"), "--format", "ftgs") if model.deforms else "html or splatv"
-        assert "html or splatv" in said
+def test_what_cannot_be_exported_is_one_sentence(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = trained / "yang4d"
+    assert "splatv" in complaint(capsys, str(run), "--format", "splat")
+    assert "holds no run" in complaint(capsys, str(tmp_path))
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    (copy / "checkpoint.pt").write_bytes((copy / "checkpoint.pt").read_bytes()[:1000])
+    assert "is damaged" in complaint(capsys, str(copy))
+    (copy / "checkpoint.pt").unlink()
+    assert "holds no checkpoint yet" in complaint(capsys, str(copy))
+    assert "version 99" in complaint(capsys, str(of_another_version(run, tmp_path / "later")))
+    assert "has no Gaussian left at step 4" in complaint(capsys, str(emptied(run, tmp_path / "empty")))
 
 
 def test_the_formats_that_are_declared_are_those_that_are_written() -> None:

@@ -19,7 +19,7 @@ from viewing.export.scenes import DURATION, HEIGHT, WIDTH, make_scene, psnr, sha
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.protocol import RasterSettings, View
 from d2_plugin.rasterizer import rasterize
-from d2_plugin.viewing.export.linear_files import write_splatv
+from d2_plugin.viewing.export.splatv import write_splatv
 
 pytestmark = pytest.mark.browser
 

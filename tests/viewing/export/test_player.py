@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from oracles.export_files import ReadPage
 from viewing.chromium import Page, browser, executable, image
 from viewing.export.scenes import DURATION, NASTY, make_scene, psnr, rasterized, sharp_model
 
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
 from d2_plugin.runs.drawing import color_scale, colorize
-from d2_plugin.viewing.export.page import read_page, write_page
+from d2_plugin.viewing.export.page import write_page
 
 pytestmark = pytest.mark.browser
 
@@ -106,7 +107,7 @@ def test_images_of_other_times_and_cameras_would_not_pass(new_page: Any, tmp_pat
 def test_harmonics_and_cosines_in_time_and_a_sky_are_drawn(
     new_page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bits: int
 ) -> None:
-    monkeypatch.setattr("d2_plugin.viewing.export.coded_scene.HARMONIC_BITS", (bits,))
+    monkeypatch.setattr("d2_plugin.viewing.export.coded.HARMONIC_BITS", (bits,))
     plain = sharp_model("yang4d")
     rows = {name: value.detach() for name, value in plain.gaussians.parameters.items()}
     generator = torch.Generator().manual_seed(3)
@@ -124,7 +125,7 @@ def test_the_depth_view_is_the_expected_depth_on_its_scale(new_page: Any, tmp_pa
     model = sharp_model("yang4d")
     page = opened(new_page, model, tmp_path / "scene.html")
     true = rasterized(model, 1, TIMES[1])
-    low, high = read_page(tmp_path / "scene.html").header["depth_range"]
+    low, high = ReadPage(tmp_path / "scene.html").header["depth_range"]
     colors = colorize(true["depth"], low, high, color_scale("viridis")) * true["opacity"][..., None]
     assert psnr(shown(page, 1, TIMES[1], "depth"), colors / 255) > 30
 

@@ -73,7 +73,7 @@ function listen(element, camera, changed) {
   const fingers = new Map();
   const focal = () => camera.view(element.clientWidth, element.clientHeight).focal[0];
   element.addEventListener("pointerdown", (event) => {
-    element.setPointerRecording(event.pointerId);
+    element.setPointerCapture(event.pointerId);
     fingers.set(event.pointerId, event);
   });
   for (const end of ["pointerup", "pointercancel"]) {

@@ -1,23 +1,47 @@
-"""Camera paths: a camera's pose and lens for each image of a video, made from the cameras of a recording.
+"""Camera paths: a camera's pose and lens for each image of a video, made from the cameras of a recording or read.
 
 All poses are `T_camera_world` [4, 4] float64 in OpenCV axes. Two to four cameras cover a small part of the sphere
 around a scene, and what they did not see cannot be shown: orbit and spiral stay inside the angle that they span.
+
+`read_camera_path` reads nerfstudio's camera_path.json, as its viewer and others write it. There poses are
+camera-to-world in OpenGL axes (x right, y up, z back), the field of view is vertical and in degrees. The path must be
+in the world of the recording: a `dataparser_transforms.json` beside it, with which nerfstudio turned and scaled that
+world, is undone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, Optional
 
 import numpy as np
 
+from d2_plugin.errors import D2Error
+from d2_plugin.reading import NoSuchFile, field, read_json
 from d2_plugin.recordings import Camera
+from d2_plugin.recordings.cameras.calibration import (
+    LARGEST_NUMBER,
+    LARGEST_SIDE,
+    OPENGL_TO_OPENCV,
+    checked_camera,
+    pinhole,
+    rigid,
+)
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation, rotation_of_quaternion, rotation_of_vector
+from d2_plugin.values import Range
 
 ALL_AROUND = 270.0
 """Cameras that span more than this many degrees stand all around: an orbit is then a whole turn."""
 LEAST_SWING = 12.0
 """Degrees that an orbit swings at least, where cameras stand close together."""
+
+EXPORT = "export the camera path again"
+
+Side = Annotated[int, Range(1, LARGEST_SIDE, unit="pixels")]
+Vertical = Annotated[float, Range(0, 180, unit="degrees", open_low=True, open_high=True)]
+Above0 = Annotated[float, Range(0, LARGEST_NUMBER, open_low=True)]
+OptionalTime = Optional[Annotated[float, Range()]]  # noqa: UP045  at run time, on Python 3.9 too
 
 
 class Lens(NamedTuple):
@@ -196,3 +220,86 @@ def _between(chain: Sequence[Camera], place: float) -> Pose:
 
 def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / max(np.linalg.norm(vector), 1e-12)
+
+
+class CameraPath(NamedTuple):
+    """What a camera_path.json says."""
+
+    poses: list[Pose]
+    shares: list[float] | None
+    """The instant of each pose, 0 first and 1 last of the recording; None where the file leaves time to run."""
+    fps: float
+
+
+def read_camera_path(path: Path) -> CameraPath:
+    """Read nerfstudio's camera_path.json.
+
+    Raises:
+        D2Error: not such a file, an empty path, or a camera that is not a perspective one.
+    """
+    try:
+        table = read_json(path, EXPORT)
+    except NoSuchFile:
+        raise D2Error(f"no camera path at {path}: give orbit, spiral, through, held-out, training or a file") from None
+    kind = table.get("camera_type", "perspective")
+    if kind != "perspective":
+        raise D2Error(f"{path} is for a camera of type {str(kind)[:40]!r}, expected perspective: export it as that")
+    size = field(table, "render_width", Side, str(path), EXPORT), field(table, "render_height", Side, str(path), EXPORT)
+    entries = field(table, "camera_path", list, str(path), EXPORT)
+    if not entries:
+        raise D2Error(f"the camera path {path} has no camera: add keyframes and {EXPORT}")
+    dataparser = _dataparser(path.parent / "dataparser_transforms.json")
+    poses, times = [], []
+    for number, entry in enumerate(entries):
+        place = f"camera {number} of {path}"
+        if not isinstance(entry, Mapping):
+            raise D2Error(f"{place} is no object: {EXPORT}")
+        poses.append(_pose(entry, size, dataparser, number, path))
+        times.append(field(entry, "render_time", OptionalTime, place, EXPORT, default=None))
+    known = [float(np.clip(time, 0, 1)) for time in times if time is not None]
+    if table.get("fps"):
+        fps = field(table, "fps", Above0, str(path), EXPORT)
+    else:
+        fps = len(poses) / (field(table, "seconds", Above0, str(path), EXPORT) if table.get("seconds") else 1.0)
+    return CameraPath(poses, known if len(known) == len(times) else None, fps)
+
+
+def _pose(
+    entry: Mapping[str, Any], size: tuple[int, int], dataparser: tuple[np.ndarray, float], number: int, path: Path
+) -> Pose:
+    place = f"camera {number} of {path}"
+    to_nerfstudio, scale = dataparser
+    T_world_camera = _matrix(entry, "camera_to_world", 4, place)
+    T_world_camera[:3, 3] /= scale
+    focal = size[1] / 2 / np.tan(np.radians(field(entry, "fov", Vertical, place, EXPORT)) / 2)
+    T_camera_world = OPENGL_TO_OPENCV @ _inverse(T_world_camera) @ to_nerfstudio
+    K = pinhole(focal, focal, size[0] / 2, size[1] / 2)
+    return pose_of(checked_camera(str(number), size, K, T_camera_world, None, str(path)))
+
+
+def _dataparser(path: Path) -> tuple[np.ndarray, float]:
+    """From the recording's world to nerfstudio's, [4, 4], and the scale that positions there were multiplied by."""
+    if not path.is_file():
+        return np.eye(4), 1.0
+    table = read_json(path, EXPORT)
+    return _matrix(table, "transform", 3, str(path)), field(table, "scale", Above0, str(path), EXPORT)
+
+
+def _matrix(table: Mapping[str, Any], name: str, rows: int, place: str) -> np.ndarray:
+    """The pose under `name`, [4, 4], from the first `rows` rows of 4 numbers, nested or not."""
+    values = field(table, name, list, place, EXPORT)
+    found = np.eye(4)
+    try:
+        found[:rows] = np.array(values, np.float64).reshape(rows, 4)
+    except (TypeError, ValueError, OverflowError):
+        raise D2Error(f"{name} of {place} is no matrix of {rows} x 4 numbers: {EXPORT}") from None
+    if not (np.abs(found) <= LARGEST_NUMBER).all():
+        raise D2Error(f"{name} of {place} has a number that is not finite or too large: {EXPORT}")
+    if not np.array_equal(found[3], (0, 0, 0, 1)):
+        raise D2Error(f"{name} of {place} ends in {found[3].tolist()}, expected 0, 0, 0, 1: {EXPORT}")
+    return found
+
+
+def _inverse(T: np.ndarray) -> np.ndarray:
+    """The inverse of a rigid transform; whether it is rigid is checked of the camera that it gives."""
+    return rigid(T[:3, :3].T, -T[:3, :3].T @ T[:3, 3])

@@ -1,9 +1,17 @@
-"""How large an image may be while something moves, and how much of a training's time may go into images."""
+"""Draws the image that a page wants, as large as fits its time, and sends it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, field
 
+from torch import Tensor
+
+from d2_plugin.viewing.live.page import Page, Wanted
+from d2_plugin.viewing.panels import KINDS, Shot
+
+MOVING_QUALITY, STILL_QUALITY = 60, 90
+"""JPEG quality."""
 SMALLEST = 72
 """Height in pixels below which no image is drawn, however slow."""
 FIXED = 4e-3
@@ -29,13 +37,13 @@ class Resolution:
         self._sums = tuple(KEPT * old + added for old, added in zip(self._sums, new, strict=True))
         _, x, y, xx, xy = (part / self._sums[0] for part in self._sums)
         spread = xx - x * x
-        slope = (xy - x * y) / spread if spread > (APART * x) ** 2 else 0.0
-        if slope > 0:
-            self.seconds_per_pixel, self.fixed = slope, max(y - slope * x, 0.0)
-        elif spread > (APART * x) ** 2:  # smaller ones took longer: the machine has other work now
-            self.seconds_per_pixel, self.fixed = max(y - FIXED, 1e-6) / max(x, 1), FIXED
-        else:
-            self.seconds_per_pixel = max(y - self.fixed, 1e-6) / max(x, 1)
+        if spread > (APART * x) ** 2:
+            slope = (xy - x * y) / spread
+            if slope > 0:
+                self.seconds_per_pixel, self.fixed = slope, max(y - slope * x, 0.0)
+                return
+            self.fixed = FIXED  # smaller ones took longer: the machine has other work now
+        self.seconds_per_pixel = max(y - self.fixed, 1e-6) / max(x, 1)
 
     def size(self, aspect: float, most: int, seconds: float | None = None) -> tuple[int, int]:
         """Width and height, at most `most` pixels high, that take about `seconds`; None is as large as allowed.
@@ -71,3 +79,28 @@ class Share:
     def due(self) -> bool:
         """Whether there is time for more."""
         return self.spent <= 0
+
+
+@dataclass
+class Drawer:
+    """One for all pages: what a pixel costs is learnt from every image."""
+
+    resolution: Resolution = field(default_factory=Resolution)
+
+    def draw(self, page: Page, wanted: Wanted, marked: Tensor | None, seconds: float | None) -> None:
+        """Send one image; where something moves, it is as large as fits `seconds`."""
+        scene, viewed = page.client.scene, page.viewed
+        if not wanted.show:
+            scene.set_background_image(None)
+            page.set_text("size", "none")
+            return
+        start = time.perf_counter()
+        size = self.resolution.size(wanted.aspect, wanted.height, seconds)
+        known = wanted.marked and marked is not None and len(marked) == len(viewed.backbone)
+        view = viewed.view(wanted.camera(*size), wanted.time, size)
+        shot = Shot(viewed, view, None, wanted.min_opacity, marked if known else None)
+        quality = STILL_QUALITY if seconds is None else MOVING_QUALITY
+        scene.set_background_image(KINDS[wanted.show](shot).image, format="jpeg", jpeg_quality=quality)
+        taken = time.perf_counter() - start
+        self.resolution.drew(size[0] * size[1], taken)
+        page.set_text("size", f"{size[0]}x{size[1]}, {1000 * taken:.0f} ms")

@@ -1,7 +1,7 @@
-"""What a camera sees of a backbone: colour, depth, alpha, and how many Gaussians each pixel has to do with.
+"""What a camera sees of a backbone: colour, depth, alpha, and the number of Gaussians over each pixel.
 
 Everything here goes through the contract (`slice_at`, and `colors` where there is one), so any trainer with an adapter
-can be looked at. Nothing is changed: the trainer's own `render` would forget what it keeps between two of its lines.
+can be shown. The trainer's own `render` is not called: it may keep state between two of the trainer's lines.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ SOLID = 0.5
 GREY = 0.6
 """Brightness of Gaussians whose adapter knows no colours."""
 MARKED = (1.0, 0.45, 0.0)
-"""RGB of Gaussians that are pointed out; the others fade."""
+"""RGB of highlighted Gaussians."""
 FADED = 0.3
-"""Share of its own brightness that a Gaussian keeps beside those that are pointed out."""
+"""Share of its brightness that a Gaussian keeps beside highlighted ones."""
 
 
-class Look(NamedTuple):
+class RenderedView(NamedTuple):
     """One view of a backbone, on the CPU."""
 
     color: Tensor  # [H, W, 3] in 0..1
@@ -35,17 +35,18 @@ class Look(NamedTuple):
 
 
 @torch.no_grad()
-def look(backbone: Any, view: View, min_opacity: float = 0.0, marked: Tensor | None = None) -> Look:
+def render_view(backbone: Any, view: View, min_opacity: float = 0.0, marked: Tensor | None = None) -> RenderedView:
     """Draw one view.
 
     Args:
         backbone: a `d2_plugin.protocol.Backbone`.
         view: camera and time; any size.
         min_opacity: Gaussians whose opacity at that time is lower are left out.
-        marked: rows to be pointed out, bool [N]; None shows the colours as they are.
+        marked: rows to highlight, bool [N]; None shows the colours as they are.
     """
     splats = backbone.slice_at(view)
-    colors = _colors(backbone, view, splats)
+    grey = splats.means.new_full((len(splats.means), 3), GREY)
+    colors = backbone.colors(view, splats) if hasattr(backbone, "colors") else grey
     if min_opacity > 0:
         kept = torch.nonzero(splats.opacities >= min_opacity).squeeze(-1)
         splats, colors = Splats(*(part[kept] for part in splats)), colors[kept]
@@ -57,7 +58,7 @@ def look(backbone: Any, view: View, min_opacity: float = 0.0, marked: Tensor | N
         render = call_optional(backbone, "behind", render, view, default=render)
     color, depth_sum, alpha = (part.cpu() for part in render[:3])
     depth = torch.where(alpha > SOLID, depth_sum / alpha.clamp(min=SOLID), torch.zeros_like(alpha))
-    return Look(color.clamp(0, 1), depth, alpha, splats)
+    return RenderedView(color.clamp(0, 1), depth, alpha, splats)
 
 
 def _colors(backbone: Any, view: View, splats: Splats) -> Tensor:
@@ -94,10 +95,7 @@ def _boxes_over_pixels(low: Tensor, high: Tensor, width: int, height: int) -> Te
     first = (low[fine] - 0.5).ceil().clamp(min=0).minimum(size).long()
     last = (high[fine] + 0.5).floor().clamp(min=0).minimum(size).long()  # one beyond the last pixel inside
     last = torch.maximum(first, last)
-    count = low.new_zeros((height + 1) * (width + 1))
-    for corner, sign in ((first, 1.0), (last, 1.0)):
-        count.index_add_(0, corner[:, 1] * (width + 1) + corner[:, 0], count.new_full((len(corner),), sign))
-    for x, y in ((first, last), (last, first)):
-        place = y[:, 1] * (width + 1) + x[:, 0]
-        count.index_add_(0, place, count.new_full((len(place),), -1.0))
-    return count.view(height + 1, width + 1).cumsum(0).cumsum(1)[:height, :width].cpu()
+    count = low.new_zeros(height + 1, width + 1)
+    for x, y, sign in ((first, first, 1.0), (last, last, 1.0), (first, last, -1.0), (last, first, -1.0)):
+        count.index_put_((y[:, 1], x[:, 0]), count.new_tensor(sign), accumulate=True)
+    return count.cumsum(0).cumsum(1)[:height, :width].cpu()

@@ -1,4 +1,9 @@
-"""The arrays of a page: a moving scene in 16-bit codes, and the same read back as a player reads it.
+"""The arrays of a page: a moving scene as numbers of 16 bits (or 8 and fewer) between the extremes of their block.
+
+Rows are coded in blocks of 256, each column with its own range in each block. Neighbours in space stand in one block
+(`morton_order`), so that the step is small, and a Gaussian far out costs precision in its own block only. An array is
+stored as ranges float32 [blocks, columns, 2], then per column the high bytes of all rows and then the low bytes: bytes
+of one kind beside each other are what a general compressor makes smaller. player/scene.js decodes.
 
 Every Gaussian has a position, a size and the six entries of its covariance's Cholesky factor relative to the size, an
 opacity and a colour. Beside those, straight lines have
@@ -10,11 +15,11 @@ costs no precision inside. Keys have positions, and shapes and opacities of the 
 
 from __future__ import annotations
 
+import gzip
 import math
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -22,26 +27,73 @@ from torch import Tensor
 
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
-from d2_plugin.viewing.export.codes import BLOCK, COMPRESSION, Coded, decode, encode, morton_order
-from d2_plugin.viewing.export.keys import ALPHA_MIN, Keys, Offset, State, cholesky
+from d2_plugin.viewing.export.keys import ALPHA_MIN, Keys, State, cholesky, morton_order
 
+BLOCK = 256
+"""Rows that share their ranges."""
+COMPRESSION = 6
 MARGINAL_REACH = math.sqrt(-2 * math.log(MARGINAL_CUT))
 """Standard deviations from mu_t at which a Gaussian is cut off: F = `MARGINAL_CUT`."""
 HARMONIC_BITS = (8, 6, 5, 4, 3)
 """Of all coefficients of a colour but the constant one: the first that fits."""
 SAMPLED = 16
-"""One block in so many tells how far harmonics can be compressed."""
+"""One block in so many is compressed to estimate the size of harmonics."""
 
 
-@dataclass(frozen=True, eq=False)
-class CodedScene:
+class Coded(NamedTuple):
+    """One array in its stored form."""
+
+    name: str
+    data: bytes
+    rows: int
+    columns: int
+    bits: int
+    decoded: Tensor | None = None
+    """[rows, columns] float64, the values that a reader finds, where they were asked for."""
+
+
+def encode(name: str, values: np.ndarray, bits: int = 16, decode: bool = False) -> Coded:
+    """Code `values` [N, C] (or [N]), all finite, in 16 bits, or in at most 8 of a byte."""
+    values = np.asarray(values, np.float64)
+    values = values[:, None] if values.ndim == 1 else values
+    rows, columns = values.shape
+    blocks = -(-rows // BLOCK)
+    padded = np.concatenate([values, np.repeat(values[-1:], blocks * BLOCK - rows, axis=0)])
+    padded = padded.reshape(blocks, BLOCK, columns)
+    ranges = np.stack([padded.min(1), padded.max(1)], -1).astype("<f4") if blocks else np.zeros((0, columns, 2), "<f4")
+    low, high = (ranges[..., i].astype(np.float64)[:, None] for i in (0, 1))
+    steps = (1 << bits) - 1
+    share = (padded - low) / np.where(high > low, high - low, 1)
+    codes = np.clip(np.rint(share * steps), 0, steps).astype(np.uint16)
+    decoded = (low + codes * ((high - low) / steps)).reshape(-1, columns)[:rows] if decode else None
+    planes = codes.reshape(blocks * BLOCK, columns)[:rows].T
+    parts = [planes >> 8, planes & 255] if bits > 8 else [planes]
+    body = np.stack(parts, axis=1).astype(np.uint8).tobytes()
+    return Coded(
+        name, ranges.tobytes() + body, rows, columns, bits, None if decoded is None else torch.from_numpy(decoded)
+    )
+
+
+def packed(arrays: Sequence[Coded]) -> tuple[list[dict[str, Any]], bytes]:
+    """A table of contents, and all arrays behind each other, compressed."""
+    contents, offset = [], 0
+    for array in arrays:
+        entry = {"name": array.name, "rows": array.rows, "columns": array.columns, "bits": array.bits}
+        contents.append(entry | {"offset": offset})
+        offset += len(array.data)
+    return contents, gzip.compress(b"".join(array.data for array in arrays), COMPRESSION, mtime=0)
+
+
+class CodedScene(NamedTuple):
     """Arrays and what a reader must know beside them."""
 
-    arrays: tuple[Coded, ...]
-    facts: dict[str, Any]
-    """count, motion ("none", "lines" or "keys"), keys, degree, time_degree."""
+    arrays: list[Coded]
     rows: Tensor
     """Which of the model's Gaussians each one is."""
+    motion: Literal["none", "lines", "keys"]
+    harmonics: Harmonics
+    """The colours of these Gaussians, as they were before they were coded."""
+    keys: Keys | None = None
 
 
 def code_lines(gaussians: MovingGaussians, duration: float, most_bytes: float = math.inf) -> CodedScene:
@@ -51,20 +103,22 @@ def code_lines(gaussians: MovingGaussians, duration: float, most_bytes: float = 
     rows = seen_rows(gaussians, duration)
     rows = rows[torch.from_numpy(morton_order(gaussians.positions[rows].numpy()))]
     chosen = gaussians.select(rows)
-    arrays, positions = [], chosen.positions
+    arrays: list[Coded] = []
+    positions = chosen.positions
     if chosen.motion is not None:
         velocities, times, sigmas = chosen.motion
-        arrays = [encode("fading", torch.stack([times, sigmas.log()], -1).numpy())]
-        times, sigmas = _fading(decode(arrays[0]))  # as a reader finds them, so that their error does no harm
-        anchors, spans = _anchors(times, sigmas, duration)
+        fading = encode("fading", torch.stack([times, sigmas.log()], -1).numpy(), decode=True)
+        assert fading.decoded is not None
+        times, sigmas = fading.decoded[:, 0], fading.decoded[:, 1].exp()  # a reader's, so that their error does no harm
+        # When each Gaussian is at its position, and how long it goes at most while it is seen.
+        anchors, spans = times.clamp(0, duration), (MARGINAL_REACH * sigmas).clamp(max=duration)
         positions = positions + velocities * (anchors - chosen.motion.times)[:, None]
-        arrays.append(encode("reaches", (velocities * spans[:, None]).numpy()))
+        arrays += [fading, encode("reaches", (velocities * spans[:, None]).numpy())]
     state = State(positions, cholesky(chosen.covariances), chosen.opacities)
     arrays += _code_state(state)
     left = most_bytes - sum(len(array.data) for array in arrays) - 6 * len(chosen)
     arrays += _code_colors(chosen.harmonics, left)
-    motion = "none" if chosen.motion is None else "lines"
-    return CodedScene(tuple(arrays), _facts(len(chosen), motion, chosen.harmonics, None), rows)
+    return CodedScene(arrays, rows, "none" if chosen.motion is None else "lines", chosen.harmonics)
 
 
 def code_keys(keys: Keys, harmonics: Harmonics) -> CodedScene:
@@ -74,54 +128,15 @@ def code_keys(keys: Keys, harmonics: Harmonics) -> CodedScene:
     for i, state in enumerate(keys.states):
         arrays.append(encode(f"positions_{i}", state.positions.numpy()))
         if keys.changing:
-            arrays.append(encode(f"shapes_{i}", shapes_of(state.factors)))
+            arrays.append(encode(f"shapes_{i}", _shapes(state.factors)))
             arrays.append(encode(f"opacities_{i}", state.opacities.numpy()))
-    told = {"times": list(keys.times), "moving": keys.moving, "changing": keys.changing}
-    return CodedScene(tuple(arrays), _facts(len(keys.rows), "keys", own, told), keys.rows)
+    return CodedScene(arrays, keys.rows, "keys", own, keys)
 
 
-def read_state(arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any], duration: float, time: float) -> State:
-    """The Gaussians at `time`, from decoded arrays: what the player draws, opacity 0 for those that it does not."""
-    start = State(_tensor(arrays["positions"]), factors_of(arrays["shapes"]), _tensor(arrays["opacities"])[:, 0])
-    if facts["motion"] == "none":
-        return start
-    if facts["motion"] == "keys":
-        told = facts["keys"]
-        states = tuple(_read_key(arrays, i, start) for i in range(len(told["times"])))
-        rows = torch.arange(len(start.positions))
-        keys = Keys(tuple(told["times"]), start, rows, told["moving"], told["changing"], states, Offset(0, 0, 0))
-        return keys.at(time)
-    times, sigmas = _fading(arrays["fading"])
-    anchors, spans = _anchors(times, sigmas, duration)
-    velocities = _tensor(arrays["reaches"]) / spans.clamp(min=1e-30)[:, None]
-    factor = torch.exp(-0.5 * ((time - times) / sigmas) ** 2)
-    opacities = torch.where(factor > MARGINAL_CUT, start.opacities * factor, 0)
-    return State(start.positions + velocities * (time - anchors)[:, None], start.factors, opacities)
-
-
-def read_harmonics(arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any]) -> Harmonics:
-    """Colours, from decoded arrays."""
-    parts = [arrays["colors"]] + ([arrays["harmonics"]] if "harmonics" in arrays else [])
-    coefficients = _tensor(np.concatenate(parts, axis=1)).unflatten(1, (-1, 3))
-    return Harmonics(coefficients, facts["degree"], facts["time_degree"])
-
-
-def shapes_of(factors: Tensor) -> np.ndarray:
+def _shapes(factors: Tensor) -> np.ndarray:
     """Columns ln size and the six entries relative to it, [M, 7], of factors [M, 6]."""
     size = factors.abs().amax(-1, keepdim=True).clamp(min=1e-30)
     return torch.cat([size.log(), factors / size], -1).numpy()
-
-
-def factors_of(shapes: np.ndarray) -> Tensor:
-    """Factors [M, 6] of what `shapes_of` made."""
-    return _tensor(np.exp(shapes[:, :1]) * shapes[:, 1:])
-
-
-def _read_key(arrays: Mapping[str, np.ndarray], i: int, start: State) -> State:
-    if f"shapes_{i}" not in arrays:
-        return State(_tensor(arrays[f"positions_{i}"]), start.factors[:0], start.opacities[:0])
-    opacities = _tensor(arrays[f"opacities_{i}"])[:, 0]
-    return State(_tensor(arrays[f"positions_{i}"]), factors_of(arrays[f"shapes_{i}"]), opacities)
 
 
 def seen_rows(gaussians: MovingGaussians, duration: float) -> Tensor:
@@ -137,20 +152,10 @@ def seen_rows(gaussians: MovingGaussians, duration: float) -> Tensor:
     return (finite & (strongest >= ALPHA_MIN)).nonzero()[:, 0]
 
 
-def _fading(decoded: np.ndarray) -> tuple[Tensor, Tensor]:
-    columns = _tensor(decoded)
-    return columns[:, 0], columns[:, 1].exp()
-
-
-def _anchors(times: Tensor, sigmas: Tensor, duration: float) -> tuple[Tensor, Tensor]:
-    """When each Gaussian is at its position, and how long it goes at most while it is seen."""
-    return times.clamp(0, duration), (MARGINAL_REACH * sigmas).clamp(max=duration)
-
-
 def _code_state(state: State) -> list[Coded]:
     return [
         encode("positions", state.positions.numpy()),
-        encode("shapes", shapes_of(state.factors)),
+        encode("shapes", _shapes(state.factors)),
         encode("opacities", state.opacities.numpy()),
     ]
 
@@ -161,7 +166,7 @@ def _code_colors(harmonics: Harmonics, most_bytes: float = math.inf) -> list[Cod
     arrays = [encode("colors", coefficients[:, 0].numpy())]
     if coefficients.shape[1] > 1:
         more = coefficients[:, 1:].flatten(1).numpy()
-        arrays.append(encode("harmonics", more, _bits_that_fit(more, most_bytes)))
+        arrays.append(encode("harmonics", more, _bits_that_fit(more, most_bytes), decode=True))
     return arrays
 
 
@@ -176,17 +181,3 @@ def _bits_that_fit(values: np.ndarray, most_bytes: float) -> int:
         if size * len(values) / rows.sum() <= most_bytes:
             return bits
     return HARMONIC_BITS[-1]
-
-
-def _facts(count: int, motion: str, harmonics: Harmonics, keys: dict[str, Any] | None) -> dict[str, Any]:
-    return {
-        "count": count,
-        "motion": motion,
-        "keys": keys,
-        "degree": harmonics.degree,
-        "time_degree": harmonics.time_degree,
-    }
-
-
-def _tensor(values: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, np.float64))

@@ -16,7 +16,7 @@ from d2_plugin.adapters.gsplat_dict import GsplatAdapter
 from d2_plugin.adapters.spacetime import SpacetimeAdapter
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.protocol import RasterSettings, Splats
-from d2_plugin.viewing.look import MARKED, gaussians_per_pixel, look
+from d2_plugin.viewing.rendering import MARKED, gaussians_per_pixel, render_view
 
 VIEW = make_views()[4]
 
@@ -29,7 +29,7 @@ def test_a_look_is_the_backbones_own_render(backbone: str, background: bool) -> 
         model.background.constant.data.fill_(0.8)
     with torch.no_grad():
         render = model.render(VIEW)
-    seen = look(make_adapter(model), VIEW)
+    seen = render_view(make_adapter(model), VIEW)
     assert torch.equal(seen.color, render.color.clamp(0, 1))
     assert torch.equal(seen.alpha, render.alpha)
     solid = render.alpha > 0.5
@@ -44,7 +44,7 @@ def test_looking_between_two_steps_leaves_training_bitwise_as_it_is() -> None:
     state = torch.random.get_rng_state()
 
     def on_step(step: int, loss: float) -> None:
-        look(watched.d2.backbone, replace(VIEW, time=0.01 * step), 0.1, watched.d2.inserted_at > 0)
+        render_view(watched.d2.backbone, replace(VIEW, time=0.01 * step), 0.1, watched.d2.inserted_at > 0)
 
     watched.run(on_step=on_step)
     assert same(parameters(alone), parameters(watched))
@@ -90,7 +90,7 @@ def test_an_adapter_without_colours_is_shown_in_grey() -> None:
     class Bare:
         settings, slice_at = adapter.settings, staticmethod(adapter.slice_at)
 
-    seen = look(Bare(), VIEW)
+    seen = render_view(Bare(), VIEW)
     covered = seen.alpha > 0.9
     assert covered.any()
     assert torch.allclose(seen.color[covered], 0.6 * seen.alpha[covered][:, None], atol=1e-5)
@@ -98,18 +98,18 @@ def test_an_adapter_without_colours_is_shown_in_grey() -> None:
 
 def test_faint_gaussians_are_clipped_and_others_stay() -> None:
     adapter = make_adapter(make_model())
-    every, clipped = look(adapter, VIEW), look(adapter, VIEW, min_opacity=0.3)
+    every, clipped = render_view(adapter, VIEW), render_view(adapter, VIEW, min_opacity=0.3)
     assert 0 < len(clipped.splats.rows) < len(every.splats.rows)
     assert clipped.splats.opacities.min() >= 0.3
-    assert not len(look(adapter, VIEW, min_opacity=1.0).splats.rows)
+    assert not len(render_view(adapter, VIEW, min_opacity=1.0).splats.rows)
 
 
 def test_those_that_d2_inserted_are_pointed_out() -> None:
     adapter = make_adapter(make_model())
     marked = torch.ones(len(adapter), dtype=torch.bool)
-    seen = look(adapter, VIEW, marked=marked)
+    seen = render_view(adapter, VIEW, marked=marked)
     assert torch.allclose(seen.color, seen.alpha[..., None] * torch.tensor(MARKED), atol=1e-4)
-    faded = look(adapter, VIEW, marked=~marked).color
+    faded = render_view(adapter, VIEW, marked=~marked).color
     assert torch.allclose(faded[..., 0], faded[..., 2], atol=1e-6)  # grey
 
 

@@ -1,0 +1,137 @@
+"""The web server behind a page: viser's, on an address of this machine, for whoever has the printed address.
+
+The address ends in a token. The page's first request trades it for a cookie, without which no connection is opened, so
+another user of the machine, or a web page in the same browser, cannot look or move. A connection must also come from
+the page itself (Origin) and, where only this machine is listened to, be addressed to it by name (Host).
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import secrets
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from types import ModuleType
+from typing import Any, NamedTuple
+from urllib.parse import parse_qs, urlsplit
+
+from d2_plugin.errors import D2Error, missing_extra
+
+LOCAL = ("127.0.0.1", "localhost", "::1")
+COOKIE = "d2-view"
+
+
+class Page(NamedTuple):
+    """A server that runs, and its address with the token."""
+
+    server: Any
+    url: str
+
+
+def viser() -> ModuleType:
+    """The module viser.
+
+    Raises:
+        MissingExtra: where it is not installed.
+    """
+    try:
+        import viser
+    except ImportError:
+        raise missing_extra("viser", "view", "the live viewer") from None
+    return viser
+
+
+def serve(host: str, port: int) -> Page:
+    """Start to serve at an address, on the next free port where this one is in use.
+
+    Raises:
+        D2Error: nothing can listen at that address.
+    """
+    _check_address(host)
+    token = secrets.token_urlsafe(16)
+    with redirect_stdout(io.StringIO()), _guarded(Access(host, token)):  # it prints a table with addresses
+        server = viser().ViserServer(host=host, port=port, label="D2-4DGS", verbose=False)
+    server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="medium")
+    name = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
+    return Page(server, f"http://{name}:{server.get_port()}/?token={token}")
+
+
+class Access(NamedTuple):
+    """Which requests are answered."""
+
+    host: str
+    """The address that is listened to."""
+    token: str
+
+    def problem(self, path: str, headers: Any) -> str:
+        """Why a request is refused; nothing where it is answered."""
+        asked = headers.get("Host") or ""
+        if self.host in LOCAL and urlsplit(f"//{asked}").hostname not in LOCAL:
+            return "this page is served to its own machine only"
+        origin = headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != asked:
+            return "another page cannot connect to this one"
+        if not self.brings_token(path) and not secrets.compare_digest(self._cookie(headers), self.token.encode()):
+            return "open the whole address that d2 printed, token included"
+        return ""
+
+    def brings_token(self, path: str) -> bool:
+        """Whether the address of a request ends in the token."""
+        given = parse_qs(urlsplit(path).query).get("token", [""])[0]
+        return secrets.compare_digest(given.encode(), self.token.encode())
+
+    def _cookie(self, headers: Any) -> bytes:
+        try:
+            cookies = SimpleCookie("; ".join(headers.get_all("Cookie")))
+        except CookieError:
+            return b""
+        return cookies[COOKIE].value.encode() if COOKIE in cookies else b""
+
+
+@contextmanager
+def _guarded(access: Access) -> Iterator[None]:
+    """Within it, a server that viser starts asks `access` first: viser has no such place of its own."""
+    import websockets.asyncio.server as module
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    plain = module.serve
+
+    def answer(respond: Callable[[Any, Any], Any], connection: Any, request: Any) -> Any:
+        try:
+            problem = access.problem(request.path, request.headers)
+        except (ValueError, LookupError):  # no address, or a header twice
+            problem = "the request is malformed"
+        if problem:
+            return Response(HTTPStatus.FORBIDDEN, "Forbidden", Headers(), problem.encode())
+        response = respond(connection, request)
+        if response is not None and access.brings_token(request.path):
+            cookie = f"{COOKIE}={access.token}; HttpOnly; SameSite=Strict; Path=/"
+            response.headers["Set-Cookie"] = cookie
+        return response
+
+    def guarded(*arguments: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
+        return plain(*arguments, process_request=functools.partial(answer, process_request), **options)
+
+    module.serve = guarded  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        module.serve = plain  # type: ignore[misc]
+
+
+def _check_address(host: str) -> None:
+    """Raise where nothing can listen at an address: viser would try one port after the other, for ever."""
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as probe:
+            probe.bind(address)
+    except (OSError, UnicodeError) as failure:
+        reason = getattr(failure, "strerror", None) or failure
+        raise D2Error(
+            f"nothing can listen at {host!r} ({reason}): give an address of this machine, or leave --host out"
+        ) from None

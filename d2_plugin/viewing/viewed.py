@@ -1,0 +1,206 @@
+"""What is looked at: Gaussians with the recording they belong to, its cameras and its depth prior.
+
+It comes from the folder of a run, a run that trains, the views of any trainer, a recording or a prior store.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from d2_plugin import registry
+from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
+from d2_plugin.protocol import View
+from d2_plugin.recordings import Camera, Recording
+from d2_plugin.runs.run import Run
+from d2_plugin.runs.start import TimedPoints
+from d2_plugin.store.store import PriorStore
+from d2_plugin.viewing.camera_paths import Pose
+
+UNKNOWN_IMAGE = 60
+"""Grey of an image that was not kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewedRun:
+    """One set of Gaussians, or none yet, and what belongs to it."""
+
+    name: str
+    recording: Recording
+    train_cameras: tuple[str, ...]
+    test_cameras: tuple[str, ...] = ()
+    backbone: Any = None
+    """A `d2_plugin.protocol.Backbone`; None where there is only a recording or a prior."""
+    store: PriorStore | None = None
+    inserted_at: Tensor | None = None
+    """Per Gaussian [N], the step at which D2 inserted it, 0 for the others; None where that is not known."""
+    points: np.ndarray | None = None
+    """Triangulated surface points [P, 3]."""
+    device: str = "cpu"
+    note: str = ""
+    """What a person should know about it, in one sentence."""
+    time_scale: float = 1.0
+    """The trainer's unit of time, per second."""
+    time_offset: float = 0.0
+    """The trainer's time at the first frame."""
+    harmonics: Harmonics | None = None
+    """Colours of a checkpoint; None where only the backbone knows them, for one direction after the other."""
+    moving: MovingGaussians | None = None
+    """A checkpoint's Gaussians as straight lines that fade, in seconds since the first frame, where they are such."""
+
+    @property
+    def training(self) -> list[Camera]:
+        """The cameras that train."""
+        return [self.recording.cameras[name] for name in self.train_cameras]
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first frame to the last."""
+        return self.recording.seconds(self.recording.frames[-1])
+
+    def frame_at(self, time: float) -> int:
+        """The recorded frame that is nearest to an instant, in seconds."""
+        return min(self.recording.frames, key=lambda frame: abs(self.recording.seconds(frame) - time))
+
+    def view(self, pose: Pose, time: float, size: tuple[int, int], camera: str = "") -> View:
+        """The view of a pose at an instant; `camera` names the camera of the recording that it is, if it is one."""
+        lens = pose.lens.fitted(*size)
+        T = torch.tensor(pose.T_camera_world, dtype=torch.float32, device=self.device)
+        K = torch.tensor(lens.K, dtype=torch.float32, device=self.device)
+        return View(camera, self.frame_at(time), self.time_offset + time * self.time_scale, T, K, *size)
+
+    @property
+    def depth(self) -> float | None:
+        """Median depth of the triangulated points in front of the first training camera; None where unknown."""
+        if self.points is None or not len(self.points):
+            return None
+        T = self.training[0].T_camera_world
+        z = self.points @ T[2, :3] + T[2, 3]
+        return float(np.median(z[z > 0])) if (z > 0).any() else None
+
+
+def viewed_run(folder: Path) -> ViewedRun:
+    """A run of `d2 train` at its last checkpoint; one that still trains is shown as far as it is.
+
+    Raises:
+        D2Error: no run, one of another version, no checkpoint yet, or no Gaussian left.
+    """
+    run = Run.load(folder)
+    trained = run.trained()
+    if not len(trained.model):
+        raise D2Error(f"{folder} has no Gaussian left at step {trained.step}: nothing can be shown, train it anew")
+    hooks = torch.load(folder / "checkpoint.pt", map_location="cpu", weights_only=True)["d2"] or {}
+    total = run.settings.iterations
+    note = "" if trained.step >= total else f"{folder.name} still trains: this is step {trained.step} of {total}"
+    adapter: Any = registry.load(registry.ADAPTERS, run.settings.backbone)
+    return replace(_of_run(run, adapter(trained.model), hooks.get("inserted_at")), note=note)
+
+
+def viewed_training(run: Run, trainer: Any) -> ViewedRun:
+    """A run while it trains."""
+    adapter: Any = registry.load(registry.ADAPTERS, run.settings.backbone)
+    if trainer.d2 is None:
+        return _of_run(run, adapter(trainer.model), None)
+    return _of_run(run, trainer.d2.backbone, trainer.d2.inserted_at)
+
+
+def _of_run(run: Run, backbone: Any, inserted_at: Tensor | None) -> ViewedRun:
+    path = run.folder / "points.npz"
+    return ViewedRun(
+        run.folder.name,
+        run.scene.recording,
+        run.scene.train_cameras,
+        run.scene.test_cameras,
+        backbone,
+        PriorStore.open(run.priors) if (run.priors / "store.json").is_file() else None,
+        inserted_at,
+        TimedPoints.load(path).positions if path.is_file() else None,
+        run.settings.device,
+    )
+
+
+def viewed_recording(recording: Recording, priors: Path | None = None) -> ViewedRun:
+    """A recording alone, or with the depth prior in `priors`, whose cameras are then the training cameras."""
+    if priors is None:
+        return ViewedRun(recording.name, recording, tuple(recording.cameras))
+    store = PriorStore.open(priors)
+    unknown = [camera for camera in store.cameras if camera not in recording.cameras]
+    if unknown:
+        raise D2Error(
+            f"{priors} has priors of camera {unknown[0]}, which {recording.name} does not have: "
+            "give the recording that they were built for"
+        )
+    return ViewedRun(recording.name, recording, store.cameras, store=store)
+
+
+def viewed_store(store: PriorStore, fps: float = 30.0) -> ViewedRun:
+    """The cameras that a prior was built for, with the images that it kept.
+
+    Raises:
+        D2Error: the store is empty, or does not say where its cameras stood.
+    """
+    known = [camera for name in store.cameras if (camera := _stored_camera(store, name)) is not None]
+    if not known:
+        raise D2Error(f"{store.path} has no prior that says where its camera stood: give --recording, or build it anew")
+    cameras = {camera.name: camera for camera in known}
+    recording = Recording(store.path.name, cameras, store.frames, fps, KeptImages(cameras, store))
+    return ViewedRun(store.path.name, recording, tuple(cameras), store=store)
+
+
+def _stored_camera(store: PriorStore, name: str) -> Camera | None:
+    for frame in store.frames:
+        record, prior = store.camera(name, frame), store.prior(name, frame)
+        if record is not None and prior is not None:
+            height, width = prior.depth.shape
+            return Camera(name, width, height, record.K.numpy(), record.T_camera_world.numpy())
+    return None
+
+
+def viewed_views(views: Sequence[View], backbone: Any, store: Any, name: str) -> ViewedRun:
+    """The cameras that a trainer has used so far; its times are taken to grow evenly from frame to frame."""
+    cameras = {view.camera: _camera_of(view) for view in views}
+    times = {view.frame: view.time for view in views}
+    frames = tuple(sorted(times))
+    first, last = times[frames[0]], times[frames[-1]]
+    fps = (frames[-1] - frames[0]) / (last - first) if last > first else 1.0
+    recording = Recording(name, cameras, frames, fps, KeptImages(cameras, store))
+    kept = store if isinstance(store, PriorStore) else None
+    device = str(views[0].T_camera_world.device)
+    return ViewedRun(name, recording, tuple(cameras), (), backbone, kept, device=device, time_offset=first)
+
+
+def _camera_of(view: View) -> Camera:
+    K, T = (tensor.detach().double().cpu().numpy() for tensor in (view.K, view.T_camera_world))
+    return Camera(view.camera, view.width, view.height, K, T)
+
+
+@dataclass(frozen=True)
+class KeptImages:
+    """Where no recording is at hand: images as the depth prior kept them, grey where there is none."""
+
+    cameras: dict[str, Camera]
+    store: Any = None
+    """Anything with `prior(camera, frame) -> DepthPrior | None`."""
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        """RGB uint8 [H, W, 3]."""
+        size = self.cameras[camera].height, self.cameras[camera].width, 3
+        try:
+            prior = None if self.store is None else self.store.prior(camera, frame)
+        except D2Error:  # a camera that has no prior
+            prior = None
+        colors = None if prior is None or prior.colors is None else prior.colors.cpu().numpy()
+        return colors if colors is not None and colors.shape == size else np.full(size, UNKNOWN_IMAGE, np.uint8)
+
+    def depth(self, camera: str, frame: int) -> None:
+        """No truth."""
+
+    def mono(self, camera: str, frame: int) -> None:
+        """No monocular maps."""
