@@ -20,7 +20,7 @@ import numpy as np
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import NoSuchFile, field, read_json
 from d2_plugin.recordings import Camera
-from d2_plugin.recordings.cameras.calibration import (
+from d2_plugin.recordings.cameras.camera import (
     LARGEST_NUMBER,
     LARGEST_SIDE,
     OPENGL_TO_OPENCV,

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from d2_plugin.recordings import Camera
-from d2_plugin.recordings.cameras.calibration import FIELD_OF_VIEW, LARGEST_NUMBER, pinhole, rigid
+from d2_plugin.recordings.cameras.camera import FIELD_OF_VIEW, LARGEST_NUMBER, pinhole, rigid
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation, rotation_of_quaternion
 from d2_plugin.viewing.camera_paths import Lens, Pose
 from d2_plugin.viewing.viewed import ViewedRun

@@ -267,7 +267,7 @@ class Follower:
         if len(self.views) == self._shown:
             return
         first, self._shown = not self._shown, len(self.views)
-        store = getattr(getattr(self.d2, "_prior", None), "store", None)
+        store = None if self.d2.prior is None else self.d2.prior.store
         viewed = viewed_views(list(self.views.values()), self.d2.backbone, store, type(self.d2.backbone).__name__)
         self.viewer.viewed = replace(viewed, inserted_at=self.d2.inserted_at if self.d2.hooks else None)
         if first:
