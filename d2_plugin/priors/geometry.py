@@ -110,20 +110,9 @@ def viewing_rays(camera: Camera, dtype: type = np.float32) -> np.ndarray:
     return rays
 
 
-def back_project(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """World points [H, W, 3] float64 of a planar depth map [H, W]."""
-    points = viewing_rays(camera, np.float64) * depth[..., None].astype(np.float64)
-    R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
-    return (points - t) @ R
-
-
 def triangulation_angle(camera: Camera, pair: ViewPair, depth: np.ndarray) -> np.ndarray:
     """Angle [H, W] in radians between the rays of both cameras at each pixel's 3D point; 0 for one centre."""
-    return angle_of_rays(viewing_rays(camera) * depth[..., None], pair)
-
-
-def angle_of_rays(points: np.ndarray, pair: ViewPair) -> np.ndarray:
-    """Angle [...] in radians between the rays of both cameras at points [..., 3] in the reference camera's frame."""
+    points = viewing_rays(camera) * depth[..., None]
     other = points - pair.direction.astype(np.float32)
     (x, y, z), (u, v, w) = np.moveaxis(points, -1, 0), np.moveaxis(other, -1, 0)
     cross = np.sqrt((y * w - z * v) ** 2 + (z * u - x * w) ** 2 + (x * v - y * u) ** 2)

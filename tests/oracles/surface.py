@@ -1,10 +1,11 @@
-"""A depth map between its pixels in NumPy, as the kernels of the filter and of `cross_view` read it."""
+"""Depth maps in NumPy: between their pixels, as the kernels of filter and `cross_view` read them, and in the world."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from d2_plugin.priors.geometry import CONTINUOUS
+from d2_plugin.priors.geometry import CONTINUOUS, viewing_rays
+from d2_plugin.recordings.recording import Camera
 
 
 def interpolated_surface(depth: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -26,3 +27,10 @@ def interpolated_surface(depth: np.ndarray, x: np.ndarray, y: np.ndarray) -> tup
     inverse = [1 / np.where(known, corner, 1).astype(np.float64) for corner in corners]
     upper, lower = (inverse[i] * (1 - right) + inverse[i + 1] * right for i in (0, 2))
     return known, 1 / (upper * (1 - down) + lower * down)
+
+
+def back_project(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """World points [H, W, 3] float64 of a planar depth map [H, W]."""
+    points = viewing_rays(camera, np.float64) * depth[..., None].astype(np.float64)
+    R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
+    return (points - t) @ R

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from oracles.surface import back_project
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.geometry import back_project
 from d2_plugin.priors.maps_on_disk import ConfidenceMaps, divided, planar
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.protocol import Label

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oracles.surface import back_project
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import (
-    back_project,
     check_depth_range,
     check_views,
     pixel_grid,

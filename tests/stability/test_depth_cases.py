@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from oracles.surface import back_project
 from slice_scenes import CONSTANTS, random_rows
 from splat_scenes import Scene, near_edge_of, random_scene, single
 from tiny import make_model, make_views
@@ -23,7 +24,7 @@ from d2_plugin.gaussians.photometric import photometric_loss, ssim
 from d2_plugin.gaussians.slicing import reference_slice
 from d2_plugin.hooks.depth_loss import charbonnier, depth_loss
 from d2_plugin.hooks.rendered_depth import EPSILON, rendered_depth
-from d2_plugin.priors.geometry import back_project, pixel_grid, view_pair
+from d2_plugin.priors.geometry import pixel_grid, view_pair
 from d2_plugin.rasterizer import Splats, rasterize
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs import metrics
