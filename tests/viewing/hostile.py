@@ -8,6 +8,9 @@ from pathlib import Path
 
 import torch
 
+from d2_plugin.durable import write_table
+from d2_plugin.runs.saved.kinds import RUN
+
 
 def still_training(trained: Path, copy: Path, step: int) -> Path:
     """A copy of a run at an earlier step."""
@@ -35,5 +38,5 @@ def of_another_version(trained: Path, copy: Path) -> Path:
     shutil.copytree(trained, copy)
     table = json.loads((copy / "run.json").read_text())
     plain = {name: value for name, value in table.items() if name not in ("format", "seal")}
-    (copy / "run.json").write_text(json.dumps(plain | {"version": 99}))
+    write_table(copy / "run.json", plain | {"version": 99}, RUN)
     return copy
