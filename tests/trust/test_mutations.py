@@ -89,7 +89,8 @@ def run_table(folder: Path) -> tuple[Path, Callable[[], Any]]:
 
 def scores(folder: Path) -> tuple[Path, Callable[[], Any]]:
     table = {"test": {"psnr": 25.5}, "seconds": {"train": 1.0}, "gaussians": 3, "iterations": 4, "recording": "room"}
-    write_table(folder / "metrics.json", {**table, "train_cameras": ["a"], "backbone": "b", "hooks": []}, METRICS)
+    table |= {"train_cameras": ["a"], "backbone": "b", "hooks": [], "made": {"commit": "c"}}
+    write_table(folder / "metrics.json", table, METRICS)
     return folder / "metrics.json", lambda: read_metrics(folder)
 
 
