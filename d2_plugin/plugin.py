@@ -70,7 +70,7 @@ class D2Hooks:
         self._idle = Idle(self.hooks, config.retire_after, config.retire_below)
         self.telling = Telling(self.hooks)
         if self.hooks:
-            self._prior = PriorLoader(store if store is not None else _open_store(config))
+            self._prior = PriorLoader(store if store is not None else _open_store(config), believe=config.believe)
             backbone.on_resize(self._follow)
 
     @classmethod

@@ -60,6 +60,8 @@ def run(given: Given) -> str:
     say_plan(run.scene.plan)
     live = _live(run) if options.view else None
     run.train(told=lambda summary: say(str(summary)), watch=None if live is None else live.watch)
+    if run.trials is not None:
+        say(str(run.trials))
     say_notes([f"{name} retired at step {step}: it changed next to nothing" for name, step in run.retired.items()])
     metrics = run.evaluate()
     if metrics["background"]:

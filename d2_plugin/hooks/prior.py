@@ -6,7 +6,7 @@ import logging
 from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -27,6 +27,24 @@ class Store(Protocol):
     """
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
+
+
+Belief = Literal["all", "stereo", "nothing"]
+"""What of a prior is believed: `all` of it, `stereo` alone, or `nothing`."""
+
+BELIEVED: dict[str, tuple[Label, ...]] = {"stereo": (Label.VERIFIED,), "nothing": ()}
+"""Labels of the pixels that keep their depth, where not all do."""
+
+
+def believed(prior: DepthPrior, belief: Belief) -> DepthPrior:
+    """The prior with those pixels left empty whose source is not believed."""
+    if belief == "all":
+        return prior
+    kept = torch.zeros_like(prior.labels, dtype=torch.bool)
+    for label in BELIEVED[belief]:
+        kept |= prior.labels == label
+    depth, labels = (torch.where(kept, map_, torch.zeros_like(map_)) for map_ in (prior.depth, prior.labels))
+    return prior._replace(depth=depth, labels=labels)
 
 
 JUDGES = 0.05
@@ -135,8 +153,8 @@ class PriorPixels(KnownPixels):
 class PriorLoader:
     """Looks up D* by camera and frame, on the view's device; keeps the last few: memory must not grow with frames."""
 
-    def __init__(self, store: Store, keep_bytes: int = 512 << 20) -> None:
-        self.store, self.keep_bytes = store, keep_bytes
+    def __init__(self, store: Store, keep_bytes: int = 512 << 20, believe: Belief = "all") -> None:
+        self.store, self.keep_bytes, self.believe = store, keep_bytes, believe
         self._kept: OrderedDict[tuple[str, int], DepthPrior | None] = OrderedDict()
         self._cameras = CameraCheck()
         self._without: set[str] = set()
@@ -154,7 +172,8 @@ class PriorLoader:
             log.info("camera %s has no prior at frame %d: it is trained without D2 there", view.camera, view.frame)
         if prior is not None:
             self._check(view, prior)
-            prior = _usable(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior))
+            prior = believed(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior), self.believe)
+            prior = _usable(prior)
         self._kept[key] = prior
         while len(self._kept) > 1 and self._bytes() > self.keep_bytes:
             dropped, _ = self._kept.popitem(last=False)

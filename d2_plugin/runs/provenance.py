@@ -77,6 +77,7 @@ def about(run: Run, trainer: Any) -> dict[str, Any]:
         "appearance": getattr(trainer.model, "appearance", None) is not None,
         "clocks": None if getattr(trainer.model, "clocks", None) is None else trainer.model.clocks.in_frames(),
         "prior": run.prior,
+        "trials": None if run.trials is None else run.trials.as_dict(),
         "plan": scene.plan.as_dict(),
         "capture": scene.capture.name,
         "mono_emulated": scene.capture.mono_emulated,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.prior.alongside import OPEN_BY, PriorAlongside, alongside
 from d2_plugin.runs.prior.build import build_priors_for, refuse_unusable
+from d2_plugin.runs.prior.trials import Trials, is_open, leave_out_in_turn
 from d2_plugin.runs.provenance import about
 from d2_plugin.runs.saved.checkpoint import fitting, load_checkpoint, save_checkpoint
 from d2_plugin.runs.saved.claim import claim
@@ -57,6 +59,8 @@ class Run:
         """Hooks that stopped because they changed next to nothing, and at which step."""
         self.prior: dict[str, Any] | None = None
         """What the depth prior became, as `PriorSummary.as_dict` has it; None without one."""
+        self.trials: Trials | None = None
+        """What left-out training cameras said of the prior; None where nothing was tried."""
         self._writes = False
         self._building: PriorAlongside | None = None
 
@@ -105,7 +109,9 @@ class Run:
             Diverged: the loss or a parameter is no finite number any more.
         """
         with self._writing(), self._beside():
-            trainer = self._trainer(self.prepare(self._building is None, told))
+            points = self.prepare(self._building is None, told)
+            self.trials = self._tried(points)
+            trainer = self._trainer(points)
             self._restore(trainer)
             watching = watch(trainer) if watch else lambda step, loss: None
             iterations = self.settings.iterations
@@ -154,6 +160,16 @@ class Run:
         views = [make_view(capture, camera, frame, self.settings.device) for frame in capture.frames]
         with self._writing():
             return write_frames(self.trained().model, views, self.folder / "ply")
+
+    def _tried(self, points: TimedPoints) -> Trials | None:
+        """What of the prior is worth inserting, kept in trials.json; None where that is not open."""
+        path, scene = self.folder / "trials.json", self.scene.with_points(points, self.settings)
+        if self.guidance is not None or not is_open(self.settings, scene):
+            return None
+        if not path.is_file():
+            with self._timed("priors"):
+                leave_out_in_turn(self.settings, scene, points, PriorStore.open(self.priors)).save(path)
+        return Trials.load(path)
 
     @property
     def priors(self) -> Path:
@@ -210,6 +226,7 @@ class Run:
     def _attach(self, model: object) -> D2Hooks:
         adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
         config = hook_config(self.settings, self.priors)
+        config = config if self.trials is None else replace(config, believe=self.trials.choice)
         write_text(self.folder / "d2.toml", config.to_toml())
         guidance, priors = self.guidance, self.priors
         others = {} if guidance is None else guidance.hooks(self.scene, self._points(), priors)

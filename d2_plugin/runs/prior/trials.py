@@ -1,0 +1,241 @@
+"""What of the depth prior is worth inserting in this recording: short trials with a training camera left out.
+
+A declared error, however honest, does not say whether a depth helps cameras that nobody trained on: that also depends
+on what would stand there without it. A training camera shows it as long as it is left out. Each of them is left out in
+turn, the others are trained for a moment on small pictures, once with the whole prior and once with its stereo alone,
+and what the left-out camera would see is compared with its pictures. SSIM decides: single floaters and colours that
+cameras see differently weigh less in it than in PSNR.
+
+The prior is the run's own, so a trial costs its training and no more. Stereo of the left-out camera's pictures is in it,
+for both beliefs alike.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from d2_plugin import registry
+from d2_plugin.captures import Capture, open_capture
+from d2_plugin.config import D2Config
+from d2_plugin.durable import Kind, read_table, write_table
+from d2_plugin.hooks.prior import Belief, Store
+from d2_plugin.plugin import D2Hooks
+from d2_plugin.progress import progress_bar
+from d2_plugin.protocol import DepthPrior
+from d2_plugin.runs.metrics import psnr, ssim_range1
+from d2_plugin.runs.scene import Scene
+from d2_plugin.runs.settings import RunSettings, hook_config, prior_settings
+from d2_plugin.runs.start import (
+    TimedPoints,
+    TrainingFrames,
+    begin_with_exposures,
+    initial_points,
+    make_view,
+    scene_extent,
+)
+
+STEPS = 100
+"""Of one trial."""
+EVALUATIONS = 5
+"""Of the hooks in a trial, if they inserted to its end."""
+SIDE = 320
+"""Pixels of the longer side of the pictures in a trial, at least."""
+INSTANTS = 2
+"""Instants of the recording in a trial."""
+
+TRIALS = Kind("table of trials", 1, "delete the file, the trials will be run again")
+"""trials.json."""
+
+
+class Score(NamedTuple):
+    """How well pictures of a left-out camera were predicted, mean over the instants."""
+
+    ssim: float
+    psnr: float
+
+
+@dataclass(frozen=True)
+class Trials:
+    """What left-out training cameras say of the prior."""
+
+    everything: Mapping[str, Score]
+    """By left-out camera, where the others were trained with the whole prior."""
+    stereo: Mapping[str, Score]
+    """The same with stereo alone."""
+    cpu_seconds: float
+
+    @property
+    def choice(self) -> Belief:
+        """The whole prior where it predicts left-out cameras better, else stereo alone."""
+        return "all" if _mean_ssim(self.everything) > _mean_ssim(self.stereo) else "stereo"
+
+    def __str__(self) -> str:
+        believed = self.choice == "all"
+        verdict = "is worth inserting: the whole prior is used" if believed else "is of no use: stereo alone is used"
+        with_it, without = _mean_ssim(self.everything), _mean_ssim(self.stereo)
+        return f"here monocular depth {verdict} (left-out cameras: SSIM {with_it:.3f} with it, {without:.3f} without)"
+
+    def as_dict(self) -> dict[str, Any]:
+        """For trials.json and metrics.json."""
+        scores = {
+            name: {camera: score._asdict() for camera, score in found.items()}
+            for name, found in (("all", self.everything), ("stereo", self.stereo))
+        }
+        return {"choice": self.choice, "said": str(self), "cpu_seconds": self.cpu_seconds, "scores": scores}
+
+    def save(self, path: Path) -> None:
+        """Write them, so that a run that is continued need not try again."""
+        write_table(path, self.as_dict(), TRIALS)
+
+    @classmethod
+    def load(cls, path: Path) -> Trials:
+        """What `save` wrote."""
+        table = read_table(path, TRIALS)
+        scores = {
+            name: {camera: Score(**score) for camera, score in found.items()}
+            for name, found in table["scores"].items()
+        }
+        return cls(scores["all"], scores["stereo"], table["cpu_seconds"])
+
+
+def _mean_ssim(scores: Mapping[str, Score]) -> float:
+    return float(np.mean([score.ssim for score in scores.values()]))
+
+
+def is_open(settings: RunSettings, scene: Scene) -> bool:
+    """Whether trials can decide: two depth sources, a second camera to train with, and no choice of the user's."""
+    chosen = "believe" in settings.overrides.get("d2", {})
+    uses_depth = bool({"densify", "depth_loss"} & set(settings.hooks))
+    both = scene.plan.uses("verification") and prior_settings(settings).variant == "dual"
+    return both and uses_depth and not chosen and not settings.priors_in_step and len(scene.train_cameras) > 1
+
+
+def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, store: Store) -> Trials:
+    """Leave out each training camera in turn and predict it, with all of the prior in `store` and with its stereo.
+
+    Args:
+        settings: of the run.
+        scene: of the run, with its plan.
+        points: the triangulated points.
+        store: the finished prior of all training cameras.
+    """
+    begin = time.process_time()
+    trial = _Trial.of(settings, scene, points, store)
+    scores: dict[Belief, dict[str, Score]] = {"all": {}, "stereo": {}}
+    with progress_bar("trials", len(scene.train_cameras) * len(scores)) as bar:
+        for camera in scene.train_cameras:
+            others = [name for name in scene.train_cameras if name != camera]
+            for belief, found in scores.items():
+                found[camera] = trial.score(trial.model(others, belief), camera)
+                bar.update(sum(map(len, scores.values())), f"without camera {camera}: SSIM {found[camera].ssim:.3f}")
+    return Trials(scores["all"], scores["stereo"], time.process_time() - begin)
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A run of a few steps on small pictures of a few instants."""
+
+    settings: RunSettings
+    scene: Scene
+    points: TimedPoints
+    store: Store
+    capture: Capture
+
+    @classmethod
+    def of(cls, settings: RunSettings, scene: Scene, points: TimedPoints, store: Store) -> _Trial:
+        cameras, frames = scene.train_cameras, scene.capture.frames
+        places = np.linspace(0, len(frames) - 1, INSTANTS + 2)[1:-1]
+        longest = min(max(scene.capture.cameras[name].width, scene.capture.cameras[name].height) for name in cameras)
+        factor = max(longest // SIDE, 1)
+        capture = open_capture(
+            settings.capture,
+            cameras=cameras,
+            frames=sorted({frames[round(place)] for place in places}),
+            downscale=settings.downscale * factor,
+        )
+        return cls(replace(settings, iterations=STEPS), scene, points, SmallStore(store, factor), capture)
+
+    def model(self, cameras: Sequence[str], belief: Belief) -> Any:
+        """A model that some of the cameras trained."""
+        settings, capture = self.settings, self.capture
+        backbone: Any = registry.load(registry.BACKBONES, settings.backbone)
+        extent = scene_extent(capture, cameras, self.points.positions)
+        start = initial_points(capture, cameras, self.points, extent, settings.seed)
+        needed = {"appearance": True} if self.scene.plan.uses("appearance") else {}
+        model = backbone.create(
+            *start.tensors(settings.device),
+            extent=extent.radius,
+            duration=capture.seconds(capture.frames[-1]),
+            temporal=self.scene.plan.uses("temporal"),
+            settings=needed | dict(settings.overrides.get("backbone", {})),
+        )
+        begin_with_exposures(model, capture, cameras, ())
+        pictures = TrainingFrames(
+            capture, cameras, settings.device, background_weight=settings.background_weight
+        )
+        training = backbone.TrainSettings(iterations=STEPS, seed=settings.seed)
+        config = replace(self._config(), believe=belief)
+        trainer = backbone.Trainer(model, pictures, training, lambda model: self._attach(model, config))
+        trainer.run()
+        return trainer.model
+
+    def _config(self) -> D2Config:
+        """The run's hooks with schedules of a trial, which is too short to gather the evidence that pruning takes."""
+        config = replace(hook_config(self.settings, Path()), prune=None)
+        if config.densify is None:
+            return config
+        return replace(config, densify=replace(config.densify, every=STEPS // EVALUATIONS))
+
+    def _attach(self, model: Any, config: D2Config) -> D2Hooks:
+        adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
+        return D2Hooks.from_config(config, backbone=adapter(model), store=self.store)
+
+    @torch.no_grad()
+    def score(self, model: Any, camera: str) -> Score:
+        """How well a model predicts a camera."""
+        scores = []
+        for frame in self.capture.frames:
+            truth = torch.from_numpy(self.capture.image(camera, frame)).float() / 255
+            view = make_view(self.capture, camera, frame, self.settings.device)
+            predicted = model.render(view).color.cpu().clamp(0, 1)
+            scores.append((ssim_range1(predicted, truth), psnr(predicted, truth)))
+        return Score(*np.mean(scores, axis=0).tolist())
+
+
+class SmallStore:
+    """The priors of a store for pictures that are `factor` times smaller along each side."""
+
+    def __init__(self, store: Store, factor: int) -> None:
+        self.store, self.factor = store, factor
+
+    def prior(self, camera: str, frame: int) -> DepthPrior | None:
+        """What is known at the middle pixel of each block, and the block's mean colour; see `downscaled`."""
+        found = self.store.prior(camera, frame)
+        return found if found is None or self.factor == 1 else small_prior(found, self.factor)
+
+
+def small_prior(prior: DepthPrior, factor: int) -> DepthPrior:
+    """The prior [H, W] of a picture of H / factor by W / factor pixels; blocks that are not whole are cut off."""
+    height, width = (size // factor * factor for size in prior.depth.shape)
+
+    def middle(map_: Tensor | None) -> Tensor | None:
+        half = factor // 2
+        return None if map_ is None else map_[half:height:factor, half:width:factor].contiguous()
+
+    depth, labels = middle(prior.depth), middle(prior.labels)
+    assert depth is not None
+    assert labels is not None
+    colors = prior.colors
+    if colors is not None:
+        blocks = F.avg_pool2d(colors[:height, :width].permute(2, 0, 1)[None].float(), factor)[0]
+        colors = blocks.permute(1, 2, 0).round().byte()
+    return DepthPrior(depth, labels, colors, middle(prior.sigma), middle(prior.reliability))
