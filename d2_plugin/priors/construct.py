@@ -41,7 +41,7 @@ from d2_plugin.priors.stereo.cache import DepthCache, StoredDepth
 from d2_plugin.priors.stereo.reuse import changed
 from d2_plugin.protocol import Label
 
-CONSTRUCTION_VERSION = 12  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 13  # raise it when alignment or fusion change what they return
 
 NO_GEOMETRY = "no geometric depth survived the filter"
 NO_MAP = "there is no monocular map of this frame"

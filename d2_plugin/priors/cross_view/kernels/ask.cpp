@@ -234,7 +234,7 @@ void inform_row(const Ask& c, const std::vector<Surface>& surfaces, int index, i
     const Asked& asked = r.asked[j];
     const int64_t pixel = int64_t(row) * view.width + int64_t(r.u[j]);
     if (asked.found > 0) {
-      view.new_labels[pixel] = c.label_verified;
+      view.new_labels[pixel] = c.label_agreed;
       view.new_depth[pixel] = float(asked.found), view.new_sigma[pixel] = float(asked.precision);
     } else if (asked.agreed) {
       view.new_labels[pixel] = c.label_agreed;
