@@ -18,7 +18,7 @@ from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.store import PriorStore
 from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.runs.plan import Decision
-from d2_plugin.runs.prior.trials import Score, Trials, is_open, leave_out_in_turn, small_prior
+from d2_plugin.runs.prior.trials import Score, Trials, is_open, leave_out_in_turn, left_out, small_prior
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TimedPoints
@@ -75,6 +75,11 @@ def test_ssim_at_left_out_cameras_decides_and_one_line_says_so(tmp_path: Path) -
     assert "the whole prior is used" in str(helps)
     harms.save(tmp_path / "trials.json")
     assert Trials.load(tmp_path / "trials.json") == harms
+
+
+@pytest.mark.parametrize(("cameras", "chosen"), [("ab", "ab"), ("abc", "ac"), ("abcd", "bd"), ("abcdefgh", "cg")])
+def test_however_many_cameras_there_are_two_are_left_out_so_that_trials_cost_the_same(cameras: str, chosen: str) -> None:
+    assert left_out(tuple(cameras)) == tuple(chosen)
 
 
 @pytest.fixture(scope="module")

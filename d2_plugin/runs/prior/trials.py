@@ -1,7 +1,7 @@
 """What of the depth prior is worth inserting in this recording: short trials with a training camera left out.
 
 A declared error, however honest, does not say whether a depth helps cameras that nobody trained on: that also depends
-on what would stand there without it. A training camera shows it as long as it is left out. Each of them is left out in
+on what would stand there without it. A training camera shows it as long as it is left out. Two of them are left out in
 turn, the others are trained for a moment on small pictures, once with the whole prior and once with its stereo alone,
 and what the left-out camera would see is compared with its pictures. SSIM decides: single floaters and colours that
 cameras see differently weigh less in it than in PSNR.
@@ -43,14 +43,21 @@ from d2_plugin.runs.start import (
     scene_extent,
 )
 
-STEPS = 100
-"""Of one trial."""
-EVALUATIONS = 5
+STEPS = 200
+"""Of one trial. Left-out cameras' SSIM with the whole prior less that with stereo alone, mean over all training
+cameras, four instants, 50, 100 and 200 steps: studio -.014, +.010, +.034; studio with PyDNet -.019, -.012, -.021; dome
+with PyDNet -.010, -.011, -.011. What is inserted begins faint, and a trial that is too short sees its cost alone."""
+EVALUATIONS = 10
 """Of the hooks in a trial, if they inserted to its end."""
 SIDE = 320
-"""Pixels of the longer side of the pictures in a trial, at least."""
-INSTANTS = 2
-"""Instants of the recording in a trial."""
+"""Pixels of the longer side of the pictures in a trial, at least. On 160 pixels errors of depth are too small to be
+seen: dome +.011, 100 steps."""
+INSTANTS = 4
+"""Instants of the recording in a trial. From two cameras of studio, 200 steps: -.002 with two instants, +.013 with four
+(the whole prior is right there)."""
+MOST_LEFT_OUT = 2
+"""Cameras that are left out, spread evenly in the order in which they are named: in 200 steps each one of dome's and
+studio's four says what all of them say."""
 
 TRIALS = Kind("table of trials", 1, "delete the file, the trials will be run again")
 """trials.json."""
@@ -120,7 +127,7 @@ def is_open(settings: RunSettings, scene: Scene) -> bool:
 
 
 def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, store: Store) -> Trials:
-    """Leave out each training camera in turn and predict it, with all of the prior in `store` and with its stereo.
+    """Leave out training cameras in turn and predict them, with all of the prior in `store` and with its stereo.
 
     Args:
         settings: of the run.
@@ -131,13 +138,20 @@ def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, 
     begin = time.process_time()
     trial = _Trial.of(settings, scene, points, store)
     scores: dict[Belief, dict[str, Score]] = {"all": {}, "stereo": {}}
-    with progress_bar("trials", len(scene.train_cameras) * len(scores)) as bar:
-        for camera in scene.train_cameras:
+    chosen = left_out(scene.train_cameras)
+    with progress_bar("trials", len(chosen) * len(scores)) as bar:
+        for camera in chosen:
             others = [name for name in scene.train_cameras if name != camera]
             for belief, found in scores.items():
                 found[camera] = trial.score(trial.model(others, belief), camera)
                 bar.update(sum(map(len, scores.values())), f"without camera {camera}: SSIM {found[camera].ssim:.3f}")
     return Trials(scores["all"], scores["stereo"], time.process_time() - begin)
+
+
+def left_out(cameras: Sequence[str]) -> tuple[str, ...]:
+    """At most `MOST_LEFT_OUT` of the cameras, evenly spread."""
+    count = min(len(cameras), MOST_LEFT_OUT)
+    return tuple(cameras[(2 * i + 1) * len(cameras) // (2 * count)] for i in range(count))
 
 
 @dataclass(frozen=True, eq=False)
