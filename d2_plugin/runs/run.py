@@ -20,7 +20,7 @@ from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.prior.alongside import OPEN_BY, PriorAlongside, alongside
 from d2_plugin.runs.prior.build import build_priors_for, refuse_unusable
-from d2_plugin.runs.prior.trials import Trials, is_open, leave_out_in_turn
+from d2_plugin.runs.prior.trials import Trials, is_open, kept_trials
 from d2_plugin.runs.provenance import about
 from d2_plugin.runs.saved.checkpoint import fitting, load_checkpoint, save_checkpoint
 from d2_plugin.runs.saved.claim import claim
@@ -163,13 +163,10 @@ class Run:
 
     def _tried(self, points: TimedPoints) -> Trials | None:
         """What of the prior is worth inserting, kept in trials.json; None where that is not open."""
-        path, scene = self.folder / "trials.json", self.scene.with_points(points, self.settings)
-        if self.guidance is not None or not is_open(self.settings, scene):
+        if self.guidance is not None or not is_open(self.settings, self.scene):
             return None
-        if not path.is_file():
-            with self._timed("priors"):
-                leave_out_in_turn(self.settings, scene, points, PriorStore.open(self.priors)).save(path)
-        return Trials.load(path)
+        with self._timed("priors"):
+            return kept_trials(self.folder / "trials.json", self.settings, self.scene, points, self.priors)
 
     @property
     def priors(self) -> Path:

@@ -142,7 +142,7 @@ def test_a_run_that_is_continued_does_not_try_again_and_its_hooks_get_the_choice
         tried.append(1)
         return Trials({"a": BAD}, {"a": GOOD}, 1.0)
 
-    monkeypatch.setattr("d2_plugin.runs.run.leave_out_in_turn", told)
+    monkeypatch.setattr("d2_plugin.runs.prior.trials.leave_out_in_turn", told)
     monkeypatch.setattr("d2_plugin.runs.run.is_open", lambda *_: True)
     capture = open_capture(room)
     priors = stored(tmp_path / "priors", capture, cameras, 0.0)

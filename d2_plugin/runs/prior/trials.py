@@ -29,6 +29,7 @@ from d2_plugin.config import D2Config
 from d2_plugin.durable import Kind, read_table, write_table
 from d2_plugin.hooks.prior import Belief, Store
 from d2_plugin.plugin import D2Hooks
+from d2_plugin.priors.store import PriorStore
 from d2_plugin.progress import progress_bar
 from d2_plugin.protocol import DepthPrior
 from d2_plugin.runs.metrics import psnr, ssim_range1
@@ -126,12 +127,19 @@ def is_open(settings: RunSettings, scene: Scene) -> bool:
     return both and uses_depth and not chosen and not settings.priors_in_step and len(scene.train_cameras) > 1
 
 
+def kept_trials(path: Path, settings: RunSettings, scene: Scene, points: TimedPoints, priors: Path) -> Trials:
+    """The trials that lie at `path`; made and kept there where nobody did yet. `priors` is the folder of the prior."""
+    if not path.is_file():
+        leave_out_in_turn(settings, scene, points, PriorStore.open(priors)).save(path)
+    return Trials.load(path)
+
+
 def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, store: Store) -> Trials:
     """Leave out training cameras in turn and predict them, with all of the prior in `store` and with its stereo.
 
     Args:
         settings: of the run.
-        scene: of the run, with its plan.
+        scene: of the run.
         points: the triangulated points.
         store: the finished prior of all training cameras.
     """
@@ -176,7 +184,8 @@ class _Trial:
             frames=sorted({frames[round(place)] for place in places}),
             downscale=settings.downscale * factor,
         )
-        return cls(replace(settings, iterations=STEPS), scene, points, SmallStore(store, factor), capture)
+        small = SmallStore(store, factor)
+        return cls(replace(settings, iterations=STEPS), scene.with_points(points, settings), points, small, capture)
 
     def model(self, cameras: Sequence[str], belief: Belief) -> Any:
         """A model that some of the cameras trained."""
