@@ -57,8 +57,8 @@ INSTANTS = 4
 """Instants of the recording in a trial. From two cameras of studio, 200 steps: -.002 with two instants, +.013 with four
 (the whole prior is right there)."""
 MOST_LEFT_OUT = 2
-"""Cameras that are left out, spread evenly in the order in which they are named: in 200 steps each one of dome's and
-studio's four says what all of them say."""
+"""Cameras that are left out, spread evenly in the order in which they are named; more of them cost more and decided
+alike on dome, studio, plaza and sear_steak."""
 
 TRIALS = Kind("table of trials", 1, "delete the file, the trials will be run again")
 """trials.json."""
