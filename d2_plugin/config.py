@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional, cast
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks.densify import DensifyConfig
 from d2_plugin.hooks.depth_loss import DepthLossConfig
+from d2_plugin.hooks.prior import Belief
 from d2_plugin.hooks.prune import PruneConfig
 from d2_plugin.hooks.table import HOOKS
 from d2_plugin.reading import NoSuchFile, read_toml
@@ -41,6 +42,9 @@ class D2Config(_HookTables):
 
     prior: str | None = None
     """Folder of the depth prior, as `d2 priors` writes it."""
+    believe: Belief = "all"
+    """What of the prior is used: all of it, stereo alone, or nothing. Where it is not set, `d2 train` tries it out on
+    training cameras that it leaves out for a moment."""
     exported: str | None = None
     """Folder that `d2 export-recording` wrote and the trainer reads, where the prior is that of the source: its cameras
     and frames have other names there. Found without this where the trainer's cameras know the paths of their images.

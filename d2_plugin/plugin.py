@@ -72,7 +72,7 @@ class D2Hooks:
             from d2_plugin.store.exported import renamed_by
 
             opened = store if store is not None else _open_store(config, self.hooks)
-            self.prior = PriorLoader(opened, config.prior_memory_mb, renamed_by)
+            self.prior = PriorLoader(opened, config.prior_memory_mb, renamed_by, config.believe)
             backbone.on_resize(self._follow)
 
     @classmethod

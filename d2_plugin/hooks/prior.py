@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -25,6 +25,24 @@ class Store(Protocol):
     """
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
+
+
+Belief = Literal["all", "stereo", "nothing"]
+"""What of a prior is believed: `all` of it, `stereo` alone, or `nothing`."""
+
+BELIEVED: dict[str, tuple[Label, ...]] = {"stereo": (Label.VERIFIED,), "nothing": ()}
+"""Labels of the pixels that keep their depth, where not all do."""
+
+
+def believed(prior: DepthPrior, belief: Belief) -> DepthPrior:
+    """The prior with those pixels left empty whose source is not believed."""
+    if belief == "all":
+        return prior
+    kept = torch.zeros_like(prior.labels, dtype=torch.bool)
+    for label in BELIEVED[belief]:
+        kept |= prior.labels == label
+    depth, labels = (torch.where(kept, map_, torch.zeros_like(map_)) for map_ in (prior.depth, prior.labels))
+    return prior._replace(depth=depth, labels=labels)
 
 
 Rename = Callable[[Store, "str | None"], Store]
@@ -71,9 +89,11 @@ class KnownMaps(NamedTuple):
 class PriorLoader:
     """Looks up D* by camera and frame, on the view's device; keeps the last few: memory must not grow with frames."""
 
-    def __init__(self, store: Store, memory_mb: int = 512, rename: Rename | None = None) -> None:
+    def __init__(
+        self, store: Store, memory_mb: int = 512, rename: Rename | None = None, believe: Belief = "all"
+    ) -> None:
         """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes."""
-        self.store, self.keep_bytes, self._rename = store, memory_mb << 20, rename
+        self.store, self.keep_bytes, self._rename, self.believe = store, memory_mb << 20, rename, believe
         self._kept: OrderedDict[tuple[str, int], DepthPrior | None] = OrderedDict()
         self._known: dict[tuple[str, int], KnownMaps] = {}
         self._cameras = CameraCheck()
@@ -105,7 +125,8 @@ class PriorLoader:
             )  # fmt: skip
         if prior is not None:
             self._check(view, prior)
-            prior = _usable(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior))
+            prior = believed(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior), self.believe)
+            prior = _usable(prior)
         self._kept[key] = prior
         while len(self._kept) > 1 and self._bytes() > self.keep_bytes:
             dropped, _ = self._kept.popitem(last=False)

@@ -34,7 +34,7 @@ from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera, MonoKind
 
-CONSTRUCTION_VERSION = 13  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 14  # raise it when alignment or fusion change what they return
 
 FARTHEST = 3.0
 """Aligned monocular depth beyond this multiple of the 99.5 percentile of the anchors is left empty."""

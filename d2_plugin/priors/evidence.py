@@ -3,7 +3,8 @@
 A mono-only pixel is a point in space that other cameras may see.
 
 - Where the pixel's ray meets a surface that another camera measured by stereo, near the monocular depth, the two
-  sources confirm each other and the surface is taken: the pixel is verified.
+  sources confirm each other and the surface is taken. The pixel is agreed and not verified: it has no stereo of its
+  own, and without the network it has no depth.
 - Where two cameras' monocular depths meet and the colours are alike, each confirms the other as far as their errors
   are independent, which is not far: both were bent by anchors of one scene, and one network errs alike in both. So
   agreement takes nearly half off sigma and no more; where sigma is infinite, as in a sky, it stays so.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.prior.alongside import OPEN_BY, PriorAlongside, alongside
 from d2_plugin.runs.prior.build import build_priors_for, refuse_unusable
+from d2_plugin.runs.prior.trials import Trials, is_open, kept_trials
 from d2_plugin.runs.provenance import circumstances
 from d2_plugin.runs.saved.checkpoint import fitting, load_checkpoint, save_checkpoint
 from d2_plugin.runs.saved.claim import claim
@@ -73,6 +75,8 @@ class Run:
         """Hooks that stopped because they changed next to nothing, and at which step."""
         self.prior: dict[str, Any] | None = None
         """What the depth prior became, as `PriorSummary.as_dict` has it; None without one."""
+        self.trials: Trials | None = None
+        """What left-out training cameras said of the prior; None where nothing was tried."""
         self._writes = False
         self._building: PriorAlongside | None = None
 
@@ -121,7 +125,9 @@ class Run:
             Diverged: the loss or a parameter is no finite number any more.
         """
         with self._writing(), self._beside():
-            trainer = self._trainer(self.prepare(self._building is None, on_prior))
+            points = self.prepare(self._building is None, on_prior)
+            self.trials = self._tried(points)
+            trainer = self._trainer(points)
             self._restore(trainer)
             watching = watch(trainer) if watch else lambda step, loss: None
             iterations = self.settings.iterations
@@ -169,6 +175,13 @@ class Run:
         views = [make_view(recording, camera, frame, self.settings.device) for frame in recording.frames]
         with self._writing():
             return write_frames(self.trained().model, views, self.folder / "ply")
+
+    def _tried(self, points: TimedPoints) -> Trials | None:
+        """What of the prior is worth inserting, kept in trials.json; None where that is not open."""
+        if self.guidance is not None or not is_open(self.settings, self.scene):
+            return None
+        with self._timed("priors"):
+            return kept_trials(self.folder / "trials.json", self.settings, self.scene, points, self.priors)
 
     @property
     def priors(self) -> Path:
@@ -225,6 +238,7 @@ class Run:
     def _attach(self, model: object) -> D2Hooks:
         adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
         config = hook_config(self.settings, self.priors)
+        config = config if self.trials is None else replace(config, believe=self.trials.choice)
         write_text(self.folder / "d2.toml", config.to_toml())
         guidance, priors = self.guidance, self.priors
         others = {} if guidance is None else guidance.hooks(self.scene, self._points(), priors)
@@ -319,6 +333,7 @@ def _about(run: Run, trainer: Any) -> dict[str, Any]:
         "background": getattr(trainer.model, "background", None) is not None,
         "appearance": getattr(trainer.model, "appearance", None) is not None,
         "prior": run.prior,
+        "trials": None if run.trials is None else run.trials.as_dict(),
         "plan": scene.plan.as_dict(),
         "recording": scene.recording.name,
         "mono_emulated": scene.recording.mono_emulated,

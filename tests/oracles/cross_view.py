@@ -69,7 +69,7 @@ def _informed(
     met, agreed = answer.depth > 0, answer.agreed
     factor = np.where(agreed, agreeing, np.where(answer.seen, ALONE, 1.0))
     labels, depths, sigmas = prior.labels.copy(), prior.depth.copy(), prior.sigma.copy()
-    labels[rows, columns] = np.where(met, Label.VERIFIED, np.where(agreed, Label.AGREED, Label.MONO))
+    labels[rows, columns] = np.where(met | agreed, Label.AGREED, Label.MONO)
     depths[rows, columns] = np.where(met, answer.depth, depth)
     sigmas[rows, columns] = np.where(met, answer.sigma, np.hypot(factor * sigma, np.where(agreed, AT_BEST, 0)))
     return replace(prior, depth=depths, labels=labels, sigma=sigmas)

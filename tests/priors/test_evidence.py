@@ -81,10 +81,12 @@ def test_maps_that_differ_by_more_than_the_tolerance_do_not_and_both_are_less_su
 
 
 @pytest.mark.parametrize("factor", [0.96, 0.99, 1.0, 1.02, 1.05])
-def test_a_surface_that_another_camera_verified_is_taken_along_the_ray(factor: float) -> None:
+def test_a_surface_that_another_camera_verified_is_taken_along_the_ray_and_is_no_stereo_of_its_own(
+    factor: float,
+) -> None:
     truth, theirs = slanted(CAMERAS["left"]), slanted(CAMERAS["right"])
     compared = left_of(prior_of(truth * factor), prior_of(theirs, Label.VERIFIED, 0.001))
-    met = compared.labels == Label.VERIFIED
+    met = compared.labels == Label.AGREED
     assert met[2:-2, 8:-2].all(), "the right camera sees all but the columns at the left"
     assert not met[:, 0].any()
     np.testing.assert_allclose(compared.depth[met], truth[met], rtol=1e-3)
@@ -108,8 +110,8 @@ def test_a_surface_that_another_camera_verified_is_taken_along_the_ray(factor: f
 def test_a_surface_farther_than_sigma_or_than_near_is_another_surface(sigma: float, away: float, taken: bool) -> None:
     truth, theirs = slanted(CAMERAS["left"]), slanted(CAMERAS["right"])
     compared = left_of(prior_of(truth * np.exp(away), sigma=sigma), prior_of(theirs, Label.VERIFIED, 0.001))
-    assert (share(compared, Label.VERIFIED) > 0.5) == taken
-    assert (share(compared, Label.VERIFIED) == 0) != taken
+    assert (share(compared, Label.AGREED) > 0.5) == taken
+    assert (share(compared, Label.AGREED) == 0) != taken
 
 
 def test_what_nothing_is_known_of_stays_unknown_however_well_two_maps_agree() -> None:
@@ -132,7 +134,7 @@ def test_only_mono_only_pixels_ever_change() -> None:
         changed = compared.labels != labels
         assert changed.any()
         assert (labels[changed] == Label.MONO).all()
-        assert np.isin(compared.labels[changed], (Label.AGREED, Label.VERIFIED)).all()
+        assert (compared.labels[changed] == Label.AGREED).all()
     np.testing.assert_array_equal(prior.labels, labels)
 
 
@@ -218,7 +220,7 @@ def test_cameras_are_compared_for_the_dual_prior_alone(tmp_path: Path) -> None:
     assert (with_it == Label.AGREED).any()
     changed = with_it != without
     assert (without[changed] == Label.MONO).all()
-    assert set(np.unique(with_it[changed])) == {Label.AGREED, Label.VERIFIED}
+    assert set(np.unique(with_it[changed])) == {Label.AGREED}
     for variant in ("dual_unverified", "mono"):
         assert not (labels(variant, PriorSettings(variant=variant)) == Label.AGREED).any()
     assert PriorSettings.paper().agreement == 0
@@ -230,9 +232,9 @@ def test_a_surface_of_another_colour_is_not_the_thing_that_the_ray_sees() -> Non
     ours, theirs = prior_of(WALL * 1.01), prior_of(WALL, Label.VERIFIED, 0.001)
     for apart, taken in ((0, True), (0.9, True), (1.1, False)):
         compared = left_of(painted(ours, 100), painted(theirs, 100 + int(apart * LIKE * 255)))
-        assert (share(compared, Label.VERIFIED) > 0.5) is taken
+        assert (share(compared, Label.AGREED) > 0.5) is taken
         assert taken or (compared.depth == ours.depth).all()
-    assert share(left_of(ours, theirs), Label.VERIFIED) > 0.5, "without images nothing speaks against it"
+    assert share(left_of(ours, theirs), Label.AGREED) > 0.5, "without images nothing speaks against it"
 
 
 @pytest.mark.parametrize(("mine", "seen", "taken"), [(100, 120, True), (100, 100, False), (120, 100, False)])
@@ -248,7 +250,7 @@ def test_a_colour_is_compared_in_the_exposure_of_the_other_camera(mine: int, see
     ours, theirs = (replace(p, colors=c.astype(np.uint8)) for p, c in zip((ours, verified), colors, strict=True))
     compared = left_of(ours, theirs)
     right = compared.labels[:, 3 * WIDTH // 4 :]
-    assert bool(np.mean(right == Label.VERIFIED) > 0.3) is taken
+    assert bool(np.mean(right == Label.AGREED) > 0.3) is taken
 
 
 def test_maps_agree_only_about_places_of_one_colour() -> None:

@@ -234,7 +234,7 @@ void compare_row(const Instant& c, const std::vector<Surface>& surfaces, int ind
     const MonoPixel& point = r.pixels[j];
     const int64_t pixel = int64_t(row) * view.width + int64_t(r.u[j]);
     if (point.met > 0) {
-      view.new_labels[pixel] = c.label_verified;
+      view.new_labels[pixel] = c.label_agreed;
       view.new_depth[pixel] = float(point.met), view.new_sigma[pixel] = float(point.precision);
     } else if (point.agreed) {
       view.new_labels[pixel] = c.label_agreed;

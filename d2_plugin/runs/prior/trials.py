@@ -1,0 +1,266 @@
+"""What of the depth prior is worth inserting in this recording: short trials with a training camera left out.
+
+A declared error, however honest, does not say whether a depth helps cameras that nobody trained on: that also depends
+on what would stand there without it. A training camera shows it as long as it is left out: the others are trained for
+a moment on small images, once with the whole prior and once with its stereo alone, and what the left-out camera would
+see is compared with its images. Where the first one does not decide clearly a second one is left out. SSIM decides:
+single floaters and colours that cameras see differently weigh less in it than in PSNR.
+
+The prior is the run's own, so a trial costs its training and no more. Stereo of the left-out camera's images is in it,
+for both beliefs alike.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from d2_plugin import registry
+from d2_plugin.config import D2Config
+from d2_plugin.durable import Kind, read_table, write_table
+from d2_plugin.hooks.prior import Belief, Store
+from d2_plugin.plugin import D2Hooks
+from d2_plugin.progress import progress_bar
+from d2_plugin.protocol import DepthPrior
+from d2_plugin.recordings import Recording, open_recording
+from d2_plugin.runs.metrics import psnr, ssim_range1
+from d2_plugin.runs.scene import Scene
+from d2_plugin.runs.settings import RunSettings, hook_config, prior_settings
+from d2_plugin.runs.start import (
+    TimedPoints,
+    TrainingFrames,
+    begin_with_exposures,
+    initial_points,
+    make_view,
+    scene_extent,
+)
+from d2_plugin.store.store import PriorStore
+
+LEAST_ITERATIONS = 1000
+"""Of a run that is worth trials; a shorter one uses the whole prior."""
+STEPS = 200
+"""Of one trial. What is inserted begins faint, and a trial that is too short sees its cost alone."""
+EVALUATIONS = 10
+"""Of the hooks in a trial, if they inserted to its end."""
+SIDE = 320
+"""Pixels of the longer side of the images in a trial, at least. On fewer, errors of depth are too small to be seen."""
+INSTANTS = 4
+"""Of the recording in a trial, evenly spread."""
+MOST_LEFT_OUT = 2
+"""Cameras that are left out, spread evenly in the order in which they are named."""
+CLEAR = 0.01
+"""A difference of SSIM at one left-out camera that needs no second one."""
+
+TRIALS = Kind("table of trials", 1, "delete the file, the trials will be run again")
+"""trials.json."""
+
+
+class Score(NamedTuple):
+    """How well images of a left-out camera were predicted, mean over the instants."""
+
+    ssim: float
+    psnr: float
+
+
+@dataclass(frozen=True)
+class Trials:
+    """What left-out training cameras say of the prior."""
+
+    everything: Mapping[str, Score]
+    """By left-out camera, where the others were trained with the whole prior."""
+    stereo: Mapping[str, Score]
+    """The same with stereo alone."""
+    cpu_seconds: float
+
+    @property
+    def choice(self) -> Belief:
+        """The whole prior where it predicts left-out cameras better, else stereo alone."""
+        return "all" if _mean_ssim(self.everything) > _mean_ssim(self.stereo) else "stereo"
+
+    def __str__(self) -> str:
+        believed = self.choice == "all"
+        verdict = "is worth inserting: the whole prior is used" if believed else "is of no use: stereo alone is used"
+        with_it, without = _mean_ssim(self.everything), _mean_ssim(self.stereo)
+        return f"here monocular depth {verdict} (left-out cameras: SSIM {with_it:.3f} with it, {without:.3f} without)"
+
+    def as_dict(self) -> dict[str, Any]:
+        """For trials.json and metrics.json."""
+        scores = {
+            name: {camera: score._asdict() for camera, score in found.items()}
+            for name, found in (("all", self.everything), ("stereo", self.stereo))
+        }
+        return {"choice": self.choice, "text": str(self), "cpu_seconds": self.cpu_seconds, "scores": scores}
+
+    def save(self, path: Path) -> None:
+        """Write them, so that a run that is continued need not try again."""
+        write_table(path, self.as_dict(), TRIALS)
+
+    @classmethod
+    def load(cls, path: Path) -> Trials:
+        """What `save` wrote."""
+        table = read_table(path, TRIALS)
+        scores = {
+            name: {camera: Score(**score) for camera, score in found.items()} for name, found in table["scores"].items()
+        }
+        return cls(scores["all"], scores["stereo"], table["cpu_seconds"])
+
+
+def _mean_ssim(scores: Mapping[str, Score]) -> float:
+    return float(np.mean([score.ssim for score in scores.values()]))
+
+
+def is_open(settings: RunSettings, scene: Scene) -> bool:
+    """Whether trials can decide: two depth sources, a second camera, a run long enough, and no choice of the user's."""
+    if settings.iterations < LEAST_ITERATIONS:
+        return False
+    chosen = "believe" in settings.overrides.get("d2", {})
+    uses_depth = bool({"densify", "depth_loss"} & set(settings.hooks))
+    both = scene.plan.uses("verification") and prior_settings(settings).variant == "dual"
+    return both and uses_depth and not chosen and not settings.priors_in_step and len(scene.train_cameras) > 1
+
+
+def kept_trials(path: Path, settings: RunSettings, scene: Scene, points: TimedPoints, priors: Path) -> Trials:
+    """The trials that lie at `path`; made and kept there where nobody did yet. `priors` is the folder of the prior."""
+    if not path.is_file():
+        leave_out_in_turn(settings, scene, points, PriorStore.open(priors)).save(path)
+    return Trials.load(path)
+
+
+def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, store: Store) -> Trials:
+    """Leave out training cameras in turn and predict them, with all of the prior in `store` and with its stereo.
+
+    Args:
+        settings: of the run.
+        scene: of the run.
+        points: the triangulated points.
+        store: the finished prior of all training cameras.
+    """
+    begin = time.process_time()
+    trial = _Trial.of(settings, scene, points, store)
+    scores: dict[Belief, dict[str, Score]] = {"all": {}, "stereo": {}}
+    chosen = left_out(scene.train_cameras)
+    with progress_bar("trials", len(chosen) * len(scores)) as bar:
+        for camera in chosen:
+            others = [name for name in scene.train_cameras if name != camera]
+            for belief, of_cameras in scores.items():
+                score = of_cameras[camera] = trial.score(trial.model(others, belief), camera)
+                bar.update(sum(map(len, scores.values())), f"without camera {camera}: SSIM {score.ssim:.3f}")
+            if abs(scores["all"][camera].ssim - scores["stereo"][camera].ssim) >= CLEAR:
+                break
+    return Trials(scores["all"], scores["stereo"], time.process_time() - begin)
+
+
+def left_out(cameras: Sequence[str]) -> tuple[str, ...]:
+    """At most `MOST_LEFT_OUT` of the cameras, evenly spread."""
+    count = min(len(cameras), MOST_LEFT_OUT)
+    return tuple(cameras[(2 * i + 1) * len(cameras) // (2 * count)] for i in range(count))
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A run of a few steps on small images of a few instants."""
+
+    settings: RunSettings
+    scene: Scene
+    points: TimedPoints
+    store: Store
+    recording: Recording
+
+    @classmethod
+    def of(cls, settings: RunSettings, scene: Scene, points: TimedPoints, store: Store) -> _Trial:
+        cameras, frames = scene.train_cameras, scene.recording.frames
+        places = np.linspace(0, len(frames) - 1, INSTANTS + 2)[1:-1]
+        longest = min(
+            max(scene.recording.cameras[name].width, scene.recording.cameras[name].height) for name in cameras
+        )
+        factor = max(longest // SIDE, 1)
+        recording = open_recording(
+            settings.recording,
+            cameras=cameras,
+            frames=sorted({frames[round(place)] for place in places}),
+            downscale=settings.downscale * factor,
+        )
+        small = SmallStore(store, factor)
+        return cls(replace(settings, iterations=STEPS), scene.with_points(points, settings), points, small, recording)
+
+    def model(self, cameras: Sequence[str], belief: Belief) -> Any:
+        """A model that some of the cameras trained."""
+        settings, recording = self.settings, self.recording
+        backbone: Any = registry.load(registry.BACKBONES, settings.backbone)
+        extent = scene_extent(recording, cameras, self.points.positions)
+        start = initial_points(recording, cameras, self.points, extent, settings.seed)
+        needed = {"appearance": True} if self.scene.plan.uses("appearance") else {}
+        model = backbone.create(
+            *start.tensors(settings.device),
+            extent=extent.radius,
+            duration=recording.seconds(recording.frames[-1]),
+            temporal=self.scene.plan.uses("temporal"),
+            settings=needed | dict(settings.overrides.get("backbone", {})),
+        )
+        begin_with_exposures(model, recording, cameras, ())
+        images = TrainingFrames(recording, cameras, settings.device, background_weight=settings.background_weight)
+        training = backbone.TrainSettings(iterations=STEPS, seed=settings.seed)
+        config = replace(self._config(), believe=belief)
+        trainer = backbone.Trainer(model, images, training, lambda model: self._attach(model, config))
+        trainer.run()
+        return trainer.model
+
+    def _config(self) -> D2Config:
+        """The run's hooks with schedules of a trial, which is too short to gather the evidence that pruning takes."""
+        config: Any = replace(cast(Any, hook_config(self.settings, Path())), prune=None)
+        if config.densify is None:
+            return config
+        return replace(config, densify=replace(config.densify, every=STEPS // EVALUATIONS))
+
+    def _attach(self, model: Any, config: D2Config) -> D2Hooks:
+        adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
+        return D2Hooks(config, adapter(model), self.store)
+
+    @torch.no_grad()
+    def score(self, model: Any, camera: str) -> Score:
+        """How well a model predicts a camera."""
+        scores = []
+        for frame in self.recording.frames:
+            truth = torch.from_numpy(self.recording.image(camera, frame)).float() / 255
+            view = make_view(self.recording, camera, frame, self.settings.device)
+            predicted = model.render(view).color.cpu().clamp(0, 1)
+            scores.append((ssim_range1(predicted, truth), psnr(predicted, truth)))
+        return Score(*np.mean(scores, axis=0).tolist())
+
+
+class SmallStore:
+    """The priors of a store for images that are `factor` times smaller along each side."""
+
+    def __init__(self, store: Store, factor: int) -> None:
+        self.store, self.factor = store, factor
+
+    def prior(self, camera: str, frame: int) -> DepthPrior | None:
+        """What is known at the middle pixel of each block, and the block's mean colour; see `downscaled`."""
+        found = self.store.prior(camera, frame)
+        return found if found is None or self.factor == 1 else small_prior(found, self.factor)
+
+
+def small_prior(prior: DepthPrior, factor: int) -> DepthPrior:
+    """The prior [H, W] of an image of H / factor by W / factor pixels; blocks that are not whole are cut off."""
+    height, width = (size // factor * factor for size in prior.depth.shape)
+
+    def middle(map_: Tensor | None) -> Tensor | None:
+        half = factor // 2
+        return None if map_ is None else map_[half:height:factor, half:width:factor].contiguous()
+
+    depth, labels = middle(prior.depth), middle(prior.labels)
+    assert depth is not None
+    assert labels is not None
+    colors = prior.colors
+    if colors is not None:
+        blocks = F.avg_pool2d(colors[:height, :width].permute(2, 0, 1)[None].float(), factor)[0]
+        colors = blocks.permute(1, 2, 0).round().byte()
+    return DepthPrior(depth, labels, colors, middle(prior.sigma), middle(prior.reliability))
