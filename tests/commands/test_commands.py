@@ -120,10 +120,10 @@ class TestTables:
         self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         words = ["train", str(recording), *CAMERAS, "--iterations", "4", "--hooks", "none", "--output", str(tmp_path)]
-        lists = ["--priors.stereo.patchmatch-rounds", "3,1"]
+        lists = ["--priors.depth-range", "1,8"]
         assert main([*words, *lists]) == 0
         assert main([*words, *lists]) == 0
-        assert main([*words, "--priors.stereo.patchmatch-rounds", "3,2"]) == 2
+        assert main([*words, "--priors.depth-range", "1,9"]) == 2
         assert "other settings of overrides" in capsys.readouterr().err
 
     def test_the_tables_of_a_backbone_are_those_of_the_chosen_one(self, capsys: pytest.CaptureFixture[str]) -> None:

@@ -46,6 +46,7 @@ int main() {
 """
 
 
+@pytest.mark.slow
 def test_no_number_outside_of_the_images_is_touched(tmp_path: Path) -> None:
     """A band of rows read up to three rows beyond its copy of the target: most times harmless, now and then a crash."""
     compiler = shutil.which("g++")

@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny import make_trainer, parameters, same
 
+from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -60,7 +61,7 @@ class Opening:
 
 class TestTheTrainer:
     def test_draws_from_what_is_open_and_begins_a_round_with_what_joins(self) -> None:
-        trainer = make_trainer({}, iterations=40)
+        trainer = make_trainer(D2Config(), iterations=40)
         frames = trainer.frames = Opening(trainer, first=2, step=8)
         trainer.run(7)
         assert set(frames.drawn) == {0, 1}
@@ -69,7 +70,7 @@ class TestTheTrainer:
         assert sorted(frames.drawn) == list(range(len(frames.views)))
 
     def test_with_everything_open_is_the_one_that_never_asks(self) -> None:
-        asking, plain = make_trainer({}, iterations=12), make_trainer({}, iterations=12)
+        asking, plain = make_trainer(D2Config(), iterations=12), make_trainer(D2Config(), iterations=12)
         asking.frames = Opening(asking, first=len(asking.frames.views), step=0)
         asking.run()
         plain.run()

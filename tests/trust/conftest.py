@@ -16,7 +16,7 @@ from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 ROWS = Path(__file__).parents[1] / "data" / "runs.jsonl"
-TRAINED = ["--train-cameras", "train0,train1", "--priors.stereo.matcher", "sweep"]
+TRAINED = ["--train-cameras", "train0,train1", "--priors.stereo.matcher", "patchmatch"]
 
 
 @dataclass(frozen=True)
@@ -102,6 +102,9 @@ def workplace(commands: Commands, recording: Path) -> Workplace:
 
     export = ["export-recording", str(recording), "--format", "transforms", "--points", "50", "--output"]
     videos = ["import", str(filmed(folder)), "--calibration", str(folder / "room" / "cameras.json")]
+    rows = folder / "training.jsonl"
+    kept = [line for line in ROWS.read_text().splitlines() if '"kind": "training"' in line]
+    rows.write_text("".join(f"{line}\n" for line in kept))
     work = {
         "import": Work([*videos, "--offsets", "none", "--output", str(out)], out, lambda: None),
         "priors": Work(["priors", str(recording), *TRAINED, "--output", str(out)], out, lambda: None),
@@ -109,7 +112,7 @@ def workplace(commands: Commands, recording: Path) -> Workplace:
         "eval": Work(["eval", str(out)], out, trained),
         "export": Work([*export, str(out)], out, lambda: None),
         "page": Work(["export", str(run), "--output", str(out)], out, lambda: None),
-        "report": Work(["report", str(ROWS), "--output", str(out)], out, lambda: None),
+        "report": Work(["report", str(rows), "--output", str(out)], out, lambda: None),
     }
     whole, operations, renames, cpu = {}, {}, {}, {}
     for name, one in work.items():

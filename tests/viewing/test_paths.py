@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Camera
-from d2_plugin.recordings.cameras.calibration import OPENGL_TO_OPENCV
+from d2_plugin.recordings.cameras.camera import OPENGL_TO_OPENCV
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.viewing.camera_paths import (
     Lens,
