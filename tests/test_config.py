@@ -17,7 +17,7 @@ from d2_plugin import D2Config, D2Error
 from d2_plugin.backbones import deform, yang4d
 from d2_plugin.backbones.trainer import TrainSettings
 from d2_plugin.config import DensifyConfig, PruneConfig
-from d2_plugin.hooks.table import HOOKS
+from d2_plugin.hooks import HOOKS
 from d2_plugin.protocol import RasterSettings
 from d2_plugin.runs.settings import RunSettings, check
 from d2_plugin.settings import Settings, declared, table_of

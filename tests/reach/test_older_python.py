@@ -19,7 +19,7 @@ import pytest
 from d2_plugin import older, registry
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
-from d2_plugin.hooks.table import HOOKS
+from d2_plugin.hooks import HOOKS
 from d2_plugin.settings import Range, Settings, declared
 
 OLDEST = "3.9"
