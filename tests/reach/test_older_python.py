@@ -81,15 +81,6 @@ def test_no_union_of_types_is_evaluated_at_run_time() -> None:
     assert unions_at_run_time("x = f(float | None)\ndef g(a: int | None) -> str | None: ...") == ["float | None"]
 
 
-def test_the_judge_sees_a_newer_word(tmp_path: Path) -> None:
-    """A green test above says something."""
-    pytest.importorskip("vermin", reason="needs vermin")
-    for number, text in enumerate(("zip([1], [2], strict=True)", "match 1:\n    case 1: pass", "import tomllib")):
-        file = tmp_path / f"newer{number}.py"
-        file.write_text(f"{text}\n")
-        assert vermin(str(file)).returncode == 1
-
-
 class TestAnnotations:
     """Settings are declared as `int | None`, which Python 3.9 evaluates with a stand-in."""
 
