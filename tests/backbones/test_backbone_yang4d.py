@@ -72,16 +72,6 @@ class TestInitialScales:
         expected = math.sqrt((1 + 4 + 9) / 3)
         assert nearest_neighbour_scales(positions)[0].item() == pytest.approx(expected)
 
-    @pytest.mark.parametrize("count", [0, 1, 2, 3])
-    def test_few_points_get_finite_scales(self, count: int) -> None:
-        scales = nearest_neighbour_scales(torch.rand(count, 3))
-        assert scales.shape == (count,)
-        assert torch.isfinite(scales).all()
-        assert (scales > 0).all()
-
-    def test_duplicated_points_get_a_floor(self) -> None:
-        assert (nearest_neighbour_scales(torch.ones(5, 3)) == 1e-7).all()
-
 
 class TestColour:
     @pytest.mark.parametrize("degree", [0, 1, 2, 3])

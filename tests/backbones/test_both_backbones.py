@@ -211,15 +211,6 @@ def test_without_time_these_are_ordinary_3d_gaussians(backbone: str) -> None:
     assert is_finite(trainer)
 
 
-def test_a_run_survives_losing_every_gaussian(backbone: str) -> None:
-    model = make_model(backbone=backbone)
-    bend_field(model)
-    model.select(torch.zeros(0, dtype=torch.int64))
-    render = model.render(make_views()[0], background=torch.zeros(3))
-    assert not render.color.any()
-    assert not render.alpha.any()
-
-
 def test_a_time_that_is_not_a_number_is_refused(backbone: str) -> None:
     with pytest.raises(D2Error, match="the time of camera 'cam0', frame 0 is NaN"):
         make_model(backbone=backbone).slice_at(replace(make_views()[0], time=math.nan))

@@ -69,12 +69,6 @@ def test_one_gaussian_has_its_opacity_at_its_centre_and_falls_off_with_its_scree
     assert alpha[7, 9].item() == pytest.approx(0.8 * math.exp(-0.5 * 4 / variance), abs=1e-12)
 
 
-def test_depth_is_accumulated_not_normalised():
-    render = single(depth=4.0, opacity=0.5).render()
-    assert render.depth_sum[7, 7].item() == pytest.approx(2.0)
-    assert (render.depth_sum / render.alpha)[7, 7].item() == pytest.approx(4.0)
-
-
 def test_the_nearer_gaussian_hides_the_farther_one_whatever_their_order():
     near, far = single(depth=2.0, opacity=0.6), single(depth=3.0, opacity=0.9)
     for first, second in ((near, far), (far, near)):
@@ -170,14 +164,6 @@ def test_survey_counts_verified_and_agreed_pixels_and_no_others(label, dtype):
     assert statistics.hits.item() == (alpha > 0).sum().item() * counted
     assert statistics.weight.item() == pytest.approx(alpha.sum().item() * counted, rel=1e-5)
     assert statistics.error.item() == pytest.approx(alpha.sum().item() * counted * (4 - 3) / 3, rel=1e-5)
-
-
-def test_survey_without_trusted_pixels_still_knows_the_largest_weight():
-    scene = single(opacity=0.5)
-    prior = DepthPrior(torch.ones(15, 15), torch.ones(15, 15, dtype=torch.uint8))
-    statistics = survey(scene.splats, scene.view, prior)
-    assert statistics.weight.item() == statistics.error.item() == statistics.hits.item() == 0
-    assert statistics.max_weight.item() == pytest.approx(0.5)
 
 
 def bad(scene: Scene, **changes: object) -> tuple:
