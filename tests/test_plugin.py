@@ -23,21 +23,12 @@ from d2_plugin.backbones.trainer import Trainer
 from d2_plugin.config import DensifyConfig, PruneConfig
 from d2_plugin.hooks.densify import shuffled_pixels
 from d2_plugin.hooks.views import ViewSampler
-from d2_plugin.protocol import Backbone, Splats, View
+from d2_plugin.protocol import Splats, View
 from d2_plugin.rasterizer import rasterize
 
 
 def only(*hooks: str) -> D2Config:
     return replace(ALL_HOOKS, **{name: None for name in ALL_HOOKS.hooks if name not in hooks})
-
-
-def test_adapter_satisfies_the_protocol() -> None:
-    adapter = Yang4DAdapter(make_model())
-    assert isinstance(adapter, Backbone)
-    members = ("settings", "__len__", "view", "slice_at", "insert", "remove", "on_resize")
-    for missing in members:
-        partial = type("Partial", (), {name: getattr(type(adapter), name) for name in members if name != missing})
-        assert not isinstance(partial(), Backbone), missing
 
 
 def trainer_without(*numbers: int) -> type[Trainer]:

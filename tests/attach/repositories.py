@@ -117,6 +117,15 @@ def inria(
     return Standing(make_adapter(), cameras, model, draw, lambda: [model.optimizer], tables, edits)
 
 
+def fudan_model(**attributes: object) -> tuple[Any, Any]:
+    """Gaussians large enough to cover the images, and their scene; `attributes` are set on the model."""
+    model, scene = fudan.make()
+    model._scaling.data += 1.0
+    vars(model).update(attributes)
+    model.training_setup(default_options())
+    return model, scene
+
+
 def make_fudan() -> Standing:
     model, scene = fudan.make()
     return inria(fudan, model, lambda: FudanAdapter(model, scene), scene.train_cameras[1.0])
