@@ -113,7 +113,7 @@ CASES = {
         D2Config.from_toml,
     ),
     "npy": Case("a.npy", lambda p: np.save(p, MAP), read_array),
-    "npz": Case("a.npz", lambda p: np.savez_compressed(p, depth=MAP), lambda p: read_array(p, key="depth", ndim=2)),
+    "npz": Case("a.npz", lambda p: np.savez_compressed(p, depth=MAP), lambda p: read_array(p, key="depth")),
     "png": Case("a.png", lambda p: write_png(p, IMAGE), lambda p: (image_size(p), read_image(p))),
     "jpeg": Case("a.jpg", lambda p: cv2.imwrite(str(p), IMAGE), lambda p: (image_size(p), read_image(p))),
     "video": Case("a.mp4", write_video, video),

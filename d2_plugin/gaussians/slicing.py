@@ -33,7 +33,7 @@ def slice_gaussians(raw: Mapping[str, Tensor], time: float = 0.0) -> Splats:
 
 
 def reference_slice(
-    raw: Mapping[str, Tensor], time: float, marginal_cut: float = MARGINAL_CUT, log_scale_limit: float = LOG_SCALE_LIMIT
+    raw: Mapping[str, Tensor], time: float, marginal_cut: float, log_scale_limit: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The slice in torch: any dtype and device, and the oracle of `native_slice`, which documents the arguments."""
     if "times" not in raw:
