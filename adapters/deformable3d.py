@@ -1,8 +1,9 @@
 """ingra14m/Deformable-3D-Gaussians (CVPR 2024): canonical 3D Gaussians moved by an MLP, `DeformModel`.
 
-d2 = D2Hooks.from_config("d2.toml", Deformable3DAdapter(gaussians, deform, warm_up=opt.warm_up))  # train.py:41
-loss = loss + d2.loss(iteration, viewpoint_cam)                                                   # before :109
-d2.step(iteration)                                                                                # after :163
+adapter = Deformable3DAdapter(gaussians, deform, warm_up=opt.warm_up)
+d2 = D2Hooks.from_config("d2.toml", backbone=adapter, iterations=opt.iterations)   # train.py:41
+loss = loss + d2.loss(iteration, viewpoint_cam)                                    # before :109
+d2.step(iteration)                                                                 # after :163
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """juno181/Ex4DGS (NeurIPS 2024): static Gaussians with a drift, and dynamic ones between key frames.
 
-    d2 = D2Hooks.attach("d2.toml", "ex4dgs", gaussians, near=dataset.near, far=dataset.far)   # train.py:50 (or restore)
-    loss = loss + d2.loss(iteration, viewpoint_cam)                                           # before :170
-    d2.step(iteration)                                                                        # after prune_nan_points
+    d2 = D2Hooks.attach("d2.toml", "ex4dgs", gaussians, near=dataset.near, far=dataset.far,
+                        iterations=opt.iterations)       # train.py:50 (or restore)
+    loss = loss + d2.loss(iteration, viewpoint_cam)      # before :170
+    d2.step(iteration)                                   # after prune_nan_points
 
 The contract's rows are those of its render: all static Gaussians, then all dynamic ones. Rows that the repository
 appends to the first table therefore land in the middle of the second's.

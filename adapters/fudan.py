@@ -1,8 +1,9 @@
 """fudan-zvg/4d-gaussian-splatting (Yang et al., ICLR 2024) and 4C4D, its fork: native 4D Gaussians, sliced at t.
 
-    d2 = D2Hooks.from_config("d2.toml", FudanAdapter(gaussians, scene))   # train.py:52, after training_setup, restore
-    loss = loss + d2.loss(iteration, viewpoint_cam)                       # before `loss = loss / batch_size` (:162)
-    d2.step(iteration)                                                    # after optimizer.zero_grad (:249)
+    adapter = FudanAdapter(gaussians, scene)                                           # after training_setup, restore
+    d2 = D2Hooks.from_config("d2.toml", backbone=adapter, iterations=opt.iterations)   # train.py:52
+    loss = loss + d2.loss(iteration, viewpoint_cam)                                    # before `/ batch_size` (:162)
+    d2.step(iteration)                                                                 # after zero_grad (:249)
 
 Line 2 lies before the division: it runs once per view, and the mean over the batch is then taken of both losses alike.
 """
@@ -22,8 +23,9 @@ from d2_plugin.gaussians.rotation4d import (
     rotation_matrices_4d,
     temporal_marginal,
     time_row,
+    unit_quaternions,
 )
-from d2_plugin.gaussians.slicing import MARGINAL_CUT, slice_gaussians, unit_quaternions
+from d2_plugin.gaussians.slicing import MARGINAL_CUT, slice_gaussians
 from d2_plugin.protocol import Points, ResizeListener, Splats, View
 
 from .cameras import correct_fields_of_view

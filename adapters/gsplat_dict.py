@@ -1,7 +1,7 @@
 """A gsplat dict of parameters with its dict of optimizers (examples/simple_trainer.py, gsplat.strategy).
 
     adapter = GsplatAdapter(splats, optimizers, strategy_state)     # after strategy.initialize_state()
-    d2 = D2Hooks.from_config("d2.toml", adapter)
+    d2 = D2Hooks.from_config("d2.toml", backbone=adapter, iterations=30_000)
     loss = loss + d2.loss(step, views)                              # before backward
     d2.step(step)                                                   # after strategy.step_post_backward and zero_grad
 
@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.slicing import unit_quaternions
+from d2_plugin.gaussians.rotation4d import unit_quaternions
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from .keys import ViewsByPose

@@ -1,8 +1,9 @@
 """hustvl/4DGaussians (CVPR 2024): canonical 3D Gaussians deformed by a HexPlane field, trained in two stages.
 
-    d2 = D2Hooks.from_config("d2.toml", Hust4DAdapter(gaussians, scene, stage))   # train.py:52, in each stage
-    loss = loss + d2.loss(iteration, viewpoint_cams)                              # before :219, the whole batch
-    d2.step(iteration)                                                            # after :292, before the checkpoint
+    adapter = Hust4DAdapter(gaussians, scene, stage)
+    d2 = D2Hooks.from_config("d2.toml", backbone=adapter, iterations=train_iter)   # train.py:52, in each stage
+    loss = loss + d2.loss(iteration, viewpoint_cams)                               # before :219, the whole batch
+    d2.step(iteration)                                                             # after :292, before the checkpoint
 
 `scene_reconstruction` runs once per stage and calls `training_setup` anew, so line 1 runs twice on one model; the
 adapter of the fine stage takes the place of the coarse one's. Iterations count from 1 in each.
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.slicing import unit_quaternions
+from d2_plugin.gaussians.rotation4d import unit_quaternions
 from d2_plugin.protocol import Points, Splats, View
 
 from .inria import InriaAdapter, RenderedCamera

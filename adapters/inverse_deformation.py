@@ -14,6 +14,10 @@ from d2_plugin.protocol import Points
 DISTANCES_AT_ONCE = 1 << 24
 """Entries of the distance matrix that are held at a time (64 MiB in float32)."""
 
+ACCEPTED = 0.5
+"""Largest accepted residual, in standard deviations of each point: one that is off by half of its own width still
+covers its pixel, whatever the unit of length."""
+
 
 class Inversion(NamedTuple):
     """Canonical positions of K points, and which of them the field really maps onto their target."""
@@ -81,17 +85,13 @@ def _length(residual: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def invert_at_times(
-    points: Points, deformed: Callable[[Tensor, float], Tensor], present: Tensor, tolerance: float = 0.5
-) -> Inversion:
+def invert_at_times(points: Points, deformed: Callable[[Tensor, float], Tensor], present: Tensor) -> Inversion:
     """Canonical positions of points that were each seen at their own time.
 
     Args:
         points: K points; `times` in the field's unit.
         deformed: canonical positions [n, 3] and a time to deformed positions [n, 3].
         present: canonical positions [N, 3] of the existing Gaussians.
-        tolerance: largest accepted residual in standard deviations of each point: one that is off by half of its own
-            width still covers its pixel, whatever the unit of length.
     """
     positions = points.positions.clone()
     accepted = torch.zeros_like(points.times, dtype=torch.bool)
@@ -104,7 +104,7 @@ def invert_at_times(
             points.positions[chosen],
             moved,
             moved - present,
-            tolerance * points.scales[chosen],
+            ACCEPTED * points.scales[chosen],
         )
         positions[chosen], accepted[chosen], residuals[chosen] = inversion
     return Inversion(positions, accepted, residuals)

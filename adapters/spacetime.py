@@ -1,8 +1,9 @@
 """oppo-us-research/SpacetimeGaussians (CVPR 2024): Gaussians with a temporal radial basis and polynomial motion.
 
-    d2 = D2Hooks.attach("d2.toml", "spacetime", gaussians, duration)   # train.py:87, after training_setup
-    loss = loss + d2.loss(iteration, viewpoint_cam)                    # before :208, inside the loop over cameras
-    d2.step(iteration)                                                 # after the optimizer's step at the end (:395)
+    # train.py:87, after training_setup
+    d2 = D2Hooks.attach("d2.toml", "spacetime", gaussians, duration, iterations=opt.iterations)
+    loss = loss + d2.loss(iteration, viewpoint_cam)      # before :208, inside the loop over cameras
+    d2.step(iteration)                                   # after the optimizer's step at the end (:395)
 
 Line 2 runs once per view; gradients are averaged over the batch afterwards (`set_batch_gradient`), those of D2 too.
 """
@@ -15,7 +16,7 @@ from typing import Any
 
 import torch
 
-from d2_plugin.gaussians.slicing import unit_quaternions
+from d2_plugin.gaussians.rotation4d import unit_quaternions
 from d2_plugin.protocol import Points, Splats, View
 
 from .inria import InriaAdapter

@@ -88,11 +88,11 @@ def grow(model: Growable, settings: DensifySettings, generator: torch.Generator)
         model.select(torch.nonzero(keep).squeeze(-1))
 
 
-def prune(model: Growable, faint: float = FAINT, huge: float = HUGE) -> None:
+def prune(model: Growable, faint: float = FAINT) -> None:
     """Remove Gaussians that are nearly transparent or as large as the scene."""
     raw = model.gaussians
     opaque = torch.sigmoid(raw["opacity_logits"]) >= faint
-    keep = opaque & (raw["log_scales"].exp().amax(-1) <= huge * model.extent)
+    keep = opaque & (raw["log_scales"].exp().amax(-1) <= HUGE * model.extent)
     if not keep.all():
         model.select(torch.nonzero(keep).squeeze(-1))
 

@@ -55,10 +55,6 @@ class Gaussians:
             self._replace(name, lambda old: old[index])
         self.statistics = {name: value[index] for name, value in self.statistics.items()}
 
-    def overwrite(self, name: str, values: Tensor) -> None:
-        """Set one named tensor and forget its moments (an opacity reset, for instance)."""
-        self._replace(name, lambda old: values.to(old), keep_moments=False)
-
     def state_dict(self) -> dict[str, Any]:
         """Everything that an exact continuation needs."""
         return {

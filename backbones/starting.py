@@ -35,15 +35,15 @@ def identity_quaternions(count: int, like: Tensor) -> Tensor:
     return identity
 
 
-def nearest_neighbour_scales(positions: Tensor, neighbours: int = 3) -> Tensor:
-    """Root mean square distance [N] to the nearest points, at least 1e-7; a lone point gets 1e-2.
+def nearest_neighbour_scales(positions: Tensor) -> Tensor:
+    """Root mean square distance [N] to the three nearest points, or all others if they are fewer, at least 1e-7.
 
-    With fewer than `neighbours` other points, all of them count.
+    A lone point gets 1e-2.
     """
     count = len(positions)
     if count < 2:
         return positions.new_full((count,), 1e-2)
-    k = min(neighbours, count - 1) + 1
+    k = min(3, count - 1) + 1
     chunks = [torch.cdist(chunk, positions).topk(k, largest=False).values for chunk in positions.split(1024)]
     return torch.cat(chunks)[:, 1:].square().mean(-1).sqrt().clamp(min=1e-7)
 

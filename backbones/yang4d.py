@@ -17,8 +17,8 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians, moving_gaussians
 from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL
-from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, rotation_matrices_4d
-from d2_plugin.gaussians.slicing import slice_gaussians, unit_quaternions
+from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, rotation_matrices_4d, unit_quaternions
+from d2_plugin.gaussians.slicing import slice_gaussians
 from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Count
 

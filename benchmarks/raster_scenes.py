@@ -91,8 +91,8 @@ def synthetic_scene(count: int, width: int, height: int, seed: int = 0) -> Scene
 def garden_scene(path: Path, width: int, height: int) -> Scene:
     """The garden's structure-from-motion points, with random shapes and opacities (seed 0), from its first camera."""
     read = partial(read_array, path, "give gsplat's test_garden.npz")
-    means, colors = read(key="means3d", ndim=2).astype(np.float64), read(key="colors", ndim=2) / 255.0
-    T_camera_world, K = read(key="viewmats", ndim=3)[0], read(key="Ks", ndim=3)[0]
+    means, colors = read(key="means3d").astype(np.float64), read(key="colors") / 255.0
+    T_camera_world, K = read(key="viewmats")[0], read(key="Ks")[0]
     original_width, original_height = int(read(key="width")), int(read(key="height"))
     inside = (np.abs(means) <= GARDEN_CROP).all(1)
     means, colors = means[inside], colors[inside]

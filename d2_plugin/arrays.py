@@ -1,7 +1,7 @@
 """Arrays in .npy and .npz files that somebody else wrote, checked before memory is taken for them.
 
-The header says how many numbers follow: it is held against the file, and a header that claims more, numbers of another
-kind (text, records, objects) or another number of axes is one sentence. Nothing is ever unpickled.
+The header says how many numbers follow: it is held against the file, and a header that claims more, or anything but
+numbers (text, records, objects), is one sentence. Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -28,9 +28,7 @@ def read_array(
     path: Path | str,
     remedy: str = RESTORE,
     *,
-    ndim: int | None = None,
     key: str | None = None,
-    kinds: str = NUMBERS,
     most: int = MOST_BYTES,
 ) -> np.ndarray:
     """The numbers of a .npy file, or of the member `key` of an .npz file.
@@ -38,33 +36,31 @@ def read_array(
     Args:
         path: the file.
         remedy: what to do, the end of the sentence.
-        ndim: how many axes are expected; any where None.
         key: name of a member of an .npz; None for a .npy.
-        kinds: kinds of dtype that are taken, as numpy names them by a letter.
         most: bytes that the array may have.
 
     Raises:
-        Unreadable: no such file, not such a file, other kinds or axes, more or fewer bytes than its header says, or a
+        Unreadable: no such file, not such a file, no plain numbers, more or fewer bytes than its header says, or a
             member whose checksum is wrong.
     """
     name = shown_path(path)
     with opened(path, remedy) as file, parsing(name, remedy):
         if key is None:
-            return _array(file, os.fstat(file.fileno()).st_size, name, remedy, ndim, kinds, most)
+            return _array(file, os.fstat(file.fileno()).st_size, name, remedy, most)
         with zipfile.ZipFile(file) as archive:
             if f"{key}.npy" not in archive.namelist():
                 have = ", ".join(member.removesuffix(".npy") for member in archive.namelist()[:8])
                 raise Unreadable(f"{name} has no array '{key}', it has {have or 'none'}: {remedy}")
             size = archive.getinfo(f"{key}.npy").file_size
             with archive.open(f"{key}.npy") as member:
-                found = _array(member, size, f"{key} in {name}", remedy, ndim, kinds, most)
+                found = _array(member, size, f"{key} in {name}", remedy, most)
                 member.read()  # the checksum of the member is compared at its end
             return found
 
 
-def _array(file: IO[bytes], size: int, name: str, remedy: str, ndim: int | None, kinds: str, most: int) -> np.ndarray:
+def _array(file: IO[bytes], size: int, name: str, remedy: str, most: int) -> np.ndarray:
     """The array that begins where `file` stands, whose file has `size` bytes."""
-    shape, columns_first, dtype = _header(file, size, name, remedy, ndim, kinds)
+    shape, columns_first, dtype = _header(file, size, name, remedy)
     needed = math.prod(shape) * dtype.itemsize
     if needed > most:
         raise Unreadable(f"{name} has {needed} bytes of numbers, more than {most}, the most that is read: {remedy}")
@@ -75,15 +71,11 @@ def _array(file: IO[bytes], size: int, name: str, remedy: str, ndim: int | None,
     return flat.reshape(shape, order="F" if columns_first else "C")
 
 
-def _header(
-    file: IO[bytes], size: int, name: str, remedy: str, ndim: int | None, kinds: str
-) -> tuple[tuple[int, ...], bool, np.dtype]:
+def _header(file: IO[bytes], size: int, name: str, remedy: str) -> tuple[tuple[int, ...], bool, np.dtype]:
     """(shape, whether the first axis runs fastest, dtype) of an array that fits the file exactly."""
     shape, columns_first, dtype = _read_header(file, name, remedy)
-    if dtype.hasobject or dtype.kind not in kinds or dtype.itemsize == 0:
+    if dtype.hasobject or dtype.kind not in NUMBERS or dtype.itemsize == 0:
         raise Unreadable(f"{name} holds {str(dtype)[:60]}, expected plain numbers: {remedy}")
-    if ndim is not None and len(shape) != ndim:
-        raise Unreadable(f"{name} has shape {_short(shape)}, expected {ndim} axes: {remedy}")
     needed, there = math.prod(shape) * dtype.itemsize, size - file.tell()
     if needed != there:
         raise Unreadable(f"{name} says {dtype} {_short(shape)}, {needed} bytes, but {there} follow: {remedy}")

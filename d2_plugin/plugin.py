@@ -19,13 +19,12 @@ from torch import Tensor
 
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
-from d2_plugin.hooks import Context, Hook, PriorLoader
+from d2_plugin.hooks import HOOKS, Context, Hook, PriorLoader
 from d2_plugin.hooks.edits import Idle, followed, limited
 from d2_plugin.hooks.expected import check_backbone, check_state, check_step, converted, fitting_state
 from d2_plugin.hooks.finite import FiniteCheck
 from d2_plugin.hooks.prior import Store
 from d2_plugin.hooks.reports import OnReport, Report, RunLog, ScalarWriter, Trace
-from d2_plugin.hooks.table import HOOKS
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Backbone, Edit, Points, call_optional
 from d2_plugin.reading import said

@@ -24,16 +24,6 @@ def test_a_lens_bends_as_kornias(coefficients: tuple[float, ...]) -> None:
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-9)
 
 
-def test_beyond_the_fold_kornia_puts_a_image_where_there_is_none() -> None:
-    lens = Lens(K, "opencv", (-0.5,))
-    corner = np.array([[320 + 500 * 1.2, 240.0]])  # r = 1.2: the polynomial grows up to r = .82
-    theirs = kornia.geometry.calibration.distort_points(
-        *map(torch.tensor, (corner, K, np.array([-0.5, 0, 0, 0], dtype=float)))
-    )
-    assert np.isnan(lens.recorded_pixels(corner)).all()
-    assert 320 < float(theirs[0, 0]) < 640
-
-
 def test_similarity_equals_kornias_inside_a_black_frame() -> None:
     generator = torch.Generator().manual_seed(0)
     images = [torch.rand(3, 30, 40, generator=generator, dtype=torch.float64) for _ in range(2)]

@@ -1,21 +1,15 @@
-"""The house: a room for every idea, arrows one way, no circle. `ROOMS` is the plan, and the imports are held to it."""
+"""The house: a room for every idea and imports that run one way, and all of it is packaged and documented.
+
+`ROOMS` is the plan. Files are parsed and nothing is imported, so that imports inside functions are seen, too.
+"""
 
 from __future__ import annotations
 
+import ast
 import configparser
 import re
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import ClassVar
-
-import pytest
-from house import (
-    House,
-    missing_documents,
-    text_files,
-    unknown_rooms,
-    unpackaged,
-    wrong_arrows,
-)
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"d2_plugin": "d2_plugin", "d2_plugin.backbones": "backbones", "d2_plugin.adapters": "adapters"}
@@ -55,172 +49,145 @@ ROOMS = {
     "adapters": "errors protocol rasterizer gaussians backbones",
 }
 
-
-def nothing_in(complaints: list[str]) -> None:
-    """Fail with one complaint a line and nothing else."""
-    if complaints:
-        pytest.fail("\n".join(complaints), pytrace=False)
+DOCUMENT = re.compile(r"(?<![\w./:{}*~<-])((?:[\w.-]+/)+[\w-]+\.md)\b")
+LINK = re.compile(r"\]\((?![a-z]+:|#)([^)#\s]+)[^)]*\)")
 
 
-@pytest.fixture(scope="module")
-def house() -> House:
-    return House.read({name: ROOT / folder for name, folder in PACKAGES.items()})
+def modules_in(root: Path, packages: Mapping[str, str]) -> dict[str, Path]:
+    """Every module by its name as it is installed."""
+    found = {}
+    for package, folder in packages.items():
+        for path in sorted((root / folder).rglob("*.py")):
+            parts = path.relative_to(root / folder).with_suffix("").parts
+            found[".".join([package, *parts]).removesuffix(".__init__")] = path
+    return found
 
 
-@pytest.fixture(scope="module")
-def setup() -> configparser.ConfigParser:
-    parser = configparser.ConfigParser(delimiters=("=",))
-    parser.optionxform = str
-    parser.read(ROOT / "setup.cfg")
-    return parser
+def room(module: str) -> str:
+    """The folder or file of d2_plugin that a module is in, `__init__` for the package itself; `benchmarks` is one."""
+    top, *inner = module.split(".")
+    return top if top == "benchmarks" else (*inner, "__init__")[0]
 
 
-def test_no_module_needs_itself(house: House) -> None:
-    nothing_in([f"these need each other: {', '.join(circle)}" for circle in house.circles()])
+def imports_of(name: str, modules: Mapping[str, Path]) -> Iterator[tuple[str, int, bool]]:
+    """Each module of this project that a module imports, the line, and whether importing the one loads the other."""
+    parts = name.split(".") if modules[name].name == "__init__.py" else name.split(".")[:-1]
+
+    def walk(node: ast.AST, at_once: bool) -> Iterator[tuple[str, int, bool]]:
+        for child in ast.iter_child_nodes(node):
+            inside = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+            inside |= isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)
+            targets: Iterable[str] = ()
+            if isinstance(child, ast.Import):
+                targets = [alias.name for alias in child.names]
+            elif isinstance(child, ast.ImportFrom):
+                above = parts[: len(parts) - child.level + 1] if child.level else []
+                base = ".".join([*above, *([child.module] if child.module else [])])
+                names = [f"{base}.{alias.name}" for alias in child.names]
+                targets = [full if full in modules else base for full in names]
+            yield from ((target, child.lineno, at_once) for target in targets if target in modules)
+            yield from walk(child, at_once and not inside)
+
+    return walk(ast.parse(modules[name].read_text(encoding="utf-8")), True)
 
 
-def test_every_room_is_in_the_plan(house: House) -> None:
-    nothing_in([f"room '{name}' is not in ROOMS: add it" for name in unknown_rooms(house, ROOMS, GROUND)])
+def wrong_arrows(modules: Mapping[str, Path], rooms: Mapping[str, str], ground: str) -> list[str]:
+    """Imports that `rooms` does not allow, one sentence each; `ground` is what that word stands for in the table."""
+    wrong = []
+    for name in modules:
+        own = room(name)
+        words = rooms.get("ground" if own in ground.split() else own, "").replace("ground", ground).split()
+        for target, line, at_once in imports_of(name, modules):
+            allowed = {own, *(word if at_once else word.strip("()") for word in words)}
+            if room(target) not in allowed:
+                wrong.append(f"{name}, line {line}, imports {target}, but {own} may not import {room(target)}")
+    return sorted(set(wrong))
 
 
-def test_arrows_run_one_way(house: House) -> None:
-    nothing_in(wrong_arrows(house, ROOMS, GROUND))
+def unpackaged(root: Path, setup: configparser.ConfigParser) -> list[str]:
+    """What setup.cfg's `packages` and `package_data` say and the tree does not, and the other way round."""
+    places = dict(re.split(r"\s*=\s*", line) for line in setup["options"]["package_dir"].split("\n") if line.strip())
+    listed = {name: root / places.get(name, name.replace(".", "/")) for name in setup["options"]["packages"].split()}
+    tops = [root / "d2_plugin", *(root / place for place in places.values())]
+    packages = {path.parent for top in tops for path in top.rglob("__init__.py")}
+    wrong = [f"{folder.relative_to(root)} is listed or a package, not both" for folder in packages ^ {*listed.values()}]
+    covered = set()
+    for package, patterns in setup["options.package_data"].items():
+        for pattern in re.split(r"[,\s]+", patterns.strip()):
+            matches = set(listed[package].glob(pattern))
+            wrong += [] if matches else [f"package_data's {package} = {pattern} matches no file"]
+            covered |= matches
+    every = {path for top in tops for path in top.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
+    beside = {path.relative_to(root) for path in every - covered}
+    return sorted(wrong + [f"{path} is in no package_data" for path in beside if not re.search(r"(^|/)\.", str(path))])
 
 
-def test_the_plan_itself_has_no_circle() -> None:
-    rooms = {name: set(entry.replace("(", "").replace(")", "").split()) - {name} for name, entry in ROOMS.items()}
-    del rooms["ground"], rooms["__init__"]
-    while free := [name for name, below in rooms.items() if not below & rooms.keys()]:
-        for name in free:
-            del rooms[name]
-    assert not rooms, f"these rooms may import each other: {sorted(rooms)}"
+def missing_documents(root: Path, files: Iterable[Path]) -> list[str]:
+    """References in `files` to Markdown files or to link targets that are not in the tree under `root`."""
+    wrong = []
+    for path in files:
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            names = DOCUMENT.findall(line) + (LINK.findall(line) if path.suffix == ".md" else [])
+            missing = [name for name in names if not ((root / name).exists() or (path.parent / name).exists())]
+            wrong += [f"{path.relative_to(root)}, line {number}, names {name}, which is not there" for name in missing]
+    return wrong
 
 
-def test_every_package_and_every_kernel_is_installed(setup: configparser.ConfigParser) -> None:
-    nothing_in(unpackaged(ROOT, setup))
+def test_imports_run_one_way_between_rooms() -> None:
+    assert wrong_arrows(modules_in(ROOT, PACKAGES), ROOMS, GROUND) == []
+
+
+def test_every_package_and_every_kernel_is_installed() -> None:
+    setup = configparser.ConfigParser(delimiters=("=",))
+    setup.optionxform = str
+    setup.read(ROOT / "setup.cfg")
+    assert unpackaged(ROOT, setup) == []
 
 
 def test_every_document_that_is_named_is_there() -> None:
-    places = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "setup.cfg", "docs", *PACKAGES.values(), "tests", ".ci"]
-    patterns = ["*.md", "*.py", "*.h", "*.cpp", "*.cu", "setup.cfg", "run"]
-    nothing_in(missing_documents(ROOT, text_files(ROOT, places, patterns)))
-
-
-def test_all_json_is_written_by_one_function() -> None:
-    """`json_text` refuses NaN and Infinity by name, which `json.dumps` writes into files that nothing else reads."""
-    plain = {"reading.py", "durable.py", "config.py", "settings.py", "files.py"}  # hashes, copies and TOML: no files
-    writers = [
-        path.relative_to(ROOT)
-        for folder in PACKAGES.values()
-        for path in (ROOT / folder).rglob("*.py")
-        if path.name not in plain and re.search(r"\bjson\.dumps?\(", path.read_text(encoding="utf-8"))
+    places = [ROOT / place for place in ("docs", *PACKAGES.values(), "tests", ".ci")]
+    files = [
+        path for place in places for path in place.rglob("*") if path.suffix in (".md", ".py", ".h", ".cpp", ".cu")
     ]
-    nothing_in([f"{path} writes JSON by itself: use d2_plugin.reading.json_text" for path in writers])
+    top = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "setup.cfg", ".ci/run")]
+    assert missing_documents(ROOT, [*top, *sorted(files)]) == []
 
 
-class TestTheReaderFinds:
-    """Each rule is broken once in a made-up tree, so a green test above says something."""
-
-    PLAN: ClassVar = {"ground": "ground", "low": "ground", "high": "ground low", "lazy": "ground (low)"}
-
-    @staticmethod
-    def house(root: Path, **files: str) -> House:
-        for name, text in files.items():
-            path = root / "d2_plugin" / f"{name.replace('__in__', '/')}.py"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text)
-        return House.read({"d2_plugin": root / "d2_plugin"})
-
-    def arrows(self, house: House) -> list[str]:
-        return wrong_arrows(house, self.PLAN, "errors")
-
-    def test_a_circle(self, tmp_path: Path) -> None:
-        house = self.house(
-            tmp_path, one="import d2_plugin.two", two="from d2_plugin import three", three="from . import one"
-        )
-        assert house.circles() == [["d2_plugin.one", "d2_plugin.three", "d2_plugin.two"]]
-
-    def test_a_circle_by_way_of_a_package(self, tmp_path: Path) -> None:
-        files = {
-            "high__in__a": "from d2_plugin.low.b import x",
-            "low__in____init__": "import d2_plugin.high.a",
-            "low__in__b": "",
-        }
-        assert self.house(tmp_path, **files).circles() == [["d2_plugin.high.a", "d2_plugin.low"]]
-
-    def test_a_package_that_its_own_module_asks_for_a_name(self, tmp_path: Path) -> None:
-        files = {"low__in____init__": "from .b import x\ny = 1", "low__in__b": "from d2_plugin.low import y"}
-        assert self.house(tmp_path, **files).circles() == [["d2_plugin.low", "d2_plugin.low.b"]]
-
-    def test_no_circle_in_a_package_that_collects_its_modules(self, tmp_path: Path) -> None:
-        files = {
-            "low__in____init__": "from .b import x",
-            "low__in__b": "from d2_plugin.low.c import z",
-            "low__in__c": "",
-        }
-        assert self.house(tmp_path, **files).circles() == []
-
-    def test_a_circle_although_one_import_waits(self, tmp_path: Path) -> None:
-        house = self.house(tmp_path, one="import d2_plugin.two", two="def f():\n    import d2_plugin.one")
-        assert house.circles() == [["d2_plugin.one", "d2_plugin.two"]]
-
-    def test_no_circle_where_one_import_is_for_types(self, tmp_path: Path) -> None:
-        for_types = "if TYPE_CHECKING:\n    import d2_plugin.one"
-        assert self.house(tmp_path, one="import d2_plugin.two", two=for_types).circles() == []
-
-    @pytest.mark.parametrize(
-        "text",
-        [
-            "import d2_plugin.high.a",
-            "from d2_plugin.high import a",
-            "from ..high.a import x",
-            "def f():\n    from d2_plugin.high.a import x",
-            "if TYPE_CHECKING:\n    from d2_plugin.high.a import x",
-            "importlib.import_module('d2_plugin.high.a')",
-        ],
+def test_each_rule_is_seen_where_it_is_broken(tmp_path: Path) -> None:
+    """So that a green test above says something."""
+    files = {
+        "__init__": "",
+        "low/__init__": "",
+        "low/b": "from ..high.a import x\ndef f():\n    import d2_plugin.high.a",
+        "high/__init__": "",
+        "high/a": "import d2_plugin.low.b",
+        "lazy": "def f():\n    import d2_plugin.low.b\nfrom d2_plugin.low import b",
+    }
+    for name, text in files.items():
+        (tmp_path / "d2_plugin" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "d2_plugin" / f"{name}.py").write_text(text)
+    plan = {"ground": "ground", "low": "ground", "high": "ground low", "lazy": "ground (low)"}
+    assert wrong_arrows(modules_in(tmp_path, {"d2_plugin": "d2_plugin"}), plan, "errors") == [
+        "d2_plugin.lazy, line 3, imports d2_plugin.low.b, but lazy may not import low",
+        "d2_plugin.low.b, line 1, imports d2_plugin.high.a, but low may not import high",
+        "d2_plugin.low.b, line 3, imports d2_plugin.high.a, but low may not import high",
+    ]
+    setup = configparser.ConfigParser()
+    setup.read_string(
+        "[options]\npackages =\n  d2_plugin\n  d2_plugin.gone\n  d2_plugin.low\npackage_dir =\n  d2_plugin.x = x\n"
+        "[options.package_data]\nd2_plugin = *.h, *.cu\n"
     )
-    def test_an_arrow_that_runs_up(self, tmp_path: Path, text: str) -> None:
-        (sentence,) = self.arrows(
-            self.house(tmp_path, low__in__b=text, high__in__a="import d2_plugin.errors", errors="")
-        )
-        assert sentence.startswith("d2_plugin.low.b, line ")
-        assert sentence.endswith("imports d2_plugin.high.a, but low may not import high")
-
-    def test_an_arrow_that_must_wait(self, tmp_path: Path) -> None:
-        house = self.house(tmp_path, low__in__b="", lazy="def f():\n    import d2_plugin.low.b\nimport d2_plugin.low.b")
-        assert self.arrows(house) == [
-            "d2_plugin.lazy, line 3, imports d2_plugin.low.b, but lazy may not import low: "
-            "allowed inside a function only (at once now)"
-        ]
-
-    def test_a_room_without_a_plan(self, tmp_path: Path) -> None:
-        house = self.house(tmp_path, attic__in__a="import d2_plugin.errors", errors="")
-        assert unknown_rooms(house, self.PLAN, "errors") == ["attic"]
-        assert self.arrows(house)
-
-    def test_files_that_would_not_be_installed(self, tmp_path: Path) -> None:
-        setup = configparser.ConfigParser()
-        setup.read_string(
-            "[options]\npackages =\n  d2_plugin\n  d2_plugin.gone\npackage_dir =\n  d2_plugin.adapters = adapters\n"
-            "[options.package_data]\nd2_plugin = *.h, *.cu\n"
-        )
-        self.house(tmp_path, __init__="", low__in____init__="")
-        for name in ("kernel.h", "kernel.cpp"):
-            (tmp_path / "d2_plugin" / name).touch()
-        wrong = [line.replace(f"{tmp_path}/", "") for line in unpackaged(tmp_path, setup)]
-        assert wrong == [
-            "d2_plugin.gone is in `packages` but d2_plugin/gone is no package",
-            "d2_plugin/low is a package but not in `packages`",
-            "package_data's d2_plugin = *.cu matches no file",
-            "d2_plugin/kernel.cpp is in no package_data",
-        ]
-
-    def test_a_document_that_is_not_there(self, tmp_path: Path) -> None:
-        gone = "/".join(["notes", "gone.md"])  # in pieces: this file is read by the test above as well
-        (tmp_path / "page.md").write_text(
-            f"[here](page.md) [web](https://a.b/c.md) [there](there.png)\nsee {gone}, 2\n"
-        )
-        assert missing_documents(tmp_path, [tmp_path / "page.md"]) == [
-            "page.md, line 1, names there.png, which is not there",
-            f"page.md, line 2, names {gone}, which is not there",
-        ]
+    for name in ("kernel.h", "kernel.cpp"):
+        (tmp_path / "d2_plugin" / name).touch()
+    assert unpackaged(tmp_path, setup) == [
+        "d2_plugin/gone is listed or a package, not both",
+        "d2_plugin/high is listed or a package, not both",
+        "d2_plugin/kernel.cpp is in no package_data",
+        "package_data's d2_plugin = *.cu matches no file",
+    ]
+    gone = "/".join(["notes", "gone.md"])  # in pieces: this file is read by the test above as well
+    (tmp_path / "page.md").write_text(f"[here](page.md) [web](https://a.b/c.md) [there](there.png)\nsee {gone}, 2\n")
+    assert missing_documents(tmp_path, [tmp_path / "page.md"]) == [
+        "page.md, line 1, names there.png, which is not there",
+        f"page.md, line 2, names {gone}, which is not there",
+    ]

@@ -23,31 +23,12 @@ from d2_plugin.backbones.trainer import Trainer
 from d2_plugin.config import DensifyConfig, PruneConfig
 from d2_plugin.hooks.densify import shuffled_pixels
 from d2_plugin.hooks.views import ViewSampler
-from d2_plugin.protocol import Backbone, Points, Splats, View
+from d2_plugin.protocol import Splats, View
 from d2_plugin.rasterizer import rasterize
 
 
 def only(*hooks: str) -> D2Config:
     return replace(ALL_HOOKS, **{name: None for name in ALL_HOOKS.hooks if name not in hooks})
-
-
-def some_points(count: int) -> Points:
-    return Points(
-        torch.rand(count, 3),
-        torch.rand(count, 3),
-        torch.zeros(count),
-        torch.full((count,), 0.1),
-        torch.full((count,), 0.5),
-    )
-
-
-def test_adapter_satisfies_the_protocol() -> None:
-    adapter = Yang4DAdapter(make_model())
-    assert isinstance(adapter, Backbone)
-    members = ("settings", "__len__", "view", "slice_at", "insert", "remove", "on_resize")
-    for missing in members:
-        partial = type("Partial", (), {name: getattr(type(adapter), name) for name in members if name != missing})
-        assert not isinstance(partial(), Backbone), missing
 
 
 def trainer_without(*numbers: int) -> type[Trainer]:
@@ -177,15 +158,6 @@ def test_renders_of_an_earlier_step_are_forgotten(monkeypatch: pytest.MonkeyPatc
     with torch.no_grad():
         model.render(view)
     assert adapter.rendered_depth(view) is None, "the trainer's last render of this view has no gradients"
-
-
-def test_insertion_keeps_the_densification_evidence_of_the_backbone() -> None:
-    model = make_model()
-    adapter = Yang4DAdapter(model)
-    model.gaussians.statistics["screen_gradient"] += torch.arange(60.0)
-    adapter.insert(some_points(5))
-    expected = torch.cat([torch.arange(60.0), torch.zeros(5)])
-    assert torch.equal(model.gaussians.statistics["screen_gradient"], expected)
 
 
 def test_a_backbone_that_changes_silently_is_noticed_once() -> None:

@@ -160,7 +160,7 @@ class TestArrays:
         array = np.asarray(np.arange(6).reshape(2, 3), dtype, order)
         np.save(tmp_path / "a.npy", array)
         np.savez_compressed(tmp_path / "a.npz", depth=array)
-        for found in (read_array(tmp_path / "a.npy", ndim=2), read_array(tmp_path / "a.npz", key="depth")):
+        for found in (read_array(tmp_path / "a.npy"), read_array(tmp_path / "a.npz", key="depth")):
             assert found.dtype == array.dtype
             assert np.array_equal(found, array)
 
@@ -190,9 +190,8 @@ class TestArrays:
         (tmp_path / "a.npy").write_bytes(content)
         assert says in refusal(read_array, tmp_path / "a.npy")
 
-    def test_another_number_of_axes_or_too_many_bytes(self, tmp_path: Path) -> None:
+    def test_too_many_bytes(self, tmp_path: Path) -> None:
         np.save(tmp_path / "a.npy", np.zeros((2, 3)))
-        assert "has shape (2, 3), expected 3 axes" in refusal(read_array, tmp_path / "a.npy", ndim=3)
         assert "48 bytes of numbers, more than 40" in refusal(read_array, tmp_path / "a.npy", most=40)
 
     def test_archives_that_are_not_what_they_say(self, tmp_path: Path) -> None:

@@ -18,7 +18,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import d2_plugin
+from d2_plugin import D2Config
+from d2_plugin.backbones.deform import DeformSettings
+from d2_plugin.backbones.trainer import TrainSettings
+from d2_plugin.backbones.yang4d import Yang4DSettings
 from d2_plugin.errors import D2Error
+from d2_plugin.hooks import HOOKS
+from d2_plugin.protocol import RasterSettings
 from d2_plugin.settings import (
     FORMAT,
     AtLeastOne,
@@ -32,6 +38,7 @@ from d2_plugin.settings import (
     Steps,
     declared,
     of_this_format,
+    table_of,
 )
 from d2_plugin.values import bare_and_range
 
@@ -257,9 +264,26 @@ def test_every_number_among_the_settings_has_a_range() -> None:
     assert without == []
 
 
-def test_no_setting_takes_what_is_no_number() -> None:
+def test_no_number_takes_what_is_none_and_every_default_is_allowed_in_files() -> None:
     for kind in every_settings_class():
+        plain = {}
         for setting in declared(kind):
             for number, limits in numbers_in(setting.kind, setting.range):
                 assert not limits.holds(math.nan), (kind, setting.name)
                 assert limits.infinite or number is int or not limits.holds(math.inf), (kind, setting.name)
+            if setting.default is not MISSING and table_of(setting.kind) is None:
+                plain[setting.name] = setting.default
+            if type(setting.default) in (int, float):
+                for wrong in ("much", [1], True):
+                    with pytest.raises(D2Error, match=setting.name):
+                        kind.from_dict({setting.name: wrong})
+        if all(setting.default is not MISSING for setting in declared(kind)):
+            assert kind.from_dict(plain) == kind()
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [D2Config, TrainSettings, Yang4DSettings, DeformSettings, RasterSettings, *(row.config for row in HOOKS.values())],
+)
+def test_every_setting_of_hooks_and_backbones_has_help(kind: type[Settings]) -> None:
+    assert [setting.name for setting in declared(kind) if not setting.help] == []

@@ -1,8 +1,9 @@
 """tho-kn/cem-4dgs: Ex4DGS whose key-framed motions are shared by kinematic parents, which are never drawn themselves.
 
-    d2 = D2Hooks.attach("d2.toml", "cem4dgs", gaussians, near=dataset.near, far=dataset.far)   # train.py:65 (restore)
-    loss = loss + d2.loss(iteration, viewpoint_cam)                                            # before :173
-    d2.step(iteration)                                                                         # after prune_nan_points
+    d2 = D2Hooks.attach("d2.toml", "cem4dgs", gaussians, near=dataset.near, far=dataset.far,
+                        iterations=opt.iterations)       # train.py:65 (restore)
+    loss = loss + d2.loss(iteration, viewpoint_cam)      # before :173
+    d2.step(iteration)                                   # after prune_nan_points
 
 The contract's rows are the splats, one table; the table of motions has no row of its own in it.
 """

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.slicing import unit_quaternions
+from d2_plugin.gaussians.rotation4d import unit_quaternions
 from d2_plugin.protocol import Points, Splats, View
 
 from ..gsplat_dict import GsplatAdapter, gsplat_view

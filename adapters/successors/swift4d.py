@@ -1,8 +1,9 @@
 """WuJH2001/swift4d (ICLR 2025): 4DGaussians in which only the Gaussians that move are deformed, by a hash grid.
 
-d2 = D2Hooks.attach("d2.toml", "swift4d", gaussians, scene, stage)   # train.py:118, in each stage
-loss = loss + d2.loss(iteration, viewpoint_cams)                     # before :258, the whole batch
-d2.step(iteration)                                                   # after hash_optimizer.zero_grad (:340)
+# train.py:118, in each stage
+d2 = D2Hooks.attach("d2.toml", "swift4d", gaussians, scene, stage, iterations=train_iter)
+loss = loss + d2.loss(iteration, viewpoint_cams)     # before :258, the whole batch
+d2.step(iteration)                                   # after hash_optimizer.zero_grad (:340)
 """
 
 from __future__ import annotations

@@ -22,8 +22,9 @@ from d2_plugin.gaussians.rotation4d import (
     rotation_matrices_3d,
     rotation_matrices_4d,
     temporal_marginal,
+    unit_quaternions,
 )
-from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, unit_quaternions
+from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT
 from d2_plugin.protocol import Splats
 
 

@@ -28,6 +28,11 @@ def normalized_quaternions(quaternions: Tensor) -> Tensor:
     return scaled * scaled.square().sum(0).rsqrt()
 
 
+def unit_quaternions(rows: Tensor) -> Tensor:
+    """Unit quaternions [4, N], components first, from raw rows [N, 4]."""
+    return normalized_quaternions(rows.T.contiguous())
+
+
 def rotation_matrices_4d(left: Tensor, right: Tensor) -> Tensor:
     """R [4, 4, N] = J (M_l M_r) J from unit quaternions left, right [4, N]; J reverses the order of the axes.
 

@@ -11,11 +11,11 @@ from d2_plugin.gaussians.native_slice import can_slice, native_slice
 from d2_plugin.gaussians.rotation4d import (
     condition_on_time,
     covariances_from_factors,
-    normalized_quaternions,
     rotation_matrices_3d,
     rotation_matrices_4d,
     temporal_marginal,
     time_row,
+    unit_quaternions,
 )
 from d2_plugin.protocol import Splats
 
@@ -33,7 +33,7 @@ def slice_gaussians(raw: Mapping[str, Tensor], time: float = 0.0) -> Splats:
 
 
 def reference_slice(
-    raw: Mapping[str, Tensor], time: float, marginal_cut: float = MARGINAL_CUT, log_scale_limit: float = LOG_SCALE_LIMIT
+    raw: Mapping[str, Tensor], time: float, marginal_cut: float, log_scale_limit: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The slice in torch: any dtype and device, and the oracle of `native_slice`, which documents the arguments."""
     if "times" not in raw:
@@ -66,15 +66,5 @@ def reference_slice(
     return means, covariances_from_factors(spatial), opacities, rows
 
 
-def unit_quaternions(rows: Tensor) -> Tensor:
-    """Unit quaternions [4, N], components first, from raw rows [N, 4]."""
-    return normalized_quaternions(_components(rows))
-
-
 def _scales(log_scales: Tensor, limit: float) -> Tensor:
-    return _components(log_scales).clamp(-limit, limit).exp()
-
-
-def _components(rows: Tensor) -> Tensor:
-    """[K, N] contiguous from [N, K]: what the functions of rotation4d work on."""
-    return rows.T.contiguous()
+    return log_scales.T.contiguous().clamp(-limit, limit).exp()

@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from d2_plugin.compiler import load_kernel
 from d2_plugin.hooks.prior import KnownMaps
-from d2_plugin.rasterizer.frame import KERNELS as RASTERIZER_KERNELS
+from d2_plugin.rasterizer.native import KERNELS as RASTERIZER_KERNELS
 
 SOURCE = Path(__file__).parent / "kernels" / "depth_loss.cpp"
 HEADERS = (RASTERIZER_KERNELS / "parallel.h", RASTERIZER_KERNELS / "simd.h")

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
+from d2_plugin.hooks import HOOKS
 from d2_plugin.hooks.hook import Hook
 from d2_plugin.hooks.prior import PriorLoader
-from d2_plugin.hooks.table import HOOKS
 from d2_plugin.protocol import Backbone
 
 log = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
-from d2_plugin.rasterizer import autograd, cuda, native, reference
+from d2_plugin.rasterizer import autograd, native, reference
 
 __all__ = ["DepthPrior", "RasterSettings", "Render", "Splats", "Survey", "View", "rasterize", "survey"]
 
@@ -101,6 +101,8 @@ def _has_kernels(means: Tensor) -> bool:
     if means.dtype != torch.float32:
         return False
     if means.device.type == "cuda":
+        from d2_plugin.rasterizer import cuda  # a trainer on the CPU loads none of it
+
         return cuda.available(means.device)
     return means.device.type == "cpu" and native.available()
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
-from d2_plugin.rasterizer import cuda, native
+from d2_plugin.rasterizer import native
 from d2_plugin.rasterizer.reference import reliability
 
 INPUTS = 9
@@ -73,7 +73,11 @@ def _map(part: Tensor | None, like: Tensor) -> Tensor | None:
 
 
 def _kernels(part: Tensor) -> ModuleType:
-    return cuda if part.is_cuda else native
+    if not part.is_cuda:
+        return native
+    from d2_plugin.rasterizer import cuda  # a trainer on the CPU loads none of it
+
+    return cuda
 
 
 class _Rasterize(torch.autograd.Function):

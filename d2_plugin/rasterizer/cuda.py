@@ -24,7 +24,7 @@ from d2_plugin.compiler.driver import Driver
 from d2_plugin.compiler.nvrtc import Binary, NoCuda, Program, build
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Survey
-from d2_plugin.rasterizer.frame import KERNELS, RECORD, PointingFrame
+from d2_plugin.rasterizer.native import KERNELS, RECORD, PointingFrame
 
 PROGRAM = Program(KERNELS / "gpu.cu", (KERNELS / "splat.h",))
 

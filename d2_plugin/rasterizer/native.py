@@ -11,6 +11,8 @@ import ctypes
 import functools
 import warnings
 from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -18,8 +20,13 @@ from torch import Tensor
 from d2_plugin.compiler import NoCompiler, load_library
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Survey
-from d2_plugin.rasterizer.frame import KERNELS, RECORD, PointingFrame
 from d2_plugin.rasterizer.reference import refuse_skew
+
+KERNELS = Path(__file__).parent / "kernels"
+"""Sources of the kernels."""
+
+RECORD = 16
+"""Floats of a projected Gaussian, one cache line; the same everywhere, so that the operators have one shape."""
 
 SOURCES = (KERNELS / "cpu.cpp",)
 HEADERS = tuple(KERNELS / name for name in ("splat.h", "simd.h", "parallel.h", "frame.h", "binning.h"))
@@ -27,6 +34,24 @@ FLAGS = ("-ffp-contract=off",)
 """The same formula must give the same bits wherever it is inlined; see kernels/simd.h."""
 
 _float, _int, _long, _bool, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_int64, ctypes.c_bool, ctypes.c_void_p
+
+
+Pointing = TypeVar("Pointing", bound="PointingFrame")
+
+
+class PointingFrame(ctypes.Structure):
+    """A C structure with pointers into tensors, which live as long as it does; absent pointers stay null.
+
+    The Frames of the CPU and of the GPU are two of them.
+    """
+
+    def point(self: Pointing, **tensors: Tensor | None) -> Pointing:
+        """Set pointers by name and keep their tensors alive as long as the frame."""
+        for name, tensor in tensors.items():
+            if tensor is not None:
+                setattr(self, name, tensor.data_ptr())
+        self.kept = (*getattr(self, "kept", ()), tensors)
+        return self
 
 
 class Frame(PointingFrame):

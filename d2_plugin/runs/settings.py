@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from d2_plugin import registry
 from d2_plugin.config import D2Config, for_iterations
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.hooks.table import HOOKS
+from d2_plugin.hooks import HOOKS
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.reading import said, shown_path
 from d2_plugin.settings import FORMAT, Count, Positional, Range, Seed, Settings, Share, declared, of_this_format

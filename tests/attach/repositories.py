@@ -63,6 +63,8 @@ class Standing(NamedTuple):
     """One coordinate of every row, in the contract's order; views of the parameters."""
     edits: dict[str, Callable[[], object]]
     """The repository's own changes of rows; the first one grows."""
+    evidence: Callable[[], Tensor] | None = None
+    """A statistic of the repository's densification, one number a row, where the adapter does not name them."""
 
 
 def jitter(*parameters: Tensor, by: float = 0.3) -> None:
@@ -115,6 +117,15 @@ def inria(
         return [model._xyz.data[:, 0], *([model._xyz_motion.data[:, 0, 0]] if moving else [])]
 
     return Standing(make_adapter(), cameras, model, draw, lambda: [model.optimizer], tables, edits)
+
+
+def fudan_model(**attributes: object) -> tuple[Any, Any]:
+    """Gaussians large enough to cover the images, and their scene; `attributes` are set on the model."""
+    model, scene = fudan.make()
+    model._scaling.data += 1.0
+    vars(model).update(attributes)
+    model.training_setup(default_options())
+    return model, scene
 
 
 def make_fudan() -> Standing:
@@ -179,7 +190,8 @@ def make_fastergs4d() -> Standing:
     edits = {"grow": grow, "sort": torch.no_grad()(gaussians.apply_morton_ordering)}
     tables = lambda: [gaussians._spatial_means.data[:, 1]]  # noqa: E731  the first coordinate orders them
     adapter = FasterGS4DAdapter(gaussians, 0.5)
-    return Standing(adapter, views, gaussians, draw, lambda: [gaussians.optimizer], tables, edits)
+    evidence = lambda: gaussians._densification_info[1]  # noqa: E731
+    return Standing(adapter, views, gaussians, draw, lambda: [gaussians.optimizer], tables, edits, evidence)
 
 
 def gsplat_edits(params: Any, optimizers: Any, state: dict[str, Any]) -> dict[str, Callable[[], object]]:
@@ -207,7 +219,7 @@ def make_gsplat() -> Standing:
 
     tables = lambda: [splats["quats"].data[:, 1]]  # noqa: E731
     made = GsplatAdapter(splats, optimizers, state), make_views(), splats, draw, lambda: list(optimizers.values())
-    return Standing(*made, tables, gsplat_edits(splats, optimizers, state))
+    return Standing(*made, tables, gsplat_edits(splats, optimizers, state), lambda: state["grad2d"])
 
 
 def make_gsplat_dynamic() -> Standing:
@@ -222,7 +234,7 @@ def make_gsplat_dynamic() -> Standing:
 
     tables = lambda: [params["quats"].data[:, 1]]  # noqa: E731
     made = adapter, gsplat_dynamic.items(), params, draw, lambda: list(optimizers.values()), tables
-    return Standing(*made, gsplat_edits(params, optimizers, state))
+    return Standing(*made, gsplat_edits(params, optimizers, state), lambda: state["grad2d"])
 
 
 VARIANTS: dict[str, Callable[[], Standing]] = {

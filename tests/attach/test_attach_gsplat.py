@@ -14,15 +14,6 @@ from d2_plugin import D2Error
 from d2_plugin.adapters.gsplat_dict import GsplatAdapter, gsplat_view
 
 
-def test_an_insertion_keeps_the_evidence_of_the_strategy() -> None:
-    adapter = make_gsplat().adapter
-    splats, state = adapter.parameters, adapter.state
-    state["grad2d"] += torch.arange(60.0)
-    assert adapter.insert(some_points(4)) == 4
-    assert torch.equal(state["grad2d"], torch.cat([torch.arange(60.0), torch.zeros(4)]))
-    assert isinstance(splats["shN"], nn.Parameter)
-
-
 def test_without_a_state_growth_counts_as_appended() -> None:
     splats, optimizers, _ = gsplat.make()
     adapter, reports = GsplatAdapter(splats, optimizers), []

@@ -13,7 +13,7 @@ from mimics import deformable3d, ex4dgs, fudan, hust4d, spacetime
 from mimics.inria import cameras_of, default_options
 from mimics.page import attached
 from mimics.workplace import HOOKS, furnish, some_points
-from repositories import run
+from repositories import fudan_model, run
 from tiny import TinyStore, make_views
 from torch import Tensor
 
@@ -30,15 +30,6 @@ from d2_plugin.config import DepthLossConfig
 from d2_plugin.protocol import Points, View
 
 DEPTH_ALONE = D2Config(depth_loss=DepthLossConfig(every=1))
-
-
-def fudan_model(**attributes: object):
-    """Gaussians large enough to cover the images."""
-    model, scene = fudan.make()
-    model._scaling.data += 1.0
-    vars(model).update(attributes)
-    model.training_setup(default_options())
-    return model, scene
 
 
 class TestFieldsOfView:

@@ -8,6 +8,7 @@ import pytest
 import torch
 from mimics import ex4dgs, fudan
 from mimics.inria import default_options
+from repositories import fudan_model
 from tiny import TinyStore
 
 from d2_plugin import D2Config, D2Hooks
@@ -18,15 +19,6 @@ from d2_plugin.config import DepthLossConfig
 from d2_plugin.rasterizer import rasterize
 
 DEPTH_ALONE = D2Config(depth_loss=DepthLossConfig(every=1))
-
-
-def fudan_model(**attributes: object):
-    """Gaussians large enough to cover the images."""
-    model, scene = fudan.make()
-    model._scaling.data += 1.0
-    vars(model).update(attributes)
-    model.training_setup(default_options())
-    return model, scene
 
 
 class TestProbe:

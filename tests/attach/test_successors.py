@@ -19,12 +19,6 @@ from d2_plugin.protocol import Points
 
 
 class TestFasterGS4D:
-    def test_an_insertion_keeps_the_densification_info(self) -> None:
-        standing = make_fastergs4d()
-        standing.model._densification_info += torch.arange(60.0)
-        assert standing.adapter.insert(some_points(4)) == 4
-        assert torch.equal(standing.model._densification_info[1], torch.cat([torch.arange(60.0), torch.zeros(4)]))
-
     def test_growth_is_told_with_the_prune_that_follows_it(self) -> None:
         standing = make_fastergs4d()
         reports: list[Tensor] = []

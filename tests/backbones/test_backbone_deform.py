@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from tiny import is_finite, make_model, make_trainer, make_views, parameters
+from tiny import make_model, make_trainer, make_views, parameters
 
-from d2_plugin import D2Error
 from d2_plugin.backbones.deform import Deform, create
 from d2_plugin.backbones.deform_fields import (
     Box,
@@ -57,15 +53,6 @@ class TestModel:
         trainer.run(until=3)
         assert trainer.model.deforms, "0.075 of 40 steps"
 
-    def test_without_time_these_are_ordinary_3d_gaussians(self, kind: str) -> None:
-        model = make_model(temporal=False, backbone=kind)
-        assert model.field is None
-        a, b = (model.slice_at(view) for view in (make_views()[0], make_views()[-1]))
-        assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
-        trainer = make_trainer(temporal=False, backbone=kind)
-        trainer.run()
-        assert is_finite(trainer)
-
     def test_noise_on_time_is_for_training_alone(self, kind: str) -> None:
         model, view = deforming(kind), make_views()[0]
         quiet = model.slice_at(view).means
@@ -89,22 +76,6 @@ class TestModel:
         after = parameters(trainer)
         assert not any(torch.equal(before[name], after[name]) for name in before)
 
-    def test_a_run_survives_losing_every_gaussian(self, kind: str) -> None:
-        model = deforming(kind)
-        model.select(torch.zeros(0, dtype=torch.int64))
-        assert not model.render(make_views()[0]).alpha.any()
-
-    def test_a_time_that_is_not_a_number_is_refused(self, kind: str) -> None:
-        with pytest.raises(D2Error, match="the time of camera 'cam0', frame 0 is NaN"):
-            make_model(backbone=kind).slice_at(replace(make_views()[0], time=math.nan))
-
-    def test_training_lowers_the_loss_of_the_tiny_scene(self, kind: str) -> None:
-        losses: list[float] = []
-        trainer = make_trainer(iterations=150, backbone=kind)
-        trainer.run(on_step=lambda step, loss: losses.append(loss))
-        assert np.mean(losses[-6:]) < 0.5 * np.mean(losses[:6])
-        assert is_finite(trainer)
-
     def test_the_box_holds_the_points_and_not_their_outliers(self) -> None:
         positions = torch.rand(1000, 3) * 2 - 1
         positions[0] = 1e6
@@ -123,22 +94,6 @@ def test_settings_arrive_through_the_entry_point() -> None:
     assert model.gaussians["harmonics"].shape == (4, 3, 3)
     assert model.field.space[0].shape[1] == 5
     assert model.settings.densify.every == 9
-
-
-@pytest.mark.parametrize(
-    ("table", "sentence"),
-    [
-        ({"field": "hexplan"}, "unknown backbone.field 'hexplan': have hexplane, mlp; did you mean 'hexplane'"),
-        ({"mlp": {"widht": 3}}, "unknown setting of backbone.mlp 'widht'.*did you mean 'width'"),
-        ({"mlp": 3}, "backbone.mlp must be a table of settings, got 3"),
-        ({"temporal": False}, "unknown setting of backbone 'temporal'"),
-    ],
-)
-def test_wrong_settings_get_one_sentence(table: dict[str, object], sentence: str) -> None:
-    with pytest.raises(D2Error, match=sentence):
-        create(
-            torch.rand(4, 3), torch.rand(4, 3), torch.zeros(4), extent=1.0, duration=1.0, temporal=True, settings=table
-        )
 
 
 @pytest.mark.parametrize("field", FIELDS)

@@ -39,13 +39,6 @@ class TestSlice:
         expected = 0.5 * math.exp(-0.5 * (0.2 / 0.4) ** 2)
         torch.testing.assert_close(model.slice_at(make_views()[0]).opacities, torch.full((60,), expected))
 
-    def test_without_time_these_are_ordinary_3d_gaussians(self) -> None:
-        model = make_model(temporal=False)
-        assert {"times", "log_time_scales", "right"}.isdisjoint(model.gaussians.parameters)
-        a, b = (model.slice_at(view) for view in (make_views()[0], make_views()[-1]))
-        assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
-        assert len(a.rows) == 60
-
     def test_time_apart_from_space_leaves_every_gaussian_where_it_is(self) -> None:
         rows = (torch.rand(9, 3), torch.rand(9, 3), torch.full((9,), 0.3))
         apart, coupled = (
@@ -78,16 +71,6 @@ class TestInitialScales:
         positions = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [50, 0, 0]])
         expected = math.sqrt((1 + 4 + 9) / 3)
         assert nearest_neighbour_scales(positions)[0].item() == pytest.approx(expected)
-
-    @pytest.mark.parametrize("count", [0, 1, 2, 3])
-    def test_few_points_get_finite_scales(self, count: int) -> None:
-        scales = nearest_neighbour_scales(torch.rand(count, 3))
-        assert scales.shape == (count,)
-        assert torch.isfinite(scales).all()
-        assert (scales > 0).all()
-
-    def test_duplicated_points_get_a_floor(self) -> None:
-        assert (nearest_neighbour_scales(torch.ones(5, 3)) == 1e-7).all()
 
 
 class TestColour:
@@ -165,13 +148,6 @@ class TestDensityControl:
         prune(model)
         assert len(model) == 58
 
-    def test_a_run_survives_losing_every_gaussian(self) -> None:
-        model = make_model()
-        model.select(torch.zeros(0, dtype=torch.int64))
-        render = model.render(make_views()[0], background=torch.zeros(3))
-        assert (render.color == 0).all()
-        assert (render.alpha == 0).all()
-
 
 class TestGaussians:
     def test_appended_rows_start_without_momentum(self) -> None:
@@ -183,24 +159,9 @@ class TestGaussians:
         assert (moments[:2] != 0).all()
         assert (moments[2] == 0).all()
 
-    def test_overwriting_forgets_the_momentum(self) -> None:
-        gaussians = Gaussians({"x": torch.zeros(2, 3)}, {"x": 0.1})
-        gaussians["x"].sum().backward()
-        gaussians.optimizer.step()
-        gaussians.overwrite("x", torch.full((2, 3), 7.0))
-        assert gaussians["x"] not in gaussians.optimizer.state
-
     def test_rows_and_rates_must_name_the_same_tensors(self) -> None:
         with pytest.raises(ValueError, match="name different tensors"):
             Gaussians({"x": torch.zeros(2, 3)}, {"y": 0.1})
-
-
-def test_training_lowers_the_loss_of_the_tiny_scene() -> None:
-    losses: list[float] = []
-    trainer = make_trainer(iterations=150)
-    trainer.run(on_step=lambda step, loss: losses.append(loss))
-    assert np.mean(losses[-6:]) < 0.5 * np.mean(losses[:6])
-    assert is_finite(trainer)
 
 
 def test_every_training_view_is_used_once_per_round() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -24,7 +25,7 @@ from tiny import (
     same,
 )
 
-from d2_plugin import D2Config, D2Hooks
+from d2_plugin import D2Config, D2Error, D2Hooks
 from d2_plugin.backbones.deform_fields import Offsets
 from d2_plugin.backbones.densify import grow, prune
 from d2_plugin.backbones.model import SplatModel
@@ -188,6 +189,31 @@ def test_every_hook_changes_every_backbone(backbone: str) -> None:
     trainer = make_trainer(ALL_HOOKS, backbone=backbone)
     trainer.run()
     assert {(entry.hook, entry.action) for entry in trainer.d2.trace} >= {("densify", "insert"), ("depth_loss", "loss")}
+
+
+def test_training_lowers_the_loss_of_the_tiny_scene(backbone: str) -> None:
+    losses: list[float] = []
+    trainer = make_trainer(iterations=150, backbone=backbone)
+    trainer.run(on_step=lambda step, loss: losses.append(loss))
+    assert sum(losses[-6:]) < 0.5 * sum(losses[:6])
+    assert is_finite(trainer)
+
+
+def test_without_time_these_are_ordinary_3d_gaussians(backbone: str) -> None:
+    trainer = make_trainer(temporal=False, backbone=backbone)
+    model = trainer.model
+    assert getattr(model, "field", None) is None
+    assert {"times", "log_time_scales", "right"}.isdisjoint(model.gaussians.parameters)
+    a, b = (model.slice_at(view) for view in (make_views()[0], make_views()[-1]))
+    assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
+    assert len(a.rows) == 60
+    trainer.run()
+    assert is_finite(trainer)
+
+
+def test_a_time_that_is_not_a_number_is_refused(backbone: str) -> None:
+    with pytest.raises(D2Error, match="the time of camera 'cam0', frame 0 is NaN"):
+        make_model(backbone=backbone).slice_at(replace(make_views()[0], time=math.nan))
 
 
 class TestInsertionIntoADeformationField:

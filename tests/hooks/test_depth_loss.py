@@ -40,13 +40,6 @@ class TestThePapersLoss:
         expected = charbonnier(tensor(1.0), 0.01).squeeze()
         torch.testing.assert_close(depth_loss(depth, valid, prior, verified, 0.01), expected)
 
-    def test_no_common_pixel_gives_zero_loss_and_zero_gradient(self) -> None:
-        depth = torch.ones(4, requires_grad=True)
-        loss = depth_loss(depth, torch.zeros(4, dtype=torch.bool), torch.ones(4), torch.ones(4, dtype=torch.bool), 0.01)
-        loss.backward()
-        assert loss.item() == 0
-        assert (depth.grad == 0).all()
-
     @pytest.mark.parametrize("bad", [float("nan"), float("inf"), 0.0, -1.0])
     def test_bad_prior_pixels_outside_the_mask_never_leak(self, bad: float) -> None:
         depth = torch.tensor([1.0, 2.0], requires_grad=True)
@@ -55,18 +48,6 @@ class TestThePapersLoss:
         loss.backward()
         assert torch.isfinite(loss)
         assert torch.isfinite(depth.grad).all()
-
-    @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
-    def test_does_not_depend_on_the_scale_of_the_scene(self, scale: float) -> None:
-        mask = torch.ones(2, dtype=torch.bool)
-        reference = depth_loss(tensor(1.1, 3.0), mask, tensor(1.0, 4.0), mask, 0.01)
-        scaled = depth_loss(tensor(1.1, 3.0) * scale, mask, tensor(1.0, 4.0) * scale, mask, 0.01)
-        torch.testing.assert_close(scaled, reference, rtol=2e-5, atol=0)
-
-    def test_depths_a_billion_apart_in_one_image_weigh_alike(self) -> None:
-        mask = torch.ones(2, dtype=torch.bool)
-        loss = depth_loss(tensor(1.1e-3, 1.1e6), mask, tensor(1e-3, 1e6), mask, 0.01)
-        torch.testing.assert_close(loss, charbonnier(tensor(0.1), 0.01).squeeze(), rtol=1e-4, atol=0)
 
 
 def prior_of(seed: int, height: int, width: int, labels: tuple[Label, ...] = LABELS, paper: bool = False) -> DepthPrior:

@@ -19,7 +19,7 @@ from d2_plugin.hooks.densify import (
 )
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.hooks.prune import depth_inconsistency, opacity_contribution, pruning_score
-from d2_plugin.hooks.rendered_depth import relative_discrepancy, rendered_depth
+from d2_plugin.hooks.rendered_depth import relative_discrepancy
 from d2_plugin.protocol import DepthPrior, Label, View
 
 
@@ -39,34 +39,6 @@ def a_view(width: int = 64, height: int = 48) -> View:
 
 
 class TestRenderedDepth:
-    def test_depth_is_normalised_by_alpha(self) -> None:
-        depth, valid = rendered_depth(tensor(2.0), tensor(0.5), tau_v=0.4)  # one Gaussian, alpha .5, at z = 4
-        torch.testing.assert_close(depth, tensor(4.0))
-        assert valid.all()
-
-    def test_nothing_rendered_gives_zero_depth_zero_mask_and_zero_gradient(self) -> None:
-        depth_sum, alpha = torch.zeros(3, requires_grad=True), torch.zeros(3, requires_grad=True)
-        depth, valid = rendered_depth(depth_sum, alpha, tau_v=0.5)
-        depth.sum().backward()
-        assert not valid.any()
-        assert (depth == 0).all()
-        assert (depth_sum.grad == 0).all()
-        assert (alpha.grad == 0).all()
-
-    def test_mask_flips_within_one_ulp_of_tau_v(self) -> None:
-        half = torch.tensor(0.5)
-        alphas = torch.stack([torch.nextafter(half, tensor(0.0)[0]), half, torch.nextafter(half, tensor(1.0)[0])])
-        depth, valid = rendered_depth(alphas * 3, alphas, tau_v=0.5)
-        assert valid.tolist() == [False, False, True]
-        assert torch.isfinite(depth).all()
-
-    @pytest.mark.parametrize("alpha", [1e-8, 1e-6, 1e-4])
-    def test_vanishing_alpha_is_masked_rather_than_amplified(self, alpha: float) -> None:
-        depth_sum = torch.full((1,), 4 * alpha, requires_grad=True)
-        depth, _ = rendered_depth(depth_sum, tensor(alpha), tau_v=0.5)
-        depth.sum().backward()
-        assert depth_sum.grad.item() == 0
-
     def test_discrepancy_is_relative_to_the_prior(self) -> None:
         torch.testing.assert_close(relative_discrepancy(tensor(1.1, 1.1e6), tensor(1.0, 1e6)), tensor(0.1, 0.1))
 

@@ -25,9 +25,10 @@ def hooks_that_remove(masks: dict[str, torch.Tensor], **settings: float) -> tupl
     return d2, model.gaussians["positions"].detach().clone()
 
 
-def test_some_stay_by_default_whatever_is_asked_for() -> None:
-    d2, _ = hooks_that_remove({"prune": torch.ones(40, dtype=torch.bool)})
-    assert d2.step(1).removed == 36
+@pytest.mark.parametrize(("settings", "gone"), [({}, 36), ({"remove_at_most": 1}, 40)], ids=["default", "no limit"])
+def test_some_stay_by_default_whatever_is_asked_for(settings: dict[str, float], gone: int) -> None:
+    d2, _ = hooks_that_remove({"prune": torch.ones(40, dtype=torch.bool)}, **settings)
+    assert d2.step(1).removed == gone
 
 
 def test_what_stays_is_spread_over_the_rows_and_it_is_said(caplog: pytest.LogCaptureFixture) -> None:
@@ -53,11 +54,6 @@ def test_what_is_less_goes_as_it_was_asked_for() -> None:
         d2, before = hooks_that_remove({"prune": rows % 3 == 0}, remove_at_most=share)
         assert d2.step(1).removed == 14
         assert torch.equal(d2.backbone.model.gaussians["positions"], before[rows % 3 != 0])
-
-
-def test_one_sets_no_limit() -> None:
-    d2, _ = hooks_that_remove({"prune": torch.ones(40, dtype=torch.bool)}, remove_at_most=1)
-    assert d2.step(1).removed == 40
 
 
 @pytest.mark.parametrize("share", [0, -1, 1.5, float("nan")])

@@ -12,9 +12,8 @@ from tiny import DISTANCE, HEIGHT, WIDTH, make_adapter, make_model, make_views
 from torch import Tensor
 
 from d2_plugin.config import DensifyConfig
-from d2_plugin.hooks.densify import Densify
+from d2_plugin.hooks.densify import CHANGED, Densify, Motion
 from d2_plugin.hooks.hook import Context
-from d2_plugin.hooks.motion import CHANGED, Motion
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.protocol import DepthPrior, Label, Points, View
 

@@ -1,4 +1,4 @@
-"""The example in the table's docstring is a whole hook: one file and one row, and everything knows it."""
+"""The example in the docstring of the hooks is a whole hook: one file and one row, and everything knows it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 import textwrap
 from pathlib import Path
 
-from d2_plugin.hooks import table
+from d2_plugin import hooks
 
 FILE_OF_THE_HOOK = """
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ from d2_plugin.settings import NotNegative
 """
 
 SCRIPT = """
-from d2_plugin.hooks import table
+from d2_plugin import hooks
 import shrink
 from shrink import Shrink, ShrinkConfig
-HookRow = table.HookRow
-table.HOOKS |= {ROW}
+HookRow = hooks.HookRow
+hooks.HOOKS |= {ROW}
 
 import torch
 from d2_plugin import D2Config, D2Error
@@ -64,8 +64,8 @@ for wrong, sentence in (
 
 
 def test_a_hook_is_added_with_one_file_and_one_row(tmp_path: Path) -> None:
-    example = re.search(r"class,\n\n(.*?)\n\nand the table", table.__doc__, re.DOTALL)[1]
-    row = re.search(r'`("shrink": HookRow\(.*?\))`', table.__doc__)[1]
+    example = re.search(r"class,\n\n(.*?)\n\nand the list", hooks.__doc__, re.DOTALL)[1]
+    row = re.search(r'`("shrink": HookRow\(.*?\))`', hooks.__doc__)[1]
     (tmp_path / "shrink.py").write_text(FILE_OF_THE_HOOK + textwrap.dedent(example))
     script = SCRIPT.replace("ROW", row)
     tests = Path(__file__).parents[1]

@@ -37,7 +37,7 @@ from cuda_cases import (
 from d2_plugin import D2Error
 from d2_plugin.compiler import NoCompiler
 from d2_plugin.protocol import Label, RasterSettings, Render, Splats
-from d2_plugin.rasterizer import autograd, cuda, native, rasterize, reference, survey
+from d2_plugin.rasterizer import autograd, cuda, rasterize, reference, survey
 
 
 @pytest.fixture(autouse=True)
@@ -300,21 +300,6 @@ def test_two_runs_give_the_same_bits(backend: torch.device) -> None:
     upstream = random_upstream(scene)
     runs = [gradients_of_kernels(scene, backend, upstream) for _ in range(2)]
     assert all(torch.equal(a, b) for a, b in zip(*runs))
-
-
-def test_cpu_and_gpu_kernels_agree(backend: torch.device) -> None:
-    if not native.available():
-        pytest.skip("no C++ compiler for the CPU kernels")
-    scene = with_edge(make_scene(300))
-    upstream = random_upstream(scene)
-    single = scene.to(torch.device("cpu"), torch.float32)
-    camera = camera_of(single)
-    constants = autograd.constants_of(scene.settings)
-    outputs = native.rasterize(*inputs_of(single), *camera, 64, 48, constants)
-    assert_same_image(scene, render_kernels(scene, backend)[1], Render(*(part.double() for part in outputs[:4])))
-    gradients = native.backward(*(part.float() for part in upstream), *inputs_of(single), *camera, constants, *outputs)
-    found = gradients_of_kernels(scene, backend, upstream)
-    assert_same_gradients(found, tuple(part.double() for part in gradients))
 
 
 def test_a_skewed_camera_is_refused(backend: torch.device) -> None:

@@ -281,12 +281,3 @@ def test_an_image_as_wide_as_a_panorama_has_its_gaussians_in_place():
     alpha = scene.to(torch.float32).render().alpha
     assert alpha.argmax().item() == 5000 + 4900
     np.testing.assert_allclose(alpha.double().numpy(), scene.render().alpha.numpy(), atol=1e-4)
-
-
-def test_nothing_is_weighed_beside_the_image() -> None:
-    """A block that sticks out of the image has pixels that are none; the survey's largest weight is not theirs."""
-    scene = random_scene(5, 50, 7, 5)
-    prior = prior_of(scene)
-    found = survey(scene.to(torch.float32).splats, scene.view, prior)
-    exact = survey(scene.splats, scene.view, prior)
-    torch.testing.assert_close(found.max_weight.double(), exact.max_weight, atol=1e-5, rtol=0)

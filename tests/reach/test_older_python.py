@@ -19,7 +19,7 @@ import pytest
 from d2_plugin import older, registry
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
-from d2_plugin.hooks.table import HOOKS
+from d2_plugin.hooks import HOOKS
 from d2_plugin.settings import Range, Settings, declared
 
 OLDEST = "3.9"
@@ -79,15 +79,6 @@ def test_no_union_of_types_is_evaluated_at_run_time() -> None:
     found = {file: unions_at_run_time(Path(file).read_text()) for file in trainer_files()}
     assert {file: unions for file, unions in found.items() if unions} == {}
     assert unions_at_run_time("x = f(float | None)\ndef g(a: int | None) -> str | None: ...") == ["float | None"]
-
-
-def test_the_judge_sees_a_newer_word(tmp_path: Path) -> None:
-    """A green test above says something."""
-    pytest.importorskip("vermin", reason="needs vermin")
-    for number, text in enumerate(("zip([1], [2], strict=True)", "match 1:\n    case 1: pass", "import tomllib")):
-        file = tmp_path / f"newer{number}.py"
-        file.write_text(f"{text}\n")
-        assert vermin(str(file)).returncode == 1
 
 
 class TestAnnotations:

@@ -66,11 +66,3 @@ class TestEveryPage:
         assert len(after) == length + 4
         for hunk in hunks(patch):
             assert after[hunk.new - 1 : hunk.new - 1 + hunk.news] == [line[1:] for line in hunk.lines]
-
-
-def test_a_line_that_moved_is_found_out() -> None:
-    """Checksums tell lines apart, and spaces do not matter."""
-    lines = checksums("fudan", "train.py")
-    assert checksum("  import   torch ") == checksum("import torch")
-    assert checksum("import torch") in lines
-    assert checksum("import torch_of_another_commit") not in lines
