@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,9 @@ depth (see `metrics.depth_absrel`), so leaving depth out never improves a score.
 Progress = Callable[[int, int], None]
 """(views done, views in total)."""
 
+BETWEEN = ("psnr", "psnr_moving")
+"""Metrics whose means over instants between the trained ones stand apart."""
+
 ERROR_SHOWN = 0.25
 """Absolute colour error, mean over channels, at the bright end of the error image's scale."""
 
@@ -57,11 +60,13 @@ def renderer(model: Any, recording: Recording, device: torch.device | str) -> Re
 def evaluate_scene(model: Any, scene: Scene, device: torch.device | str, images: Path | None = None) -> dict[str, Any]:
     """`evaluate` at the test cameras of a scene; at its training cameras, under `train` instead of `test`, where it has
     none."""
-    cameras, frames = scene.test_cameras or scene.train_cameras, scene.recording.frames
+    recording, cameras = scene.scored, scene.test_cameras or scene.train_cameras
+    frames = recording.frames
     with progress_bar("evaluate", len(cameras) * len(frames)) as bar:
         scores = evaluate(
-            renderer(model, scene.recording, device),
-            *(scene.recording, cameras, frames, images),
+            renderer(model, recording, device),
+            *(recording, cameras, frames, images),
+            between=scene.between,
             lpips=find_lpips("alex"),
             lpips_vgg=find_lpips("vgg"),
             progress=lambda done, _: bar.update(done),
@@ -76,6 +81,7 @@ def evaluate(
     frames: Iterable[int],
     output: Path | None = None,
     *,
+    between: Collection[int] = (),
     lpips: Lpips | None = None,
     lpips_vgg: Lpips | None = None,
     progress: Progress | None = None,
@@ -93,6 +99,8 @@ def evaluate(
         cameras, frames: what to compare: every camera at every frame.
         output: folder for one image per view, `<camera>_<frame>.png`: truth, render, rendered depth and error side
             by side (and true depth where there is one). No images where None.
+        between: frames that were not trained, between others that were. The means leave them out; `psnr` and
+            `psnr_moving` over them stand beside the means as `psnr_between` and `psnr_moving_between`.
         lpips, lpips_vgg: from `find_lpips`, on AlexNet and on VGG16; a score is null where its network is None.
         progress: called after every view.
 
@@ -138,12 +146,18 @@ def evaluate(
             write_png(output / f"{camera}_{frame:05d}.png", side_by_side(panels))
         if progress is not None:
             progress(done, len(views))
+    trained = [row for row in rows if row["frame"] not in between]
+    apart = [row for row in rows if row["frame"] in between]
+    means = {f"{name}_between": _mean(row[name] for row in apart) for name in BETWEEN if apart}
+    definitions = {f"{name}_between": f"at instants between trained ones: {metrics.VARIANTS[name]}" for name in BETWEEN}
     return {
-        "test": _means(rows),
+        "test": _means(trained) | means,
         "per_view": rows,
         "per_frame": _grouped(rows, "frame"),
-        "per_camera": _grouped(rows, "camera"),
-        "variants": metrics.VARIANTS | {name: net.variant for name, net in networks.items() if net is not None},
+        "per_camera": _grouped(trained, "camera"),
+        "variants": metrics.VARIANTS
+        | {name: text for name, text in definitions.items() if name in means}
+        | {name: net.variant for name, net in networks.items() if net is not None},
     }
 
 

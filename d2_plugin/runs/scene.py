@@ -30,6 +30,13 @@ class Scene:
     plan: ScenePlan
     priors: PriorSettings
     """Of the prior builder, before the plan."""
+    between: tuple[int, ...] = ()
+    """Frames between those of `recording`, which train nothing and are scored apart."""
+
+    @property
+    def scored(self) -> Recording:
+        """The recording with all frames that are scored, those between the trained ones too."""
+        return replace(self.recording, frames=tuple(sorted((*self.recording.frames, *self.between))))
 
     @property
     def prior_settings(self) -> PriorSettings:
@@ -48,6 +55,7 @@ class Scene:
         recording = open_recording(
             settings.recording, cameras=named, frames=settings.frames, downscale=settings.downscale
         )
+        recording, between = _without_held_out_instants(recording, settings.hold_out_instants)
         train, test = _split(recording, settings)
         check_memory(recording, train)
         check_background_weight(recording, train, settings.background_weight)
@@ -56,7 +64,7 @@ class Scene:
         )
         priors = prior_settings(settings)
         plan = plan_scene(recording, train, _mono_source(recording, settings), priors)
-        return cls(recording, train, test, plan.override(**settings.overrides.get("plan", {})), priors)
+        return cls(recording, train, test, plan.override(**settings.overrides.get("plan", {})), priors, between)
 
     def with_points(self, points: TimedPoints, settings: RunSettings) -> Scene:
         """The same scene with what triangulated points decide: whether the cameras' exposures differ."""
@@ -99,6 +107,19 @@ class Remembered:
     def hooks(self, scene: Scene, points: TimedPoints, priors: Path) -> Mapping[str, Hook]:
         """Refused: what the hooks are is known by name only."""
         raise D2Error(f"this run is guided by '{self.table['name']}': continue it with the command that began it")
+
+
+def _without_held_out_instants(recording: Recording, every: int) -> tuple[Recording, tuple[int, ...]]:
+    """The recording with every so-manieth frame, and the frames between them; those after the last one are left out."""
+    trained = recording.frames[:: max(every, 1)]
+    if len(trained) == len(recording.frames):
+        return recording, ()
+    if len(trained) < 2:
+        raise D2Error(
+            f"--hold-out-instants {every} leaves one of {len(recording.frames)} instants: give a smaller number"
+        )
+    between = tuple(frame for frame in recording.frames if frame not in trained and frame < trained[-1])
+    return replace(recording, frames=trained), between
 
 
 def _split(recording: Recording, settings: RunSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -58,6 +58,8 @@ class RunSettings(Settings):
     """Make images this many times smaller along each side."""
     frames: tuple[Count, ...] | None = None
     """Numbers of the frames to use; all if not given."""
+    hold_out_instants: Annotated[int, Range(0, 10_000, unit="instants")] = 0
+    """Train every so-manieth instant alone and score those between apart (`psnr_between`); 0 or 1 trains all."""
     test_cameras: tuple[str, ...] | None = None
     """Cameras to score with; all that do not train if not given."""
     mono_onnx: str | None = None

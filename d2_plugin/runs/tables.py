@@ -32,6 +32,8 @@ COLUMNS = (
     Column("PSNR", "psnr", ".2f", True, unit="dB"),
     Column("PSNR cc", "psnr_cc", ".2f", True, always=False, unit="dB"),
     Column("PSNR moving", "psnr_moving", ".2f", True, always=False, unit="dB"),
+    Column("PSNR between", "psnr_between", ".2f", True, always=False, unit="dB"),
+    Column("moving between", "psnr_moving_between", ".2f", True, always=False, unit="dB"),
     Column("PSNR mask", "psnr_mask", ".2f", True, always=False, unit="dB"),
     Column("SSIM1", "ssim1", ".4f", True),
     Column("SSIM2", "ssim2", ".4f", True),
@@ -43,7 +45,8 @@ COLUMNS = (
     Column("depth delta1", "depth_delta1", ".4f", True, always=False),
 )
 
-STUDY_COLUMNS = tuple(c for c in COLUMNS if c.key in ("psnr", "psnr_moving", "ssim1", "ssim2", "lpips", "depth_absrel"))
+_STUDY = ["psnr", "psnr_moving", "psnr_between", "psnr_moving_between", "ssim1", "ssim2", "lpips", "depth_absrel"]
+STUDY_COLUMNS = tuple(column for column in COLUMNS if column.key in _STUDY)
 """The columns by which variants are compared: no single one of them says which is better."""
 
 

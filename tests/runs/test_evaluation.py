@@ -11,12 +11,15 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.images import image_size, read_image
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.selection import select_cameras
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs import drawing, metrics
 from d2_plugin.runs.evaluation import RenderView, evaluate
+from d2_plugin.runs.scene import Scene
+from d2_plugin.runs.settings import RunSettings
 
 NAMES = ["test0", "test1"]
 
@@ -63,6 +66,33 @@ def test_every_frame_and_every_camera_has_its_mean(recording: Recording) -> None
         for row in result[name]:
             views = [view["psnr"] for view in result["per_view"] if view[key] == row[key]]
             assert row["psnr"] == pytest.approx(np.mean(views))
+
+
+def test_instants_between_the_trained_ones_are_scored_apart(recording: Recording) -> None:
+    def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
+        return renderer(recording, offset=0.02 + 0.1 * (frame == 1))(camera, frame)
+
+    result = evaluate(render, recording, NAMES, recording.frames, between=(1,))
+    psnr = {frame: np.mean([row["psnr"] for row in result["per_view"] if row["frame"] == frame]) for frame in (0, 1)}
+    assert result["test"]["psnr"] == pytest.approx(psnr[0])
+    assert result["test"]["psnr_between"] == pytest.approx(psnr[1])
+    assert result["test"]["psnr_moving_between"] is None, "two frames do not say what moves"
+    assert set(result["variants"]) == {*metrics.VARIANTS, "psnr_between", "psnr_moving_between"}
+    assert "psnr_between" not in evaluate(render, recording, NAMES, recording.frames)["test"]
+
+
+@pytest.mark.parametrize(("every", "trained", "between"), [(0, 5, ()), (1, 5, ()), (2, 3, (1, 3)), (3, 2, (1, 2))])
+def test_every_second_instant_trains_and_those_after_the_last_are_left_out(
+    tmp_path: Path, every: int, trained: int, between: tuple[int, ...]
+) -> None:
+    room = synthetic_recording(cameras=2, held_out=1, frames=5, width=48, height=27)
+    folder = str(save_recording(room, tmp_path / "room"))
+    scene = Scene.open(RunSettings(folder, ("train0", "train1"), hold_out_instants=every))
+    assert len(scene.recording.frames) == trained
+    assert scene.between == between
+    assert all(scene.scored.seconds(frame) == room.seconds(frame) for frame in scene.scored.frames)
+    with pytest.raises(D2Error, match="leaves one of 5 instants: give a smaller number"):
+        Scene.open(RunSettings(folder, ("train0", "train1"), hold_out_instants=5))
 
 
 def test_flicker_is_the_error_of_change_and_belongs_to_one_camera(recording: Recording) -> None:

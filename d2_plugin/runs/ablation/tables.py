@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from d2_plugin.runs.ablation.presets import PRESETS, PUBLISHED, TABLES, Preset
 from d2_plugin.runs.markup import Table, latex, markdown
 from d2_plugin.runs.shared import Job, Metrics
-from d2_plugin.runs.tables import STUDY_COLUMNS
+from d2_plugin.runs.tables import STUDY_COLUMNS, Column
 from d2_plugin.runs.verdict import EXPLANATION, Estimate, seeds_in_words, verdicts_table
 
 MARK = "○"
@@ -25,8 +25,10 @@ def table(
 
     `published` holds the paper's PSNR by preset: it stands in a column of its own, labelled as the paper's.
     """
-    header = ["variant", "seeds", *(column.title for column in STUDY_COLUMNS), "Gaussians", "train s"]
-    lines = [[_title(name), *_cells(_of(results, backbone, name), as_latex)] for name in rows]
+    measured = {key for run in results.values() for key, value in (run["test"] or {}).items() if value is not None}
+    columns = [column for column in STUDY_COLUMNS if column.always or column.key in measured]
+    header = ["variant", "seeds", *(column.title for column in columns), "Gaussians", "train s"]
+    lines = [[_title(name), *_cells(_of(results, backbone, name), columns, as_latex)] for name in rows]
     if published:
         header.append(f"{MARK} paper's PSNR")
         lines = [[*line, f"{published[name]:.2f}" if name in published else "-"] for line, name in zip(lines, rows)]
@@ -42,9 +44,9 @@ def _of(results: Mapping[Job, Metrics], backbone: str, preset: str) -> list[Metr
     return [metrics for job, metrics in results.items() if (job.settings.backbone, job.preset) == (backbone, preset)]
 
 
-def _cells(runs: Sequence[Metrics], as_latex: bool) -> list[str]:
+def _cells(runs: Sequence[Metrics], columns: Sequence[Column], as_latex: bool) -> list[str]:
     scores = [run["test"] or {} for run in runs]
-    estimates = [(Estimate.of([score.get(column.key) for score in scores]), column.form) for column in STUDY_COLUMNS]
+    estimates = [(Estimate.of([score.get(column.key) for score in scores]), column.form) for column in columns]
     estimates.append((Estimate.of([run["gaussians"] for run in runs]), ".0f"))
     estimates.append((Estimate.of([run["seconds"]["train"] for run in runs]), ".1f"))
     return [seeds_in_words(len(runs)), *(_cell(value, form, as_latex) for value, form in estimates)]

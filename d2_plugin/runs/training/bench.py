@@ -46,6 +46,8 @@ class TrainingBench(Settings):
     """Name of a registered backbone."""
     frames: tuple[Count, ...] | None = None
     """Numbers of the frames, in every recording; all if not given."""
+    hold_out_instants: Annotated[int, Range(0, 10_000, unit="instants")] = 0
+    """Train every so-manieth instant alone and score those between apart; 0 or 1 trains all."""
     downscale: AtLeastOne = 1
     """Make images this many times smaller along each side."""
     mono_onnx: str | None = None
@@ -126,6 +128,9 @@ def case_of(text: str, base: RunSettings) -> Case:
     title = Path(path).resolve().name
     size = f", 1/{base.downscale} size" if base.downscale > 1 else ""
     slug = "_".join([title, *train]) + (f"_small{base.downscale}" if base.downscale > 1 else "")
+    if base.hold_out_instants > 1:
+        size += f", 1/{base.hold_out_instants} of the instants"
+        slug += f"_every{base.hold_out_instants}"
     name = f"{title}, {len(train)} views{size}" + (f", {protocol}" if protocol else "")
     return Case(name, slug + (f"_{protocol.replace(':', '_')}" if protocol else ""), settings)
 
@@ -143,7 +148,7 @@ def _lines(
     settings: TrainingBench, text: str, presets: Sequence[Preset], known: Sequence[Row], command: str
 ) -> Iterator[Line]:
     """One line per method of a case; points and priors are made here, before anything is measured."""
-    shown = ("backbone", "frames", "downscale", "mono_onnx", "mono_kind")
+    shown = ("backbone", "frames", "hold_out_instants", "downscale", "mono_onnx", "mono_kind")
     tables = {} if settings.config is None else read_toml(settings.config, "write TOML tables, or leave out --config")
     base = RunSettings("", (), **{n: getattr(settings, n) for n in shown}, overrides=tables)
     case = case_of(text, base)
