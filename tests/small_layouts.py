@@ -70,7 +70,7 @@ def _enerf(recording: Recording, path: Path) -> Path:
     path.mkdir(parents=True, exist_ok=True)
     files = {name: cv2.FileStorage(str(path / f"{name}.yml"), cv2.FILE_STORAGE_WRITE) for name in ("intri", "extri")}
     for name, camera in recording.cameras.items():
-        files["intri"].write(f"K_{name}", camera.K)
+        files["intri"].write(f"K_{name}", camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         files["intri"].write(f"dist_{name}", np.array([[0.01, 0, 0, 0, 0]]))
         files["extri"].write(f"R_{name}", cv2.Rodrigues(camera.T_camera_world[:3, :3])[0])
         files["extri"].write(f"T_{name}", camera.T_camera_world[:3, 3:])

@@ -9,7 +9,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.recordings.images import shrink_depth, shrink_image, shrink_mask
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.recording import Camera, Recording, Source
 from d2_plugin.values import checked_arguments
 
 
@@ -53,7 +53,7 @@ def downscale(recording: Recording, factor: int) -> Recording:
 
 
 @dataclass(frozen=True)
-class DownscaledSource:
+class DownscaledSource(Source):
     """The images and depths of a recording, made smaller by a whole factor after their size was checked."""
 
     recording: Recording

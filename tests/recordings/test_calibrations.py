@@ -101,12 +101,31 @@ def test_our_own_json_says_everything(tmp_path: Path) -> None:
         assert_same(again, known, POINTS)
 
 
-def test_millimetres_are_noted_with_the_scale_that_mends_them(tmp_path: Path) -> None:
-    cameras = [camera._replace(t=1000 * camera.t) for camera in rig()]
-    found = open_calibration(anipose(tmp_path, cameras))
-    (note,) = found.notes
-    assert "looks like millimetres (scale .001) instead of metres" in note
-    for camera, known in zip(scaled(found.cameras, 0.001), rig(), strict=True):
+@pytest.mark.parametrize(
+    ("per_metre", "unit"),
+    [(1000, "millimetres (scale .001)"), (100, "centimetres (scale .01) or, of a small rig, millimetres (scale .001)")],
+)
+def test_units_that_are_no_metres_are_noted_with_the_scale_that_mends_them(
+    per_metre: float, unit: str, tmp_path: Path
+) -> None:
+    cameras = [camera._replace(t=per_metre * camera.t) for camera in rig()]
+    calibration = open_calibration(anipose(tmp_path, cameras))
+    (note,) = calibration.notes
+    assert f"looks like {unit} instead of metres" in note
+    for camera, known in zip(scaled(calibration.cameras, 1 / per_metre), rig(), strict=True):
+        assert_same(camera, known, POINTS)
+
+
+def test_names_that_only_some_files_have(tmp_path: Path) -> None:
+    """Caliscope's numbers have gaps, and Multical's poses are called after a master camera where one was chosen."""
+    path = CASES["caliscope"].write(tmp_path, rig())
+    path.write_text(path.read_text().replace("cam_id = 1", "cam_id = 3\nrotation_count = -1\ngrid_count = 25"))
+    assert [camera.name for camera in read_calibration(path)] == ["cam_0", "cam_3", "cam_2"]
+    path = CASES["multical"].write(tmp_path, rig())
+    table = json.loads(path.read_text())
+    table["camera_poses"] = {f"{name}_to_cam_0": pose for name, pose in table["camera_poses"].items()}
+    path.write_text(json.dumps(table))
+    for camera, known in zip(read_calibration(path), rig(), strict=True):
         assert_same(camera, known, POINTS)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.images import opencv
-from d2_plugin.recordings.recording import Camera, MaskedSource, Source
+from d2_plugin.recordings.recording import Camera, Source
 from d2_plugin.values import checked_arguments
 
 KEPT_MAPS = 8
@@ -76,7 +76,7 @@ class Undistortion:
 
 
 @dataclass(frozen=True)
-class UndistortedSource:
+class UndistortedSource(Source):
     """The images of `source` as pinhole cameras would have taken them; maps on disk fit these already."""
 
     source: Source
@@ -98,12 +98,12 @@ class UndistortedSource:
 
     def mask(self, camera: str, frame: int) -> np.ndarray | None:
         """The mask of the recorded image, undistorted with it, or None."""
-        mask = self.source.mask(camera, frame) if isinstance(self.source, MaskedSource) else None
+        mask = self.source.mask(camera, frame)
         return None if mask is None else self._undone(camera, mask)
 
     def recorded(self, camera: str) -> np.ndarray | None:
         """Which pixels [H, W] of the undistorted image were recorded, or None where all were."""
-        valid = self.source.recorded(camera) if isinstance(self.source, MaskedSource) else None
+        valid = self.source.recorded(camera)
         if camera not in self.cameras:
             return valid
         here = self._undistortion(camera).valid

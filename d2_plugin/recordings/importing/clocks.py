@@ -12,6 +12,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.importing.motion import Watched, offsets_from_motion
+from d2_plugin.recordings.importing.settings import by_camera, finite
 from d2_plugin.recordings.importing.sound import Sound, lag_between, read_sound
 from d2_plugin.recordings.importing.video import VideoFile
 
@@ -89,18 +90,9 @@ def given_clock(videos: Mapping[str, VideoFile], given: Sequence[str]) -> dict[s
     Raises:
         D2Error: what is no number, and cameras that there are not.
     """
-    starts = dict.fromkeys(videos, 0.0)
-    for text in given:
-        name, _, frames = text.partition("=")
-        if name not in videos:
-            raise D2Error(f"--offsets names camera '{name}', have {', '.join(videos)}: write NAME=FRAMES,NAME=FRAMES")
-        try:
-            starts[name] = float(frames) / (videos[name].rate or 25.0)
-        except ValueError:
-            starts[name] = np.nan
-        if not np.isfinite(starts[name]):
-            raise D2Error(f"--offsets says '{text}', expected NAME=FRAMES such as {name}=-7.5: correct it")
-    return {name: Clock(seconds, 0.0, "given") for name, seconds in starts.items()}
+    expected = f"{', '.join(METHODS)}, or NAME=FRAMES such as {next(iter(videos))}=-7.5"
+    starts = by_camera("--offsets", given, videos, finite, expected)
+    return {name: Clock(starts.get(name, 0.0) / (video.rate or 25.0), 0.0, "given") for name, video in videos.items()}
 
 
 def timecode_seconds(text: str, rate: float) -> float | None:

@@ -21,7 +21,7 @@ from d2_plugin.recordings.cameras.camera import LARGEST_NUMBER, CalibratedCamera
 from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.files import FrameFiles, cameras_with_images, collect, common_frames, numbered_files
 from d2_plugin.recordings.images import IMAGE_SUFFIXES, image_size
-from d2_plugin.recordings.importing.video import VideoFrames, video_header
+from d2_plugin.recordings.importing.video import VideoFrames, read_video, usual_rate
 from d2_plugin.recordings.recording import Recording
 
 log = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ def is_n3dv(path: Path) -> bool:
 
 
 def open_n3dv(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Recording:
-    """Read the N3DV layout; frames are decoded when asked for, only headers are opened here.
+    """Read the N3DV layout; frames are decoded when asked for, time stamps and headers alone are read here.
 
     A camera whose video or folder is empty is refused by name, and so are rows without a camera. Where `intersect`
     both are left out with a note: an empty camera keeps its row, and of the whole rig (`RIG_SIZE` rows) the number in
@@ -120,16 +120,16 @@ def _rows(path: Path) -> np.ndarray:
 def _from_videos(
     path: Path, rows: dict[str, np.ndarray], videos: dict[str, Path], names: list[str], notes: tuple[str, ...]
 ) -> Recording:
-    headers = {name: video_header(videos[name]) for name in names}
-    frames, frame_notes = common_frames({name: range(header.frames) for name, header in headers.items()}, path)
+    files = {name: read_video(videos[name]) for name in names}
+    frames, frame_notes = common_frames({name: range(len(file.stamps)) for name, file in files.items()}, path)
     where = str(path / POSES)
-    cameras = {name: camera_from_row(rows[name], name, headers[name].size, where) for name in names}
+    cameras = {name: camera_from_row(rows[name], name, files[name].size, where) for name in names}
     return Recording(
         name=path.resolve().name,
         cameras={name: camera.pinhole(where) for name, camera in cameras.items()},
         frames=frames,
-        fps=checked_rate(headers[names[0]].fps or N3DV_FPS, str(videos[names[0]])),
-        source=VideoFrames({name: videos[name] for name in names}),
+        fps=checked_rate(usual_rate(files[names[0]].rate) or N3DV_FPS, str(videos[names[0]])),
+        source=VideoFrames(files),
         path=path,
         notes=(*notes, *frame_notes, *_known_flaws(path, names)),
     )

@@ -20,7 +20,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.camera import pinhole, rigid
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.recording import Camera, Recording, Source
 from d2_plugin.recordings.synthetic import materials
 from d2_plugin.recordings.synthetic.raycast import Motion, Room, Scene, Solid, render_color, render_depth
 from d2_plugin.values import checked_arguments
@@ -133,7 +133,7 @@ def emulated_monocular(depth: np.ndarray, bias: np.ndarray, scale: float, shift:
 
 
 @dataclass(eq=False)
-class SyntheticSource:
+class SyntheticSource(Source):
     """Renders an image or a map when it is asked for; images stay in a small cache."""
 
     scene: Scene
