@@ -34,7 +34,7 @@ from d2_plugin.recordings.export.folder import described
 from d2_plugin.recordings.images import VALID_FOLDER, encode_jpeg, write_mask, write_png
 from d2_plugin.recordings.importing.clocks import METHODS, Clock, common_clock, given_clock
 from d2_plugin.recordings.importing.exposure import measured_exposures
-from d2_plugin.recordings.importing.grid import Grid, grid_of
+from d2_plugin.recordings.importing.grid import grid_of
 from d2_plugin.recordings.importing.motion import small_images
 from d2_plugin.recordings.importing.settings import UNITS, ImportSettings, check_calibration
 from d2_plugin.recordings.importing.solved_rig import calibration_table, rig_of_videos, summary
@@ -92,14 +92,22 @@ def import_videos(settings: ImportSettings, report: Report = lambda line: None) 
         clocks = _clocks(settings, folder, videos, cameras)
         report(_clocks_in_words(clocks, videos))
         grid = grid_of(videos, clocks, settings.rate, settings.times, settings.frames)
-        recording = _recording(folder, videos, cameras, cuts, grid, notes)
+        source = VideosSource(videos, grid.indices, cameras, cuts)
+        frames, notes = tuple(grid.indices[next(iter(videos))]), (*notes, *grid.notes)
+        recording = Recording(
+            folder.resolve().name, source.pinholes(), frames, grid.rate, source, folder, notes=notes, late=grid.late
+        )
         if settings.refine_poses:
             recording = _with_refined_poses(folder, recording, report)
         if settings.images != "videos":
             _write_images(folder, recording, settings.images, report)
         if settings.exposure and len(recording.cameras) > 1:
             recording = replace(recording, exposures=_exposures(folder, recording, report))
-        _finish(settings, folder, recording)
+        description = described(recording)  # last: without this file the folder is no recording
+        if isinstance(recording.source, VideosSource) and settings.images == "videos":
+            write_table(folder / TABLE, {"cameras": recording.source.as_dict(), "recording": description}, VIDEOS)
+        else:
+            write_text(folder / "cameras.json", json_text(description, "cameras.json", indent=1) + "\n")
     return Imported(recording, clocks, folder)
 
 
@@ -183,22 +191,6 @@ def _clocks_in_words(clocks: Mapping[str, Clock], videos: Mapping[str, VideoFile
     return f"start in frames, by {methods}: {', '.join(one(*item) for item in clocks.items())}"
 
 
-def _recording(
-    folder: Path,
-    videos: Mapping[str, VideoFile],
-    cameras: Mapping[str, CalibratedCamera],
-    cuts: Mapping[str, Cut],
-    grid: Grid,
-    notes: tuple[str, ...],
-) -> Recording:
-    """The recording as it is in the videos."""
-    source = VideosSource(videos, grid.indices, cameras, cuts)
-    frames, notes = tuple(grid.indices[next(iter(videos))]), (*notes, *grid.notes)
-    return Recording(
-        folder.resolve().name, source.pinholes(), frames, grid.rate, source, folder, notes=notes, late=grid.late
-    )
-
-
 def _with_refined_poses(folder: Path, recording: Recording, report: Report) -> Recording:
     """The recording with the poses that its images prove to be better, or with those that were given."""
 
@@ -249,12 +241,3 @@ def _exposures(folder: Path, recording: Recording, report: Report) -> dict[str, 
     gains = ", ".join(f"{name} {100 * (sum(one.gain) / 3 - 1):+.1f} %" for name, one in exposures.items())
     report(f"exposure: {gains or 'not known'}" + (f"; too few shared features for {unknown}" if unknown else ""))
     return exposures
-
-
-def _finish(settings: ImportSettings, folder: Path, recording: Recording) -> None:
-    """The file that makes the folder a recording."""
-    description = described(recording)
-    if isinstance(recording.source, VideosSource) and settings.images == "videos":
-        write_table(folder / TABLE, {"cameras": recording.source.as_dict(), "recording": description}, VIDEOS)
-    else:
-        write_text(folder / "cameras.json", json_text(description, "cameras.json", indent=1) + "\n")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,14 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings.assembly import assembled
 from d2_plugin.recordings.cameras.camera import LARGEST_NUMBER, CalibratedCamera, checked_rate, pinhole, rigid
 from d2_plugin.recordings.cameras.lens import Lens
-from d2_plugin.recordings.files import FrameFiles, cameras_with_images, collect, common_frames, numbered_files
+from d2_plugin.recordings.files import (
+    FrameFiles,
+    by_camera,
+    by_prefix,
+    cameras_with_images,
+    common_frames,
+    numbered_files,
+)
 from d2_plugin.recordings.images import IMAGE_SUFFIXES, image_size
 from d2_plugin.recordings.importing.video import VideoFrames, read_video, usual_rate
 from d2_plugin.recordings.recording import Recording
@@ -38,7 +44,6 @@ RIG_SIZE = 21
 """Cameras of the rig, cam00 to cam20. Scenes with fewer rows lack cameras, and their rows do not say which."""
 
 _NUMBERED_NAME = re.compile(r"cam(\d+)$")
-_EXTRACTED_NAME = re.compile(r"(?P<camera>.+)_\d+$")
 
 
 def is_n3dv(path: Path) -> bool:
@@ -168,15 +173,5 @@ def _extracted(path: Path) -> dict[str, FrameFiles]:
             return files
         if not partly and any(files.values()):
             partly = files
-    return partly or dict(_by_prefix(path / "images"))
-
-
-def _by_prefix(folder: Path) -> Iterator[tuple[str, FrameFiles]]:
-    images = sorted(file for file in folder.glob("*_*") if file.suffix.lower() in IMAGE_SUFFIXES)
-    prefixes: dict[str, list[Path]] = {}
-    for image in images:
-        match = _EXTRACTED_NAME.match(image.stem)
-        if match:
-            prefixes.setdefault(match["camera"], []).append(image)
-    for camera, paths in sorted(prefixes.items()):
-        yield camera, collect(paths)
+    loose = {file.name: file for file in (path / "images").glob("*_*") if file.suffix.lower() in IMAGE_SUFFIXES}
+    return partly or by_camera({name: shot for name in sorted(loose) if (shot := by_prefix(name))}, loose)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from operator import le
 
 import numpy as np
 
@@ -107,11 +108,13 @@ def solve_features(
     `wanted` are the cameras that must be settled, `corners` matches that are known beside those of descriptors.
     """
     known = {name: replace(intrinsics[name], T_camera_world=np.eye(4)) for name in features}
-    matched = _joined(match_all(features), corners or {})
+    matched = match_all(features)
+    for pair, more in (corners or {}).items():
+        matched[pair] = np.concatenate([matched[pair], more])
     known = known if focal is None else _likely_focal(matched, features, known)
     matches = verified(matched, features, known)
     tracks = join_matches(matches, tuple(features))
-    bundle = grown(matches, tracks, features, known)
+    bundle = _grown(matches, tracks, features, known)
     unsettled = list(wanted) if bundle is None else [name for name in wanted if name not in bundle.cameras]
     if bundle is None or unsettled:
         raise D2Error(f"the images do not settle where camera {', '.join(unsettled)} stands: {ADD}")
@@ -130,10 +133,6 @@ def _of_one_size(name: str, taken: Sequence[np.ndarray]) -> Sequence[np.ndarray]
     return taken
 
 
-def _joined(matches: Matches, more: Matches) -> Matches:
-    return {pair: np.concatenate([pairs, more[pair]]) if pair in more else pairs for pair, pairs in matches.items()}
-
-
 def _likely_focal(matches: Matches, features: Mapping[str, Features], known: Mapping[str, Camera]) -> dict[str, Camera]:
     """The cameras with the focal length, one for all, with which the most matches agree on a motion."""
 
@@ -150,12 +149,13 @@ def _likely_focal(matches: Matches, features: Mapping[str, Features], known: Map
     return cameras(float(max(FOCALS, key=agreeing)))
 
 
-def grown(
+def _grown(
     matches: Matches, tracks: Tracks, features: Mapping[str, Features], known: Mapping[str, Camera]
 ) -> Bundle | None:
     """The bundle with the most cameras, then the most observations; None where no two cameras make a start."""
     bundles = [_grow(pair, matches, tracks, features, known) for pair in _starts(matches, features, known)]
-    return max((bundle for bundle in bundles if bundle is not None), key=_worth, default=None)
+    made = [bundle for bundle in bundles if bundle is not None]
+    return max(made, key=lambda one: (len(one.cameras), int((one.tracks.seen >= 0).sum())), default=None)
 
 
 def _starts(matches: Matches, features: Mapping[str, Features], known: Mapping[str, Camera]) -> list[Pair]:
@@ -234,10 +234,6 @@ def _resect(camera: Camera, features: Features, seen: np.ndarray, points: np.nda
     return placed if np.isfinite(errors).any() else None
 
 
-def _worth(bundle: Bundle) -> tuple[int, int]:
-    return len(bundle.cameras), int((bundle.tracks.seen >= 0).sum())
-
-
 def _doubt(
     bundle: Bundle,
     tracks: Tracks,
@@ -271,7 +267,7 @@ def _halves(tracks: Tracks, features: Mapping[str, Features], cameras: Mapping[s
 def _refuse_unsure(
     doubt: Mapping[str, tuple[float, float]], focals: Mapping[str, float], wanted: Sequence[str]
 ) -> None:
-    unsure = [name for name in wanted if name not in doubt or not _sure(doubt[name])]
+    unsure = [name for name in wanted if name not in doubt or not all(map(le, doubt[name], LARGEST_DOUBT))]
     if unsure:
         raise D2Error(
             f"two halves of the images disagree about where camera {', '.join(unsure)} stands, so that is not known: "
@@ -284,7 +280,3 @@ def _refuse_unsure(
             f"two halves of the images disagree about the focal length of camera {', '.join(vague)} by {share:.0%}: "
             "say it (--focal PIXELS, --intrinsics FILE), or video a board and calibrate the lens with another tool"
         )
-
-
-def _sure(doubt: tuple[float, float]) -> bool:
-    return all(value <= limit for value, limit in zip(doubt, LARGEST_DOUBT, strict=True))
