@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.recordings.images import shrink_depth, shrink_image, shrink_mask
 from d2_plugin.recordings.recording import Camera, Recording, Source
 from d2_plugin.values import checked_arguments
+
+T = TypeVar("T")
 
 
 @checked_arguments
@@ -36,6 +39,11 @@ def select_frames(recording: Recording, frames: Iterable[int]) -> Recording:
         what = f"frame {missing[0]} is not in {recording.name}" if missing else f"no frame chosen from {recording.name}"
         raise D2Error(f"{what}: choose among frames {recording.frames[0]} to {recording.frames[-1]}")
     return replace(recording, frames=chosen)
+
+
+def spread(items: Sequence[T], most: int) -> list[T]:
+    """At most `most` of the items, evenly spread from the first to the last."""
+    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
 
 
 def downscale(recording: Recording, factor: int) -> Recording:

@@ -63,15 +63,8 @@ def test_known_cameras_come_back(name: str, tmp_path: Path) -> None:
         cameras = in_first_camera(cameras)
     for camera, known in zip(found.cameras, cameras, strict=True):
         assert_same(camera, known, points)
-
-
-@pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.format not in ("easymocap", "colmap")])
-def test_the_format_is_seen_from_the_content_not_the_name(name: str, tmp_path: Path) -> None:
-    case = CASES[name]
-    written = case.write(tmp_path, rig(case.coefficients, case.fisheye, case.names))
-    other = written.rename(tmp_path / "rig.txt")
-    sizes = None if case.sizes else dict.fromkeys(case.names, (1280, 720))
-    assert open_calibration(other, sizes).format == case.format
+    if case.format not in ("easymocap", "colmap"):  # the format is seen from the content, not the name
+        assert open_calibration(written.rename(tmp_path / "rig.txt"), sizes).format == case.format
 
 
 def test_a_folder_with_one_calibration_is_enough(tmp_path: Path) -> None:

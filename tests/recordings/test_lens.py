@@ -16,7 +16,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Source, open_recording
 from d2_plugin.recordings.cameras.camera import CalibratedCamera, pinhole
 from d2_plugin.recordings.cameras.lens import Lens, checked_lens
-from d2_plugin.recordings.cameras.undistort import UndistortedSource, black_share
+from d2_plugin.recordings.cameras.undistort import UndistortedSource, refuse_black
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
@@ -116,8 +116,8 @@ def test_rays_beyond_the_fold_of_the_polynomial_have_no_image(k1: float, k2: flo
 
 
 def test_the_share_of_black_pixels_is_measured() -> None:
-    assert black_share(of(Lens(K, "opencv", (-0.1,)))) == 0  # a barrel is cut, not widened
-    wide = black_share(of(Lens(K, "opencv", (0.4,))))
+    assert refuse_black(of(Lens(K, "opencv", (-0.1,)))) == 0  # a barrel is cut, not widened
+    wide = refuse_black(of(Lens(K, "opencv", (0.4,))))
     x, y = np.moveaxis(Lens(K, "opencv", (0.4,)).recorded_pixels(centres()), -1, 0)
     exact = 1 - ((x >= 0) & (x <= SIZE[0]) & (y >= 0) & (y <= SIZE[1])).mean()
     assert wide == pytest.approx(exact, abs=0.05)

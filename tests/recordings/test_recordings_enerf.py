@@ -106,15 +106,6 @@ def test_distortion_is_undone_under_either_name(tmp_path: Path, key: str) -> Non
     assert not any("undone" in note for note in open_recording(scene(tmp_path, key=None)).notes)
 
 
-def test_a_image_that_is_smaller_than_its_calibration_scales_it(tmp_path: Path) -> None:
-    path = scene(tmp_path)
-    with (path / "intri.yml").open("a") as file:
-        file.write(f"W_11: {2 * W}\nH_11: {2 * H}\n")
-    cameras = open_recording(path).cameras
-    np.testing.assert_allclose(cameras["11"].K, [[20.05, 0, 12.78], [0, 20.15, 6.9], [0, 0, 1]])
-    assert cameras["00"].K[0, 0] == 40.1
-
-
 def test_declared_depth_bounds_are_read(tmp_path: Path) -> None:
     path = scene(tmp_path)
     with (path / "extri.yml").open("a") as file:

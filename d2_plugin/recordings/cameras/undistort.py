@@ -138,20 +138,14 @@ def recorded_at(camera: CalibratedCamera, pixels: np.ndarray) -> np.ndarray:
     return np.asarray(inside.all(axis=-1))
 
 
-def black_share(camera: CalibratedCamera) -> float:
-    """Share of the undistorted image that was not recorded, from a coarse grid."""
-    places = camera.lens.recorded_pixels(_centres(camera.width, camera.height, COVERAGE_STEP))
-    inside = ((places >= 0) & (places <= (camera.width, camera.height))).all(axis=-1)
-    return 1 - float(inside.mean())
-
-
 def refuse_black(camera: CalibratedCamera) -> float:
     """The share of its undistorted images that a camera did not record.
 
     Raises:
         D2Error: its lens leaves hardly anything of them.
     """
-    share = black_share(camera)
+    places = camera.lens.recorded_pixels(_centres(camera.width, camera.height, COVERAGE_STEP))
+    share = 1 - float(((places >= 0) & (places <= (camera.width, camera.height))).all(axis=-1).mean())
     if share > MOST_BLACK:
         raise D2Error(
             f"undoing the lens distortion of camera {camera.name} leaves {1 - share:.0%} of its images, expected at "

@@ -73,22 +73,18 @@ def export_recording(
         refuse_skew(camera.name, camera.K)
     with whole_folder(path) as folder:
         written = WRITERS[layout](Export(recording, held_out, cloud, folder))
-        described = json_text(_description(recording, layout, written, held_out), EXPORT_FILE, indent=1)
+        description = {
+            "source": recording.name,
+            "layout": layout,
+            "cameras": written.cameras,
+            "frames": written.frames,
+            "calibrations": {name: _calibration(camera) for name, camera in recording.cameras.items()},
+            "fps": recording.fps,
+            "test_cameras": [written.cameras[name] for name in held_out if name in written.cameras],
+        }
         # Written last: a folder without it is half an export.
-        (folder / EXPORT_FILE).write_text(described + "\n")
+        (folder / EXPORT_FILE).write_text(json_text(description, EXPORT_FILE, indent=1) + "\n")
     return Path(path)
-
-
-def _description(recording: Recording, layout: str, written: Written, held_out: tuple[str, ...]) -> dict[str, Any]:
-    return {
-        "source": recording.name,
-        "layout": layout,
-        "cameras": written.cameras,
-        "frames": written.frames,
-        "calibrations": {name: _calibration(camera) for name, camera in recording.cameras.items()},
-        "fps": recording.fps,
-        "test_cameras": [written.cameras[name] for name in held_out if name in written.cameras],
-    }
 
 
 def _calibration(camera: Camera) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ SOUND_ERROR = 1e-3
 """Seconds at least that an offset from sound may be wrong: sound travels a third of a metre in that time."""
 
 DAY = 86_400
-"""Seconds after which a timecode begins anew."""
+"""Seconds after which a timecode begins anew, so that the shorter way around midnight counts."""
 
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.])(\d{2,3})$")
 
@@ -116,21 +117,15 @@ def timecode_seconds(text: str, rate: float) -> float | None:
     return number / rate
 
 
-def shortest(seconds: float) -> float:
-    """A difference of two times of day, the shorter way around midnight."""
-    return (seconds + DAY / 2) % DAY - DAY / 2
-
-
 def _of_timecodes(videos: Mapping[str, VideoFile]) -> list[Evidence]:
     read = {name: timecode_seconds(video.timecode or "", video.rate) for name, video in videos.items()}
     starts = {name: time - float(videos[name].times[0]) for name, time in read.items() if time is not None}
     error = {name: TIMECODE_ERROR / (videos[name].rate or 25.0) for name in starts}
-    return [
-        Evidence(
-            one, other, shortest(starts[other] - starts[one]), float(np.hypot(error[one], error[other])), "timecode"
-        )
-        for one, other in combinations(starts, 2)
-    ]
+    evidence = []
+    for one, other in combinations(starts, 2):
+        seconds = math.remainder(starts[other] - starts[one], DAY)
+        evidence.append(Evidence(one, other, seconds, float(np.hypot(error[one], error[other])), "timecode"))
+    return evidence
 
 
 def _of_sound(sounds: Mapping[str, Sound | None]) -> list[Evidence]:

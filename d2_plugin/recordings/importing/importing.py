@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,18 +52,11 @@ Report = Callable[[str], None]
 JPEG_QUALITY = 95
 
 
-@dataclass(frozen=True)
-class Imported:
-    """The recording, and how its cameras' clocks were brought together."""
-
-    recording: Recording
-    clocks: Mapping[str, Clock]
-    folder: Path
-
-
 @checked_arguments
-def import_videos(settings: ImportSettings, report: Report = lambda line: None) -> Imported:
-    """Import the videos, or continue an import that was stopped; a finished one is only read.
+def import_videos(settings: ImportSettings, report: Report = lambda line: None) -> tuple[Recording, dict[str, Clock]]:
+    """(the recording, when each camera started) of an import, or of one that was stopped and goes on.
+
+    A finished one is only read.
 
     Raises:
         D2Error: one sentence for whatever does not fit; nothing that was there is written over.
@@ -108,7 +101,7 @@ def import_videos(settings: ImportSettings, report: Report = lambda line: None) 
             write_table(folder / TABLE, {"cameras": recording.source.as_dict(), "recording": description}, VIDEOS)
         else:
             write_text(folder / "cameras.json", json_text(description, "cameras.json", indent=1) + "\n")
-    return Imported(recording, clocks, folder)
+    return recording, clocks
 
 
 def _known_rig(

@@ -28,6 +28,7 @@ from d2_plugin.recordings.importing.clocks import METHODS, Clock, common_clock, 
 from d2_plugin.recordings.importing.grid import grid_of
 from d2_plugin.recordings.importing.settings import ImportChoices, by_camera, finite
 from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
+from d2_plugin.recordings.selection import spread
 
 MOMENTS = 8
 """Images of each camera that are read, spread over the recording."""
@@ -193,7 +194,7 @@ def _images(
     """Undistorted images by camera: of moments that all share, or one of what stands still where none are known."""
     clocks = _clocks(videos, offsets)
     indices = _together(videos, clocks, moments) if clocks is not None else None
-    chosen = indices or {name: _spread(len(video.stamps), moments) for name, video in videos.items()}
+    chosen = indices or {name: spread(range(len(video.stamps)), moments) for name, video in videos.items()}
     frames = VideoFrames(videos, {name: dict(enumerate(places)) for name, places in chosen.items()})
     source = UndistortedSource(frames, {name: one for name, one in lenses.cameras.items() if one.lens.bends})
     images: dict[str, list[np.ndarray]] = {}
@@ -235,10 +236,5 @@ def _together(
     together = [frame for frame in frames if apart[frame] <= TOGETHER]
     if len(together) < min(3, len(frames)):
         return None
-    chosen = [together[place] for place in _spread(len(together), moments)]
+    chosen = spread(together, moments)
     return {name: [grid.indices[name][frame] for frame in chosen] for name in videos}
-
-
-def _spread(count: int, moments: int) -> list[int]:
-    places: list[int] = np.unique(np.linspace(0, count - 1, moments).round().astype(int)).tolist()
-    return places

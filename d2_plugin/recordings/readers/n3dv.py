@@ -66,10 +66,18 @@ def open_n3dv(path: Path, cameras: tuple[str, ...] | None = None, intersect: boo
     rows, notes = _assigned(_rows(path / POSES), listed, intersect, path / POSES)
     pictured = {name for name in listed if (videos[name].stat().st_size if videos else extracted[name])}
     names, missing = cameras_with_images(rows, pictured, cameras, intersect, path / POSES)
-    notes = (*notes, *missing)
-    if videos:
-        return _from_videos(path, rows, videos, names, notes)
-    return _from_images(path, rows, extracted, names, notes)
+    notes, where = (*notes, *missing, *_known_flaws(path, names)), str(path / POSES)
+    if not videos:
+        images = {name: extracted[name] for name in names}
+        frames, more = common_frames(images, path)
+        sizes = {name: image_size(images[name][frames[0]]) for name in names}
+        calibrated = {name: camera_from_row(rows[name], name, sizes[name], where) for name in names}
+        return assembled(path, calibrated, images, frames, N3DV_FPS, where, (*notes, *more))
+    files = {name: read_video(videos[name]) for name in names}
+    frames, more = common_frames({name: range(len(file.stamps)) for name, file in files.items()}, path)
+    pinholes = {name: camera_from_row(rows[name], name, files[name].size, where).pinhole(where) for name in names}
+    fps = checked_rate(usual_rate(files[names[0]].rate) or N3DV_FPS, str(videos[names[0]]))
+    return Recording(path.resolve().name, pinholes, frames, fps, VideoFrames(files), path, notes=(*notes, *more))
 
 
 def _assigned(
@@ -120,35 +128,6 @@ def _rows(path: Path) -> np.ndarray:
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise D2Error(f"{path} has shape {rows.shape}, expected [cameras, 17]: see the LLFF format")
     return rows.astype(np.float64)
-
-
-def _from_videos(
-    path: Path, rows: dict[str, np.ndarray], videos: dict[str, Path], names: list[str], notes: tuple[str, ...]
-) -> Recording:
-    files = {name: read_video(videos[name]) for name in names}
-    frames, frame_notes = common_frames({name: range(len(file.stamps)) for name, file in files.items()}, path)
-    where = str(path / POSES)
-    cameras = {name: camera_from_row(rows[name], name, files[name].size, where) for name in names}
-    return Recording(
-        name=path.resolve().name,
-        cameras={name: camera.pinhole(where) for name, camera in cameras.items()},
-        frames=frames,
-        fps=checked_rate(usual_rate(files[names[0]].rate) or N3DV_FPS, str(videos[names[0]])),
-        source=VideoFrames(files),
-        path=path,
-        notes=(*notes, *frame_notes, *_known_flaws(path, names)),
-    )
-
-
-def _from_images(
-    path: Path, rows: dict[str, np.ndarray], extracted: dict[str, FrameFiles], names: list[str], notes: tuple[str, ...]
-) -> Recording:
-    files = {name: extracted[name] for name in names}
-    frames, frame_notes = common_frames(files, path)
-    where = str(path / POSES)
-    cameras = {name: camera_from_row(rows[name], name, image_size(files[name][frames[0]]), where) for name in names}
-    notes = (*notes, *frame_notes, *_known_flaws(path, names))
-    return assembled(path, cameras, files, frames, N3DV_FPS, where, notes)
 
 
 def _known_flaws(path: Path, names: list[str]) -> tuple[str, ...]:

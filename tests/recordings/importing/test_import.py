@@ -144,10 +144,10 @@ def test_margins_of_undistorted_images_are_not_valid() -> None:
 def test_motion_alone_is_within_half_a_frame(plaza: Recording, tmp_path: Path) -> None:
     shootings = {name: replace(SHOOTINGS[name], offset=frames / FPS) for name, frames in zip(NAMES, (0, 3, -5, 6))}
     videos = video(plaza, tmp_path, shootings)
-    found = import_videos(settings_of(videos, tmp_path / "recording", exposure=False, images="videos"))
+    _, clocks = import_videos(settings_of(videos, tmp_path / "recording", exposure=False, images="videos"))
     for name, shot in shootings.items():
-        assert found.clocks[name].method == "motion"
-        assert abs(found.clocks[name].seconds - shot.offset) * FPS < 0.5
+        assert clocks[name].method == "motion"
+        assert abs(clocks[name].seconds - shot.offset) * FPS < 0.5
 
 
 def test_the_commands(filmed: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
