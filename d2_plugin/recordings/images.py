@@ -159,7 +159,12 @@ def _whole(path: Path) -> bytes:
     """The bytes of an image that says a possible size and was not cut off."""
     encoded = read_bytes(path, _REMEDY)
     _size(path, encoded)
-    _check_whole(path, encoded)
+    # Decoders fill in what is missing without a word.
+    if encoded.startswith(_PNG_SIGNATURE):
+        if not _png_is_whole(encoded):
+            raise _unreadable(path, " (cut off, or its checksums are wrong)")
+    elif b"\xff\xd9" not in encoded[-(1 << 16) :]:
+        raise _unreadable(path, " (cut off: its end marker is missing)")
     return encoded
 
 
@@ -182,15 +187,6 @@ def _size(path: Path, data: bytes) -> tuple[int, int]:
     if not 0 < width * height <= MOST_PIXELS:
         raise D2Error(f"image {shown_path(path)} says {width}x{height} pixels, at most {MOST_PIXELS}: {_REMEDY}")
     return width, height
-
-
-def _check_whole(path: Path, data: bytes) -> None:
-    """Refuse a file that was cut off or changed: decoders fill in what is missing, without a word."""
-    if data.startswith(_PNG_SIGNATURE):
-        if not _png_is_whole(data):
-            raise _unreadable(path, " (cut off, or its checksums are wrong)")
-    elif b"\xff\xd9" not in data[-(1 << 16) :]:
-        raise _unreadable(path, " (cut off: its end marker is missing)")
 
 
 def _png_is_whole(data: bytes) -> bool:

@@ -67,7 +67,6 @@ class _Pair(NamedTuple):
 
     one: str
     other: str
-    features: int
     distance: float
     missed: bool
 
@@ -292,4 +291,4 @@ def _pair(recording: Recording, one: str, other: str, features: Mapping[str, _Fe
         return None
     off = np.abs((epipolar_lines(a, b, p[inside]) * homogeneous(q[inside])).sum(axis=1))
     distance = float(np.median(off))
-    return _Pair(one, other, int(inside.sum()), distance, distance > max(MISSED * diagonal, 4.0))
+    return _Pair(one, other, distance, distance > max(MISSED * diagonal, 4.0))

@@ -30,9 +30,7 @@ from d2_plugin.recordings.export.transforms_json import write_transforms
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.values import checked_arguments
 
-Writer = Callable[[Export], Written]
-
-WRITERS: dict[str, Writer] = {
+WRITERS: dict[str, Callable[[Export], Written]] = {
     "transforms": write_transforms,
     "n3dv": write_n3dv,
     "multipleview": write_multipleview,

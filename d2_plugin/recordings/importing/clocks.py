@@ -58,12 +58,12 @@ class Evidence(NamedTuple):
     method: str
 
 
-Watching = Callable[[], Mapping[str, Watched]]
-"""Small images of all cameras; called only where motion must decide, since all videos are decoded for it."""
-
-
-def common_clock(videos: Mapping[str, VideoFile], how: str, watching: Watching) -> dict[str, Clock]:
+def common_clock(
+    videos: Mapping[str, VideoFile], how: str, watching: Callable[[], Mapping[str, Watched]]
+) -> dict[str, Clock]:
     """When each video's clock began, by the best evidence there is: timecode, then sound, then motion.
+
+    `watching` gives small images of all cameras; all videos are decoded for it, so only where motion must decide.
 
     Raises:
         D2Error: no evidence links a camera to the others, or the evidence contradicts itself.

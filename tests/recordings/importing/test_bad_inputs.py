@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recorded import Filmed, Shooting, video
+from recorded import Filmed, Shooting, video, write_video
 from stand_in_recordings import renamed
-from videos import write_video
 
 from d2_plugin.commands.cli import main
 from d2_plugin.recordings import Recording, open_recording, select_frames

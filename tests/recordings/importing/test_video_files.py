@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from videos import write_video
+from recorded import write_video
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.importing.video import Decoder, VideoFile, read_video

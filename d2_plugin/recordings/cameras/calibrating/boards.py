@@ -109,7 +109,14 @@ def board_matches(
     features: Mapping[str, Features], images: Mapping[str, Sequence[np.ndarray]], board: Board
 ) -> tuple[dict[str, Features], Matches]:
     """(the features with the corners of the board behind them, which corners two cameras saw at the same moment)."""
-    seen = {name: _corners_seen(board, taken) for name, taken in images.items()}
+    seen = {  # (moment, number of the corner) -> its pixel; moment 0 is what stands still
+        name: {
+            (moment, number): corner
+            for moment, image in enumerate(taken, start=1)
+            for number, corner in board.corners(image).items()
+        }
+        for name, taken in images.items()
+    }
     more = {name: _with_corners(features[name], corners) for name, corners in seen.items()}
     matches = {}
     for one, other in combinations(seen, 2):
@@ -118,12 +125,6 @@ def board_matches(
         pairs = [(begin + i, start + places[key]) for i, key in enumerate(seen[one]) if key in places]
         matches[one, other] = np.array(pairs, int).reshape(-1, 2)
     return {**features, **more}, matches
-
-
-def _corners_seen(board: Board, taken: Sequence[np.ndarray]) -> dict[tuple[int, int], np.ndarray]:
-    """(moment, number of the corner) -> its pixel."""
-    moments = [(moment, board.corners(image)) for moment, image in enumerate(taken, start=1)]  # 0 is the still
-    return {(moment, number): corner for moment, corners in moments for number, corner in corners.items()}
 
 
 def _with_corners(features: Features, corners: Mapping[tuple[int, int], np.ndarray]) -> Features:
