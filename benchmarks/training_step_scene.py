@@ -18,7 +18,7 @@ from d2_plugin.hooks import DepthLossConfig
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.rasterizer import Splats, rasterize
-from d2_plugin.recordings import Camera, Recording
+from d2_plugin.recordings import Camera, Recording, Source
 from d2_plugin.runs.start import TrainingFrames
 
 RASTER = "rasterizer"
@@ -32,7 +32,7 @@ WARM = 80
 """Views whose known pixels are found before a step is timed: a run finds them in its first round."""
 
 
-class Images:
+class Images(Source):
     """A source of images that are one texture, moved on with every frame: a decoder's work is not measured here."""
 
     def __init__(self, width: int, height: int) -> None:
@@ -44,12 +44,6 @@ class Images:
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3]."""
         return np.roll(self._texture, 3 * frame + 11 * int(camera), axis=1)
-
-    def depth(self, camera: str, frame: int) -> None:
-        """There is no truth."""
-
-    def mono(self, camera: str, frame: int) -> None:
-        """There are no maps."""
 
 
 class RandomPrior:

@@ -31,7 +31,7 @@ PAIR = ("03", "04")
 
 
 @dataclass(frozen=True)
-class Spoiled:
+class Spoiled(Source):
     """The images of one camera, brighter or of another instant."""
 
     source: Source

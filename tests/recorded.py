@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
-from videos import write_video
+import pytest
 
 from d2_plugin.recordings import Recording
 from d2_plugin.recordings.export.folder import described
 
 SOUND_RATE = 48_000
+UNIT = Fraction(1, 12_800)
+"""Of the time stamps."""
 
 
 @dataclass(frozen=True)
@@ -96,3 +99,54 @@ def video(
 def graded(image: np.ndarray, gain: tuple[float, float, float]) -> np.ndarray:
     """The image as a camera of another exposure has it."""
     return np.rint(image.astype(float) * gain).clip(0, 255).astype(np.uint8)
+
+
+def write_video(
+    path: Path,
+    images: Sequence[np.ndarray],
+    times: Sequence[float],
+    *,
+    turn: int = 0,
+    sound: np.ndarray | None = None,
+    timecode: str | None = None,
+) -> Path:
+    """An MP4 of images RGB uint8 [H, W, 3] shown at `times`, seconds.
+
+    `turn` is what a player does to show it upright, degrees counter-clockwise: the images are stored turned back.
+    """
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        rate = Fraction(round(1 / np.median(np.diff(times)))) if len(times) > 1 else Fraction(25)
+        stream = container.add_stream("libx264", rate=rate)
+        stored = [np.ascontiguousarray(np.rot90(image, -(turn // 90))) for image in images]
+        stream.height, stream.width = stored[0].shape[:2]
+        stream.pix_fmt, stream.options, stream.gop_size = "yuv420p", {"crf": "8", "preset": "veryfast"}, 12
+        stream.time_base = stream.codec_context.time_base = UNIT
+        if turn:
+            stream.set_display_rotation(turn)
+        if timecode is not None:
+            stream.metadata["timecode"] = timecode
+        track = None
+        if sound is not None:
+            track = container.add_stream("aac", rate=SOUND_RATE)
+            track.bit_rate, track.layout = 128_000, "mono"
+        for image, time in zip(stored, times, strict=True):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.pts, frame.time_base = round(time / float(UNIT)), UNIT
+            for packet in stream.encode(frame):
+                container.mux(packet)
+        for packet in stream.encode():
+            container.mux(packet)
+        if track is not None and sound is not None:
+            for packet in _encoded(av, track, sound):
+                container.mux(packet)
+    return path
+
+
+def _encoded(av, track, sound: np.ndarray):
+    for start in range(0, len(sound), 1024):
+        part = sound[None, start : start + 1024].astype(np.float32)
+        frame = av.AudioFrame.from_ndarray(np.ascontiguousarray(part), format="fltp", layout="mono")
+        frame.sample_rate, frame.pts, frame.time_base = SOUND_RATE, start, Fraction(1, SOUND_RATE)
+        yield from track.encode(frame)
+    yield from track.encode()

@@ -43,7 +43,10 @@ def write_layout(name: str, path: Path) -> Path:
     cloud = PointCloud(np.eye(3) + 2, np.full((3, 3), 0.5), np.zeros(3))
     export_recording(recording, name.removesuffix("_text"), path, cloud=cloud)
     if name == "colmap_text":
-        _as_text(path / "sparse" / "0")
+        model = path / "sparse" / "0"
+        pytest.importorskip("pycolmap").Reconstruction(str(model)).write_text(str(model))
+        for file in model.glob("*.bin"):
+            file.unlink()
     return path
 
 
@@ -66,36 +69,13 @@ def _technicolor(recording: Recording, path: Path) -> Path:
 
 
 def _enerf(recording: Recording, path: Path) -> Path:
-    cv2 = pytest.importorskip("cv2")
-    path.mkdir(parents=True, exist_ok=True)
-    files = {name: cv2.FileStorage(str(path / f"{name}.yml"), cv2.FILE_STORAGE_WRITE) for name in ("intri", "extri")}
+    for module in ("cv2", "yaml", "scipy"):
+        pytest.importorskip(module)
+    from calibration_writers import Known, easymocap
+
+    known, half = [], np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
     for name, camera in recording.cameras.items():
-        files["intri"].write(f"K_{name}", camera.K)
-        files["intri"].write(f"dist_{name}", np.array([[0.01, 0, 0, 0, 0]]))
-        files["extri"].write(f"R_{name}", cv2.Rodrigues(camera.T_camera_world[:3, :3])[0])
-        files["extri"].write(f"T_{name}", camera.T_camera_world[:3, 3:])
         _images(recording, name, path / "images" / name)
-    for file in files.values():
-        file.release()
-    return path
-
-
-def _as_text(folder: Path) -> None:
-    """The binary model of a folder as COLMAP writes it in text."""
-    from d2_plugin.recordings.cameras.formats.colmap import read_model
-
-    model = read_model(folder)
-    cameras = [
-        f"{number} {c.model} {c.width} {c.height} {' '.join(map(str, c.parameters))}"
-        for number, c in model.cameras.items()
-    ]
-    images = []
-    for number, image in model.images.items():
-        T = image.T_camera_world
-        pose = " ".join(f"{value:.17g}" for value in (*quaternion_of_rotation(T[:3, :3]), *T[:3, 3]))
-        images.append(f"{number} {pose} {image.camera} {image.name}\n")
-    (folder / "cameras.txt").write_text("# cameras\n" + "\n".join(cameras) + "\n")
-    (folder / "images.txt").write_text("# images\n" + "\n".join(images) + "\n")
-    (folder / "points3D.txt").write_text("# points\n1 0.5 0.5 3 10 20 30 0.7 1 0\n2 0.1 0.5 3 10 20 30 0.7 1 0\n")
-    for file in folder.glob("*.bin"):
-        file.unlink()
+        size, T = (camera.width, camera.height), camera.T_camera_world
+        known.append(Known(name, size, camera.K - half, (0.01, 0, 0, 0, 0), T[:3, :3], T[:3, 3]))
+    return easymocap(path, known)

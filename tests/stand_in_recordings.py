@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings import Recording, open_recording
+from d2_plugin.recordings import Recording, Source, open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.export.n3dv import llff_row
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -19,7 +19,7 @@ LLFF_DIGITS = 7
 
 
 @dataclass(frozen=True)
-class Smooth:
+class Smooth(Source):
     """Soft colours and a bright spot that moves by three pixels per frame: a video loses little of them."""
 
     width: int
@@ -33,14 +33,8 @@ class Smooth:
         spot = np.exp(-((x * self.height - 12 - 3 * frame) ** 2 + (y * self.height - self.height / 2) ** 2) / 72)
         return np.rint(soft + 90 * spot[..., None]).astype(np.uint8)
 
-    def depth(self, camera: str, frame: int) -> None:
-        """No true depth."""
 
-    def mono(self, camera: str, frame: int) -> None:
-        """No monocular maps."""
-
-
-class _Renamed:
+class _Renamed(Source):
     def __init__(self, recording: Recording, names: dict[str, str]) -> None:
         self.recording, self.names = recording, names
 

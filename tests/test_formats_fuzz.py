@@ -25,7 +25,7 @@ from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.reading import read_json
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.images import image_size, read_image, write_png
-from d2_plugin.recordings.importing.video import VideoFrames, video_header
+from d2_plugin.recordings.importing.video import VideoFrames, read_video
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.runs.report.report import collect, make_report
 from d2_plugin.store.exported import RenamedStore
@@ -80,8 +80,7 @@ def network(path: Path) -> np.ndarray:
 
 
 def video(path: Path) -> np.ndarray:
-    video_header(path)
-    return VideoFrames({"a": path}).image("a", 1)
+    return VideoFrames({"a": read_video(path)}).image("a", 1)
 
 
 def write_video(path: Path) -> None:

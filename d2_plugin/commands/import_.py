@@ -12,12 +12,11 @@ def form(words: list[str]) -> Form:
     from d2_plugin.recordings.importing.settings import ImportSettings
 
     def run(settings: ImportSettings) -> str:
-        imported = import_videos(settings, report=show)
-        recording = imported.recording
+        recording, _ = import_videos(settings, report=show)
         show_notes(recording.notes)
         sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
         shown = ", ".join(f"{width}x{height}" for width, height in sizes)
         about = f"{len(recording.cameras)} cameras, {len(recording.frames)} frames at {recording.fps:g} per second"
-        return f"{about}, {shown} pixels in {imported.folder}\n`d2 doctor {imported.folder}` says what it lacks"
+        return f"{about}, {shown} pixels in {settings.output}\n`d2 doctor {settings.output}` says what it lacks"
 
     return Form.of("d2 import", __doc__, ImportSettings, run)

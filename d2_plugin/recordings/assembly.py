@@ -22,8 +22,7 @@ from d2_plugin.reading import read_bytes, read_json
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.undistort import UndistortedSource, refuse_black
 from d2_plugin.recordings.files import FrameFiles, numbered_files
-from d2_plugin.recordings.images import read_image
-from d2_plugin.recordings.masks import MASK_FOLDERS, VALID_FOLDER, read_mask
+from d2_plugin.recordings.images import MASK_FOLDERS, VALID_FOLDER, read_image, read_mask
 from d2_plugin.recordings.recording import MonoKind, Recording, Source
 from d2_plugin.values import shown
 
@@ -37,7 +36,7 @@ REPLACE = "replace the file or remove it"
 
 
 @dataclass(frozen=True)
-class FolderSource:
+class FolderSource(Source):
     """Images, maps and masks as files by camera; every read opens one file."""
 
     images: Mapping[str, FrameFiles]

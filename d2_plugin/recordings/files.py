@@ -42,13 +42,8 @@ def numbered_files(folder: Path, suffixes: Iterable[str] = IMAGE_SUFFIXES) -> Fr
     Raises `D2Error` for a file without a number and for two files of one frame (1.png beside 00001.jpg).
     """
     wanted = tuple(suffixes)
-    return collect(path for path in sorted(folder.iterdir()) if path.suffix.lower() in wanted)
-
-
-def collect(paths: Iterable[Path]) -> FrameFiles:
-    """Frame number -> path; see `numbered_files`."""
     files: FrameFiles = {}
-    for path in paths:
+    for path in sorted(path for path in folder.iterdir() if path.suffix.lower() in wanted):
         number = _LAST_NUMBER.search(path.stem)
         if number is None:
             raise D2Error(f"{path} has no frame number in its name: name it like 00012{path.suffix}")

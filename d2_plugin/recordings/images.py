@@ -1,4 +1,4 @@
-"""Images on disk: read, measured without decoding, written without any extra package, and made smaller."""
+"""Images and masks on disk: read, measured without decoding, written without any extra package, and made smaller."""
 
 from __future__ import annotations
 
@@ -15,6 +15,14 @@ from d2_plugin.reading import opened, parsing, read_bytes, shown_path
 from d2_plugin.values import shown
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+MASK_FOLDERS = ("masks", "fmasks", "mask", "bgmtv2")
+"""Where masks of the foreground (people, or whatever the scene is about) may lie as FOLDER/<camera>/<frame>.png, in the
+order in which they are tried: this project's own, Diffuman4D's, EasyMocap's, ENeRF's and EasyVolcap's. White counts
+fully, grey in part."""
+
+VALID_FOLDER = "valid"
+"""valid/<camera>.png is black where nothing was recorded: undistorting leaves such pixels."""
 
 MOST_PIXELS = 1 << 28
 """Larger images are refused before anything is decoded: 16384 x 16384."""
@@ -85,6 +93,22 @@ def write_png(path: Path, image: np.ndarray) -> None:
     write(path, _PNG_SIGNATURE, *(_png_chunk(kind, body) for kind, body in chunks), synced=False)
 
 
+def read_mask(path: Path) -> np.ndarray:
+    """An image of any number of channels as one number per pixel, 0..1: its opacity where it has one."""
+    stored = read_numbers(path)
+    full = float(np.iinfo(stored.dtype).max) if np.issubdtype(stored.dtype, np.integer) else 1.0
+    if stored.ndim == 3:
+        stored = stored[..., 3] if stored.shape[2] == 4 else stored.max(axis=2)
+    return (stored.astype(np.float32) / np.float32(full)).clip(0, 1)
+
+
+def write_mask(path: Path, mask: np.ndarray) -> None:
+    """Write a mask [H, W] in 0..1, or of true and false, as a grey image."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    grey = np.rint(mask.astype(np.float32) * 255).astype(np.uint8)
+    write_png(path, np.repeat(grey[..., None], 3, axis=2))
+
+
 def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
     """RGB uint8 [H, W, 3] as a JPEG file."""
     cv2 = opencv("writing JPEG images")
@@ -135,7 +159,12 @@ def _whole(path: Path) -> bytes:
     """The bytes of an image that says a possible size and was not cut off."""
     encoded = read_bytes(path, _REMEDY)
     _size(path, encoded)
-    _check_whole(path, encoded)
+    # Decoders fill in what is missing without a word.
+    if encoded.startswith(_PNG_SIGNATURE):
+        if not _png_is_whole(encoded):
+            raise _unreadable(path, " (cut off, or its checksums are wrong)")
+    elif b"\xff\xd9" not in encoded[-(1 << 16) :]:
+        raise _unreadable(path, " (cut off: its end marker is missing)")
     return encoded
 
 
@@ -158,15 +187,6 @@ def _size(path: Path, data: bytes) -> tuple[int, int]:
     if not 0 < width * height <= MOST_PIXELS:
         raise D2Error(f"image {shown_path(path)} says {width}x{height} pixels, at most {MOST_PIXELS}: {_REMEDY}")
     return width, height
-
-
-def _check_whole(path: Path, data: bytes) -> None:
-    """Refuse a file that was cut off or changed: decoders fill in what is missing, without a word."""
-    if data.startswith(_PNG_SIGNATURE):
-        if not _png_is_whole(data):
-            raise _unreadable(path, " (cut off, or its checksums are wrong)")
-    elif b"\xff\xd9" not in data[-(1 << 16) :]:
-        raise _unreadable(path, " (cut off: its end marker is missing)")
 
 
 def _png_is_whole(data: bytes) -> bool:

@@ -90,12 +90,10 @@ def _recognised(folder: Path) -> str:
     for name, layout in LAYOUTS.items():
         if layout.recognised(folder):
             return name
-    if (folder / CALIBRATION).is_file():
-        raise D2Error(f"{folder} has {CALIBRATION} but no folder images: put images at images/<camera>/<frame>.png")
-    if (folder / "images").is_dir():
-        raise D2Error(f"{folder} has images but no {CALIBRATION}: write the calibration of every camera there")
+    missing = [part for part in (CALIBRATION, "images") if not (folder / part).exists()]
+    half = f", as it has no {missing[0]}" if len(missing) == 1 else ""
     others = ", ".join(name for name in LAYOUTS if name != "folder")
     raise D2Error(
-        f"{folder} is no recording: expected {CALIBRATION} and images/<camera>/<frame>.png, or the files of another "
-        f"layout ({others}; see docs/recordings.md)"
+        f"{folder} is no recording{half}: expected {CALIBRATION} and images/<camera>/<frame>.png, or the files of "
+        f"another layout ({others}; see docs/recordings.md)"
     )

@@ -1,34 +1,40 @@
-"""Which cameras to train on with two, three or four views, by data set.
+"""Which cameras train and which are scored, by name: this project's own lists and the published ones.
 
-The paper's own camera lists are in a supplement that is not public; those of other publications are in
-`d2_plugin.recordings.protocols`. N3DV's four views are those of 4C4D; the other lists are this project's choice. Each
-data set has one order: three views are the two views and one camera more, so scores over the number of views compare
-like with like.
+    preset:4                       four views of the data set that the recording is recognised as; 2 and 3 alike
+    preset:n3dv:4                  four views by the order of N3DV, whatever the recording is
+    protocol:ours-4                the same as preset:4
+    protocol:gc-4dgs-2  -3  -4     N3DV as GC-4DGS trains it (Li et al. 2025, github.com/liyw420/GC-4DGS, its script
+                                   scripts/pre_dynerf/pose2MVS.py): lists by scene, which count the recording's
+                                   cameras in the order of their names; the first camera, cam00, is scored
+    protocol:4c4d                  N3DV as 4C4D trains it (Zhou et al., CVPR 2026, github.com/yangzf-1023/4C4D, default
+                                   of scripts/n3v2blender.py): cam01 cam10 cam13 cam20; all others are scored
 
-    preset:4          four views of the data set that the recording is recognised as
-    preset:n3dv:4     four views by the order of N3DV, whatever the recording is
+A preset has one order by data set: three views are the two views and one camera more, so scores over the number of
+views compare like with like. Both published protocols use the first 300 frames at half size (1352 x 1014). The lists of
+the D²-4DGS paper are in a supplement that is not public: asking for them is refused with that sentence, since a list
+that was made up could be taken for the paper's.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.recordings import Recording, open_recording
-from d2_plugin.recordings.protocols import OURS, CameraSplit, is_protocol, protocol_split
-from d2_plugin.recordings.protocols import PREFIX as PROTOCOL
 from d2_plugin.recordings.readers.n3dv import UNSYNCHRONISED
 
 ALL = ("all",)
 """In place of camera names: every camera that is not held out trains."""
 
-PREFIX = "preset:"
-"""How a preset begins where camera names are expected."""
+PRESET, PROTOCOL = "preset:", "protocol:"
+"""How a text begins that stands in place of camera names."""
+
+PAPER = "d2-4dgs"
+"""Protocols whose names begin so are refused."""
 
 
-@dataclass(frozen=True)
-class Rig:
+class Rig(NamedTuple):
     """The training cameras of a data set, most important first; `spare` ones stand in for those that are missing."""
 
     order: tuple[str, ...]
@@ -63,38 +69,35 @@ RIGS = {
 
 VIEWS = (2, 3, 4)
 
+GC_4DGS: dict[str, dict[int, tuple[int, ...]]] = {
+    "cut_roasted_beef": {2: (6, 14), 3: (5, 10, 15), 4: (4, 8, 13, 16)},
+    "coffee_martini": {2: (5, 11), 3: (4, 9, 14), 4: (4, 6, 10, 14)},
+    "flame_salmon": {2: (6, 13), 3: (5, 9, 14), 4: (4, 8, 11, 15)},
+    "cook_spinach": {2: (7, 14), 3: (5, 11, 16), 4: (4, 9, 12, 17)},
+    "flame_steak": {2: (7, 14), 3: (5, 11, 16), 4: (4, 9, 12, 17)},
+    "sear_steak": {2: (7, 14), 3: (5, 11, 16), 4: (4, 9, 12, 17)},
+}
+"""Places of the training cameras, from 0, in the sorted list of a scene's cameras, by number of views."""
 
-def is_preset(text: str) -> bool:
-    """Whether what stands in place of camera names is a preset."""
-    return text.startswith(PREFIX)
+FEWEST_CAMERAS = 18
+"""Of a whole N3DV recording (coffee_martini): with fewer the places would mean other cameras."""
+
+CAMERAS_4C4D = ("cam01", "cam10", "cam13", "cam20")
+
+PROTOCOLS = {
+    **{f"gc-4dgs-{views}": "GC-4DGS, scripts/pre_dynerf/pose2MVS.py" for views in VIEWS},
+    "4c4d": "4C4D, default of scripts/n3v2blender.py",
+    **{f"ours-{views}": "this project's choice" for views in VIEWS},
+}
+"""By name, where each is written."""
 
 
-def camera_preset(recording: Recording, preset: str) -> CameraSplit:
-    """Training and test cameras for `preset`, "preset:VIEWS" or "preset:DATASET:VIEWS".
+class CameraSplit(NamedTuple):
+    """Cameras to train on and to score, and what is worth knowing about the choice."""
 
-    Test cameras are all others but those known to be unsynchronised, which are never trained on either.
-
-    Raises:
-        D2Error: not a preset, a recording that is none of the data sets, or too few of the cameras are there.
-    """
-    dataset, views = _parsed(recording, preset)
-    rig = RIGS[dataset]
-    unsound = [name for name in UNSYNCHRONISED.get(recording.name, ()) if name in recording.cameras]
-    sound = [name for name in recording.cameras if name not in unsound]
-    candidates = [name for name in (*rig.order[:views], *rig.order[views:], *rig.spare) if name in sound]
-    if len(candidates) < views:
-        raise D2Error(
-            f"{preset} needs {views} of {', '.join((*rig.order, *rig.spare))} and {recording.name} has "
-            f"{', '.join(recording.cameras)}: name the training cameras instead"
-        )
-    chosen = candidates[:views]
-    replaced = [name for name in rig.order[:views] if name not in chosen]
-    notes = [f"{preset} trains on {', '.join(sorted(chosen))} ({rig.source})"]
-    if replaced:
-        notes.append(f"{', '.join(replaced)} missing or unsynchronised: the next in order stand in")
-    if unsound:
-        notes.append(f"{', '.join(unsound)} known to be unsynchronised: neither trained on nor scored")
-    return CameraSplit(tuple(sorted(chosen)), tuple(name for name in sound if name not in chosen), tuple(notes))
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+    notes: tuple[str, ...]
 
 
 def resolve_cameras(
@@ -113,33 +116,67 @@ def resolve_cameras(
     if len(train) > 1:
         raise D2Error(f"'{', '.join(train)}' mixes a preset with other names: give the preset alone, or names only")
     recording = open_recording(path, intersect=True)
-    split = _split(recording, train[0])
+    split = camera_split(recording, train[0])
     chosen = split.test if test is None else test
     # A run reads the chosen cameras alone (see `Scene.open`), so only this note says what the others lack.
-    said_by_the_run = open_recording(path, cameras=dict.fromkeys((*split.train, *chosen))).notes
-    return split.train, chosen, (*split.notes, *(note for note in recording.notes if note not in said_by_the_run))
+    noted_by_the_run = open_recording(path, cameras=dict.fromkeys((*split.train, *chosen))).notes
+    return split.train, chosen, (*split.notes, *(note for note in recording.notes if note not in noted_by_the_run))
 
 
 def split_name(train: tuple[str, ...]) -> str | None:
     """The preset or protocol among what stands for training cameras, None where cameras are named."""
-    return next((text for text in train if is_preset(text) or is_protocol(text)), None)
+    return next((text for text in train if text.startswith((PRESET, PROTOCOL))), None)
 
 
-def _split(recording: Recording, text: str) -> CameraSplit:
-    if text.removeprefix(PROTOCOL) in OURS:
-        return camera_preset(recording, f"{PREFIX}{text.rpartition('-')[2]}")
-    return protocol_split(recording, text) if is_protocol(text) else camera_preset(recording, text)
+def camera_split(recording: Recording, text: str) -> CameraSplit:
+    """Training and test cameras for "preset:VIEWS", "preset:DATASET:VIEWS" or "protocol:NAME".
+
+    Raises:
+        D2Error: no such name, one whose lists are not public, a recording that it is not about, or too few cameras.
+    """
+    if not text.startswith(PROTOCOL):
+        return _preset(recording, text)
+    name = text.removeprefix(PROTOCOL)
+    if name.startswith(PAPER):
+        raise D2Error(
+            "the camera lists of the D²-4DGS paper are in a supplement that is not public: choose "
+            f"{', '.join(PROTOCOL + one for one in PROTOCOLS)}, or name the training cameras"
+        )
+    if name not in PROTOCOLS:
+        raise unknown_name("protocol", name, PROTOCOLS)
+    if name.startswith("ours-"):
+        return _preset(recording, f"{PRESET}{name[-1]}")
+    train = _trained_by_4c4d(recording) if name == "4c4d" else _trained_by_gc_4dgs(recording, int(name[-1]))
+    others = tuple(one for one in recording.cameras if one not in train)
+    test = others if name == "4c4d" else (min(recording.cameras),)
+    note = f"{text} trains on {', '.join(train)} and scores {', '.join(test)} ({PROTOCOLS[name]})"
+    return CameraSplit(train, test, (note,))
 
 
-def _parsed(recording: Recording, preset: str) -> tuple[str, int]:
-    """(data set, number of views) of a preset's text."""
-    *dataset, views = preset.removeprefix(PREFIX).split(":")
-    if not is_preset(preset) or len(dataset) > 1 or views not in map(str, VIEWS):
+def _preset(recording: Recording, preset: str) -> CameraSplit:
+    """Test cameras are all others but those known to be unsynchronised, which are never trained on either."""
+    *dataset, views_text = preset.removeprefix(PRESET).split(":")
+    if not preset.startswith(PRESET) or len(dataset) > 1 or views_text not in map(str, VIEWS):
         raise D2Error(f"'{preset}' is no camera preset: expected preset:2, preset:3, preset:4 or preset:n3dv:4")
-    name = dataset[0] if dataset else _recognised(recording)
+    name, views = dataset[0] if dataset else _recognised(recording), int(views_text)
     if name not in RIGS:
         raise unknown_name("data set", name, RIGS)
-    return name, int(views)
+    rig = RIGS[name]
+    unsound = [name for name in UNSYNCHRONISED.get(recording.name, ()) if name in recording.cameras]
+    sound = [name for name in recording.cameras if name not in unsound]
+    chosen = [name for name in (*rig.order, *rig.spare) if name in sound][:views]
+    if len(chosen) < views:
+        raise D2Error(
+            f"{preset} needs {views} of {', '.join((*rig.order, *rig.spare))} and {recording.name} has "
+            f"{', '.join(recording.cameras)}: name the training cameras instead"
+        )
+    replaced = [name for name in rig.order[:views] if name not in chosen]
+    notes = [f"{preset} trains on {', '.join(sorted(chosen))} ({rig.source})"]
+    if replaced:
+        notes.append(f"{', '.join(replaced)} missing or unsynchronised: the next in order stand in")
+    if unsound:
+        notes.append(f"{', '.join(unsound)} known to be unsynchronised: neither trained on nor scored")
+    return CameraSplit(tuple(sorted(chosen)), tuple(name for name in sound if name not in chosen), tuple(notes))
 
 
 def _recognised(recording: Recording) -> str:
@@ -152,3 +189,29 @@ def _recognised(recording: Recording) -> str:
         f"{recording.name} (layout {recording.layout}) is none of the data sets with presets ({', '.join(RIGS)}): "
         "name its training cameras, or the data set as in preset:n3dv:4"
     )
+
+
+def _trained_by_gc_4dgs(recording: Recording, views: int) -> tuple[str, ...]:
+    scene = next((name for name in GC_4DGS if name in recording.name.lower()), None)
+    if scene is None:
+        raise D2Error(
+            f"protocol:gc-4dgs-{views} has lists for {', '.join(GC_4DGS)} of N3DV and not for '{recording.name}': "
+            "name the folder after its scene, or choose protocol:ours-2, -3 or -4"
+        )
+    cameras = sorted(recording.cameras)
+    if len(cameras) < FEWEST_CAMERAS:
+        raise D2Error(
+            f"protocol:gc-4dgs-{views} counts the cameras of the whole recording, at least {FEWEST_CAMERAS}, and "
+            f"{recording.name} has {len(cameras)}: use the whole recording, or name the training cameras"
+        )
+    return tuple(cameras[place] for place in GC_4DGS[scene][views])
+
+
+def _trained_by_4c4d(recording: Recording) -> tuple[str, ...]:
+    absent = [name for name in CAMERAS_4C4D if name not in recording.cameras]
+    if absent:
+        raise D2Error(
+            f"protocol:4c4d trains on {', '.join(CAMERAS_4C4D)} and {recording.name} has no {', '.join(absent)}: "
+            "use the whole recording, or name the training cameras"
+        )
+    return CAMERAS_4C4D

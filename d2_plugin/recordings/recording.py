@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -39,31 +39,31 @@ class Exposure(NamedTuple):
     """Standard error."""
 
 
-class Source(Protocol):
+class Source:
     """Where images come from; each read opens one file (or decodes one video frame) and keeps nothing.
 
-    A source may also have `mask(camera, frame)` and `recorded(camera)`, see `MaskedSource`.
+    A source of its own inherits from this one and has at least `image`.
     """
 
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3]."""
+        raise NotImplementedError
 
     def depth(self, camera: str, frame: int) -> np.ndarray | None:
         """True planar z float32 [H, W], 0 where unknown, or None where there is no truth."""
+        return None
 
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
         """A monocular prediction float32 [h, w] lying on disk, or None."""
-
-
-@runtime_checkable
-class MaskedSource(Protocol):
-    """What a source has that knows of masks."""
+        return None
 
     def mask(self, camera: str, frame: int) -> np.ndarray | None:
-        """How much each pixel is foreground, float32 [H, W] in 0..1, or None where nobody says."""
+        """How much each pixel is foreground, float32 [H, W] in 0..1, or None where nothing is known of it."""
+        return None
 
     def recorded(self, camera: str) -> np.ndarray | None:
         """Which pixels were recorded, bool [H, W], or None where all were."""
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,13 +108,13 @@ class Recording:
     def mask(self, camera: str, frame: int) -> np.ndarray | None:
         """How much each pixel is foreground, float32 [H, W] in 0..1, or None where nobody says."""
         self._known(camera, frame)
-        mask = self.source.mask(camera, frame) if isinstance(self.source, MaskedSource) else None
+        mask = self.source.mask(camera, frame)
         return None if mask is None else self._sized(mask, camera, frame, "mask of frame")
 
     def recorded(self, camera: str) -> np.ndarray | None:
         """Which pixels were recorded, bool [H, W], or None where all were: undistorting leaves some without."""
         self._known(camera)
-        valid = self.source.recorded(camera) if isinstance(self.source, MaskedSource) else None
+        valid = self.source.recorded(camera)
         return None if valid is None else self._sized(valid, camera, self.frames[0], "valid region at frame")
 
     def seconds(self, frame: int, camera: str | None = None) -> float:

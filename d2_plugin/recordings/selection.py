@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.recordings.images import shrink_depth, shrink_image, shrink_mask
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.recording import Camera, Recording, Source
 from d2_plugin.values import checked_arguments
+
+T = TypeVar("T")
 
 
 @checked_arguments
@@ -38,6 +41,11 @@ def select_frames(recording: Recording, frames: Iterable[int]) -> Recording:
     return replace(recording, frames=chosen)
 
 
+def spread(items: Sequence[T], most: int) -> list[T]:
+    """At most `most` of the items, evenly spread from the first to the last."""
+    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
+
+
 def downscale(recording: Recording, factor: int) -> Recording:
     """The recording with every `factor` x `factor` block of pixels made one, and K made to fit.
 
@@ -53,7 +61,7 @@ def downscale(recording: Recording, factor: int) -> Recording:
 
 
 @dataclass(frozen=True)
-class DownscaledSource:
+class DownscaledSource(Source):
     """The images and depths of a recording, made smaller by a whole factor after their size was checked."""
 
     recording: Recording

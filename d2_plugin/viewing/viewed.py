@@ -18,7 +18,7 @@ from d2_plugin import registry
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.protocol import View
-from d2_plugin.recordings import Camera, Recording
+from d2_plugin.recordings import Camera, Recording, Source
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.store.store import PriorStore
@@ -182,7 +182,7 @@ def _camera_of(view: View) -> Camera:
 
 
 @dataclass(frozen=True)
-class KeptImages:
+class KeptImages(Source):
     """Where no recording is at hand: images as the depth prior kept them, grey where there is none."""
 
     cameras: dict[str, Camera]
@@ -198,9 +198,3 @@ class KeptImages:
             prior = None
         colors = None if prior is None or prior.colors is None else prior.colors.cpu().numpy()
         return colors if colors is not None and colors.shape == size else np.full(size, UNKNOWN_IMAGE, np.uint8)
-
-    def depth(self, camera: str, frame: int) -> None:
-        """No truth."""
-
-    def mono(self, camera: str, frame: int) -> None:
-        """No monocular maps."""

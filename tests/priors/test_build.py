@@ -32,7 +32,7 @@ SETTINGS = PriorSettings(stereo=StereoSettings(matcher="patchmatch"))
 
 
 @dataclass
-class Recorder:
+class Recorder(Source):
     """A source that passes on what another one has, notes what was read, and may be told to lie."""
 
     inner: Source

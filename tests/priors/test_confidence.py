@@ -15,7 +15,7 @@ from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.maps_on_disk import ConfidenceMaps, divided, planar
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.protocol import Label
-from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.recording import Recording, Source
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
@@ -114,7 +114,7 @@ def test_an_unknown_direction_is_refused(recording: Recording) -> None:
         built(recording)
 
 
-class Monocular:
+class Monocular(Source):
     """A source whose monocular map is given."""
 
     def __init__(self, room: Recording, map_: np.ndarray) -> None:

@@ -16,7 +16,7 @@ from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.recording import Recording, Source
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
@@ -25,7 +25,7 @@ pytest.importorskip("cv2")
 TRAINING = ["00", "02", "05", "07"]
 
 
-class WithTruth:
+class WithTruth(Source):
     """A source that has a truth of its own, or none."""
 
     def __init__(self, recording: Recording, truth: np.ndarray | None) -> None:

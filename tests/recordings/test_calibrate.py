@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import NOISE, arc, filmed, moved, seen_by, worst
+from rigs import NOISE, arc, moved, seen_by, worst
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.cameras.calibrating import SolvedRig, scaled_by_board
 from d2_plugin.recordings.cameras.calibrating.bundle import project
 from d2_plugin.recordings.cameras.calibrating.features import find_features
 from d2_plugin.recordings.cameras.calibrating.refine import RefinedPoses, refine_poses
@@ -18,7 +17,6 @@ from d2_plugin.recordings.cameras.calibrating.rig import aligned
 from d2_plugin.recordings.cameras.calibrating.solve import solve_features
 from d2_plugin.recordings.cameras.camera import rig_width, rigid
 from d2_plugin.recordings.cameras.epipolar import sampson
-from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
 cv2 = pytest.importorskip("cv2", reason="opencv is in the `calibration` extra")
@@ -124,38 +122,6 @@ class TestRigsFromImagesAlone:
         truth = arc(2)
         with pytest.raises(D2Error, match="add stills"):
             solve_features(seen_by(truth, things=80, wrong=1.0), truth, tuple(truth))
-
-
-class TestBoards:
-    """Scale from a board that was filmed."""
-
-    def solved(self) -> tuple[SolvedRig, dict[str, Camera]]:
-        truth = arc(3)
-        first = np.linalg.inv(truth["c0"].T_camera_world)
-        inside = {name: replace(camera, T_camera_world=camera.T_camera_world @ first) for name, camera in truth.items()}
-        nothing = dict.fromkeys(truth, 0.0)
-        rig = SolvedRig(inside, nothing, dict.fromkeys(truth, 0), dict.fromkeys(truth, (0.0, 0.0)))
-        return rig.times(0.37, "arbitrary"), truth
-
-    def test_a_charuco_board_says_how_large_the_world_is(self) -> None:
-        rig, truth = self.solved()
-        images, board = filmed(truth, 0.25)
-        scaled = scaled_by_board(rig, images, board)
-        assert rig_width(scaled.cameras.values()) == pytest.approx(rig_width(truth.values()), rel=0.003)
-        assert "sides of a board's squares" in scaled.scale
-
-    def test_a_board_that_one_camera_saw_says_nothing(self) -> None:
-        rig, truth = self.solved()
-        images, board = filmed(truth, 0.25)
-        blank = [np.full((480, 640, 3), 128, np.uint8)]
-        with pytest.raises(D2Error, match="saw 0 sides of the board's squares .* show the whole board"):
-            scaled_by_board(rig, {"c0": images["c0"], "c1": blank, "c2": blank}, board)
-
-    def test_an_unknown_dictionary(self) -> None:
-        rig, truth = self.solved()
-        images, board = filmed(truth, 0.25)
-        with pytest.raises(D2Error, match="unknown marker dictionary 'DICT_9'"):
-            scaled_by_board(rig, images, replace(board, dictionary="DICT_9"))
 
 
 def test_features_lie_where_things_are_not_a_quarter_of_a_pixel_beside() -> None:

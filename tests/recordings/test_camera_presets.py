@@ -1,52 +1,47 @@
-"""Camera presets: nested, without the cameras that are known to be unsound, and explained in words."""
+"""Cameras by the name of a preset or a published protocol: nested, sound, explained, and never made up."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
-from stand_in_recordings import five_cameras
+from stand_in_recordings import five_cameras, smooth_recording
 
+from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.presets import RIGS, VIEWS, camera_preset, is_preset, resolve_cameras
-from d2_plugin.recordings.recording import Recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.recordings import Recording, open_recording
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.presets import PROTOCOLS, RIGS, VIEWS, camera_split, resolve_cameras, split_name
 
+N3DV = tuple(f"cam{i:02d}" for i in range(21))
 NAMES = {
-    "n3dv": tuple(f"cam{i:02d}" for i in range(21)),
+    "n3dv": N3DV,
     "technicolor": tuple(f"{i:02d}" for i in range(16)),
     "enerf": tuple(f"{i:02d}" for i in range(18)),
 }
 
 
-def recording_of(layout: str, names: tuple[str, ...] | None = None, name: str = "scene", frames: int = 1) -> Recording:
-    model = synthetic_recording(cameras=2, frames=frames, width=16, height=12)
-    [camera, *_] = model.cameras.values()
-    cameras = {n: replace(camera, name=n) for n in names or NAMES[layout]}
-    return replace(model, cameras=cameras, layout=layout, name=name)
+def rig(name: str = "sear_steak", cameras: tuple[str, ...] = N3DV, layout: str = "n3dv") -> Recording:
+    return replace(smooth_recording(cameras, frames=1, width=32, height=24), name=name, layout=layout)
 
 
 @pytest.mark.parametrize("layout", list(RIGS))
 def test_more_views_are_fewer_views_and_one_camera_more(layout: str) -> None:
-    recording = recording_of(layout)
+    recording = rig("scene", NAMES[layout], layout)
     before: set[str] = set()
     for views in VIEWS:
-        split = camera_preset(recording, f"preset:{views}")
+        split = camera_split(recording, f"preset:{views}")
         assert len(split.train) == len(set(split.train)) == views
         assert before < set(split.train)
         assert set(split.train) | set(split.test) == set(NAMES[layout])
         assert not set(split.train) & set(split.test)
         before = set(split.train)
-
-
-@pytest.mark.parametrize("layout", list(RIGS))
-def test_what_dense_comparisons_test_with_is_never_trained_on(layout: str) -> None:
-    rig = RIGS[layout]
-    assert not {*rig.order, *rig.spare} & set(rig.held_out)
-    assert {*rig.order, *rig.spare, *rig.held_out} <= set(NAMES[layout])
-    assert set(rig.held_out) <= set(camera_preset(recording_of(layout), "preset:4").test)
+    one = RIGS[layout]  # what dense comparisons test with is never trained on
+    assert not {*one.order, *one.spare} & set(one.held_out)
+    assert {*one.order, *one.spare, *one.held_out} <= set(NAMES[layout])
+    assert set(one.held_out) <= set(split.test)
 
 
 @pytest.mark.parametrize(("layout", "title"), [("n3dv", "N3DV"), ("technicolor", "Technicolor"), ("enerf", "ENeRF")])
@@ -54,16 +49,11 @@ def test_the_documentation_has_the_same_lists(layout: str, title: str) -> None:
     page = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text()
     [line] = [line for line in page.splitlines() if line.startswith(f"| {title}")]
     two, three, four, spare = (cell.replace("+", " ").split() for cell in line.strip("|").split("|")[1:])
-    rig = RIGS[layout]
-    assert (tuple(two + three + four), tuple(spare)) == (rig.order, rig.spare)
-
-
-def test_four_views_of_n3dv_are_those_of_4c4d() -> None:
-    assert camera_preset(recording_of("n3dv"), "preset:4").train == ("cam01", "cam10", "cam13", "cam20")
+    assert (tuple(two + three + four), tuple(spare)) == (RIGS[layout].order, RIGS[layout].spare)
 
 
 def test_the_unsynchronised_camera_is_neither_trained_on_nor_scored() -> None:
-    split = camera_preset(recording_of("n3dv", name="coffee_martini"), "preset:4")
+    split = camera_split(rig("coffee_martini"), "preset:4")
     assert split.train == ("cam01", "cam10", "cam12", "cam20")
     assert "cam13" not in split.test
     assert any("cam13 known to be unsynchronised" in note for note in split.notes)
@@ -71,37 +61,10 @@ def test_the_unsynchronised_camera_is_neither_trained_on_nor_scored() -> None:
 
 
 def test_a_recording_of_five_cameras_has_a_preset(tmp_path: Path) -> None:
-    recording = open_recording(five_cameras(tmp_path / "scene"))  # read as a folder, an N3DV scene by its names
-    split = camera_preset(recording, "preset:4")
+    path = five_cameras(tmp_path / "scene")  # read as a folder, an N3DV scene by its names
+    split = camera_split(open_recording(path), "preset:4")
     assert (split.train, split.test) == (("cam03", "cam05", "cam08", "cam14"), ("cam00",))
     assert any("cam01, cam13, cam10, cam20 missing" in note for note in split.notes)
-
-
-def test_a_data_set_can_be_named() -> None:
-    recording = recording_of("folder", NAMES["technicolor"])
-    assert camera_preset(recording, "preset:technicolor:2").train == ("00", "15")
-    with pytest.raises(D2Error, match="none of the data sets with presets .*preset:n3dv:4"):
-        camera_preset(recording, "preset:2")
-    with pytest.raises(D2Error, match="unknown data set 'n3d'.*did you mean 'n3dv'"):
-        camera_preset(recording, "preset:n3d:2")
-
-
-@pytest.mark.parametrize("text", ["preset:5", "preset:", "preset:four", "preset:a:b:4", "cam01"])
-def test_texts_that_are_no_preset_are_refused(text: str) -> None:
-    with pytest.raises(D2Error, match="is no camera preset: expected preset:2"):
-        camera_preset(recording_of("n3dv"), text)
-    assert is_preset(text) == text.startswith("preset:")
-
-
-def test_too_few_known_cameras_are_refused() -> None:
-    with pytest.raises(
-        D2Error, match=r"needs 3 of cam01, cam13.* and scene has cam00, cam01, cam02: name the training"
-    ):
-        camera_preset(recording_of("n3dv", ("cam00", "cam01", "cam02")), "preset:3")
-
-
-def test_a_run_is_given_names_in_place_of_a_preset(tmp_path: Path) -> None:
-    path = five_cameras(tmp_path / "scene")
     train, test, notes = resolve_cameras(path, ("preset:2",))
     assert (train, test) == (("cam03", "cam14"), ("cam00", "cam05", "cam08"))
     assert notes
@@ -109,3 +72,81 @@ def test_a_run_is_given_names_in_place_of_a_preset(tmp_path: Path) -> None:
     assert resolve_cameras("nowhere", ("a", "b")) == (("a", "b"), None, ())
     with pytest.raises(D2Error, match="mixes a preset with other names"):
         resolve_cameras(path, ("preset:2", "cam00"))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "train"),
+    [
+        ("scene", "preset:4", "cam01 cam10 cam13 cam20"),  # those of 4C4D
+        ("sear_steak", "protocol:4c4d", "cam01 cam10 cam13 cam20"),
+        ("sear_steak", "protocol:gc-4dgs-4", "cam04 cam09 cam12 cam17"),
+        ("flame_salmon_1", "protocol:gc-4dgs-3", "cam05 cam09 cam14"),
+    ],
+)
+def test_lists_are_those_of_their_source(name: str, text: str, train: str) -> None:
+    split = camera_split(rig(name), text)
+    assert split.train == tuple(train.split())
+    others = {"cam00"} if "gc-4dgs" in text else set(N3DV) - set(split.train)
+    assert set(split.test) == others
+
+
+def test_gc_4dgs_counts_places_and_not_names() -> None:
+    beef = rig("cut_roasted_beef", tuple(name for name in N3DV if name != "cam03"))
+    assert camera_split(beef, "protocol:gc-4dgs-2").train == ("cam07", "cam15")
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_a_protocol_says_its_source_and_never_trains_on_what_it_scores(name: str) -> None:
+    split = camera_split(rig(), f"protocol:{name}")
+    assert not set(split.train) & set(split.test)
+    assert PROTOCOLS[name] in split.notes[0]
+    if name.startswith("ours"):
+        assert split == camera_split(rig(), f"preset:{name[-1]}")
+
+
+SIXTEEN = rig("scene", NAMES["technicolor"], "folder")
+NO_PRESET = "is no camera preset: expected preset:2"
+
+
+@pytest.mark.parametrize(
+    ("recording", "text", "message"),
+    [
+        *((rig(), text, NO_PRESET) for text in ("preset:5", "preset:", "preset:four", "preset:a:b:4", "cam01")),
+        (SIXTEEN, "preset:2", "none of the data sets with presets .*preset:n3dv:4"),
+        (SIXTEEN, "preset:n3d:2", "unknown data set 'n3d'.*did you mean 'n3dv'"),
+        (rig("scene", N3DV[:3]), "preset:3", "needs 3 of cam01, cam13.* and scene has cam00, cam01, cam02: name the"),
+        (rig(), "protocol:d2-4dgs-4", "not public.*protocol:ours-4"),
+        (rig(cameras=N3DV[:5]), "protocol:gc-4dgs-4", "whole recording"),
+        (rig(cameras=N3DV[:12]), "protocol:4c4d", "no cam13, cam20"),
+        (rig("den"), "protocol:gc-4dgs-3", "not for 'den'"),
+        (rig(), "protocol:gc-4dgs4", "did you mean"),
+    ],
+    ids=lambda one: one if isinstance(one, str) else "",
+)
+def test_what_fits_no_list_is_refused(recording: Recording, text: str, message: str) -> None:
+    with pytest.raises(D2Error, match=message):
+        camera_split(recording, text)
+
+
+def test_a_data_set_can_be_named() -> None:
+    assert camera_split(SIXTEEN, "preset:technicolor:2").train == ("00", "15")
+
+
+def test_the_name_of_a_split_is_known_and_camera_names_have_none() -> None:
+    assert split_name(("protocol:4c4d",)) == "protocol:4c4d"
+    assert split_name(("preset:4",)) == "preset:4"
+    assert split_name(("00", "02")) is None
+
+
+def test_results_carry_the_protocols_name(tmp_path: Path) -> None:
+    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+    path = save_recording(rig(), tmp_path / "sear_steak")
+    command = ["train", str(path), "--train-cameras", "protocol:4c4d", "--test-cameras", "cam00", "--hooks", "none"]
+    assert main([*command, "--iterations", "1", "--output", str(tmp_path / "run")]) == 0
+    assert '"protocol": "protocol:4c4d"' in (tmp_path / "run" / "metrics.json").read_text()
+    from d2_plugin.runs.report.run_folders import training_rows
+
+    (row,) = training_rows([tmp_path / "run"])
+    assert row["protocol"] == "protocol:4c4d"
+    assert row["case"] == "sear_steak, 4 views, protocol:4c4d"
+    assert np.isfinite(row["scores"]["psnr"])

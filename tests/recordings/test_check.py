@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings import Recording, open_recording, select_cameras
+from d2_plugin.recordings import Recording, Source, open_recording, select_cameras
 from d2_plugin.recordings.cameras.camera import checked_camera
 from d2_plugin.recordings.cameras.check import check_recording
 from d2_plugin.recordings.checks import memory as memory_module
@@ -85,13 +85,9 @@ def test_a_rig_far_from_the_origin_is_named(room: Recording) -> None:
 
 
 def test_images_of_one_colour_are_named(room: Recording) -> None:
-    class Dark:
+    class Dark(Source):
         def image(self, camera: str, frame: int) -> np.ndarray:
             return np.full((H, W, 3), 200 * frame, np.uint8)
-
-        def depth(self, camera: str, frame: int) -> None: ...
-
-        def mono(self, camera: str, frame: int) -> None: ...
 
     name = next(iter(room.cameras))
     notes = notes_of(replace(room, source=Dark()))

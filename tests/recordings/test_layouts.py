@@ -55,7 +55,7 @@ def test_a_reader_is_two_functions_and_one_row(tmp_path: Path, monkeypatch: pyte
         assert (recording.layout, recording.frames) == ("tiny", (4,))
         assert recording.cameras["only"].K[0, 0] == 10
         assert (recording.image("only", 4) == 4).all()
-    with pytest.raises(D2Error, match=r"files of another layout \(.*colmap, tiny; see"):
+    with pytest.raises(D2Error, match=r"of another layout \(.*colmap, tiny; see"):
         open_recording(tmp_path.parent)
 
 

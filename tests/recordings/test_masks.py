@@ -20,7 +20,7 @@ from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.cameras.undistort import Undistortion
 from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.masks import MASK_FOLDERS
+from d2_plugin.recordings.images import MASK_FOLDERS
 from d2_plugin.runs.evaluation import evaluate
 from d2_plugin.runs.start import TrainingFrames
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import zlib  # noqa: F401  before pycolmap, see d2_plugin.priors.colmap.points
 from pathlib import Path
 
@@ -167,19 +166,6 @@ def test_models_without_undistortion_are_refused(tmp_path: Path) -> None:
     two_cameras(tmp_path)
     (tmp_path / "sparse" / "0" / "cameras.txt").write_text("1 FOV 32 24 30 31 15.5 12.25 0.9\n")
     refused(tmp_path, "model FOV with 5 parameters, which cannot be undistorted here: run `colmap image_undistorter`")
-
-
-def test_cameras_without_images_are_named_and_left_out_only_when_asked(tmp_path: Path) -> None:
-    two_cameras(tmp_path)
-    for file in (tmp_path / "images").glob("cam10*"):
-        file.unlink()
-    refused(tmp_path, "camera cam10 of .*0 has no image")
-    recording = open_recording(tmp_path, intersect=True)
-    assert list(recording.cameras) == ["cam01"]
-    assert any("cam10" in note for note in recording.notes)
-    refused(tmp_path, "unknown camera 'cam1'.*did you mean", cameras=["cam1"])
-    shutil.rmtree(tmp_path / "images")
-    refused(tmp_path, "is no folder", layout="colmap")
 
 
 def test_damaged_models_are_refused_by_file(original: Recording, tmp_path: Path) -> None:

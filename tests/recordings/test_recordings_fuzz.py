@@ -101,9 +101,9 @@ def test_two_thousand_damaged_files(written: Callable, name: str, tmp_path: Path
 def test_a_focal_length_that_cannot_be_is_named(place: int, number: str, message: str, tmp_path: Path) -> None:
     path = write_layout("colmap_text", tmp_path / "recording")
     cameras = path / "sparse" / "0" / "cameras.txt"
-    comment, first, *rest = cameras.read_text().splitlines()
+    *comments, first, last = cameras.read_text().splitlines()
     words = first.split()
     words[place] = number
-    cameras.write_text("\n".join([comment, " ".join(words), *rest]))
+    cameras.write_text("\n".join([*comments, " ".join(words), last]))
     with pytest.raises(D2Error, match=f"camera .* {message}"):
         open_recording(path)

@@ -94,9 +94,14 @@ class TestBoards:
         for taken in half.values():
             taken[0][:, 320:] = 128
         rig = solve_features(seen_by(truth), truth, tuple(truth))
-        assert rig_width(scaled_by_board(rig, half, board).cameras.values()) == pytest.approx(
-            rig_width(truth.values()), rel=0.01
-        )
+        scaled = scaled_by_board(rig, half, board)
+        assert rig_width(scaled.cameras.values()) == pytest.approx(rig_width(truth.values()), rel=0.01)
+        assert "sides of a board's squares" in scaled.scale
+        blank = [np.full((480, 640, 3), 128, np.uint8)]
+        with pytest.raises(D2Error, match="saw 0 sides of the board's squares .* show the whole board"):
+            scaled_by_board(rig, {"c0": half["c0"], "c1": blank, "c2": blank}, board)
+        with pytest.raises(D2Error, match="unknown marker dictionary 'DICT_9'"):
+            scaled_by_board(rig, half, replace(board, dictionary="DICT_9"))
         with pytest.raises(D2Error, match="saw 0 sides of the board's squares .* show the whole board"):
             scaled_by_board(rig, half, replace(board, marker=None))
 

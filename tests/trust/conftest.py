@@ -74,7 +74,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def filmed(folder: Path) -> Path:
     """Videos of the first two cameras of the recording beside it, six frames each."""
-    from videos import write_video
+    from recorded import write_video
 
     recording = synthetic_recording(cameras=2, held_out=1, frames=6, width=96, height=54, arc_degrees=15)
     (folder / "videos").mkdir()

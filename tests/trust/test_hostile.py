@@ -197,7 +197,7 @@ def imported(place: Path, videos: Path, output: Path) -> Words:
 @pytest.fixture(scope="module")
 def place(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """videos/ with a video of each camera and cameras.json, a filmed `room` and a trained `run`."""
-    from videos import write_video
+    from recorded import write_video
 
     folder = tmp_path_factory.mktemp("newer")
     filmed = synthetic_recording(cameras=2, held_out=0, frames=12, width=96, height=54, arc_degrees=15)

@@ -11,6 +11,7 @@ import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import eq
 from pathlib import Path
 
 import numpy as np
@@ -159,9 +160,7 @@ def _matched(
 ) -> tuple[list[CalibratedCamera], tuple[str, ...]]:
     """(the cameras under the names of the recordings and in their order, notes)."""
     by_name = {camera.name: camera for camera in cameras}
-    pairs = next(
-        (pairs for same in (_equal, _holds, _same_number) if (pairs := _pairs(by_name, recordings, same))), None
-    )
+    pairs = next((pairs for same in (eq, _holds, _same_number) if (pairs := _pairs(by_name, recordings, same))), None)
     if pairs is not None:
         return [replace(by_name[pairs[name]], name=name) for name in recordings], ()
     if len(cameras) != len(recordings):
@@ -188,10 +187,6 @@ def _pairs(
     candidates = {name: [camera for camera in cameras if same(camera, name)] for name in recordings}
     pairs = {name: ones[0] for name, ones in candidates.items() if len(ones) == 1}
     return pairs if len(set(pairs.values())) == len(recordings) else None
-
-
-def _equal(camera: str, recording: str) -> bool:
-    return camera == recording
 
 
 def _holds(camera: str, recording: str) -> bool:

@@ -171,7 +171,8 @@ def checked_camera(
             f"sees {across:.3g} x {down:.3g} degrees, expected {FIELD_OF_VIEW[0]:g} to {FIELD_OF_VIEW[1]:g} "
             "(are the focal lengths in pixels of these images?)"
         )
-    oblique = off_axis(K, size)
+    middle = (np.array(size) / 2 - K[:2, 2]) / K[[0, 1], [0, 1]]
+    oblique = float(np.rad2deg(np.arctan(np.hypot(*middle))))
     if oblique > MOST_OBLIQUE:
         raise refuse(
             f"has its principal point at ({K[0, 2]:g}, {K[1, 2]:g}), {oblique:.1f} degrees from the middle of the "
@@ -191,12 +192,6 @@ def field_of_view(K: np.ndarray, size: tuple[int, int]) -> tuple[float, float]:
     angles = np.arctan2(edges - K[:2, 2], K[[0, 1], [0, 1]])
     across, down = np.rad2deg(angles[1] - angles[0])
     return float(across), float(down)
-
-
-def off_axis(K: np.ndarray, size: tuple[int, int]) -> float:
-    """Angle between a camera's axis and the ray through the middle of its image, degrees."""
-    middle = (np.array(size) / 2 - K[:2, 2]) / K[[0, 1], [0, 1]]
-    return float(np.rad2deg(np.arctan(np.hypot(*middle))))
 
 
 def check_name(name: str, where: str) -> None:

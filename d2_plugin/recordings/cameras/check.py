@@ -20,6 +20,7 @@ from d2_plugin.recordings.cameras.camera import field_of_view
 from d2_plugin.recordings.cameras.epipolar import epipolar_lines, homogeneous, sift_features
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.selection import spread
 
 USUAL_VIEW = (5.0, 170.0)
 """Degrees across or down that a camera usually sees."""
@@ -66,7 +67,6 @@ class _Pair(NamedTuple):
 
     one: str
     other: str
-    features: int
     distance: float
     missed: bool
 
@@ -151,9 +151,7 @@ def _frames(recording: Recording, cameras: int) -> tuple[int, ...]:
     """Frames to look at, spread over the recording."""
     pixels = max(camera.width * camera.height for camera in recording.cameras.values())
     count = min(max(LOOKED_AT // (pixels * max(cameras, 1)), 2), len(recording.frames))
-    return tuple(
-        recording.frames[i] for i in np.unique(np.linspace(0, len(recording.frames) - 1, count).round().astype(int))
-    )
+    return tuple(spread(recording.frames, count))
 
 
 def _plain(recording: Recording, cameras: Sequence[str]) -> Iterator[str]:
@@ -293,4 +291,4 @@ def _pair(recording: Recording, one: str, other: str, features: Mapping[str, _Fe
         return None
     off = np.abs((epipolar_lines(a, b, p[inside]) * homogeneous(q[inside])).sum(axis=1))
     distance = float(np.median(off))
-    return _Pair(one, other, int(inside.sum()), distance, distance > max(MISSED * diagonal, 4.0))
+    return _Pair(one, other, distance, distance > max(MISSED * diagonal, 4.0))

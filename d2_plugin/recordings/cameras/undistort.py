@@ -15,7 +15,7 @@ import numpy as np
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.images import opencv
-from d2_plugin.recordings.recording import Camera, MaskedSource, Source
+from d2_plugin.recordings.recording import Camera, Source
 from d2_plugin.values import checked_arguments
 
 KEPT_MAPS = 8
@@ -76,7 +76,7 @@ class Undistortion:
 
 
 @dataclass(frozen=True)
-class UndistortedSource:
+class UndistortedSource(Source):
     """The images of `source` as pinhole cameras would have taken them; maps on disk fit these already."""
 
     source: Source
@@ -98,12 +98,12 @@ class UndistortedSource:
 
     def mask(self, camera: str, frame: int) -> np.ndarray | None:
         """The mask of the recorded image, undistorted with it, or None."""
-        mask = self.source.mask(camera, frame) if isinstance(self.source, MaskedSource) else None
+        mask = self.source.mask(camera, frame)
         return None if mask is None else self._undone(camera, mask)
 
     def recorded(self, camera: str) -> np.ndarray | None:
         """Which pixels [H, W] of the undistorted image were recorded, or None where all were."""
-        valid = self.source.recorded(camera) if isinstance(self.source, MaskedSource) else None
+        valid = self.source.recorded(camera)
         if camera not in self.cameras:
             return valid
         here = self._undistortion(camera).valid
@@ -138,20 +138,14 @@ def recorded_at(camera: CalibratedCamera, pixels: np.ndarray) -> np.ndarray:
     return np.asarray(inside.all(axis=-1))
 
 
-def black_share(camera: CalibratedCamera) -> float:
-    """Share of the undistorted image that was not recorded, from a coarse grid."""
-    places = camera.lens.recorded_pixels(_centres(camera.width, camera.height, COVERAGE_STEP))
-    inside = ((places >= 0) & (places <= (camera.width, camera.height))).all(axis=-1)
-    return 1 - float(inside.mean())
-
-
 def refuse_black(camera: CalibratedCamera) -> float:
     """The share of its undistorted images that a camera did not record.
 
     Raises:
         D2Error: its lens leaves hardly anything of them.
     """
-    share = black_share(camera)
+    places = camera.lens.recorded_pixels(_centres(camera.width, camera.height, COVERAGE_STEP))
+    share = 1 - float(((places >= 0) & (places <= (camera.width, camera.height))).all(axis=-1).mean())
     if share > MOST_BLACK:
         raise D2Error(
             f"undoing the lens distortion of camera {camera.name} leaves {1 - share:.0%} of its images, expected at "

@@ -15,8 +15,6 @@ from d2_plugin.recordings.recording import Camera, Recording
 FAR_APART = 35.0
 """Degrees between a camera and its nearest neighbour from which stereo verifies little: see docs/your-recording.md."""
 
-FEW_FRAMES = 2
-
 SHORT_SIDE = 180
 """Images with a shorter side have little to match."""
 
@@ -55,7 +53,10 @@ def _cameras(rig: Sequence[Camera]) -> Iterator[Finding]:
     if len(rig) < 2:
         yield Finding("lacks", "cameras", "one camera: without a second one nothing can be triangulated or verified")
         return
-    apart = neighbour_angles(rig)
+    axes = np.stack([camera.T_camera_world[2, :3] for camera in rig])
+    angles = np.rad2deg(np.arccos(np.clip(axes @ axes.T, -1, 1)))
+    np.fill_diagonal(angles, 180.0)
+    apart = angles.min(axis=1)  # degrees from each camera's optical axis to the nearest other camera's
     yield Finding(
         "has", "cameras", f"{len(rig)}, {min(apart):.0f} to {max(apart):.0f} degrees from the nearest other one"
     )
@@ -66,22 +67,13 @@ def _cameras(rig: Sequence[Camera]) -> Iterator[Finding]:
         )
 
 
-def neighbour_angles(rig: Sequence[Camera]) -> list[float]:
-    """Degrees from each camera's optical axis to the nearest other camera's."""
-    axes = np.stack([camera.T_camera_world[2, :3] for camera in rig])
-    angles = np.rad2deg(np.arccos(np.clip(axes @ axes.T, -1, 1)))
-    np.fill_diagonal(angles, 180.0)
-    nearest: list[float] = angles.min(axis=1).tolist()
-    return nearest
-
-
 def _images(recording: Recording) -> Iterator[Finding]:
     sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
     shown = ", ".join(f"{width}x{height}" for width, height in sizes)
     yield Finding("has", "images", f"{len(recording.frames)} frames at {recording.fps:g} per second, {shown} pixels")
     if min(min(size) for size in sizes) < SHORT_SIDE:
         yield Finding("lacks", "resolution", f"a side below {SHORT_SIDE} pixels: import with a larger --scale")
-    if len(recording.frames) < FEW_FRAMES:
+    if len(recording.frames) < 2:
         yield Finding("lacks", "time", "one instant: the scene will not move; import more with --times or --frames")
 
 

@@ -41,16 +41,12 @@ def check_memory(recording: Recording, cameras: Sequence[str]) -> None:
     Raises:
         D2Error: the estimate is above what is available.
     """
-    available, needed = available_bytes(), needed_bytes(recording, cameras)
-    if available is None or needed <= available:
-        return
-    fits = [scale for scale in SCALES if needed_bytes(recording, cameras, scale) <= available]
+    available = available_bytes()
+    fits = [scale for scale in SCALES if available is None or needed_bytes(recording, cameras, scale) <= available]
     proposal = f"--downscale {fits[0]}" if fits else "a machine with more memory"
     largest = max((recording.cameras[name] for name in cameras), key=lambda camera: camera.width * camera.height)
-    raise D2Error(
-        f"{len(cameras)} cameras of {largest.width}x{largest.height} pixels need about {needed / 2**30:.1f} GiB of "
-        f"memory and {available / 2**30:.1f} GiB are available: use {proposal}"
-    )
+    what = f"{len(cameras)} cameras of {largest.width}x{largest.height} pixels"
+    check_bytes(needed_bytes(recording, cameras), what, f"use {proposal}")
 
 
 def check_bytes(needed: float, what: str, remedy: str) -> None:
@@ -82,14 +78,12 @@ def _left_of_group() -> list[int]:
     ):
         with suppress(OSError, ValueError):
             folder = Path("/sys/fs/cgroup")
-            inactive = re.search(r"^(?:total_)?inactive_file (\d+)", _statistics(folder / used), re.MULTILINE)
+            inactive = re.search(
+                r"^(?:total_)?inactive_file (\d+)", (folder / used).with_name("memory.stat").read_text(), re.MULTILINE
+            )
             left = int((folder / limit).read_text()) - int((folder / used).read_text())
             return [left + (int(inactive[1]) if inactive else 0)]  # files in memory give way
     return []
-
-
-def _statistics(used: Path) -> str:
-    return used.with_name("memory.stat").read_text()
 
 
 def _left_of_process() -> list[int]:

@@ -17,14 +17,11 @@ from d2_plugin.recordings.export.ply import PointCloud
 from d2_plugin.recordings.images import write_png
 from d2_plugin.recordings.recording import Camera, Recording
 
-Names = dict[str, str]
-"""Camera of the source -> camera of the export."""
-
 
 class Written(NamedTuple):
     """What the cameras and frames of the source are called in the export; those that were not written are absent."""
 
-    cameras: Names
+    cameras: dict[str, str]
     frames: dict[int, int]
 
 

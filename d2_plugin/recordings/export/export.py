@@ -30,9 +30,7 @@ from d2_plugin.recordings.export.transforms_json import write_transforms
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.values import checked_arguments
 
-Writer = Callable[[Export], Written]
-
-WRITERS: dict[str, Writer] = {
+WRITERS: dict[str, Callable[[Export], Written]] = {
     "transforms": write_transforms,
     "n3dv": write_n3dv,
     "multipleview": write_multipleview,
@@ -73,22 +71,18 @@ def export_recording(
         refuse_skew(camera.name, camera.K)
     with whole_folder(path) as folder:
         written = WRITERS[layout](Export(recording, held_out, cloud, folder))
-        described = json_text(_description(recording, layout, written, held_out), EXPORT_FILE, indent=1)
+        description = {
+            "source": recording.name,
+            "layout": layout,
+            "cameras": written.cameras,
+            "frames": written.frames,
+            "calibrations": {name: _calibration(camera) for name, camera in recording.cameras.items()},
+            "fps": recording.fps,
+            "test_cameras": [written.cameras[name] for name in held_out if name in written.cameras],
+        }
         # Written last: a folder without it is half an export.
-        (folder / EXPORT_FILE).write_text(described + "\n")
+        (folder / EXPORT_FILE).write_text(json_text(description, EXPORT_FILE, indent=1) + "\n")
     return Path(path)
-
-
-def _description(recording: Recording, layout: str, written: Written, held_out: tuple[str, ...]) -> dict[str, Any]:
-    return {
-        "source": recording.name,
-        "layout": layout,
-        "cameras": written.cameras,
-        "frames": written.frames,
-        "calibrations": {name: _calibration(camera) for name, camera in recording.cameras.items()},
-        "fps": recording.fps,
-        "test_cameras": [written.cameras[name] for name in held_out if name in written.cameras],
-    }
 
 
 def _calibration(camera: Camera) -> dict[str, Any]:

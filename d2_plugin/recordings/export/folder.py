@@ -10,8 +10,7 @@ import numpy as np
 from d2_plugin.reading import json_text
 from d2_plugin.recordings.cameras.formats.cameras_json import camera_table
 from d2_plugin.recordings.export.base import whole_folder
-from d2_plugin.recordings.images import write_png
-from d2_plugin.recordings.masks import MASK_FOLDERS, VALID_FOLDER, write_mask
+from d2_plugin.recordings.images import MASK_FOLDERS, VALID_FOLDER, write_mask, write_png
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.values import checked_arguments
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.export.base import Export, Names, Written, refuse_off_centre
+from d2_plugin.recordings.export.base import Export, Written, refuse_off_centre
 from d2_plugin.recordings.export.ply import PointCloud, write_point_cloud
 from d2_plugin.recordings.recording import Camera
 
@@ -50,7 +50,7 @@ def write_n3dv(export: Export) -> Written:
     return export.written(names)
 
 
-def sorted_names(cameras: list[str], held_out: int) -> Names:
+def sorted_names(cameras: list[str], held_out: int) -> dict[str, str]:
     """Names that begin with `cam` and whose sorted order puts the first `held_out` of `cameras` first."""
     kept = {name: name if name.startswith("cam") else f"cam{name}" for name in cameras}
     plain = all(name.startswith("cam") or name.isdigit() for name in cameras)

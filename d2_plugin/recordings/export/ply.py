@@ -41,9 +41,7 @@ def write_point_cloud(path: Path, cloud: PointCloud) -> None:
     of a whole number of floats: hence alpha. The others ignore both.
     """
     count = len(cloud.positions)
-    for name, values, shape in (("colors", cloud.colors, (count, 3)), ("times", cloud.times, (count,))):
-        if values is not None and np.shape(values) != shape:
-            raise D2Error(f"{name} of a point cloud have shape {np.shape(values)}, expected {shape}: one per position")
+    cloud.check()
     layout = [(axis, "<f4") for axis in ("x", "y", "z", *_NORMALS)] + [(c, "u1") for c in _CHANNELS]
     layout += [("time", "<f4")] if cloud.times is not None else []
     rows = np.zeros(count, layout)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.importing.motion import Watched, offsets_from_motion
+from d2_plugin.recordings.importing.settings import by_camera, finite
 from d2_plugin.recordings.importing.sound import Sound, lag_between, read_sound
 from d2_plugin.recordings.importing.video import VideoFile
 
@@ -28,7 +30,7 @@ SOUND_ERROR = 1e-3
 """Seconds at least that an offset from sound may be wrong: sound travels a third of a metre in that time."""
 
 DAY = 86_400
-"""Seconds after which a timecode begins anew."""
+"""Seconds after which a timecode begins anew, so that the shorter way around midnight counts."""
 
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.])(\d{2,3})$")
 
@@ -56,12 +58,12 @@ class Evidence(NamedTuple):
     method: str
 
 
-Watching = Callable[[], Mapping[str, Watched]]
-"""Small images of all cameras; called only where motion must decide, since all videos are decoded for it."""
-
-
-def common_clock(videos: Mapping[str, VideoFile], how: str, watching: Watching) -> dict[str, Clock]:
+def common_clock(
+    videos: Mapping[str, VideoFile], how: str, watching: Callable[[], Mapping[str, Watched]]
+) -> dict[str, Clock]:
     """When each video's clock began, by the best evidence there is: timecode, then sound, then motion.
+
+    `watching` gives small images of all cameras; all videos are decoded for it, so only where motion must decide.
 
     Raises:
         D2Error: no evidence links a camera to the others, or the evidence contradicts itself.
@@ -89,18 +91,9 @@ def given_clock(videos: Mapping[str, VideoFile], given: Sequence[str]) -> dict[s
     Raises:
         D2Error: what is no number, and cameras that there are not.
     """
-    starts = dict.fromkeys(videos, 0.0)
-    for text in given:
-        name, _, frames = text.partition("=")
-        if name not in videos:
-            raise D2Error(f"--offsets names camera '{name}', have {', '.join(videos)}: write NAME=FRAMES,NAME=FRAMES")
-        try:
-            starts[name] = float(frames) / (videos[name].rate or 25.0)
-        except ValueError:
-            starts[name] = np.nan
-        if not np.isfinite(starts[name]):
-            raise D2Error(f"--offsets says '{text}', expected NAME=FRAMES such as {name}=-7.5: correct it")
-    return {name: Clock(seconds, 0.0, "given") for name, seconds in starts.items()}
+    expected = f"{', '.join(METHODS)}, or NAME=FRAMES such as {next(iter(videos))}=-7.5"
+    starts = by_camera("--offsets", given, videos, finite, expected)
+    return {name: Clock(starts.get(name, 0.0) / (video.rate or 25.0), 0.0, "given") for name, video in videos.items()}
 
 
 def timecode_seconds(text: str, rate: float) -> float | None:
@@ -124,21 +117,15 @@ def timecode_seconds(text: str, rate: float) -> float | None:
     return number / rate
 
 
-def shortest(seconds: float) -> float:
-    """A difference of two times of day, the shorter way around midnight."""
-    return (seconds + DAY / 2) % DAY - DAY / 2
-
-
 def _of_timecodes(videos: Mapping[str, VideoFile]) -> list[Evidence]:
     read = {name: timecode_seconds(video.timecode or "", video.rate) for name, video in videos.items()}
     starts = {name: time - float(videos[name].times[0]) for name, time in read.items() if time is not None}
     error = {name: TIMECODE_ERROR / (videos[name].rate or 25.0) for name in starts}
-    return [
-        Evidence(
-            one, other, shortest(starts[other] - starts[one]), float(np.hypot(error[one], error[other])), "timecode"
-        )
-        for one, other in combinations(starts, 2)
-    ]
+    evidence = []
+    for one, other in combinations(starts, 2):
+        seconds = math.remainder(starts[other] - starts[one], DAY)
+        evidence.append(Evidence(one, other, seconds, float(np.hypot(error[one], error[other])), "timecode"))
+    return evidence
 
 
 def _of_sound(sounds: Mapping[str, Sound | None]) -> list[Evidence]:

@@ -15,6 +15,7 @@ from d2_plugin.recordings.cameras.epipolar import epipolar_lines, homogeneous, s
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.importing.clocks import linked_names
 from d2_plugin.recordings.recording import Camera, Exposure, Recording
+from d2_plugin.recordings.selection import spread
 
 FRAMES = 6
 """Instants at which features are looked for."""
@@ -44,8 +45,7 @@ def measured_exposures(recording: Recording, cameras: Sequence[str]) -> dict[str
     The logarithms of the ratios of each pair, the median over its matches, are weighed by their errors.
     """
     ratios: dict[tuple[str, str], list[np.ndarray]] = {}
-    chosen = np.unique(np.linspace(0, len(recording.frames) - 1, FRAMES).round().astype(int))
-    for frame in (recording.frames[i] for i in chosen):
+    for frame in spread(recording.frames, FRAMES):
         images = {name: recording.image(name, frame) for name in cameras}
         features = {name: sift_features(image, FEATURES, "measuring exposure")[:2] for name, image in images.items()}
         for one, other in combinations(cameras, 2):

@@ -13,7 +13,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.importing.clocks import Clock
-from d2_plugin.recordings.importing.video import VideoFile
+from d2_plugin.recordings.importing.video import VideoFile, usual_rate
 
 REACH = 0.75
 """An image farther than this many frames of the recording, or half of the camera's own, stands for no instant."""
@@ -58,7 +58,7 @@ def grid_of(
     """
     taken = {name: clocks[name].seconds + video.times for name, video in videos.items()}
     begin, end = max(one[0] for one in taken.values()), min(one[-1] for one in taken.values())
-    fps = rate or _rounded(min((video.rate for video in videos.values() if video.rate), default=25.0))
+    fps = rate or usual_rate(min((video.rate for video in videos.values() if video.rate), default=25.0))
     if end < begin - REACH / fps:
         late, early = max(taken, key=lambda name: taken[name][0]), min(taken, key=lambda name: taken[name][-1])
         raise D2Error(
@@ -83,13 +83,6 @@ def grid_of(
         {} if together else {name: dict(zip(frames, off[kept].round(6).tolist())) for name, (_, off) in near.items()}
     )
     return Grid(fps, indices, {} if together else lateness, _notes(kept, videos, fps))
-
-
-def _rounded(rate: float) -> float:
-    """A measured rate as cameras have it: 29.97 of stamps that are rounded to whole units is 30000 / 1001."""
-    usual = [*map(float, range(1, 241)), *(n * 1000 / 1001 for n in (24, 30, 48, 60, 120, 240))]
-    nearest = min(usual, key=lambda one: abs(one - rate))
-    return nearest if abs(nearest - rate) < 2e-4 * rate else rate
 
 
 def _asked(numbers: np.ndarray, fps: float, times: Sequence[float] | None, frames: Sequence[int] | None) -> np.ndarray:

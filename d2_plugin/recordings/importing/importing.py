@@ -12,33 +12,35 @@ cameras.json          last: a folder without it is no recording yet (videos.json
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from d2_plugin.durable import make_folder, remove_leftovers, write, write_table, write_text
+from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
 from d2_plugin.reading import json_text
 from d2_plugin.recordings.cameras.calibrating.refine import refine
-from d2_plugin.recordings.cameras.camera import CalibratedCamera
+from d2_plugin.recordings.cameras.calibration import LARGE_RIG, Calibration, open_calibration
+from d2_plugin.recordings.cameras.camera import CalibratedCamera, rig_width, scaled
+from d2_plugin.recordings.cameras.check import calibration_contradicted
 from d2_plugin.recordings.cameras.formats.cameras_json import read_camera
 from d2_plugin.recordings.export.folder import described
-from d2_plugin.recordings.images import encode_jpeg, write_png
+from d2_plugin.recordings.images import VALID_FOLDER, encode_jpeg, write_mask, write_png
 from d2_plugin.recordings.importing.clocks import METHODS, Clock, common_clock, given_clock
 from d2_plugin.recordings.importing.exposure import measured_exposures
-from d2_plugin.recordings.importing.grid import Grid, grid_of
-from d2_plugin.recordings.importing.known_rig import known_rig
+from d2_plugin.recordings.importing.grid import grid_of
 from d2_plugin.recordings.importing.motion import small_images
-from d2_plugin.recordings.importing.settings import ImportSettings, check_calibration
+from d2_plugin.recordings.importing.settings import UNITS, ImportSettings, check_calibration
 from d2_plugin.recordings.importing.solved_rig import calibration_table, rig_of_videos, summary
 from d2_plugin.recordings.importing.source import Cut, VideosSource, cuts_of
 from d2_plugin.recordings.importing.steps import STEPS, identity, kept, paths_of, refuse_another
 from d2_plugin.recordings.importing.video import VideoFile, read_video
-from d2_plugin.recordings.masks import VALID_FOLDER, write_mask
 from d2_plugin.recordings.readers.videos import KIND as VIDEOS
 from d2_plugin.recordings.readers.videos import TABLE
 from d2_plugin.recordings.recording import Exposure, Recording
@@ -50,18 +52,11 @@ Report = Callable[[str], None]
 JPEG_QUALITY = 95
 
 
-@dataclass(frozen=True)
-class Imported:
-    """The recording, and how its cameras' clocks were brought together."""
-
-    recording: Recording
-    clocks: Mapping[str, Clock]
-    folder: Path
-
-
 @checked_arguments
-def import_videos(settings: ImportSettings, report: Report = lambda line: None) -> Imported:
-    """Import the videos, or continue an import that was stopped; a finished one is only read.
+def import_videos(settings: ImportSettings, report: Report = lambda line: None) -> tuple[Recording, dict[str, Clock]]:
+    """(the recording, when each camera started) of an import, or of one that was stopped and goes on.
+
+    A finished one is only read.
 
     Raises:
         D2Error: one sentence for whatever does not fit; nothing that was there is written over.
@@ -73,7 +68,7 @@ def import_videos(settings: ImportSettings, report: Report = lambda line: None) 
     check_calibration(settings)
     solved = None
     if settings.calibration is not None:
-        videos, cameras, notes = known_rig(settings, settings.calibration, videos)
+        videos, cameras, notes = _known_rig(settings, settings.calibration, videos)
     else:
         solved = _solved(settings, folder, videos, report)
         cameras = {entry["name"]: read_camera(entry, "the solved calibration") for entry in solved["cameras"]}
@@ -90,15 +85,70 @@ def import_videos(settings: ImportSettings, report: Report = lambda line: None) 
         clocks = _clocks(settings, folder, videos, cameras)
         report(_clocks_in_words(clocks, videos))
         grid = grid_of(videos, clocks, settings.rate, settings.times, settings.frames)
-        recording = _recording(folder, videos, cameras, cuts, grid, notes)
+        source = VideosSource(videos, grid.indices, cameras, cuts)
+        frames, notes = tuple(grid.indices[next(iter(videos))]), (*notes, *grid.notes)
+        recording = Recording(
+            folder.resolve().name, source.pinholes(), frames, grid.rate, source, folder, notes=notes, late=grid.late
+        )
         if settings.refine_poses:
             recording = _with_refined_poses(folder, recording, report)
         if settings.images != "videos":
             _write_images(folder, recording, settings.images, report)
         if settings.exposure and len(recording.cameras) > 1:
             recording = replace(recording, exposures=_exposures(folder, recording, report))
-        _finish(settings, folder, recording)
-    return Imported(recording, clocks, folder)
+        description = described(recording)  # last: without this file the folder is no recording
+        if isinstance(recording.source, VideosSource) and settings.images == "videos":
+            write_table(folder / TABLE, {"cameras": recording.source.as_dict(), "recording": description}, VIDEOS)
+        else:
+            write_text(folder / "cameras.json", json_text(description, "cameras.json", indent=1) + "\n")
+    return recording, clocks
+
+
+def _known_rig(
+    settings: ImportSettings, calibration: Path, videos: Mapping[str, VideoFile]
+) -> tuple[dict[str, VideoFile], dict[str, CalibratedCamera], tuple[str, ...]]:
+    """(videos turned as the calibration has them, their cameras, notes).
+
+    Raises:
+        D2Error: a calibration of another rig or in another unit than it seems.
+    """
+    turned, read, notes = _oriented(calibration, videos)
+    more = tuple(note for note in read.notes if "scale" not in note) if settings.unit else read.notes
+    cameras = scaled(read.cameras, UNITS[settings.unit]) if settings.unit else read.cameras
+    width = rig_width(cameras)
+    if settings.unit is None and width > LARGE_RIG:
+        raise D2Error(
+            f"{calibration} puts the cameras up to {width:.0f} apart, which is no metres: say what it is with "
+            "--unit mm, --unit cm or --unit m"
+        )
+    if len(cameras) > 1 and width == 0:
+        raise D2Error(f"{calibration} puts all cameras at one place: give a calibration with their poses")
+    wrong = _contradiction(turned, cameras) if len(cameras) > 1 else ""
+    if wrong:
+        raise D2Error(f"{calibration} does not fit the videos: {wrong}")
+    return turned, {camera.name: camera for camera in cameras}, (*notes, *more)
+
+
+def _oriented(path: Path, videos: Mapping[str, VideoFile]) -> tuple[dict[str, VideoFile], Calibration, tuple[str, ...]]:
+    """The calibration of the upright videos; of the stored ones where only those have its aspect."""
+    try:
+        return dict(videos), open_calibration(path, {name: video.size for name, video in videos.items()}), ()
+    except D2Error:
+        if not any(video.turn % 180 for video in videos.values()):
+            raise
+        stored = {name: replace(video, turn=0) for name, video in videos.items()}
+        with suppress(D2Error):
+            read = open_calibration(path, {name: video.size for name, video in stored.items()})
+            return stored, read, ("the calibration is of the images as stored: rotation flags are not followed",)
+        raise
+
+
+def _contradiction(videos: Mapping[str, VideoFile], cameras: Sequence[CalibratedCamera]) -> str:
+    """What the images in the middle of the videos say against the calibration, or nothing."""
+    indices = {name: {0: len(video.stamps) // 2} for name, video in videos.items()}
+    cuts = {camera.name: Cut(0, 0, *camera.size) for camera in cameras}
+    source = VideosSource(videos, indices, {camera.name: camera for camera in cameras}, cuts)
+    return calibration_contradicted(Recording("videos", source.pinholes(), (0,), 1.0, source))
 
 
 def _solved(settings: ImportSettings, folder: Path, videos: Mapping[str, VideoFile], report: Report) -> dict[str, Any]:
@@ -132,22 +182,6 @@ def _clocks_in_words(clocks: Mapping[str, Clock], videos: Mapping[str, VideoFile
 
     methods = " and ".join(sorted({clock.method for clock in clocks.values()}))
     return f"start in frames, by {methods}: {', '.join(one(*item) for item in clocks.items())}"
-
-
-def _recording(
-    folder: Path,
-    videos: Mapping[str, VideoFile],
-    cameras: Mapping[str, CalibratedCamera],
-    cuts: Mapping[str, Cut],
-    grid: Grid,
-    notes: tuple[str, ...],
-) -> Recording:
-    """The recording as it is in the videos."""
-    source = VideosSource(videos, grid.indices, cameras, cuts)
-    frames, notes = tuple(grid.indices[next(iter(videos))]), (*notes, *grid.notes)
-    return Recording(
-        folder.resolve().name, source.pinholes(), frames, grid.rate, source, folder, notes=notes, late=grid.late
-    )
 
 
 def _with_refined_poses(folder: Path, recording: Recording, report: Report) -> Recording:
@@ -200,12 +234,3 @@ def _exposures(folder: Path, recording: Recording, report: Report) -> dict[str, 
     gains = ", ".join(f"{name} {100 * (sum(one.gain) / 3 - 1):+.1f} %" for name, one in exposures.items())
     report(f"exposure: {gains or 'not known'}" + (f"; too few shared features for {unknown}" if unknown else ""))
     return exposures
-
-
-def _finish(settings: ImportSettings, folder: Path, recording: Recording) -> None:
-    """The file that makes the folder a recording."""
-    description = described(recording)
-    if isinstance(recording.source, VideosSource) and settings.images == "videos":
-        write_table(folder / TABLE, {"cameras": recording.source.as_dict(), "recording": description}, VIDEOS)
-    else:
-        write_text(folder / "cameras.json", json_text(description, "cameras.json", indent=1) + "\n")

@@ -232,7 +232,9 @@ def curve_between(
 ) -> Curve | None:
     """The agreement of two cameras over the lag; None where no half-plane is in both images."""
     angles = _angles(one.camera, other.camera)
-    low, high = (pick(bound(angle, q) for angle in angles) for pick, bound, q in ((max, _at, 0.01), (min, _at, 0.99)))
+    low, high = (
+        pick(float(np.nanquantile(angle, share)) for angle in angles) for pick, share in ((max, 0.01), (min, 0.99))
+    )
     if not high > low:
         return None
     profiles = [
@@ -241,10 +243,6 @@ def curve_between(
     ]
     starts = (float(changes[1][0]), float(other_changes[1][0]))
     return _correlated(profiles[0], profiles[1], starts, step, search)
-
-
-def _at(angles: np.ndarray, share: float) -> float:
-    return float(np.nanquantile(angles, share))
 
 
 def _angles(one: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Count, Positional, Range, Settings
@@ -80,3 +82,32 @@ def check_calibration(settings: ImportSettings) -> None:
         )
     if settings.calibration is None and settings.unit is not None:
         raise D2Error("--unit says what a calibration is in, and none is given: give --distance or --board for a scale")
+
+
+def by_camera(
+    option: str, texts: Sequence[str], names: Iterable[str], value: Callable[[str], Any], expected: str
+) -> dict:
+    """The value of each camera out of VALUE (for all) and NAME=VALUE; `value` gives None for what is none.
+
+    Raises:
+        D2Error: a camera that is not among `names`, or what is no value.
+    """
+    values: dict[str, Any] = {}
+    for text in texts:
+        name, named, written = text.rpartition("=")
+        if named and name not in names:
+            raise D2Error(f"{option} names camera '{name}', have {', '.join(names)}: correct the name")
+        given = value(written.strip())
+        if given is None:
+            raise D2Error(f"{option} says '{text}', expected {expected}: correct it")
+        values |= dict.fromkeys([name] if named else names, given)
+    return values
+
+
+def finite(text: str) -> float | None:
+    """A number, None for what is none."""
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None

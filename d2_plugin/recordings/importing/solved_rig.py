@@ -26,8 +26,9 @@ from d2_plugin.recordings.cameras.undistort import UndistortedSource, Undistorti
 from d2_plugin.recordings.images import IMAGE_SUFFIXES, opencv, read_image
 from d2_plugin.recordings.importing.clocks import METHODS, Clock, common_clock, given_clock
 from d2_plugin.recordings.importing.grid import grid_of
-from d2_plugin.recordings.importing.settings import ImportChoices
+from d2_plugin.recordings.importing.settings import ImportChoices, by_camera, finite
 from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
+from d2_plugin.recordings.selection import spread
 
 MOMENTS = 8
 """Images of each camera that are read, spread over the recording."""
@@ -116,32 +117,14 @@ def _lenses(intrinsics: Path | None, focal: Sequence[str], sizes: Mapping[str, t
                 "as --focal NAME=PIXELS,..., or --intrinsics FILE"
             )
         return Lenses({name: _ideal(name, size, float(max(size))) for name, size in sizes.items()}, focal[0])
-    lengths = _lengths(focal, list(sizes))
-    return Lenses({name: _ideal(name, size, lengths[name]) for name, size in sizes.items()}, None)
-
-
-def _lengths(focal: Sequence[str], names: Sequence[str]) -> dict[str, float]:
-    """Pixels by camera."""
-    lengths: dict[str, float] = {}
-    for text in focal:
-        name, named, number = text.rpartition("=")
-        if named and name not in names:
-            raise D2Error(f"--focal names camera '{name}', have {', '.join(names)}: correct the name")
-        try:
-            length = float(number)
-        except ValueError:
-            length = 0.0
-        if not (np.isfinite(length) and length > 0):
-            raise D2Error(
-                f"--focal says '{text}', expected shared, each, a number of pixels above 0, or NAME=PIXELS: correct it"
-            )
-        lengths |= {name: length} if named else dict.fromkeys(names, length)
-    missing = [name for name in names if name not in lengths]
+    expected = "shared, each, a number of pixels above 0, or NAME=PIXELS"
+    lengths = by_camera("--focal", focal, sizes, _positive, expected)
+    missing = [name for name in sizes if name not in lengths]
     if missing:
         raise D2Error(
             f"--focal says nothing of camera {', '.join(missing)}: add NAME=PIXELS, or give one number for all"
         )
-    return lengths
+    return Lenses({name: _ideal(name, size, lengths[name]) for name, size in sizes.items()}, None)
 
 
 def _ideal(name: str, size: tuple[int, int], length: float) -> CalibratedCamera:
@@ -150,17 +133,18 @@ def _ideal(name: str, size: tuple[int, int], length: float) -> CalibratedCamera:
 
 
 def _distance(words: tuple[str, ...], names: list[str]) -> tuple[str, str, float]:
-    try:
-        one, other, metres = words
-        length = float(metres)
-    except ValueError:
-        one, other, length = "", "", 0.0
-    if one not in names or other not in names or one == other or not 0 < length < np.inf:
+    length = _positive(words[-1])
+    if len(words) != 3 or not set(words[:2]) <= set(names) or words[0] == words[1] or length is None:
         raise D2Error(
             f"--distance says '{','.join(words)}', expected CAMERA,CAMERA,METRES with two of {', '.join(names)}: "
             "correct it"
         )
-    return one, other, length
+    return words[0], words[1], length
+
+
+def _positive(text: str) -> float | None:
+    number = finite(text)
+    return number if number is not None and number > 0 else None
 
 
 def _stills(folder: Path, lenses: Lenses) -> dict[str, tuple[str, np.ndarray]]:
@@ -210,7 +194,7 @@ def _images(
     """Undistorted images by camera: of moments that all share, or one of what stands still where none are known."""
     clocks = _clocks(videos, offsets)
     indices = _together(videos, clocks, moments) if clocks is not None else None
-    chosen = indices or {name: _spread(len(video.stamps), moments) for name, video in videos.items()}
+    chosen = indices or {name: spread(range(len(video.stamps)), moments) for name, video in videos.items()}
     frames = VideoFrames(videos, {name: dict(enumerate(places)) for name, places in chosen.items()})
     source = UndistortedSource(frames, {name: one for name, one in lenses.cameras.items() if one.lens.bends})
     images: dict[str, list[np.ndarray]] = {}
@@ -252,10 +236,5 @@ def _together(
     together = [frame for frame in frames if apart[frame] <= TOGETHER]
     if len(together) < min(3, len(frames)):
         return None
-    chosen = [together[place] for place in _spread(len(together), moments)]
+    chosen = spread(together, moments)
     return {name: [grid.indices[name][frame] for frame in chosen] for name in videos}
-
-
-def _spread(count: int, moments: int) -> list[int]:
-    places: list[int] = np.unique(np.linspace(0, count - 1, moments).round().astype(int)).tolist()
-    return places

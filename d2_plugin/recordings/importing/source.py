@@ -16,9 +16,9 @@ from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.formats.cameras_json import camera_table, read_camera
 from d2_plugin.recordings.cameras.undistort import UndistortedSource, recorded_at
 from d2_plugin.recordings.images import opencv
-from d2_plugin.recordings.importing.settings import ImportChoices
+from d2_plugin.recordings.importing.settings import ImportChoices, by_camera
 from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
-from d2_plugin.recordings.recording import Camera
+from d2_plugin.recordings.recording import Camera, Source
 
 
 @dataclass(frozen=True)
@@ -69,22 +69,22 @@ def cuts_of(choices: ImportChoices, sizes: Mapping[str, tuple[int, int]]) -> dic
         D2Error: a part that is not written WIDTHxHEIGHT+LEFT+TOP, lies outside of the image or is of no camera.
     """
     cuts = {name: Cut(0, 0, *size, choices.scale) for name, size in sizes.items()}
-    for text in choices.crop:
-        camera, named, part = text.rpartition("=")
-        if named and camera not in sizes:
-            raise D2Error(f"--crop names camera '{camera}', have {', '.join(sizes)}: correct the name")
-        match = re.fullmatch(r"(\d{1,6})x(\d{1,6})\+(\d{1,6})\+(\d{1,6})", part.strip())
+
+    def part(text: str) -> Cut | None:
+        match = re.fullmatch(r"(\d{1,6})x(\d{1,6})\+(\d{1,6})\+(\d{1,6})", text)
         if match is None:
-            raise D2Error(f"--crop says '{text}', expected WIDTHxHEIGHT+LEFT+TOP such as 1280x720+0+100: correct it")
+            return None
         width, height, left, top = map(int, match.groups())
-        cuts |= dict.fromkeys([camera] if named else sizes, Cut(left, top, width, height, choices.scale))
+        return Cut(left, top, width, height, choices.scale)
+
+    cuts |= by_camera("--crop", choices.crop, sizes, part, "WIDTHxHEIGHT+LEFT+TOP such as 1280x720+0+100")
     for name, cut in cuts.items():
         cut.check(name, sizes[name])
     return cuts
 
 
 @dataclass(frozen=True)
-class VideosSource:
+class VideosSource(Source):
     """The images of a recording that stays in its videos; not for several threads at the same time."""
 
     videos: Mapping[str, VideoFile]
@@ -113,15 +113,6 @@ class VideosSource:
                 "within the video, so choose --times of one size"
             )
         return self.cuts[camera].of(image)
-
-    def depth(self, camera: str, frame: int) -> None:
-        """None: a video carries no true depth."""
-
-    def mono(self, camera: str, frame: int) -> None:
-        """None: a video carries no monocular maps."""
-
-    def mask(self, camera: str, frame: int) -> None:
-        """None: a video carries no masks."""
 
     def recorded(self, camera: str) -> np.ndarray | None:
         """Which pixels [h, w] were recorded, or None where all were."""

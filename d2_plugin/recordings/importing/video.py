@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.extras import import_av
 from d2_plugin.reading import opened, parsing, said, shown_path
 from d2_plugin.recordings.images import MOST_PIXELS
+from d2_plugin.recordings.recording import Source
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".360", ".lrv")
 """Endings by which a folder's videos are listed."""
@@ -96,14 +97,6 @@ class VideoFile:
         return cls(Path(table["path"]), (width, height), table["turn"], stamps, unit, table["timecode"], table["sound"])
 
 
-class VideoHeader(NamedTuple):
-    """What is known of a video without walking through it."""
-
-    frames: int
-    fps: float  # 0 where the file does not say
-    size: tuple[int, int]  # width, height in pixels, upright
-
-
 def pyav() -> ModuleType:
     """The module av."""
     return import_av("reading videos with their time stamps")
@@ -144,18 +137,6 @@ def read_video(path: Path) -> VideoFile:
     return VideoFile(path, size, turn, stamps, unit, timecode, sound)
 
 
-def video_header(path: Path) -> VideoHeader:
-    """Number of frames, frame rate and size from the header and the first frame; errors as `read_video`."""
-    with container_of(path) as container:
-        stream = _image_stream(container, path)
-        frames, fps = stream.frames, float(stream.average_rate or 0)
-    (width, height), turn = _first_frame(path)
-    frames = frames or len(read_video(path).stamps)  # not every container says it
-    if frames > MOST_FRAMES:
-        raise D2Error(f"video {shown_path(path)} says {frames} frames, at most {MOST_FRAMES}: {REMEDY}")
-    return VideoHeader(frames, fps, (height, width) if turn % 180 else (width, height))
-
-
 def _image_stream(container: Any, path: Path) -> Any:
     if not container.streams.video:
         kinds = " and ".join(sorted({stream.type for stream in container.streams})) or "nothing"
@@ -191,6 +172,13 @@ def _first_frame(path: Path) -> tuple[tuple[int, int], int]:
                 f"{REMEDY}"
             )
         return (frame.width, frame.height), 90 * (round(float(frame.rotation) / 90) % 4)
+
+
+def usual_rate(rate: float) -> float:
+    """A measured rate as cameras have it: 29.97 of stamps that are rounded to whole units is 30000 / 1001."""
+    usual = [*map(float, range(1, 241)), *(n * 1000 / 1001 for n in (24, 30, 48, 60, 120, 240))]
+    nearest = min(usual, key=lambda one: abs(one - rate))
+    return nearest if abs(nearest - rate) < 2e-4 * rate else rate
 
 
 def videos_below(folder: Path) -> tuple[Path, ...]:
@@ -267,11 +255,10 @@ class Decoder:
 
 
 @dataclass(frozen=True)
-class VideoFrames:
+class VideoFrames(Source):
     """Upright images out of one video per camera, decoded when asked for; not for several threads at the same time."""
 
-    videos: Mapping[str, VideoFile | Path]
-    """A path is walked through when its first image is asked for."""
+    videos: Mapping[str, VideoFile]
     indices: Mapping[str, Mapping[int, int]] | None = None
     """By camera, the video's frame of each frame of the recording; the same where None."""
     _decoders: dict[str, Decoder] = field(default_factory=dict, repr=False, compare=False)
@@ -282,15 +269,8 @@ class VideoFrames:
         if index is None:
             raise D2Error(f"camera {camera} has no frame {frame}: choose one of the recording's frames")
         if camera not in self._decoders:
-            video = self.videos[camera]
-            self._decoders[camera] = Decoder(video if isinstance(video, VideoFile) else read_video(video))
+            self._decoders[camera] = Decoder(self.videos[camera])
         return self._decoders[camera].image(index)
-
-    def depth(self, camera: str, frame: int) -> None:
-        """None: a video carries no true depth."""
-
-    def mono(self, camera: str, frame: int) -> None:
-        """None: a video carries no monocular maps."""
 
     def __reduce__(self) -> tuple[Any, ...]:  # another process opens its own decoders
         return VideoFrames, (self.videos, self.indices)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +18,16 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings.assembly import assembled
 from d2_plugin.recordings.cameras.camera import LARGEST_NUMBER, CalibratedCamera, checked_rate, pinhole, rigid
 from d2_plugin.recordings.cameras.lens import Lens
-from d2_plugin.recordings.files import FrameFiles, cameras_with_images, collect, common_frames, numbered_files
+from d2_plugin.recordings.files import (
+    FrameFiles,
+    by_camera,
+    by_prefix,
+    cameras_with_images,
+    common_frames,
+    numbered_files,
+)
 from d2_plugin.recordings.images import IMAGE_SUFFIXES, image_size
-from d2_plugin.recordings.importing.video import VideoFrames, video_header
+from d2_plugin.recordings.importing.video import VideoFrames, read_video, usual_rate
 from d2_plugin.recordings.recording import Recording
 
 log = logging.getLogger(__name__)
@@ -38,7 +44,6 @@ RIG_SIZE = 21
 """Cameras of the rig, cam00 to cam20. Scenes with fewer rows lack cameras, and their rows do not say which."""
 
 _NUMBERED_NAME = re.compile(r"cam(\d+)$")
-_EXTRACTED_NAME = re.compile(r"(?P<camera>.+)_\d+$")
 
 
 def is_n3dv(path: Path) -> bool:
@@ -47,7 +52,7 @@ def is_n3dv(path: Path) -> bool:
 
 
 def open_n3dv(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Recording:
-    """Read the N3DV layout; frames are decoded when asked for, only headers are opened here.
+    """Read the N3DV layout; frames are decoded when asked for, time stamps and headers alone are read here.
 
     A camera whose video or folder is empty is refused by name, and so are rows without a camera. Where `intersect`
     both are left out with a note: an empty camera keeps its row, and of the whole rig (`RIG_SIZE` rows) the number in
@@ -61,10 +66,18 @@ def open_n3dv(path: Path, cameras: tuple[str, ...] | None = None, intersect: boo
     rows, notes = _assigned(_rows(path / POSES), listed, intersect, path / POSES)
     pictured = {name for name in listed if (videos[name].stat().st_size if videos else extracted[name])}
     names, missing = cameras_with_images(rows, pictured, cameras, intersect, path / POSES)
-    notes = (*notes, *missing)
-    if videos:
-        return _from_videos(path, rows, videos, names, notes)
-    return _from_images(path, rows, extracted, names, notes)
+    notes, where = (*notes, *missing, *_known_flaws(path, names)), str(path / POSES)
+    if not videos:
+        images = {name: extracted[name] for name in names}
+        frames, more = common_frames(images, path)
+        sizes = {name: image_size(images[name][frames[0]]) for name in names}
+        calibrated = {name: camera_from_row(rows[name], name, sizes[name], where) for name in names}
+        return assembled(path, calibrated, images, frames, N3DV_FPS, where, (*notes, *more))
+    files = {name: read_video(videos[name]) for name in names}
+    frames, more = common_frames({name: range(len(file.stamps)) for name, file in files.items()}, path)
+    pinholes = {name: camera_from_row(rows[name], name, files[name].size, where).pinhole(where) for name in names}
+    fps = checked_rate(usual_rate(files[names[0]].rate) or N3DV_FPS, str(videos[names[0]]))
+    return Recording(path.resolve().name, pinholes, frames, fps, VideoFrames(files), path, notes=(*notes, *more))
 
 
 def _assigned(
@@ -117,35 +130,6 @@ def _rows(path: Path) -> np.ndarray:
     return rows.astype(np.float64)
 
 
-def _from_videos(
-    path: Path, rows: dict[str, np.ndarray], videos: dict[str, Path], names: list[str], notes: tuple[str, ...]
-) -> Recording:
-    headers = {name: video_header(videos[name]) for name in names}
-    frames, frame_notes = common_frames({name: range(header.frames) for name, header in headers.items()}, path)
-    where = str(path / POSES)
-    cameras = {name: camera_from_row(rows[name], name, headers[name].size, where) for name in names}
-    return Recording(
-        name=path.resolve().name,
-        cameras={name: camera.pinhole(where) for name, camera in cameras.items()},
-        frames=frames,
-        fps=checked_rate(headers[names[0]].fps or N3DV_FPS, str(videos[names[0]])),
-        source=VideoFrames({name: videos[name] for name in names}),
-        path=path,
-        notes=(*notes, *frame_notes, *_known_flaws(path, names)),
-    )
-
-
-def _from_images(
-    path: Path, rows: dict[str, np.ndarray], extracted: dict[str, FrameFiles], names: list[str], notes: tuple[str, ...]
-) -> Recording:
-    files = {name: extracted[name] for name in names}
-    frames, frame_notes = common_frames(files, path)
-    where = str(path / POSES)
-    cameras = {name: camera_from_row(rows[name], name, image_size(files[name][frames[0]]), where) for name in names}
-    notes = (*notes, *frame_notes, *_known_flaws(path, names))
-    return assembled(path, cameras, files, frames, N3DV_FPS, where, notes)
-
-
 def _known_flaws(path: Path, names: list[str]) -> tuple[str, ...]:
     flawed = [name for name in names if name in UNSYNCHRONISED.get(path.resolve().name, ())]
     notes = tuple(f"{name} is known to be unsynchronised: consider leaving it out" for name in flawed)
@@ -168,15 +152,5 @@ def _extracted(path: Path) -> dict[str, FrameFiles]:
             return files
         if not partly and any(files.values()):
             partly = files
-    return partly or dict(_by_prefix(path / "images"))
-
-
-def _by_prefix(folder: Path) -> Iterator[tuple[str, FrameFiles]]:
-    images = sorted(file for file in folder.glob("*_*") if file.suffix.lower() in IMAGE_SUFFIXES)
-    prefixes: dict[str, list[Path]] = {}
-    for image in images:
-        match = _EXTRACTED_NAME.match(image.stem)
-        if match:
-            prefixes.setdefault(match["camera"], []).append(image)
-    for camera, paths in sorted(prefixes.items()):
-        yield camera, collect(paths)
+    loose = {file.name: file for file in (path / "images").glob("*_*") if file.suffix.lower() in IMAGE_SUFFIXES}
+    return partly or by_camera({name: shot for name in sorted(loose) if (shot := by_prefix(name))}, loose)

@@ -83,7 +83,9 @@ def _directions(camera: Camera, offset: tuple[float, float]) -> np.ndarray:
 
 def _first_hits(scene: Scene, camera: Camera, directions: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """(distance [R], index of the solid met first [R], -1 for the room)."""
-    distance = _room_distance(scene.room, camera.centre, directions)
+    walls = np.where(directions > 0, scene.room.high[:, None], scene.room.low[:, None]) - camera.centre[:, None]
+    with np.errstate(divide="ignore"):
+        distance = np.where(directions == 0, np.inf, walls / directions).min(axis=0)
     owner = np.full(distance.shape, -1)
     for index, solid in enumerate(scene.solids):
         rays = _candidates(camera, solid, seconds)
@@ -111,12 +113,6 @@ def _span(focal: float, principal: float, offset: float, z: float, reach: float,
     angle, spread = np.arctan2(offset, z), np.arcsin(reach / np.hypot(offset, z))
     low, high = (focal * np.tan(np.clip(angle + side * spread, -1.5, 1.5)) + principal for side in (-1, 1))
     return slice(int(np.clip(np.floor(low) - 1, 0, size)), int(np.clip(np.ceil(high) + 1, 0, size)))
-
-
-def _room_distance(room: Room, origin: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    walls = np.where(directions > 0, room.high[:, None], room.low[:, None]) - origin[:, None]
-    with np.errstate(divide="ignore"):
-        return np.where(directions == 0, np.inf, walls / directions).min(axis=0)
 
 
 def _distances(solid: Solid, origins: np.ndarray, directions: np.ndarray, seconds: float) -> np.ndarray:

@@ -20,7 +20,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.camera import pinhole, rigid
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.recording import Camera, Recording, Source
 from d2_plugin.recordings.synthetic import materials
 from d2_plugin.recordings.synthetic.raycast import Motion, Room, Scene, Solid, render_color, render_depth
 from d2_plugin.values import checked_arguments
@@ -95,7 +95,7 @@ def split(recording: Recording) -> tuple[list[str], list[str]]:
 
 def arc_cameras(cameras: int, held_out: int, width: int, height: int, arc_degrees: float) -> dict[str, Camera]:
     """Cameras 4 m from the target on an arc; held-out ones in the middle of the gaps, 12 cm higher or lower."""
-    angles = np.radians(arc_degrees) * (_even(cameras) - 0.5)
+    angles = np.radians(arc_degrees) * (np.linspace(0, 1, cameras) - 0.5 if cameras > 1 else np.zeros(1))
     between = np.radians(arc_degrees) * ((np.arange(held_out) + 0.5) / max(held_out, 1) - 0.5)
     placed = {f"train{i}": _look_at(f"train{i}", angle, 1.45, width, height) for i, angle in enumerate(angles)}
     for i, angle in enumerate(between):
@@ -123,17 +123,8 @@ def furnished_room(seed: int, moving: bool) -> Scene:
     return Scene(room, solids, np.array([-0.9, -1.6, 2.75]) + spread)
 
 
-def emulated_monocular(depth: np.ndarray, bias: np.ndarray, scale: float, shift: float, blur: float) -> np.ndarray:
-    """Affine-invariant inverse depth float32 [H, W]: scale * blurred(1 / depth) * (1 + bias) + shift.
-
-    `bias` is a relative error per pixel, `blur` the standard deviation of the edge blur in pixels.
-    """
-    inverse = _blurred(1 / depth.astype(np.float64), blur)
-    return (scale * inverse * (1 + bias) + shift).astype(np.float32)
-
-
 @dataclass(eq=False)
-class SyntheticSource:
+class SyntheticSource(Source):
     """Renders an image or a map when it is asked for; images stay in a small cache."""
 
     scene: Scene
@@ -158,7 +149,8 @@ class SyntheticSource:
         changing = np.random.default_rng([self.seed, 2, number, frame])
         bias = FIXED_BIAS * _smooth_field(fixed, depth.shape) + FRAME_BIAS * _smooth_field(changing, depth.shape)
         scale, shift = changing.uniform(*SCALE), changing.uniform(*SHIFT)
-        return emulated_monocular(depth, bias, scale, shift, EDGE_BLUR * depth.shape[1])
+        inverse = _blurred(1 / depth.astype(np.float64), EDGE_BLUR * depth.shape[1])
+        return (scale * inverse * (1 + bias) + shift).astype(np.float32)
 
     def _kept(
         self, what: str, camera: str, frame: int, render: Callable[[Scene, Camera, float], np.ndarray]
@@ -169,11 +161,6 @@ class SyntheticSource:
             while sum(array.nbytes for array in self._cache.values()) > CACHE_BYTES and len(self._cache) > 1:
                 self._cache.popitem(last=False)
         return self._cache[key].copy()
-
-
-def _even(count: int) -> np.ndarray:
-    """`count` numbers over 0..1, the middle where there is one only."""
-    return np.linspace(0, 1, count) if count > 1 else np.full(1, 0.5)
 
 
 def _look_at(name: str, angle: float, camera_height: float, width: int, height: int, distance: float = 4.0) -> Camera:

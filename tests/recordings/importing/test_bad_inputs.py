@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recorded import Filmed, Shooting, video
+from recorded import Filmed, Shooting, video, write_video
 from stand_in_recordings import renamed
-from videos import write_video
 
 from d2_plugin.commands.cli import main
 from d2_plugin.recordings import Recording, open_recording, select_frames
@@ -168,7 +167,7 @@ CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
     (overwritten("cameras.json", b"{]"), [], r"not JSON|no calibration that can be read"),
     (overwritten("cameras.json", None), [], r"no such calibration|there is no such file|is not there"),
     (lambda given: None, ["--offsets", "07=3"], r"--offsets names camera '07', have 02, 03, 04"),
-    (lambda given: None, ["--offsets", "03=soon"], r"--offsets says '03=soon', expected NAME=FRAMES"),
+    (lambda given: None, ["--offsets", "03=soon"], r"--offsets says '03=soon', expected auto, .* or NAME=FRAMES"),
     (lambda given: None, ["--offsets", "03=900"], r"camera 0\d stopped .* seconds before camera 03 began"),
     (lambda given: None, ["--offsets", "timecode"], r"nothing in the timecode links"),
     (lambda given: None, ["--times", "40,50"], r"--times asks for 40 to 50 seconds"),

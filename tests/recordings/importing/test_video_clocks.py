@@ -18,7 +18,6 @@ from d2_plugin.recordings.importing.clocks import (
     _solved,
     common_clock,
     given_clock,
-    shortest,
     timecode_seconds,
 )
 from d2_plugin.recordings.importing.motion import Watched, offsets_from_motion
@@ -45,10 +44,6 @@ def test_timecode_counts_frames_as_smpte_12m_does(text: str, rate: float, second
 @pytest.mark.parametrize("text", ["", "noon", "00:61:00:00", "00:00:00:30", "1:2:3"])
 def test_what_is_no_timecode_counts_for_nothing(text: str) -> None:
     assert timecode_seconds(text, 30.0) is None
-
-
-def test_midnight_is_no_day_apart() -> None:
-    assert shortest(86_399.5) == pytest.approx(-0.5)
 
 
 def heard(sound: np.ndarray, seed: int, loudness: float) -> Sound:
@@ -140,6 +135,8 @@ def test_timecode_needs_no_look_at_images() -> None:
     clocks = common_clock(videos, "auto", never)
     assert [clocks[name].seconds for name in videos] == pytest.approx([0.0, -0.2, 1.0], abs=1e-9)
     assert 0 < clocks["b"].error < 0.04
+    midnight = common_clock({"a": a_video(25, "23:59:59:00"), "b": a_video(25, "00:00:00:00")}, "auto", never)
+    assert midnight["b"].seconds == pytest.approx(1.0)
     assert clocks["b"].method == "timecode"
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Annotated, Any
@@ -90,35 +91,32 @@ class Board(Settings):
 
         Columns and rows count squares, as printed; sides are in metres.
         """
-        kind, *parts = text.split(":")
-        match = re.fullmatch(r"(\d{1,3})x(\d{1,3})", parts[0]) if parts else None
-        sides = [_side(part) for part in parts[1:3]]
-        wanted = {"charuco": (2, 3), "checkerboard": (1, 1)}.get(kind)
-        fits = wanted is not None and wanted[0] <= len(parts) - 1 <= wanted[1] and all(sides[: wanted[0]])
-        fits = fits and (len(sides) < 2 or sides[1] < sides[0])
-        if match is None or not fits or min(int(match[1]), int(match[2])) < 3:
-            raise D2Error(
-                f"--board says '{text}', expected charuco:COLUMNSxROWS:SQUARE:MARKER such as charuco:7x5:0.04:0.03, or "
-                "checkerboard:COLUMNSxROWS:SQUARE: count squares, 3 at least, and give their sides in metres"
-            )
-        marker, names = (sides[1], parts[3:]) if kind == "charuco" else (None, [])
-        return cls(int(match[1]), int(match[2]), sides[0], marker, *names)
-
-
-def _side(text: str) -> float:
-    """Metres, 0 for what is none."""
-    try:
-        side = float(text)
-    except ValueError:
-        return 0.0
-    return side if 0 < side < np.inf else 0.0
+        side = r"(\d*\.?\d+(?:[eE]-?\d+)?)"
+        size = r"(\d{1,3})x(\d{1,3})"
+        match = re.fullmatch(rf"charuco:{size}:{side}:{side}(?::(\w+))?|checkerboard:{size}:{side}", text)
+        with suppress(D2Error):
+            if match is not None:
+                columns, rows, square, *more = (group for group in match.groups() if group is not None)
+                marker = float(more[0]) if more else None
+                return cls(int(columns), int(rows), float(square), marker, *more[1:])
+        raise D2Error(
+            f"--board says '{text}', expected charuco:COLUMNSxROWS:SQUARE:MARKER such as charuco:7x5:0.04:0.03, or "
+            "checkerboard:COLUMNSxROWS:SQUARE: count squares, 3 at least, and give their sides in metres"
+        )
 
 
 def board_matches(
     features: Mapping[str, Features], images: Mapping[str, Sequence[np.ndarray]], board: Board
 ) -> tuple[dict[str, Features], Matches]:
     """(the features with the corners of the board behind them, which corners two cameras saw at the same moment)."""
-    seen = {name: _corners_seen(board, taken) for name, taken in images.items()}
+    seen = {  # (moment, number of the corner) -> its pixel; moment 0 is what stands still
+        name: {
+            (moment, number): corner
+            for moment, image in enumerate(taken, start=1)
+            for number, corner in board.corners(image).items()
+        }
+        for name, taken in images.items()
+    }
     more = {name: _with_corners(features[name], corners) for name, corners in seen.items()}
     matches = {}
     for one, other in combinations(seen, 2):
@@ -127,12 +125,6 @@ def board_matches(
         pairs = [(begin + i, start + places[key]) for i, key in enumerate(seen[one]) if key in places]
         matches[one, other] = np.array(pairs, int).reshape(-1, 2)
     return {**features, **more}, matches
-
-
-def _corners_seen(board: Board, taken: Sequence[np.ndarray]) -> dict[tuple[int, int], np.ndarray]:
-    """(moment, number of the corner) -> its pixel."""
-    moments = [(moment, board.corners(image)) for moment, image in enumerate(taken, start=1)]  # 0 is the still
-    return {(moment, number): corner for moment, corners in moments for number, corner in corners.items()}
 
 
 def _with_corners(features: Features, corners: Mapping[tuple[int, int], np.ndarray]) -> Features:

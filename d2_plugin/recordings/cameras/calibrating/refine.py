@@ -26,6 +26,7 @@ from d2_plugin.recordings.cameras.calibrating.rig import aligned, differences
 from d2_plugin.recordings.cameras.calibrating.sharpen import sharpened
 from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.selection import spread
 from d2_plugin.values import checked_arguments
 
 MOMENTS = 6
@@ -89,8 +90,7 @@ def refine(recording: Recording, cameras: Sequence[str] | None = None, moments: 
     names = list(recording.cameras if cameras is None else cameras)
     if len(names) < 2:
         raise D2Error(f"poses are refined between cameras, and {recording.name} has {len(names)} to train: name two")
-    chosen = np.unique(np.linspace(0, len(recording.frames) - 1, moments).round().astype(int))
-    frames = [recording.frames[i] for i in chosen]
+    frames = spread(recording.frames, moments)
     features = {
         name: of_a_still_camera([recording.image(name, frame) for frame in frames], recording.recorded(name))
         for name in names

@@ -32,19 +32,18 @@ class SolvedRig:
     deviations."""
     scale: str = ARBITRARY
     focals: dict[str, float] = field(default_factory=dict)
-    """Camera -> share by which two halves of the images differ about its focal length, where that was bundle."""
+    """Camera -> share by which two halves of the images differ about its focal length, where that was adjusted."""
 
     def verdicts(self) -> dict[str, str]:
         """A sentence per camera."""
-        return {name: self._verdict(name) for name in self.cameras}
-
-    def _verdict(self, name: str) -> str:
-        degrees, share = self.doubt[name]
-        said = f"{self.pixels[name]:.2f} pixels over {self.seen[name]} points"
-        known = f"known to {degrees:.2g} degrees and {share:.2%} of the rig's width"
-        if name not in self.focals:
-            return f"{said}, {known}"
-        return f"{said}, {known}, focal length {self.cameras[name].K[0, 0]:.0f} pixels within {self.focals[name]:.1%}"
+        sentences = {}
+        for name, (degrees, share) in self.doubt.items():
+            known = f"known to {degrees:.2g} degrees and {share:.2%} of the rig's width"
+            sentences[name] = f"{self.pixels[name]:.2f} pixels over {self.seen[name]} points, {known}"
+            if name in self.focals:
+                length = self.cameras[name].K[0, 0]
+                sentences[name] += f", focal length {length:.0f} pixels within {self.focals[name]:.1%}"
+        return sentences
 
     @checked_arguments
     def scaled(self, one: str, other: str, distance: float) -> SolvedRig:

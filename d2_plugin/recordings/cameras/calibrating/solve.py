@@ -11,25 +11,30 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from operator import le
 
 import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.calibrating.boards import Board, board_matches
-from d2_plugin.recordings.cameras.calibrating.bundle import Bundle, Tracks, join_matches
+from d2_plugin.recordings.cameras.calibrating.bundle import Bundle, Tracks, fitting, join_matches, project, triangulate
 from d2_plugin.recordings.cameras.calibrating.features import (
     Features,
     Matches,
+    Pair,
+    as_colmap,
+    essential_pose,
     find_features,
     match_all,
     of_a_still_camera,
+    pixel_error,
+    silent_pycolmap,
     verified,
 )
-from d2_plugin.recordings.cameras.calibrating.grow import grown
 from d2_plugin.recordings.cameras.calibrating.refine import SCHEDULE, bundled, half_of
 from d2_plugin.recordings.cameras.calibrating.rig import SolvedRig, differences
 from d2_plugin.recordings.cameras.calibrating.sharpen import sharpened
-from d2_plugin.recordings.cameras.camera import pinhole
+from d2_plugin.recordings.cameras.camera import pinhole, rigid
 from d2_plugin.recordings.images import checked_image
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.values import checked_arguments
@@ -45,6 +50,16 @@ LARGEST_FOCAL_DOUBT = 0.03
 
 FOCALS = np.geomspace(0.45, 2.4, 9)
 """Focal lengths that are tried where none is known, in longer sides of the image: 96 to 24 degrees across."""
+
+STARTS = 2
+"""Pairs of cameras that are tried as a start, the most promising first."""
+
+FEWEST_SEEN = 12
+"""Points that settle a camera, at least, and as a share of those it should see."""
+LEAST_SHARE = 0.25
+
+GROWING = ((8.0, 1.3), (4.0, 0.4))
+"""Rounds of the adjustment while cameras are added, as `refine.SCHEDULE`."""
 
 ADD = (
     "add stills on the way between the cameras (at most 20 degrees apart), bring neighbouring cameras closer together, "
@@ -93,11 +108,13 @@ def solve_features(
     `wanted` are the cameras that must be settled, `corners` matches that are known beside those of descriptors.
     """
     known = {name: replace(intrinsics[name], T_camera_world=np.eye(4)) for name in features}
-    matched = _joined(match_all(features), corners or {})
+    matched = match_all(features)
+    for pair, more in (corners or {}).items():
+        matched[pair] = np.concatenate([matched[pair], more])
     known = known if focal is None else _likely_focal(matched, features, known)
     matches = verified(matched, features, known)
     tracks = join_matches(matches, tuple(features))
-    bundle = grown(matches, tracks, features, known)
+    bundle = _grown(matches, tracks, features, known)
     unsettled = list(wanted) if bundle is None else [name for name in wanted if name not in bundle.cameras]
     if bundle is None or unsettled:
         raise D2Error(f"the images do not settle where camera {', '.join(unsettled)} stands: {ADD}")
@@ -116,10 +133,6 @@ def _of_one_size(name: str, taken: Sequence[np.ndarray]) -> Sequence[np.ndarray]
     return taken
 
 
-def _joined(matches: Matches, more: Matches) -> Matches:
-    return {pair: np.concatenate([pairs, more[pair]]) if pair in more else pairs for pair, pairs in matches.items()}
-
-
 def _likely_focal(matches: Matches, features: Mapping[str, Features], known: Mapping[str, Camera]) -> dict[str, Camera]:
     """The cameras with the focal length, one for all, with which the most matches agree on a motion."""
 
@@ -134,6 +147,91 @@ def _likely_focal(matches: Matches, features: Mapping[str, Features], known: Map
         return sum(len(pairs) for pairs in verified(matches, features, cameras(factor)).values())
 
     return cameras(float(max(FOCALS, key=agreeing)))
+
+
+def _grown(
+    matches: Matches, tracks: Tracks, features: Mapping[str, Features], known: Mapping[str, Camera]
+) -> Bundle | None:
+    """The bundle with the most cameras, then the most observations; None where no two cameras make a start."""
+    bundles = [_grow(pair, matches, tracks, features, known) for pair in _starts(matches, features, known)]
+    made = [bundle for bundle in bundles if bundle is not None]
+    return max(made, key=lambda one: (len(one.cameras), int((one.tracks.seen >= 0).sum())), default=None)
+
+
+def _starts(matches: Matches, features: Mapping[str, Features], known: Mapping[str, Camera]) -> list[Pair]:
+    """The pairs with the most points at a good angle, best first."""
+    worth = {}
+    for (a, b), pairs in matches.items():
+        rig = _pair_rig((a, b), pairs, features, known)
+        if rig is not None:
+            worth[a, b] = len(triangulate(rig, features, join_matches({(a, b): pairs}, (a, b))).points)
+    return sorted(worth, key=lambda pair: -worth[pair])[:STARTS]
+
+
+def _pair_rig(
+    pair: Pair, pairs: np.ndarray, features: Mapping[str, Features], known: Mapping[str, Camera]
+) -> dict[str, Camera] | None:
+    """Two cameras, a unit apart, by their essential matrix."""
+    pose = essential_pose(pair, pairs, features, known)
+    if pose is None:
+        return None
+    return {pair[0]: known[pair[0]], pair[1]: replace(known[pair[1]], T_camera_world=pose)}
+
+
+def _grow(
+    start: Pair, matches: Matches, tracks: Tracks, features: Mapping[str, Features], known: Mapping[str, Camera]
+) -> Bundle | None:
+    """A bundle from two cameras on, with all the cameras that can be added."""
+    rig = _pair_rig(start, matches[start], features, known)
+    bundle = None if rig is None else bundled(rig, features, tracks, GROWING)
+    while bundle is not None:
+        added = _add(bundle, tracks, features, known)
+        larger = None if added is None else bundled({**bundle.cameras, added.name: added}, features, tracks, GROWING)
+        if larger is None:
+            return bundle
+        bundle = larger
+    return None
+
+
+def _add(
+    bundle: Bundle, tracks: Tracks, features: Mapping[str, Features], known: Mapping[str, Camera]
+) -> Camera | None:
+    """The camera that sees the most points of the bundle, where they settle its pose."""
+    points = fitting(triangulate(bundle.cameras, features, tracks), features, GROWING[-1][0])
+    place = {key: i for i, row in enumerate(points.tracks.seen) for key in _keys(row, tracks.names, bundle.cameras)}
+    seen: dict[str, list[tuple[int, int]]] = {}
+    for row in tracks.seen:
+        of = next((place[key] for key in _keys(row, tracks.names, bundle.cameras) if key in place), None)
+        for name, index in zip(tracks.names, row.tolist(), strict=True):
+            if of is not None and index >= 0 and name not in bundle.cameras:
+                seen.setdefault(name, []).append((index, of))
+    for name in sorted(seen, key=lambda name: -len(seen[name])):
+        camera = _resect(known[name], features[name], np.array(seen[name]), points.points)
+        if camera is not None:
+            return camera
+    return None
+
+
+def _keys(row: np.ndarray, names: Sequence[str], cameras: Mapping[str, Camera]) -> list[tuple[str, int]]:
+    """The features (camera, index) of a track in `cameras`."""
+    return [(name, index) for name, index in zip(names, row.tolist(), strict=True) if index >= 0 and name in cameras]
+
+
+def _resect(camera: Camera, features: Features, seen: np.ndarray, points: np.ndarray) -> Camera | None:
+    """The camera at the pose that explains enough of the points it sees."""
+    if len(seen) < FEWEST_SEEN:
+        return None
+    pycolmap = silent_pycolmap("finding cameras")
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error, options.ransac.random_seed = 2 * pixel_error(camera), 0
+    pixels, there = features.pixels[seen[:, 0]], points[seen[:, 1]]
+    estimate = pycolmap.estimate_and_refine_absolute_pose(pixels, there, as_colmap(camera), options)
+    if estimate is None or estimate["num_inliers"] < max(FEWEST_SEEN, LEAST_SHARE * len(seen)):
+        return None
+    pose = estimate["cam_from_world"]
+    placed = replace(camera, T_camera_world=rigid(pose.rotation.matrix(), np.asarray(pose.translation)))
+    errors = np.linalg.norm(project(placed, there) - pixels, axis=1)
+    return placed if np.isfinite(errors).any() else None
 
 
 def _doubt(
@@ -169,7 +267,7 @@ def _halves(tracks: Tracks, features: Mapping[str, Features], cameras: Mapping[s
 def _refuse_unsure(
     doubt: Mapping[str, tuple[float, float]], focals: Mapping[str, float], wanted: Sequence[str]
 ) -> None:
-    unsure = [name for name in wanted if name not in doubt or not _sure(doubt[name])]
+    unsure = [name for name in wanted if name not in doubt or not all(map(le, doubt[name], LARGEST_DOUBT))]
     if unsure:
         raise D2Error(
             f"two halves of the images disagree about where camera {', '.join(unsure)} stands, so that is not known: "
@@ -182,7 +280,3 @@ def _refuse_unsure(
             f"two halves of the images disagree about the focal length of camera {', '.join(vague)} by {share:.0%}: "
             "say it (--focal PIXELS, --intrinsics FILE), or video a board and calibrate the lens with another tool"
         )
-
-
-def _sure(doubt: tuple[float, float]) -> bool:
-    return all(value <= limit for value, limit in zip(doubt, LARGEST_DOUBT, strict=True))

@@ -185,13 +185,13 @@ def read_panoptic(document: Document) -> Cameras:
     """calibration_SEQUENCE.json of CMU's Panoptic Studio: hundreds of cameras (HD, VGA, Kinect), in centimetres."""
     if not has(document.cameras(), "K", "distCoef", "resolution"):
         return None
-    return [_panoptic_camera(entry, document.place) for entry in document.cameras()]
-
-
-def _panoptic_camera(entry: Any, document: str) -> CalibratedCamera:
-    table = object_of(entry, f"a camera in {document}")
-    name = field(table, "name", str, f"a camera in {document}", CORRECT)
-    place = f"camera {name} in {document}"
-    K, distortion = numbers(table, "K", (3, 3), place), numbers(table, "distCoef", (-1,), place)
-    rotation, translation = numbers(table, "R", (3, 3), place), CENTIMETRES * numbers(table, "t", (3,), place)
-    return _camera(name, place, size_of(table, "resolution", place), K, "opencv", distortion, rotation, translation)
+    cameras = []
+    for entry in document.cameras():
+        place = f"a camera in {document.place}"
+        table = object_of(entry, place)
+        name = field(table, "name", str, place, CORRECT)
+        place = f"camera {name} in {document.place}"
+        K, distortion = numbers(table, "K", (3, 3), place), numbers(table, "distCoef", (-1,), place)
+        R, t = numbers(table, "R", (3, 3), place), CENTIMETRES * numbers(table, "t", (3,), place)
+        cameras.append(_camera(name, place, size_of(table, "resolution", place), K, "opencv", distortion, R, t))
+    return cameras

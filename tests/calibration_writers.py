@@ -36,6 +36,9 @@ class Known(NamedTuple):
         return cv2.projectPoints(points, vector, self.t, self.K, coefficients)[0][:, 0]
 
 
+Writer = Callable[[Path, Sequence[Known]], Path]
+
+
 def rig(
     coefficients: int = 5, fisheye: bool = False, names: Sequence[str] = ("cam_0", "cam_1", "cam_2")
 ) -> list[Known]:
@@ -54,40 +57,29 @@ def rig(
     return found
 
 
-def toml_tables(
-    path: Path, cameras: Sequence[Known], prefix: str = "", metadata: str = "", matrix: bool = False
-) -> None:
-    """Pose2Sim's, Anipose's and Caliscope's tables."""
-    text = ""
-    for number, camera in enumerate(cameras):
-        rotation = camera.R if matrix else cv2.Rodrigues(camera.R)[0].ravel()
-        text += f"[{f'{prefix}{number}' if prefix else camera.name}]\n"
-        text += f"cam_id = {number}\n" if prefix else f'name = "{camera.name}"\n'
-        text += f"size = [ {camera.size[0]}.0, {camera.size[1]}.0]\n" if not prefix else f"size = {list(camera.size)}\n"
-        text += f"matrix = {camera.K.tolist()}\ndistortions = {list(camera.distortion)}\n"
-        text += f"rotation = {np.asarray(rotation).tolist()}\ntranslation = {camera.t.tolist()}\n"
-        text += f"fisheye = {str(camera.fisheye).lower()}\n\n"
-    path.write_text(text + metadata)
+def toml(file: str, prefix: str = "", metadata: str = "", matrix: bool = False) -> Writer:
+    """Writes Pose2Sim's, Anipose's and Caliscope's tables."""
+
+    def write(path: Path, cameras: Sequence[Known]) -> Path:
+        text = ""
+        for number, camera in enumerate(cameras):
+            rotation = camera.R if matrix else cv2.Rodrigues(camera.R)[0].ravel()
+            text += f"[{f'{prefix}{number}' if prefix else camera.name}]\n"
+            text += f"cam_id = {number}\n" if prefix else f'name = "{camera.name}"\n'
+            text += f"size = {list(camera.size) if prefix else [float(side) for side in camera.size]}\n"
+            text += f"matrix = {camera.K.tolist()}\ndistortions = {list(camera.distortion)}\n"
+            text += f"rotation = {np.asarray(rotation).tolist()}\ntranslation = {camera.t.tolist()}\n"
+            text += f"fisheye = {str(camera.fisheye).lower()}\n\n"
+        (path / file).write_text(text + metadata)
+        return path / file
+
+    return write
 
 
-def pose2sim(path: Path, cameras: Sequence[Known]) -> Path:
-    toml_tables(path / "Calib_board.toml", cameras, metadata="[metadata]\nadjusted = false\nerror = 0.0\n")
-    return path / "Calib_board.toml"
-
-
-def anipose(path: Path, cameras: Sequence[Known]) -> Path:
-    toml_tables(path / "calibration.toml", cameras, metadata="[metadata]\nerror = 0.31\n")
-    return path / "calibration.toml"
-
-
-def caliscope(path: Path, cameras: Sequence[Known]) -> Path:
-    toml_tables(path / "camera_array.toml", cameras, prefix="cameras.")
-    return path / "camera_array.toml"
-
-
-def old_caliscope(path: Path, cameras: Sequence[Known]) -> Path:
-    toml_tables(path / "config.toml", cameras, prefix="cameras.", matrix=True)
-    return path / "config.toml"
+pose2sim = toml("Calib_board.toml", metadata="[metadata]\nadjusted = false\nerror = 0.0\n")
+anipose = toml("calibration.toml", metadata="[metadata]\nerror = 0.31\n")
+caliscope = toml("camera_array.toml", prefix="cameras.")
+old_caliscope = toml("config.toml", prefix="cameras.", matrix=True)
 
 
 def easymocap(path: Path, cameras: Sequence[Known]) -> Path:
@@ -260,7 +252,7 @@ def rig_config(path: Path, cameras: Sequence[Known]) -> Path:
 class Case(NamedTuple):
     """One format: how it is written, what the table calls it, which lenses it holds."""
 
-    write: Callable[[Path, Sequence[Known]], Path]
+    write: Writer
     format: str
     coefficients: int = 5
     fisheye: bool = False
