@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from d2_plugin.priors.cross_view import kernel
 from d2_plugin.priors.cross_view.kernel import (
     BESIDE,
     COMPARED,
@@ -102,20 +103,8 @@ class Answer(NamedTuple):
     """Whether another camera has a depth where the point lies in its image, bool."""
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """One view of an instant; contiguous maps [H, W]."""
-
-    labels: np.ndarray
-    """`Label`, uint8."""
-    depth: np.ndarray
-    """float32."""
-    log: np.ndarray
-    """Logarithm of the depth, float32; infinite where there is none."""
-    sigma: np.ndarray
-    """float32."""
-    colors: np.ndarray | None
-    """Mean of 3x3 pixels, uint8 [H, W, 3]; None where there is no image."""
+class View(kernel.View):
+    """One view of an instant."""
 
     @functools.cached_property
     def surface(self) -> np.ndarray:
