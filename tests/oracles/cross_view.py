@@ -128,15 +128,7 @@ class View(kernel.View):
 def ask(
     points: Points, name: str, views: Mapping[str, View], cameras: Mapping[str, Camera], tolerance: float
 ) -> Answer:
-    """What all others say about points of view `name`.
-
-    Args:
-        points: of that view.
-        name: of that view.
-        views: all of one instant, by camera.
-        cameras: their calibrations.
-        tolerance: largest difference in log depth at which two monocular depths agree.
-    """
+    """What all others show of points of view `name`; `tolerance` is in log depth."""
     count = len(points.depth)
     depth, sigma = np.zeros(count), np.full(count, np.inf)
     agreed, seen = np.zeros(count, bool), np.zeros(count, bool)
@@ -144,14 +136,13 @@ def ask(
         if other == name or not count:
             continue
         pair = view_pair(cameras[name], cameras[other])
-        asked = _as_seen_by(points, _gain(views[name], theirs, pair))
+        gain = _gain(views[name], theirs, pair)
+        asked = points if points.colors is None else points._replace(colors=points.colors * gain)
         place, at, logs = _inside(asked, pair, theirs.depth.shape)
         apart = theirs.apart(at, logs, (Label.MONO, Label.AGREED))
         seen[place] |= np.isfinite(apart)
         close = np.flatnonzero(apart < tolerance)
         agreed[place[close]] |= _alike(asked.only(place[close]), theirs, *(values[close] for values in at))
-        # Most rays start where nothing is verified; those whose first step leaves the allowed way several times over
-        # meet nothing either. Only the others are followed.
         near = place[theirs.apart(at, logs, (Label.VERIFIED,)) < MISSED]
         found, precision = _intersection(asked.only(near), pair, theirs)
         seen[near] |= found > 0
@@ -202,17 +193,7 @@ def _alike(points: Points, theirs: View, row: np.ndarray, column: np.ndarray) ->
     if points.colors is None or theirs.colors is None:
         return np.ones(len(points.depth), bool)
     apart = np.abs(points.colors.astype(np.float32) - theirs.colors[row, column])
-    return _in_all_channels(apart < LIKE * 255)
-
-
-def _in_all_channels(holds: np.ndarray) -> np.ndarray:
-    """Whether something holds [K, 3] in all three, [K]; NumPy's own reduction takes ten times as long."""
-    return holds[:, 0] & holds[:, 1] & holds[:, 2]
-
-
-def _as_seen_by(points: Points, gain: np.ndarray) -> Points:
-    """The points in the colours of a camera that shows everything so many times brighter."""
-    return points if points.colors is None else points._replace(colors=points.colors * gain)
+    return (apart < LIKE * 255).all(axis=1)
 
 
 def _gain(ours: View, theirs: View, pair: ViewPair) -> np.ndarray:
@@ -224,10 +205,10 @@ def _gain(ours: View, theirs: View, pair: ViewPair) -> np.ndarray:
     place, at, logs = _inside(Points(columns, rows, depth, depth, mine), pair, theirs.surface.shape)
     seen = theirs.colors[at].astype(np.float32)
     one_place = theirs.apart(at, logs, (Label.VERIFIED,)) < ONE_PLACE
-    bright = one_place & _in_all_channels(np.minimum(mine[place], seen) > DARK)
+    bright = one_place & (np.minimum(mine[place], seen) > DARK).all(axis=1)
     if np.count_nonzero(bright) < FEWEST:
         return np.ones(3, np.float32)
-    return np.median((seen[bright] / mine[place[bright]]).T.copy(), axis=1)
+    return np.median(seen[bright] / mine[place[bright]], axis=0)
 
 
 def _allowed(points: Points) -> np.ndarray:

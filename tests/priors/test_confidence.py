@@ -99,12 +99,6 @@ def test_distances_along_the_ray_become_planar_depth_once(recording: Recording) 
     np.testing.assert_allclose(built(recording).prior(NAME, 0).depth, before, rtol=1e-3)
 
 
-def test_an_unknown_direction_is_refused(recording: Recording) -> None:
-    write_sensor(recording, recording.depth(NAME, 0), {"scale": 1.0, "along": "rays"})
-    with pytest.raises(D2Error, match=r"unknown along in .*depth.json 'rays'.*ray"):
-        built(recording)
-
-
 class Monocular:
     """A source whose monocular map is given."""
 

@@ -134,6 +134,7 @@ def test_sensor_depth_comes_at_the_size_of_images_with_fewer_or_more_pixels(reco
         ({"unit": "m", "scale": 1}, "either scale .* or unit"),
         ({"unit": "feet"}, "unknown unit in .*depth.json 'feet'"),
         ({"scale": -1}, "scale -1, expected"),
+        ({"scale": 1, "along": "rays"}, "unknown along in .*depth.json 'rays'.*ray"),
         ({"scale": "1"}, "scale '1', expected"),
         ([], "either scale .* or unit"),
     ],

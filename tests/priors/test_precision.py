@@ -77,13 +77,6 @@ def test_where_anything_is_unknown_sigma_is_infinite_and_never_nan() -> None:
     assert sigma.dtype == np.float32
 
 
-def test_values_outside_of_their_range_count_as_its_ends() -> None:
-    depth = plane(20, 30)
-    np.testing.assert_array_equal(sigma_of(depth, coherence=7.0), sigma_of(depth, coherence=1.0))
-    np.testing.assert_array_equal(sigma_of(depth, coherence=-7.0), sigma_of(depth, coherence=0.0))
-    np.testing.assert_array_equal(sigma_of(depth, gradient=0.0), sigma_of(depth, gradient=-1.0))
-
-
 def test_the_gradient_is_that_of_the_grey_value_whatever_its_direction() -> None:
     rows, columns = np.mgrid[:40, :60]
     ramp = (20 + 2 * columns + rows).astype(np.uint8)

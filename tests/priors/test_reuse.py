@@ -107,13 +107,6 @@ def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(
     assert priors_of(tmp_path) == priors_of(built)
 
 
-def test_shards_built_in_any_order_join_to_the_same_store(recording: Recording, built: Path, tmp_path: Path) -> None:
-    parts = [build_priors(recording, NAMES, tmp_path, SETTINGS, shard=(index, 2)) for index in (1, 0)]
-    assert [part.built for part in parts] == [4, 6]
-    assert priors_of(tmp_path) == priors_of(built)
-    assert (tmp_path / "store.json").read_bytes() == (built / "store.json").read_bytes()
-
-
 @pytest.mark.parametrize("shard", [(2, 2), (-1, 2), (0, 0)])
 def test_a_shard_that_does_not_exist_is_refused(recording: Recording, tmp_path: Path, shard: tuple[int, int]) -> None:
     with pytest.raises(D2Error, match="does not exist"):

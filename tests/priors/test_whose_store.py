@@ -13,7 +13,6 @@ import pytest
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, PriorSummary, build_priors
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
@@ -130,19 +129,3 @@ def test_a_header_that_lies_is_refused(recording: Recording, tmp_path: Path) -> 
         array.write_bytes(content)
         with pytest.raises(D2Error, match="camera train0, frame 0 is damaged"):
             PriorStore.open(tmp_path)
-
-
-def test_the_summary_says_what_is_usable_camera_by_camera() -> None:
-    summary = PriorSummary()
-    shares = dict.fromkeys((label.name.lower() for label in Label), 0.0)
-    summary.add("a", 0, {"shares": shares | {"verified": 0.5}, "refused": ""}, True)
-    summary.add("b", 0, {"shares": shares | {"empty": 1.0}, "refused": "no depth"}, True)
-    assert summary.usable
-    assert summary.headline() == "prior: 1 of 2 views are usable; none of camera b; maps refused 1x no depth"
-    told = summary.as_dict()
-    assert told["refused"] == [{"camera": "b", "frame": 0, "reason": "no depth"}]
-    assert told["cameras"]["b"]["usable"] == 0
-    other = PriorSummary()
-    other.add("b", 1, {"shares": shares | {"far": 1.0}, "refused": ""}, False)
-    summary.add_part(other)
-    assert summary.headline().startswith("prior: 2 of 3 views are usable; maps")

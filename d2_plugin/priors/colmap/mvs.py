@@ -113,7 +113,13 @@ def colmap_patch_match(
         write_workspace(workspace, grays, cameras, sources, patch_match_options((near, far), settings))
         (run or run_patch_match)(workspace, 60 * settings.colmap_minutes)
         kind = "geometric" if settings.colmap_geometric else "photometric"
-        maps = _checked_maps(workspace / "stereo" / "depth_maps", kind, cameras, sources)
+        left = workspace / "stereo" / "depth_maps"
+        maps = [
+            _checked_map(left / f"{_image(index)}.{kind}.bin", camera)
+            if sources[index]  # COLMAP was asked for no other
+            else np.zeros((camera.height, camera.width), np.float32)
+            for index, camera in enumerate(cameras)
+        ]
     maps = [np.where((depth >= near) & (depth <= far), depth, np.float32(0)) for depth in maps]
     if not any(depth.any() for depth in maps):
         logger.warning("COLMAP found no depth in any view: no texture, a wrong depth range, or a GPU it is too old for")
@@ -233,18 +239,6 @@ def _last_words(text: str) -> str:
     lines = [line.strip() for line in text.splitlines()]
     reasons = [line for line in lines if line and not line.startswith(("@", "***", "terminate called"))]
     return reasons[-1][:300] if reasons else "without a word"
-
-
-def _checked_maps(
-    folder: Path, kind: str, cameras: Sequence[Camera], sources: Sequence[Sequence[int]]
-) -> list[np.ndarray]:
-    """The maps that COLMAP left, zeros for views that it was not asked for."""
-    return [
-        _checked_map(folder / f"{_image(index)}.{kind}.bin", camera)
-        if sources[index]
-        else np.zeros((camera.height, camera.width), np.float32)
-        for index, camera in enumerate(cameras)
-    ]
 
 
 def _checked_map(path: Path, camera: Camera) -> np.ndarray:

@@ -192,28 +192,21 @@ def error_shape(depth: np.ndarray, anchors: np.ndarray, at: np.ndarray | None = 
     beyond = np.maximum(chosen(log_depth) - np.float32(median(log_anchors)), 0)
     nowhere_above = np.where(predicted, log_depth, np.float32(-EVER))
     nowhere_below = np.where(predicted, log_depth, np.float32(EVER))
-    edge, wide_edge = (
-        _span(*(chosen(far) for far in _farthest(cv2, nowhere_above, nowhere_below, share * width)))
-        for share in (0.005, 0.02)
-    )
+
+    def spanned(share: float) -> np.ndarray:
+        """Span of log depth within a square of that share of the width around each pixel; 0 where there is none."""
+        side = 2 * max(1, round(share * width)) + 1
+        kernel = np.ones((side, side), np.uint8)
+        largest, smallest = chosen(cv2.dilate(nowhere_above, kernel)), chosen(cv2.erode(nowhere_below, kernel))
+        return np.where(largest < smallest, 0, largest - smallest)
+
+    edge, wide_edge = spanned(0.005), spanned(0.02)
     own = (EDGE * np.minimum(edge, 0.7)) ** 2, (WIDE_EDGE * np.minimum(wide_edge, 1)) ** 2, (BEYOND * beyond) ** 2
     near, next_near = (
         DISTANCE**2 * np.minimum(far / width, 0.3) for far in (chosen(distance), np.full(1, NEXT * width, np.float32))
     )
     usual = np.sqrt(sum(own, FLOOR**2 + near + (GAP * np.minimum(gap, 0.6)) ** 2))
     return usual, np.sqrt(sum(own, FLOOR**2 + next_near))
-
-
-def _farthest(cv2: Any, above: np.ndarray, below: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Largest of `above` and smallest of `below` [H, W] within a square of that radius, pixels."""
-    side = 2 * max(1, round(radius)) + 1
-    kernel = np.ones((side, side), np.uint8)
-    return cv2.dilate(above, kernel), cv2.erode(below, kernel)
-
-
-def _span(largest: np.ndarray, smallest: np.ndarray) -> np.ndarray:
-    """Largest minus smallest; 0 where there is neither."""
-    return np.where(largest < smallest, 0, largest - smallest)
 
 
 def _count(masks: np.ndarray) -> np.ndarray:
