@@ -140,26 +140,22 @@ class DepthOnDisk(GeometricSource):
 
     def _inputs(self, frame: Frame) -> list[list[str | None]]:
         """Hashes of the maps and of their confidence."""
-        confidences = [None if map_ is None else digest(map_) for map_ in self._confidences(frame.number)]
-        return [[digest(depth) for depth in self._read(frame.number)], confidences]
+        confidences = [self.confidence.of(camera, frame.number) for camera in self.cameras]
+        hashes = [None if map_ is None else digest(map_) for map_ in confidences]
+        return [[digest(depth) for depth in self._read(frame.number)], hashes]
 
     def _computed(self, frame: Frame) -> list[GeometricDepth]:
         """D^g per camera at one frame."""
-        confidences = self._confidences(frame.number)
+        confidences = [self.confidence.of(camera, frame.number) for camera in self.cameras]
         known = [True if values is None else values > 0 for values in confidences]
         maps = [np.where(where, depth, np.float32(0)) for where, depth in zip(known, self._read(frame.number))]
-        filtered = self._filtered(frame, maps)
-        return [replace(depth, sigma=divided(depth.sigma, c)) for depth, c in zip(filtered, confidences)]
-
-    def _filtered(self, frame: Frame, maps: list[np.ndarray]) -> list[GeometricDepth]:
         if self.matcher == SensorDepth.name:
-            return [filter_sensor(depth, self.settings) for depth in maps]
-        grays = [gray(frame.images[camera.name]) for camera in self.cameras]
-        costs = [np.zeros(depth.shape, np.float32) for depth in maps]
-        return filter_depths(grays, self.cameras, maps, costs, self.settings)
-
-    def _confidences(self, number: int) -> list[np.ndarray | None]:
-        return [self.confidence.of(camera, number) for camera in self.cameras]
+            filtered = [filter_sensor(depth, self.settings) for depth in maps]
+        else:
+            grays = [gray(frame.images[camera.name]) for camera in self.cameras]
+            costs = [np.zeros(depth.shape, np.float32) for depth in maps]
+            filtered = filter_depths(grays, self.cameras, maps, costs, self.settings)
+        return [replace(depth, sigma=divided(depth.sigma, c)) for depth, c in zip(filtered, confidences)]
 
     def _read(self, number: int) -> list[np.ndarray]:
         """The maps of one frame, float32 [H, W] per camera, 0 where unknown or out of range; the last are kept."""

@@ -8,24 +8,17 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
-SHOWN = {
-    "verified": "verified",
-    "agreed": "agreed",
-    "mono only": "mono",
-    "far": "far",
-    "conflict": "conflict",
-    "empty": "empty",
-}
-"""Columns of the summary, and the share each shows."""
-
-TOLD = ("shares", "sigmas", "refused")
-"""What of a record the summary keeps."""
+SHOWN = {label: label for label in ("verified", "agreed", "mono", "far", "conflict", "empty")} | {"mono": "mono only"}
+"""Columns of the summary: label and title."""
 
 USED = ("verified", "agreed", "mono", "far")
 """Labels of pixels that the hooks can use."""
 
-DECLARED = {"verified": "verified", "agreed": "agreed", "mono only": "mono"}
-"""Columns that also show a median sigma."""
+DECLARED = ("verified", "agreed", "mono")
+"""Labels that also show a median sigma."""
+
+TOLD = ("shares", "sigmas", "refused")
+"""What of a record the summary keeps."""
 
 
 @dataclass
@@ -108,7 +101,7 @@ class PriorSummary:
                 "views": len(self._of(camera)),
                 "usable": self._used(camera),
                 "shares": shares,
-                "sigma": {label: self.sigma(camera, label) for label in DECLARED.values()},
+                "sigma": {label: self.sigma(camera, label) for label in DECLARED},
             }
             for camera, shares in self.shares.items()
         }
@@ -124,18 +117,18 @@ class PriorSummary:
         return "\n".join([*lines, *self.notes])
 
     def _share_lines(self) -> list[str]:
-        lines = [f"{'camera':12}" + "  ".join(f"{name:>9}" for name in SHOWN)]
+        lines = [f"{'camera':12}" + "  ".join(f"{title:>9}" for title in SHOWN.values())]
         for camera, share in self.shares.items():
-            values = (share.get(label, 0.0) for label in SHOWN.values())
+            values = (share.get(label, 0.0) for label in SHOWN)
             lines.append(f"{camera:12}" + "  ".join(f"{value:9.1%}" for value in values))
         return lines
 
     def _sigma_lines(self) -> list[str]:
         """Median sigma per camera and label; nothing where no sigma was declared, as in the paper."""
-        rows = {camera: [self.sigma(camera, label) for label in DECLARED.values()] for camera in self.shares}
+        rows = {camera: [self.sigma(camera, label) for label in DECLARED] for camera in self.shares}
         if all(value is None for values in rows.values() for value in values):
             return []
-        lines = [f"{'sigma':12}" + "  ".join(f"{name:>9}" for name in DECLARED)]
+        lines = [f"{'sigma':12}" + "  ".join(f"{SHOWN[label]:>9}" for label in DECLARED)]
         for camera, values in rows.items():
             shown = (f"{'-':>9}" if value is None else f"{value:9.2%}" for value in values)
             lines.append(f"{camera:12}" + "  ".join(shown))
