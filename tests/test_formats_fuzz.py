@@ -18,7 +18,7 @@ from tiny_onnx import mean_network
 from benchmarks.report import EVERY
 from d2_plugin.arrays import read_array
 from d2_plugin.config import D2Config, for_iterations
-from d2_plugin.priors.colmap.dense_arrays import read_dense_array
+from d2_plugin.priors.colmap.workspace import read_dense_array
 from d2_plugin.priors.depth_on_disk import SensorDepth
 from d2_plugin.priors.monocular.network import MonocularModel
 from d2_plugin.protocol import EXPORT_FILE

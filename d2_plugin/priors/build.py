@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -222,10 +223,7 @@ def _geometric_source(
     if len(cameras) == 1 or stereo.matcher == NO_MATCHER:
         return None, None
     bounds = _chosen_bounds(settings) or _rounded(depth_bounds(cameras, points, stereo.max_angle))
-
-    def read(number: int) -> Frame:
-        return Frame.read(recording, names, number)
-
+    read = functools.partial(Frame.read, recording, names)
     return MatchedDepth(cameras, bounds, stereo, cache, recording.frames, read), bounds
 
 

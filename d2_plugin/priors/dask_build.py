@@ -62,30 +62,15 @@ def build_priors_on_cluster(
     if recording.path is not None:
         recording = replace(recording, path=recording.path.absolute())
     with cluster_client(scheduler, workers) as client, client.as_current():
-        count = _part_count(recording, settings, len(client.nthreads()))
-        points = None if sparse_points is None else np.asarray(sparse_points)
+        # Parts are whole blocks, since frames within a block are built in order.
+        blocks = len(frame_blocks(recording.frames, settings.stereo))
+        count = min(blocks, PARTS_PER_WORKER * max(len(client.nthreads()), 1))
+        shared = {"sparse_points": None if sparse_points is None else np.asarray(sparse_points), "pure": False}
         parts = [
-            client.submit(_build_part, recording, list(cameras), folder, settings, points, (index, count), pure=False)
+            client.submit(build_priors, recording, list(cameras), folder, settings, shard=(index, count), **shared)
             for index in range(count)
         ]
         return _joined(parts, len(recording.frames) * len(cameras), progress)
-
-
-def _build_part(
-    recording: Recording,
-    cameras: list[str],
-    output: Path,
-    settings: PriorSettings,
-    points: np.ndarray | None,
-    shard: tuple[int, int],
-) -> PriorSummary:
-    """What a worker does."""
-    return build_priors(recording, cameras, output, settings, sparse_points=points, shard=shard)
-
-
-def _part_count(recording: Recording, settings: PriorSettings, workers: int) -> int:
-    """Parts are whole blocks, since frames within a block are built in order."""
-    return min(len(frame_blocks(recording.frames, settings.stereo)), PARTS_PER_WORKER * max(workers, 1))
 
 
 def _joined(parts: list[Any], total: int, progress: Progress | None) -> PriorSummary:

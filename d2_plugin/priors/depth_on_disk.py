@@ -13,7 +13,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
@@ -46,16 +46,6 @@ SAME_SURFACE = 0.03
 """Neighbours of a sensor's depth agree within this share of it."""
 
 
-class DepthMaps(Protocol):
-    """A folder of depth maps; `name` is what the setting `matcher` calls it, `about` describes it to a person."""
-
-    name: ClassVar[str]
-    about: str
-
-    def depth(self, camera: Camera, frame: int) -> np.ndarray | None:
-        """Planar depth float32 [H, W] at the camera's size in world units, 0 where unknown, or None: no map."""
-
-
 class SensorDepth:
     """The maps of depth sensors in one folder.
 
@@ -66,14 +56,14 @@ class SensorDepth:
     name: ClassVar[str] = "sensor"
 
     def __init__(self, folder: Path, cameras: Sequence[str]) -> None:
-        self.scale, self.along_ray = _scale(folder / "depth.json"), _along_ray(folder / "depth.json")
+        self.scale, self.along_ray = _meaning(folder / "depth.json")
         self.files: dict[str, FrameFiles] = {
             name: numbered_files(folder / name, SUFFIXES) for name in cameras if (folder / name).is_dir()
         }
         self.about = f"sensor depth of {', '.join(self.files) or 'no camera'} in {folder.name}/"
 
     def depth(self, camera: Camera, frame: int) -> np.ndarray | None:
-        """The map of one camera at one frame (see `DepthMaps`)."""
+        """Planar depth float32 [H, W] at the camera's size in world units, 0 where unknown, or None: no map."""
         path = self.files.get(camera.name, {}).get(frame)
         if path is None:
             return None
@@ -82,6 +72,10 @@ class SensorDepth:
         known = np.isfinite(stored) & (stored > 0)
         depth = at_image_size(np.where(known, stored, np.float32(0)), camera, path)
         return planar(depth, camera) if self.along_ray else depth
+
+
+DepthMaps = SensorDepth | WorkspaceDepth
+"""A folder of depth maps; `name` is what the setting `matcher` calls it, `about` describes it to a person."""
 
 
 def find_depth_on_disk(recording: Recording, cameras: Sequence[str], settings: StereoSettings) -> DepthMaps | None:
@@ -146,26 +140,22 @@ class DepthOnDisk(GeometricSource):
 
     def _inputs(self, frame: Frame) -> list[list[str | None]]:
         """Hashes of the maps and of their confidence."""
-        confidences = [None if map_ is None else digest(map_) for map_ in self._confidences(frame.number)]
-        return [[digest(depth) for depth in self._read(frame.number)], confidences]
+        confidences = [self.confidence.of(camera, frame.number) for camera in self.cameras]
+        hashes = [None if map_ is None else digest(map_) for map_ in confidences]
+        return [[digest(depth) for depth in self._read(frame.number)], hashes]
 
     def _computed(self, frame: Frame) -> list[GeometricDepth]:
         """D^g per camera at one frame."""
-        confidences = self._confidences(frame.number)
+        confidences = [self.confidence.of(camera, frame.number) for camera in self.cameras]
         known = [True if values is None else values > 0 for values in confidences]
         maps = [np.where(where, depth, np.float32(0)) for where, depth in zip(known, self._read(frame.number))]
-        filtered = self._filtered(frame, maps)
-        return [replace(depth, sigma=divided(depth.sigma, c)) for depth, c in zip(filtered, confidences)]
-
-    def _filtered(self, frame: Frame, maps: list[np.ndarray]) -> list[GeometricDepth]:
         if self.matcher == SensorDepth.name:
-            return [filter_sensor(depth, self.settings) for depth in maps]
-        grays = [gray(frame.images[camera.name]) for camera in self.cameras]
-        costs = [np.zeros(depth.shape, np.float32) for depth in maps]
-        return filter_depths(grays, self.cameras, maps, costs, self.settings)
-
-    def _confidences(self, number: int) -> list[np.ndarray | None]:
-        return [self.confidence.of(camera, number) for camera in self.cameras]
+            filtered = [filter_sensor(depth, self.settings) for depth in maps]
+        else:
+            grays = [gray(frame.images[camera.name]) for camera in self.cameras]
+            costs = [np.zeros(depth.shape, np.float32) for depth in maps]
+            filtered = filter_depths(grays, self.cameras, maps, costs, self.settings)
+        return [replace(depth, sigma=divided(depth.sigma, c)) for depth, c in zip(filtered, confidences)]
 
     def _read(self, number: int) -> list[np.ndarray]:
         """The maps of one frame, float32 [H, W] per camera, 0 where unknown or out of range; the last are kept."""
@@ -206,30 +196,18 @@ def flying_pixels(depth: np.ndarray) -> np.ndarray:
     return (depth > 0) & (2 * (agreeing - 1) < len(steps) ** 2 - 1)
 
 
-def _described(path: Path) -> dict[str, Any]:
-    """What depth.json holds."""
-    return read_json(path, "write either scale (world units per stored number) or unit into it")
-
-
-def _along_ray(path: Path) -> bool:
-    """Whether the maps hold distances along the ray."""
-    table = _described(path)
-    along = table.get("along", ALONG[0])
-    if along not in ALONG:
-        raise unknown_name(f"along in {path}", str(along)[:40], ALONG)
-    return bool(along == "ray")
-
-
-def _scale(path: Path) -> float:
-    """World units per stored number."""
-    table = _described(path)
+def _meaning(path: Path) -> tuple[float, bool]:
+    """What a depth.json declares: world units per stored number, and whether distances are measured along the ray."""
+    table = read_json(path, "write either scale (world units per stored number) or unit into it")
     if ("unit" in table) == ("scale" in table):
         raise D2Error(f"{path} must have either scale (world units per stored number) or unit, got {shown(table)}")
+    along, unit, scale = table.get("along", ALONG[0]), table.get("unit"), table.get("scale")
+    if along not in ALONG:
+        raise unknown_name(f"along in {path}", str(along)[:40], ALONG)
     if "unit" in table:
-        if not isinstance(table["unit"], str) or table["unit"] not in UNITS:
-            raise unknown_name(f"unit in {path}", str(table["unit"])[:40], UNITS)
-        return UNITS[table["unit"]]
-    scale = table["scale"]
-    if isinstance(scale, bool) or not isinstance(scale, int | float) or not SCALES[0] <= scale <= SCALES[1]:
+        if not isinstance(unit, str) or unit not in UNITS:
+            raise unknown_name(f"unit in {path}", str(unit)[:40], UNITS)
+        scale = UNITS[unit]
+    elif isinstance(scale, bool) or not isinstance(scale, int | float) or not SCALES[0] <= scale <= SCALES[1]:
         raise D2Error(f"{path} says scale {shown(scale)}, expected world units per stored number above 0: correct it")
-    return float(scale)
+    return float(scale), along == "ray"

@@ -46,9 +46,8 @@ def with_evidence(
         tolerance: largest relative difference at which two monocular depths agree.
         tails: by camera, how many times sigma is enlarged for a heavy tail (`Skill.tail`); 1 where that is unknown.
     """
-    known = {} if tails is None else {name: tail for name, tail in tails.items() if tail >= 1}
     views = {name: view_of(prior) for name, prior in priors.items()}
-    factors = {name: AGREED / known.get(name, 1.0) for name in priors}
+    factors = {name: AGREED / np.fmax((tails or {}).get(name, 1.0), 1.0) for name in priors}
     changed = compare_views(views, cameras, factors, {"tolerance": tolerance, "at_best": AT_BEST, "alone": ALONE})
     return {
         name: replace(prior, labels=changed[name][0], depth=changed[name][1], sigma=changed[name][2])

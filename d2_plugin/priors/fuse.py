@@ -28,16 +28,15 @@ EPSILON = 1e-9
 """The paper's eps, world units."""
 
 
-def cross_source_discrepancy(mono: np.ndarray, geometric: np.ndarray, epsilon: float = EPSILON) -> np.ndarray:
+def cross_source_discrepancy(mono: np.ndarray, geometric: np.ndarray) -> np.ndarray:
     """e = |D-bar^m - D^g| / (D^g + eps), float32 [H, W]; infinite where there is no geometric depth.
 
     Args:
         mono: aligned monocular depth float [H, W].
         geometric: D^g float [H, W], 0 where unknown.
-        epsilon: the paper's eps.
     """
     known = geometric > 0
-    relative = np.abs(mono - geometric) / (np.where(known, geometric, 1) + epsilon)
+    relative = np.abs(mono - geometric) / (np.where(known, geometric, 1) + EPSILON)
     return np.where(known, relative, np.inf).astype(np.float32)
 
 

@@ -5,24 +5,20 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
 from typing import Any
 
-SHOWN = {
-    "verified": "verified",
-    "agreed": "agreed",
-    "mono only": "mono",
-    "far": "far",
-    "conflict": "conflict",
-    "empty": "empty",
-}
-"""Columns of the summary, and the share each shows."""
+SHOWN = {label: label for label in ("verified", "agreed", "mono", "far", "conflict", "empty")} | {"mono": "mono only"}
+"""Columns of the summary: label and title."""
 
 USED = ("verified", "agreed", "mono", "far")
 """Labels of pixels that the hooks can use."""
 
-DECLARED = {"verified": "verified", "agreed": "agreed", "mono only": "mono"}
-"""Columns that also show a median sigma."""
+DECLARED = ("verified", "agreed", "mono")
+"""Labels that also show a median sigma."""
+
+TOLD = ("shares", "sigmas", "refused")
+"""What of a record the summary keeps."""
 
 
 @dataclass
@@ -31,61 +27,58 @@ class PriorSummary:
 
     built: int = 0
     kept: int = 0
-    shares: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Mean share of the pixels with each label, by camera."""
-    sigmas: dict[str, dict[str, list[float]]] = field(default_factory=dict)
-    """Median sigma of each frame's pixels with each label, by camera; frames without a finite one are left out."""
-    refused: list[tuple[str, int, str]] = field(default_factory=list)
+    views: dict[tuple[str, int], dict[str, Any]] = field(default_factory=dict)
+    """What the record of each view says of its `shares`, `sigmas` and `refused`, by camera and frame."""
     notes: list[str] = field(default_factory=list)
     folder: Path | None = None
     """Where the priors are: the output, or a folder of their own in it, beside the priors of other cameras."""
-    _counts: Counter[str] = field(default_factory=Counter)
-    _used: Counter[str] = field(default_factory=Counter)
-    """Views with a usable pixel, by camera."""
 
     def add(self, camera: str, frame: int, record: dict[str, Any], built: bool) -> None:
         """Take one view's record into account."""
         self.built, self.kept = self.built + built, self.kept + (not built)
-        count = self._counts[camera]
-        mean = self.shares.setdefault(camera, dict.fromkeys(record["shares"], 0.0))
-        for label, share in record["shares"].items():
-            mean[label] += (share - mean[label]) / (count + 1)
-        self._counts[camera] += 1
-        self._used[camera] += any(record["shares"].get(label, 0.0) > 0 for label in USED)
-        sigmas = self.sigmas.setdefault(camera, {})
-        for label, sigma in record.get("sigmas", {}).items():
-            if sigma is not None:
-                sigmas.setdefault(label, []).append(sigma)
-        if record["refused"]:
-            self.refused.append((camera, frame, record["refused"]))
+        self.views[camera, frame] = {"sigmas": {}} | {name: record[name] for name in TOLD if name in record}
 
     def add_part(self, part: PriorSummary) -> None:
         """Take in the summary of another part of the same build; notes that both have are kept once."""
         self.built, self.kept = self.built + part.built, self.kept + part.kept
-        for camera, share in part.shares.items():
-            mean = self.shares.setdefault(camera, dict.fromkeys(share, 0.0))
-            total = self._counts[camera] + part._counts[camera]
-            for label, value in share.items():
-                mean[label] += (value - mean[label]) * part._counts[camera] / total
-            self._counts[camera] = total
-        self._used.update(part._used)
-        for camera, labels in part.sigmas.items():
-            sigmas = self.sigmas.setdefault(camera, {})
-            for label, values in labels.items():
-                sigmas.setdefault(label, []).extend(values)
-        self.refused = sorted([*self.refused, *part.refused], key=lambda refusal: refusal[1])
+        self.views |= part.views
         self.folder = part.folder or self.folder
         self.notes += [note for note in part.notes if note not in self.notes]
 
+    @property
+    def shares(self) -> dict[str, dict[str, float]]:
+        """Mean share of the pixels with each label, by camera."""
+        of_camera = {camera: [view["shares"] for view in self._of(camera)] for camera in self._cameras()}
+        return {
+            camera: {label: fmean(share[label] for share in shares) for label in shares[0]}
+            for camera, shares in of_camera.items()
+        }
+
+    @property
+    def refused(self) -> list[tuple[str, int, str]]:
+        """Camera, frame and reason of each view whose map was refused, by frame."""
+        refused = [(camera, frame, view["refused"]) for (camera, frame), view in self.views.items() if view["refused"]]
+        return sorted(refused, key=lambda refusal: refusal[1])
+
+    def _cameras(self) -> list[str]:
+        return list(dict.fromkeys(camera for camera, _ in self.views))
+
+    def _of(self, camera: str) -> list[dict[str, Any]]:
+        return [view for (name, _), view in self.views.items() if name == camera]
+
+    def _used(self, camera: str) -> int:
+        """How many views of a camera have a pixel that the hooks can use."""
+        return sum(any(view["shares"].get(label, 0.0) > 0 for label in USED) for view in self._of(camera))
+
     def sigma(self, camera: str, label: str) -> float | None:
         """Median over the frames of the median sigma of a label's pixels; None where it is infinite or paper's 0."""
-        values = self.sigmas.get(camera, {}).get(label, [])
+        values = [value for view in self._of(camera) if (value := view["sigmas"].get(label)) is not None]
         return median(values) or None if values else None
 
     @property
     def usable(self) -> bool:
         """Whether any view has a pixel that the hooks can use."""
-        return any(self._used.values())
+        return any(self._used(camera) for camera in self._cameras())
 
     def reasons(self) -> str:
         """Why views were refused, each reason with their number; empty where none was."""
@@ -94,9 +87,9 @@ class PriorSummary:
 
     def headline(self) -> str:
         """The prior in one line: how many views have one, which cameras have none, and every reason of a refusal."""
-        used, total = sum(self._used.values()), sum(self._counts.values())
-        without = [camera for camera, count in self._counts.items() if count and not self._used[camera]]
-        parts = [f"prior: {used} of {total} views are usable"]
+        used = {camera: self._used(camera) for camera in self._cameras()}
+        without = [camera for camera, count in used.items() if not count]
+        parts = [f"prior: {sum(used.values())} of {len(self.views)} views are usable"]
         parts += [f"none of camera{'' if len(without) == 1 else 's'} {', '.join(without)}"] if without else []
         parts += [f"maps refused {self.reasons()}"] if self.refused else []
         return "; ".join(parts)
@@ -105,10 +98,10 @@ class PriorSummary:
         """For metrics.json: the same whether the priors were built now or before."""
         cameras = {
             camera: {
-                "views": self._counts[camera],
-                "usable": self._used[camera],
-                "shares": dict(shares),
-                "sigma": {label: self.sigma(camera, label) for label in DECLARED.values()},
+                "views": len(self._of(camera)),
+                "usable": self._used(camera),
+                "shares": shares,
+                "sigma": {label: self.sigma(camera, label) for label in DECLARED},
             }
             for camera, shares in self.shares.items()
         }
@@ -124,18 +117,18 @@ class PriorSummary:
         return "\n".join([*lines, *self.notes])
 
     def _share_lines(self) -> list[str]:
-        lines = [f"{'camera':12}" + "  ".join(f"{name:>9}" for name in SHOWN)]
+        lines = [f"{'camera':12}" + "  ".join(f"{title:>9}" for title in SHOWN.values())]
         for camera, share in self.shares.items():
-            values = (share.get(label, 0.0) for label in SHOWN.values())
+            values = (share.get(label, 0.0) for label in SHOWN)
             lines.append(f"{camera:12}" + "  ".join(f"{value:9.1%}" for value in values))
         return lines
 
     def _sigma_lines(self) -> list[str]:
         """Median sigma per camera and label; nothing where no sigma was declared, as in the paper."""
-        rows = {camera: [self.sigma(camera, label) for label in DECLARED.values()] for camera in self.shares}
+        rows = {camera: [self.sigma(camera, label) for label in DECLARED] for camera in self.shares}
         if all(value is None for values in rows.values() for value in values):
             return []
-        lines = [f"{'sigma':12}" + "  ".join(f"{name:>9}" for name in DECLARED)]
+        lines = [f"{'sigma':12}" + "  ".join(f"{SHOWN[label]:>9}" for label in DECLARED)]
         for camera, values in rows.items():
             shown = (f"{'-':>9}" if value is None else f"{value:9.2%}" for value in values)
             lines.append(f"{camera:12}" + "  ".join(shown))

@@ -60,7 +60,8 @@ class Entry:
 
     def checksum_problem(self) -> str:
         """Empty where the bytes match the record's checksum."""
-        intact = checksum(_mapped(self.path)) == self.record.get("checksum")
+        pixels = np.ascontiguousarray(_mapped(self.path)).view(np.uint8)
+        intact = zlib.crc32(pixels.data) == self.record.get("checksum")
         return "" if intact else "its checksum differs from the one recorded"
 
 
@@ -82,7 +83,7 @@ class EntryFolder:
         """
         path = self.location(camera, frame)
         try:
-            return Entry(path, read_record(path))
+            return Entry(path, read_table(path.with_suffix(".json"), RECORD))
         except FileNotFoundError:
             return None
 
@@ -143,16 +144,6 @@ def write_entry(path: Path, array: np.ndarray, record: dict[str, Any], synced: b
     return written
 
 
-def read_record(path: Path) -> dict[str, Any]:
-    """The record of the array at `path`.
-
-    Raises:
-        FileNotFoundError: it was never finished.
-        D2Error: it is damaged, or that of another version.
-    """
-    return read_table(path.with_suffix(".json"), RECORD)
-
-
 def _mapped(path: Path) -> np.ndarray:
     """The array of an .npy file, memory-mapped; unlike `np.load` it takes the file for nothing else."""
     refuse_no_file(path)
@@ -162,8 +153,3 @@ def _mapped(path: Path) -> np.ndarray:
 def hash_of(*parts: Any) -> str:
     """Hash of plain values, in an order that does not depend on dictionaries."""
     return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=16).hexdigest()
-
-
-def checksum(array: np.ndarray) -> int:
-    """CRC-32 of an array's bytes."""
-    return zlib.crc32(np.ascontiguousarray(array).view(np.uint8).data)

@@ -7,7 +7,6 @@
     STORE/cache/...                      stereo and monocular maps, so that other fusion settings cost seconds
     STORE/cameras/NAME+NAME/...          a store of its own for the priors of other cameras of the same recording
 
-Logarithmic depth in 16 bits is exact to 1e-5 in a room and to 1.6e-4 from 1e-3 to 1e6; sigma in 8 bits is exact to 2 %.
 The image lies beside them, at 7 bytes per pixel in all: inserted Gaussians take its colours, and training need not
 open the recording for them. Every file is written under a temporary name and renamed, the array before its record: a
 record therefore vouches for its array, a build that is killed loses the frame in work, and readers never see half a

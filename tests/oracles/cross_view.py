@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from d2_plugin.priors.cross_view import kernel
 from d2_plugin.priors.cross_view.kernel import (
     BESIDE,
     COMPARED,
@@ -102,20 +103,8 @@ class Answer(NamedTuple):
     """Whether another camera has a depth where the point lies in its image, bool."""
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """One view of an instant; contiguous maps [H, W]."""
-
-    labels: np.ndarray
-    """`Label`, uint8."""
-    depth: np.ndarray
-    """float32."""
-    log: np.ndarray
-    """Logarithm of the depth, float32; infinite where there is none."""
-    sigma: np.ndarray
-    """float32."""
-    colors: np.ndarray | None
-    """Mean of 3x3 pixels, uint8 [H, W, 3]; None where there is no image."""
+class View(kernel.View):
+    """One view of an instant."""
 
     @functools.cached_property
     def surface(self) -> np.ndarray:
@@ -139,15 +128,7 @@ class View:
 def ask(
     points: Points, name: str, views: Mapping[str, View], cameras: Mapping[str, Camera], tolerance: float
 ) -> Answer:
-    """What all others say about points of view `name`.
-
-    Args:
-        points: of that view.
-        name: of that view.
-        views: all of one instant, by camera.
-        cameras: their calibrations.
-        tolerance: largest difference in log depth at which two monocular depths agree.
-    """
+    """What all others show of points of view `name`; `tolerance` is in log depth."""
     count = len(points.depth)
     depth, sigma = np.zeros(count), np.full(count, np.inf)
     agreed, seen = np.zeros(count, bool), np.zeros(count, bool)
@@ -155,14 +136,13 @@ def ask(
         if other == name or not count:
             continue
         pair = view_pair(cameras[name], cameras[other])
-        asked = _as_seen_by(points, _gain(views[name], theirs, pair))
+        gain = _gain(views[name], theirs, pair)
+        asked = points if points.colors is None else points._replace(colors=points.colors * gain)
         place, at, logs = _inside(asked, pair, theirs.depth.shape)
         apart = theirs.apart(at, logs, (Label.MONO, Label.AGREED))
         seen[place] |= np.isfinite(apart)
         close = np.flatnonzero(apart < tolerance)
         agreed[place[close]] |= _alike(asked.only(place[close]), theirs, *(values[close] for values in at))
-        # Most rays start where nothing is verified; those whose first step leaves the allowed way several times over
-        # meet nothing either. Only the others are followed.
         near = place[theirs.apart(at, logs, (Label.VERIFIED,)) < MISSED]
         found, precision = _intersection(asked.only(near), pair, theirs)
         seen[near] |= found > 0
@@ -213,17 +193,7 @@ def _alike(points: Points, theirs: View, row: np.ndarray, column: np.ndarray) ->
     if points.colors is None or theirs.colors is None:
         return np.ones(len(points.depth), bool)
     apart = np.abs(points.colors.astype(np.float32) - theirs.colors[row, column])
-    return _in_all_channels(apart < LIKE * 255)
-
-
-def _in_all_channels(holds: np.ndarray) -> np.ndarray:
-    """Whether something holds [K, 3] in all three, [K]; NumPy's own reduction takes ten times as long."""
-    return holds[:, 0] & holds[:, 1] & holds[:, 2]
-
-
-def _as_seen_by(points: Points, gain: np.ndarray) -> Points:
-    """The points in the colours of a camera that shows everything so many times brighter."""
-    return points if points.colors is None else points._replace(colors=points.colors * gain)
+    return (apart < LIKE * 255).all(axis=1)
 
 
 def _gain(ours: View, theirs: View, pair: ViewPair) -> np.ndarray:
@@ -235,10 +205,10 @@ def _gain(ours: View, theirs: View, pair: ViewPair) -> np.ndarray:
     place, at, logs = _inside(Points(columns, rows, depth, depth, mine), pair, theirs.surface.shape)
     seen = theirs.colors[at].astype(np.float32)
     one_place = theirs.apart(at, logs, (Label.VERIFIED,)) < ONE_PLACE
-    bright = one_place & _in_all_channels(np.minimum(mine[place], seen) > DARK)
+    bright = one_place & (np.minimum(mine[place], seen) > DARK).all(axis=1)
     if np.count_nonzero(bright) < FEWEST:
         return np.ones(3, np.float32)
-    return np.median((seen[bright] / mine[place[bright]]).T.copy(), axis=1)
+    return np.median(seen[bright] / mine[place[bright]], axis=0)
 
 
 def _allowed(points: Points) -> np.ndarray:

@@ -31,17 +31,7 @@ def coherence(
     stride: int,
     relative: float,
 ) -> np.ndarray:
-    """What `kernel.coherence` returns, bit for bit.
-
-    Args:
-        gray: uint8 [H, W].
-        inverse: inverse depth float32 [H, W], 0 where there is none.
-        slopes: of inverse depth across and down, float32 [H, W].
-        weights: float32 [257] by difference of grey values; the last, 0, is that of a pixel outside.
-        radius: half the side of the window, pixels.
-        stride: pixels between the neighbours that are asked.
-        relative: a neighbour agrees within this share of the inverse depth.
-    """
+    """What `kernel.coherence` returns, bit for bit; its arguments."""
     height, width = inverse.shape
     padded_inverse = np.pad(inverse, radius)
     values = gray.astype(np.int16)
@@ -65,13 +55,7 @@ def _offsets(radius: int, stride: int) -> list[tuple[int, int]]:
 def slopes(depth: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What `kernel.slopes` returns, bit for bit: (inverse depth, its slopes), per pixel.
 
-    Args:
-        depth: float32 [H, W], 0 where there is none.
-        reach: pixels between the ends of a difference.
-
-    Returns:
-        inverse depth, 0 where there is none, and its slopes across and down: the flatter one-sided difference, since at
-        a depth edge one side runs over the edge and is the steeper one; a side without depth has no say. All float32.
+    The flatter one-sided difference: at a depth edge one side runs over the edge and is the steeper one.
     """
     valid = depth > 0
     inverse = np.where(valid, 1 / np.where(valid, depth, 1), 0).astype(np.float32)
@@ -170,16 +154,7 @@ def sigma(
     spread: np.ndarray,
     scatter: np.ndarray,
 ) -> np.ndarray:
-    """What `kernel.sigma` returns, bit for bit.
-
-    Args:
-        depth: as above, float32 like the next two.
-        coherence: as above.
-        gradient: as above.
-        parallax: as above, float64 like the next two.
-        spread: as above.
-        scatter: about the plane of the window (see `plane_scatter`) [H, W].
-    """
+    """What `kernel.sigma` returns, bit for bit; its maps."""
     known = (depth > 0) & (parallax > 0) & np.isfinite(depth) & ~np.isnan(coherence)
     known &= np.isfinite(spread) & ~np.isnan(gradient)
     coherence, spread = (np.where(known, map_, 0) for map_ in (coherence, spread))
@@ -191,14 +166,9 @@ def sigma(
 
 
 def scatter(depth: np.ndarray, reach: int, slack: float) -> np.ndarray:
-    """What `kernel.scatter` returns, bit for bit: float64 [H, W].
+    """What `kernel.scatter` returns, bit for bit; its arguments.
 
     Moments are about the window's own pixel: those about another one would differ by little from their products.
-
-    Args:
-        depth: float32 [H, W], 0, infinite or NaN where there is none.
-        reach: half the side of the window, pixels.
-        slack: added to the second moments of the columns and rows, pixels^2.
     """
     known = (depth > 0) & np.isfinite(depth)
     weight, inverse = known.astype(np.float64), np.where(known, 1 / np.where(known, depth, 1).astype(np.float64), 0)

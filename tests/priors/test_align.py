@@ -111,15 +111,6 @@ def test_an_unaligned_map_is_used_as_it_is() -> None:
     np.testing.assert_allclose(aligned_depth(mono, not_aligned("metric"), 100.0), mono)
 
 
-def test_every_status_is_a_sentence_and_the_record_is_json() -> None:
-    for status in AlignStatus:
-        assert len(status.value) > 5
-    record = Alignment(AlignStatus.EMPTY, "metric").as_json()
-    assert record["status"] == "empty"
-    assert record["reason"] == AlignStatus.EMPTY.value
-    assert record["scale"] is None
-
-
 def test_the_rank_correlation_is_spearmans() -> None:
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=500), rng.normal(size=500)

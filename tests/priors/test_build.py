@@ -99,25 +99,18 @@ def errors_of(recording: Recording, store: PriorStore, *labels: Label) -> np.nda
     return np.concatenate(found)
 
 
-def test_verified_pixels_are_right_and_mono_only_ones_roughly(plain: Recording, built: tuple) -> None:
+def test_verified_pixels_are_right_and_others_the_better_the_more_cameras_agree(plain: Recording, built: tuple) -> None:
     store = PriorStore.open(built[0])
-    verified, mono = errors_of(plain, store, Label.VERIFIED), errors_of(plain, store, Label.MONO, Label.AGREED)
+    verified, agreed, alone = (errors_of(plain, store, label) for label in (Label.VERIFIED, Label.AGREED, Label.MONO))
     assert verified.size > 0.1 * 3 * 160 * 90
     assert np.median(verified) < 0.006
     assert (verified > 0.05).mean() < 0.01
-    assert np.median(mono) < 0.08
-
-
-def test_where_two_cameras_agree_monocular_depth_is_better_than_where_they_do_not(
-    plain: Recording, built: tuple
-) -> None:
-    store = PriorStore.open(built[0])
-    agreed, alone = errors_of(plain, store, Label.AGREED), errors_of(plain, store, Label.MONO)
     assert agreed.size > 0.02 * 3 * 160 * 90
     assert np.median(agreed) < 0.5 * np.median(alone)
+    assert np.median(np.concatenate([agreed, alone])) < 0.08
 
 
-def test_the_summary_tells_shares_per_camera(built: tuple) -> None:
+def test_the_summary_and_the_record_say_what_was_built(built: tuple) -> None:
     path, summary = built
     assert (summary.built, summary.kept, summary.refused) == (6, 0, [])
     store = PriorStore.open(path)
@@ -127,28 +120,17 @@ def test_the_summary_tells_shares_per_camera(built: tuple) -> None:
         assert sum(summary.shares[camera].values()) == pytest.approx(1)
     assert "6 priors built, 0 kept" in str(summary)
     assert "train1" in str(summary)
-
-
-def test_the_record_tells_everything_that_decided(built: tuple) -> None:
-    record = PriorStore.open(built[0]).record("train0", 1)
+    record = store.record("train0", 1)
     assert record["alignment"]["status"] == "ok"
-    assert record["alignment"]["gap"] <= 1e-9
+    assert record["alignment"]["across"] is None, "JSON has no NaN"
     assert record["settings"]["stereo"]["matcher"] == "patchmatch"
-    assert record["settings"]["tau_c"] == SETTINGS.tau_c
-    assert record["stereo"]["survivors"]["kept"] > 0
     assert "emulated" in record["monocular"]
-    assert record["camera"]["size"] == [160, 90]
-    assert record["refused"] == ""
 
 
-def test_only_training_cameras_are_read_and_no_true_depth(recording: Recording, tmp_path: Path) -> None:
-    build_priors(recording, NAMES[:2], tmp_path, SETTINGS)
-    assert recording.source.reads == {("image", camera, frame) for camera in NAMES[:2] for frame in (0, 1)}
-
-
-def test_a_frame_is_matched_within_its_own_timestamp(
+def test_training_cameras_alone_are_read_and_matched_within_their_timestamp(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Neither held-out cameras nor true depth."""
     matched = []
     original = matched_depth.geometric_depth
 
@@ -158,6 +140,7 @@ def test_a_frame_is_matched_within_its_own_timestamp(
 
     monkeypatch.setattr(matched_depth, "geometric_depth", watch)
     build_priors(recording, NAMES[:2], tmp_path, SETTINGS)
+    assert recording.source.reads == {("image", camera, frame) for camera in NAMES[:2] for frame in (0, 1)}
     for frame, images in zip(recording.frames, matched, strict=True):
         for camera, image in zip(NAMES, images):
             np.testing.assert_array_equal(image, recording.image(camera, frame))
@@ -167,22 +150,13 @@ def test_a_second_build_computes_nothing_and_changes_nothing(
     plain: Recording, built: tuple, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     no_stereo(monkeypatch)
-    before = contents(built[0])
-    summary = build_priors(plain, NAMES, built[0], SETTINGS)
+    before, seen = contents(built[0]), []
+    progress = lambda done, total, note: seen.append((done, total))  # noqa: E731
+    summary = build_priors(plain, NAMES, built[0], SETTINGS, progress=progress)
     assert (summary.built, summary.kept) == (0, 6)
+    assert seen == [(done, 6) for done in range(1, 7)]
     assert summary.shares == built[1].shares
     assert contents(built[0]) == before
-
-
-def test_a_build_that_is_up_to_date_reads_each_monocular_map_once(
-    recording: Recording, built: tuple, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Cameras that must agree depend on each other's maps, which are hashed once per frame and not once per pair."""
-    read = []
-    original = Recorder.mono
-    monkeypatch.setattr(Recorder, "mono", lambda self, *view: read.append(view) or original(self, *view))
-    assert build_priors(recording, NAMES, built[0], SETTINGS).kept == 6
-    assert sorted(read) == [(camera, frame) for camera in NAMES for frame in (0, 1)]
 
 
 @pytest.mark.parametrize(
@@ -286,12 +260,6 @@ def test_in_the_paper_a_refused_view_is_empty_with_its_reason_and_the_others_are
     assert "refused 1x (train0/1)" in str(summary)
 
 
-def test_progress_counts_images(plain: Recording, built: tuple) -> None:
-    seen: list[tuple[int, int]] = []
-    build_priors(plain, NAMES, built[0], SETTINGS, progress=lambda done, total, note: seen.append((done, total)))
-    assert seen == [(done, 6) for done in range(1, 7)]
-
-
 def test_without_monocular_depth_geometric_depth_stands_alone_and_that_is_said(
     plain: Recording, tmp_path: Path
 ) -> None:
@@ -328,21 +296,17 @@ def test_no_source_at_all_is_an_error(plain: Recording, tmp_path: Path) -> None:
     assert not (tmp_path / "p").exists()
 
 
-@pytest.mark.parametrize("variant", ["mono", "mvs", "dual_unaligned", "dual_unverified"])
-def test_each_ablation_row_can_be_built(plain: Recording, tmp_path: Path, variant: str) -> None:
+def test_each_row_of_the_ablation_can_be_built(plain: Recording, tmp_path: Path) -> None:
     alone = replace(SETTINGS, agreement=0.0)  # the other cameras' evidence is no part of the table
-    dual = build_priors(plain, NAMES, tmp_path, alone).shares["train0"]
-    shares = build_priors(plain, NAMES, tmp_path, replace(alone, variant=variant)).shares["train0"]
-    if variant == "mono":
-        assert shares["verified"] > 0.95
-    elif variant == "mvs":
-        assert shares["verified"] == pytest.approx(dual["verified"] + dual["conflict"])
-        assert shares["mono"] == 0
-    elif variant == "dual_unaligned":
-        assert shares["conflict"] > 0.8 * (dual["verified"] + dual["conflict"])
-    else:
-        assert shares["conflict"] == 0
-        assert shares["verified"] == pytest.approx(dual["verified"] + dual["conflict"])
+    rows = {
+        variant: build_priors(plain, NAMES, tmp_path, replace(alone, variant=variant)).shares["train0"]
+        for variant in ("dual", "mono", "mvs", "dual_unaligned", "dual_unverified")
+    }
+    geometric = rows["dual"]["verified"] + rows["dual"]["conflict"]
+    assert rows["mono"]["verified"] > 0.95
+    assert rows["mvs"]["verified"] == rows["dual_unverified"]["verified"] == pytest.approx(geometric)
+    assert rows["mvs"]["mono"] == rows["dual_unverified"]["conflict"] == 0
+    assert rows["dual_unaligned"]["conflict"] > 0.8 * geometric
 
 
 def test_the_papers_preset_is_the_papers_equations_and_nothing_else(plain: Recording, tmp_path: Path) -> None:
@@ -397,9 +361,7 @@ def test_a_network_is_asked_once_per_image(plain: Recording, tmp_path: Path, mon
         (["train0", "cam7"], {}, "unknown camera 'cam7'"),
         ([], {}, "name at least one"),
         (["train0", "train0"], {}, "named twice"),
-        (NAMES, {"variant": "duel"}, "did you mean 'dual'"),
         (NAMES, {"mono_kind": "metric"}, "declared relative"),
-        (NAMES, {"depth_range": (9.0, 1.0)}, "swap or correct"),
     ],
 )
 def test_mistakes_are_told_before_anything_is_written(

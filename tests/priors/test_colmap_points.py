@@ -11,11 +11,15 @@ import numpy as np
 import pytest
 
 from d2_plugin.errors import D2Error, MissingExtra
-from d2_plugin.priors.colmap.matching import fundamental_matrix, sampson_distance
-from d2_plugin.priors.colmap.points import SparsePoints, triangulate, triangulate_frames
+from d2_plugin.priors.colmap.points import (
+    SparsePoints,
+    fundamental_matrix,
+    sampson_distance,
+    triangulate,
+    triangulate_frames,
+)
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.cameras.camera import pinhole, rigid
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("pycolmap")
@@ -69,12 +73,6 @@ def test_points_carry_the_colour_of_their_surface(recording: Recording) -> None:
     assert np.median(np.abs(points.colors - seen)) < 0.06
 
 
-def test_the_same_images_give_the_same_points(recording: Recording) -> None:
-    first, second = (points_of(recording, ["train0", "train1", "train2"]) for _ in range(2))
-    for name in ("positions", "colors", "errors", "track_lengths", "frames"):
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-
-
 def test_points_of_several_frames_carry_their_frame(recording: Recording) -> None:
     joined = triangulate_frames(recording, ["train1", "train2"], [0, 3])
     assert set(joined.frames) == {0, 3}
@@ -120,17 +118,6 @@ def test_as_many_images_as_cameras_are_wanted(recording: Recording) -> None:
         triangulate([recording.image("train0", 0)], [recording.cameras["train0"], recording.cameras["train1"]])
 
 
-def test_sampson_distance_is_the_pixel_distance_for_a_pure_sideways_move() -> None:
-    """Rectified cameras: epipolar lines are rows, and the first-order distance of a row offset d is d / sqrt(2)."""
-    first = Camera("a", 100, 80, pinhole(90, 90, 50, 40), np.eye(4))
-    second = Camera("b", 100, 80, pinhole(90, 90, 50, 40), rigid(np.eye(3), np.array([-0.3, 0, 0])))
-    fundamental = fundamental_matrix(first, second)
-    pixels = np.random.default_rng(0).uniform(0, 80, (20, 2))
-    moved = pixels - [7.0, 0.0]
-    np.testing.assert_allclose(sampson_distance(fundamental, pixels, moved), 0, atol=1e-9)
-    np.testing.assert_allclose(sampson_distance(fundamental, pixels, moved + [0, 3.0]), 3 / np.sqrt(2))
-
-
 def test_epipolar_geometry_holds_for_projected_points(recording: Recording) -> None:
     first, second = recording.cameras["train0"], recording.cameras["test2"]
     points = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 2], (50, 3))
@@ -147,13 +134,15 @@ def test_a_missing_pycolmap_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> 
         triangulate([], [])
 
 
-@pytest.mark.parametrize(
-    "later", ["zlib.compress(bytes(10**5))", "np.savez_compressed(io.BytesIO(), a=np.zeros(10**4))"]
-)
-def test_compression_works_after_pycolmap_was_imported(later: str) -> None:
+@pytest.mark.parametrize("order", ["torch, zlib, colmap", "colmap, torch, zlib", "zlib, colmap, torch"])
+def test_compression_survives_pycolmap_whatever_is_imported_first(order: str) -> None:
     """pycolmap exports its own zlib; imported before the system's, it makes every later compression abort."""
-    first = "from d2_plugin.extras import import_pycolmap; import_pycolmap('a test', 'stereo')"
-    code = f"{first}; import io, zlib, numpy as np; {later}; print('alive')"
+    imports = {
+        "torch": "import torch",
+        "zlib": "import zlib",
+        "colmap": "from d2_plugin.extras import import_pycolmap; import_pycolmap('a test', 'stereo')",
+    }
+    code = "\n".join([*(imports[name] for name in order.split(", ")), "zlib.compress(bytes(10**5)); print('alive')"])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout.strip()) == (0, "alive"), done.stderr
 
@@ -171,19 +160,3 @@ def test_real_images_of_studio_give_accurate_points(shared_data) -> None:
     errors = depth_errors(studio, ["00", "02", "05", "07"], points)
     assert np.median(errors) < 0.003
     assert np.mean(errors < 0.01) > 0.85
-
-
-@pytest.mark.slow
-def test_points_of_sear_steak_agree_with_the_checked_ones(shared_data) -> None:
-    path = shared_data("n3dv_sear_steak_t0")
-    scene = open_recording(path)
-    points = points_of(scene, list(scene.cameras))
-    assert len(points) > 1000
-    checked = np.load(path / "sift_points.npz")["xyz"].astype(float)
-
-    def coinciding(positions: np.ndarray) -> float:
-        """Share of points with a checked one within 0.02 units: the same feature, in a scene 15 units deep."""
-        return np.mean([np.linalg.norm(checked - position, axis=1).min() < 0.02 for position in positions])
-
-    assert coinciding(points.positions) > 0.3  # the checked ones come from another SIFT: not every feature is shared
-    assert coinciding(points.positions + [0.1, 0, 0.1]) < 0.05

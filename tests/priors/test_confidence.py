@@ -12,7 +12,7 @@ from oracles.surface import back_project
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.maps_on_disk import ConfidenceMaps, divided, planar
+from d2_plugin.priors.maps_on_disk import planar
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording, Source
@@ -86,15 +86,6 @@ def test_a_confidence_outside_of_0_to_1_is_refused_with_its_file(recording: Reco
     write_confidence(recording, np.full((54, 96), wrong))
     with pytest.raises(D2Error, match=r"depth_confidence.*00000.npy .*a confidence is in 0..1"):
         built(recording)
-
-
-def test_without_a_map_or_a_folder_nothing_is_said(recording: Recording) -> None:
-    camera = recording.cameras[NAME]
-    assert ConfidenceMaps.beside(None, "depth_confidence", [NAME]).of(camera, 0) is None
-    assert ConfidenceMaps.beside(recording.path, "depth_confidence", [NAME]).of(camera, 0) is None
-    sigma = np.array([[0.1, np.inf]], np.float32)
-    assert divided(sigma, None) is sigma
-    np.testing.assert_array_equal(divided(sigma, np.array([[0.0, 0.5]])), [[np.inf, np.inf]])
 
 
 def test_distances_along_the_ray_become_planar_depth_once(recording: Recording) -> None:

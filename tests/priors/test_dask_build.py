@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from d2_plugin.errors import D2Error, MissingExtra
-from d2_plugin.priors import dask_build as module
 from d2_plugin.priors.build import PriorSummary, build_priors
 from d2_plugin.priors.dask_build import build_priors_on_cluster
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
@@ -90,18 +89,6 @@ def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(
 
 
 @needs_dask
-def test_a_second_build_on_the_cluster_computes_nothing(
-    recording: Recording, two_workers: object, tmp_path: Path
-) -> None:
-    store = tmp_path / "priors"
-    build_priors(recording, NAMES, store, SETTINGS)
-    before = contents(store)
-    summary = build_priors_on_cluster(recording, NAMES, store, SETTINGS, scheduler=two_workers.scheduler_address)
-    assert (summary.built, summary.kept) == (0, 20)
-    assert contents(store) == before
-
-
-@needs_dask
 def test_what_a_single_build_refuses_the_cluster_refuses_in_the_same_words(
     recording: Recording, two_workers: object, tmp_path: Path
 ) -> None:
@@ -119,11 +106,6 @@ def test_without_dask_its_extra_is_named(recording: Recording, tmp_path: Path, m
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingExtra, match=r"dask.distributed, which is not installed: .*d2-4dgs\[cluster\]"):
         build_priors_on_cluster(recording, NAMES, tmp_path / "p", SETTINGS)
-
-
-def test_parts_are_blocks_and_few_enough_to_load_a_network_seldom(recording: Recording) -> None:
-    assert module._part_count(recording, SETTINGS, workers=8) == 5
-    assert module._part_count(recording, SETTINGS, workers=1) == module.PARTS_PER_WORKER
 
 
 def test_summaries_of_parts_join_to_the_summary_of_the_whole(

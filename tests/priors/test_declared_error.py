@@ -123,6 +123,16 @@ def test_the_summary_shows_median_sigma_and_parts_add_up() -> None:
     paper = PriorSummary()
     paper.add("a", 0, record(0.0, None), True)
     assert "sigma" not in str(paper)
+    nothing = {"shares": dict.fromkeys(shares, 0.0), "refused": "no depth"}
+    paper.add("b", 0, nothing, True)
+    assert paper.usable
+    assert paper.headline() == "prior: 1 of 2 views are usable; none of camera b; maps refused 1x no depth"
+    assert paper.as_dict()["refused"] == [{"camera": "b", "frame": 0, "reason": "no depth"}]
+    assert paper.as_dict()["cameras"]["b"]["usable"] == 0
+    far = PriorSummary()
+    far.add("b", 1, {"shares": nothing["shares"] | {"far": 1.0}, "refused": ""}, False)
+    paper.add_part(far)
+    assert paper.headline().startswith("prior: 2 of 3 views are usable; maps")
 
 
 def test_a_rounded_truth_is_told_by_its_steps_and_an_exact_one_is_not() -> None:

@@ -23,6 +23,7 @@ from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.cameras.camera import pinhole
 from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.selection import downscale
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
@@ -117,20 +118,15 @@ def test_what_a_sensor_does_not_know_is_empty(recording: Recording, tmp_path: Pa
 
 
 @pytest.mark.parametrize("factor", [2, 3])
-def test_sensor_depth_follows_images_that_are_made_smaller(recording: Recording, factor: int) -> None:
-    from d2_plugin.recordings.selection import downscale
-
+def test_sensor_depth_comes_at_the_size_of_images_with_fewer_or_more_pixels(recording: Recording, factor: int) -> None:
     folder = write_sensor(recording, {"unit": "m"}, 1.0, ".npy")
     smaller = downscale(recording, factor)
     depth = SensorDepth(folder, NAMES).depth(smaller.cameras["train0"], 0)
     np.testing.assert_allclose(depth, smaller.depth("train0", 0), rtol=1e-6)
-
-
-def test_a_sensor_of_fewer_pixels_gives_each_image_pixel_its_nearest(recording: Recording) -> None:
-    folder = write_sensor(recording, {"unit": "m"}, 1.0, ".npy")
-    np.save(folder / "train0" / "00000.npy", recording.depth("train0", 0)[::2, ::2])
+    coarse = recording.depth("train0", 0)[::2, ::2]
+    np.save(folder / "train0" / "00000.npy", coarse)
     depth = SensorDepth(folder, NAMES).depth(recording.cameras["train0"], 0)
-    np.testing.assert_array_equal(depth, recording.depth("train0", 0)[::2, ::2].repeat(2, 0).repeat(2, 1))
+    np.testing.assert_array_equal(depth, coarse.repeat(2, 0).repeat(2, 1))
 
 
 @pytest.mark.parametrize(
@@ -140,6 +136,7 @@ def test_a_sensor_of_fewer_pixels_gives_each_image_pixel_its_nearest(recording: 
         ({"unit": "m", "scale": 1}, "either scale .* or unit"),
         ({"unit": "feet"}, "unknown unit in .*depth.json 'feet'"),
         ({"scale": -1}, "scale -1, expected"),
+        ({"scale": 1, "along": "rays"}, "unknown along in .*depth.json 'rays'.*ray"),
         ({"scale": "1"}, "scale '1', expected"),
         ([], "either scale .* or unit"),
     ],
@@ -249,8 +246,6 @@ def test_a_workspace_is_found_where_it_usually_lies_or_where_the_settings_say(re
     write_maps(recording, "dense", 0)
     assert find_depth_on_disk(replace(recording, frames=(0,)), NAMES, AUTO).about.endswith("dense")
     assert find_depth_on_disk(recording, NAMES, StereoSettings(matcher="patchmatch")) is None
-    with pytest.raises(D2Error, match="braces around other than frame"):
-        workspace(recording, "elsewhere/{number}")
 
 
 def test_a_workspace_of_one_instant_is_not_the_depth_of_all(recording: Recording) -> None:
@@ -308,43 +303,44 @@ def test_a_map_of_another_size_and_lens_is_looked_up_ray_by_ray(recording: Recor
     np.testing.assert_allclose(found[inside], tilted[inside], rtol=0.005)  # half a pixel of the map's slope
 
 
-@pytest.mark.parametrize("turn", [0.5, 3.0])
-def test_cameras_of_a_workspace_may_differ_by_a_bundle_adjustment_and_no_more(
-    recording: Recording, turn: float
-) -> None:
-    poses = {name: camera.T_camera_world.copy() for name, camera in recording.cameras.items()}
-    angle = np.deg2rad(turn)
-    turned = np.eye(4)
-    turned[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    poses["train1"] = turned @ poses["train1"]
+def test_cameras_of_a_workspace_may_differ_by_a_bundle_adjustment_and_no_more(recording: Recording) -> None:
     cameras = list(recording.cameras.values())
-    if turn < 1:
-        assert scale_of_world(cameras, poses, Path("w")) == pytest.approx(1, abs=0.01)
-    else:
-        with pytest.raises(D2Error, match="train0 and train1 are 3.0 degrees off"):
-            scale_of_world(cameras, poses, Path("w"))
 
+    def scale(**changed: np.ndarray) -> float:
+        """With a change of pose of some cameras."""
+        poses = {camera.name: changed.get(camera.name, np.eye(4)) @ camera.T_camera_world for camera in cameras}
+        return scale_of_world(cameras, poses, Path("w"))
 
-def test_a_workspace_of_another_rig_is_refused(recording: Recording) -> None:
-    def moved(camera: Camera) -> np.ndarray:
-        pose = camera.T_camera_world.copy()
-        pose[:3, 3] += np.random.default_rng(len(camera.name)).normal(0, 0.3, 3) * (camera.name == "train1")
-        return pose
+    def turned(degrees: float) -> np.ndarray:
+        angle, turn = np.deg2rad(degrees), np.eye(4)
+        turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        return turn
 
-    cameras = list(recording.cameras.values())
+    moved = np.eye(4)
+    moved[:3, 3] = 0.3, -0.2, 0.4
+    assert scale(train1=turned(0.5)) == pytest.approx(1, abs=0.01)
+    with pytest.raises(D2Error, match="train0 and train1 are 3.0 degrees off"):
+        scale(train1=turned(3.0))
     with pytest.raises(D2Error, match="another arrangement"):
-        scale_of_world(cameras, {camera.name: moved(camera) for camera in cameras}, Path("w"))
-    alone = {"train0": np.diag([1.0, 1.0, 1.0, 1.0])}
-    with pytest.raises(D2Error, match="whose scale cannot be known"):
-        scale_of_world(cameras[:1], alone, Path("w"))
+        scale(train1=moved)
     assert scale_of_world(cameras[:1], {"train0": cameras[0].T_camera_world}, Path("w")) == 1
+    with pytest.raises(D2Error, match="whose scale cannot be known"):
+        scale_of_world(cameras[:1], {"train0": np.eye(4)}, Path("w"))
 
 
-def test_a_workspace_of_other_images_says_how_to_name_them(still: Recording) -> None:
-    folder = write_maps(still, "colmap", 0)
-    images = folder / "sparse" / "images.txt"
-    images.write_text(images.read_text().replace("train", "view"))
-    with pytest.raises(D2Error, match="has no image of train0, train1, train2 at frame 0: name images"):
+@pytest.mark.parametrize(
+    ("file", "text", "other", "more", "message"),
+    [
+        ("images.txt", "train", "view", "", "has no image of train0, train1, train2 at frame 0: name images"),
+        ("cameras.txt", "PINHOLE", "OPENCV", " 0.1 0 0 0", "lens distortion: give the output of `colmap image_und"),
+    ],
+)
+def test_a_workspace_of_other_images_or_lenses_is_refused(
+    still: Recording, file: str, text: str, other: str, more: str, message: str
+) -> None:
+    path = write_maps(still, "colmap", 0) / "sparse" / file
+    path.write_text("".join(f"{line}{more}\n" for line in path.read_text().replace(text, other).splitlines()))
+    with pytest.raises(D2Error, match=message):
         workspace(still).depth(still.cameras["train0"], 0)
 
 
@@ -356,25 +352,18 @@ def test_a_workspace_that_saw_other_cameras_is_warned_of(still: Recording, caplo
     assert "saw train2.png as well" in caplog.text
 
 
-def test_images_with_lens_distortion_are_refused(still: Recording) -> None:
-    folder = write_maps(still, "colmap", 0)
-    cameras = folder / "sparse" / "cameras.txt"
-    lines = [line.replace("PINHOLE", "OPENCV") + " 0.1 0 0 0" for line in cameras.read_text().splitlines()]
-    cameras.write_text("\n".join(lines))
-    with pytest.raises(D2Error, match="lens distortion: give the output of `colmap image_undistorter`"):
-        workspace(still).depth(still.cameras["train0"], 0)
-
-
-def test_priors_from_a_workspace_pass_the_common_filter(recording: Recording) -> None:
+def test_priors_from_a_workspace_pass_the_filter_and_are_right_as_is_what_other_cameras_saw(
+    recording: Recording,
+) -> None:
     write_maps(recording, "colmap/00000", 0, 3.0)
     write_maps(recording, "colmap/00001", 1, 0.2)
     summary = build_priors(recording, NAMES, recording.path / "priors", PriorSettings(agreement=0.0))
     assert min(share["verified"] for share in summary.shares.values()) > 0.3
-    store = PriorStore.open(recording.path / "priors")
+    store, verified = PriorStore.open(recording.path / "priors"), {}
     for frame in recording.frames:
         prior, truth = store.prior("train1", frame), recording.depth("train1", frame)
-        verified = prior.verified.numpy()
-        np.testing.assert_allclose(prior.depth.numpy()[verified], truth[verified], rtol=2e-4)
+        verified[frame] = prior.verified.numpy()
+        np.testing.assert_allclose(prior.depth.numpy()[verified[frame]], truth[verified[frame]], rtol=2e-4)
     survivors = store.record("train1", 0)["stereo"]["survivors"]
     assert 0 < survivors["kept"] <= survivors["confirmed"] < survivors["matched"]
 
@@ -403,7 +392,8 @@ def test_depth_that_is_asked_for_and_absent_is_told(recording: Recording, matche
 
 
 @pytest.mark.parametrize(
-    "place", ["{frame:99999999999d}", "{frame.__class__}", "{frame:.99999999999f}", "{frame", "{}"]
+    "place",
+    ["elsewhere/{number}", "{frame:99999999999d}", "{frame.__class__}", "{frame:.99999999999f}", "{frame", "{}"],
 )
 def test_braces_never_fill_the_memory_or_look_things_up(place: str, tmp_path: Path) -> None:
     camera = Camera("a", 8, 6, np.eye(3), np.eye(4))

@@ -12,7 +12,7 @@ import torch
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.cross_view.kernel import BESIDE, LIKE, NEAR, WITHIN
 from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, with_evidence
-from d2_plugin.priors.fuse import FusedPrior, empty_prior
+from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings.recording import Camera
@@ -157,45 +157,6 @@ def test_points_behind_another_camera_or_off_its_image_are_not_looked_up() -> No
             compared = with_evidence({"left": prior_of(WALL), "away": theirs}, {"left": camera(0), "away": there}, 0.02)
             assert share(compared["left"], Label.MONO) == 1
             np.testing.assert_array_equal(compared["left"].sigma, np.float32(SIGMA))
-
-
-@pytest.mark.parametrize(("height", "width"), [(1, 1), (1, 5), (5, 1), (2, 2)])
-def test_images_of_a_pixel_or_a_row_are_possible(height: int, width: int) -> None:
-    rig = {"left": camera(0, width, height), "right": camera(1e-3, width, height)}
-    full = np.full((height, width), WALL, np.float32)
-    sigma = np.full_like(full, SIGMA)
-    mono = FusedPrior(full, np.full(full.shape, 1, np.uint8), sigma)
-    agreed = with_evidence({"left": mono, "right": mono}, rig, TOLERANCE)["left"]
-    assert share(agreed, Label.AGREED) == 1
-    verified = FusedPrior(full, np.full(full.shape, 2, np.uint8), sigma)
-    compared = with_evidence({"left": mono, "right": verified}, rig, TOLERANCE)["left"]
-    assert np.isfinite(compared.depth).all()
-    assert not np.isnan(compared.sigma).any()
-
-
-def test_a_view_without_depth_changes_nothing_and_stays_as_it_is() -> None:
-    nothing = empty_prior((HEIGHT, WIDTH))
-    compared = with_evidence({"left": prior_of(WALL), "right": nothing}, CAMERAS, TOLERANCE)
-    np.testing.assert_array_equal(compared["left"].labels, Label.MONO)
-    np.testing.assert_array_equal(compared["left"].sigma, np.float32(SIGMA))
-    for map_, before in zip((compared["right"].depth, compared["right"].labels), (nothing.depth, nothing.labels)):
-        np.testing.assert_array_equal(map_, before)
-
-
-@pytest.mark.parametrize("unit", [1e-3, 1e6])
-def test_the_unit_of_the_world_does_not_matter(unit: float) -> None:
-    truth, theirs = slanted(CAMERAS["left"]), slanted(CAMERAS["right"])
-    compared = left_of(prior_of(truth * 1.02), prior_of(theirs, Label.VERIFIED, 0.001))
-    scaled_cameras = {"left": camera(0.0), "right": camera(0.5 * unit)}
-    scaled = with_evidence(
-        {"left": prior_of(truth * 1.02 * unit), "right": prior_of(theirs * unit, Label.VERIFIED, 0.001)},
-        scaled_cameras,
-        TOLERANCE,
-    )["left"]
-    same = scaled.labels == compared.labels
-    assert same.mean() > 0.97, "but for points that rounding moves across the rim of the image"
-    np.testing.assert_allclose(scaled.depth[same] / unit, compared.depth[same], rtol=1e-5)
-    np.testing.assert_allclose(scaled.sigma[same], compared.sigma[same], rtol=1e-3)
 
 
 def test_trusted_is_verified_and_agreed_and_far_is_neither_trusted_nor_supported() -> None:

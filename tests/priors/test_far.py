@@ -45,37 +45,31 @@ def test_the_sky_grows_to_the_outline_that_a_blurred_map_gives_it_as_far_as_its_
     assert not far_pixels(inverse, geometric, image)[HORIZON - 8 :].any()
 
 
-def test_a_smooth_wall_within_the_range_of_stereo_is_not_far() -> None:
+def no_sky(what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The scene with one kind of evidence gone."""
     inverse, geometric, image = scene()
-    inverse[:HORIZON] = 1 / WALL
-    assert not far_pixels(inverse, geometric, image).any()
+    if what == "within the range of stereo":
+        inverse[:HORIZON] = 1 / WALL
+    elif what == "no anchors":
+        geometric[:] = 0
+    elif what == "measured":
+        geometric[:] = WALL
+    elif what == "not at the rim":
+        for map_, wall in ((inverse, 1 / WALL), (geometric, WALL)):
+            map_[:6] = map_[:, :6] = map_[:, -6:] = wall
+    elif what == "textured":
+        image[:HORIZON] = np.random.default_rng(1).integers(0, 256, (HORIZON, WIDTH, 3))
+    else:
+        inverse[:HORIZON, 8:] = 1 / WALL
+        inverse[8:HORIZON] = 1 / WALL
+    return inverse, geometric, image
 
 
-def test_without_anchors_nothing_is_far() -> None:
-    inverse, geometric, image = scene()
-    assert not far_pixels(inverse, np.zeros_like(geometric), image).any()
-
-
-def test_what_stereo_measured_is_not_far() -> None:
-    inverse, geometric, image = scene()
-    assert not far_pixels(inverse, np.full_like(geometric, WALL), image).any()
-
-
-def test_a_region_that_does_not_reach_the_rim_is_no_sky() -> None:
-    inverse, geometric, image = scene()
-    for map_, wall in ((inverse, 1 / WALL), (geometric, WALL)):
-        map_[:6] = map_[:, :6] = map_[:, -6:] = wall
-    assert not far_pixels(inverse, geometric, image).any()
-
-
-def test_a_textured_region_is_no_sky_and_neither_is_a_speck() -> None:
-    inverse, geometric, image = scene()
-    textured = image.copy()
-    textured[:HORIZON] = np.random.default_rng(1).integers(0, 256, (HORIZON, WIDTH, 3))
-    assert not far_pixels(inverse, geometric, textured).any()
-    inverse[:HORIZON, 8:] = 1 / WALL
-    inverse[8:HORIZON] = 1 / WALL
-    assert not far_pixels(inverse, geometric, image).any()
+@pytest.mark.parametrize(
+    "what", ["within the range of stereo", "no anchors", "measured", "not at the rim", "textured", "a speck"]
+)
+def test_fewer_than_four_kinds_of_evidence_are_no_sky(what: str) -> None:
+    assert not far_pixels(*no_sky(what)).any()
 
 
 def test_the_zeros_of_a_saturated_network_are_far_whatever_the_shift() -> None:

@@ -117,12 +117,6 @@ def test_the_blur_of_a_depth_edge_proposes_nothing_but_still_verifies() -> None:
     assert not hanging_pixels(mono, 0.08)[:, 20:50].any()
 
 
-def test_a_refused_frame_is_empty_everywhere() -> None:
-    prior = empty_prior((3, 4))
-    assert not prior.depth.any()
-    assert not prior.labels.any()
-
-
 def test_unknown_variants_and_unequal_sizes_are_refused() -> None:
     with pytest.raises(D2Error, match="did you mean 'dual_unverified'"):
         fuse(MONO, GEOMETRIC, tau_c=0.1, variant="dual_unverifed")

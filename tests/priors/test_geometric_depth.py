@@ -13,7 +13,7 @@ from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo import geometric_depth as stereo
 from d2_plugin.priors.stereo.depth_range import depth_bounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
-from d2_plugin.priors.stereo.geometric_depth import choose_matcher, enlarged, geometric_depth, gray
+from d2_plugin.priors.stereo.geometric_depth import choose_matcher, enlarged, geometric_depth
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
@@ -48,12 +48,6 @@ def test_a_good_part_of_a_narrow_pair_is_matched(pair: Recording) -> None:
     assert completeness > 0.2
     assert median < 0.006
     assert wrong < 0.02
-
-
-def test_a_range_ten_times_too_wide_does_no_harm(pair: Recording) -> None:
-    narrow, wide = (scores(run(pair, bounds), pair) for bounds in ((2.0, 9.0), (0.2, 90.0)))
-    assert wide[0] > 0.8 * narrow[0]
-    assert wide[1] < 1.3 * narrow[1]
 
 
 def test_half_resolution_comes_back_at_full_size(pair: Recording) -> None:
@@ -139,11 +133,7 @@ def test_points_behind_or_beside_the_camera_do_not_count(pair: Recording) -> Non
     assert "triangulated" not in depth_bounds(cameras, behind).origin
 
 
-def test_auto_is_patchmatch_where_colmap_has_no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stereo.mvs, "why_not_usable", lambda: "there is no CUDA device")
-    assert choose_matcher("auto") == "patchmatch"
-    monkeypatch.setattr(stereo.mvs, "why_not_usable", lambda: "")
-    assert choose_matcher("auto") == "colmap"
+def test_what_is_no_matcher_is_refused() -> None:
     with pytest.raises(D2Error, match="did you mean 'patchmatch'"):
         choose_matcher("patch-match")
     with pytest.raises(D2Error, match="matcher = sensor reads depth that lies beside a recording"):
@@ -161,8 +151,3 @@ def test_any_function_can_be_a_matcher(pair: Recording, monkeypatch: pytest.Monk
     results = geometric_depth(images, cameras, (2.0, 9.0), SETTINGS, matcher="oracle")
     assert scores(results, pair)[0] > 0.6
     assert scores(results, pair)[1] == 0
-
-
-def test_grey_is_luma() -> None:
-    image = np.array([[[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 255]]], np.uint8)
-    np.testing.assert_array_equal(gray(image), [[76, 150, 29, 255]])

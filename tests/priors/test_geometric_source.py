@@ -113,15 +113,3 @@ def test_maps_are_made_anew_where_a_setting_changed_that_they_depend_on_and_kept
         if Computed(tmp_path, replace(StereoSettings(), **{name: value}), matcher).key(FRAME) != key
     }
     assert voided == set(DEPENDS_ON[matcher])
-
-
-def test_the_setting_of_another_matcher_and_the_place_of_computation_keep_the_maps_of_patchmatch(
-    tmp_path: Path,
-) -> None:
-    Computed(tmp_path).depths(FRAME)
-    kept = Computed(tmp_path, StereoSettings(colmap_geometric=False, colmap_minutes=1, patchmatch_device="cpu"))
-    kept.depths(FRAME)
-    assert kept.calls == 0
-    anew = Computed(tmp_path, StereoSettings(patchmatch_sources=2))
-    anew.depths(FRAME)
-    assert anew.calls == 1

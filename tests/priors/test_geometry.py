@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles.surface import back_project
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import (
@@ -49,17 +48,6 @@ def test_a_projection_agrees_with_world_points_and_half_pixel_centres(
         assert (at.x[0], at.y[0]) == pytest.approx((pixel[0], pixel[1]), rel=1e-9, abs=1e-6)
 
 
-def test_there_and_back_is_the_identity() -> None:
-    reference, source = camera(), camera("b", 0.4, 0.2)
-    u, v = pixel_grid(reference, np.float64)
-    depth = np.full((48, 64), 3.0)
-    forth = view_pair(reference, source).project(u, v, depth)
-    back = view_pair(source, reference).project(forth.x, forth.y, forth.z)
-    np.testing.assert_allclose(back.x, np.broadcast_to(u, depth.shape), atol=1e-9)
-    np.testing.assert_allclose(back.y, np.broadcast_to(v, depth.shape), atol=1e-9)
-    np.testing.assert_allclose(back.z, depth, atol=1e-12)
-
-
 def test_true_depth_of_one_view_lands_on_true_depth_of_the_other() -> None:
     recording = synthetic_recording(cameras=2, frames=1, width=96, height=54)
     first, second = (recording.cameras[name] for name in ("train0", "train1"))
@@ -70,14 +58,6 @@ def test_true_depth_of_one_view_lands_on_true_depth_of_the_other() -> None:
     agree = np.abs(there - at.z[inside]) < 0.02 * at.z[inside]
     assert agree.mean() > 0.7  # the rest is hidden from the other view
     assert np.median(np.abs(there - at.z[inside])[agree] / at.z[inside][agree]) < 0.005
-
-
-def test_rays_times_depth_are_world_points() -> None:
-    view = camera(x=0.3, turn=0.1)
-    depth = np.full((48, 64), 2.5)
-    points = back_project(view, depth)
-    local = points @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
-    np.testing.assert_allclose(local, viewing_rays(view, np.float64) * 2.5, atol=1e-12)
 
 
 def test_a_camera_at_another_size_sees_the_same_rays() -> None:

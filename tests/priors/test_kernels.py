@@ -19,7 +19,8 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors import build
 from d2_plugin.priors.evidence import with_evidence
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.stereo.filtering import coherence, confirm, kernel, precision
+from d2_plugin.priors.stereo.filtering import confirm, kernel, precision
+from d2_plugin.priors.stereo.filtering.filter import surface_coherence
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.patchmatch import patchmatch
 from d2_plugin.priors.stereo.settings import StereoSettings
@@ -84,7 +85,7 @@ class TestStereoFilter:
     def compiled(rig: Rig, chosen: StereoSettings = SETTINGS) -> list[np.ndarray]:
         """Coherence of every view, then what confirms each."""
         grays, cameras, depths = rig
-        shares = [coherence.surface_coherence(*pair) for pair in zip(grays, depths)]
+        shares = [surface_coherence(*pair) for pair in zip(grays, depths)]
         return shares + [map_ for i in range(len(cameras)) for map_ in confirm.confirm(i, cameras, depths, chosen)]
 
     def expected(self, rig: Rig, chosen: StereoSettings = SETTINGS) -> list[np.ndarray]:
@@ -306,38 +307,6 @@ class TestCrossView:
             for name, prior in first.items():
                 for map_ in ("labels", "depth", "sigma"):
                     np.testing.assert_array_equal(getattr(prior, map_), getattr(other[name], map_), map_)
-
-    def test_a_point_at_the_centre_of_another_camera_is_nowhere_in_its_image(self) -> None:
-        middle, shape = (20.5 / 41, 15.5 / 31), (31, 41)
-        cameras = {name: camera(np.array([0, 0, z]), 0.0, 41, 31, middle) for name, z in (("ours", 0), ("theirs", 2.0))}
-        prior = FusedPrior(np.full(shape, 2, np.float32), np.full(shape, 1, np.uint8), np.full(shape, 0.1, np.float32))
-        ours = with_evidence({"ours": prior, "theirs": prior}, cameras, TOLERANCE)["ours"]
-        assert (ours.labels == Label.MONO).all()
-        np.testing.assert_array_equal(ours.sigma, prior.sigma)
-
-    def test_maps_of_another_order_in_memory_are_read_alike_and_left_as_they_are(self) -> None:
-        priors, cameras = self.rig([(40, 30)] * 3, 1.0, 0.02, True, 4)
-        maps = ("depth", "labels", "sigma", "colors")
-        turned = {
-            name: FusedPrior(*(np.asfortranarray(getattr(prior, map_)) for map_ in maps))
-            for name, prior in priors.items()
-        }
-        before = {name: prior.labels.copy() for name, prior in turned.items()}
-        self.assert_same(with_evidence(priors, cameras, TOLERANCE), with_evidence(turned, cameras, TOLERANCE))
-        for name, prior in turned.items():
-            np.testing.assert_array_equal(prior.labels, before[name])
-
-    def test_the_gain_is_the_median_halfway_between_the_middle_two_of_an_even_number(self) -> None:
-        """Both verified the left half, where the other image is 1 to 1.3 times brighter; the right half tells."""
-        view, shape = camera(np.zeros(3), 0.0, 40, 30, (0.5, 0.5)), (30, 40)
-        left, top = np.arange(40)[None] < 20, np.arange(30)[:, None] < 15
-        labels = np.broadcast_to(np.where(left, Label.VERIFIED, Label.MONO), shape).astype(np.uint8)
-        depth, sigma = np.full(shape, 4, np.float32), np.full(shape, 0.05, np.float32)
-        greys = {"ours": np.full(shape, 100), "theirs": np.where(left, np.where(top, 100, 130), 103)}
-        images = {name: np.repeat(grey[..., None], 3, -1).astype(np.uint8) for name, grey in greys.items()}
-        priors = {name: FusedPrior(depth, labels, sigma, image) for name, image in images.items()}
-        compared = with_evidence(priors, {"ours": view, "theirs": view}, TOLERANCE)
-        assert (compared["ours"].labels[:, 22:] == Label.AGREED).all(), "the larger of the two is too bright for it"
 
 
 def wall(view: Camera, distance: float) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -82,15 +81,6 @@ def test_enlarging_aligns_the_corners_as_torch_does() -> None:
     np.testing.assert_array_equal(upsample(small[:1, :1], 4, 5), np.full((4, 5), small[0, 0]))
 
 
-def test_the_provider_and_preprocessing_that_were_taken_are_logged(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.INFO, logger="d2_plugin.priors.monocular.network"):
-        model = MonocularModel(tiny_onnx.mean_network(tmp_path / "net.onnx", 60, 80), "relative")
-    assert model.provider in caplog.text
-    assert "preprocessing unit" in caplog.text
-
-
 def test_the_fingerprint_changes_with_file_and_preprocessing(tmp_path: Path) -> None:
     path = tiny_onnx.mean_network(tmp_path / "a.onnx", 28, 42)
     other = tiny_onnx.mean_network(tmp_path / "b.onnx", 28, 56)
@@ -103,23 +93,32 @@ def test_the_fingerprint_changes_with_file_and_preprocessing(tmp_path: Path) -> 
     assert MonocularModel(path, "relative").fingerprint() in prints
 
 
-def test_what_is_no_monocular_network_is_refused(tmp_path: Path) -> None:
-    good = tiny_onnx.mean_network(tmp_path / "good.onnx", 60, 80)
-    with pytest.raises(D2Error, match="unknown monocular kind 'inverse'"):
-        MonocularModel(good, "inverse")
-    with pytest.raises(D2Error, match="unknown preprocessing 'imagenet'"):
-        MonocularModel(good, "relative", preprocessing="imagenet")
+@pytest.mark.parametrize(
+    ("made", "given", "message"),
+    [
+        ({}, {"kind": "inverse"}, "unknown monocular kind 'inverse'"),
+        ({}, {"preprocessing": "imagenet"}, "unknown preprocessing 'imagenet'"),
+        ({"channels": 4}, {}, r"export a network whose input is \[1, 3, H, W\]"),
+        ({"batch": 4}, {}, "takes 4 images at once: export it with a batch of 1"),
+        ({"height": 200_000}, {}, "takes images of 80x200000, expected at most 8192 a side"),
+        ({"outputs": 2}, {}, r"returns \(1, 2, 60, 80\): expected one map"),
+    ],
+)
+def test_what_is_no_monocular_network_is_refused(tmp_path: Path, made: dict, given: dict, message: str) -> None:
+    path = tiny_onnx.mean_network(tmp_path / "net.onnx", **({"height": 60, "width": 80} | made))
+    with pytest.raises(D2Error, match=message):
+        MonocularModel(path, **({"kind": "relative"} | given)).predict(IMAGE)
+
+
+def test_files_that_are_no_network_and_images_that_fill_the_memory_are_refused(tmp_path: Path) -> None:
     with pytest.raises(D2Error, match="no monocular network at"):
         MonocularModel(tmp_path / "none.onnx", "relative")
     (tmp_path / "text.onnx").write_text("this is no network")
     with pytest.raises(D2Error, match="is not an ONNX network that onnxruntime can run"):
         MonocularModel(tmp_path / "text.onnx", "relative")
-    four = tiny_onnx.mean_network(tmp_path / "four.onnx", 60, 80, channels=4)
-    with pytest.raises(D2Error, match=r"export a network whose input is \[1, 3, H, W\]"):
-        MonocularModel(four, "relative")
-    two = MonocularModel(tiny_onnx.mean_network(tmp_path / "two.onnx", 60, 80, outputs=2), "relative")
-    with pytest.raises(D2Error, match=r"returns \(1, 2, 60, 80\): expected one map"):
-        two.predict(IMAGE)
+    free = MonocularModel(tiny_onnx.mean_network(tmp_path / "free.onnx", "h", "w"), "relative")
+    with pytest.raises(D2Error, match="an image of 60000x10 would enter .* at most 8192 a side"):
+        free.input_size(10, 60_000)
 
 
 def test_a_missing_onnxruntime_is_told_with_the_command_that_mends_it(
@@ -142,16 +141,6 @@ def test_a_real_network_sees_the_nearer_thing_as_nearer(shared_data: Callable[[s
     aligned = aligned_depth(model(recording.image("train0", 0)), alignment, 30.0)
     spread = np.median(np.abs(depth - np.median(depth)) / depth)
     assert np.median(np.abs(aligned - depth) / depth) < 0.8 * spread  # better than one depth for all
-
-
-def test_a_batch_of_four_and_an_input_that_fills_the_memory_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(D2Error, match="takes 4 images at once: export it with a batch of 1"):
-        MonocularModel(tiny_onnx.mean_network(tmp_path / "four.onnx", 32, 48, batch=4), "relative")
-    with pytest.raises(D2Error, match="takes images of 200000x200000, expected at most 8192 a side"):
-        MonocularModel(tiny_onnx.mean_network(tmp_path / "large.onnx", 200_000, 200_000), "relative")
-    free = MonocularModel(tiny_onnx.mean_network(tmp_path / "free.onnx", "h", "w"), "relative")
-    with pytest.raises(D2Error, match="an image of 60000x10 would enter .* at most 8192 a side"):
-        free.input_size(10, 60_000)
 
 
 def test_a_network_that_fails_on_a_image_names_itself(tmp_path: Path) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import pytest
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.settings import AlignSettings, PriorSettings, StereoSettings
-from d2_plugin.settings import declared
+from d2_plugin.priors.settings import PriorSettings
 
 
 def test_settings_come_from_tables_and_unknown_names_are_refused() -> None:
@@ -23,13 +22,6 @@ def test_settings_come_from_tables_and_unknown_names_are_refused() -> None:
         PriorSettings.from_dict({"stereo": {"matchers": "colmap"}})
     with pytest.raises(D2Error, match="unknown setting of priors 'tauc': .* did you mean 'tau_c'"):
         PriorSettings.from_dict({"tauc": 0.2})
-    with pytest.raises(D2Error, match="priors.tau_c must be a number, got 'small'"):
-        PriorSettings.from_dict({"tau_c": "small"})
-    with pytest.raises(D2Error, match="priors.stereo.min_sources must be a whole number, got True"):
-        PriorSettings.from_dict({"stereo": {"min_sources": True}})
-    with pytest.raises(D2Error, match="stereo must be a table"):
-        PriorSettings.from_dict({"stereo": "colmap"})
-    assert PriorSettings.from_dict({"tau_c": 1}).tau_c == 1
 
 
 @pytest.mark.parametrize(
@@ -40,41 +32,18 @@ def test_settings_come_from_tables_and_unknown_names_are_refused() -> None:
         ({"depth_range": [9.0, 1.0]}, "0 < near < far"),
         ({"depth_range": [1.0, float("inf")]}, r"depth_range\[1\] must be above 0, got inf"),
         ({"tau_c": float("nan")}, "tau_c must be at least 0, got nan"),
-        ({"tau_c": -0.1}, "tau_c must be at least 0, got -0.1"),
         ({"variant": "duel"}, "unknown priors.variant 'duel': .* did you mean 'dual'"),
-        ({"mono_kind": "metirc"}, "unknown priors.mono_kind 'metirc': .* did you mean 'metric'"),
-        ({"mono_preprocessing": "none"}, "unknown priors.mono_preprocessing 'none'"),
         ({"mono_threads": -1}, "mono_threads must be at least 0 threads, got -1"),
         ({"stereo": {"matcher": "patch-match"}}, "unknown priors.stereo.matcher .* did you mean 'patchmatch'"),
-        ({"stereo": {"max_pixels": -5}}, "max_pixels must be at least 1 pixels, got -5"),
-        ({"stereo": {"colmap_minutes": 0}}, "colmap_minutes must be above 0 minutes, got 0"),
         ({"stereo": {"patchmatch_sources": 33}}, "patchmatch_sources must be at least 1 and at most 32, got 33"),
-        ({"stereo": {"max_angle": 200}}, "max_angle must be at least 0 and at most 180 degrees, got 200"),
         ({"stereo": {"min_angle": 60.0}}, "min_angle must be below max_angle, got 60 and 60 degrees"),
-        ({"stereo": {"seed": -1}}, "seed must be at least 0"),
         ({"align": {"residual": "absolut"}}, "unknown priors.align.residual 'absolut': .* did you mean 'absolute'"),
-        ({"align": {"epsilon": 0.0}}, "epsilon must be above 0, got 0.0"),
-        ({"align": {"min_inliers": 1.5}}, "min_inliers must be at least 0 and at most 1, got 1.5"),
     ],
 )
 def test_a_value_that_cannot_be_meant_is_refused_in_one_sentence(table: dict[str, Any], message: str) -> None:
     with pytest.raises(D2Error, match=message) as refusal:
         PriorSettings.from_dict(table)
     assert "\n" not in str(refusal.value)
-
-
-def test_python_meets_the_same_checks() -> None:
-    with pytest.raises(D2Error, match="PriorSettings.tau_c must be at least 0, got nan"):
-        replace(PriorSettings(), tau_c=float("nan"))
-    with pytest.raises(D2Error, match="AlignSettings.epsilon must be above 0"):
-        AlignSettings(epsilon=0.0)
-    with pytest.raises(D2Error, match="StereoSettings.colmap_minutes must be above 0 minutes"):
-        StereoSettings(colmap_minutes=-1.0)
-
-
-@pytest.mark.parametrize("kind", [PriorSettings, StereoSettings, AlignSettings])
-def test_every_setting_says_what_it_does(kind: type) -> None:
-    assert [setting.name for setting in declared(kind) if not setting.help] == []
 
 
 @pytest.mark.parametrize("settings", [PriorSettings(), PriorSettings.paper(depth_range=(1, 9))])

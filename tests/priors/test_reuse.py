@@ -10,11 +10,8 @@ import pytest
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, build_priors
-from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.geometric_depth import geometric_depth
-from d2_plugin.priors.stereo.matched_depth import MatchedDepth
 from d2_plugin.priors.stereo.reuse import RADIUS, MatchMemory, changed
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording
@@ -54,22 +51,6 @@ def test_a_change_is_what_outlasts_noise_and_its_neighbourhood_changes_with_it()
     mask = changed(moved, before)
     assert mask[30 - RADIUS : 34 + RADIUS, 40 - RADIUS : 44].all()
     assert not mask[:15].any()
-
-
-def test_the_memory_takes_in_what_was_matched_and_keeps_the_rest() -> None:
-    rng = np.random.default_rng(0)
-    grays = [rng.integers(0, 255, (6, 7)).astype(np.uint8)]
-    first = [(rng.random((6, 7)).astype(np.float32), rng.random((6, 7)).astype(np.float32))]
-    memory = MatchMemory()
-    assert memory.wanted(grays) is None
-    memory.merge(grays, first, None)
-    assert memory.matched_share == 1
-    mask = rng.random((6, 7)) < 0.3
-    second = [(first[0][0] + 1, first[0][1] + 1)]
-    (depth, cost), *_ = memory.merge(grays, second, [mask])
-    np.testing.assert_array_equal(depth, np.where(mask, second[0][0], first[0][0]))
-    np.testing.assert_array_equal(cost, np.where(mask, second[0][1], first[0][1]))
-    assert memory.matched_share == pytest.approx(mask.mean())
 
 
 def test_a_scene_that_stands_still_is_matched_once() -> None:
@@ -126,32 +107,7 @@ def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(
     assert priors_of(tmp_path) == priors_of(built)
 
 
-def test_shards_built_in_any_order_join_to_the_same_store(recording: Recording, built: Path, tmp_path: Path) -> None:
-    parts = [build_priors(recording, NAMES, tmp_path, SETTINGS, shard=(index, 2)) for index in (1, 0)]
-    assert [part.built for part in parts] == [4, 6]
-    assert priors_of(tmp_path) == priors_of(built)
-    assert (tmp_path / "store.json").read_bytes() == (built / "store.json").read_bytes()
-
-
 @pytest.mark.parametrize("shard", [(2, 2), (-1, 2), (0, 0)])
 def test_a_shard_that_does_not_exist_is_refused(recording: Recording, tmp_path: Path, shard: tuple[int, int]) -> None:
     with pytest.raises(D2Error, match="does not exist"):
         build_priors(recording, NAMES, tmp_path, SETTINGS, shard=shard)
-
-
-def test_a_source_is_asked_in_order_even_from_the_middle_of_a_block(recording: Recording, tmp_path: Path) -> None:
-    """The key of a frame covers the frames before it in its block."""
-
-    def source(frames: tuple[int, ...]) -> MatchedDepth:
-        return MatchedDepth(
-            list(recording.cameras.values()),
-            DepthBounds(2, 9, "test"),
-            STEREO,
-            tmp_path,
-            frames,
-            lambda number: Frame.read(recording, NAMES, number),
-        )
-
-    frame = Frame.read(recording, NAMES, 2)
-    assert source((0, 1, 2)).key(frame) == source((0, 1, 2, 3, 4)).key(frame)
-    assert source((0, 1, 2)).key(frame) != source((1, 2)).key(frame)

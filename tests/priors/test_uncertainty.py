@@ -10,8 +10,7 @@ import pytest
 from d2_plugin.priors.fuse import FusedPrior, fuse
 from d2_plugin.priors.monocular.align import align, aligned_depth
 from d2_plugin.priors.monocular.correct import corrected_depth
-from d2_plugin.priors.monocular.error_shape import FLOOR, ErrorShape
-from d2_plugin.priors.monocular.uncertainty import HARDER, USUAL, _scale, monocular_uncertainty
+from d2_plugin.priors.monocular.uncertainty import monocular_uncertainty
 from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -74,12 +73,8 @@ def test_the_declared_sigma_holds_and_one_twice_too_large_or_small_would_not(sce
     assert holds(error, sigma)
     assert not holds(error, sigma / 2)
     assert not holds(error, sigma * 2)
-
-
-def test_where_sigma_is_larger_errors_are_larger(scenes: list[Scene]) -> None:
-    error, sigma = (np.concatenate(values) for values in zip(*(held(scene, scene.aligned) for scene in scenes)))
     sure = sigma < np.median(sigma)
-    assert np.quantile(error[~sure], 0.68) > 1.3 * np.quantile(error[sure], 0.68)
+    assert np.quantile(error[~sure], 0.68) > 1.3 * np.quantile(error[sure], 0.68), "larger where it says so"
 
 
 def bad_map(scene: Scene, what: str) -> np.ndarray:
@@ -102,7 +97,7 @@ def test_a_map_that_knows_less_declares_more_and_still_holds(scenes: list[Scene]
     assert np.median(sigma) > np.median(error)
     assert (error <= sigma).mean() > 0.6
     # Of a constant map no edge is known, at which errors are larger: it is the least well judged (and no alignment
-    # accepts one). Measured: .84 with K = 1.25.
+    # accepts one).
     assert (error <= 2 * sigma).mean() > (0.8 if what == "constant" else 0.9)
 
 
@@ -114,16 +109,6 @@ def test_a_map_that_says_less_than_its_anchors_proposes_at_most(scenes: list[Sce
         assert np.isfinite(found.at_anchors).all(), "it must not veto right stereo"
         good = monocular_uncertainty(scene.aligned, scene.anchors, SETTINGS).skill
         assert good.gain > 1 > found.skill.gain
-
-
-def test_a_few_anchors_do_not_make_a_map_surer_than_usual_and_many_do() -> None:
-    """Few anchors lie together: left out from near by, they cannot show how wrong the map is elsewhere."""
-    small, large = np.full(500, USUAL / 10), np.full(500, 3 * USUAL)
-    scales = [_scale(small, anchors) for anchors in (100, 1000, 1_000_000)]
-    assert scales == sorted(scales, reverse=True)
-    assert scales[0] > 0.7 * USUAL
-    assert scales[-1] == pytest.approx(USUAL / 10, rel=0.03)
-    assert [_scale(large, anchors) for anchors in (100, 100_000)] == pytest.approx([3 * USUAL] * 2)
 
 
 def test_a_confidence_spreads_sigma_and_does_not_change_what_errors_say_of_its_size(scenes: list[Scene]) -> None:
@@ -140,16 +125,6 @@ def test_a_confidence_spreads_sigma_and_does_not_change_what_errors_say_of_its_s
     assert left == pytest.approx(2 * right, rel=0.01)
     half[:, :120] = 0
     assert np.isinf(monocular_uncertainty(scene.aligned, scene.anchors, SETTINGS, half).sigma[:, :118]).all()
-
-
-def test_stripes_without_depth_have_no_sigma_and_leave_the_rest_as_sure(scenes: list[Scene]) -> None:
-    scene = scenes[0]
-    striped = scene.aligned.copy()
-    striped[:, ::7] = 0
-    sigma = monocular_uncertainty(striped, scene.anchors, SETTINGS).sigma
-    whole = monocular_uncertainty(scene.aligned, scene.anchors, SETTINGS).sigma
-    assert np.isinf(sigma[:, ::7]).all()
-    assert np.median(sigma[striped > 0]) == pytest.approx(np.median(whole), rel=0.15)
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1e6])
@@ -229,17 +204,6 @@ def test_stiff_cases_give_a_standard_deviation_or_infinity_and_no_warning(scenes
     assert np.isinf(found.sigma[aligned == 0]).all()
 
 
-def test_sigma_grows_with_the_distance_to_the_nearest_anchor_and_is_never_below_its_floor() -> None:
-    depth = np.full((60, 160), 3.0, np.float32)
-    anchors = np.zeros_like(depth)
-    anchors[:, :40] = 3.0
-    shape = ErrorShape.of(depth, anchors).usual()
-    assert (np.diff(shape[30, 40:]) >= 0).all()
-    assert shape[30, 100] > 2 * shape[30, 41]
-    np.testing.assert_allclose(shape[:, :39], FLOOR, rtol=0.01)
-    assert HARDER > 1
-
-
 def verified(scene: Scene, map_: np.ndarray, geometric: np.ndarray, sigmas: float, sigma: float) -> FusedPrior:
     """Fusion by likelihood, as the construction does it, with the geometric sigma given."""
     found = monocular_uncertainty(map_, scene.anchors, SETTINGS)
@@ -258,7 +222,7 @@ def test_a_network_that_is_noise_does_not_veto_right_stereo_as_the_fixed_thresho
         noise = bad_map(scene, "noise")
         by_likelihood = verified(scene, noise, scene.anchors, 3.0, 0.001)
         fixed = fuse(corrected_depth(noise, scene.anchors, SETTINGS), scene.anchors, tau_c=0.1)
-        assert conflicts(scene, by_likelihood) < 0.02  # measured: .005 to .010
+        assert conflicts(scene, by_likelihood) < 0.02
         assert conflicts(scene, fixed) > 0.4
 
 

@@ -23,8 +23,8 @@ import numpy as np
 
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.extras import import_pycolmap
-from d2_plugin.priors.colmap.dense_arrays import read_dense_array
 from d2_plugin.priors.colmap.mvs_process import OPTIONS
+from d2_plugin.priors.colmap.workspace import read_dense_array
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import check_depth_range, check_views, index_intrinsics
 from d2_plugin.priors.stereo.pyramid import NO_MATCH
@@ -100,8 +100,11 @@ def colmap_patch_match(
     """
     check_views(grays, cameras)
     near, far = check_depth_range(depth_range)
-    if run is None:
-        _refuse_without_cuda()
+    if run is None and (reason := why_not_usable()):
+        raise D2Error(
+            f"matcher = colmap needs pycolmap with CUDA and a CUDA device, but {reason}: install pycolmap-cuda12 in "
+            "place of pycolmap on a machine with a GPU, or set matcher = patchmatch"
+        )
     sources = mutual_sources([choose_sources(i, cameras, (near, far), settings) for i in range(len(cameras))])
     if not any(sources):
         return [_with_cost(np.zeros((camera.height, camera.width), np.float32)) for camera in cameras]
@@ -110,20 +113,17 @@ def colmap_patch_match(
         write_workspace(workspace, grays, cameras, sources, patch_match_options((near, far), settings))
         (run or run_patch_match)(workspace, 60 * settings.colmap_minutes)
         kind = "geometric" if settings.colmap_geometric else "photometric"
-        maps = _checked_maps(workspace / "stereo" / "depth_maps", kind, cameras, sources)
+        left = workspace / "stereo" / "depth_maps"
+        maps = [
+            _checked_map(left / f"{_image(index)}.{kind}.bin", camera)
+            if sources[index]  # COLMAP was asked for no other
+            else np.zeros((camera.height, camera.width), np.float32)
+            for index, camera in enumerate(cameras)
+        ]
     maps = [np.where((depth >= near) & (depth <= far), depth, np.float32(0)) for depth in maps]
     if not any(depth.any() for depth in maps):
         logger.warning("COLMAP found no depth in any view: no texture, a wrong depth range, or a GPU it is too old for")
     return [_with_cost(depth) for depth in maps]
-
-
-def _refuse_without_cuda() -> None:
-    reason = why_not_usable()
-    if reason:
-        raise D2Error(
-            f"matcher = colmap needs pycolmap with CUDA and a CUDA device, but {reason}: install pycolmap-cuda12 in "
-            "place of pycolmap on a machine with a GPU, or set matcher = patchmatch"
-        )
 
 
 def mutual_sources(sources: Sequence[Sequence[int]]) -> list[list[int]]:
@@ -237,20 +237,8 @@ def _ending(code: int) -> str:
 def _last_words(text: str) -> str:
     """The last line that says what went wrong; glog prints a stack trace (`@ 0x...`) after it."""
     lines = [line.strip() for line in text.splitlines()]
-    telling = [line for line in lines if line and not line.startswith(("@", "***", "terminate called"))]
-    return telling[-1][:300] if telling else "without a word"
-
-
-def _checked_maps(
-    folder: Path, kind: str, cameras: Sequence[Camera], sources: Sequence[Sequence[int]]
-) -> list[np.ndarray]:
-    """The maps that COLMAP left, zeros for views that it was not asked for."""
-    return [
-        _checked_map(folder / f"{_image(index)}.{kind}.bin", camera)
-        if sources[index]
-        else np.zeros((camera.height, camera.width), np.float32)
-        for index, camera in enumerate(cameras)
-    ]
+    reasons = [line for line in lines if line and not line.startswith(("@", "***", "terminate called"))]
+    return reasons[-1][:300] if reasons else "without a word"
 
 
 def _checked_map(path: Path, camera: Camera) -> np.ndarray:

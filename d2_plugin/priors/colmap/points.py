@@ -17,14 +17,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error
 from d2_plugin.extras import import_pycolmap
-from d2_plugin.priors.colmap.matching import Features, epipolar_matches, fundamental_matrix, same_spot
+from d2_plugin.priors.geometry import relative_pose
 from d2_plugin.recordings.recording import Camera, Recording
 
 LUMA = np.array([0.299, 0.587, 0.114])
@@ -37,12 +37,23 @@ PEAK_THRESHOLD = 0.0033
 """SIFT contrast threshold; half of COLMAP's, since the epipolar test is strict."""
 MAX_FEATURES = 8192
 """Strongest features kept per image."""
+MAX_RATIO = 0.8
+"""Largest angle to the best match over the angle to the second best (Lowe's ratio test)."""
+MAX_ANGLE = 0.7
+"""Largest angle between matching descriptors, radians."""
 EPIPOLAR_ERROR = 1.0
 """Largest Sampson distance of a match from the known epipolar geometry, pixels."""
 REPROJECTION_ERROR = 2.0
 """Largest reprojection error of a point, pixels."""
 MIN_ANGLE = 0.5
 """Smallest angle between two rays that meet in a point, degrees."""
+
+
+class Features(NamedTuple):
+    """Feature points of one image."""
+
+    pixels: np.ndarray  # [F, 2] float64, pixel centres at i + 0.5
+    descriptors: np.ndarray  # [F, 128] float32, unit length
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +179,57 @@ def _matched_pairs(features: Sequence[Features], cameras: Sequence[Camera]) -> d
     for i, j in itertools.combinations(range(len(cameras)), 2):
         if not same_spot(cameras[i], cameras[j]):
             fundamental = fundamental_matrix(cameras[i], cameras[j])
-            pairs[i, j] = epipolar_matches(features[i], features[j], fundamental, EPIPOLAR_ERROR)
+            pairs[i, j] = epipolar_matches(features[i], features[j], fundamental)
     return {pair: matches for pair, matches in pairs.items() if len(matches)}
+
+
+def epipolar_matches(first: Features, second: Features, fundamental: np.ndarray) -> np.ndarray:
+    """Pairs of feature indices [M, 2] that are each other's nearest, unambiguous, and fit the geometry F [3, 3]."""
+    if min(len(first.pixels), len(second.pixels)) < 2:
+        return np.zeros((0, 2), np.int64)
+    forward = _nearest(first.descriptors, second.descriptors)
+    backward = _nearest(second.descriptors, first.descriptors)
+    here = np.flatnonzero(forward >= 0)
+    here = here[backward[forward[here]] == here]
+    matches = np.stack([here, forward[here]], axis=1)
+    error = sampson_distance(fundamental, first.pixels[matches[:, 0]], second.pixels[matches[:, 1]])
+    return matches[error <= EPIPOLAR_ERROR]
+
+
+def _nearest(queries: np.ndarray, candidates: np.ndarray, block: int = 1024) -> np.ndarray:
+    """Index of the candidate nearest to each query [Q], -1 where it is too far or a second one is as near."""
+    nearest = np.full(len(queries), -1)
+    for start in range(0, len(queries), block):
+        similarity = queries[start : start + block] @ candidates.T
+        best, rows = similarity.argmax(axis=1), np.arange(len(similarity))
+        angle = np.arccos(np.clip(similarity[rows, best], -1, 1))
+        similarity[rows, best] = -np.inf
+        second = np.arccos(np.clip(similarity.max(axis=1), -1, 1))
+        clear = (angle <= MAX_ANGLE) & (angle <= MAX_RATIO * second)
+        nearest[start : start + block] = np.where(clear, best, -1)
+    return nearest
+
+
+def sampson_distance(fundamental: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """First-order distance [M] in pixels of matched points [M, 2] from the epipolar geometry F [3, 3]."""
+    x, y = (np.concatenate([points, np.ones((len(points), 1))], axis=1) for points in (first, second))
+    line_second, line_first = x @ fundamental.T, y @ fundamental
+    gradient = np.hypot(np.hypot(*line_second[:, :2].T), np.hypot(*line_first[:, :2].T))
+    return np.abs((y * line_second).sum(axis=1)) / np.maximum(gradient, np.finfo(float).tiny)
+
+
+def same_spot(first: Camera, second: Camera) -> bool:
+    """Whether two cameras stand on the same spot, up to rounding: they see no parallax."""
+    baseline = np.linalg.norm(first.centre - second.centre)
+    return bool(baseline <= 1e-9 * max(1.0, np.abs(first.centre).max()))
+
+
+def fundamental_matrix(first: Camera, second: Camera) -> np.ndarray:
+    """F [3, 3] with y^T F x = 0 for pixels x of `first` and y of `second` of one world point."""
+    pose = relative_pose(first, second)
+    rotation, (x, y, z) = pose[:3, :3], pose[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.linalg.inv(second.K).T @ cross @ rotation @ np.linalg.inv(first.K)
 
 
 def _triangulated(

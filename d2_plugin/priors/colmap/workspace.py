@@ -17,8 +17,9 @@ from typing import ClassVar
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.colmap.dense_arrays import read_dense_array
+from d2_plugin.priors.geometry import relative_pose
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.reading import read_bytes
 from d2_plugin.recordings.cameras.formats.colmap import ColmapImage, ColmapModel, read_model
 from d2_plugin.recordings.recording import Camera
 
@@ -32,11 +33,13 @@ moves them by a few tenths."""
 TRANSLATION = 0.03
 """And their relative translation, after scaling, by this share of it."""
 
-logger = logging.getLogger(__name__)
-
-
 FRAME_IN_BRACES = re.compile(r"\{frame(?::0?[0-9]{1,2}d?)?\}")
 """Where stereo.folder has the number of a frame."""
+
+HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,2})&")
+HEADER_LENGTH = 64  # bytes, more than any header has
+
+logger = logging.getLogger(__name__)
 
 
 class WorkspaceDepth:
@@ -161,6 +164,28 @@ class WorkspaceDepth:
         return next((path for path in paths if path.is_file()), None)
 
 
+def read_dense_array(path: Path) -> np.ndarray:
+    """A depth map as float32 [H, W], 0 where there is none: the text `W&H&1&`, then little-endian float32.
+
+    The format is that of COLMAP's `mvs/mat.h`.
+
+    Raises:
+        D2Error: there is no such file, it has no header, or more or fewer numbers than the header says.
+    """
+    data = read_bytes(path, "let COLMAP compute the map again")
+    header = HEADER.match(data[:HEADER_LENGTH])
+    if header is None:
+        raise D2Error(f"{path} does not begin with width&height&channels& as COLMAP's maps do: compute it again")
+    width, height, channels = (int(number) for number in header.groups())
+    if width * height == 0 or channels != 1:
+        raise D2Error(f"{path} is {width}x{height}x{channels}, expected pixels of one number each: compute it again")
+    held, expected = len(data) - header.end(), 4 * width * height
+    if held != expected:
+        raise D2Error(f"{path} holds {held} bytes of numbers but {width}x{height} need {expected}: compute it again")
+    depth = np.frombuffer(data, "<f4", offset=header.end()).reshape(height, width)
+    return np.ascontiguousarray(depth, dtype=np.float32)
+
+
 def _intrinsics(model: ColmapModel, image: ColmapImage, shape: tuple[int, ...]) -> np.ndarray:
     """K [3, 3] of a map, which COLMAP may have computed at less than the size of its image."""
     recorded = model.cameras[image.camera]
@@ -222,7 +247,7 @@ def scale_of_world(cameras: Sequence[Camera], poses: dict[str, np.ndarray], fold
         raise _other_poses(folder, "one camera in another world, whose scale cannot be known")
     ours, theirs = [], []
     for first, second in itertools.combinations(cameras, 2):
-        here = second.T_camera_world @ np.linalg.inv(first.T_camera_world)
+        here = relative_pose(first, second)
         there = poses[second.name] @ np.linalg.inv(poses[first.name])
         turned = np.arccos(np.clip((np.trace(here[:3, :3].T @ there[:3, :3]) - 1) / 2, -1, 1))
         if np.rad2deg(turned) > ROTATION:

@@ -1,15 +1,15 @@
 """The positive-scale Charbonnier fit, solved to a certified duality gap.
 
-    minimise over a >= a_min, b:   F(a, b) = sum_i rho(w_i (a x_i + b - y_i)),   rho(r) = sqrt(r^2 + eps^2) - eps
+    minimise over a >= 0, b:   F(a, b) = sum_i rho(w_i (a x_i + b - y_i)),   rho(r) = sqrt(r^2 + eps^2) - eps
 
 (paper, section "Dual-source Depth Consistency Prior Construction"). F is convex and smooth, so the optimum is unique
-unless x is constant. The paper's a > 0 is an open set; the closed problem a >= a_min is solved, and an optimum on the
+unless x is constant. The paper's a > 0 is an open set; the closed problem a >= 0 is solved, and an optimum on the
 boundary says that no positive scale is best.
 
 The certificate holds for any iterate. rho(r) = max over |u| <= 1 of u r - eps (1 - sqrt(1 - u^2)), hence for every u
 with |u_i| <= 1, sum w_i u_i = 0 and s = sum w_i x_i u_i >= 0
 
-    F* >= a_min s - sum u_i w_i y_i - eps sum (1 - sqrt(1 - u_i^2)),
+    F* >= - sum u_i w_i y_i - eps sum (1 - sqrt(1 - u_i^2)),
 
 and u = rho'(r), projected onto the equalities, makes this bound tight at the optimum.
 """
@@ -38,7 +38,7 @@ class AffineFit:
     """y ~ scale x + shift with its certificate.
 
     `objective` is F and `gap` an upper bound of F - F*, relative to max(F, 1e-6 n eps): below a millionth of the
-    smoothing per point an objective is zero to all purposes. `boundary` is True where scale = a_min, `flat` where x is
+    smoothing per point an objective is zero to all purposes. `boundary` is True where scale = 0, `flat` where x is
     constant (then only the shift was fitted). `scale_error` is the sandwich standard error of the scale.
     """
 
@@ -59,18 +59,16 @@ def fit_affine(
     weights: np.ndarray | None = None,
     *,
     epsilon: float,
-    scale_min: float = 0.0,
     tolerance: float = 1e-10,
     max_iterations: int = 100,
 ) -> AffineFit:
-    """Fit scale >= `scale_min` and shift; non-finite points and those without positive weight are ignored.
+    """Fit scale >= 0 and shift; non-finite points and those without positive weight are ignored.
 
     Args:
         x: [n] what is aligned (a monocular prediction).
         y: [n] what it is aligned to.
         weights: [n] multiplies each residual; 1 where None.
         epsilon: smoothing of rho, in units of weights * y; must be positive.
-        scale_min: lower bound of the scale.
         tolerance: relative duality gap to stop at.
         max_iterations: Newton steps at most; the certificate tells what was reached.
 
@@ -80,34 +78,37 @@ def fit_affine(
     x, y, weights = _usable(x, y, weights)
     if x.size == 0:
         return AffineFit(np.nan, np.nan, np.nan, np.nan, 0, 0, boundary=False, flat=True, scale_error=np.nan)
-    unit = _Units.of(x, y, weights, epsilon)
+    # Centre and spread: in these units an offset of 1e8 or a scale of 1e-3..1e6 changes nothing.
+    weight, x_centre, y_centre = median(weights), median(x), median(y)
+    weights, tiny = weights / weight, np.finfo(float).tiny
+    x_spread = max(float(np.abs(x - x_centre).mean()), tiny)
+    y_spread = max(float(np.abs(y - y_centre).mean()), epsilon / weight, tiny)
     problem = _Problem(
-        p=unit.weights * (x - unit.x_centre) / unit.x_spread,
-        q=unit.weights,
-        t=unit.weights * (y - unit.y_centre) / unit.y_spread,
-        epsilon=max(epsilon / unit.weight / unit.y_spread, MIN_EPSILON),
-        scale_min=scale_min * unit.x_spread / unit.y_spread,
+        p=weights * (x - x_centre) / x_spread,
+        q=weights,
+        t=weights * (y - y_centre) / y_spread,
+        epsilon=max(epsilon / weight / y_spread, MIN_EPSILON),
     )
-    flat = x.size < 2 or not unit.x_spread > 64 * np.finfo(float).eps * np.abs(x).max()
+    flat = x.size < 2 or not x_spread > 64 * np.finfo(float).eps * np.abs(x).max()
     if flat:
-        problem = _Problem(np.zeros_like(problem.p), problem.q, problem.t, problem.epsilon, 0.0)
+        problem = _Problem(np.zeros_like(problem.p), problem.q, problem.t, problem.epsilon)
         shift = problem.best_shift(0.0, problem.median_shift())
         state = _State(0.0, shift, problem.sums(0.0, shift), 0.0, 0)
         boundary = False
     else:
         state = problem.solve(tolerance, max_iterations)
-        boundary = state.a <= problem.scale_min
-    scale = state.a * unit.y_spread / unit.x_spread
+        boundary = state.a <= 0
+    scale = state.a * y_spread / x_spread
     return AffineFit(
         scale=scale,
-        shift=state.b * unit.y_spread + unit.y_centre - scale * unit.x_centre,
-        objective=state.sums.value * unit.y_spread * unit.weight,
+        shift=state.b * y_spread + y_centre - scale * x_centre,
+        objective=state.sums.value * y_spread * weight,
         gap=state.gap,
         iterations=state.iterations,
         count=x.size,
         boundary=boundary,
         flat=flat,
-        scale_error=_scale_error(state.sums) * unit.y_spread / unit.x_spread,
+        scale_error=_scale_error(state.sums) * y_spread / x_spread,
     )
 
 
@@ -121,27 +122,6 @@ def _usable(x: np.ndarray, y: np.ndarray, weights: np.ndarray | None) -> tuple[n
     weights = np.ones_like(x) if weights is None else np.asarray(weights, np.float64).ravel()
     keep = np.isfinite(x) & np.isfinite(y) & np.isfinite(weights) & (weights > 0)
     return (x, y, weights) if keep.all() else (x[keep], y[keep], weights[keep])
-
-
-@dataclass(frozen=True, eq=False)
-class _Units:
-    """Centre and spread of the data: in these units an offset of 1e8 or a scale of 1e-3..1e6 changes nothing."""
-
-    x_centre: float
-    x_spread: float
-    y_centre: float
-    y_spread: float
-    weight: float
-    weights: np.ndarray
-
-    @classmethod
-    def of(cls, x: np.ndarray, y: np.ndarray, weights: np.ndarray, epsilon: float) -> _Units:
-        weight = median(weights)
-        x_centre, y_centre = median(x), median(y)
-        x_spread, y_spread = float(np.abs(x - x_centre).mean()), float(np.abs(y - y_centre).mean())
-        tiny = np.finfo(float).tiny
-        y_spread = max(y_spread, epsilon / weight, tiny)
-        return cls(x_centre, max(x_spread, tiny), y_centre, y_spread, weight, weights / weight)
 
 
 Step = tuple[float, float]
@@ -167,17 +147,6 @@ class Sums(NamedTuple):
     """c = u^2."""
 
 
-class Dual(NamedTuple):
-    """Of u that was moved by its room times a step and divided by `shrink`."""
-
-    largest: float
-    """Its largest size before the division."""
-    product: float
-    """Sum of it times t."""
-    conjugate: float
-    """sum (1 - sqrt(1 - u^2))."""
-
-
 class _State(NamedTuple):
     a: float
     b: float
@@ -188,7 +157,7 @@ class _State(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """min over a >= scale_min, b of sum rho(a p + b q - t): the same problem in normalised units.
+    """min over a >= 0, b of sum rho(a p + b q - t): the same problem in normalised units.
 
     `p`, `q`, `t` are float64 [n].
     """
@@ -197,7 +166,6 @@ class _Problem:
     q: np.ndarray
     t: np.ndarray
     epsilon: float
-    scale_min: float
 
     def residual(self, a: float, b: float) -> np.ndarray:
         return a * self.p + b * self.q - self.t
@@ -214,26 +182,6 @@ class _Problem:
         curvatures = inverse_root, inverse_root * sharp**2, 1 - u * u, u * u
         slope = dot(self.p, u), dot(self.q, u)
         return Sums(dot(r, u / (1 + sharp)), slope, *(self.normal(curvature) for curvature in curvatures))
-
-    def duals(self, a: float, b: float, steps: tuple[Step, Step], shrink: tuple[float, float]) -> tuple[Dual, Dual]:
-        """What u at (a, b) gives when it is moved.
-
-        Args:
-            a, b: where u is.
-            steps: in units of p and of q; the first is times 1 - u^2, the second times 1.
-            shrink: what the result is divided by.
-        """
-        r = self.residual(a, b)
-        u = r * (1 / self.root(r))
-
-        def moved(room: np.ndarray, step: Step, by: float) -> Dual:
-            given = u - room * (step[0] * self.p + step[1] * self.q)
-            feasible = given / by
-            square = np.minimum(feasible * feasible, 1.0)
-            conjugate = float((square / (1 + np.sqrt(1 - square))).sum())
-            return Dual(float(np.abs(given).max()), dot(feasible, self.t), conjugate)
-
-        return moved(1 - u * u, steps[0], shrink[0]), moved(np.ones_like(u), steps[1], shrink[1])
 
     def normal(self, curvature: np.ndarray) -> Normal:
         """The matrix of `curvature` [n]."""
@@ -269,15 +217,15 @@ class _Problem:
         """Least squares, then two reweighted steps."""
         least = _solve_2x2(*self.plain, dot(self.p, self.t), dot(self.q, self.t))
         if least is None:
-            return self.scale_min, self.median_shift()
-        a = max(self.scale_min, least[0])
+            return 0.0, self.median_shift()
+        a = max(0.0, least[0])
         b = dot(self.q, self.t - a * self.p) / self.plain[2]
         for _ in range(2):
             here = self.sums(a, b)
             step = _solve_2x2(*here.irls, -here.slope[0], -here.slope[1])
             if step is None:
                 break
-            moved = max(self.scale_min, a + step[0]) - a
+            moved = max(0.0, a + step[0]) - a
             a, b = a + moved, b - (here.slope[1] + here.irls[1] * moved) / here.irls[2]
         return a, b
 
@@ -290,14 +238,14 @@ class _Problem:
             if step is None:
                 continue
             a_new, b_new = a + step[0], b + step[1]
-            if a_new <= self.scale_min:
-                a_new = self.scale_min
+            if a_new <= 0:
+                a_new = 0.0
                 b_new = b - (gradient_b + h_ab * (a_new - a)) / h_bb
             predicted = gradient_a * (a_new - a) + gradient_b * (b_new - b)
             there = self.sums(a_new, b_new)
             if there.value < here.value + ARMIJO * min(predicted, 0.0):
                 return a_new, b_new, there
-        b_new = self.best_shift(a, b) if a <= self.scale_min else b
+        b_new = self.best_shift(a, b) if a <= 0 else b
         return None if b_new == b else (a, b_new, self.sums(a, b_new))
 
     def best_shift(self, a: float, b: float) -> float:
@@ -321,19 +269,21 @@ class _Problem:
     def lower_bound(self, a: float, b: float, here: Sums) -> float:
         """The dual value of u = rho'(r) after making it feasible; valid for every feasible a and b."""
         slope_a, slope_b = here.slope
-        keep = max(0.0, slope_a) if a <= self.scale_min else 0.0
-        # Moving only those u that have room to +-1 wastes least; where none has, all of them move and are scaled.
-        found = [_solve_2x2(*normal, slope_a - keep, slope_b) for normal in (here.room, self.plain)]
-        steps = found[0] or (0.0, 0.0), found[1] or (0.0, 0.0)
-        shrink = 1.0, 1.0
-        duals = self.duals(a, b, steps, shrink)
-        if max(dual.largest for dual in duals) > 1:
-            shrink = max(1.0, duals[0].largest), max(1.0, duals[1].largest)
-            duals = self.duals(a, b, steps, shrink)
+        keep = max(0.0, slope_a) if a <= 0 else 0.0
+        r = self.residual(a, b)
+        u = r * (1 / self.root(r))
         best = -np.inf
-        for step, by, dual in zip(found, shrink, duals):
-            if step is not None or (keep == slope_a and slope_b == 0):
-                best = max(best, self.scale_min * keep / by - dual.product - self.epsilon * dual.conjugate)
+        # Moving only those u that have room to +-1 wastes least; where none has, all of them move and are scaled.
+        for room, normal in ((1 - u * u, here.room), (np.ones_like(u), self.plain)):
+            step = _solve_2x2(*normal, slope_a - keep, slope_b)
+            if step is None and (keep != slope_a or slope_b != 0):
+                continue
+            along_a, along_b = step or (0.0, 0.0)
+            moved = u - room * (along_a * self.p + along_b * self.q)
+            feasible = moved / max(1.0, float(np.abs(moved).max()))
+            square = np.minimum(feasible * feasible, 1.0)
+            conjugate = float((square / (1 + np.sqrt(1 - square))).sum())
+            best = max(best, -dot(feasible, self.t) - self.epsilon * conjugate)
         return best
 
 

@@ -235,14 +235,10 @@ def _fitted(mono: np.ndarray, geometric: np.ndarray, kind: MonoKind, settings: A
     if _central_range(depth) <= MIN_SPREAD * median(depth):
         return Alignment(AlignStatus.ONE_DEPTH, kind, anchors=count)
     target = 1 / depth if kind == "relative" else depth
-    return _Fitted(count, x, depth, target, *_fit(x, target, settings))
-
-
-def _fit(x: np.ndarray, target: np.ndarray, settings: AlignSettings) -> tuple[AffineFit, float]:
-    """The line, and the smoothing it was fitted with."""
     relative = settings.residual == "relative"
     epsilon = settings.epsilon if relative else settings.epsilon * float(np.median(target))
-    return fit_affine(x, target, 1 / target if relative else None, epsilon=epsilon), epsilon
+    fit = fit_affine(x, target, 1 / target if relative else None, epsilon=epsilon)
+    return _Fitted(count, x, depth, target, fit, epsilon)
 
 
 def _nearest(z_far: float) -> float:

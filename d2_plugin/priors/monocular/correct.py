@@ -8,6 +8,7 @@ disagrees with the many around it is outvoted there, so verification by the corr
 
 from __future__ import annotations
 
+import functools
 from types import ModuleType
 
 import numpy as np
@@ -21,9 +22,9 @@ PRIOR = 0.05
 """Weight of "no correction": a window in which this share of the pixels is known is corrected by half."""
 LIMIT = 0.7
 """Anchors off by more than this in log depth (a factor of two) say nothing about the bend of the map."""
-GRID = 80  # cells across the image: twice as many change the median error by less than .0002 and take 8 times longer
+GRID = 80  # cells across the image
 OUTLIER = 0.03  # of log depth: an anchor this far from the average of its window has 0.7 of its weight
-ROUNDS = 2  # of reweighting; two more change no digit that is reported
+ROUNDS = 2  # of reweighting
 
 
 def corrected_depth(aligned: np.ndarray, geometric: np.ndarray, settings: AlignSettings) -> np.ndarray:
@@ -103,25 +104,17 @@ def _robust_average(down: np.ndarray, across: np.ndarray, values: np.ndarray, sh
     return average(weight)
 
 
+@functools.cache
 def _blur_matrix(cv2: ModuleType, size: int, sigma: float) -> np.ndarray:
     """Gaussian blur of a row of `size` cells with nothing beyond its ends, float32 [size, size].
 
-    So few cells are blurred in a fifth of the time by a product of matrices; the numbers are OpenCV's own.
+    A product of matrices is faster for so few cells; the numbers are OpenCV's own.
     """
-    if (size, sigma) not in _BLURS:
-        window = cv2.getGaussianKernel(2 * _reach(sigma) + 1, sigma, cv2.CV_32F).ravel()
-        places = np.arange(size)[:, None] - np.arange(size) + _reach(sigma)
-        inside = (places >= 0) & (places < window.size)
-        _BLURS[size, sigma] = np.where(inside, window[np.clip(places, 0, window.size - 1)], 0).astype(np.float32)
-    return _BLURS[size, sigma]
-
-
-def _reach(sigma: float) -> int:
-    """Cells beyond which a Gaussian is taken for zero."""
-    return round(4 * sigma)
-
-
-_BLURS: dict[tuple[int, float], np.ndarray] = {}
+    reach = round(4 * sigma)  # beyond it a Gaussian is taken for zero
+    window = cv2.getGaussianKernel(2 * reach + 1, sigma, cv2.CV_32F).ravel()
+    places = np.arange(size)[:, None] - np.arange(size) + reach
+    inside = (places >= 0) & (places < window.size)
+    return np.where(inside, window[np.clip(places, 0, window.size - 1)], 0).astype(np.float32)
 
 
 def _block_sum(values: np.ndarray, cell: int) -> np.ndarray:

@@ -47,15 +47,11 @@ def extrapolation_error(
     error, beyond = np.zeros(aligned.shape), np.flatnonzero(depth != held)
     parted = []
     for rest in (anchors > near, anchors < far):
-        line = _line(depth, np.where(rest, anchors, 0), kind, settings)
+        others = np.where(rest, anchors, 0)
+        line = unjudged_line(1 / depth if kind == "relative" else depth, others, kind=kind, settings=settings)
         parted.append(_parted(depth.ravel()[beyond], held.ravel()[beyond], *line, kind))
     error.ravel()[beyond] = np.sqrt((1 - THIRD) / THIRD) * np.hypot(*parted)
     return error
-
-
-def _line(depth: np.ndarray, rest: np.ndarray, kind: MonoKind, settings: AlignSettings) -> tuple[float, float]:
-    """Scale and shift that the remaining anchors [H, W] give."""
-    return unjudged_line(1 / depth if kind == "relative" else depth, rest, kind=kind, settings=settings)
 
 
 def _parted(depth: np.ndarray, held: np.ndarray, scale: float, shift: float, kind: MonoKind) -> np.ndarray:

@@ -52,7 +52,7 @@ def far_pixels(inverse: np.ndarray, geometric: np.ndarray, image: np.ndarray) ->
     gray = (cv2.add(cv2.add(red, green, dtype=cv2.CV_16U), blue, dtype=cv2.CV_16U) / np.float32(3)) / 255
     mean = cv2.blur(gray, (5, 5))
     smooth = np.sqrt(np.maximum(cv2.blur(gray * gray, (5, 5)) - mean * mean, 0)) < SMOOTH
-    clear = _large(cv2, (beyond < CLEARLY) & smooth & ~measured, rim=True)
+    clear = _large(cv2, (beyond < CLEARLY) & smooth & ~measured)
     if not clear.any():
         return clear
     colored = _like_around(cv2, image.astype(np.float32) / 255, clear)
@@ -60,12 +60,12 @@ def far_pixels(inverse: np.ndarray, geometric: np.ndarray, image: np.ndarray) ->
     return _touching(cv2, candidates, clear)
 
 
-def _large(cv2: Any, mask: np.ndarray, rim: bool) -> np.ndarray:
+def _large(cv2: Any, mask: np.ndarray) -> np.ndarray:
     """The connected pieces that are large enough and reach the rim of the image."""
     _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     left, top, width, height, area = stats.T
     at_rim = (left == 0) | (top == 0) | (left + width == mask.shape[1]) | (top + height == mask.shape[0])
-    keep = (area >= LEAST * mask.size) & (at_rim | (not rim))
+    keep = (area >= LEAST * mask.size) & at_rim
     keep[0] = False
     return keep[pieces]
 

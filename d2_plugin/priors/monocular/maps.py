@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -15,19 +14,6 @@ from d2_plugin.recordings.recording import MonoKind, Recording
 from d2_plugin.store.files import EntryFolder, hash_of
 
 MONO_VERSION = 1  # raise it when prediction changes what it returns, so that caches are not trusted
-
-
-class MonoSource(Protocol):
-    """Where monocular maps come from."""
-
-    kind: MonoKind
-    about: str
-
-    def key(self, camera: str, frame: Frame) -> str:
-        """Hash of everything the map depends on."""
-
-    def map(self, camera: str, frame: Frame) -> np.ndarray | None:
-        """The map float32 [H, W] at the image's size, or None where there is none."""
 
 
 class MapsOnDisk:
@@ -70,6 +56,10 @@ class MapsFromNetwork:
         else:
             prediction = entry.array()
         return upsample(prediction, *frame.images[camera].shape[:2])
+
+
+MonoSource = MapsOnDisk | MapsFromNetwork
+"""Where monocular maps come from."""
 
 
 def mono_source(recording: Recording, settings: PriorSettings, cache: Path) -> MonoSource | None:

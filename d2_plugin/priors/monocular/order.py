@@ -1,7 +1,7 @@
 """Medians and quantiles of vectors, each by a partition around one place.
 
-NumPy has that one compiled for vectors of numbers; its own median and quantile look for several places at once, which
-takes six times as long.
+NumPy has that one compiled for vectors of numbers; its own median and quantile look for several places at once and take
+several times as long.
 """
 
 from __future__ import annotations

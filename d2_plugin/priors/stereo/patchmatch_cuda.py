@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -48,13 +47,6 @@ class Call(ctypes.Structure):
     )
 
 
-class Launcher(Protocol):
-    """Runs kernels of patchmatch.cu on one device."""
-
-    def launch(self, kernel: str, sources: int, blocks: int, call: Call) -> None:
-        """Enqueue `kernel`, compiled for that many sources, on `blocks` blocks of THREADS threads; `call` is copied."""
-
-
 def flags_for(sources: int) -> tuple[str, ...]:
     """Flags of NVRTC, or nvcc, to compile the kernels for so many sources of a view."""
     return (*FLAGS, f"-DD2_MAX_SOURCES={sources}", f"-DD2_CALL_SIZE={ctypes.sizeof(Call)}")
@@ -65,7 +57,7 @@ LEAST_SOURCES = 2
 
 
 class CudaLauncher:
-    """Launches the kernels on one CUDA device, on torch's current stream (`Launcher`)."""
+    """Launches the kernels on one CUDA device, on torch's current stream."""
 
     def __init__(self, device: torch.device) -> None:
         """Compile (or find) the kernels and load them.
@@ -79,7 +71,7 @@ class CudaLauncher:
         self._module(LEAST_SOURCES)
 
     def launch(self, kernel: str, sources: int, blocks: int, call: Call) -> None:
-        """See `Launcher.launch`; returns before the kernel has run."""
+        """Enqueue `kernel`, compiled for that many sources, on `blocks` blocks of THREADS threads; `call` is copied."""
         key = (kernel, sources)
         if key not in self._functions:
             self._functions[key] = self._driver.function(self._module(sources), kernel)
@@ -93,7 +85,7 @@ class CudaLauncher:
 
 
 @functools.cache
-def launcher(device: torch.device) -> Launcher:
+def launcher(device: torch.device) -> CudaLauncher:
     """The launcher of a CUDA device; `device` has an index.
 
     Raises:

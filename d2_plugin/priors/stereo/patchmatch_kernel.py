@@ -131,7 +131,7 @@ class PatchMatchKernel:
             threads=torch.get_num_threads(),
             inverse_far=1 / far,
             inverse_near=1 / near,
-            per_gray=per_squared_gray(CONTRAST),
+            per_gray=-0.5 * math.log2(math.e) / (255 * CONTRAST) ** 2,  # log2 of the weight per squared difference
         )
 
     def _view_arrays(self, view: LevelView) -> Arrays:
@@ -155,11 +155,6 @@ def _pointed(task: Task, arrays: Arrays) -> Task:
     for name, array in arrays.items():
         setattr(task, name, array.ctypes.data)
     return task
-
-
-def per_squared_gray(contrast: float) -> float:
-    """log2 of the bilateral weight per squared difference of grey values in 0..255; `contrast` is in 0..1."""
-    return -0.5 * math.log2(math.e) / (255 * contrast) ** 2
 
 
 def _intrinsics(camera: Camera) -> ctypes.Array:
