@@ -25,7 +25,7 @@ def form(words: list[str]) -> Form:
 
 def run(settings: Comparison) -> str:
     """The table."""
-    from d2_plugin.runs.saved.kinds import read_metrics
+    from d2_plugin.runs.saved import read_metrics
     from d2_plugin.runs.tables import metrics_table
 
     return metrics_table({folder.name: read_metrics(folder) for folder in settings.run_folders})

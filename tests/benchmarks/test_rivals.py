@@ -30,7 +30,7 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.ablation import ablate
 from d2_plugin.runs.ablation.presets import PRESETS, rows_named
 from d2_plugin.runs.run import Run
-from d2_plugin.runs.saved.kinds import read_run
+from d2_plugin.runs.saved import read_run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import make_view
 from d2_plugin.store.store import PriorStore

@@ -120,10 +120,10 @@ class TestTables:
         self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         words = ["train", str(recording), *CAMERAS, "--iterations", "4", "--hooks", "none", "--output", str(tmp_path)]
-        lists = ["--priors.stereo.patchmatch-rounds", "3,1"]
+        lists = ["--priors.depth-range", "1,9"]
         assert main([*words, *lists]) == 0
         assert main([*words, *lists]) == 0
-        assert main([*words, "--priors.stereo.patchmatch-rounds", "3,2"]) == 2
+        assert main([*words, "--priors.depth-range", "1,8"]) == 2
         assert "other settings of overrides" in capsys.readouterr().err
 
     def test_the_tables_of_a_backbone_are_those_of_the_chosen_one(self, capsys: pytest.CaptureFixture[str]) -> None:
@@ -139,12 +139,12 @@ class TestTables:
 
 class TestFlagsOfARun:
     def test_values_are_those_that_were_written(self) -> None:
-        words = "room --train-cameras a,b --frames 0:8:2 --hooks prior,densify --output o --export-ply"
+        words = "room --train-cameras a,b --frames 0:8:2 --hooks prior,densify --output o --view"
         values = parsed("train", *words.split()).values
         assert values["train_cameras"] == ("a", "b")
         assert values["frames"] == (0, 2, 4, 6, 8)
         assert values["hooks"] == ("prior", "densify")
-        assert values["export_ply"] is True
+        assert values["view"] is True
         assert parsed("train", "room", *CAMERAS, "--output", "o", "--hooks", "none").values["hooks"] == ()
 
     def test_what_is_needed_is_asked_for(self, capsys: pytest.CaptureFixture[str]) -> None:

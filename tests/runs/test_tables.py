@@ -14,7 +14,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings.selection import select_cameras
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.evaluation import evaluate
-from d2_plugin.runs.saved.kinds import read_metrics
+from d2_plugin.runs.saved import read_metrics
 from d2_plugin.runs.tables import metrics_table, view_tables
 
 NAMES = ["test0", "test1"]

@@ -91,7 +91,7 @@ def workplace(commands: Commands, recording: Path) -> Workplace:
     folder = recording.parent
     priors, run, out = folder / "priors", folder / "run", folder / "written" / "out"
     out.parent.mkdir()
-    train = ["train", str(recording), *TRAINED, "--iterations", "5", "--priors", str(priors), "--export-ply"]
+    train = ["train", str(recording), *TRAINED, "--iterations", "5", "--priors", str(priors)]
     for words in (["priors", str(recording), *TRAINED, "--output", str(priors)], [*train, "--output", str(run)]):
         ended = commands.run(words)
         assert ended.code == 0, ended.said

@@ -7,20 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-from torch import Tensor
-
 from d2_plugin.durable import make_folder, remove_leftovers
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import MovingGaussians
-from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
 from d2_plugin.reading import opened
-from d2_plugin.runs.gaussian_ply import write_ply
 from d2_plugin.settings import AtLeastOne, Count, Positional, Positive, Settings
 from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.export.coded import seen_rows
 from d2_plugin.viewing.export.page import GENERATOR, write_page
+from d2_plugin.viewing.export.ply import write_ply
 from d2_plugin.viewing.export.scene import ExportScene, export_scene
 from d2_plugin.viewing.export.splatv import fit_curves, write_splatv
 from d2_plugin.viewing.export.spz import write_spz
@@ -129,15 +126,9 @@ def _frame_files(scene: ExportScene, settings: Export, folder: Path) -> Written:
         for frame, time in zip(scene.frames, scene.seconds):
             if frame in chosen:
                 paths.append(folder / settings.format / f"frame_{frame:05d}.{settings.format}")
-                (write_spz if settings.format == "spz" else _write_ply)(paths[-1], *scene.still_at(time))
+                (write_spz if settings.format == "spz" else write_ply)(paths[-1], *scene.still_at(time))
                 bar.update(len(paths))
     return Written(tuple(paths))
-
-
-def _write_ply(path: Path, shown: MovingGaussians, shapes: tuple[Tensor, Tensor]) -> None:
-    coefficients = shown.harmonics.coefficients
-    parts = shown.positions, shown.covariances, SH_C0 * coefficients[:, 0] + 0.5, shown.opacities
-    write_ply(path, *parts, coefficients[:, 1:], shapes=shapes)
 
 
 FORMATS: dict[str, Callable[[ExportScene, Export, Path], Written]] = {

@@ -15,7 +15,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
 from d2_plugin.runs.metrics import psnr
 from d2_plugin.runs.run import Run
-from d2_plugin.runs.saved.finite import OnStep
+from d2_plugin.runs.saved import OnStep
 from d2_plugin.settings import AtLeastOne, Positional, Range, Settings
 from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.camera_paths import pose_of
