@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from d2_plugin.commands.arguments.form import Form
 from d2_plugin.settings import Positional, Settings
 
 
@@ -16,11 +15,6 @@ class Comparison(Settings):
 
     run_folders: Annotated[tuple[Path, ...], Positional()]
     """The --output folders of `d2 train`."""
-
-
-def form(words: list[str]) -> Form:
-    """What `d2 compare` takes."""
-    return Form.of("d2 compare", __doc__, Comparison, run)
 
 
 def run(settings: Comparison) -> str:

@@ -20,7 +20,7 @@ from d2_plugin.progress import progress_bar
 from d2_plugin.runs.prior.alongside import OPEN_BY, PriorAlongside, alongside
 from d2_plugin.runs.prior.build import build_priors_for, refuse_unusable
 from d2_plugin.runs.prior.trials import Trials, is_open, kept_trials
-from d2_plugin.runs.provenance import circumstances
+from d2_plugin.runs.rows import circumstances
 from d2_plugin.runs.saved import (
     METRICS,
     OnStep,

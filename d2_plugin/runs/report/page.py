@@ -9,9 +9,8 @@ from typing import NamedTuple
 
 from d2_plugin.runs import markup
 from d2_plugin.runs.markup import Table
-from d2_plugin.runs.provenance import provenance
 from d2_plugin.runs.report.svg import style
-from d2_plugin.runs.rows import Row
+from d2_plugin.runs.rows import Row, provenance
 
 TITLE = "D²-4DGS: quality against run time"
 
