@@ -143,14 +143,14 @@ def evaluate(
     }
 
 
-def still_image(recording: Recording, camera: str, frames: Sequence[int], most: int = 9) -> np.ndarray | None:
-    """What a camera sees where nothing moves, [H, W, 3] in 0..1: the median of up to `most` frames spread in time.
+def still_image(recording: Recording, camera: str, frames: Sequence[int]) -> np.ndarray | None:
+    """What a camera sees where nothing moves, [H, W, 3] in 0..1: the median of up to nine frames spread in time.
 
     None where there are fewer than three frames: the median of two is neither.
     """
     if len(frames) < 3:
         return None
-    chosen = np.unique(np.linspace(0, len(frames) - 1, most).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(frames) - 1, 9).round().astype(int))
     return np.median([recording.image(camera, frames[i]) for i in chosen], axis=0).astype(np.float32) / 255
 
 

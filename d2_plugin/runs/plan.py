@@ -215,9 +215,9 @@ def _own_points(recording: Recording) -> np.ndarray | None:
     return None if model is None else read_points(model).positions
 
 
-def changed_share(recording: Recording, camera: str, samples: int = 5) -> float:
-    """Largest share of a camera's pixels that differ from the first frame, over a few frames spread in time."""
-    chosen = np.unique(np.linspace(0, len(recording.frames) - 1, samples).round().astype(int))
+def changed_share(recording: Recording, camera: str) -> float:
+    """Largest share of a camera's pixels that differ from the first frame, over five frames spread in time."""
+    chosen = np.unique(np.linspace(0, len(recording.frames) - 1, 5).round().astype(int))
     first = recording.image(camera, recording.frames[0]).astype(np.int16)
     shares = [
         np.mean(np.abs(recording.image(camera, recording.frames[i]).astype(np.int16) - first).max(-1) > CHANGED * 255)

@@ -147,10 +147,6 @@ class TestFlagsOfARun:
         assert values["view"] is True
         assert parsed("train", "room", *CAMERAS, "--output", "o", "--hooks", "none").values["hooks"] == ()
 
-    def test_what_is_needed_is_asked_for(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(["train", "room"]) == 2
-        assert "d2 train needs --train-cameras and --output" in capsys.readouterr().err
-
     @pytest.mark.parametrize(("part", "message"), [("3/2", "parts are 1 to 2"), ("half", "give I/N")])
     def test_a_part_that_does_not_exist_is_refused(
         self, part: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import random
 from collections.abc import Callable
@@ -86,19 +85,6 @@ class TestADamagedFile:
         write_table(copied / "metrics.json", table, METRICS)
         with pytest.raises(D2Error, match=r"is damaged \(no .* in it\): run `d2 eval`"):
             read_metrics(copied)
-
-    def test_a_changed_score_is_found(self, copied: Path) -> None:
-        table = json.loads((copied / "metrics.json").read_text())
-        table["test"]["psnr"] += 1
-        (copied / "metrics.json").write_text(json.dumps(table))
-        with pytest.raises(D2Error, match="its content differs from its checksum"):
-            read_metrics(copied)
-
-    def test_changed_settings_are_found(self, copied: Path) -> None:
-        text = (copied / "run.json").read_text()
-        (copied / "run.json").write_text(text.replace('"seed": 0', '"seed": 1'))
-        with pytest.raises(D2Error, match="its content differs from its checksum"):
-            Run.load(copied)
 
     def test_a_checkpoint_of_another_version_is_named(self, copied: Path) -> None:
         path = copied / "checkpoint.pt"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,11 +9,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings.selection import select_cameras
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.evaluation import evaluate
-from d2_plugin.runs.saved import read_metrics
 from d2_plugin.runs.tables import metrics_table, view_tables
 
 NAMES = ["test0", "test1"]
@@ -68,10 +65,3 @@ def test_a_missing_score_is_a_dash_and_an_unmeasured_column_is_left_out() -> Non
     assert second[head.index("flicker")] == "0.0200"
     assert second[-3:] == ["6", "0.0", "1.2"]
     assert len({len(line) for line in table.splitlines()}) == 1
-
-
-@pytest.mark.parametrize("content", [b"", b'{"test": {"psnr": 2', b"[1, 2]", b"\xff\xfe"])
-def test_a_damaged_file_of_scores_is_one_sentence(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "metrics.json").write_bytes(content)
-    with pytest.raises(D2Error, match="metrics.json is damaged .*: run `d2 eval` on that folder"):
-        read_metrics(tmp_path)

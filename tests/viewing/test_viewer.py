@@ -130,7 +130,7 @@ class TestWhoOnlyLooks:
                 clock.now += seconds
                 drawn.append(seconds)
 
-            patch.setattr(viewer._drawer, "draw", draw)
+            patch.setattr("d2_plugin.viewing.live.viewer.draw", draw)
             viewer._connected(client)
             for step in range(self.STEPS):
                 clock.now += self.SECONDS_OF_A_STEP
@@ -323,7 +323,7 @@ def test_a_page_that_fails_is_given_up_and_the_training_goes_on(
     viewed: ViewedRun, port: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     viewer = Viewer(viewed=viewed, port=port, height=48, iterations=10)
-    monkeypatch.setattr(viewer._drawer, "draw", lambda *_: 1 / 0)
+    monkeypatch.setattr("d2_plugin.viewing.live.viewer.draw", lambda *_: 1 / 0)
     try:
         viewer._connected(looker())
         viewer.after_step(1)

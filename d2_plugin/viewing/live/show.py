@@ -95,15 +95,15 @@ def address_line(viewer: Viewer, host: str) -> str:
 class LiveRun:
     """A run that is watched: give `watch` to `Run.train`."""
 
-    def __init__(self, run: Run, host: str = "127.0.0.1", port: int = 8080) -> None:
-        self.run, self.host, self.port = run, host, port
+    def __init__(self, run: Run) -> None:
+        self.run = run
         self.viewer: Viewer | None = None
 
     def watch(self, trainer: Any) -> OnStep:
         """Open the page once there is a model; returns what is called after every step."""
         viewed = viewed_training(self.run, trainer)
         iterations = self.run.settings.iterations
-        self.viewer = viewer = Viewer(viewed=viewed, host=self.host, port=self.port, iterations=iterations)
+        self.viewer = viewer = Viewer(viewed=viewed, iterations=iterations)
         scorer = Scorer(viewed)
         if trainer.d2 is not None:
             viewer.marks = lambda: trainer.d2.inserted_at
