@@ -6,8 +6,10 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+import command_lines
 import pytest
 from small_layouts import write_layout
 
@@ -26,21 +28,7 @@ Refused = Callable[..., str]
 @pytest.fixture
 def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
     """The sentence with which a command line is refused."""
-
-    def run(*words: str) -> str:
-        assert main(words) == 2
-        return told(capsys)
-
-    return run
-
-
-def told(capsys: pytest.CaptureFixture[str]) -> str:
-    """The one line on stderr, which is no fault of ours."""
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("[")]  # ffmpeg's own
-    assert len(lines) == 1, lines
-    assert lines[0].startswith("d2: "), lines
-    assert "unexpected" not in lines[0], lines
-    return lines[0]
+    return partial(command_lines.refused, capsys)
 
 
 @pytest.fixture(scope="module")

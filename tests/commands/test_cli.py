@@ -13,8 +13,6 @@ import torch
 
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.store.store import PriorStore
 
@@ -22,13 +20,6 @@ pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
 CAMERAS = "train0,train1,train2"
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording small enough to train in seconds."""
-    path = tmp_path_factory.mktemp("recording") / "room"
-    return save_recording(synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54), path)
 
 
 @pytest.fixture(scope="module")

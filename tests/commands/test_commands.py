@@ -16,19 +16,10 @@ from d2_plugin.commands import cli
 from d2_plugin.commands.arguments.form import Form, Given, ModuleCommand
 from d2_plugin.commands.cli import COMMANDS, main
 from d2_plugin.config import DensifyConfig
-from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import hook_config, prior_settings
 
 CAMERAS = ["--train-cameras", "train0,train1,train2"]
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording small enough to train in seconds."""
-    path = tmp_path_factory.mktemp("recording") / "room"
-    return save_recording(synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54), path)
 
 
 def form_of(command: str, words: list[str]) -> Form:
