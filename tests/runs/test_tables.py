@@ -1,4 +1,4 @@
-"""Tables of scores: every view, frame and camera."""
+"""Tables of scores: every view, frame and camera; what stands out is bold, and no cell can break its table."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from d2_plugin.recordings.selection import select_cameras
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.evaluation import evaluate
-from d2_plugin.runs.tables import metrics_table, view_tables
+from d2_plugin.runs.tables import Table, latex, markdown, metrics_table, view_tables
 
 NAMES = ["test0", "test1"]
 
@@ -65,3 +65,31 @@ def test_a_missing_score_is_a_dash_and_an_unmeasured_column_is_left_out() -> Non
     assert second[head.index("flicker")] == "0.0200"
     assert second[-3:] == ["6", "0.0", "1.2"]
     assert len({len(line) for line in table.splitlines()}) == 1
+
+
+TABLE = Table(("name", "dB"), (("a|b", "28.9 ± 0.5"), ("c", "3")), frozenset({(0, 1)}))
+
+
+def test_markdown_keeps_bars_inside_their_cell_and_stresses_the_best() -> None:
+    assert markdown(TABLE).splitlines() == ["| name | dB |", "| --- | --- |", r"| a\|b | **28.9 ± 0.5** |", "| c | 3 |"]
+    best = Table(("a",), (("1|2",),), frozenset({(0, 0)}))
+    assert markdown(best).splitlines()[-1] == r"| **1\|2** |"
+
+
+def test_padded_columns_line_up() -> None:
+    lines = markdown(TABLE, padded=True).splitlines()
+    assert len({len(line) for line in lines}) == 1
+    assert [cell.strip() for cell in lines[3].strip("|").split("|")] == ["c", "3"]
+
+
+def test_latex_is_a_booktabs_table() -> None:
+    assert latex(Table(("method", "D²"), (("a", "1"), ("b", "2")))).splitlines() == [
+        r"\begin{tabular}{lc}",
+        r"\toprule",
+        r"method & D$^2$ \\",
+        r"\midrule",
+        r"a & 1 \\",
+        r"b & 2 \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
