@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from d2_plugin.durable import make_folder, remove_leftovers, write_text
+from d2_plugin.durable import make_folder, refuse_foreign, remove_leftovers, write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
-from d2_plugin.reading import opened, parsing
+from d2_plugin.reading import parsing
 from d2_plugin.runs.report.page import TITLE, Image, Section, html, markdown
 from d2_plugin.runs.report.quality import ablation, quality, training
 from d2_plugin.runs.report.run_folders import image_of, method_of, training_rows
@@ -23,9 +23,6 @@ Builder = Callable[[Sequence[Row]], Section]
 
 BUILDERS: dict[str, Builder] = {"quality": quality, "training": training, "ablation": ablation}
 """By the kind of row, in the order of the page."""
-
-HEAD = 1000
-"""Bytes of a file of the report among which it says that it is one."""
 
 LEAD = (
     "Every figure here was measured by a command of this package and is shown with the machine, the commit and the "
@@ -87,20 +84,10 @@ def make_report(
     with only_writer(make_folder(output)):
         remove_leftovers(output, below=False)  # of a report that was killed
         for name in texts:
-            _refuse_another(output / name)
+            refuse_foreign(output / name, '<svg class="plot"' if name.endswith(".svg") else TITLE, "d2 report")
         for name, content in texts.items():
             write_text(output / name, content)
     return [output / name for name in texts]
-
-
-def _refuse_another(path: Path) -> None:
-    """Refuse a file that no report wrote."""
-    if not path.exists():
-        return
-    own = '<svg class="plot"' if path.suffix == ".svg" else TITLE
-    with opened(path, "give another --output") as file:
-        if own.encode() not in file.read(HEAD):
-            raise D2Error(f"{path} was not written by `d2 report` and is kept: give another --output")
 
 
 def _built(kind: str, build: Builder, rows: Sequence[Row]) -> Section:

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-from d2_plugin.durable import make_folder, remove_leftovers
+from d2_plugin.durable import make_folder, refuse_foreign, remove_leftovers
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import MovingGaussians
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
-from d2_plugin.reading import opened
 from d2_plugin.settings import AtLeastOne, Count, Positional, Positive, Settings
 from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.export.coded import seen_rows
@@ -21,9 +20,6 @@ from d2_plugin.viewing.export.ply import write_ply
 from d2_plugin.viewing.export.scene import ExportScene, export_scene
 from d2_plugin.viewing.export.splatv import fit_curves, write_splatv
 from d2_plugin.viewing.export.spz import write_spz
-
-HEAD = 1000
-"""Bytes of a page among which its generator is named."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +81,7 @@ def write_export(scene: ExportScene, settings: Export, folder: Path) -> Written:
 
 def _html(scene: ExportScene, settings: Export, folder: Path) -> Written:
     path = folder / "scene.html"
-    if path.exists():
-        with opened(path, "give another --output") as file:
-            if f'content="{GENERATOR} '.encode() not in file.read(HEAD):
-                raise D2Error(f"{path} was not written by `d2 export` and is kept: give another --output")
+    refuse_foreign(path, f'content="{GENERATOR} ', "d2 export")
     return Written((path,), tuple(write_page(scene, path, settings.megabytes)))
 
 
