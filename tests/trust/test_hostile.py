@@ -86,7 +86,7 @@ def lines(text: str) -> list[Words]:
 
 def train(recording: Path, output: Path, *more: str) -> Words:
     words = ["train", str(recording), "--train-cameras", "train0,train1", "--iterations", "3"]
-    return [*words, "--priors.stereo.matcher", "sweep", "--output", str(output), *more]
+    return [*words, "--output", str(output), *more]
 
 
 def imported(place: Path, videos: Path, output: Path) -> Words:
