@@ -14,8 +14,8 @@ import torch
 from benchmarks.align_measure import AlignMethod, AlignProblem, align_problem, measure, methods
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.recordings.recording import MonoKind
-from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
+from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import AtATime, NotNegative, Range, Settings, Share
 
 logger = logging.getLogger(__name__)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from d2_plugin.priors.declared_error import DECLARED, label_name
-from d2_plugin.runs.markup import Table
 from d2_plugin.runs.report.page import Section, cases_of, sources_of
 from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure
 from d2_plugin.runs.rows import Row
+from d2_plugin.runs.tables import Table
 
 LABELS = tuple(map(label_name, DECLARED))
 """Labels whose sigma is drawn; each has its colour in all plots."""

@@ -18,10 +18,10 @@ import numpy as np
 from benchmarks.memory import in_fresh_process
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import split, synthetic_recording
-from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
+from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import Range, Settings
 
 

@@ -14,8 +14,8 @@ import torch
 from benchmarks.stereo_measure import Method, measure, methods
 from benchmarks.stereo_rigs import ARCS, MIDDLEBURY, load_rigs
 from d2_plugin.errors import unknown_name
-from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
+from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import AtATime, Range, Settings
 
 logger = logging.getLogger(__name__)

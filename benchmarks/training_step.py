@@ -21,8 +21,8 @@ from benchmarks.raster import parse_size
 from benchmarks.raster_measure import timed
 from benchmarks.training_step_scene import RASTER, StepScene, look_at_all, works_of
 from d2_plugin.errors import D2Error
-from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
+from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import AtATime, Range, Settings
 
 BARE, GUIDED = "step", "step with D2"

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import MOST_TEXT, json_text
+from d2_plugin.reading import MOST_TEXT, json_text, opened
 
 LEFTOVER = ".part"
 """How the temporary names end; what a killed process left behind is found by it."""
@@ -135,6 +135,14 @@ def _write_new(path: Path, parts: tuple[bytes | memoryview, ...], synced: bool) 
             os.fsync(descriptor)  # before the rename, or a power cut may leave the new name with nothing in it
     finally:
         os.close(descriptor)
+
+
+def refuse_foreign(path: Path, sign: str, command: str) -> None:
+    """Refuse to replace a file without the sign, among its first 1000 bytes, of the command that writes it."""
+    if path.exists():
+        with opened(path, "give another --output") as file:
+            if sign.encode() not in file.read(1000):
+                raise D2Error(f"{path} was not written by `{command}` and is kept: give another --output")
 
 
 def remove_leftovers(folder: Path, below: bool = True) -> None:

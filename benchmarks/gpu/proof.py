@@ -23,8 +23,8 @@ import torch
 from benchmarks.gpu.static import ARCHITECTURES, static_analysis
 from d2_plugin.durable import make_folder
 from d2_plugin.errors import D2Error
-from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
+from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import Range, Settings
 
 logger = logging.getLogger(__name__)

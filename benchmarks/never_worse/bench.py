@@ -21,7 +21,6 @@ from benchmarks.never_worse.maps import SPOILED, spoiled_recording
 from d2_plugin.errors import D2Error
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.ablation.presets import PRESETS, Preset
-from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.prior.build import build_priors_for
 from d2_plugin.runs.report.quality import groups_of, scores_table
 from d2_plugin.runs.rows import Row, append_rows, command_line, read_rows
@@ -29,6 +28,7 @@ from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings, check, prior_settings
 from d2_plugin.runs.shared import Job, Shared, share
 from d2_plugin.runs.start import TimedPoints
+from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.runs.training.bench import Case, case_of
 from d2_plugin.runs.training.measured import Line, Work, follow, workers
 from d2_plugin.settings import AtLeastOne, Count, Positional, Range, Seed, Settings

@@ -20,8 +20,8 @@ from benchmarks.stability.priors import prior_sweeps
 from benchmarks.work_precision import shown
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.progress import progress_bar
-from d2_plugin.runs.markup import Table, markdown
 from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
+from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import Settings
 
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}

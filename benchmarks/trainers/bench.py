@@ -20,8 +20,7 @@ from benchmarks.trainers.trials import TRIALS
 from d2_plugin.durable import append
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import json_text, read_text
-from d2_plugin.runs.provenance import circumstances
-from d2_plugin.runs.rows import command_line
+from d2_plugin.runs.rows import circumstances, command_line
 from d2_plugin.settings import Positional, Range, Seed, Settings
 
 log = logging.getLogger(__name__)

@@ -9,7 +9,7 @@ from statistics import mean, stdev
 from benchmarks.trainers.trial_run import ATTACHED, BARE, NO_HOOKS, Row
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import parse_json, read_text
-from d2_plugin.runs.markup import Table, markdown
+from d2_plugin.runs.tables import Table, markdown
 
 START, END = "<!-- rows -->", "<!-- end -->"
 HEADER = (

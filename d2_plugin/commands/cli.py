@@ -19,11 +19,16 @@ COMMANDS: dict[str, str | ModuleCommand] = {
         *("d2_plugin.viewing.demo", "Demo"),
         "A synthetic recording, trained by the backbone alone and with D2: a table, an image and a player.",
     ),
-    "import": "import_",
+    "import": ModuleCommand(
+        *("d2_plugin.commands.import_", "ImportSettings"),
+        "Turn videos into a recording: where the cameras stand, one clock for all of them, images, exposures.",
+    ),
     "plan": "plan",
     "priors": "priors",
     "train": "train",
-    "eval": "eval",
+    "eval": ModuleCommand(
+        "d2_plugin.commands.eval", "Evaluation", "Score the held-out cameras of a trained run again."
+    ),
     "render": ModuleCommand(
         *("d2_plugin.viewing.videos.render", "RenderSettings"),
         "A video of a run: its held-out cameras, or a camera that moves; depth, errors, several runs together.",
@@ -32,7 +37,9 @@ COMMANDS: dict[str, str | ModuleCommand] = {
         *("d2_plugin.viewing.live.show", "ViewSettings"),
         "A page in the browser that shows a run, a recording or a depth prior, in space and time.",
     ),
-    "compare": "compare",
+    "compare": ModuleCommand(
+        "d2_plugin.commands.compare", "Comparison", "One Markdown table of the scores of several runs."
+    ),
     "ablate": "ablate",
     "bench": "bench",
     "report": ModuleCommand(
@@ -46,7 +53,10 @@ COMMANDS: dict[str, str | ModuleCommand] = {
         *("d2_plugin.commands.export_recording", "RecordingExport"),
         "Write a recording in the input layout of another 4D Gaussian Splatting repository.",
     ),
-    "doctor": "doctor",
+    "doctor": ModuleCommand(
+        *("d2_plugin.commands.doctor", "Doctor"),
+        "What is installed and what is missing for which feature; of a recording, what it lacks.",
+    ),
 }
 """Name -> what serves it: a module beside this file, whose docstring is the help and whose `form(words)` says what it
 takes; or any module with settings and `run`."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from d2_plugin.commands.arguments.form import Form
 from d2_plugin.settings import Positional, Settings
 
 
@@ -18,14 +17,9 @@ class Comparison(Settings):
     """The --output folders of `d2 train`."""
 
 
-def form(words: list[str]) -> Form:
-    """What `d2 compare` takes."""
-    return Form.of("d2 compare", __doc__, Comparison, run)
-
-
 def run(settings: Comparison) -> str:
     """The table."""
-    from d2_plugin.runs.saved.kinds import read_metrics
+    from d2_plugin.runs.saved import read_metrics
     from d2_plugin.runs.tables import metrics_table
 
     return metrics_table({folder.name: read_metrics(folder) for folder in settings.run_folders})

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Annotated
 
 from d2_plugin import __version__, compiler, registry
-from d2_plugin.commands.arguments.form import Form
 from d2_plugin.compiler import prebuilt
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Positional, Settings
@@ -39,11 +38,6 @@ class Doctor(Settings):
     """A recording; with --attach the folder of a trainer's repository, or its script. Else what is installed."""
     attach: str | None = None
     """Name of the repository, as the launcher knows it."""
-
-
-def form(words: list[str]) -> Form:
-    """What `d2 doctor` takes."""
-    return Form.of("d2 doctor", __doc__, Doctor, run)
 
 
 def run(settings: Doctor) -> str:

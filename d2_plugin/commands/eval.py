@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from d2_plugin.commands.arguments.form import Form
 from d2_plugin.settings import Positional, Settings
 
 
@@ -18,11 +17,6 @@ class Evaluation(Settings):
     """The --output of `d2 train`."""
     no_images: bool = False
     """Scores only."""
-
-
-def form(words: list[str]) -> Form:
-    """What `d2 eval` takes."""
-    return Form.of("d2 eval", __doc__, Evaluation, run)
 
 
 def run(settings: Evaluation) -> str:

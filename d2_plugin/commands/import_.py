@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from d2_plugin.commands.arguments.form import Form
 from d2_plugin.commands.arguments.recording import show, show_notes
+from d2_plugin.recordings.importing.importing import import_videos
+from d2_plugin.recordings.importing.settings import ImportSettings
+
+__all__ = ["ImportSettings", "run"]
 
 
-def form(words: list[str]) -> Form:
-    """What `d2 import` takes."""
-    from d2_plugin.recordings.importing.importing import import_videos
-    from d2_plugin.recordings.importing.settings import ImportSettings
-
-    def run(settings: ImportSettings) -> str:
-        recording, _ = import_videos(settings, report=show)
-        show_notes(recording.notes)
-        sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
-        shown = ", ".join(f"{width}x{height}" for width, height in sizes)
-        about = f"{len(recording.cameras)} cameras, {len(recording.frames)} frames at {recording.fps:g} per second"
-        return f"{about}, {shown} pixels in {settings.output}\n`d2 doctor {settings.output}` says what it lacks"
-
-    return Form.of("d2 import", __doc__, ImportSettings, run)
+def run(settings: ImportSettings) -> str:
+    """Import; returns what the recording holds and where it is."""
+    recording, _ = import_videos(settings, report=show)
+    show_notes(recording.notes)
+    sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
+    shown = ", ".join(f"{width}x{height}" for width, height in sizes)
+    about = f"{len(recording.cameras)} cameras, {len(recording.frames)} frames at {recording.fps:g} per second"
+    return f"{about}, {shown} pixels in {settings.output}\n`d2 doctor {settings.output}` says what it lacks"

@@ -40,8 +40,6 @@ class TrainOptions(ConfigFile):
     there is a table of settings more, `import`."""
     view: bool = False
     """Watch it train on a page in the browser."""
-    export_ply: bool = False
-    """Also write one 3DGS PLY per frame."""
 
 
 def form(words: list[str]) -> Form:
@@ -67,8 +65,6 @@ def run(given: Given) -> str:
     metrics = run.evaluate()
     if metrics["background"]:
         show("background: the prior found sky, so directions have a colour of their own at infinity")
-    if options.export_ply:
-        show(f"{len(run.export_ply())} PLY files in {options.output / 'ply'}")
     if live is not None:
         live.stay()
     table = metrics_table({options.output.name: metrics})

@@ -13,6 +13,10 @@ _INFERNO = "000004 1b0c41 4a0c6b 781c6d a52c60 cf4446 ed6925 fb9b06 f7d13d fcffa
 BACKGROUND, INK = 24, 235
 GAP = 4
 """Pixels between panels."""
+ERROR_SHOWN = 0.25
+"""Absolute colour error, mean over channels, at the bright end of its scale."""
+
+Scale = tuple[float, float]
 
 
 class Panel(NamedTuple):
@@ -29,10 +33,38 @@ def colorize(values: np.ndarray, low: float, high: float, colors: np.ndarray) ->
     return colors[np.rint(place).astype(np.int64)]
 
 
-def color_scale(name: str, steps: int = 256) -> np.ndarray:
-    """Colours uint8 [steps, 3] of `viridis` (depth, near is dark) or `inferno` (error, none is black)."""
+def as_bytes(image: np.ndarray) -> np.ndarray:
+    """RGB uint8 of an image in 0..1."""
+    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+
+
+def depth_scale(depths: Sequence[np.ndarray]) -> Scale:
+    """1st and 99th percentile of the known depths of several maps; (0, 1) where none is known."""
+    known = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths]) if depths else np.zeros(0)
+    if not known.size:
+        return 0.0, 1.0
+    low, high = np.percentile(known, (1, 99))
+    return float(low), float(high)
+
+
+def depth_panel(title: str, depth: np.ndarray, depths: Scale | None, note: str = "") -> Panel:
+    """Near is dark; black where nothing is known."""
+    low, high = depths or depth_scale([depth])
+    known, scale = np.isfinite(depth) & (depth > 0), color_scale("viridis")
+    image = colorize(np.where(known, depth, 0), low, high, scale)
+    return Panel(f"{title} {low:.3g}..{high:.3g}{note}", np.where(known[..., None], image, np.uint8(0)), scale)
+
+
+def error_panel(error: np.ndarray, note: str = "") -> Panel:
+    """Absolute errors [H, W, 3] of colour."""
+    scale = color_scale("inferno")
+    return Panel(f"error 0..{ERROR_SHOWN:g}{note}", colorize(error.mean(-1), 0, ERROR_SHOWN, scale), scale)
+
+
+def color_scale(name: str) -> np.ndarray:
+    """Colours uint8 [256, 3] of `viridis` (depth, near is dark) or `inferno` (error, none is black)."""
     anchors = np.array([list(bytes.fromhex(code)) for code in {"viridis": _VIRIDIS, "inferno": _INFERNO}[name].split()])
-    place = np.linspace(0, len(anchors) - 1, steps)
+    place = np.linspace(0, len(anchors) - 1, 256)
     channels = [np.interp(place, np.arange(len(anchors)), anchors[:, channel]) for channel in range(3)]
     return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
 

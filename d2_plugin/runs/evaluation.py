@@ -16,7 +16,7 @@ from d2_plugin.progress import progress_bar
 from d2_plugin.recordings.images import write_png
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.runs import metrics
-from d2_plugin.runs.drawing import Panel, color_scale, colorize, side_by_side
+from d2_plugin.runs.drawing import Panel, as_bytes, depth_panel, depth_scale, error_panel, side_by_side
 from d2_plugin.runs.lpips import Lpips, find_lpips
 from d2_plugin.runs.plan import CHANGED, MOVING_SHARE
 from d2_plugin.runs.scene import Scene
@@ -34,10 +34,6 @@ Progress = Callable[[int, int], None]
 
 BETWEEN = ("psnr", "psnr_moving")
 """Metrics whose means over instants between the trained ones stand apart."""
-
-ERROR_SHOWN = 0.25
-"""Absolute colour error, mean over channels, at the bright end of the error image's scale."""
-
 
 RENDERED_ALPHA = 0.5
 """A rendered depth is reported where the accumulated alpha exceeds this."""
@@ -161,14 +157,14 @@ def evaluate(
     }
 
 
-def still_image(recording: Recording, camera: str, frames: Sequence[int], most: int = 9) -> np.ndarray | None:
-    """What a camera sees where nothing moves, [H, W, 3] in 0..1: the median of up to `most` frames spread in time.
+def still_image(recording: Recording, camera: str, frames: Sequence[int]) -> np.ndarray | None:
+    """What a camera sees where nothing moves, [H, W, 3] in 0..1: the median of up to nine frames spread in time.
 
     None where there are fewer than three frames: the median of two is neither.
     """
     if len(frames) < 3:
         return None
-    chosen = np.unique(np.linspace(0, len(frames) - 1, most).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(frames) - 1, 9).round().astype(int))
     return np.median([recording.image(camera, frames[i]) for i in chosen], axis=0).astype(np.float32) / 255
 
 
@@ -226,36 +222,13 @@ def _panels(
     row: dict[str, Any], truth: np.ndarray, color: np.ndarray, depth: Tensor | None, true_depth: np.ndarray | None
 ) -> list[Panel]:
     panels = [
-        Panel(f"truth  {row['camera']}  frame {row['frame']}", _bytes(truth)),
-        Panel(f"rendered  {row['psnr']:.2f} dB", _bytes(color)),
+        Panel(f"truth  {row['camera']}  frame {row['frame']}", as_bytes(truth)),
+        Panel(f"rendered  {row['psnr']:.2f} dB", as_bytes(color)),
     ]
-    maps = {"depth": None if depth is None else depth.numpy(), "true depth": true_depth}
-    shown = {title: array for title, array in maps.items() if array is not None}
+    score = "" if row["depth_absrel"] is None else f"  AbsRel {row['depth_absrel']:.3f}"
+    maps = {"depth": (None if depth is None else depth.numpy(), score), "true depth": (true_depth, "")}
+    shown = [(title, array, note) for title, (array, note) in maps.items() if array is not None]
     if shown:
-        low, high = _depth_range(list(shown.values())[-1])  # the true one's where there is one
-        panels += [_depth_panel(title, array, low, high, row["depth_absrel"]) for title, array in shown.items()]
-    error = np.abs(color - truth).mean(axis=-1)
-    fire = color_scale("inferno")
-    panels.append(Panel(f"error  0 .. {ERROR_SHOWN:g}", colorize(error, 0, ERROR_SHOWN, fire), fire))
-    return panels
-
-
-def _depth_panel(title: str, depth: np.ndarray, low: float, high: float, error: float | None) -> Panel:
-    scale = color_scale("viridis")
-    known = np.isfinite(depth) & (depth > 0)
-    image = colorize(np.where(known, depth, 0), low, high, scale)
-    score = f"  AbsRel {error:.3f}" if error is not None and title == "depth" else ""
-    return Panel(f"{title}  {low:.3g} .. {high:.3g}{score}", np.where(known[..., None], image, np.uint8(0)), scale)
-
-
-def _depth_range(depth: np.ndarray) -> tuple[float, float]:
-    """1st and 99th percentile of the known depths; (0, 1) where none is known."""
-    known = depth[np.isfinite(depth) & (depth > 0)]
-    if known.size == 0:
-        return 0.0, 1.0
-    low, high = np.percentile(known, (1, 99))
-    return float(low), float(high)
-
-
-def _bytes(image: np.ndarray) -> np.ndarray:
-    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+        scale = depth_scale([shown[-1][1]])  # the true one's where there is one
+        panels += [depth_panel(title, array, scale, note) for title, array, note in shown]
+    return [*panels, error_panel(np.abs(color - truth))]

@@ -29,19 +29,8 @@ SCALE = (0.458, 0.448, 0.450)
 SMALLEST = 64
 """Least width and height in pixels: below it the deepest features have no pixel left."""
 
-_VGG16: tuple[int | str, ...] = (
-    64,
-    64,
-    "pool",
-    128,
-    128,
-    "pool",
-    *(256,) * 3,
-    "pool",
-    *(512,) * 3,
-    "pool",
-    *(512,) * 3,
-)
+_VGG16 = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
+"""Width and number of the convolutions of each block; blocks are pooled in between."""
 _TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}  # layers (ReLUs) whose output is compared
 _FILES = {"alex": ("alexnet*.pth", "alex.pth"), "vgg": ("vgg16-*.pth", "vgg.pth")}
 
@@ -134,10 +123,9 @@ def _vgg16() -> nn.Sequential:
     """The convolutions of VGG16 up to relu5_3, numbered as torchvision does."""
     layers: list[nn.Module] = []
     width = 3
-    for step in _VGG16:
-        if isinstance(step, str):
-            layers.append(nn.MaxPool2d(2, 2))
-        else:
-            layers += [nn.Conv2d(width, step, 3, padding=1), nn.ReLU()]
-            width = step
+    for out, count in _VGG16:
+        layers += [nn.MaxPool2d(2, 2)] if layers else []
+        for _ in range(count):
+            layers += [nn.Conv2d(width, out, 3, padding=1), nn.ReLU()]
+            width = out
     return nn.Sequential(*layers)

@@ -130,8 +130,8 @@ def depth_absrel(depth: Tensor, truth: Tensor) -> float | None:
     return error.mean().item()
 
 
-def depth_delta1(depth: Tensor, truth: Tensor, threshold: float = 1.25) -> float | None:
-    """Share of pixels with true depth where max(z / z*, z* / z) < `threshold`; None where there is no truth.
+def depth_delta1(depth: Tensor, truth: Tensor) -> float | None:
+    """Share of pixels with true depth where max(z / z*, z* / z) < 1.25; None where there is no truth.
 
     A missing rendered depth counts as a miss.
     """
@@ -139,7 +139,7 @@ def depth_delta1(depth: Tensor, truth: Tensor, threshold: float = 1.25) -> float
     if true.numel() == 0:
         return None
     ratio = torch.maximum(rendered / true, true / rendered.clamp(min=torch.finfo(true.dtype).tiny))
-    return ((ratio < threshold) & (rendered > 0)).double().mean().item()
+    return ((ratio < 1.25) & (rendered > 0)).double().mean().item()
 
 
 def _known_depths(depth: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:

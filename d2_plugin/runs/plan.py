@@ -182,29 +182,22 @@ def appearance_decision(
     """
     if len(cameras) < 2:
         return Decision("appearance", False, "one training camera", "it takes a second training camera")
-    if set(cameras) <= recording.exposures.keys():
-        return _measured_at_import(recording, cameras)
-    exposures = relative_exposures(recording, cameras, positions, times)
-    if exposures is None:
-        return Decision("appearance", False, f"exposures not known: a camera shares fewer than {FEWEST} points")
-    gain, error = exposures.largest
+    if set(cameras) <= recording.exposures.keys():  # the import of the videos measured them
+        gains = np.log([recording.exposures[name].gain for name in cameras])
+        off = np.abs(gains - gains.mean(0))
+        worst = np.unravel_index(off.argmax(), off.shape)
+        gain = float(off[worst])
+        error = float(np.array([recording.exposures[name].error for name in cameras])[worst])
+        measured = "measured at import"
+    else:
+        exposures = relative_exposures(recording, cameras, positions, times)
+        if exposures is None:
+            reason = f"exposures not known: a camera shares fewer than {FEWEST} points"
+            return Decision("appearance", False, reason)
+        gain, error = exposures.largest
+        measured = f"{exposures.points} points or more"
     differ = gain > DIFFERENT_GAIN and gain > 3 * error
-    agree = "differ" if differ else "agree"
-    figures = (
-        f"gains off the mean by {gain:.1%} at most (standard error {error:.1%}, {exposures.points} points or more)"
-    )
-    return Decision("appearance", differ, f"the cameras' exposures {agree}: {figures}")
-
-
-def _measured_at_import(recording: Recording, cameras: Sequence[str]) -> Decision:
-    """The decision by the gains that the import of the videos found."""
-    gains = np.log([recording.exposures[name].gain for name in cameras])
-    errors = np.array([recording.exposures[name].error for name in cameras])
-    off = np.abs(gains - gains.mean(0))
-    worst = np.unravel_index(off.argmax(), off.shape)
-    gain, error = float(off[worst]), float(errors[worst])
-    differ = gain > DIFFERENT_GAIN and gain > 3 * error
-    figures = f"gains off the mean by {gain:.1%} at most (standard error {error:.1%}, measured at import)"
+    figures = f"gains off the mean by {gain:.1%} at most (standard error {error:.1%}, {measured})"
     return Decision("appearance", differ, f"the cameras' exposures {'differ' if differ else 'agree'}: {figures}")
 
 
@@ -222,9 +215,9 @@ def _own_points(recording: Recording) -> np.ndarray | None:
     return None if model is None else read_points(model).positions
 
 
-def changed_share(recording: Recording, camera: str, samples: int = 5) -> float:
-    """Largest share of a camera's pixels that differ from the first frame, over a few frames spread in time."""
-    chosen = np.unique(np.linspace(0, len(recording.frames) - 1, samples).round().astype(int))
+def changed_share(recording: Recording, camera: str) -> float:
+    """Largest share of a camera's pixels that differ from the first frame, over five frames spread in time."""
+    chosen = np.unique(np.linspace(0, len(recording.frames) - 1, 5).round().astype(int))
     first = recording.image(camera, recording.frames[0]).astype(np.int16)
     shares = [
         np.mean(np.abs(recording.image(camera, recording.frames[i]).astype(np.int16) - first).max(-1) > CHANGED * 255)

@@ -7,8 +7,11 @@ stands beside these under names of its own; `d2 report` makes tables and plots o
 
 from __future__ import annotations
 
+import functools
 import math
+import platform
 import shlex
+import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,10 +19,10 @@ from typing import Any
 
 import torch
 
+from d2_plugin import __version__
 from d2_plugin.durable import append
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import field, json_text, opened, parse_json, read_text
-from d2_plugin.runs.provenance import circumstances
 from d2_plugin.settings import Settings, declared
 
 Row = dict[str, Any]
@@ -195,3 +198,44 @@ def _without_folders(value: Any) -> str:
     """An absolute path as its last part: the rest says nothing about the measurement."""
     text = str(value)
     return Path(text).name if text.startswith("/") else text
+
+
+def circumstances(device: torch.device | str = "cpu") -> dict[str, str | int | None]:
+    """Device, threads, versions and commit, for a row of results."""
+    device = torch.device(device)
+    return {
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name(),
+        "threads": torch.get_num_threads(),
+        "version": __version__,
+        "commit": commit(),
+        "torch": torch.__version__,
+    }
+
+
+def provenance(row: Mapping[str, Any]) -> str:
+    """One sentence for a caption, from a row that has what `circumstances` gives and the `command`."""
+    where = f"{row['device']}, {row['threads']} threads, torch {row['torch']}"
+    return f"{where}, commit {row['commit'] or row['version']}, `{row['command']}`."
+
+
+def cpu_name() -> str:
+    """What the processor calls itself."""
+    info = Path("/proc/cpuinfo")
+    for line in info.read_text().splitlines() if info.exists() else ():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+@functools.cache
+def commit() -> str | None:
+    """The commit of the checkout when first asked, with + where files differ; None for an installed package."""
+    try:
+        revision, changed = _git("rev-parse", "--short", "HEAD"), _git("status", "--porcelain", "--", "..")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return revision.strip() + ("+" if changed else "")
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=Path(__file__).parent, capture_output=True, text=True, check=True).stdout

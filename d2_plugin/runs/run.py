@@ -20,11 +20,19 @@ from d2_plugin.progress import progress_bar
 from d2_plugin.runs.prior.alongside import OPEN_BY, PriorAlongside, alongside
 from d2_plugin.runs.prior.build import build_priors_for, refuse_unusable
 from d2_plugin.runs.prior.trials import Trials, is_open, kept_trials
-from d2_plugin.runs.provenance import circumstances
-from d2_plugin.runs.saved.checkpoint import fitting, load_checkpoint, save_checkpoint
-from d2_plugin.runs.saved.claim import claim
-from d2_plugin.runs.saved.finite import Watch, watched, what_diverged
-from d2_plugin.runs.saved.kinds import METRICS, read_run
+from d2_plugin.runs.rows import circumstances
+from d2_plugin.runs.saved import (
+    METRICS,
+    OnStep,
+    Watch,
+    claim,
+    fitting,
+    load_checkpoint,
+    read_run,
+    save_checkpoint,
+    watched,
+    what_diverged,
+)
 from d2_plugin.runs.scene import Guidance, Remembered, Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config
 from d2_plugin.runs.start import (
@@ -32,7 +40,6 @@ from d2_plugin.runs.start import (
     TrainingFrames,
     begin_with_exposures,
     initial_points,
-    make_view,
     scene_extent,
     triangulated_points,
 )
@@ -134,15 +141,16 @@ class Run:
             chunk = max(iterations // CHECKPOINTS, 1)
             with progress_bar("train", iterations) as bar:
 
-                def on_step(step: int, loss: float) -> None:
+                def on_step(check: OnStep, step: int, loss: float) -> None:
+                    check(step, loss)
                     built = "" if self._building is None else f", prior {self._building.share:.0%}"
                     bar.update(step, f"loss {loss:.4f}{built}")
                     watching(step, loss)
 
                 while trainer.step < iterations:
                     until = min((trainer.step // chunk + 1) * chunk, iterations)
-                    with self._timed("train"), watched(trainer, self._checkpoint) as finite:
-                        trainer.run(until, finite(on_step))
+                    with self._timed("train"), watched(trainer, self._checkpoint) as check:
+                        trainer.run(until, partial(on_step, check))
                     if trainer.step >= OPEN_BY * iterations:
                         self._finish_prior(on_prior)
                     self._save(trainer)
@@ -166,15 +174,6 @@ class Run:
             write_text(self.folder / "metrics.md", view_tables(metrics))
             write_table(self.folder / "metrics.json", metrics, METRICS)
         return metrics
-
-    def export_ply(self) -> list[Path]:
-        """One 3DGS PLY per frame under ply/; a background is left out, for which it has no place."""
-        from d2_plugin.runs.gaussian_ply import write_frames
-
-        recording, camera = self.scene.recording, self.scene.train_cameras[0]
-        views = [make_view(recording, camera, frame, self.settings.device) for frame in recording.frames]
-        with self._writing():
-            return write_frames(self.trained().model, views, self.folder / "ply")
 
     def _tried(self, points: TimedPoints) -> Trials | None:
         """What of the prior is worth inserting, kept in trials.json; None where that is not open."""
@@ -278,7 +277,7 @@ class Run:
             yield
             return
         with only_writer(self.folder):
-            for folder in (self.folder, self.folder / "images", self.folder / "ply"):
+            for folder in (self.folder, self.folder / "images"):
                 remove_leftovers(folder, below=False)
             self._writes = True
             try:

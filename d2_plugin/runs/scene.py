@@ -14,7 +14,7 @@ from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.cameras.check import check_background_weight, check_recording
 from d2_plugin.recordings.checks.memory import check_memory
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
-from d2_plugin.runs.saved.kinds import RUN
+from d2_plugin.runs.saved import RUN
 from d2_plugin.runs.settings import RunSettings, prior_settings
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.values import shown

@@ -117,17 +117,16 @@ class Awaited(Protocol):
 
 
 class TrainingFrames:
-    """Views and images of the training cameras; decoded images are kept up to `keep_bytes`, the rest re-read."""
+    """Views and images of the training cameras; decoded images are kept up to `KEPT_IMAGES`, the rest re-read."""
 
     def __init__(
         self,
         recording: Recording,
         cameras: Sequence[str],
         device: torch.device | str = "cpu",
-        keep_bytes: int = KEPT_IMAGES,
         background_weight: float = 1.0,
     ) -> None:
-        self.recording, self.device, self.keep_bytes = recording, device, keep_bytes
+        self.recording, self.device = recording, device
         self.background_weight = background_weight
         self._recorded = {camera: recording.recorded(camera) for camera in cameras}
         self.views = [make_view(recording, camera, frame, device) for frame in recording.frames for camera in cameras]
@@ -150,7 +149,7 @@ class TrainingFrames:
             self.awaited.wait_for(view.frame)
         if index not in self._kept:
             self._kept[index] = self.recording.image(view.camera, view.frame)
-            while len(self._kept) > 1 and sum(kept.nbytes for kept in self._kept.values()) > self.keep_bytes:
+            while len(self._kept) > 1 and sum(kept.nbytes for kept in self._kept.values()) > KEPT_IMAGES:
                 self._kept.popitem(last=False)
         else:
             self._kept.move_to_end(index)
@@ -243,12 +242,12 @@ def _random_points(
     return TimedPoints((in_camera - translation) @ rotation, colors, times)
 
 
-def triangulated_points(recording: Recording, cameras: Sequence[str], instants: int = 5) -> TimedPoints:
-    """Points triangulated with the known poses at up to `instants` frames spread over the recording.
+def triangulated_points(recording: Recording, cameras: Sequence[str]) -> TimedPoints:
+    """Points triangulated with the known poses at up to five frames spread over the recording.
 
     There are none for a single camera, or where pycolmap is not installed; the latter gives a warning.
     """
-    chosen = np.unique(np.linspace(0, len(recording.frames) - 1, instants).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(recording.frames) - 1, 5).round().astype(int))
     try:
         triangulated = triangulate_frames(recording, cameras, [recording.frames[i] for i in chosen])
     except MissingExtra as error:

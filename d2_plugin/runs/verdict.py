@@ -10,8 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import mean, variance
 
-from d2_plugin.runs.markup import Table
-from d2_plugin.runs.tables import STUDY_COLUMNS, Column
+from d2_plugin.runs.tables import STUDY_COLUMNS, Column, Table
 
 LEAST_SEEDS = 3
 """Two seeds agree by chance in far too many experiments, and one has no spread at all."""

@@ -97,8 +97,8 @@ def orbit(
     return [Pose(look_at(rig.focus + offset, rig.focus, rig.up), rig.lens) for offset in around]
 
 
-def spiral(cameras: Sequence[Camera], count: int, depth: float | None = None, turns: int = 2) -> list[Pose]:
-    """LLFF's spiral about the mean camera, looking at the point that the cameras look at.
+def spiral(cameras: Sequence[Camera], count: int, depth: float | None = None) -> list[Pose]:
+    """LLFF's spiral of two turns about the mean camera, looking at the point that the cameras look at.
 
     Its radii are half of the 90th percentile of the cameras' distances from their mean, along each axis: the whole
     of it would leave what an arc of few cameras has seen.
@@ -108,8 +108,8 @@ def spiral(cameras: Sequence[Camera], count: int, depth: float | None = None, tu
     offsets = np.abs((np.stack([camera.centre for camera in cameras]) - rig.middle) @ axes.T)
     radii = 0.5 * np.percentile(offsets, 90, axis=0)
     radii = np.maximum(radii, 0.02 * np.linalg.norm(rig.focus - rig.middle) * np.array([1, 1, 0]))
-    angle = 2 * np.pi * turns * np.arange(count) / max(count, 1)
-    local = np.stack([np.sin(angle), np.cos(angle) - 1, np.sin(angle / turns)], -1) * radii
+    angle = 4 * np.pi * np.arange(count) / max(count, 1)
+    local = np.stack([np.sin(angle), np.cos(angle) - 1, np.sin(angle / 2)], -1) * radii
     return [Pose(look_at(rig.middle + offset @ axes, rig.focus, rig.up), rig.lens) for offset in local]
 
 

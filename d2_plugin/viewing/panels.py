@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,17 +13,13 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors.sheet import LABEL_COLORS, SURE, UNSURE, label_colors, sigma_colors
 from d2_plugin.protocol import DepthPrior, Label, View
 from d2_plugin.recordings.images import opencv
-from d2_plugin.runs.drawing import Panel, color_scale, colorize
+from d2_plugin.runs.drawing import Panel, Scale, as_bytes, color_scale, colorize, depth_panel, error_panel
 from d2_plugin.viewing.camera_paths import Lens
 from d2_plugin.viewing.rendering import RenderedView, gaussians_per_pixel, render_view
 from d2_plugin.viewing.viewed import ViewedRun
 
-ERROR_SHOWN = 0.25
-"""Absolute colour error, mean over channels, at the bright end of its scale."""
 MOST_GAUSSIANS = 200.0
 """Gaussians per pixel at the bright end of their scale, which is logarithmic."""
-
-Scale = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +66,7 @@ def truth(shot: Shot) -> Panel:
 
 def depth(shot: Shot) -> Panel:
     """Rendered depth."""
-    return _depth_panel("depth", shot.rendered.depth.numpy(), shot.depths)
+    return depth_panel("depth", shot.rendered.depth.numpy(), shot.depths)
 
 
 def true_depth(shot: Shot) -> Panel:
@@ -78,16 +74,14 @@ def true_depth(shot: Shot) -> Panel:
     recorded = shot.viewed.recording.depth(shot.view.camera, shot.view.frame)
     size = shot.view.width, shot.view.height
     exact = np.zeros(size[::-1], np.float32) if recorded is None else fitted(recorded, *size, nearest=True)
-    return _depth_panel("true depth", exact, shot.depths)
+    return depth_panel("true depth", exact, shot.depths)
 
 
 def error(shot: Shot) -> Panel:
     """Absolute error of the render against the recorded image."""
     difference = np.abs(shot.rendered.color.numpy() - shot.truth / np.float32(255))
-    scale = color_scale("inferno")
     noise = float(np.mean(difference**2))
-    score = f"  {-10 * np.log10(noise):.1f} dB" if noise > 0 else ""
-    return Panel(f"error 0..{ERROR_SHOWN:g}{score}", colorize(difference.mean(-1), 0, ERROR_SHOWN, scale), scale)
+    return error_panel(difference, f"  {-10 * np.log10(noise):.1f} dB" if noise > 0 else "")
 
 
 def alpha(shot: Shot) -> Panel:
@@ -105,7 +99,7 @@ def count(shot: Shot) -> Panel:
 
 def prior(shot: Shot) -> Panel:
     """The depth prior D*."""
-    return _depth_panel("prior", _of_prior(shot, lambda prior: prior.depth.numpy()), shot.depths)
+    return depth_panel("prior", _of_prior(shot, lambda prior: prior.depth.numpy()), shot.depths)
 
 
 def sigma(shot: Shot) -> Panel:
@@ -155,28 +149,6 @@ def fitted(array: np.ndarray, width: int, height: int, nearest: bool = False) ->
     large = cv2.resize(array, whole, interpolation=how)
     left, top = (whole[0] - width) // 2, (whole[1] - height) // 2
     return large[top : top + height, left : left + width]
-
-
-def depth_scale(depths: Sequence[np.ndarray]) -> Scale:
-    """1st and 99th percentile of the known depths of several maps; (0, 1) where none is known."""
-    known = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths]) if depths else np.zeros(0)
-    if not known.size:
-        return 0.0, 1.0
-    low, high = np.percentile(known, (1, 99))
-    return float(low), float(high)
-
-
-def as_bytes(image: np.ndarray) -> np.ndarray:
-    """RGB uint8 of an image in 0..1."""
-    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
-
-
-def _depth_panel(title: str, depth: np.ndarray, depths: Scale | None) -> Panel:
-    """Near is dark; black where nothing is known."""
-    low, high = depths or depth_scale([depth])
-    known, scale = np.isfinite(depth) & (depth > 0), color_scale("viridis")
-    image = colorize(np.where(known, depth, 0), low, high, scale)
-    return Panel(f"{title} {low:.3g}..{high:.3g}", np.where(known[..., None], image, np.uint8(0)), scale)
 
 
 def _of_prior(shot: Shot, draw: Callable[[DepthPrior], np.ndarray]) -> np.ndarray:

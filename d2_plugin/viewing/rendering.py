@@ -61,11 +61,6 @@ def render_view(backbone: Any, view: View, min_opacity: float = 0.0, marked: Ten
     return RenderedView(color.clamp(0, 1), depth, alpha, splats)
 
 
-def _colors(backbone: Any, view: View, splats: Splats) -> Tensor:
-    colors: Tensor | None = call_optional(backbone, "colors", view, splats)
-    return splats.means.new_full((len(splats.means), 3), GREY) if colors is None else colors
-
-
 @torch.no_grad()
 def gaussians_per_pixel(splats: Splats, view: View, settings: RasterSettings) -> Tensor:
     """In how many Gaussians' footprints each pixel lies, [H, W] float.

@@ -22,27 +22,6 @@ ptxas info    : Compiling entry function 'd2_list' for 'sm_90'
 ptxas info    : Used 24 registers, used 0 barriers
 """
 
-NVDISASM = """
-	.section	.text.d2_render,"ax",@progbits
-.L_x_1:
-        /*0000*/                   S2R R1, SR_TID.X ;
-.L_x_2:
-        /*0010*/                   LDS R2, [R1] ;
-        /*0020*/                   MUFU.EX2 R3, R2 ;
-        /*0030*/              @!P0 BRA `(.L_x_3) ;
-        /*0040*/                   FFMA R4, R3, R2, R4 ;
-        /*0050*/               @P1 BRA `(.L_x_2) ;
-        /*0060*/               @P2 BRA `(.L_x_1) ;
-.L_x_3:
-        /*0070*/                   EXIT ;
-.L_x_4:
-        /*0080*/                   BRA `(.L_x_4);
-	.section	.text.d2_list,"ax",@progbits
-.L_x_5:
-        /*0000*/                   IADD3 R1, R1, 0x1, RZ ;
-        /*0010*/                   BRA `(.L_x_5) ;
-"""
-
 
 def test_all_steps_together_end_in_time() -> None:
     assert sum(step.limit for step in gpu.STEPS.values()) <= gpu.LONGEST

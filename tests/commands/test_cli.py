@@ -13,8 +13,6 @@ import torch
 
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.store.store import PriorStore
 
@@ -22,13 +20,6 @@ pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
 CAMERAS = "train0,train1,train2"
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording small enough to train in seconds."""
-    path = tmp_path_factory.mktemp("recording") / "room"
-    return save_recording(synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54), path)
 
 
 @pytest.fixture(scope="module")
@@ -174,10 +165,11 @@ def test_plan_names_each_decision_with_its_measurement(recording: Path, capsys: 
 
 
 def test_one_instant_leaves_the_temporal_dimension_out(recording: Path, tmp_path: Path) -> None:
-    assert train(recording, tmp_path / "still", "--frames", "1:1", "--hooks", "none", "--export-ply") == 0
+    assert train(recording, tmp_path / "still", "--frames", "1:1", "--hooks", "none") == 0
     metrics = json.loads((tmp_path / "still" / "metrics.json").read_text())
     assert metrics["plan"]["temporal"] == {"use": False, "reason": "one instant"}
-    assert [path.name for path in (tmp_path / "still" / "ply").iterdir()] == ["frame_00001.ply"]
+    assert main(["export", str(tmp_path / "still"), "--format", "ply"]) == 0
+    assert [path.name for path in (tmp_path / "still" / "export" / "ply").iterdir()] == ["frame_00001.ply"]
 
 
 def test_one_training_camera_without_metric_depth_is_refused_or_trains_bare(
@@ -205,6 +197,16 @@ class TestMistakes:
         message = refused(capsys, train(recording, finished, "--seed", "5"))
         assert "holds another run, made with other settings of seed" in message
         assert contents(finished) == before
+
+    @pytest.mark.parametrize("place", ["images", "images/run", "images/train0"])
+    def test_an_output_among_the_images_is_refused(
+        self, recording: Path, capsys: pytest.CaptureFixture[str], place: str
+    ) -> None:
+        before = contents(recording)
+        message = refused(capsys, train(recording, recording / place))
+        assert "where every folder is a camera: give another --output" in message
+        assert contents(recording) == before
+        assert not (recording / "images" / "run").exists()
 
     def test_a_folder_with_other_files_is_left_alone(
         self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -41,31 +41,25 @@ def renderer(recording: Recording, offset: float = 0.0, depth_factor: float = 1.
     return render
 
 
-def test_the_mean_over_views_is_the_mean_of_the_rows(recording: Recording) -> None:
-    def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
-        return renderer(recording, offset=0.02 * (1 + frame))(camera, frame)
-
-    result = evaluate(render, recording, NAMES, recording.frames)
-    assert [(row["camera"], row["frame"]) for row in result["per_view"]] == [(n, f) for n in NAMES for f in (0, 1)]
-    for name in ("psnr", "ssim1", "ssim2", "ssim_3dgs", "depth_absrel", "depth_delta1"):
-        assert result["test"][name] == pytest.approx(np.mean([row[name] for row in result["per_view"]]))
-    assert result["per_view"][0]["psnr"] > result["per_view"][1]["psnr"]
-    assert result["test"]["lpips"] is None
-    assert set(result["variants"]) == set(metrics.VARIANTS)
-    json.dumps(result)
-
-
-def test_every_frame_and_every_camera_has_its_mean(recording: Recording) -> None:
+def test_means_over_views_frames_and_cameras_are_those_of_the_rows(recording: Recording) -> None:
     def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
         return renderer(recording, offset=0.02 * (1 + frame) + 0.1 * (camera == "test1"))(camera, frame)
 
     result = evaluate(render, recording, NAMES, iter(recording.frames))
+    views = result["per_view"]
+    assert [(row["camera"], row["frame"]) for row in views] == [(n, f) for n in NAMES for f in (0, 1)]
+    assert views[0]["psnr"] > views[1]["psnr"]
     assert [row["frame"] for row in result["per_frame"]] == [0, 1]
     assert [row["camera"] for row in result["per_camera"]] == NAMES
-    for key, name in (("frame", "per_frame"), ("camera", "per_camera")):
-        for row in result[name]:
-            views = [view["psnr"] for view in result["per_view"] if view[key] == row[key]]
-            assert row["psnr"] == pytest.approx(np.mean(views))
+    groups = [(result["test"], views)]
+    groups += [(row, [v for v in views if v["frame"] == row["frame"]]) for row in result["per_frame"]]
+    groups += [(row, [v for v in views if v["camera"] == row["camera"]]) for row in result["per_camera"]]
+    for mean, rows in groups:
+        for name in ("psnr", "ssim1", "ssim2", "ssim_3dgs", "depth_absrel", "depth_delta1"):
+            assert mean[name] == pytest.approx(np.mean([row[name] for row in rows]))
+    assert result["test"]["lpips"] is None
+    assert set(result["variants"]) == set(metrics.VARIANTS)
+    json.dumps(result)
 
 
 def test_instants_between_the_trained_ones_are_scored_apart(recording: Recording) -> None:

@@ -239,11 +239,6 @@ def test_no_stereo_reaches_the_priors(moving, tmp_path: Path, monkeypatch: pytes
     assert prior.support.numpy().mean() > 0.8
 
 
-def test_a_recording_of_one_instant_on_disk_has_no_temporal_dimension(moving, tmp_path: Path) -> None:
-    path = save_recording(select_frames(moving, [2]), tmp_path / "scene")
-    assert not plan_scene(open_recording(path), ["train0", "train1"], None).uses("temporal")
-
-
 @pytest.mark.parametrize(
     ("name", "cameras", "frames", "moves"),
     [

@@ -20,7 +20,7 @@ from d2_plugin.runs.report.report import BUILDERS, ReportSettings, collect, make
 from d2_plugin.runs.report.run_folders import training_rows
 from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure, number
 from d2_plugin.runs.rows import Row, append_rows, begin_rows, make_row, named_by_cameras, read_rows
-from d2_plugin.runs.saved.kinds import METRICS, RUN
+from d2_plugin.runs.saved import METRICS, RUN
 
 RUNS = Path(__file__).parents[1] / "data" / "runs.jsonl"
 
@@ -154,6 +154,20 @@ def test_what_cannot_be_reported_is_one_sentence(tmp_path: Path) -> None:
         make_report([], tmp_path)
     with pytest.raises(D2Error, match="rows of kind 'raster' are drawn from a checkout alone"):
         make_report([make_row("raster", "a", "b", error=None, seconds=None)], tmp_path)
+
+
+@pytest.mark.parametrize("name", ["report.md", "report.html", "quality.svg"])
+def test_a_file_that_no_report_wrote_is_kept(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(D2Error, match=rf"{name} was not written by `d2 report` and is kept: give another --output"):
+        make_report(committed(), tmp_path)
+    assert (tmp_path / name).read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_report_takes_the_place_of_an_earlier_one(tmp_path: Path) -> None:
+    for _ in range(2):
+        assert make_report(committed(), tmp_path)[0].is_file()
 
 
 def test_what_a_killed_report_left_is_removed_by_the_next(tmp_path: Path) -> None:

@@ -1,8 +1,7 @@
-"""Tables of scores: every view, frame and camera."""
+"""Tables of scores: every view, frame and camera; what stands out is bold, and no cell can break its table."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,12 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings.selection import select_cameras
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.evaluation import evaluate
-from d2_plugin.runs.saved.kinds import read_metrics
-from d2_plugin.runs.tables import metrics_table, view_tables
+from d2_plugin.runs.tables import Table, latex, markdown, metrics_table, view_tables
 
 NAMES = ["test0", "test1"]
 
@@ -70,8 +67,29 @@ def test_a_missing_score_is_a_dash_and_an_unmeasured_column_is_left_out() -> Non
     assert len({len(line) for line in table.splitlines()}) == 1
 
 
-@pytest.mark.parametrize("content", [b"", b'{"test": {"psnr": 2', b"[1, 2]", b"\xff\xfe"])
-def test_a_damaged_file_of_scores_is_one_sentence(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "metrics.json").write_bytes(content)
-    with pytest.raises(D2Error, match="metrics.json is damaged .*: run `d2 eval` on that folder"):
-        read_metrics(tmp_path)
+TABLE = Table(("name", "dB"), (("a|b", "28.9 ± 0.5"), ("c", "3")), frozenset({(0, 1)}))
+
+
+def test_markdown_keeps_bars_inside_their_cell_and_stresses_the_best() -> None:
+    assert markdown(TABLE).splitlines() == ["| name | dB |", "| --- | --- |", r"| a\|b | **28.9 ± 0.5** |", "| c | 3 |"]
+    best = Table(("a",), (("1|2",),), frozenset({(0, 0)}))
+    assert markdown(best).splitlines()[-1] == r"| **1\|2** |"
+
+
+def test_padded_columns_line_up() -> None:
+    lines = markdown(TABLE, padded=True).splitlines()
+    assert len({len(line) for line in lines}) == 1
+    assert [cell.strip() for cell in lines[3].strip("|").split("|")] == ["c", "3"]
+
+
+def test_latex_is_a_booktabs_table() -> None:
+    assert latex(Table(("method", "D²"), (("a", "1"), ("b", "2")))).splitlines() == [
+        r"\begin{tabular}{lc}",
+        r"\toprule",
+        r"method & D$^2$ \\",
+        r"\midrule",
+        r"a & 1 \\",
+        r"b & 2 \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]

@@ -19,8 +19,19 @@ from d2_plugin.runs.rows import TRY, Row, make_row
 from d2_plugin.runs.scene import Remembered
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Job, Shared
-from d2_plugin.runs.training.bench import Case, TrainingBench, _line, _targets, _Template, case_of
-from d2_plugin.runs.training.budget import PILOT, TOLERANCE, fits, nearest, next_steps
+from d2_plugin.runs.training.bench import (
+    PILOT,
+    TOLERANCE,
+    Case,
+    TrainingBench,
+    _line,
+    _targets,
+    _Template,
+    case_of,
+    fits,
+    nearest,
+    next_steps,
+)
 from d2_plugin.runs.training.measured import Work, fingerprint, follow
 
 SETTINGS = RunSettings("room", ("a", "b"))

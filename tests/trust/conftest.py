@@ -14,9 +14,11 @@ from trust_commands import Commands, compiled_faults, contents
 
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.runs.report.report import BUILDERS
+from d2_plugin.runs.rows import append_rows, read_rows
 
 ROWS = Path(__file__).parents[1] / "data" / "runs.jsonl"
-TRAINED = ["--train-cameras", "train0,train1", "--priors.stereo.matcher", "patchmatch"]
+TRAINED = ["--train-cameras", "train0,train1"]
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,10 @@ def workplace(commands: Commands, recording: Path) -> Workplace:
 
     folder = recording.parent
     priors, run, out = folder / "priors", folder / "run", folder / "written" / "out"
+    rows = folder / "rows.jsonl"
+    append_rows(rows, [row for row in read_rows([ROWS]) if row["kind"] in BUILDERS])
     out.parent.mkdir()
-    train = ["train", str(recording), *TRAINED, "--iterations", "5", "--priors", str(priors), "--export-ply"]
+    train = ["train", str(recording), *TRAINED, "--iterations", "5", "--priors", str(priors)]
     for words in (["priors", str(recording), *TRAINED, "--output", str(priors)], [*train, "--output", str(run)]):
         ended = commands.run(words)
         assert ended.code == 0, ended.said

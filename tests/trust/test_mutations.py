@@ -16,8 +16,7 @@ from d2_plugin.durable import write_table
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import Label
-from d2_plugin.runs.saved.checkpoint import load_checkpoint, save_checkpoint
-from d2_plugin.runs.saved.kinds import METRICS, RUN, read_metrics, read_run
+from d2_plugin.runs.saved import METRICS, RUN, load_checkpoint, read_metrics, read_run, save_checkpoint
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.store.store import PriorStore
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from d2_plugin.durable import write_table
-from d2_plugin.runs.saved.kinds import RUN
+from d2_plugin.runs.saved import RUN
 
 
 def still_training(trained: Path, copy: Path, step: int) -> Path:

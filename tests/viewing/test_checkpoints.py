@@ -18,7 +18,6 @@ from d2_plugin import registry
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import View
-from d2_plugin.runs.run import Run
 from d2_plugin.viewing.camera_paths import pose_of
 from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.checkpoints.files import read_options, read_ply
@@ -243,17 +242,17 @@ class Test4DGaussians:
             read_options(path)
 
 
+def of_gsplat(count: int) -> dict[str, Tensor]:
+    """Gaussians by gsplat's names."""
+    shapes = {"means": (3,), "quats": (4,), "sh0": (1, 3)}
+    drawn = {name: torch.rand(count, *shape) for name, shape in shapes.items()}
+    still = {"scales": torch.full((count, 3), -1.0), "opacities": torch.zeros(count), "shN": torch.zeros(count, 15, 3)}
+    return drawn | still
+
+
 class TestClouds:
     def test_a_checkpoint_of_gsplat_stands_still(self, room: Path, tmp_path: Path) -> None:
-        count = 20
-        splats = {
-            "means": torch.randn(count, 3),
-            "scales": torch.full((count, 3), -1.0),
-            "quats": torch.randn(count, 4),
-            "opacities": torch.zeros(count),
-            "sh0": torch.rand(count, 1, 3),
-            "shN": torch.zeros(count, 15, 3),
-        }
+        splats = of_gsplat(20)
         kept = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in splats.items()}).state_dict()
         path = tmp_path / "ckpt_6999_rank0.pt"
         torch.save({"step": 6999, "scene_id": "garden", "splats": kept}, path)
@@ -288,10 +287,11 @@ class TestClouds:
         assert torch.allclose(found.backbone.slice_at(view).opacities, expected.opacities, atol=1e-6)
 
     def test_a_point_cloud_is_shown_as_the_run_that_wrote_it(
-        self, trained: Path, room: Path, viewed: ViewedRun, monkeypatch: pytest.MonkeyPatch
+        self, trained: Path, room: Path, viewed: ViewedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(viewed.backbone.model, "background", None)  # a point cloud has none
-        [first, *_] = Run.load(trained).export_ply()
+        assert main(["export", str(trained), "--format", "ply", "--frames", "0", "--output", str(tmp_path)]) == 0
+        first = tmp_path / "ply" / "frame_00000.ply"
         found = open_viewed(first, room)
         view = seen(viewed, 0.0, "train1")
         difference = (render_view(found.backbone, view).color - render_view(viewed.backbone, view).color).abs()
@@ -394,15 +394,7 @@ class TestRefused:
     def test_a_checkpoint_whose_tensors_do_not_fit_is_one_sentence(
         self, room: Path, tmp_path: Path, name: str, value: object, said: str
     ) -> None:
-        splats = {
-            "means": torch.randn(20, 3),
-            "scales": torch.full((20, 3), -1.0),
-            "quats": torch.randn(20, 4),
-            "opacities": torch.zeros(20),
-            "sh0": torch.rand(20, 1, 3),
-            "shN": torch.zeros(20, 15, 3),
-        }
-        torch.save({"step": 1, "splats": splats | {name: value}}, tmp_path / "a.pt")
+        torch.save({"step": 1, "splats": of_gsplat(20) | {name: value}}, tmp_path / "a.pt")
         with pytest.raises(D2Error, match=said) as caught:
             open_viewed(tmp_path / "a.pt", room)
         assert "\n" not in str(caught.value)

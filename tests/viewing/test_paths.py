@@ -21,7 +21,6 @@ from d2_plugin.viewing.camera_paths import (
     focus_of,
     look_at,
     orbit,
-    pose_of,
     read_camera_path,
     spiral,
     through,
@@ -133,15 +132,6 @@ class TestCameraPathFiles:
         path = folder / "camera_path.json"
         path.write_text(json.dumps(table))
         return path
-
-    def test_a_pose_comes_back_in_our_axes(self, tmp_path: Path) -> None:
-        found = read_camera_path(self.write(tmp_path, ARC[1]))
-        assert len(found.poses) == 2
-        assert found.fps == 24
-        assert found.shares is None
-        pose = pose_of(ARC[1])
-        assert np.allclose(found.poses[0].T_camera_world, pose.T_camera_world)
-        assert np.allclose(found.poses[0].lens.K[1, 1], pose.lens.K[1, 1])
 
     def test_what_nerfstudio_did_to_the_world_is_undone(self, tmp_path: Path) -> None:
         turn = np.array([[0.0, -1, 0, 0.5], [1, 0, 0, -2], [0, 0, 1, 0.25]])

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from command_lines import refused
 from viewing.hostile import emptied, of_another_version, still_training
 
 from d2_plugin.commands.cli import main
@@ -48,14 +49,6 @@ def rendered(trained: Path) -> Callable[[str, int], np.ndarray]:
             return model.render(make_view(recording, camera, frame)).color.clamp(0, 1).numpy()
 
     return at
-
-
-def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    capsys.readouterr()
-    assert main(["render", *map(str, words)]) == 2
-    message = capsys.readouterr().err.strip()
-    assert len(message.splitlines()) == 1
-    return message
 
 
 def test_a_held_out_camera_plays_the_whole_recording_as_the_rasterizer_draws_it(
@@ -187,18 +180,18 @@ def test_panels_show_what_they_say(viewed: ViewedRun) -> None:
 def test_what_cannot_be_shown_is_one_sentence(
     trained: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "holds no run" in refused(capsys, tmp_path)
-    assert "no run at" in refused(capsys, tmp_path / "none")
-    assert "d2 render needs RUN" in refused(capsys)
-    assert "has no Gaussian left at step 40" in refused(capsys, emptied(trained, tmp_path / "empty"))
-    assert "version 99" in refused(capsys, of_another_version(trained, tmp_path / "later"))
+    assert "holds no run" in refused(capsys, "render", tmp_path)
+    assert "no run at" in refused(capsys, "render", tmp_path / "none")
+    assert "d2 render needs RUN" in refused(capsys, "render")
+    assert "has no Gaussian left at step 40" in refused(capsys, "render", emptied(trained, tmp_path / "empty"))
+    assert "version 99" in refused(capsys, "render", of_another_version(trained, tmp_path / "later"))
     for more in (["--recording", room], ["--train-cameras", "train0"], ["--downscale", "2"]):
-        assert "is a folder of a run, which knows its recording" in refused(capsys, trained, *more)
-    assert "did you mean 'orbit'?" in refused(capsys, trained, "--path", "orbti")
-    assert "did you mean 'depth'?" in refused(capsys, trained, "--show", "rgb,deph")
-    assert "did you mean 'test0'?" in refused(capsys, trained, "--cameras", "test")
-    assert "at the recording's cameras only" in refused(capsys, trained, "--path", "orbit", "--show", "error")
-    assert "there is no depth prior of camera test0" in refused(capsys, trained, "--show", "sigma")
+        assert "is a folder of a run, which knows its recording" in refused(capsys, "render", trained, *more)
+    assert "did you mean 'orbit'?" in refused(capsys, "render", trained, "--path", "orbti")
+    assert "did you mean 'depth'?" in refused(capsys, "render", trained, "--show", "rgb,deph")
+    assert "did you mean 'test0'?" in refused(capsys, "render", trained, "--cameras", "test")
+    assert "at the recording's cameras only" in refused(capsys, "render", trained, "--path", "orbit", "--show", "error")
+    assert "there is no depth prior of camera test0" in refused(capsys, "render", trained, "--show", "sigma")
 
 
 def test_a_run_that_still_trains_is_shown_with_a_note(
@@ -208,11 +201,11 @@ def test_a_run_that_still_trains_is_shown_with_a_note(
     assert main(["render", str(copy), "--output", str(tmp_path / "a.mp4")]) == 0
     assert f"{copy.name} still trains: this is step 33 of 40" in capsys.readouterr().out
     (copy / "checkpoint.pt").unlink()
-    assert "holds no checkpoint yet" in refused(capsys, copy)
+    assert "holds no checkpoint yet" in refused(capsys, "render", copy)
 
 
 def test_a_run_without_a_prior_shows_all_but_it(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "bare"
     Run(RunSettings(str(room), ("train0", "train1"), iterations=2, hooks=()), folder).train()
     assert main(["render", str(folder), "--output", str(tmp_path / "a.gif"), "--format", "gif"]) == 0
-    assert "no depth prior" in refused(capsys, folder, "--path", "training", "--show", "rgb,labels")
+    assert "no depth prior" in refused(capsys, "render", folder, "--path", "training", "--show", "rgb,labels")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +15,7 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 import torch
+from command_lines import refused
 from tiny import ALL_HOOKS, make_trainer, parameters, same
 from viewing.hostile import emptied, of_another_version, still_training
 
@@ -50,16 +51,9 @@ class Gui:
             if name == "add_dropdown":
                 handle.options = values[0]
             handle.on_update = handle.on_click = lambda react: setattr(handle, "react", react)
-            handle.__dict__["__enter__"] = None
-            return Folder() if name == "add_folder" else handle
+            return nullcontext() if name == "add_folder" else handle
 
         return add
-
-
-class Folder:
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, *_: object) -> None: ...
 
 
 class Scene:
@@ -130,7 +124,7 @@ class TestWhoOnlyLooks:
                 clock.now += seconds
                 drawn.append(seconds)
 
-            patch.setattr(viewer._drawer, "draw", draw)
+            patch.setattr("d2_plugin.viewing.live.viewer.draw", draw)
             viewer._connected(client)
             for step in range(self.STEPS):
                 clock.now += self.SECONDS_OF_A_STEP
@@ -323,7 +317,7 @@ def test_a_page_that_fails_is_given_up_and_the_training_goes_on(
     viewed: ViewedRun, port: int, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     viewer = Viewer(viewed=viewed, port=port, height=48, iterations=10)
-    monkeypatch.setattr(viewer._drawer, "draw", lambda *_: 1 / 0)
+    monkeypatch.setattr("d2_plugin.viewing.live.viewer.draw", lambda *_: 1 / 0)
     try:
         viewer._connected(looker())
         viewer.after_step(1)
@@ -371,25 +365,19 @@ class TestAccess:
 
 
 class TestSentences:
-    def refused(self, capsys: pytest.CaptureFixture[str], *words: object) -> str:
-        assert main(["view", *map(str, words)]) == 2
-        message = capsys.readouterr().err.strip()
-        assert len(message.splitlines()) == 1
-        return message
-
     def test_what_cannot_be_shown(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "is empty: give the folder of a run" in self.refused(capsys, tmp_path)
-        assert "no such recording" in self.refused(capsys, tmp_path / "none")
+        assert "is empty: give the folder of a run" in refused(capsys, "view", tmp_path)
+        assert "no such recording" in refused(capsys, "view", tmp_path / "none")
         (tmp_path / "store.json").write_text('{"format": 1}')
-        assert "has format 1 but this version reads format" in self.refused(capsys, tmp_path)
+        assert "has format 1 but this version reads format" in refused(capsys, "view", tmp_path)
 
     def test_a_run_that_still_trains_an_empty_one_and_one_of_another_version(
         self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         young = viewed_at(ViewSettings(still_training(trained, tmp_path / "<script>alert(1)<", 33)))
         assert young.note == "<script>alert(1)< still trains: this is step 33 of 40"
-        assert "has no Gaussian left at step 40" in self.refused(capsys, emptied(trained, tmp_path / "empty"))
-        assert "version 99" in self.refused(capsys, of_another_version(trained, tmp_path / "later"))
+        assert "has no Gaussian left at step 40" in refused(capsys, "view", emptied(trained, tmp_path / "empty"))
+        assert "version 99" in refused(capsys, "view", of_another_version(trained, tmp_path / "later"))
 
     def test_a_run_without_a_prior_has_no_points_to_show(self, room: Path, tmp_path: Path) -> None:
         Run(RunSettings(str(room), ("train0", "train1"), iterations=2, hooks=()), tmp_path / "bare").train()

@@ -12,7 +12,7 @@ from d2_plugin.progress import be_silent, progress_bar
 from d2_plugin.runs.ablation.presets import Preset
 from d2_plugin.runs.ablation.tables import report
 from d2_plugin.runs.rows import Row, as_line, make_row, rms_error
-from d2_plugin.runs.saved.kinds import read_metrics
+from d2_plugin.runs.saved import read_metrics
 from d2_plugin.runs.settings import RunSettings, prior_settings
 from d2_plugin.runs.shared import Cost, Job, Metrics, give_points, share, share_points
 from d2_plugin.runs.workers import worker_pool

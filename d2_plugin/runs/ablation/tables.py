@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from d2_plugin.runs.ablation.presets import PRESETS, PUBLISHED, TABLES, Preset
-from d2_plugin.runs.markup import Table, latex, markdown
 from d2_plugin.runs.shared import Job, Metrics
-from d2_plugin.runs.tables import STUDY_COLUMNS, Column
+from d2_plugin.runs.tables import STUDY_COLUMNS, Column, Table, latex, markdown
 from d2_plugin.runs.verdict import EXPLANATION, Estimate, seeds_in_words, verdicts_table
 
 MARK = "○"

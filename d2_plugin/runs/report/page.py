@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from html import escape
 from typing import NamedTuple
 
-from d2_plugin.runs import markup
-from d2_plugin.runs.markup import Table
-from d2_plugin.runs.provenance import provenance
+from d2_plugin.runs import tables
 from d2_plugin.runs.report.svg import style
-from d2_plugin.runs.rows import Row
+from d2_plugin.runs.rows import Row, provenance
+from d2_plugin.runs.tables import Table
 
 TITLE = "D²-4DGS: quality against run time"
 
@@ -174,6 +173,6 @@ def markdown(sections: Sequence[Section], lead: str) -> str:
         parts += [f"## {section.title}", section.text]
         parts += [f"![{section.title}]({name}.svg)" for name in section.figures]
         for title, table in section.tables:
-            parts += [f"**{title}**", markup.markdown(table)]
+            parts += [f"**{title}**", tables.markdown(table)]
         parts += list(section.sources)
     return "\n\n".join(parts) + "\n"

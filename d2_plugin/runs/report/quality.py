@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from statistics import mean
 from typing import NamedTuple
 
-from d2_plugin.runs.markup import Table
 from d2_plugin.runs.report.page import Section, sources_of
 from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure
 from d2_plugin.runs.rows import TRY, Row
-from d2_plugin.runs.tables import STUDY_COLUMNS, Column
+from d2_plugin.runs.tables import STUDY_COLUMNS, Column, Table
 from d2_plugin.runs.verdict import EXPLANATION, Estimate, seeds_in_words, verdicts_table
 
 D2, STEREO, BACKBONE = "D²", "stereo alone", "backbone alone"

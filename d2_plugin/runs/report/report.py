@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from d2_plugin.durable import make_folder, remove_leftovers, write_text
+from d2_plugin.durable import make_folder, refuse_foreign, remove_leftovers, write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.reading import parsing
-from d2_plugin.runs.report.page import Image, Section, html, markdown
+from d2_plugin.runs.report.page import TITLE, Image, Section, html, markdown
 from d2_plugin.runs.report.quality import ablation, quality, training
 from d2_plugin.runs.report.run_folders import image_of, method_of, training_rows
 from d2_plugin.runs.rows import Row, named_by_cameras, read_rows
-from d2_plugin.runs.saved.kinds import read_metrics
+from d2_plugin.runs.saved import read_metrics
 from d2_plugin.settings import Positional, Settings
 
 Builder = Callable[[Sequence[Row]], Section]
@@ -57,7 +57,7 @@ def make_report(
 
     Args:
         rows: of any kinds, see `d2_plugin.runs.rows`.
-        output: folder, created where absent; files of the same names are replaced.
+        output: folder, created where absent; an earlier report in it is replaced.
         images: for the page; the Markdown has none.
         builders: what makes a section of each kind of row.
 
@@ -65,7 +65,8 @@ def make_report(
         The files that were written.
 
     Raises:
-        D2Error: there is no row, or one that no builder knows.
+        D2Error: there is no row, or one that no builder knows, or a file of somebody else stands where one of the
+            report would; nothing is written.
     """
     if not rows:
         raise D2Error("there is nothing to report: give a runs.jsonl with rows in it, or the folder of a finished run")
@@ -82,6 +83,8 @@ def make_report(
     texts |= {f"{name}.svg": svg for section in sections for name, svg in section.figures.items()}
     with only_writer(make_folder(output)):
         remove_leftovers(output, below=False)  # of a report that was killed
+        for name in texts:
+            refuse_foreign(output / name, '<svg class="plot"' if name.endswith(".svg") else TITLE, "d2 report")
         for name, content in texts.items():
             write_text(output / name, content)
     return [output / name for name in texts]

@@ -11,7 +11,7 @@ from typing import Any
 from d2_plugin.errors import MissingExtra
 from d2_plugin.recordings.images import opencv, read_image, shrink_image
 from d2_plugin.runs.rows import Row, make_row, rms_error
-from d2_plugin.runs.saved.kinds import read_metrics, read_run
+from d2_plugin.runs.saved import read_metrics, read_run
 from d2_plugin.runs.settings import HOOK_NAMES
 
 IMAGE_WIDTH = 1600

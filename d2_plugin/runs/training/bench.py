@@ -9,6 +9,7 @@ finish, and the same command continues where it was stopped. `d2 report` draws t
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,9 +24,20 @@ from d2_plugin.runs.ablation.presets import PRESETS, TABLES, Preset, rows_named
 from d2_plugin.runs.rows import TRY, Row, append_rows, command_line, read_rows
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Job, Shared, share, share_points
-from d2_plugin.runs.training.budget import TRIES, Timed, fits, nearest, next_steps
 from d2_plugin.runs.training.measured import Line, Work, follow, workers
 from d2_plugin.settings import AtATime, AtLeastOne, Count, Positional, Positive, Range, Seed, Settings
+
+PILOT = 100
+"""Steps of the first try."""
+TOLERANCE = 0.1
+"""A run whose time is this near to the budget is the run of that budget."""
+TRIES = 4
+"""After so many the nearest counts; its own time stands beside its score."""
+GROWTH = 1.1
+"""Time ~ steps^GROWTH where only one length was tried: Gaussians become more."""
+
+Timed = tuple[int, float]
+"""Steps of a run, and the CPU seconds that it trained."""
 
 
 @dataclass(frozen=True)
@@ -194,6 +206,35 @@ def _line(template: _Template, known: Sequence[Row]) -> Line:
         if rows and all(row["failed"] for row in rows):
             return
         tried += [(row["iterations"], row["seconds"]) for row in rows if row["seconds"]]
+
+
+def next_steps(target: float, tried: Sequence[Timed]) -> int:
+    """Steps to try for `target` seconds, from what was tried before: a power law through the two nearest."""
+    if not tried:
+        return PILOT
+    lengths: dict[int, list[float]] = {}
+    for steps, seconds in tried:
+        lengths.setdefault(steps, []).append(max(seconds, 1e-3))
+    means = [(steps, sum(seconds_of) / len(seconds_of)) for steps, seconds_of in lengths.items()]
+    (steps, seconds), *others = sorted(means, key=lambda timed: abs(math.log(timed[1] / target)))
+    power = _power((steps, seconds), others[0]) if others else GROWTH
+    return max(round(steps * (target / seconds) ** (1 / power)), 1)
+
+
+def _power(first: Timed, second: Timed) -> float:
+    """Slope of log time over log steps, kept where the noise of short runs cannot lead astray."""
+    slope = math.log(second[1] / first[1]) / math.log(second[0] / first[0])
+    return min(max(slope, 0.8), 2.0)
+
+
+def fits(target: float, timed: Timed) -> bool:
+    """Whether a run took that long."""
+    return abs(timed[1] / target - 1) <= TOLERANCE
+
+
+def nearest(target: float, tried: Sequence[Timed]) -> int:
+    """Steps of the run whose time is nearest to the budget, in ratio."""
+    return min(tried, key=lambda timed: abs(math.log(max(timed[1], 1e-3) / target)))[0]
 
 
 def _settled(by_run: dict[tuple[str, str], Row], template: _Template, target: str) -> int | None:

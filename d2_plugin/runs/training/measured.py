@@ -11,7 +11,7 @@ from typing import Any
 
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.rows import Row, make_row, rms_error
-from d2_plugin.runs.saved.kinds import read_metrics
+from d2_plugin.runs.saved import read_metrics
 from d2_plugin.runs.shared import Job, give_points
 from d2_plugin.runs.workers import worker_pool
 from d2_plugin.store.files import hash_of

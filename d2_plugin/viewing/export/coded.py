@@ -27,7 +27,8 @@ from torch import Tensor
 
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
-from d2_plugin.viewing.export.keys import ALPHA_MIN, Keys, State, cholesky, morton_order
+from d2_plugin.viewing.export.keys import Keys, State, cholesky, morton_order
+from d2_plugin.viewing.export.ply import ALPHA_MIN
 
 BLOCK = 256
 """Rows that share their ranges."""

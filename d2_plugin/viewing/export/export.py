@@ -7,26 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-from torch import Tensor
-
-from d2_plugin.durable import make_folder, remove_leftovers
+from d2_plugin.durable import make_folder, refuse_foreign, remove_leftovers
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import MovingGaussians
-from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
-from d2_plugin.reading import opened
-from d2_plugin.runs.gaussian_ply import write_ply
 from d2_plugin.settings import AtLeastOne, Count, Positional, Positive, Settings
 from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.export.coded import seen_rows
 from d2_plugin.viewing.export.page import GENERATOR, write_page
+from d2_plugin.viewing.export.ply import write_ply
 from d2_plugin.viewing.export.scene import ExportScene, export_scene
 from d2_plugin.viewing.export.splatv import fit_curves, write_splatv
 from d2_plugin.viewing.export.spz import write_spz
-
-HEAD = 1000
-"""Bytes of a page among which its generator is named."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +81,7 @@ def write_export(scene: ExportScene, settings: Export, folder: Path) -> Written:
 
 def _html(scene: ExportScene, settings: Export, folder: Path) -> Written:
     path = folder / "scene.html"
-    if path.exists():
-        with opened(path, "give another --output") as file:
-            if f'content="{GENERATOR} '.encode() not in file.read(HEAD):
-                raise D2Error(f"{path} was not written by `d2 export` and is kept: give another --output")
+    refuse_foreign(path, f'content="{GENERATOR} ', "d2 export")
     return Written((path,), tuple(write_page(scene, path, settings.megabytes)))
 
 
@@ -129,15 +119,9 @@ def _frame_files(scene: ExportScene, settings: Export, folder: Path) -> Written:
         for frame, time in zip(scene.frames, scene.seconds):
             if frame in chosen:
                 paths.append(folder / settings.format / f"frame_{frame:05d}.{settings.format}")
-                (write_spz if settings.format == "spz" else _write_ply)(paths[-1], *scene.still_at(time))
+                (write_spz if settings.format == "spz" else write_ply)(paths[-1], *scene.still_at(time))
                 bar.update(len(paths))
     return Written(tuple(paths))
-
-
-def _write_ply(path: Path, shown: MovingGaussians, shapes: tuple[Tensor, Tensor]) -> None:
-    coefficients = shown.harmonics.coefficients
-    parts = shown.positions, shown.covariances, SH_C0 * coefficients[:, 0] + 0.5, shown.opacities
-    write_ply(path, *parts, coefficients[:, 1:], shapes=shapes)
 
 
 FORMATS: dict[str, Callable[[ExportScene, Export, Path], Written]] = {

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from d2_plugin.viewing.export.ply import ALPHA_MIN
 from d2_plugin.viewing.export.scene import ExportScene
 
 STILL = 0.05
@@ -31,8 +32,6 @@ MOST_CHECKS = 8
 """Instants at which the error is measured at most: a large field takes seconds for each."""
 MOST_STATES = 8_000_000
 """Gaussians times instants that are evaluated and kept, 40 bytes each: of 300,000 Gaussians, 26 instants."""
-ALPHA_MIN = 1 / 255
-"""Gaussians that stay below this are never drawn."""
 
 
 class State(NamedTuple):

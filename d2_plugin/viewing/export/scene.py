@@ -15,8 +15,8 @@ from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import RasterSettings, Splats, View
 from d2_plugin.recordings import Camera
-from d2_plugin.runs.gaussian_ply import scales_and_rotations
 from d2_plugin.viewing.camera_paths import focus_of, pose_of
+from d2_plugin.viewing.export.ply import scales_and_rotations
 from d2_plugin.viewing.viewed import ViewedRun
 
 

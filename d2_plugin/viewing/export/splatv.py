@@ -21,8 +21,8 @@ from d2_plugin.gaussians.moving import LinearMotion, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.reading import json_text
 from d2_plugin.recordings import Camera
-from d2_plugin.runs.gaussian_ply import scales_and_rotations
-from d2_plugin.viewing.export.keys import ALPHA_MIN, Offset, covariances_of, distance, state_at
+from d2_plugin.viewing.export.keys import Offset, covariances_of, distance, state_at
+from d2_plugin.viewing.export.ply import ALPHA_MIN, scales_and_rotations
 from d2_plugin.viewing.export.scene import ExportScene
 
 MAGIC, TEXELS_A_ROW = 0x674B, 4096

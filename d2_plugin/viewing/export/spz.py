@@ -17,7 +17,7 @@ from torch import Tensor
 
 from d2_plugin.durable import write
 from d2_plugin.gaussians.moving import MovingGaussians
-from d2_plugin.viewing.export.keys import ALPHA_MIN
+from d2_plugin.viewing.export.ply import ALPHA_MIN
 
 MAGIC, VERSION = 0x5053474E, 3
 MOST_FRACTION_BITS = 12

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from torch import Tensor
 
@@ -81,26 +81,20 @@ class Share:
         return self.spent <= 0
 
 
-@dataclass
-class Drawer:
-    """One for all pages: what a pixel costs is learnt from every image."""
-
-    resolution: Resolution = field(default_factory=Resolution)
-
-    def draw(self, page: Page, wanted: Wanted, marked: Tensor | None, seconds: float | None) -> None:
-        """Send one image; where something moves, it is as large as fits `seconds`."""
-        scene, viewed = page.client.scene, page.viewed
-        if not wanted.show:
-            scene.set_background_image(None)
-            page.set_text("size", "none")
-            return
-        start = time.perf_counter()
-        size = self.resolution.size(wanted.aspect, wanted.height, seconds)
-        known = wanted.marked and marked is not None and len(marked) == len(viewed.backbone)
-        view = viewed.view(wanted.camera(*size), wanted.time, size)
-        shot = Shot(viewed, view, None, wanted.min_opacity, marked if known else None)
-        quality = STILL_QUALITY if seconds is None else MOVING_QUALITY
-        scene.set_background_image(KINDS[wanted.show](shot).image, format="jpeg", jpeg_quality=quality)
-        taken = time.perf_counter() - start
-        self.resolution.drew(size[0] * size[1], taken)
-        page.set_text("size", f"{size[0]}x{size[1]}, {1000 * taken:.0f} ms")
+def draw(page: Page, wanted: Wanted, marked: Tensor | None, seconds: float | None, resolution: Resolution) -> None:
+    """Send one image; where something moves, it is as large as fits `seconds`."""
+    scene, viewed = page.client.scene, page.viewed
+    if not wanted.show:
+        scene.set_background_image(None)
+        page.set_text("size", "none")
+        return
+    start = time.perf_counter()
+    size = resolution.size(wanted.aspect, wanted.height, seconds)
+    known = wanted.marked and marked is not None and len(marked) == len(viewed.backbone)
+    view = viewed.view(wanted.camera(*size), wanted.time, size)
+    shot = Shot(viewed, view, None, wanted.min_opacity, marked if known else None)
+    quality = STILL_QUALITY if seconds is None else MOVING_QUALITY
+    scene.set_background_image(KINDS[wanted.show](shot).image, format="jpeg", jpeg_quality=quality)
+    taken = time.perf_counter() - start
+    resolution.drew(size[0] * size[1], taken)
+    page.set_text("size", f"{size[0]}x{size[1]}, {1000 * taken:.0f} ms")

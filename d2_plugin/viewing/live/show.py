@@ -15,7 +15,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
 from d2_plugin.runs.metrics import psnr
 from d2_plugin.runs.run import Run
-from d2_plugin.runs.saved.finite import OnStep
+from d2_plugin.runs.saved import OnStep
 from d2_plugin.settings import AtLeastOne, Positional, Range, Settings
 from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.camera_paths import pose_of
@@ -95,15 +95,15 @@ def address_line(viewer: Viewer, host: str) -> str:
 class LiveRun:
     """A run that is watched: give `watch` to `Run.train`."""
 
-    def __init__(self, run: Run, host: str = "127.0.0.1", port: int = 8080) -> None:
-        self.run, self.host, self.port = run, host, port
+    def __init__(self, run: Run) -> None:
+        self.run = run
         self.viewer: Viewer | None = None
 
     def watch(self, trainer: Any) -> OnStep:
         """Open the page once there is a model; returns what is called after every step."""
         viewed = viewed_training(self.run, trainer)
         iterations = self.run.settings.iterations
-        self.viewer = viewer = Viewer(viewed=viewed, host=self.host, port=self.port, iterations=iterations)
+        self.viewer = viewer = Viewer(viewed=viewed, iterations=iterations)
         scorer = Scorer(viewed)
         if trainer.d2 is not None:
             viewer.marks = lambda: trainer.d2.inserted_at

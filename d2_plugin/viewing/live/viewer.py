@@ -26,7 +26,7 @@ from d2_plugin.hooks.reports import Report
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import View
 from d2_plugin.values import checked_arguments
-from d2_plugin.viewing.live.images import Drawer, Share
+from d2_plugin.viewing.live.images import Resolution, Share, draw
 from d2_plugin.viewing.live.overlay import Overlay, frustum_size, rig_of
 from d2_plugin.viewing.live.page import Page, Training, vertical_angle
 from d2_plugin.viewing.live.server import serve
@@ -75,7 +75,7 @@ class Viewer:
         self._waiting: list[Any] = []
         self._pages: dict[int, tuple[Page, Overlay]] = {}
         self._wake, self._guard = threading.Event(), threading.Lock()
-        self._drawer = Drawer()
+        self._resolution = Resolution()  # one for all pages: every image teaches what a pixel costs
         self._watched, self._moved, self._last = Share(WATCHED), Share(MOVED), time.monotonic()
         self._followed = None if d2 is None else Follower(d2, self)
         self._server, self.url = serve(host, port)
@@ -196,7 +196,7 @@ class Viewer:
             if page.viewed.backbone is not None:
                 marks = self.marks()
                 marked = None if marks is None else marks > 0
-                self._drawer.draw(page, wanted, marked, MOVING_SECONDS if moving else None)
+                draw(page, wanted, marked, MOVING_SECONDS if moving else None, self._resolution)
             page.drawn = wanted, self.step, moving
         overlay.refresh(page.viewed, wanted.time, moving)
         taken = time.monotonic() - now

@@ -11,9 +11,9 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.extras import import_av
 from d2_plugin.progress import progress_bar
 from d2_plugin.recordings.checks.memory import check_bytes
-from d2_plugin.runs.drawing import GAP, Panel, side_by_side
+from d2_plugin.runs.drawing import GAP, Panel, Scale, depth_scale, side_by_side
 from d2_plugin.viewing.checkpoints import open_viewed
-from d2_plugin.viewing.panels import KINDS, Scale, Shot, depth_scale
+from d2_plugin.viewing.panels import KINDS, Shot
 from d2_plugin.viewing.rendering import render_view
 from d2_plugin.viewing.videos.plan import Plan, RenderSettings, Stop, plan_video
 from d2_plugin.viewing.videos.video import write_video

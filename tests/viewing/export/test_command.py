@@ -8,6 +8,7 @@ from typing import get_args, get_type_hints
 
 import pytest
 import torch
+from command_lines import refused
 from oracles.export_files import ReadPage
 from viewing.hostile import emptied, of_another_version, still_training
 
@@ -29,16 +30,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for backbone in ("yang4d", "deform"):
         assert main([*words, "--backbone", backbone, "--output", str(folder / backbone)]) == 0
     return folder
-
-
-def complaint(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    """What `d2 export` says on stderr when it refuses."""
-    capsys.readouterr()
-    assert main(["export", *words]) == 2
-    said = capsys.readouterr().err.strip()
-    assert said.startswith("d2: ")
-    assert "\n" not in said
-    return said
 
 
 @pytest.mark.parametrize("backbone", ["yang4d", "deform"])
@@ -65,9 +56,9 @@ def test_frames_are_chosen_by_number(trained: Path, capsys: pytest.CaptureFixtur
     said = capsys.readouterr().out
     assert f"2 files in {folder}" in said
     assert "the background behind the Gaussians is left out" in said
-    assert "no frame 7: it has 0 to 2" in complaint(capsys, run, "--format", "ply", "--frames", "7")
-    assert "--frames is for ply and spz" in complaint(capsys, run, "--frames", "1")
-    assert "--frames" in complaint(capsys, run, "--format", "ply", "--frames", "")
+    assert "no frame 7: it has 0 to 2" in refused(capsys, "export", run, "--format", "ply", "--frames", "7")
+    assert "--frames is for ply and spz" in refused(capsys, "export", run, "--frames", "1")
+    assert "--frames" in refused(capsys, "export", run, "--format", "ply", "--frames", "")
 
 
 def test_a_run_that_still_trains_is_exported_as_far_as_it_is(
@@ -82,15 +73,15 @@ def test_what_cannot_be_exported_is_one_sentence(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = trained / "yang4d"
-    assert "splatv" in complaint(capsys, str(run), "--format", "splat")
-    assert "holds no run" in complaint(capsys, str(tmp_path))
+    assert "splatv" in refused(capsys, "export", run, "--format", "splat")
+    assert "holds no run" in refused(capsys, "export", tmp_path)
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     (copy / "checkpoint.pt").write_bytes((copy / "checkpoint.pt").read_bytes()[:1000])
-    assert "is damaged" in complaint(capsys, str(copy))
+    assert "is damaged" in refused(capsys, "export", copy)
     (copy / "checkpoint.pt").unlink()
-    assert "holds no checkpoint yet" in complaint(capsys, str(copy))
-    assert "version 99" in complaint(capsys, str(of_another_version(run, tmp_path / "later")))
-    assert "has no Gaussian left at step 4" in complaint(capsys, str(emptied(run, tmp_path / "empty")))
+    assert "holds no checkpoint yet" in refused(capsys, "export", copy)
+    assert "version 99" in refused(capsys, "export", of_another_version(run, tmp_path / "later"))
+    assert "has no Gaussian left at step 4" in refused(capsys, "export", emptied(run, tmp_path / "empty"))
 
 
 def test_the_formats_that_are_declared_are_those_that_are_written() -> None:

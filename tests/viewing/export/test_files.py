@@ -26,12 +26,12 @@ from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.slicing import slice_gaussians
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
-from d2_plugin.runs.gaussian_ply import scales_and_rotations, write_ply
 from d2_plugin.viewing.checkpoints import read_ply
 from d2_plugin.viewing.export.coded import encode, seen_rows
 from d2_plugin.viewing.export.export import FORMATS, Export, write_export
 from d2_plugin.viewing.export.keys import STILL, bake, cholesky, covariances_of, morton_order, state_at
 from d2_plugin.viewing.export.page import to_json, write_page
+from d2_plugin.viewing.export.ply import scales_and_rotations, write_ply
 from d2_plugin.viewing.export.splatv import write_splatv
 from d2_plugin.viewing.export.spz import FLIPS, write_spz
 
@@ -215,7 +215,7 @@ class TestStills:
     def test_ply_frames_hold_harmonics_where_viewers_look(self, tmp_path: Path) -> None:
         still, path = harmonic_scene(), tmp_path / "a.ply"
         c, kept = still.harmonics.coefficients, still.opacities >= 1 / 255
-        write_ply(path, still.positions, still.covariances, SH_C0 * c[:, 0] + 0.5, still.opacities, c[:, 1:])
+        write_ply(path, still, scales_and_rotations(still.covariances))
         green = read_ply(path)["f_rest_15"].double()  # of the first coefficient above the constant one
         torch.testing.assert_close(green, c[kept, 1, 1], rtol=1e-6, atol=0)
         read = read_still_ply(path)
