@@ -106,9 +106,6 @@ def workplace(commands: Commands, recording: Path) -> Workplace:
 
     export = ["export-recording", str(recording), "--format", "transforms", "--points", "50", "--output"]
     videos = ["import", str(filmed(folder)), "--calibration", str(folder / "room" / "cameras.json")]
-    rows = folder / "training.jsonl"
-    kept = [line for line in ROWS.read_text().splitlines() if '"kind": "training"' in line]
-    rows.write_text("".join(f"{line}\n" for line in kept))
     work = {
         "import": Work([*videos, "--offsets", "none", "--output", str(out)], out, lambda: None),
         "priors": Work(["priors", str(recording), *TRAINED, "--output", str(out)], out, lambda: None),
