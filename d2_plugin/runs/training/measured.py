@@ -75,10 +75,10 @@ def _metrics(work: Work) -> dict[str, Any]:
 
 
 def row_of(work: Work, metrics: Mapping[str, Any]) -> Row:
-    """A finished run as a row."""
+    """A finished run as a row; trials that decided what of the prior is used count as time of the prior."""
     scores = metrics["test"] or {}
     error = rms_error(scores)
-    return _row(
+    row = _row(
         work,
         error=error,
         seconds=metrics["cpu_seconds"]["train"],
@@ -89,6 +89,9 @@ def row_of(work: Work, metrics: Mapping[str, Any]) -> Row:
         background=metrics["background"],
         mono_emulated=metrics["mono_emulated"],
     )
+    if metrics.get("trials") and row["prior_seconds"] is not None:
+        row["prior_seconds"] += metrics["trials"]["cpu_seconds"]
+    return row
 
 
 def _row(work: Work, **measured: Any) -> Row:
