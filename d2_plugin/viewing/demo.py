@@ -14,7 +14,7 @@ from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.images import read_image, write_png
 from d2_plugin.recordings.synthetic.room import split, synthetic_recording
-from d2_plugin.runs.drawing import Panel, side_by_side
+from d2_plugin.runs.drawing import BACKGROUND, text
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings
 from d2_plugin.runs.tables import metrics_table
@@ -85,5 +85,9 @@ def _compare(folders: dict[str, Path], camera: str, image: Path) -> None:
     rows = []
     for name, folder in folders.items():
         images = sorted((folder / "images").glob(f"{camera}_*.png"))
-        rows.append(side_by_side([Panel(name, read_image(images[len(images) // 2]))]))
+        panels = read_image(images[len(images) // 2])
+        title = np.full((24, panels.shape[1], 3), BACKGROUND, np.uint8)
+        letters = text(name, 2)
+        title[2 : 2 + letters.shape[0], 4 : 4 + letters.shape[1]] = letters
+        rows += [title, panels]
     write_png(image, np.concatenate(rows))
