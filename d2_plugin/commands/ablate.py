@@ -34,7 +34,7 @@ class AblationOptions(ConfigFile):
 
 def form(words: list[str]) -> Form:
     """What `d2 ablate` takes."""
-    return recording_form("d2 ablate", __doc__, run, ("test_cameras",), AblationOptions, TABLES)
+    return recording_form("d2 ablate", __doc__, run, ("test_cameras", "hold_out_instants"), AblationOptions, TABLES)
 
 
 def run(given: Given) -> str:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 OF_THE_RUN = (
     *("test_cameras", "backbone", "iterations", "hooks", "priors", "priors_in_step", "accept_empty_prior"),
-    *("background_weight", "seed", "device"),
+    *("hold_out_instants", "background_weight", "seed", "device"),
 )
 TABLES = ("densify", "prune", "depth_loss", "d2", "priors", "backbone", "plan", "import")
 

@@ -13,6 +13,8 @@ import torch
 
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.store.store import PriorStore
 
@@ -272,3 +274,15 @@ class TestMistakes:
         message = refused(capsys, train(recording, tmp_path / "y", "--hooks", "none", "--config", str(config)))
         assert "did you mean 'sh_degree'?" in message
         assert not (tmp_path / "y").exists()
+
+
+def test_instants_between_the_trained_ones_have_their_own_score(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room = synthetic_recording(cameras=3, held_out=1, frames=5, width=48, height=27)
+    folder = save_recording(room, tmp_path / "longer")
+    assert train(folder, tmp_path / "run", "--hold-out-instants", "2", "--hooks", "none") == 0
+    assert "PSNR between" in capsys.readouterr().out
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["test"]["psnr_between"] > 0
+    assert len(metrics["per_frame"]) == 5
