@@ -9,6 +9,7 @@ import ast
 import configparser
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -131,6 +132,13 @@ def missing_documents(root: Path, files: Iterable[Path]) -> list[str]:
             missing = [name for name in names if not ((root / name).exists() or (path.parent / name).exists())]
             wrong += [f"{path.relative_to(root)}, line {number}, names {name}, which is not there" for name in missing]
     return wrong
+
+
+def test_no_module_needs_itself() -> None:
+    """Not by way of others either, nor by an import inside a function."""
+    modules = modules_in(ROOT, PACKAGES)
+    needs = {name: {target for target, _, _ in imports_of(name, modules)} - {name} for name in modules}
+    TopologicalSorter(needs).prepare()  # raises CycleError, which names the circle
 
 
 def test_imports_run_one_way_between_rooms() -> None:
