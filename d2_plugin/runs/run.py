@@ -82,8 +82,6 @@ class Run:
         """Hooks that stopped because they changed next to nothing, and at which step."""
         self.prior: dict[str, Any] | None = None
         """What the depth prior became, as `PriorSummary.as_dict` has it; None without one."""
-        self.trials: Trials | None = None
-        """What left-out training cameras said of the prior; None where nothing was tried."""
         self._writes = False
         self._building: PriorAlongside | None = None
 
@@ -133,7 +131,7 @@ class Run:
         """
         with self._writing(), self._beside():
             points = self.prepare(self._building is None, on_prior)
-            self.trials = self._tried(points)
+            self._try_prior(points)
             trainer = self._trainer(points)
             self._restore(trainer)
             watching = watch(trainer) if watch else lambda step, loss: None
@@ -175,12 +173,17 @@ class Run:
             write_table(self.folder / "metrics.json", metrics, METRICS)
         return metrics
 
-    def _tried(self, points: TimedPoints) -> Trials | None:
-        """What of the prior is worth inserting, kept in trials.json; None where that is not open."""
-        if self.guidance is not None or not is_open(self.settings, self.scene):
-            return None
-        with self._timed("priors"):
-            return kept_trials(self.folder / "trials.json", self.settings, self.scene, points, self.priors)
+    @property
+    def trials(self) -> Trials | None:
+        """What left-out training cameras showed of the prior, from trials.json; None where nothing was tried."""
+        path = self.folder / "trials.json"
+        return Trials.load(path) if path.is_file() else None
+
+    def _try_prior(self, points: TimedPoints) -> None:
+        """Find out what of the prior is worth inserting, where that is open."""
+        if self.guidance is None and is_open(self.settings, self.scene):
+            with self._timed("priors"):
+                kept_trials(self.folder / "trials.json", self.settings, self.scene, points, self.priors)
 
     @property
     def priors(self) -> Path:
@@ -237,7 +240,8 @@ class Run:
     def _attach(self, model: object) -> D2Hooks:
         adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
         config = hook_config(self.settings, self.priors)
-        config = config if self.trials is None else replace(config, believe=self.trials.choice)
+        trials = self.trials
+        config = config if trials is None else replace(config, believe=trials.choice)
         write_text(self.folder / "d2.toml", config.to_toml())
         guidance, priors = self.guidance, self.priors
         others = {} if guidance is None else guidance.hooks(self.scene, self._points(), priors)

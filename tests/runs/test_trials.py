@@ -157,6 +157,8 @@ def test_a_run_that_is_continued_does_not_try_again_and_its_hooks_get_the_choice
         assert run.trials is not None
         assert run.trials.choice == "stereo"
     assert tried == [1]
+    reopened = Run(settings, tmp_path / "run")
+    assert reopened.evaluate(images=False)["trials"]["choice"] == "stereo", "scored again, the run still says so"
     assert D2Config.from_toml(tmp_path / "run" / "d2.toml").believe == "stereo"
 
 
