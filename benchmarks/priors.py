@@ -76,19 +76,13 @@ def run(settings: PriorsBench) -> str:
     """Measure and add the rows; a table per recording, and where the rows lie."""
     begin_rows(settings.output)
     torch.set_num_threads(settings.threads)
-    command, shown_text = _command(settings), []
+    command, shown_text = command_line("bench priors", settings), []
     for case in cases(settings):
         found, seconds = measure(case)
         append_rows(settings.output, rows_of(case, found, seconds, command))
         shown_text.append(f"{case.name}, {seconds:.2f} s per image, {found}")
         logger.info("the prior of %s is measured", case.name)
     return "\n\n".join([*shown_text, f"rows are in {settings.output}; `python -m benchmarks report` draws them"])
-
-
-def _command(settings: PriorsBench) -> str:
-    """As it is typed: recordings stand apart, the values of a flag are joined by commas."""
-    joined = {name: ",".join(map(str, getattr(settings, name))) for name in ("rigs", "train_cameras", "frames")}
-    return command_line("bench priors", settings, **joined)
 
 
 def cases(settings: PriorsBench) -> list[Case]:

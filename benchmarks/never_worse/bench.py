@@ -26,11 +26,11 @@ from d2_plugin.runs.report.quality import groups_of, scores_table
 from d2_plugin.runs.rows import Row, append_rows, command_line, read_rows
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings, check, prior_settings
-from d2_plugin.runs.shared import Job, Shared, share
+from d2_plugin.runs.shared import Shared, share
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.runs.training.bench import Case, case_of
-from d2_plugin.runs.training.measured import Line, Work, follow, workers
+from d2_plugin.runs.training.measured import Work, side_by_side
 from d2_plugin.settings import AtLeastOne, Count, Positional, Range, Seed, Settings
 
 BACKBONE, STEREO = "backbone alone", "stereo alone"
@@ -89,8 +89,7 @@ def run(settings: NeverWorseBench) -> str:
             append_rows(path, [row])
             bar.update(next(done), f"{row['case']}: {row['method']}, {row['setting']}")
 
-        with workers(settings.jobs, None) as submit:
-            follow([_all_of(missing)] if missing else [], submit, write)
+        side_by_side(missing, settings.jobs, write)
     return f"{markdown(table(_rows(path)))}\n\nrows are in {path}; `python -m benchmarks report` draws them"
 
 
@@ -101,10 +100,6 @@ def _rows(path: Path) -> list[Row]:
 def table(rows: Sequence[Row]) -> Table:
     """The scores of each recording, by what the monocular maps were."""
     return scores_table(groups_of([{**row, "method": f"yang4d {row['method']}"} for row in rows]))
-
-
-def _all_of(works: Sequence[Work]) -> Line:
-    yield works
 
 
 def _works(settings: NeverWorseBench, text: str) -> Iterator[Work]:
@@ -153,8 +148,7 @@ class _Template:
 
     def __init__(self, settings: NeverWorseBench, case: str, shared: Shared) -> None:
         self.settings, self.case, self.shared = settings, case, shared
-        listed = {name: ",".join(map(str, getattr(settings, name) or ())) for name in ("maps", "seeds", "frames")}
-        self.command = command_line("bench never-worse", settings, **listed)
+        self.command = command_line("bench never-worse", settings)
 
     def works(self, method: str, base: RunSettings, preset: Preset) -> Iterator[Work]:
         """The seeds of one method, its prior built where it needs one."""
@@ -164,17 +158,9 @@ class _Template:
         about = {"prior": self._build(used, store) if preset.hooks else None, "frames": base.frames}
         for seed in self.settings.seeds:
             folder = self.shared.folder / "runs" / name / f"{base.iterations}steps" / f"seed{seed}"
-            job = Job(preset.name, replace(used, seed=seed), folder)
-            yield Work(
-                job,
-                self.shared.points,
-                self.case,
-                method,
-                self.command,
-                f"{base.iterations} steps",
-                about,
-                "never_worse",
-            )
+            run = replace(used, seed=seed), folder, self.shared.points
+            target = f"{base.iterations} steps"
+            yield Work(*run, self.case, method, self.command, target, about, kind="never_worse")
 
     def _build(self, settings: RunSettings, store: Path) -> str:
         """The prior of one method, with the geometric depth of the full one; what it became, in a line."""

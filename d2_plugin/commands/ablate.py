@@ -39,16 +39,11 @@ def form(words: list[str]) -> Form:
 
 def run(given: Given) -> str:
     """Train what is not finished; returns the tables."""
-    from d2_plugin.runs.ablation import ablate
+    from d2_plugin.runs.ablation.ablate import ablate
     from d2_plugin.runs.ablation.presets import rows_named
 
     options = given.make(AblationOptions)
-    presets = rows_named(options.rows)
-    work = ablate.jobs(run_settings(given), presets, options.backbones, options.seeds, options.output)
-    text = ablate.write(ablate.run_jobs(work, options.jobs, options.output), presets, options.output, _command_line())
+    words = [Path(word).name if word.startswith("/") else word for word in sys.argv[1:]]  # no folders of this machine
+    chosen = rows_named(options.rows), options.backbones, options.seeds
+    text = ablate(run_settings(given), *chosen, options.output, options.jobs, " ".join(["d2", *words]))
     return f"{text}\ntables and runs.jsonl in {options.output}"
-
-
-def _command_line() -> str:
-    """How this was started, without the folders of this machine."""
-    return " ".join(["d2", *(Path(word).name if word.startswith("/") else word for word in sys.argv[1:])])

@@ -167,36 +167,24 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def command_line(command: str, settings: Settings, **written: str) -> str:
-    """`d2 COMMAND` with every setting that is not the default; folders of this machine are left out.
-
-    Args:
-        command: its words after `d2`.
-        settings: what was given.
-        written: flags whose text is not simply that of the value.
-    """
+def command_line(command: str, settings: Settings) -> str:
+    """`d2 COMMAND` with every setting that is not the default; of an absolute path the last part alone, since the rest
+    says nothing about the measurement."""
     words = ["d2", *command.split()]
-    kind: Any = type(settings)
-    for setting in declared(kind):
+    for setting in declared(type(settings)):
         value = getattr(settings, setting.name)
         if value == setting.default:
             continue
-        texts = [written[setting.name]] if setting.name in written else _texts(value)
-        words += texts if setting.positional else [f"--{setting.name.replace('_', '-')}", *texts]
+        texts = [_typed(item) for item in value] if isinstance(value, tuple) else [_typed(value)]
+        if setting.positional:
+            words += texts
+        else:
+            words += [f"--{setting.name.replace('_', '-')}", *([] if value is True else [",".join(texts)])]
     return shlex.join(words)
 
 
-def _texts(value: Any) -> list[str]:
-    if isinstance(value, bool):
-        return []
-    if isinstance(value, tuple):
-        return [text for item in value for text in _texts(item)]
-    return [_without_folders(value)]
-
-
-def _without_folders(value: Any) -> str:
-    """An absolute path as its last part: the rest says nothing about the measurement."""
-    text = str(value)
+def _typed(value: object) -> str:
+    text = f"{value:g}" if isinstance(value, float) else str(value)
     return Path(text).name if text.startswith("/") else text
 
 

@@ -156,6 +156,14 @@ def hook_config(settings: RunSettings, priors: Path) -> D2Config:
     return D2Config.from_dict(_over(plain, settings.overrides.get("d2", {}), "d2") | tables)
 
 
+def layered(below: Any, above: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested tables with others over them; neither is changed."""
+    result = dict(below) if isinstance(below, Mapping) else {}
+    for key, value in above.items():
+        result[key] = layered(result.get(key), value) if isinstance(value, Mapping) else value
+    return result
+
+
 def _over(defaults: Mapping[str, Any], table: Any, name: str) -> dict[str, Any]:
     """The defaults with the user's table over them."""
     if not isinstance(table, Mapping):

@@ -1,8 +1,7 @@
-"""What the runs of one comparison share: starting points and depth priors, each made once; and one such run."""
+"""What the runs of one comparison share: starting points and depth priors, each made once."""
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -11,52 +10,12 @@ from typing import Any
 
 from d2_plugin.durable import Kind, make_folder, read_table, write_table
 from d2_plugin.runs.prior.build import build_priors_for
-from d2_plugin.runs.run import Run
-from d2_plugin.runs.scene import Guidance, Scene
+from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, prior_settings
 from d2_plugin.runs.start import TimedPoints, triangulated_points
 
 COST = Kind("time that something shared took", 1, "delete it")
 """NAME.seconds.json, beside what it is about."""
-
-Metrics = Mapping[str, Any]
-"""What metrics.json of a run holds."""
-
-
-@dataclass(frozen=True, eq=False)
-class Job:
-    """One run of a comparison."""
-
-    preset: str
-    settings: RunSettings
-    folder: Path
-    guidance: Guidance | None = None
-    """What guides it in place of D2's hooks."""
-
-    @property
-    def uses_prior(self) -> bool:
-        """Whether hooks or another guidance read a depth prior."""
-        return bool(self.settings.hooks) or self.guidance is not None
-
-    def run(self) -> Run:
-        """The run in its folder; refuses a folder of other settings, with one sentence."""
-        return Run(self.settings, self.folder, self.guidance)
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What something shared took to make; None where a build was cut off, since its parts were not timed together."""
-
-    seconds: float | None
-    """Wall time."""
-    cpu_seconds: float | None
-    """CPU time of the process that made it; None as well where a cluster did."""
-
-    @classmethod
-    def of(cls, made: Path) -> Cost:
-        """As recorded beside `made`; of nothing where there is no record."""
-        record = _record(made)
-        return cls(**read_table(record, COST)) if record.is_file() else cls(None, None)
 
 
 @dataclass(frozen=True)
@@ -77,17 +36,12 @@ class Shared:
         return self.folder / "priors" / self.variant
 
     @property
-    def cost(self) -> Cost:
-        """Of points and prior together."""
-        parts = Cost.of(self.points), Cost.of(self.priors)
-        wall, cpu = ([getattr(part, name) for part in parts] for name in ("seconds", "cpu_seconds"))
-        return Cost(None if None in wall else sum(wall), None if None in cpu else sum(cpu))
-
-
-def give_points(points: Path, run: Path) -> None:
-    """The shared points into the folder of a run, which must exist."""
-    if not (run / "points.npz").is_file():
-        shutil.copyfile(points, run / "points.npz")
+    def seconds(self) -> float | None:
+        """CPU seconds that points and prior took, wall seconds where a cluster built the prior; None where a build was
+        cut off, since its parts were not timed together."""
+        records = [record for made in (self.points, self.priors) if (record := _record(made)).is_file()]
+        parts = [read_table(record, COST)["seconds"] for record in records]
+        return None if len(parts) < 2 or None in parts else sum(parts)
 
 
 def share_points(settings: RunSettings, folder: Path) -> Path:
@@ -112,8 +66,8 @@ def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None
     if not _record(shared.priors).is_file():
         scene = Scene.open(check(replace(settings, hooks=HOOK_NAMES)))
         positions = TimedPoints.load(points).positions
-        build = lambda: build_priors_for(scene, positions, shared.priors, cluster=cluster)  # noqa: E731
-        _timed(shared.priors, build, here=cluster is None)
+        clock = time.process_time if cluster is None else time.monotonic
+        _timed(shared.priors, lambda: build_priors_for(scene, positions, shared.priors, cluster=cluster), clock)
     return shared
 
 
@@ -121,12 +75,9 @@ def _record(made: Path) -> Path:
     return Path(f"{made}.seconds.json")
 
 
-def _timed(made: Path, make: Callable[[], Any], here: bool = True) -> None:
+def _timed(made: Path, make: Callable[[], Any], clock: Callable[[], float] = time.process_time) -> None:
     """Make it, and record beside it what that took, where nothing of it was there before."""
     make_folder(made.parent)
-    whole = not made.exists()
-    start, cpu = time.monotonic(), time.process_time()
+    whole, start = not made.exists(), clock()
     make()
-    wall, used = time.monotonic() - start, time.process_time() - cpu
-    cost = {"seconds": wall if whole else None, "cpu_seconds": used if whole and here else None}
-    write_table(_record(made), cost, COST)
+    write_table(_record(made), {"seconds": clock() - start if whole else None}, COST)

@@ -5,27 +5,20 @@ from __future__ import annotations
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 
 
-def worker_pool(count: int, prepare: Callable[[], None] | None = None) -> ProcessPoolExecutor:
-    """An executor of `count` new processes, each of which first calls `prepare`, which must pickle.
+def worker_pool(count: int) -> ProcessPoolExecutor:
+    """An executor of `count` new processes.
 
     The workers of an executor whose process was killed would otherwise wait for work for ever, with all their memory.
     """
-    return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), _begin, (prepare,))
+    return ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), end_with_parent)
 
 
 def end_with_parent() -> None:
     """Called in a worker: it ends when the process that started it does, however that one ends."""
     threading.Thread(target=_wait_for_parent, daemon=True).start()
-
-
-def _begin(prepare: Callable[[], None] | None) -> None:
-    end_with_parent()
-    if prepare is not None:
-        prepare()
 
 
 def _wait_for_parent() -> None:

@@ -27,7 +27,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs.ablation import ablate
+from d2_plugin.runs.ablation.ablate import ablate
 from d2_plugin.runs.ablation.presets import PRESETS, rows_named
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import read_run
@@ -249,8 +249,7 @@ def ablation(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("ablation") / "out"
     base = RunSettings(str(room), ("train0", "train1", "train2"), iterations=24)
     presets = rows_named(["backbone", *RIVALS, "full"], PRESETS | RIVAL_PRESETS)
-    work = ablate.jobs(base, presets, ["yang4d"], [0], output)
-    ablate.write(ablate.run_jobs(work, 1, output), presets, output, "")
+    ablate(base, presets, ["yang4d"], [0], output, 1, "")
     return output
 
 

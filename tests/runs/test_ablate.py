@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,10 +12,9 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import VARIANTS
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs.ablation import tables
+from d2_plugin.runs.ablation.ablate import order_table, report, table
 from d2_plugin.runs.ablation.presets import PRESETS, TABLES, rows_named
 from d2_plugin.runs.settings import RunSettings, check, hook_config, prior_settings
-from d2_plugin.runs.shared import Job
 from d2_plugin.runs.verdict import EXPLANATION
 
 
@@ -61,81 +59,75 @@ class TestPresets:
         assert mine["prune"]["lambda_e"] == 0.4
 
 
-def results(**psnr: list[float]) -> dict[Job, dict]:
-    """Metrics of made-up runs, one per seed."""
+Rows = dict[str, list[dict]]
 
-    def metrics(value: float) -> dict:
+
+def rows_of(**psnr: list[float]) -> Rows:
+    """Rows of made-up runs by preset, one per seed."""
+
+    def row(name: str, value: float) -> dict:
         scores = {"psnr": value, "ssim1": 0.9, "ssim2": 0.95, "lpips": None, "depth_absrel": 0.04}
-        seconds = {"train": 10.0, "priors": 2.0}
-        return {"test": scores, "gaussians": 1000, "seconds": seconds, "iterations": 5, "recording": "room"} | {
-            "train_cameras": ["a", "b"]
-        }
+        return {"method": f"yang4d {name}", "scores": scores, "gaussians": 1000, "seconds": 10.0}
 
-    return {
-        Job(name, replace(settings_of(name), seed=seed), Path()): metrics(value)
-        for name, values in psnr.items()
-        for seed, value in enumerate(values)
-    }
+    return {name: [row(name, value) for value in values] for name, values in psnr.items()}
 
 
-def order(**psnr: list[float]) -> dict[str, str]:
-    """What is said of PSNR, by the title of the other row."""
-    return {cells[0]: cells[1] for cells in tables.order_table(results(**psnr), "yang4d").rows}
+def order(rows: Rows) -> dict[str, str]:
+    """The verdict on PSNR, by the title of the other row."""
+    return {cells[0]: cells[1] for cells in order_table(rows).rows}
 
 
 class TestTables:
-    def test_a_cell_is_mean_and_standard_error(self) -> None:
-        text = tables.table(results(full=[28.0, 30.0]), "yang4d", ["full"])
-        assert "| D²-4DGS | two seeds | 29.00 ± 1.00 |" in text  # the sample deviation, 1.41, over sqrt(2)
-        assert "| - |" in text  # LPIPS was not measured
-        assert "| D²-4DGS | 3 | 29.00 ± 0.58 |" in tables.table(results(full=[28.0, 29.0, 30.0]), "yang4d", ["full"])
-
-    def test_one_seed_says_so_and_has_no_error(self) -> None:
-        text = tables.table(results(full=[28.0]), "yang4d", ["full"])
-        assert "| D²-4DGS | one seed | 28.00 |" in text
-        assert "±" not in text
+    @pytest.mark.parametrize(
+        ("psnr", "cells"),
+        [
+            ([28.0], "one seed | 28.00"),
+            ([28.0, 30.0], "two seeds | 29.00 ± 1.00"),  # the sample deviation, 1.41, over sqrt(2)
+            ([28.0, 29.0, 30.0], "3 | 29.00 ± 0.58"),
+        ],
+    )
+    def test_a_cell_is_mean_and_standard_error(self, psnr: list[float], cells: str) -> None:
+        text = table(rows_of(full=psnr))
+        assert f"| D²-4DGS | {cells} |" in text
+        assert "| - |" in text, "LPIPS was not measured"
 
     def test_latex_has_a_row_per_variant(self) -> None:
-        text = tables.table(
-            results(full=[28.0, 30.0], backbone=[25.0, 26.0]), "yang4d", ["backbone", "full"], as_latex=True
-        )
+        text = table(rows_of(backbone=[25.0, 26.0], full=[28.0, 30.0]), as_latex=True)
         assert text.count(r"\pm") == 2 * 6
         assert r"D$^2$-4DGS & two seeds & $29.00 \pm 1.00$" in text
 
-    def test_an_order_that_fails_is_said_with_its_margin(self) -> None:
-        found = order(full=[28.0, 28.1, 27.9], backbone=[25.0, 25.1, 24.9], no_pruning=[28.5, 28.6, 28.4])
-        assert found["Backbone"] == "holds (+3.00 ± 0.08 dB)"
-        assert found["w/o Pruning"] == "fails (-0.50 ± 0.08 dB)"
-        assert len(found) == 2  # nothing is claimed about rows that were not run
-
-    def test_an_order_within_the_spread_of_the_seeds_is_undecided(self) -> None:
-        found = order(full=[28.0, 29.0, 30.0], backbone=[25.0, 25.05, 25.1], no_pruning=[29.3, 29.5, 29.4])
-        assert found["Backbone"].startswith("holds")
-        assert found["w/o Pruning"] == "undecided (-0.40 ± 0.58 dB)"  # sqrt(1 / 3 + 0.01 / 3)
-
-    def test_fewer_than_three_seeds_give_no_verdict_however_large_the_margin(self) -> None:
-        alone = order(full=[28.001], backbone=[28.0])
-        assert alone["Backbone"] == "one seed: no verdict (+0.00 dB)"
-        pair = order(full=[40.0, 40.1], backbone=[20.0, 20.1, 20.2])
-        assert pair["Backbone"].startswith("two seeds: no verdict")
-        made = tables.report(results(full=[28.001], backbone=[28.0]), rows_named(["full", "backbone"]))
-        assert "holds" not in made.replace(EXPLANATION, "")
+    @pytest.mark.parametrize(
+        ("full", "backbone", "verdict"),
+        [
+            ([28.0, 28.1, 27.9], [25.0, 25.1, 24.9], "holds (+3.00 ± 0.08 dB)"),
+            ([28.0, 28.1, 27.9], [28.5, 28.6, 28.4], "fails (-0.50 ± 0.08 dB)"),
+            ([28.0, 29.0, 30.0], [29.3, 29.5, 29.4], "undecided (-0.40 ± 0.58 dB)"),  # sqrt(1 / 3 + 0.01 / 3)
+            ([28.001], [28.0], "one seed: no verdict (+0.00 dB)"),
+            ([40.0, 40.1], [20.0, 20.1, 20.2], "two seeds: no verdict (+19.95 ± 0.08 dB)"),
+        ],
+    )
+    def test_a_verdict_needs_three_seeds_and_two_standard_errors(
+        self, full: list[float], backbone: list[float], verdict: str
+    ) -> None:
+        assert order(rows_of(full=full, backbone=backbone)) == {"Backbone": verdict}
 
     def test_each_metric_has_a_verdict_of_its_own(self) -> None:
-        runs = results(full=[28.0, 28.1, 27.9], mvs_only=[25.0, 25.1, 24.9])
-        for job, metrics in runs.items():
-            metrics["test"]["ssim1"] = (0.8 if job.preset == "full" else 0.9) + 0.001 * job.settings.seed
-            metrics["test"]["depth_absrel"] = (0.03 if job.preset == "full" else 0.05) + 0.001 * job.settings.seed
-        [row] = tables.order_table(runs, "yang4d").rows
-        assert [cell.split()[0] for cell in row[1:]] == ["holds", "fails", "no", "holds"]
-        assert tables.order_table(runs, "yang4d").header[1:] == ("PSNR", "SSIM1", "SSIM2", "depth AbsRel")
+        rows = rows_of(full=[28.0, 28.1, 27.9], mvs_only=[25.0, 25.1, 24.9])
+        for name, mine in rows.items():
+            for seed, row in enumerate(mine):
+                row["scores"]["ssim1"] = (0.8 if name == "full" else 0.9) + 0.001 * seed
+                row["scores"]["depth_absrel"] = (0.03 if name == "full" else 0.05) + 0.001 * seed
+        made = order_table(rows)
+        assert [cell.split()[0] for cell in made.rows[0][1:]] == ["holds", "fails", "no", "holds"]
+        assert made.header[1:] == ("PSNR", "SSIM1", "SSIM2", "depth AbsRel")
 
     def test_the_papers_own_figures_stand_beside_labelled(self) -> None:
-        made = results(**{name: [28.0] for name in TABLES["pruning"]})
-        text = tables.report(made, rows_named(["pruning"]))
+        rows = rows_of(**{name: [28.0] for name in TABLES["pruning"]})
+        text = report([row for mine in rows.values() for row in mine], rows_named(["pruning"]))
         assert "○ paper's PSNR" in text
         assert "| 22.21 |" in text
         assert "not measured here" in text
+        assert "holds" not in text.replace(EXPLANATION, "")
 
 
 def test_the_command_trains_shares_priors_and_repeats_nothing(

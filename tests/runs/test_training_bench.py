@@ -18,17 +18,16 @@ from d2_plugin.runs.ablation.presets import PRESETS
 from d2_plugin.runs.rows import TRY, Row, make_row
 from d2_plugin.runs.scene import Remembered
 from d2_plugin.runs.settings import RunSettings
-from d2_plugin.runs.shared import Job, Shared
+from d2_plugin.runs.shared import Shared
 from d2_plugin.runs.training.bench import (
     PILOT,
     TOLERANCE,
     Case,
+    Method,
     TrainingBench,
-    _line,
-    _targets,
-    _Template,
     case_of,
     fits,
+    line_of,
     nearest,
     next_steps,
 )
@@ -73,14 +72,10 @@ class TestCases:
         with pytest.raises(D2Error, match="PATH@00"):
             case_of(text, SETTINGS)
 
-    def test_seconds_are_the_default_and_steps_may_stand_alone(self) -> None:
-        assert [value for _, value in _targets(TrainingBench())] == [10, 30, 100]
-        assert _targets(TrainingBench(steps=(50, 20))) == [("steps", 20), ("steps", 50)]
-
 
 def pretend(work: Work, seconds_per_step: float = 0.05) -> Row:
     """A row as if the run had taken so long."""
-    settings = work.job.settings
+    settings = work.settings
     about = {
         "cameras": list(settings.train_cameras),
         "target": work.target,
@@ -96,7 +91,7 @@ def pretend(work: Work, seconds_per_step: float = 0.05) -> Row:
         seconds=seconds_per_step * settings.iterations,
         scores=scores,
         prior_seconds=3.0 if "full" in work.method else 0.0,
-        fingerprint=fingerprint(work.job),
+        fingerprint=fingerprint(work),
         command="d2 bench training",
         **about,
     )
@@ -112,7 +107,7 @@ def bench(known: Sequence[Row], methods: Sequence[str] = ("backbone", "full"), *
     """The rows that one call writes, given what lies there already."""
     settings = TrainingBench(("room@a+b",), **more)
     case, shared = Case("room, 2 views", "room", SETTINGS), Shared(Path("/out/room"), "dual")
-    lines = [_line(_Template(settings, case, shared, PRESETS[name], "d2"), known) for name in methods]
+    lines = [line_of(Method(settings, case, shared, PRESETS[name], "d2"), known) for name in methods]
     rows: list[Row] = []
     follow(lines, now, rows.append)
     return rows
@@ -135,13 +130,15 @@ class TestPlan:
         assert [(row["method"], row["seed"]) for row in more] == [("yang4d backbone", 2), ("yang4d full", 2)]
         assert len(bench(first[:-1], seconds=(10,), seeds=(0, 1))) == 1
 
-    def test_steps_need_no_try(self) -> None:
+    def test_steps_need_no_try_and_seconds_are_the_default(self) -> None:
         rows = bench([], steps=(70, 20), seeds=(5,))
         assert [row["iterations"] for row in rows if row["method"] == "yang4d backbone"] == [20, 70]
+        assert {row["target"] for row in bench([])} == {TRY, "10 s", "30 s", "100 s"}
 
     def test_other_settings_are_other_runs_wherever_the_files_lie(self) -> None:
         def job(settings: RunSettings, **guidance: object) -> str:
-            return fingerprint(Job("full", settings, Path("x"), Remembered(guidance) if guidance else None))
+            rival = Remembered(guidance) if guidance else None
+            return fingerprint(Work(settings, Path("x"), Path("p"), "room", "full", "d2", TRY, guidance=rival))
 
         elsewhere = replace(SETTINGS, recording="/elsewhere/room", priors="/elsewhere/dual")
         assert job(elsewhere) == job(replace(SETTINGS, recording="room", priors="dual"))
@@ -155,6 +152,6 @@ class TestPlan:
             return future
 
         settings, case = TrainingBench(("room@a",), steps=(5,)), Case("room", "room", SETTINGS)
-        line = _line(_Template(settings, case, Shared(Path("/out"), "dual"), PRESETS["backbone"], "d2"), [])
+        line = line_of(Method(settings, case, Shared(Path("/out"), "dual"), PRESETS["backbone"], "d2"), [])
         with pytest.raises(MemoryError):
             follow([line], broken, lambda row: None)

@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from d2_plugin.runs.workers import worker_pool
-
 PARENT = """
 import os, time
 from d2_plugin.runs.workers import worker_pool
@@ -51,13 +49,3 @@ def test_a_busy_worker_ends_with_a_parent_that_is_killed(how: signal.Signals, tm
         if alive:
             os.kill(worker, signal.SIGKILL)
         assert not alive
-
-
-def test_each_worker_is_prepared_first() -> None:
-    with worker_pool(1, _mark) as pool:
-        assert pool.submit(os.getenv, "D2_TEST_MARK").result() == "prepared"
-    assert "D2_TEST_MARK" not in os.environ
-
-
-def _mark() -> None:
-    os.environ["D2_TEST_MARK"] = "prepared"

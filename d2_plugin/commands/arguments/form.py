@@ -1,7 +1,8 @@
 """What a command takes, made from declared settings: the one way from words on a command line to checked values.
 
 Flags, types, ranges, defaults and help are those of the dataclasses (`d2_plugin.settings.declared`). A setting marked
-`Positional` is taken by its place. Tables of settings are given by dotted flags, as `--priors.stereo.min-angle 2`.
+`Positional` is taken by its place, a switch of the command stands alone, any other flag takes one word. Tables of
+settings are given by dotted flags, as `--priors.stereo.min-angle 2`.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ import difflib
 import importlib
 import inspect
 import re
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, is_dataclass
 from typing import Any, NamedTuple, TypeVar, get_args
@@ -47,7 +47,7 @@ class Group(NamedTuple):
 
 
 class Section(NamedTuple):
-    """One table with its dotted name, ready for flags and for help."""
+    """One table with its dotted name; its settings have dotted names too."""
 
     name: str
     about: str
@@ -81,16 +81,19 @@ class Form:
             D2Error: an unknown flag, with the nearest one suggested; a wrong, missing or surplus value.
         """
         places, given = self._split(words)
-        values = {s.name: s.default for s in self.settings if s.default is not MISSING}
-        by_name = {s.name: s for s in self.settings}
-        for name, texts in given.items():
-            if name in by_name:
-                values[name] = self._read(by_name[name], texts)
-        values |= self._placed(places)
+        values = {s.name: s.default for s in self.settings if s.default is not MISSING} | self._placed(places)
+        tables: dict[str, Any] = {}
+        for setting, text in given.values():
+            value = self._read(setting, [text])
+            *path, last = setting.name.split(".")
+            table = tables if path else values
+            for part in path:
+                table = table.setdefault(part, {})
+            table[last] = _as_toml(value) if path else value
         missing = [typed_as(setting) for setting in self.settings if setting.name not in values]
         if missing:
             raise D2Error(f"{self.command} needs {' and '.join(missing)}: `{self.command} --help` says what that is")
-        return Given(values, self._tables({name: texts for name, texts in given.items() if "." in name}, words))
+        return Given(values, tables)
 
     def sections(self, words: Sequence[str]) -> dict[str, Section]:
         """All tables of a command line by their dotted names, those inside others too."""
@@ -98,69 +101,37 @@ class Form:
         sections = [s for name, group in groups.items() for s in _sections(name, group.kind, group.without)]
         return {section.name: section for section in sections}
 
-    def _split(self, words: Sequence[str]) -> tuple[list[str], dict[str, list[str]]]:
-        """Words taken by their place, and the words of each flag by the name of its setting."""
-        queue, places, given = deque(words), list[str](), dict[str, list[str]]()
-        while queue:
-            word = queue.popleft()
+    def _split(self, words: Sequence[str]) -> tuple[list[str], dict[str, tuple[Declared, str]]]:
+        """Words taken by their place, and each setting that is given by a flag with its word, by name."""
+        places, given, left = list[str](), dict[str, tuple[Declared, str]](), iter(words)
+        flags = {flag_of(setting.name): setting for setting in self.settings if not setting.positional}
+        if any("." in word for word in words if _is_flag(word)):
+            flags |= {flag_of(s.name): s for section in self.sections(words).values() for s in section.settings}
+        for word in left:
             if not _is_flag(word):
                 places.append(word)
                 continue
-            flag, attached, value = word.partition("=")
-            name = self._name(flag, words)
-            given[name] = [value] if attached else self._take(name, queue)
-            if not given[name]:
-                raise D2Error(f"{flag} needs a value: `{self.command} --help` says which")
+            flag, attached, text = word.partition("=")
+            setting = flags.get(flag.replace("_", "-"))
+            if setting is None:
+                raise D2Error(f"unknown flag {flag} of {self.command}{self._hint(flag, words)}")
+            if _is_switch(setting) and not attached:
+                text = "true"
+            elif not attached:
+                text = next(left, "--none")
+                if _is_flag(text):
+                    raise D2Error(f"{flag} needs a value: `{self.command} --help` says which")
+            given[setting.name] = setting, text
         return places, given
 
-    def _take(self, name: str, queue: deque[str]) -> list[str]:
-        """The words that belong to a flag: one, but none or `true` or `false` for a switch.
-
-        A list takes all words up to the next flag where no word of the command is taken by its place.
-        """
-        setting = next((s for s in self.settings if s.name == name), None)
-        if setting is not None and bare(setting.kind) is bool:
-            return [queue.popleft()] if queue and queue[0].lower() in ("true", "false") else ["true"]
-        many = setting is not None and item_kind(setting.kind) is not None
-        many = many and not any(s.positional for s in self.settings)
-        taken: list[str] = []
-        while queue and not _is_flag(queue[0]) and (many or not taken):
-            taken.append(queue.popleft())
-        return taken
-
-    def _name(self, flag: str, words: Sequence[str]) -> str:
-        """The setting of a flag: spelled out, or cut short where that fits one flag alone."""
-        wanted = "--" + flag.lstrip("-").replace("_", "-")
-        own = {flag_of(s.name): s.name for s in self.settings if not s.positional}
-        begun = [name for known, name in own.items() if known.startswith(wanted)]
-        if wanted in own or len(begun) == 1:
-            return own.get(wanted, begun[0] if begun else "")
-        dotted = {flag_of(name): name for name in self._dotted(words)}
-        if wanted in dotted:
-            return dotted[wanted]
-        raise D2Error(f"unknown flag {flag} of {self.command}{self._hint(wanted, [*own, *dotted])}")
-
-    def _hint(self, flag: str, known: Sequence[str]) -> str:
-        whole = {name.rsplit(".", 1)[-1].lstrip("-"): name for name in known if "." in name}  # without its table
-        spelled = {name: name for name in known} | {f"--{last}": name for last, name in whole.items()}
-        near = [*difflib.get_close_matches(flag, known, n=1), *difflib.get_close_matches(flag, spelled, n=1)]
+    def _hint(self, flag: str, words: Sequence[str]) -> str:
+        """The flag that was meant, spelled out, or given without the name of its table."""
+        own = [setting.name for setting in self.settings if not setting.positional]
+        names = [*own, *(s.name for section in self.sections(words).values() for s in section.settings)]
+        spelled = {flag_of(name.rpartition(".")[2]): flag_of(name) for name in reversed(names)}
+        spelled |= {flag_of(name): flag_of(name) for name in names}
+        near = difflib.get_close_matches(flag.replace("_", "-"), spelled, n=1)
         return f"; did you mean {spelled[near[0]]}?" if near else f": `{self.command} --help` lists the flags"
-
-    def _dotted(self, words: Sequence[str]) -> dict[str, Declared]:
-        sections = self.sections(words).values()
-        return {f"{section.name}.{s.name}": s for section in sections for s in section.settings}
-
-    def _tables(self, dotted: Mapping[str, Sequence[str]], words: Sequence[str]) -> dict[str, Any]:
-        """The dotted settings, checked and nested."""
-        tables: dict[str, Any] = {}
-        known = self._dotted(words) if dotted else {}
-        for name, texts in dotted.items():
-            *path, last = name.split(".")
-            table = tables
-            for part in path:
-                table = table.setdefault(part, {})
-            table[last] = _as_toml(read(known[name], texts, flag_of(name)))
-        return tables
 
     def _read(self, setting: Declared, texts: Sequence[str]) -> Any:
         if setting.name in self.readers:
@@ -199,20 +170,22 @@ def typed_as(setting: Declared) -> str:
     return setting.name.upper() if setting.positional else flag_of(setting.name)
 
 
-def about_class(kind: type) -> str:
-    """The first line of a class's docstring; none where the class has only the one that dataclass makes."""
-    text = (kind.__doc__ or "").strip()
-    return "" if text.startswith(f"{kind.__name__}(") else text.partition("\n")[0]
-
-
 def _sections(name: str, kind: type, without: tuple[str, ...] = ()) -> Iterator[Section]:
     """The table `name` and the tables inside it."""
     settings = [setting for setting in declared(kind) if setting.name not in without]
     inner = {s.name: option for s in settings for option in (s.kind, *get_args(s.kind)) if is_dataclass(option)}
-    yield Section(name, about_class(kind), tuple(s for s in settings if s.name not in inner))
+    text = (kind.__doc__ or "").strip()
+    about = "" if text.startswith(f"{kind.__name__}(") else text.partition("\n")[0]  # not what dataclass makes
+    flags = (s._replace(name=f"{name}.{s.name}", positional=False) for s in settings if s.name not in inner)
+    yield Section(name, about, tuple(flags))
     for place, option in inner.items():
         if isinstance(option, type):
             yield from _sections(f"{name}.{place}", option)
+
+
+def _is_switch(setting: Declared) -> bool:
+    """Whether a flag stands alone: in a table, where a switch may be on by default, it takes true or false."""
+    return bare(setting.kind) is bool and "." not in setting.name
 
 
 def _is_flag(word: str) -> bool:

@@ -1,20 +1,20 @@
-"""The help of a command: each setting with unit, range, default and the evidence in its docstring."""
+"""The help of a command: each setting with its docstring, unit, range and default."""
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import textwrap
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import MISSING, replace
 
 from d2_plugin.commands.arguments.form import HELP, Form, Section, typed_as
-from d2_plugin.commands.arguments.text import bare, flag_of, item_kind, limits, placeholder, shown
+from d2_plugin.commands.arguments.text import bare, flag_of, item_kind, limits, placeholder, written
 from d2_plugin.errors import unknown_name
-from d2_plugin.settings import Declared, Range
+from d2_plugin.settings import Declared
 
 COLUMN = 30
 """Where the explanations begin."""
-
 LARGE = 1e15
 """An upper bound beyond this is the machine's and not worth reading."""
 
@@ -24,9 +24,10 @@ def help_text(form: Form, words: Sequence[str]) -> str:
     sections = form.sections(words)
     if "--help-all" in words:
         return "\n\n".join([_overview(form), *(_table(section) for section in sections.values())])
-    topic = _topic(words)
-    if topic is None or not sections:
-        return "\n\n".join([_overview(form), *([_tables(form, sections.values())] if sections else [])])
+    topics = [after for word, after in itertools.pairwise(words) if word in HELP and not after.startswith("-")]
+    if not topics or not sections:
+        return "\n\n".join([_overview(form), *([_tables(form, sections)] if sections else [])])
+    topic = topics[-1].replace("-", "_").removesuffix(".*").rstrip(".")
     chosen = [section for name, section in sections.items() if name == topic or name.startswith(f"{topic}.")]
     if not chosen:
         raise unknown_name("table of settings", topic, sections)
@@ -42,69 +43,44 @@ def entry(title: str, text: str) -> str:
 
 
 def _overview(form: Form) -> str:
-    needed = [setting for setting in form.settings if setting.default is MISSING]
-    usage = " ".join([form.command, *(_typed(setting) for setting in sorted(needed, key=lambda s: not s.positional))])
-    more = " [more flags]" if len(needed) < len(form.settings) else ""
-    parts = [f"usage: {usage}{more}", form.about.strip()]
     order = sorted(form.settings, key=lambda setting: (not setting.positional, setting.default is not MISSING))
+    needed = [_typed(setting) for setting in order if setting.default is MISSING]
+    more = ["[more flags]"] if len(needed) < len(order) else []
+    parts = [f"usage: {' '.join([form.command, *needed, *more])}", form.about.strip()]
     entries = [entry(_typed(setting), _explained(setting)) for setting in order]
     return "\n\n".join([*(part for part in parts if part), "\n".join(entries)]).rstrip()
 
 
-def _tables(form: Form, sections: Collection[Section]) -> str:
+def _tables(form: Form, sections: dict[str, Section]) -> str:
     """One line per table."""
-    titles = [entry(f"--{section.name.replace('_', '-')}.*", _counted(section)) for section in sections]
-    head = "Tables of settings; they may also stand in a --config file, and flags win:"
-    foot = (
-        f"`{form.command} --help {next(iter(sections)).name}` shows the settings of one table, "
-        f"`{form.command} --help-all` all of them."
-    )
-    return "\n".join([head, *titles, "", foot])
-
-
-def _counted(section: Section) -> str:
-    count = len(section.settings)
-    return f"{section.about} ({count} setting{'' if count == 1 else 's'})".strip()
+    lines = ["Tables of settings; they may also stand in a --config file, and flags win:"]
+    for name, section in sections.items():
+        count = len(section.settings)
+        lines.append(entry(f"{flag_of(name)}.*", f"{section.about} ({count} setting{'' if count == 1 else 's'})"))
+    foot = f"`{form.command} --help {next(iter(sections))}` shows the settings of one table"
+    return "\n".join([*lines, "", f"{foot}, `{form.command} --help-all` all of them."])
 
 
 def _table(section: Section) -> str:
-    flags = [s._replace(name=f"{section.name}.{s.name}", positional=False) for s in section.settings]
-    entries = [entry(f"{flag_of(s.name)} {placeholder(s.kind)}", _explained(s)) for s in flags]
+    entries = [entry(f"{flag_of(s.name)} {placeholder(s.kind)}", _explained(s)) for s in section.settings]
     return "\n".join([f"[{section.name}] {section.about}".rstrip(), *entries])
 
 
 def _typed(setting: Declared) -> str:
-    """A setting as it is typed."""
+    """A setting of a command as it is typed."""
     if setting.positional:
         return typed_as(setting) + (" ..." if item_kind(setting.kind) is not None else "")
     return typed_as(setting) if bare(setting.kind) is bool else f"{typed_as(setting)} {placeholder(setting.kind)}"
 
 
 def _explained(setting: Declared) -> str:
-    """The docstring, then range, unit and default."""
-    facts = [_bounds(limits(setting)), "needed" if setting.default is MISSING else _default(setting)]
-    facts_text = "; ".join(fact for fact in facts if fact)
-    return f"{setting.help} ({facts_text})".strip() if facts_text else setting.help
-
-
-def _bounds(where: Range) -> str:
+    """The docstring, then unit, range, and the default where it is a value: no word for a switch that is off."""
+    where, default = limits(setting), setting.default
     if where.high is not None and where.high > LARGE:
         where = replace(where, high=None)
-    bounds = str(where) if (where.low, where.high) != (None, None) else ""
-    return ", ".join(part for part in (where.unit, bounds) if part)
-
-
-def _default(setting: Declared) -> str:
-    """The default where it is a value: not for what is left out, and not for a switch that is off."""
-    off = setting.default is False and "." not in setting.name
-    if off or setting.default is None or setting.default in ("", ()):
-        return ""
-    return f"default {shown(setting.default)}"
-
-
-def _topic(words: Sequence[str]) -> str | None:
-    """The word behind --help."""
-    for word, following in zip(words, [*words[1:], "-"]):
-        if word in HELP and not following.startswith("-"):
-            return following.replace("-", "_").removesuffix(".*").rstrip(".")
-    return None
+    facts = [where.unit, str(where) if (where.low, where.high) != (None, None) else ""]
+    bounds = ", ".join(fact for fact in facts if fact)
+    off = default is None or default in ("", ()) or (default is False and "." not in setting.name)
+    known = "needed" if default is MISSING else "" if off else f"default {written(default)}"
+    text = "; ".join(fact for fact in (bounds, known) if fact)
+    return f"{setting.help} ({text})".strip() if text else setting.help

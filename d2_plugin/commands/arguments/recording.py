@@ -15,7 +15,7 @@ from d2_plugin.commands.arguments.form import Form, Given, Group
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import NoSuchFile, shown_path
 from d2_plugin.reading import read_toml as tables_of_toml
-from d2_plugin.settings import Declared, Settings, declared
+from d2_plugin.settings import Settings, declared
 
 if TYPE_CHECKING:
     from d2_plugin.runs.plan import ScenePlan
@@ -65,11 +65,12 @@ def recording_form(
     from d2_plugin.runs.settings import RunSettings
 
     own = declared(options)
-    of_run = {setting.name: _spelled(setting) for setting in declared(RunSettings)}
+    of_run = {setting.name: setting._replace(more=WRITTEN.get(setting.name, "")) for setting in declared(RunSettings)}
     taken = [of_run[name] for name in (*RECORDING, *more) if name not in {setting.name for setting in own}]
 
     def groups(typed: Mapping[str, str]) -> dict[str, Group]:
-        known = all_tables(_backbone(typed))
+        named = typed.get("backbone") or typed.get("backbones") or "yang4d"
+        known = all_tables(named.partition(",")[0])
         return {name: known[name] for name in tables if name != "import" or "calibration" in typed}
 
     return Form(command, about or "", (*taken, *own), run, groups, {"hooks": hook_names})
@@ -98,13 +99,13 @@ def all_tables(backbone: str) -> dict[str, Group]:
 def run_settings(given: Given, **more: Any) -> RunSettings:
     """The settings of a run that were given, with camera presets resolved and the tables of file and flags."""
     from d2_plugin.recordings.presets import resolve_cameras, split_name
-    from d2_plugin.runs.settings import RunSettings
+    from d2_plugin.runs.settings import RunSettings, layered
 
     train, test, notes = resolve_cameras(
         given.values["recording"], given.values["train_cameras"], given.values.get("test_cameras")
     )
     show_notes(notes)
-    overrides = _over(read_toml(given.values["config"]), given.tables)
+    overrides = layered(read_toml(given.values["config"]), given.tables)
     overrides.pop("import", None)  # of the recording, not of the run
     more["protocol"] = split_name(given.values["train_cameras"])
     return given.make(RunSettings, train_cameras=train, test_cameras=test, overrides=overrides, **more)
@@ -112,7 +113,9 @@ def run_settings(given: Given, **more: Any) -> RunSettings:
 
 def table_of_config(given: Given, name: str) -> dict[str, Any]:
     """One table of settings: that of the --config file with the flags over it."""
-    both = _over(read_toml(given.values["config"]), given.tables)
+    from d2_plugin.runs.settings import layered
+
+    both = layered(read_toml(given.values["config"]), given.tables)
     table = both.get(name, {})
     return table if isinstance(table, dict) else {name: table}
 
@@ -158,21 +161,3 @@ def show_notes(notes: Sequence[str]) -> None:
 def show_plan(plan: ScenePlan) -> None:
     """Each decision with its measurement."""
     show(*(f"{'use' if one.use else 'leave out':>9}  {one.name:12} {one.reason}" for one in plan.decisions))
-
-
-def _spelled(setting: Declared) -> Declared:
-    """A setting of a run as a command line takes it."""
-    return setting._replace(more=WRITTEN.get(setting.name, ""))
-
-
-def _backbone(typed: Mapping[str, str]) -> str:
-    """The backbone that a command line names; the first of several."""
-    return (typed.get("backbone") or typed.get("backbones") or "yang4d").partition(",")[0]
-
-
-def _over(below: Any, above: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested tables with others over them; neither is changed."""
-    result = dict(below) if isinstance(below, Mapping) else {}
-    for key, value in above.items():
-        result[key] = _over(result.get(key), value) if isinstance(value, Mapping) else value
-    return result

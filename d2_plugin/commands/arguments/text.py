@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import types
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Declared, Range, checked
+from d2_plugin.values import bare_and_range, options_of
 
 MOST_NUMBERS = 1_000_000
 """How many numbers a list may hold: a range of more would fill the memory."""
@@ -29,7 +29,7 @@ def read(setting: Declared, texts: Sequence[str], flag: str) -> Any:
     Raises:
         D2Error: a value of another type, or out of range.
     """
-    if optional(setting.kind) and [text.lower() for text in texts] == ["none"]:
+    if type(None) in options_of(setting.kind) and [text.lower() for text in texts] == ["none"]:
         return None
     item = item_kind(setting.kind)
     if item is None:
@@ -39,20 +39,9 @@ def read(setting: Declared, texts: Sequence[str], flag: str) -> Any:
     return checked(setting.kind, setting.range, value, flag)
 
 
-def options(kind: Any) -> list[Any]:
-    """The types of a union, or the one type, without what `Annotated` adds."""
-    inner = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
-    return [get_args(option)[0] if get_origin(option) is Annotated else option for option in inner]
-
-
 def bare(kind: Any) -> Any:
-    """The first type that is not None."""
-    return next(option for option in options(kind) if option is not type(None))
-
-
-def optional(kind: Any) -> bool:
-    """Whether None is a value."""
-    return type(None) in options(kind)
+    """The first type of a union that is not None, or the one type, without what `Annotated` adds."""
+    return next(bare_and_range(option)[0] for option in options_of(kind) if option is not type(None))
 
 
 def item_kind(kind: Any) -> Any:
@@ -79,18 +68,18 @@ def placeholder(kind: Any) -> str:
     return {int: "N", float: "X", bool: "true|false", Path: "PATH", str: "TEXT"}.get(kind, "VALUE")
 
 
-def shown(value: Any) -> str:
-    """A default as it would be typed."""
+def written(value: Any) -> str:
+    """A value as it would be typed."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, (tuple, list)):
-        return ",".join(map(shown, value))
+        return ",".join(map(written, value))
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _plain(kind: Any, text: str) -> Any:
     """The value that a word looks like; the word itself where it fits no type, which the check then refuses."""
-    kinds = options(kind)
+    kinds = [bare_and_range(option)[0] for option in options_of(kind)]
     choices = [choice for option in kinds if get_origin(option) is Literal for choice in get_args(option)]
     named = {str(choice): choice for choice in choices} | ({"true": True, "false": False} if bool in kinds else {})
     if text in named or text.lower() in named:

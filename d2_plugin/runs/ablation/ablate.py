@@ -3,123 +3,154 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import as_completed
 from dataclasses import replace
 from pathlib import Path
 
 from d2_plugin.durable import write_text
-from d2_plugin.progress import be_silent, progress_bar
-from d2_plugin.runs.ablation.presets import Preset
-from d2_plugin.runs.ablation.tables import report
-from d2_plugin.runs.rows import Row, as_line, make_row, rms_error
-from d2_plugin.runs.saved import read_metrics
+from d2_plugin.progress import progress_bar
+from d2_plugin.runs.ablation.presets import PRESETS, PUBLISHED, TABLES, Preset
+from d2_plugin.runs.rows import Row, as_line
 from d2_plugin.runs.settings import RunSettings, prior_settings
-from d2_plugin.runs.shared import Cost, Job, Metrics, give_points, share, share_points
-from d2_plugin.runs.workers import worker_pool
+from d2_plugin.runs.shared import Shared, share, share_points
+from d2_plugin.runs.tables import STUDY_COLUMNS, Table, latex, markdown
+from d2_plugin.runs.training.measured import Work, side_by_side
+from d2_plugin.runs.verdict import EXPLANATION, Estimate, seeds_in_words, verdicts_table
+
+MARK = "○"
+"""What a published figure carries in a table, where ours carry nothing."""
 
 
-def jobs(
-    base: RunSettings, presets: Sequence[Preset], backbones: Sequence[str], seeds: Sequence[int], output: Path
-) -> list[Job]:
-    """Every run, preset by preset; runs with the same variant of the prior share one under `output`/priors.
+def ablate(
+    base: RunSettings,
+    presets: Sequence[Preset],
+    backbones: Sequence[str],
+    seeds: Sequence[int],
+    output: Path,
+    workers: int,
+    command: str,
+) -> str:
+    """Train and score what is not finished, `workers` runs at a time with one thread each; returns the tables.
+
+    Priors and starting points are made once under `output`, before the runs that share them start. Writes ablation.md,
+    ablation.tex and one row per run in runs.jsonl.
 
     Args:
         base: gives recording, cameras, iterations and the user's own tables; hooks, backbone and seed are set here.
-        presets, backbones, seeds: what is run.
+        presets, backbones, seeds: what is run; runs with the same variant of the prior share one.
         output: folder of the ablation.
+        workers: processes of this machine.
+        command: how this was started, for the rows.
     """
-    output, made = output.absolute(), []
-    for backbone in backbones:
-        for preset in presets:
-            for seed in seeds:
-                settings = replace(
-                    base, backbone=backbone, hooks=preset.hooks, seed=seed, overrides=preset.merged(base.overrides)
-                )
-                settings = replace(settings, priors=str(output / "priors" / prior_settings(settings).variant))
-                guidance = None if preset.guidance is None else preset.guidance(settings.iterations)
-                folder = output / backbone / preset.name / f"seed{seed}"
-                made.append(Job(preset.name, settings, folder, guidance))
-    return made
+    output = output.absolute()
+    works = [
+        _work(base, backbone, preset, seed, output, command)
+        for backbone in backbones
+        for preset in presets
+        for seed in seeds
+    ]
+    rows: dict[tuple[str, str], Row] = {}
+    with progress_bar("ablate", len(works)) as bar:
 
+        def note(row: Row) -> None:
+            rows[row["fingerprint"], row["method"]] = row
+            bar.update(len(rows), f"{row['method']}, {row['setting']}")
 
-def run_jobs(work: Sequence[Job], workers: int, output: Path) -> dict[Job, Metrics]:
-    """Train and score what is not finished, `workers` runs at a time with one thread each; the metrics of all.
-
-    Priors and starting points are made once under `output`, before the runs that share them start.
-    """
-    results = {job: metrics for job in work if (metrics := _finished(job)) is not None}
-    missing = [job for job in work if job not in results]
-    with progress_bar("ablate", len(work)) as bar:
-        bar.update(len(results))
-        for job in missing:
-            job.run()  # takes its folder
-            points = share_points(job.settings, output.absolute())
-            if job.uses_prior:
-                share(job.settings, output.absolute())
-            give_points(points, job.folder)
-        with worker_pool(max(workers, 1), _prepare_worker) as pool:
-            started = {pool.submit(_run, job): job for job in missing}
-            for future in as_completed(started):
-                job = started[future]
-                try:
-                    results[job] = future.result()
-                except BaseException:
-                    pool.shutdown(wait=False, cancel_futures=True)  # else all other runs would still be trained
-                    raise
-                bar.update(len(results), f"{job.settings.backbone} {job.preset} seed {job.settings.seed}")
-    return {job: results[job] for job in work}
-
-
-def _finished(job: Job) -> Metrics | None:
-    """The metrics of a job that ran to its end with the same settings."""
-    path = job.folder / "metrics.json"
-    if not path.is_file():
-        return None
-    job.run()  # refuses a folder of other settings, with one sentence
-    metrics = read_metrics(job.folder)
-    return metrics if metrics["iterations"] == job.settings.iterations else None
-
-
-def _prepare_worker() -> None:
-    import torch
-
-    torch.set_num_threads(1)
-    be_silent()
-
-
-def _run(job: Job) -> Metrics:
-    run = job.run()
-    run.train()
-    return run.evaluate(images=job.settings.seed == 0)
-
-
-def write(results: Mapping[Job, Metrics], presets: Sequence[Preset], output: Path, command: str) -> str:
-    """ablation.md, ablation.tex and one row per run in runs.jsonl under `output`; returns the Markdown."""
-    text = report(results, presets)
+        side_by_side(works, workers, note)
+    ordered = [rows[work.key[0], work.method] for work in works]
+    text = report(ordered, presets)
     write_text(output / "ablation.md", text)
-    write_text(output / "ablation.tex", report(results, presets, as_latex=True))
-    rows = "".join(as_line(_row(job, metrics, command)) for job, metrics in results.items())
-    write_text(output / "runs.jsonl", rows)
+    write_text(output / "ablation.tex", report(ordered, presets, as_latex=True))
+    write_text(output / "runs.jsonl", "".join(map(as_line, ordered)))
     return text
 
 
-def _row(job: Job, metrics: Metrics, command: str) -> Row:
-    scores = metrics["test"] or {}
-    protocol, frames = job.settings.protocol, job.settings.frames
-    further = (f", {len(frames)} frames" if frames else "") + (f", {protocol}" if protocol else "")
-    return make_row(
-        "ablation",
-        f"{metrics['recording']}, {len(metrics['train_cameras'])} views{further}",
-        f"{job.settings.backbone} {job.preset}",
-        f"seed {job.settings.seed}",
-        error=rms_error(scores),
-        seconds=metrics["seconds"]["train"],
-        command=command,
-        scores=scores,
-        gaussians=metrics["gaussians"],
-        iterations=metrics["iterations"],
-        seed=job.settings.seed,
-        prior_seconds=Cost.of(Path(str(job.settings.priors))).seconds if job.uses_prior else 0.0,
-        cameras=list(metrics["train_cameras"]),
-        protocol=protocol,
+def _work(base: RunSettings, backbone: str, preset: Preset, seed: int, output: Path, command: str) -> Work:
+    """One run with all that it shares, in a folder that is its own from here on."""
+    guidance = None if preset.guidance is None else preset.guidance(base.iterations)
+    settings = replace(base, backbone=backbone, hooks=preset.hooks, seed=seed, overrides=preset.merged(base.overrides))
+    variant = prior_settings(settings).variant
+    settings = replace(settings, priors=str(output / "priors" / variant))
+    protocol, frames = settings.protocol, settings.frames
+    case = f"{Path(settings.recording).resolve().name}, {len(settings.train_cameras)} views"
+    case += (f", {len(frames)} frames" if frames else "") + (f", {protocol}" if protocol else "")
+    shared = Shared(output, variant)
+    share_points(settings, output)
+    if preset.hooks or guidance is not None:
+        share(settings, output)
+    work = Work(
+        *(settings, output / backbone / preset.name / f"seed{seed}", shared.points),
+        *(case, f"{backbone} {preset.name}", command, f"{settings.iterations} steps"),
+        {"prior_seconds": preset.seconds_of_prior(settings, shared), "protocol": protocol},
+        kind="ablation",
+        guidance=guidance,
+        kept=True,
     )
+    work.run()  # refuses a folder of other settings, with one sentence
+    return work
+
+
+def report(rows: Sequence[Row], presets: Sequence[Preset], as_latex: bool = False) -> str:
+    """All tables whose rows were run, and the paper's order of the rows, for each backbone."""
+    parts, names = [], {preset.name for preset in presets}
+    for backbone in dict.fromkeys(row["method"].partition(" ")[0] for row in rows):
+        parts.append(f"% {backbone}" if as_latex else f"## {backbone}")
+        mine = {
+            preset.name: [row for row in rows if row["method"] == f"{backbone} {preset.name}"] for preset in presets
+        }
+        complete = [title for title in PUBLISHED if set(TABLES[title]) <= names]
+        for title in complete:
+            about, published = PUBLISHED[title]
+            parts.append(table({name: mine[name] for name in TABLES[title]}, as_latex, published))
+            parts.append(f"{'% ' if as_latex else ''}{MARK} as published, not measured here ({about}).")
+        if not complete:
+            parts.append(table(mine, as_latex))
+        order = order_table(mine)
+        if order.rows and not as_latex:
+            parts += [EXPLANATION, markdown(order)]
+    return "\n\n".join(parts) + "\n"
+
+
+def table(
+    runs: Mapping[str, Sequence[Row]], as_latex: bool = False, published: Mapping[str, float] | None = None
+) -> str:
+    """One table, Markdown or LaTeX: mean ± standard error over the seeds of each preset; what was not measured shows as
+    `-`.
+
+    `published` holds the paper's PSNR by preset: it stands in a column of its own, labelled as the paper's.
+    """
+    scores = {name: [_scores(row) for row in mine] for name, mine in runs.items()}
+    measured = {key for mine in scores.values() for score in mine for key, value in score.items() if value is not None}
+    columns = [column for column in STUDY_COLUMNS if column.always or column.key in measured]
+    header = ["variant", "seeds", *(column.title for column in columns), "Gaussians", "train s"]
+    lines = []
+    for name, mine in runs.items():
+        shown = [([score.get(column.key) for score in scores[name]], column.form) for column in columns]
+        shown += [([row.get("gaussians") for row in mine], ".0f"), ([row["seconds"] for row in mine], ".1f")]
+        lines.append([_title(name), seeds_in_words(len(mine)), *(_cell(*values, as_latex) for values in shown)])
+        if published:
+            lines[-1].append(f"{published[name]:.2f}" if name in published else "-")
+    header += [f"{MARK} paper's PSNR"] if published else []
+    made = Table(tuple(header), tuple(map(tuple, lines)))
+    return latex(made) if as_latex else markdown(made)
+
+
+def order_table(runs: Mapping[str, Sequence[Row]]) -> Table:
+    """Whether the full method is better than each other preset that was run, metric by metric."""
+    scores = {_title(name): [_scores(row) for row in mine if row.get("scores")] for name, mine in runs.items()}
+    full = PRESETS["full"].title
+    return verdicts_table(scores, full, [name for name in scores if name != full], f"{full} is better than")
+
+
+def _scores(row: Row) -> dict[str, float | None]:
+    return row.get("scores") or {}
+
+
+def _title(name: str) -> str:
+    return PRESETS[name].title if name in PRESETS else name
+
+
+def _cell(values: Sequence[float | None], form: str, as_latex: bool) -> str:
+    estimate = Estimate.of(values)
+    if estimate is None:
+        return "-"
+    return "$" + estimate.text(form, r"\pm") + "$" if as_latex else estimate.text(form)

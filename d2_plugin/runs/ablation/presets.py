@@ -8,7 +8,8 @@ from typing import Any
 
 from d2_plugin.errors import unknown_name
 from d2_plugin.runs.scene import Guidance
-from d2_plugin.runs.settings import HOOK_NAMES, RunSettings
+from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, layered
+from d2_plugin.runs.shared import Shared
 
 
 @dataclass(frozen=True)
@@ -26,19 +27,15 @@ class Preset:
     prior_seconds: Callable[[RunSettings, float | None], float | None] = lambda settings, full: full
     """CPU seconds of what it needs of a prior that took so long; for presets with guidance."""
 
+    def seconds_of_prior(self, settings: RunSettings, shared: Shared) -> float | None:
+        """CPU seconds of what a run of this preset needs beforehand, of all that was shared."""
+        if self.guidance is not None:
+            return self.prior_seconds(settings, shared.seconds)
+        return shared.seconds if self.hooks else 0.0
+
     def merged(self, tables: Mapping[str, Any]) -> dict[str, Any]:
         """The user's `tables` with this preset's settings over them; neither is changed."""
-        merged = {name: dict(table) for name, table in tables.items()}
-        for name, table in self.overrides.items():
-            merged[name] = _over(merged.get(name, {}), table)
-        return merged
-
-
-def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    result = dict(below)
-    for key, value in above.items():
-        result[key] = _over(result.get(key, {}), value) if isinstance(value, Mapping) else value
-    return result
+        return layered(tables, self.overrides)
 
 
 def _without(hook: str) -> tuple[str, ...]:

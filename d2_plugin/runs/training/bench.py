@@ -13,6 +13,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -23,7 +24,7 @@ from d2_plugin.recordings.presets import resolve_cameras, split_name
 from d2_plugin.runs.ablation.presets import PRESETS, TABLES, Preset, rows_named
 from d2_plugin.runs.rows import TRY, Row, append_rows, command_line, read_rows
 from d2_plugin.runs.settings import RunSettings
-from d2_plugin.runs.shared import Job, Shared, share, share_points
+from d2_plugin.runs.shared import Shared, share, share_points
 from d2_plugin.runs.training.measured import Line, Work, follow, workers
 from d2_plugin.settings import AtATime, AtLeastOne, Count, Positional, Positive, Range, Seed, Settings
 
@@ -96,7 +97,7 @@ def run(
     path = settings.output / "training.jsonl"
     known = read_rows([path]) if path.is_file() else []
     chosen = rows_named(settings.methods, presets, tables)
-    command = command_line(name, settings, **_joined(settings))
+    command = command_line(name, settings)
     lines = [line for text in settings.recordings for line in _lines(settings, text, chosen, known, command)]
     with progress_bar(name, len(lines) * len(settings.seeds) * len(_targets(settings))) as bar:
         done: list[Row] = []
@@ -171,17 +172,17 @@ def _lines(
         used = replace(case.settings, overrides=preset.merged(case.settings.overrides))
         needed = preset.hooks or preset.guidance is not None
         shared = share(used, folder, cluster) if needed else Shared(folder, "none")
-        yield _line(_Template(settings, case, shared, preset, command), known)
+        yield line_of(Method(settings, case, shared, preset, command), known)
 
 
-def _line(template: _Template, known: Sequence[Row]) -> Line:
+def line_of(method: Method, known: Sequence[Row]) -> Line:
     """All targets of one method: the length of a run is tried with the first seed, then the other seeds follow."""
-    settings, case = template.settings, template.case
+    settings, case = method.settings, method.case
     by_run = {(row["fingerprint"], row["target"]): row for row in known if row["kind"] == "quality"}
     tried: list[Timed] = [
         (row["iterations"], row["seconds"])
         for row in by_run.values()
-        if _same(row, case) and row["method"] == template.method and row["seconds"]
+        if _same(row, case) and row["method"] == method.name and row["seconds"]
     ]
 
     def missing(works: Sequence[Work]) -> list[Work]:
@@ -190,19 +191,19 @@ def _line(template: _Template, known: Sequence[Row]) -> Line:
     for kind, size in _targets(settings):
         target, steps = (f"{size:g} s", 0) if kind == "seconds" else (f"{size:g} steps", round(size))
         if not steps:
-            steps = _settled(by_run, template, target) or 0
+            steps = _settled(by_run, method, target) or 0
             for _ in range(TRIES if not steps else 0):
                 length = next_steps(size, tried)
                 if any(length == n for n, _ in tried):
                     break
-                rows = yield missing([template.work(length, settings.seeds[0], TRY)])
+                rows = yield missing([method.work(length, settings.seeds[0], TRY)])
                 if any(row["failed"] for row in rows):
                     return
                 tried += [(row["iterations"], row["seconds"]) for row in rows]
                 if tried and fits(size, tried[-1]):
                     break
             steps = steps or nearest(size, tried)
-        rows = yield missing([template.work(steps, seed, target) for seed in settings.seeds])
+        rows = yield missing([method.work(steps, seed, target) for seed in settings.seeds])
         if rows and all(row["failed"] for row in rows):
             return
         tried += [(row["iterations"], row["seconds"]) for row in rows if row["seconds"]]
@@ -237,10 +238,10 @@ def nearest(target: float, tried: Sequence[Timed]) -> int:
     return min(tried, key=lambda timed: abs(math.log(max(timed[1], 1e-3) / target)))[0]
 
 
-def _settled(by_run: dict[tuple[str, str], Row], template: _Template, target: str) -> int | None:
+def _settled(by_run: dict[tuple[str, str], Row], method: Method, target: str) -> int | None:
     """The number of steps that an earlier call chose for this time."""
-    mine = template.method, target
-    same = (row for row in by_run.values() if _same(row, template.case) and (row["method"], row["target"]) == mine)
+    mine = method.name, target
+    same = (row for row in by_run.values() if _same(row, method.case) and (row["method"], row["target"]) == mine)
     return next((row["iterations"] for row in same), None)
 
 
@@ -248,13 +249,26 @@ def _same(row: Row, case: Case) -> bool:
     return row["case"] == case.name and row["cameras"] == list(case.settings.train_cameras)
 
 
-class _Template:
-    """Makes the runs of one method on one case."""
+@dataclass(frozen=True)
+class Method:
+    """One method on one case, which makes its runs."""
 
-    def __init__(self, settings: TrainingBench, case: Case, shared: Shared, preset: Preset, command: str) -> None:
-        self.settings, self.case, self.shared, self.preset, self.command = settings, case, shared, preset, command
-        self.method = f"{settings.backbone} {preset.name}" + (f", {settings.label}" if settings.label else "")
-        self.prior_seconds = _prior_seconds(preset, case, shared)
+    settings: TrainingBench
+    case: Case
+    shared: Shared
+    preset: Preset
+    command: str
+
+    @property
+    def name(self) -> str:
+        """As rows have it."""
+        name = f"{self.settings.backbone} {self.preset.name}"
+        return f"{name}, {self.settings.label}" if self.settings.label else name
+
+    @cached_property
+    def prior_seconds(self) -> float | None:
+        """CPU seconds of what its runs need of the prior."""
+        return self.preset.seconds_of_prior(self.case.settings, self.shared)
 
     def work(self, steps: int, seed: int, target: str) -> Work:
         """One run of so many steps."""
@@ -263,27 +277,9 @@ class _Template:
         guidance = None if preset.guidance is None else preset.guidance(steps)
         if run.hooks or guidance is not None:
             run = replace(run, priors=str(shared.priors))
-        name = preset.name + (f"_{self.settings.label}".replace(" ", "_") if self.settings.label else "")
-        folder = shared.folder / "runs" / self.settings.backbone / name / f"{steps}steps" / f"seed{seed}"
-        job = Job(preset.name, run, folder, guidance)
+        label = f"_{self.settings.label}".replace(" ", "_") if self.settings.label else ""
+        folder = shared.folder / "runs" / base.backbone / f"{preset.name}{label}" / f"{steps}steps" / f"seed{seed}"
         about = {"prior_seconds": self.prior_seconds, "protocol": base.protocol}
-        return Work(job, shared.points, self.case.name, self.method, self.command, target, about)
-
-
-def _prior_seconds(preset: Preset, case: Case, shared: Shared) -> float | None:
-    """CPU seconds of what a method needs beforehand; wall seconds where a cluster built it."""
-    cost = shared.cost
-    built = cost.seconds if cost.cpu_seconds is None else cost.cpu_seconds
-    if preset.guidance is not None:
-        return preset.prior_seconds(case.settings, built)
-    return built if preset.hooks else 0.0
-
-
-def _joined(settings: TrainingBench) -> dict[str, str]:
-    """The values of a flag, joined by commas, where recordings stand apart."""
-    many = {name: getattr(settings, name) or () for name in ("methods", "seconds", "steps", "seeds", "frames")}
-    return {name: ",".join(_plain(value) for value in values) for name, values in many.items()}
-
-
-def _plain(value: float | str) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
+        return Work(
+            *(run, folder, shared.points, self.case.name, self.name, self.command, target, about), guidance=guidance
+        )

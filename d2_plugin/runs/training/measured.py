@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import shutil
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,17 +12,20 @@ from typing import Any
 
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.rows import Row, make_row, rms_error
+from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import read_metrics
-from d2_plugin.runs.shared import Job, give_points
+from d2_plugin.runs.scene import Guidance
+from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.workers import worker_pool
 from d2_plugin.store.files import hash_of
 
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """A run, and what its row says beside the scores; travels to a worker."""
+    """A run of a comparison, and what its row says beside the scores; travels to a worker."""
 
-    job: Job
+    settings: RunSettings
+    folder: Path
     points: Path
     """The starting points that the runs of the case share."""
     case: str
@@ -33,18 +37,26 @@ class Work:
     """Further fields of the row."""
     kind: str = "quality"
     """Of the row."""
+    guidance: Guidance | None = None
+    """What guides the run in place of D2's hooks."""
+    kept: bool = False
+    """Whether the checkpoint stays once the run is scored, and the first seed gets images."""
 
     @property
     def key(self) -> tuple[str, str]:
         """What makes two of them the same measurement, on whatever machine its files lie."""
-        return fingerprint(self.job), self.target
+        return fingerprint(self), self.target
+
+    def run(self) -> Run:
+        """The run in its folder; refuses a folder of other settings, with one sentence."""
+        return Run(self.settings, self.folder, self.guidance)
 
 
-def fingerprint(job: Job) -> str:
+def fingerprint(work: Work) -> str:
     """Hash of everything that decides a run, without folders."""
-    table = job.settings.as_table()
+    table = work.settings.as_table()
     table |= {name: Path(table[name]).name for name in ("recording", "priors", "mono_onnx") if table.get(name)}
-    return hash_of(table, None if job.guidance is None else dict(job.guidance.identity()))
+    return hash_of(table, None if work.guidance is None else dict(work.guidance.identity()))
 
 
 def measure(work: Work) -> Row:
@@ -56,51 +68,50 @@ def measure(work: Work) -> Row:
     torch.set_num_threads(1)
     be_silent()
     try:
-        return row_of(work, _metrics(work))
+        return _row(work, _metrics(work))
     except D2Error as error:
-        return _row(work, error=None, seconds=None, failed=str(error))
+        return _row(work, None, str(error))
 
 
 def _metrics(work: Work) -> dict[str, Any]:
-    """The metrics of the run, which is continued where it was cut off; its checkpoint goes once it is scored."""
-    job, done = work.job, work.job.folder / "metrics.json"
-    run = job.run()
-    if done.is_file() and not (job.folder / "checkpoint.pt").is_file():
-        return read_metrics(job.folder)
-    give_points(work.points, job.folder)
+    """The metrics of the run, which is continued where it was cut off."""
+    run, checkpoint = work.run(), work.folder / "checkpoint.pt"
+    if (work.folder / "metrics.json").is_file() and (work.kept or not checkpoint.is_file()):
+        return read_metrics(work.folder)
+    if not (work.folder / "points.npz").is_file():
+        shutil.copyfile(work.points, work.folder / "points.npz")
     run.train()
-    metrics = run.evaluate(images=False)
-    (job.folder / "checkpoint.pt").unlink()
+    metrics = run.evaluate(images=work.kept and work.settings.seed == 0)
+    if not work.kept:
+        checkpoint.unlink()
     return metrics
 
 
-def row_of(work: Work, metrics: Mapping[str, Any]) -> Row:
-    """A finished run as a row; trials that decided what of the prior is used count as time of the prior."""
-    scores = metrics["test"] or {}
-    error = rms_error(scores)
-    row = _row(
-        work,
-        error=error,
-        seconds=metrics["cpu_seconds"]["train"],
-        failed=None if error is not None else "no camera was held out",
-        wall_seconds=metrics["seconds"]["train"],
-        scores=scores,
-        gaussians=metrics["gaussians"],
-        background=metrics["background"],
-        mono_emulated=metrics["mono_emulated"],
-    )
-    if metrics.get("trials") and row["prior_seconds"] is not None:
-        row["prior_seconds"] += metrics["trials"]["cpu_seconds"]
-    return row
-
-
-def _row(work: Work, **measured: Any) -> Row:
-    settings = work.job.settings
+def _row(work: Work, metrics: Mapping[str, Any] | None, failed: str | None = None) -> Row:
+    """A run as a row; trials that decided what of the prior is used count as time of the prior."""
+    settings, error, measured = work.settings, None, dict[str, Any]()
     about: dict[str, Any] = {"target": work.target, "iterations": settings.iterations, "seed": settings.seed}
-    about |= {"cameras": list(settings.train_cameras), **work.about}
-    setting = f"{settings.iterations} steps, seed {settings.seed}"
-    about["fingerprint"] = fingerprint(work.job)
-    return make_row(work.kind, work.case, work.method, setting, command=work.command, **measured, **about)
+    about |= {"cameras": list(settings.train_cameras), **work.about, "fingerprint": fingerprint(work)}
+    if metrics is not None:
+        scores = metrics["test"] or {}
+        error = rms_error(scores)
+        failed = None if error is not None else "no camera was held out"
+        measured = {name: metrics[name] for name in ("gaussians", "background", "mono_emulated")}
+        measured |= {"scores": scores, "wall_seconds": metrics["seconds"]["train"]}
+        if metrics.get("trials") and about.get("prior_seconds") is not None:
+            about["prior_seconds"] += metrics["trials"]["cpu_seconds"]
+    return make_row(
+        work.kind,
+        work.case,
+        work.method,
+        f"{settings.iterations} steps, seed {settings.seed}",
+        error=error,
+        seconds=None if metrics is None else metrics["cpu_seconds"]["train"],
+        failed=failed,
+        command=work.command,
+        **measured,
+        **about,
+    )
 
 
 Submit = Callable[[Work], Any]
@@ -119,13 +130,6 @@ def follow(lines: Sequence[Line], submit: Submit, on_row: Callable[[Row], None])
     owner: dict[Any, tuple[Line, int]] = {}
     open_work: dict[Line, list[Row | None]] = {}
 
-    def start(line: Line, batch: Sequence[Work]) -> None:
-        open_work[line] = [None] * len(batch)
-        for place, work in enumerate(batch):
-            future = submit(work)
-            owner[future] = (line, place)
-            future.add_done_callback(finished.put)
-
     def resume(line: Line, rows: Sequence[Row] | None) -> None:
         try:
             batch: Sequence[Work] = next(line) if rows is None else line.send(rows)
@@ -133,7 +137,11 @@ def follow(lines: Sequence[Line], submit: Submit, on_row: Callable[[Row], None])
                 batch = line.send([])
         except StopIteration:
             return
-        start(line, batch)
+        open_work[line] = [None] * len(batch)
+        for place, work in enumerate(batch):
+            future = submit(work)
+            owner[future] = (line, place)
+            future.add_done_callback(finished.put)
 
     for line in lines:
         resume(line, None)
@@ -143,8 +151,19 @@ def follow(lines: Sequence[Line], submit: Submit, on_row: Callable[[Row], None])
         row: Row = future.result()
         on_row(row)
         open_work[line][place] = row
-        if all(row_of_work is not None for row_of_work in open_work[line]):
-            resume(line, [row_of_work for row_of_work in open_work[line] if row_of_work is not None])
+        rows = [known for known in open_work[line] if known is not None]
+        if len(rows) == len(open_work[line]):
+            resume(line, rows)
+
+
+def side_by_side(works: Sequence[Work], jobs: int, on_row: Callable[[Row], None]) -> None:
+    """Measure all of them, `jobs` at a time on this machine."""
+
+    def line() -> Line:
+        yield works
+
+    with workers(jobs, None) as submit:
+        follow([line()], submit, on_row)
 
 
 @contextmanager
