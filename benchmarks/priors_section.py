@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from d2_plugin.priors.declared_error import DECLARED, label_name
-from d2_plugin.runs.report.page import Section, cases_of, sources_of
+from d2_plugin.runs.report.page import Section, sources_of
 from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure
 from d2_plugin.runs.rows import Row
 from d2_plugin.runs.tables import Table
@@ -20,7 +20,8 @@ def priors(rows: Sequence[Row]) -> Section:
     """Declared against true error: one diagram per recording, one line per label, on the same axes."""
     curves = [row for row in rows if row.get("curve")]
     ends = _ends(value for row in curves for point in row["curve"] for value in point[:2])
-    plots = [_diagram(case, mine, ends) for case, mine in cases_of(curves).items()]
+    cases = dict.fromkeys(row["case"] for row in curves)
+    plots = [_diagram(case, [row for row in curves if row["case"] == case], ends) for case in cases]
     emulated = any(row.get("mono_emulated") for row in rows)
     tables = [("Errors within the declared sigma", _calibration_table(rows)), ("Far pixels", _far_table(rows))]
     return Section(

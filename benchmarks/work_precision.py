@@ -112,8 +112,7 @@ def _point(mark: Drawn, unit: float, on_front: bool, error_label: str, seconds_l
     measured = f"{error_label} {shown(mark.error)}, {seconds_label} {shown(mark.seconds * unit)}"
     note = f"{mean.method}, {mean.setting}: {measured}"
     note += f"; failed on {mean.failures} of {mean.cases}" if mean.failures else ""
-    label = mean.setting if on_front and mean.setting != "default" else ""
-    return Point(mark.seconds * unit, max(mark.error, SMALLEST), note, label, faded=not on_front)
+    return Point(mark.seconds * unit, max(mark.error, SMALLEST), note, faded=not on_front)
 
 
 def shown(value: float | None) -> str:

@@ -15,7 +15,7 @@ import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -24,6 +24,9 @@ from d2_plugin.durable import append
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import field, json_text, opened, parse_json, read_text
 from d2_plugin.settings import Settings, declared
+
+if TYPE_CHECKING:
+    from d2_plugin.runs.settings import RunSettings
 
 Row = dict[str, Any]
 
@@ -78,6 +81,14 @@ def rms_error(scores: Mapping[str, float | None]) -> float | None:
     """The root mean square error of colour, 0..1, that a PSNR stands for: 10^(-PSNR / 20)."""
     psnr = scores.get("psnr")
     return None if psnr is None else 10 ** (-psnr / 20)
+
+
+def case_name(recording: str, settings: RunSettings) -> str:
+    """The recording, how many cameras trained, what of it was used where that is not all, and the protocol."""
+    parts = [recording, f"{len(settings.train_cameras)} views"]
+    parts += [f"1/{settings.downscale} size"] if settings.downscale > 1 else []
+    parts += [f"1/{settings.hold_out_instants} of the instants"] if settings.hold_out_instants > 1 else []
+    return ", ".join([*parts, *([settings.protocol] if settings.protocol else [])])
 
 
 def named_by_cameras(rows: Sequence[Row]) -> list[Row]:
@@ -198,12 +209,6 @@ def circumstances(device: torch.device | str = "cpu") -> dict[str, str | int | N
         "commit": commit(),
         "torch": torch.__version__,
     }
-
-
-def provenance(row: Mapping[str, Any]) -> str:
-    """One sentence for a caption, from a row that has what `circumstances` gives and the `command`."""
-    where = f"{row['device']}, {row['threads']} threads, torch {row['torch']}"
-    return f"{where}, commit {row['commit'] or row['version']}, `{row['command']}`."
 
 
 def cpu_name() -> str:

@@ -1,13 +1,10 @@
-"""Tables of texts as Markdown or LaTeX, and those of metrics: the one place that knows how either is written."""
+"""Tables of texts as Markdown, and those of metrics."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
-
-_LATEX = {"²": "$^2$", "○": r"$\circ$", "µ": r"$\mu$"}
-"""Signs of our tables that LaTeX writes otherwise."""
 
 
 class Table(NamedTuple):
@@ -28,19 +25,6 @@ def markdown(table: Table, padded: bool = False) -> str:
         widths = [max(len(line[column]) for line in lines) for column in range(len(table.header))]
         lines = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def latex(table: Table) -> str:
-    """The table in the form of the paper's (booktabs): the first column to the left, the others centred.
-
-    Its cells are LaTeX already; signs that LaTeX lacks are replaced here.
-    """
-    head, *body = (" & ".join(line) + r" \\" for line in (table.header, *table.rows))
-    begin = rf"\begin{{tabular}}{{l{'c' * (len(table.header) - 1)}}}"
-    text = "\n".join([begin, r"\toprule", head, r"\midrule", *body, r"\bottomrule", r"\end{tabular}"])
-    for sign, written in _LATEX.items():
-        text = text.replace(sign, written)
-    return text
 
 
 def _markdown_cell(cell: str, best: bool) -> str:

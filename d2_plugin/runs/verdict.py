@@ -41,9 +41,9 @@ class Estimate:
         error = math.sqrt(variance(known) / len(known)) if len(known) > 1 else None
         return cls(mean(known), error, len(known))
 
-    def text(self, form: str, sign: str = "±") -> str:
+    def text(self, form: str) -> str:
         """Such as `28.94 ± 0.17`, or the mean alone where there is no error."""
-        error = "" if self.error is None else f" {sign} {format(self.error, form)}"
+        error = "" if self.error is None else f" ± {format(self.error, form)}"
         return f"{format(self.mean, form)}{error}"
 
 

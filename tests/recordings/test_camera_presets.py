@@ -144,9 +144,9 @@ def test_results_carry_the_protocols_name(tmp_path: Path) -> None:
     command = ["train", str(path), "--train-cameras", "protocol:4c4d", "--test-cameras", "cam00", "--hooks", "none"]
     assert main([*command, "--iterations", "1", "--output", str(tmp_path / "run")]) == 0
     assert '"protocol": "protocol:4c4d"' in (tmp_path / "run" / "metrics.json").read_text()
-    from d2_plugin.runs.report.run_folders import training_rows
+    from d2_plugin.runs.report.run_folders import training_row
 
-    (row,) = training_rows([tmp_path / "run"])
+    row = training_row(tmp_path / "run")
     assert row["protocol"] == "protocol:4c4d"
     assert row["case"] == "sear_steak, 4 views, protocol:4c4d"
     assert np.isfinite(row["scores"]["psnr"])

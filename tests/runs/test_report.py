@@ -17,10 +17,11 @@ from d2_plugin.recordings.images import write_png
 from d2_plugin.runs.report.page import Image
 from d2_plugin.runs.report.quality import groups_of, scores_table
 from d2_plugin.runs.report.report import BUILDERS, ReportSettings, collect, make_report, run
-from d2_plugin.runs.report.run_folders import training_rows
+from d2_plugin.runs.report.run_folders import training_row
 from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure, number
 from d2_plugin.runs.rows import Row, append_rows, begin_rows, make_row, named_by_cameras, read_rows
 from d2_plugin.runs.saved import METRICS, RUN
+from d2_plugin.runs.settings import RunSettings
 
 RUNS = Path(__file__).parents[1] / "data" / "runs.jsonl"
 
@@ -54,7 +55,9 @@ def write_run(folder: Path, psnr: float | None = 25.0, **more: object) -> Path:
         **more,
     }
     write_table(folder / "metrics.json", metrics, METRICS)
-    write_table(folder / "run.json", {"seed": 7}, RUN)
+    hooks = tuple(metrics["hooks"])
+    settings = RunSettings("/data/den", ("a", "b"), iterations=500, hooks=hooks, seed=7)
+    write_table(folder / "run.json", settings.as_table(), RUN)
     return folder
 
 
@@ -227,14 +230,14 @@ def test_other_cameras_of_one_recording_are_another_case() -> None:
 
 
 def test_a_run_folder_becomes_a_row_with_the_priors_time_beside(tmp_path: Path) -> None:
-    (row,) = training_rows([write_run(tmp_path / "run")])
+    row = training_row(write_run(tmp_path / "run"))
     assert (row["case"], row["method"], row["setting"]) == ("den, 2 views", "yang4d + D2", "500 steps, seed 7")
     assert (row["seconds"], row["prior_seconds"], row["gaussians"]) == (30.0, 60.0, 1234)
     assert row["error"] == pytest.approx(10 ** (-25 / 20))
     assert (row["device"], row["commit"]) == ("a CPU", "abc")
-    (row,) = training_rows([write_run(tmp_path / "all", psnr=None, hooks=["prior", "densify"])])
+    row = training_row(write_run(tmp_path / "all", psnr=None, hooks=["prior", "densify"]))
     assert (row["method"], row["error"], row["failed"]) == ("yang4d + densify", None, "no camera was held out")
-    command = "d2 train den --train-cameras a,b --backbone yang4d --iterations 500 --hooks prior,densify --seed 7"
+    command = "d2 train den --train-cameras a,b --iterations 500 --hooks prior,densify --seed 7"
     assert row["command"] == f"{command} --output all"
 
 
@@ -268,7 +271,7 @@ def test_ticks_are_round_and_numbers_short() -> None:
 
 
 def test_marks_lie_inside_the_image_and_carry_their_numbers() -> None:
-    points = (Point(1.0, 2.0, "the first"), Point(3.0, 4.0, "the <second>", "label"))
+    points = (Point(1.0, 2.0, "the first"), Point(3.0, 4.0, "the <second>"))
     series = Series("one", points, ((1.0, 2.0), (3.0, 4.0)))
     limit = Series("limit", (), ((1.0, 2.0), (3.0, 2.0)), color=1, hollow=True)
     plot = Plot("title", Axis.around("x", [1, 3]), Axis.around("y", [2, 4]), (series, limit))

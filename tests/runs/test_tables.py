@@ -12,7 +12,7 @@ from torch import Tensor
 from d2_plugin.recordings.selection import select_cameras
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.evaluation import evaluate
-from d2_plugin.runs.tables import Table, latex, markdown, metrics_table, view_tables
+from d2_plugin.runs.tables import Table, markdown, metrics_table, view_tables
 
 NAMES = ["test0", "test1"]
 
@@ -80,16 +80,3 @@ def test_padded_columns_line_up() -> None:
     lines = markdown(TABLE, padded=True).splitlines()
     assert len({len(line) for line in lines}) == 1
     assert [cell.strip() for cell in lines[3].strip("|").split("|")] == ["c", "3"]
-
-
-def test_latex_is_a_booktabs_table() -> None:
-    assert latex(Table(("method", "D²"), (("a", "1"), ("b", "2")))).splitlines() == [
-        r"\begin{tabular}{lc}",
-        r"\toprule",
-        r"method & D$^2$ \\",
-        r"\midrule",
-        r"a & 1 \\",
-        r"b & 2 \\",
-        r"\bottomrule",
-        r"\end{tabular}",
-    ]

@@ -9,10 +9,10 @@ from pathlib import Path
 from d2_plugin.durable import write_text
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.ablation.presets import PRESETS, PUBLISHED, TABLES, Preset
-from d2_plugin.runs.rows import Row, as_line
+from d2_plugin.runs.rows import Row, as_line, case_name
 from d2_plugin.runs.settings import RunSettings, prior_settings
 from d2_plugin.runs.shared import Shared, share, share_points
-from d2_plugin.runs.tables import STUDY_COLUMNS, Table, latex, markdown
+from d2_plugin.runs.tables import STUDY_COLUMNS, Table, markdown
 from d2_plugin.runs.training.measured import Work, side_by_side
 from d2_plugin.runs.verdict import EXPLANATION, Estimate, seeds_in_words, verdicts_table
 
@@ -31,8 +31,8 @@ def ablate(
 ) -> str:
     """Train and score what is not finished, `workers` runs at a time with one thread each; returns the tables.
 
-    Priors and starting points are made once under `output`, before the runs that share them start. Writes ablation.md,
-    ablation.tex and one row per run in runs.jsonl.
+    Priors and starting points are made once under `output`, before the runs that share them start. Writes ablation.md
+    and one row per run in runs.jsonl.
 
     Args:
         base: gives recording, cameras, iterations and the user's own tables; hooks, backbone and seed are set here.
@@ -59,7 +59,6 @@ def ablate(
     ordered = [rows[work.key[0], work.method] for work in works]
     text = report(ordered, presets)
     write_text(output / "ablation.md", text)
-    write_text(output / "ablation.tex", report(ordered, presets, as_latex=True))
     write_text(output / "runs.jsonl", "".join(map(as_line, ordered)))
     return text
 
@@ -70,9 +69,8 @@ def _work(base: RunSettings, backbone: str, preset: Preset, seed: int, output: P
     settings = replace(base, backbone=backbone, hooks=preset.hooks, seed=seed, overrides=preset.merged(base.overrides))
     variant = prior_settings(settings).variant
     settings = replace(settings, priors=str(output / "priors" / variant))
-    protocol, frames = settings.protocol, settings.frames
-    case = f"{Path(settings.recording).resolve().name}, {len(settings.train_cameras)} views"
-    case += (f", {len(frames)} frames" if frames else "") + (f", {protocol}" if protocol else "")
+    case = case_name(Path(settings.recording).resolve().name, settings)
+    case += f", {len(settings.frames)} frames" if settings.frames else ""
     shared = Shared(output, variant)
     share_points(settings, output)
     if preset.hooks or guidance is not None:
@@ -80,7 +78,7 @@ def _work(base: RunSettings, backbone: str, preset: Preset, seed: int, output: P
     work = Work(
         *(settings, output / backbone / preset.name / f"seed{seed}", shared.points),
         *(case, f"{backbone} {preset.name}", command, f"{settings.iterations} steps"),
-        {"prior_seconds": preset.seconds_of_prior(settings, shared), "protocol": protocol},
+        {"prior_seconds": preset.seconds_of_prior(settings, shared), "protocol": settings.protocol},
         kind="ablation",
         guidance=guidance,
         kept=True,
@@ -89,32 +87,29 @@ def _work(base: RunSettings, backbone: str, preset: Preset, seed: int, output: P
     return work
 
 
-def report(rows: Sequence[Row], presets: Sequence[Preset], as_latex: bool = False) -> str:
+def report(rows: Sequence[Row], presets: Sequence[Preset]) -> str:
     """All tables whose rows were run, and the paper's order of the rows, for each backbone."""
     parts, names = [], {preset.name for preset in presets}
     for backbone in dict.fromkeys(row["method"].partition(" ")[0] for row in rows):
-        parts.append(f"% {backbone}" if as_latex else f"## {backbone}")
+        parts.append(f"## {backbone}")
         mine = {
             preset.name: [row for row in rows if row["method"] == f"{backbone} {preset.name}"] for preset in presets
         }
         complete = [title for title in PUBLISHED if set(TABLES[title]) <= names]
         for title in complete:
             about, published = PUBLISHED[title]
-            parts.append(table({name: mine[name] for name in TABLES[title]}, as_latex, published))
-            parts.append(f"{'% ' if as_latex else ''}{MARK} as published, not measured here ({about}).")
+            parts.append(table({name: mine[name] for name in TABLES[title]}, published))
+            parts.append(f"{MARK} as published, not measured here ({about}).")
         if not complete:
-            parts.append(table(mine, as_latex))
+            parts.append(table(mine))
         order = order_table(mine)
-        if order.rows and not as_latex:
+        if order.rows:
             parts += [EXPLANATION, markdown(order)]
     return "\n\n".join(parts) + "\n"
 
 
-def table(
-    runs: Mapping[str, Sequence[Row]], as_latex: bool = False, published: Mapping[str, float] | None = None
-) -> str:
-    """One table, Markdown or LaTeX: mean ± standard error over the seeds of each preset; what was not measured shows as
-    `-`.
+def table(runs: Mapping[str, Sequence[Row]], published: Mapping[str, float] | None = None) -> str:
+    """One Markdown table: mean ± standard error over the seeds of each preset; what was not measured shows as `-`.
 
     `published` holds the paper's PSNR by preset: it stands in a column of its own, labelled as the paper's.
     """
@@ -126,12 +121,11 @@ def table(
     for name, mine in runs.items():
         shown = [([score.get(column.key) for score in scores[name]], column.form) for column in columns]
         shown += [([row.get("gaussians") for row in mine], ".0f"), ([row["seconds"] for row in mine], ".1f")]
-        lines.append([_title(name), seeds_in_words(len(mine)), *(_cell(*values, as_latex) for values in shown)])
+        lines.append([_title(name), seeds_in_words(len(mine)), *(_cell(*values) for values in shown)])
         if published:
             lines[-1].append(f"{published[name]:.2f}" if name in published else "-")
     header += [f"{MARK} paper's PSNR"] if published else []
-    made = Table(tuple(header), tuple(map(tuple, lines)))
-    return latex(made) if as_latex else markdown(made)
+    return markdown(Table(tuple(header), tuple(map(tuple, lines))))
 
 
 def order_table(runs: Mapping[str, Sequence[Row]]) -> Table:
@@ -149,8 +143,6 @@ def _title(name: str) -> str:
     return PRESETS[name].title if name in PRESETS else name
 
 
-def _cell(values: Sequence[float | None], form: str, as_latex: bool) -> str:
+def _cell(values: Sequence[float | None], form: str) -> str:
     estimate = Estimate.of(values)
-    if estimate is None:
-        return "-"
-    return "$" + estimate.text(form, r"\pm") + "$" if as_latex else estimate.text(form)
+    return "-" if estimate is None else estimate.text(form)

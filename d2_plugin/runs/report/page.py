@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -9,7 +10,7 @@ from typing import NamedTuple
 
 from d2_plugin.runs import tables
 from d2_plugin.runs.report.svg import style
-from d2_plugin.runs.rows import Row, provenance
+from d2_plugin.runs.rows import Row
 from d2_plugin.runs.tables import Table
 
 TITLE = "D²-4DGS: quality against run time"
@@ -57,23 +58,14 @@ class Section:
 
 def sources_of(rows: Sequence[Row]) -> tuple[str, ...]:
     """One sentence per machine, commit and command that the rows come from."""
-    return tuple(dict.fromkeys(_source(row) for row in rows))
+    return tuple(dict.fromkeys(map(_source, rows)))
 
 
 def _source(row: Row) -> str:
     if row["device"] is None:
         return f"`{row['command']}`, which recorded neither machine nor commit."
-    return provenance(row)
-
-
-def cases_of(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """The rows by case, in order of appearance."""
-    return {case: [row for row in rows if row["case"] == case] for case in dict.fromkeys(row["case"] for row in rows)}
-
-
-def distinct(rows: Sequence[Row], name: str) -> list[float]:
-    """The values of a field, ascending, each once."""
-    return sorted({row[name] for row in rows})
+    where = f"{row['device']}, {row['threads']} threads, torch {row['torch']}"
+    return f"{where}, commit {row['commit'] or row['version']}, `{row['command']}`."
 
 
 class Image(NamedTuple):
@@ -85,7 +77,7 @@ class Image(NamedTuple):
 
 def html(sections: Sequence[Section], images: Sequence[Image], lead: str) -> str:
     """The page; `lead` is the paragraph at its top."""
-    entries = [(section.name, _short(section)) for section in sections]
+    entries = [(section.name, section.title.partition(":")[0]) for section in sections]
     entries += [("images", "Images")] if images else []
     links = "".join(f'<li><a href="#{name}">{escape(title)}</a></li>' for name, title in entries)
     body = "".join(map(_section, sections)) + (_gallery(images) if images else "")
@@ -100,32 +92,18 @@ def html(sections: Sequence[Section], images: Sequence[Image], lead: str) -> str
     )
 
 
-def _short(section: Section) -> str:
-    """The title up to its colon."""
-    return section.title.partition(":")[0]
-
-
 def _section(section: Section) -> str:
-    figures = "".join(f"<figure>{_inline(svg)}</figure>" for svg in section.figures.values())
+    rules = re.compile("<style>.*?</style>")  # the page states them once
+    figures = "".join(f"<figure>{rules.sub('', svg)}</figure>" for svg in section.figures.values())
     tables = "".join(f"<h3>{escape(title)}</h3>{_table(table)}" for title, table in section.tables)
+    sources = "".join(f"<p class='soft'>{_code(source)}</p>" for source in section.sources)
+    if len(section.sources) > 2:
+        made = f"Made by {len(section.sources)} commands"
+        sources = f"<details><summary class='soft'>{made}</summary>{sources}</details>"
     return (
         f'<section id="{section.name}"><h2>{escape(section.title)}</h2><p>{escape(section.text)}</p>'
-        f"{figures}{tables}{_sources(section)}</section>\n"
+        f"{figures}{tables}{sources}</section>\n"
     )
-
-
-def _sources(section: Section) -> str:
-    """Where the figures come from, folded where there are many."""
-    lines = "".join(f"<p class='soft'>{_code(source)}</p>" for source in section.sources)
-    if len(section.sources) < 3:
-        return lines
-    return f"<details><summary class='soft'>Made by {len(section.sources)} commands</summary>{lines}</details>"
-
-
-def _inline(svg: str) -> str:
-    """A plot without the rules that the page states once."""
-    start, end = svg.index("<style>"), svg.index("</style>") + len("</style>")
-    return svg[:start] + svg[end:]
 
 
 def _code(sentence: str) -> str:

@@ -38,52 +38,47 @@ class Group(NamedTuple):
         return [value for row in self.rows if (value := row["scores"].get(column.key)) is not None]
 
 
-def quality(rows: Sequence[Row]) -> Section:
-    """Of `d2 bench training`: scores against CPU minutes of prior and training."""
-    text = (
+QUALITY = {
+    "quality": (
+        "Quality against minutes",
         "PSNR of cameras that trained nothing, against the CPU minutes that prior and training took on one thread; "
         "upper left is better. All methods have the same starting points, images and backbone settings; a mark is the "
-        "mean over the seeds."
-    )
-    return _section("quality", "Quality against minutes", text, rows, "CPU minutes, prior included")
-
-
-def training(rows: Sequence[Row]) -> Section:
-    """Of run folders of `d2 train`: scores against wall minutes of prior and training."""
-    text = (
+        "mean over the seeds.",
+        "CPU minutes, prior included",
+    ),
+    "training": (
+        "Runs of `d2 train`",
         "PSNR of cameras that trained nothing, against the minutes that prior and training took; upper left is "
-        "better. A mark is the mean over the seeds. A prior that several runs share counts where it was built."
-    )
-    return _section("training", "Runs of `d2 train`", text, rows, "minutes, prior included")
+        "better. A mark is the mean over the seeds. A prior that several runs share counts where it was built.",
+        "minutes, prior included",
+    ),
+    "ablation": (
+        "Ablation: what each part is worth",
+        "Held-out scores of the paper's variants on the same recording, points and number of steps.",
+        None,
+    ),
+}
+"""By the kind of row, those of `d2 bench training`, of run folders and of `d2 ablate`: the title of the section, its
+text, and the label of the axis of time where the section has a plot."""
 
 
-def ablation(rows: Sequence[Row]) -> Section:
-    """Of `d2 ablate`: what each variant scores, and whether the full method is better."""
-    text = "Held-out scores of the paper's variants on the same recording, points and number of steps."
-    return _section("ablation", "Ablation: what each part is worth", text, rows)
-
-
-def _section(name: str, title: str, text: str, rows: Sequence[Row], time: str | None = None) -> Section:
-    """A section with its picture where `time` labels the axis of one."""
+def section(name: str, rows: Sequence[Row]) -> Section:
+    """Held-out scores of one kind of row (see `QUALITY`): against time, at each length, and whether D² is better."""
+    title, text, time = QUALITY[name]
     groups = groups_of(rows)
     order = _order(groups)
-    emulated = any(row.get("mono_emulated") for row in rows)
     failed = [row for row in rows if row["failed"]]
-    by_unit = {unit: [group for group in groups if _length(group)[0] == unit] for unit in ("steps", "s")}
-    titles = {"steps": "At equal steps, mean ± standard error over seeds", "s": "At equal time of training, the same"}
-    tables = [(titles[unit], scores_table(mine)) for unit, mine in by_unit.items() if mine]
+    tables = []
+    for unit, where in (("steps", "steps, mean ± standard error over seeds"), ("s", "time of training, the same")):
+        if mine := [group for group in groups if _length(group)[0] == unit]:
+            tables.append((f"At equal {where}", scores_table(mine)))
     tables += [(f"Is {D2} better?", order)] if order.rows else []
     tables += [("Runs without a score", _failures(failed))] if failed else []
-    return Section(
-        name,
-        title,
-        text
-        + (" Monocular depth of some recordings is emulated, not predicted." if emulated else "")
-        + (f" {EXPLANATION}" if order.rows else ""),
-        {} if time is None else {name: _figure(groups, time)},
-        tuple(tables),
-        sources=sources_of(rows),
-    )
+    if any(row.get("mono_emulated") for row in rows):
+        text += " Monocular depth of some recordings is emulated, not predicted."
+    text += f" {EXPLANATION}" if order.rows else ""
+    figures = {} if time is None else {name: _figure(groups, time)}
+    return Section(name, title, text, figures, tuple(tables), sources_of(rows))
 
 
 def groups_of(rows: Sequence[Row]) -> list[Group]:
@@ -92,19 +87,22 @@ def groups_of(rows: Sequence[Row]) -> list[Group]:
     Tries are left out, and a run that was repeated with its seed counts once.
     """
     scored = [row for row in rows if (row.get("scores") or {}).get("psnr") is not None and row.get("target") != TRY]
-    backbones = [_backbone(row) for row in scored]
+    backbones = [row["method"].partition(" ")[0] for row in scored]
     usual = max(backbones, key=backbones.count, default="")
     runs: dict[tuple[str, str, str], list[Row]] = {}
     for row in scored:
         length = row.get("target") or f"{row['iterations']} steps"
         runs.setdefault((row["case"], length, _method(row["method"], usual)), []).append(row)
-    groups = [Group(case, method, length, _one_per_seed(mine)) for (case, length, method), mine in runs.items()]
+    groups = []
+    for (case, length, method), mine in runs.items():
+        groups.append(Group(case, method, length, list({row.get("seed"): row for row in mine}.values())))
     cases = list(dict.fromkeys(group.case for group in groups))
-    return sorted(groups, key=lambda g: (_emulated(g), cases.index(g.case), _length(g), _rank(g.method)))
 
+    def place(group: Group) -> tuple[bool, int, tuple[str, float], tuple[int, str]]:
+        emulated = bool(group.rows[0].get("mono_emulated"))
+        return emulated, cases.index(group.case), _length(group), _rank(group.method)
 
-def _emulated(group: Group) -> bool:
-    return bool(group.rows[0].get("mono_emulated"))
+    return sorted(groups, key=place)
 
 
 def _length(group: Group) -> tuple[str, float]:
@@ -119,20 +117,12 @@ def _rank(method: str) -> tuple[int, str]:
     return next((place for place, name in enumerate(known) if method.startswith(name)), len(known)), method
 
 
-def _backbone(row: Row) -> str:
-    return row["method"].partition(" ")[0]
-
-
 def _method(text: str, usual: str) -> str:
     """`yang4d full, label` as `D², label`, with the backbone's name behind it where that is not the usual one."""
     backbone, _, rest = text.partition(" ")
     preset, comma, label = rest.partition(", ")
     other = "" if backbone == usual else f" ({backbone})"
     return NAMES.get(preset, preset.removeprefix("+ ")) + other + comma + label
-
-
-def _one_per_seed(rows: Sequence[Row]) -> list[Row]:
-    return list({row.get("seed"): row for row in rows}.values())
 
 
 def _figure(groups: Sequence[Group], time: str) -> str:
@@ -142,7 +132,8 @@ def _figure(groups: Sequence[Group], time: str) -> str:
     groups = [group for group in groups if not group.method.endswith(")")]
     methods = sorted({group.method for group in groups}, key=_rank)
     plots = []
-    for case, mine in _by_case(groups).items():
+    for case in dict.fromkeys(group.case for group in groups):
+        mine = [group for group in groups if group.case == case]
         drawn = [group for group in mine if group.length.endswith(" s")] or mine
         series = []
         for color, method in enumerate(methods):
@@ -152,10 +143,6 @@ def _figure(groups: Sequence[Group], time: str) -> str:
         y = Axis.around("held-out PSNR, dB", [point.y for each in series for point in each.points])
         plots.append(Plot(case, x, y, tuple(series)))
     return figure(plots, "Held-out PSNR against minutes", columns=3, size=(360, 320))
-
-
-def _by_case(groups: Sequence[Group]) -> dict[str, list[Group]]:
-    return {case: [group for group in groups if group.case == case] for case in dict.fromkeys(g.case for g in groups)}
 
 
 def _point(group: Group) -> Point:

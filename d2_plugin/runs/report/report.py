@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -12,8 +13,8 @@ from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.reading import parsing
 from d2_plugin.runs.report.page import TITLE, Image, Section, html, markdown
-from d2_plugin.runs.report.quality import ablation, quality, training
-from d2_plugin.runs.report.run_folders import image_of, method_of, training_rows
+from d2_plugin.runs.report.quality import QUALITY, section
+from d2_plugin.runs.report.run_folders import image_of, method_of, training_row
 from d2_plugin.runs.rows import Row, named_by_cameras, read_rows
 from d2_plugin.runs.saved import read_metrics
 from d2_plugin.settings import Positional, Settings
@@ -21,7 +22,7 @@ from d2_plugin.settings import Positional, Settings
 Builder = Callable[[Sequence[Row]], Section]
 """Makes a section from the rows of one kind."""
 
-BUILDERS: dict[str, Builder] = {"quality": quality, "training": training, "ablation": ablation}
+BUILDERS: dict[str, Builder] = {name: partial(section, name) for name in QUALITY}
 """By the kind of row, in the order of the page."""
 
 LEAD = (
@@ -77,8 +78,11 @@ def make_report(
                 f"rows of kind '{row['kind']}' are drawn from a checkout alone: `python -m benchmarks report` there, "
                 f"or give rows of {', '.join(builders)}"
             )
-    by_kind = {kind: [row for row in rows if row["kind"] == kind] for kind in builders}
-    sections = [_built(kind, builders[kind], mine) for kind, mine in by_kind.items() if mine]
+    sections = []
+    for kind, build in builders.items():
+        if mine := [row for row in rows if row["kind"] == kind]:
+            with parsing(f"the rows of kind {kind}", "measure them again, their form is not that of this version"):
+                sections.append(build(mine))
     texts = {"report.html": html(sections, images, LEAD), "report.md": markdown(sections, LEAD)}
     texts |= {f"{name}.svg": svg for section in sections for name, svg in section.figures.items()}
     with only_writer(make_folder(output)):
@@ -90,12 +94,6 @@ def make_report(
     return [output / name for name in texts]
 
 
-def _built(kind: str, build: Builder, rows: Sequence[Row]) -> Section:
-    """The section of one kind of row; each reads what else its rows hold, which only it knows."""
-    with parsing(f"the rows of kind {kind}", "measure them again, their form is not that of this version"):
-        return build(rows)
-
-
 def collect(sources: Sequence[Path]) -> tuple[list[Row], list[Image]]:
     """Rows of all files and run folders, and an image of each method; a folder of runs stands for every run in it.
 
@@ -103,13 +101,15 @@ def collect(sources: Sequence[Path]) -> tuple[list[Row], list[Image]]:
         D2Error: a folder that holds no finished run, or a file that holds no rows.
     """
     folders = [folder for source in sources if source.is_dir() for folder in _runs(source)]
-    rows = read_rows([source for source in sources if not source.is_dir()]) + training_rows(folders)
+    rows = read_rows([source for source in sources if not source.is_dir()]) + [
+        training_row(folder) for folder in folders
+    ]
     first: dict[tuple[str, str], Image] = {}
     for folder in folders:
         metrics = read_metrics(folder)
         key = (metrics["recording"], method_of(metrics))
-        if key not in first and (image := _image(folder, *key)) is not None:
-            first[key] = image
+        if key not in first and (image := image_of(folder)) is not None:
+            first[key] = Image(f"{', '.join(key)}: {image[0]} of run {folder.name}", image[1])
     return rows, [first[key] for key in sorted(first)]
 
 
@@ -118,8 +118,3 @@ def _runs(folder: Path) -> list[Path]:
     if not folders:
         raise D2Error(f"no finished run lies in {folder}: expected metrics.json, as `d2 train` writes it")
     return folders
-
-
-def _image(folder: Path, recording: str, method: str) -> Image | None:
-    image = image_of(folder)
-    return None if image is None else Image(f"{recording}, {method}: {image[0]} of run {folder.name}", image[1])

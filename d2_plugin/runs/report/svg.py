@@ -9,7 +9,7 @@ as well as by colour.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import NamedTuple
@@ -20,12 +20,11 @@ EDGE = 0.06
 
 
 class Point(NamedTuple):
-    """One mark: its place, what the tooltip says, and a label beside it where there is room."""
+    """One mark: its place, and what the tooltip says."""
 
     x: float
     y: float
     note: str = ""
-    label: str = ""
     faded: bool = False
 
 
@@ -113,8 +112,6 @@ SHAPES = ("circle", "square", "diamond", "triangle", "cross", "wedge")
 MARGIN_LEFT, MARGIN_RIGHT, MARGIN_TOP, MARGIN_BOTTOM = 76, 18, 34, 46
 LETTER = 6.4
 """Mean width of a letter at 12 px, px."""
-LABELLED = 320
-"""In plots narrower than this marks have tooltips but no labels, px."""
 
 
 def style() -> str:
@@ -126,7 +123,7 @@ def style() -> str:
 
     fixed = (
         "svg.plot text{font:12px system-ui,sans-serif}svg.plot .title{font-weight:600;font-size:13px}"
-        "svg.plot .small{font-size:10.5px}.front{fill:none;stroke-width:2}.hollow{fill:none;stroke-width:1.8}"
+        ".front{fill:none;stroke-width:2}.hollow{fill:none;stroke-width:1.8}"
         ".faded{opacity:.4}.edge{stroke:none}"
     )
     light = rules("#fcfcfb", "#1b1b1a", "#5c5b57", "#e4e3df", LIGHT)
@@ -145,7 +142,7 @@ def figure(plots: Sequence[Plot], description: str, columns: int = 1, size: tupl
     if not plots:
         return document(text(size[0] / 2, 40, "nothing was measured", "soft", "middle"), size[0], 70, description)
     columns = min(columns, len(plots))
-    legend, top = _legend(_entries(plots), columns * size[0])
+    legend, top = _legend(plots, columns * size[0])
     parts = [legend]
     for first in range(0, len(plots), columns):
         row = plots[first : first + columns]
@@ -169,34 +166,23 @@ def text(x: float, y: float, words: str, classes: str = "ink", anchor: str = "st
     return f'<text class="{classes}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{turned}>{escape(words)}</text>'
 
 
-Entry = tuple[str, Callable[[float, float], str]]
-"""A name in the legend, and what draws its sign at a place (x, y)."""
-
-
-def _entries(plots: Sequence[Plot]) -> list[Entry]:
-    """Each series of the plots once: a dashed line where it has no marks, its mark otherwise."""
+def _legend(plots: Sequence[Plot], width: float) -> tuple[str, float]:
+    """Each series of the plots once, in as many rows as that needs, and their height; none for a single series."""
     known: dict[tuple[str, int, bool], Series] = {}
     for series in (series for plot in plots for series in plot.series if series.name):
         known.setdefault((series.name, series.color, series.hollow), series)
-    return [(series.name, _sign(series)) for series in known.values()]
-
-
-def _sign(series: Series) -> Callable[[float, float], str]:
-    if series.points or not series.line:
-        return lambda x, y: _mark(x, y, series.color, series.hollow)
-    return lambda x, y: f'<path class="{_color(series.color)} front" d="M{x - 7:.1f} {y:.1f}h16"{_dashes(series)}/>'
-
-
-def _legend(entries: Sequence[Entry], width: float) -> tuple[str, float]:
-    """The legend in as many rows as it needs, and its height; none for a single series."""
-    if len(entries) < 2:
+    if len(known) < 2:
         return "", 6
     parts, x, y = [], 16.0, 18.0
-    for name, draw in entries:
-        wide = 36 + 1.1 * LETTER * len(name)
+    for series in known.values():
+        wide = 36 + 1.1 * LETTER * len(series.name)
         if x + wide > width - 10 and x > 16:
             x, y = 16.0, y + 20
-        parts += [draw(x + 6, y - 4), text(x + 18, y, name)]
+        if series.points or not series.line:
+            sign = _mark(x + 6, y - 4, series.color, series.hollow)
+        else:
+            sign = f'<path class="{_color(series.color)} front" d="M{x - 1:.1f} {y - 4:.1f}h16"{_dashes(series)}/>'
+        parts += [sign, text(x + 18, y, series.name)]
         x += wide
     return "".join(parts), y + 10
 
@@ -222,14 +208,11 @@ def _plot(plot: Plot, left: float, top: float, size: tuple[int, int]) -> str:
         parts += [f'<path class="grid" d="M{x0:.1f} {y:.1f}H{x1:.1f}"/>', text(x0 - 6, y + 4, words, "soft", "end")]
     parts.append(text((x0 + x1) / 2, y0 + 36, plot.x.label, "soft", "middle"))
     parts.append(text(left + 14, (y0 + y1) / 2, plot.y.label, "soft", "middle", turn=True))
-    taken: list[tuple[float, float, float]] = []
     for series in plot.series:
         if len(series.line) > 1:
             path = "L".join("{:.1f} {:.1f}".format(*at(*point)) for point in series.line)
             parts.append(f'<path class="{_color(series.color)} front" d="M{path}"{_dashes(series)}/>')
         parts += [_mark(*at(p.x, p.y), series.color, series.hollow, p.note, p.faded) for p in series.points]
-    for series in plot.series if size[0] >= LABELLED else ():
-        parts += [_label(*at(p.x, p.y), p.label, taken, x1) for p in series.points if p.label]
     return "".join(parts)
 
 
@@ -248,15 +231,3 @@ def _mark(x: float, y: float, color: int, hollow: bool, note: str = "", faded: b
         "cross": f"M{x - 1.5:.1f} {y - 5:.1f}h3v3.5h3.5v3h-3.5v3.5h-3v-3.5h-3.5v-3h3.5z",
     }
     return f'<path class="{classes}" d="{outlines[shape]}">{tip}</path>'
-
-
-def _label(x: float, y: float, words: str, taken: list[tuple[float, float, float]], limit: float) -> str:
-    """The text beside a mark, or nothing where another one stands already; the mark keeps its tooltip."""
-    wide = 0.9 * LETTER * len(words)
-    x = x + 8 if x + 8 + wide < limit else x - 8 - wide
-    for shift in (-6, 14, -18, 26):
-        place = (x, x + wide, y + shift)
-        if not any(place[0] < right and left < place[1] and abs(place[2] - line) < 12 for left, right, line in taken):
-            taken.append(place)
-            return text(x, y + shift, words, "soft small")
-    return ""

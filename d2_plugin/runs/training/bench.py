@@ -22,7 +22,7 @@ from d2_plugin.progress import progress_bar
 from d2_plugin.reading import read_toml
 from d2_plugin.recordings.presets import resolve_cameras, split_name
 from d2_plugin.runs.ablation.presets import PRESETS, TABLES, Preset, rows_named
-from d2_plugin.runs.rows import TRY, Row, append_rows, command_line, read_rows
+from d2_plugin.runs.rows import TRY, Row, append_rows, case_name, command_line, read_rows
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Shared, share, share_points
 from d2_plugin.runs.training.measured import Line, Work, follow, workers
@@ -139,13 +139,10 @@ def case_of(text: str, base: RunSettings) -> Case:
     protocol = split_name(named[0])
     settings = replace(base, recording=path, train_cameras=train, test_cameras=test, protocol=protocol)
     title = Path(path).resolve().name
-    size = f", 1/{base.downscale} size" if base.downscale > 1 else ""
     slug = "_".join([title, *train]) + (f"_small{base.downscale}" if base.downscale > 1 else "")
-    if base.hold_out_instants > 1:
-        size += f", 1/{base.hold_out_instants} of the instants"
-        slug += f"_every{base.hold_out_instants}"
-    name = f"{title}, {len(train)} views{size}" + (f", {protocol}" if protocol else "")
-    return Case(name, slug + (f"_{protocol.replace(':', '_')}" if protocol else ""), settings)
+    slug += f"_every{base.hold_out_instants}" if base.hold_out_instants > 1 else ""
+    slug += f"_{protocol.replace(':', '_')}" if protocol else ""
+    return Case(case_name(title, settings), slug, settings)
 
 
 Target = tuple[Literal["seconds", "steps"], float]
