@@ -20,6 +20,8 @@ KEPT = 0.85
 """What a measurement still weighs when the next one comes."""
 APART = 0.2
 """Spread of sizes, relative to their mean, from which both costs of an image can be told apart."""
+SAVED = 0.5
+"""Seconds of time whose share may be saved up."""
 
 
 @dataclass
@@ -63,17 +65,11 @@ class Share:
 
     share: float
     spent: float = 0.0
-    """Seconds that are still to be paid off."""
-    kept: float = 0.5
-    """Seconds of work that may be saved up."""
+    """Seconds of work that are still to be paid off."""
 
     def passes(self, seconds: float) -> None:
         """Time has passed."""
-        self.spent = max(self.spent - self.share * seconds, -self.kept * self.share)
-
-    def spend(self, seconds: float) -> None:
-        """Work was done."""
-        self.spent += seconds
+        self.spent = max(self.spent - self.share * seconds, -SAVED * self.share)
 
     @property
     def due(self) -> bool:

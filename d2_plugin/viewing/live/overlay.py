@@ -47,8 +47,11 @@ class Overlay:
 
     def _show_frusta(self, viewed: ViewedRun, frame: int, moving: bool) -> None:
         visible = self.page.ticked("frusta", True)
-        if visible and (set(self.frusta) != set(viewed.recording.cameras)):
-            self._add_frusta(viewed)
+        if visible and set(self.frusta) != set(viewed.recording.cameras):
+            for number, (name, camera) in enumerate(viewed.recording.cameras.items()):
+                if name not in self.frusta:
+                    self.frusta[name] = self._frustum(number, camera, name in viewed.train_cameras)
+            self._images_of = None
         scale = self.unit * self.page.number("size_of_frusta", 1.0)
         eye = np.array(self.page.eye)
         for name, handle in self.frusta.items():
@@ -61,13 +64,9 @@ class Overlay:
         if visible and not moving and frame != self._images_of:
             self._images_of = frame
             for name, handle in self.frusta.items():
-                handle.image = _thumbnail(viewed, name, frame)
-
-    def _add_frusta(self, viewed: ViewedRun) -> None:
-        for number, (name, camera) in enumerate(viewed.recording.cameras.items()):
-            if name not in self.frusta:
-                self.frusta[name] = self._frustum(number, camera, name in viewed.train_cameras)
-        self._images_of = None
+                image = viewed.recording.image(name, frame)
+                width = min(image.shape[1], THUMBNAIL)
+                handle.image = fitted(image, width, max(round(image.shape[0] * width / image.shape[1]), 1))
 
     def _frustum(self, number: int, camera: Camera, trains: bool) -> Any:
         # Numbered: a name with a slash would be a path in the scene.
@@ -120,14 +119,6 @@ def rig_of(viewed: ViewedRun) -> tuple[np.ndarray, float]:
     return middle, max(float(np.linalg.norm(centres - middle, axis=1).max()), 3 * frustum_size(viewed))
 
 
-def _thumbnail(viewed: ViewedRun, name: str, frame: int) -> np.ndarray:
-    image = viewed.recording.image(name, frame)
-    height, width = image.shape[:2]
-    if width <= THUMBNAIL:
-        return image
-    return fitted(image, THUMBNAIL, max(round(height * THUMBNAIL / width), 1))
-
-
 class Cloud(NamedTuple):
     """Points with colours."""
 
@@ -137,12 +128,11 @@ class Cloud(NamedTuple):
 
 def cloud_of(viewed: ViewedRun, frame: int, by: str, most: int = MOST_POINTS) -> Cloud:
     """The prior of all cameras at one frame, thinned evenly; sky has no place and is left out."""
-    store = viewed.store
-    cameras = [] if store is None else [name for name in store.cameras if name in viewed.recording.cameras]
-    priors = {name: prior for name in cameras if store is not None and (prior := store.prior(name, frame))}
-    pixels = sum(prior.depth.numel() for prior in priors.values())
-    stride = max(int(np.ceil(np.sqrt(pixels / most))), 1)
-    parts = [_points(viewed.recording.cameras[name], prior, by, stride) for name, prior in priors.items()]
+    store, cameras = viewed.store, viewed.recording.cameras
+    known = () if store is None else ((name, store.prior(name, frame)) for name in store.cameras if name in cameras)
+    priors = [(cameras[name], prior) for name, prior in known if prior is not None]
+    stride = max(int(np.ceil(np.sqrt(sum(prior.depth.numel() for _, prior in priors) / most))), 1)
+    parts = [_points(camera, prior, by, stride) for camera, prior in priors]
     if not parts:
         return Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
     return Cloud(*(np.concatenate(values) for values in zip(*parts, strict=True)))
@@ -157,14 +147,9 @@ def _points(camera: Camera, prior: DepthPrior, by: str, stride: int) -> Cloud:
     y, x = np.meshgrid(rows.numpy() + 0.5, columns.numpy() + 0.5, indexing="ij")
     rays = np.stack([x, y, np.ones_like(x)], -1)[shown] @ np.linalg.inv(camera.K).T
     R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
-    return Cloud(((rays * depth[shown][:, None] - t) @ R).astype(np.float32), _painted(thin, by)[shown])
-
-
-def _painted(prior: DepthPrior, by: str) -> np.ndarray:
-    """RGB uint8 [h, w, 3] of every pixel."""
-    if by == "label":
-        return label_colors(prior.labels.numpy())
-    if by == "sigma":
-        return prior_sigma_colors(prior)
-    grey = torch.full((*prior.depth.shape, 3), 160, dtype=torch.uint8)
-    return (grey if prior.colors is None else prior.colors).numpy()
+    if by == "image":
+        grey = torch.full((*depth.shape, 3), 160, dtype=torch.uint8)
+        colors = (grey if thin.colors is None else thin.colors).numpy()
+    else:
+        colors = label_colors(thin.labels.numpy()) if by == "label" else prior_sigma_colors(thin)
+    return Cloud(((rays * depth[shown][:, None] - t) @ R).astype(np.float32), colors[shown])

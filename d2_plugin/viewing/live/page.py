@@ -81,60 +81,49 @@ class Page:
 
     def build(self) -> None:
         """Lay out the controls; what the run does not have is left out."""
-        gui, viewed = self.client.gui, self.viewed
+        gui, viewed, controls = self.client.gui, self.viewed, self.controls
         self._text("shown", "shown", viewed.name)
         if viewed.note:
             self._text("note", "note", viewed.note)
         if self.training is not None:
             with gui.add_folder("Training"):
-                self._text("progress", "step", "")
-                self._text("scores", "score", "")
-                self.controls["pause"] = gui.add_button("Go on" if self.training.paused else "Pause")
-                self.controls["pause"].on_click(lambda _: self._toggle_pause())
+                self._text("progress", "step")
+                self._text("scores", "score")
+                controls["pause"] = gui.add_button("Go on" if self.training.paused else "Pause")
+                controls["pause"].on_click(lambda _: self._toggle_pause())
         if viewed.duration > 0:
+            step = 10.0 ** math.floor(math.log10(viewed.duration / 100))
+            most = round(math.floor(viewed.duration / step + 1e-6) * step, 9)
             with gui.add_folder("Time"):
-                self._time_controls()
+                controls["time"] = gui.add_slider("seconds", 0.0, most, step, 0.0)
+                self._text("frame", "frame", str(viewed.recording.frames[0]))
+                controls["play"] = gui.add_checkbox("play", False)
+                controls["speed"] = gui.add_dropdown("speed", list(SPEEDS), initial_value="1")
         if viewed.backbone is not None:
+            known, height = viewed.inserted_at is not None, self.most_height
             with gui.add_folder("Image"):
-                self._image_controls()
+                controls["show"] = gui.add_dropdown("show", [*IMAGES, NO_IMAGE], initial_value="image")
+                controls["opacity"] = gui.add_slider("opacity from", 0.0, 0.95, 0.05, 0.0)
+                controls["marked"] = gui.add_checkbox("inserted by D2 in orange", False, disabled=not known)
+                controls["height"] = gui.add_slider("height", min(90, height), max(height * 2, 720), 1, height)
         with gui.add_folder("Recording"):
-            self._recording_controls()
+            names = tuple(viewed.recording.cameras)
+            controls["camera"] = gui.add_dropdown("stand at", [FREE, *names], initial_value=FREE)
+            controls["camera"].on_update(lambda _: self.stand_at(controls["camera"].value))
+            controls["frusta"] = gui.add_checkbox("cameras", True)
+            controls["size_of_frusta"] = gui.add_slider("camera size", 0.1, 3.0, 0.1, 1.0)
+            if viewed.store is not None:
+                first = "none" if viewed.backbone is not None else "image"
+                controls["cloud"] = gui.add_dropdown("prior as points, by", CLOUDS, initial_value=first)
+                controls["point_size"] = gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
         if viewed.backbone is not None:
-            self._text("size", "image size", "")
-        for control in self.controls.values():
+            self._text("size", "image size")
+        for control in controls.values():
             if hasattr(control, "on_update"):
                 control.on_update(lambda _: self.wake())
         self.client.camera.on_update(lambda _: self.wake())
 
-    def _time_controls(self) -> None:
-        gui, viewed = self.client.gui, self.viewed
-        step = 10.0 ** math.floor(math.log10(viewed.duration / 100))
-        most = round(math.floor(viewed.duration / step + 1e-6) * step, 9)
-        self.controls["time"] = gui.add_slider("seconds", 0.0, most, step, 0.0)
-        self._text("frame", "frame", str(viewed.recording.frames[0]))
-        self.controls["play"] = gui.add_checkbox("play", False)
-        self.controls["speed"] = gui.add_dropdown("speed", list(SPEEDS), initial_value="1")
-
-    def _image_controls(self) -> None:
-        gui, known = self.client.gui, self.viewed.inserted_at is not None
-        self.controls["show"] = gui.add_dropdown("show", [*IMAGES, NO_IMAGE], initial_value="image")
-        self.controls["opacity"] = gui.add_slider("opacity from", 0.0, 0.95, 0.05, 0.0)
-        self.controls["marked"] = gui.add_checkbox("inserted by D2 in orange", False, disabled=not known)
-        low = min(90, self.most_height)
-        self.controls["height"] = gui.add_slider("height", low, max(self.most_height * 2, 720), 1, self.most_height)
-
-    def _recording_controls(self) -> None:
-        gui, names = self.client.gui, tuple(self.viewed.recording.cameras)
-        self.controls["camera"] = gui.add_dropdown("stand at", [FREE, *names], initial_value=FREE)
-        self.controls["camera"].on_update(lambda _: self.stand_at(self.controls["camera"].value))
-        self.controls["frusta"] = gui.add_checkbox("cameras", True)
-        self.controls["size_of_frusta"] = gui.add_slider("camera size", 0.1, 3.0, 0.1, 1.0)
-        if self.viewed.store is not None:
-            first = "none" if self.viewed.backbone is not None else "image"
-            self.controls["cloud"] = gui.add_dropdown("prior as points, by", CLOUDS, initial_value=first)
-            self.controls["point_size"] = gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
-
-    def _text(self, name: str, label: str, value: str) -> None:
+    def _text(self, name: str, label: str, value: str = "") -> None:
         self.controls[name] = self.client.gui.add_text(label, value, disabled=True)
 
     def number(self, name: str, default: float) -> float:
@@ -207,23 +196,21 @@ class Page:
 
     def wanted(self, now: float) -> tuple[Wanted, bool] | None:
         """What the page wants, and whether something moves; None before the browser has a camera that can be one."""
-        seen = _seen_through(self.client.camera) or (self._last[:2] if self._last is not None else None)
+        seen = _seen_through(self.client.camera) or (None if self._last is None else self._last[:2])
         if seen is None:
             return None
-        wanted = Wanted(
-            *seen,
+        show = IMAGES.get(self.word("show", NO_IMAGE), "")
+        time, least, height = (
             self.number("time", 0.0),
-            IMAGES.get(self.word("show", NO_IMAGE), ""),
             self.number("opacity", 0.0),
-            self.ticked("marked"),
-            int(self.number("height", self.most_height)),
+            self.number("height", self.most_height),
         )
+        wanted = Wanted(*seen, time, show, least, self.ticked("marked"), int(height))
         if wanted != self._last:
             self._last = wanted
             if self._played_at is None:
                 self.changed_at = now
-        moving = self._played_at is not None or now - self.changed_at < REST
-        return wanted, moving
+        return wanted, self._played_at is not None or now - self.changed_at < REST
 
 
 def vertical_angle(camera: Camera) -> float:
@@ -241,11 +228,8 @@ def _seen_through(camera: Any) -> tuple[tuple[float, ...], float] | None:
     except (TypeError, ValueError, ZeroDivisionError):
         return None
     fits = len(pose) == 8 and all(abs(number) <= LARGEST_NUMBER for number in pose)  # NaN is not
-    if not fits or not 1 / WIDEST <= aspect <= WIDEST:
-        return None
-    turns = abs(math.hypot(*pose[3:7]) - 1) < 0.1
-    sees = FIELD_OF_VIEW[0] <= math.degrees(pose[7]) <= FIELD_OF_VIEW[1]
-    return (pose, aspect) if turns and sees else None
+    fits = fits and 1 / WIDEST <= aspect <= WIDEST and abs(math.hypot(*pose[3:7]) - 1) < 0.1
+    return (pose, aspect) if fits and FIELD_OF_VIEW[0] <= math.degrees(pose[7]) <= FIELD_OF_VIEW[1] else None
 
 
 def _is_number(value: object) -> bool:

@@ -56,9 +56,7 @@ def run(settings: ViewSettings) -> str:
     """Show it until Ctrl-C."""
     viewed = viewed_at(settings)
     viewer = Viewer(viewed=viewed, host=settings.host, port=settings.port, height=settings.height)
-    notes = [viewed.note] if viewed.note else []
-    sys.stdout.write("".join(f"     note  {note}\n" for note in notes) + f"{address_line(viewer, settings.host)}\n")
-    sys.stdout.flush()
+    _print(*([f"     note  {viewed.note}"] if viewed.note else []), address_line(viewer, settings.host))
     try:
         viewer.stay()
     except KeyboardInterrupt:
@@ -92,6 +90,11 @@ def address_line(viewer: Viewer, host: str) -> str:
     return f"{viewer.url}  (Ctrl-C ends){who}"
 
 
+def _print(*lines: str) -> None:
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.flush()
+
+
 class LiveRun:
     """A run that is watched: give `watch` to `Run.train`."""
 
@@ -107,8 +110,7 @@ class LiveRun:
         scorer = Scorer(viewed)
         if trainer.d2 is not None:
             viewer.marks = lambda: trainer.d2.inserted_at
-        sys.stdout.write(f"watch it train at {viewer.url}\n")
-        sys.stdout.flush()
+        _print(f"watch it train at {viewer.url}")
 
         def on_step(step: int, loss: float) -> None:
             if viewer.clients and (score := scorer.score()) is not None:
@@ -124,8 +126,7 @@ class LiveRun:
         viewer = self.viewer
         try:
             if viewer.clients:
-                sys.stdout.write(f"{viewer.url} stays until its last page is closed, or Ctrl-C\n")
-                sys.stdout.flush()
+                _print(f"{viewer.url} stays until its last page is closed, or Ctrl-C")
             viewer.stay(lambda: not viewer.clients)
         except KeyboardInterrupt:
             pass
@@ -158,7 +159,7 @@ class Scorer:
         view = self.viewed.view(pose_of(camera), self.viewed.recording.seconds(frame), size, name)
         truth = torch.from_numpy(self.viewed.recording.image(name, frame)).float() / 255
         self._scores.append(psnr(render_view(self.viewed.backbone, view).color, truth))
-        self._share.spend(time.monotonic() - now)
+        self._share.spent += time.monotonic() - now
         kind = "held-out" if self.viewed.test_cameras else "training"
         mean = sum(self._scores) / len(self._scores)
         return f"{mean:.2f} dB PSNR, {kind}, last {len(self._scores)} views"

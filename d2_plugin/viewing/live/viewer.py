@@ -72,9 +72,9 @@ class Viewer:
         """Per Gaussian [N], the step at which D2 inserted it; None where that is not known."""
         self.training = Training(iterations) if d2 is not None or iterations is not None else None
         self.height, self.step = height, 0
-        self._waiting: list[Any] = []
+        self._clients: dict[int, Any] = {}
         self._pages: dict[int, tuple[Page, Overlay]] = {}
-        self._wake, self._guard = threading.Event(), threading.Lock()
+        self._wake = threading.Event()
         self._resolution = Resolution()  # one for all pages: every image teaches what a pixel costs
         self._watched, self._moved, self._last = Share(WATCHED), Share(MOVED), time.monotonic()
         self._followed = None if d2 is None else Follower(d2, self)
@@ -87,7 +87,7 @@ class Viewer:
     @property
     def clients(self) -> int:
         """How many browsers look."""
-        return len(self._pages) + len(self._waiting)
+        return len(self._clients)
 
     def after_step(self, step: int, loss: float | None = None) -> None:
         """A trainer has finished a step: draw what is due, and wait here while somebody pauses.
@@ -100,7 +100,7 @@ class Viewer:
             return
         self._note_progress(step, loss)
         self._draw_all(within_share=True)
-        while self.training is not None and self.training.paused and self._pages:
+        while self.training is not None and self.training.paused and self._clients:
             self._note_progress(step, loss)
             self._draw_all()
             self._wait()
@@ -139,34 +139,29 @@ class Viewer:
         initial.position, initial.look_at, initial.up = eye, target, up
         initial.fov = vertical_angle(camera)
 
+    # Called by threads of viser, which touch nothing but the table of clients.
     def _connected(self, client: Any) -> None:
-        with self._guard:
-            self._waiting.append(client)
+        self._clients[client.client_id] = client
         self._wake.set()
 
     def _disconnected(self, client: Any) -> None:
-        with self._guard:
-            self._waiting = [other for other in self._waiting if other.client_id != client.client_id]
-            self._pages.pop(client.client_id, None)
+        self._clients.pop(client.client_id, None)
         self._wake.set()
 
     def _open_pages(self) -> list[tuple[Page, Overlay]]:
-        """The pages of all clients; those that came since the last look are laid out."""
-        viewed = self.viewed
+        """The pages of all clients; those of new ones are laid out."""
+        viewed, clients = self.viewed, dict(self._clients)
+        for gone in self._pages.keys() - clients.keys():
+            del self._pages[gone]
         if viewed is None:
             return []
-        with self._guard:
-            waiting, self._waiting = self._waiting, []
-        for client in waiting:
-            page = Page(client, viewed, self.training, self.height, self._wake.set)
-            with self._guard:
-                self._pages[client.client_id] = page, Overlay(page, frustum_size(viewed))
-            self._attempt(page, page.build)
-        with self._guard:
-            pages = list(self._pages.values())
-        for page, _ in pages:
-            page.viewed = viewed
-        return pages
+        for number, client in clients.items():
+            if number not in self._pages:
+                page = Page(client, viewed, self.training, self.height, self._wake.set)
+                self._pages[number] = page, Overlay(page, frustum_size(viewed))
+                self._attempt(page, page.build)
+            self._pages[number][0].viewed = viewed
+        return list(self._pages.values())
 
     def _draw_all(self, within_share: bool = False) -> None:
         for page, overlay in self._open_pages():
@@ -200,17 +195,16 @@ class Viewer:
             page.drawn = wanted, self.step, moving
         overlay.refresh(page.viewed, wanted.time, moving)
         taken = time.monotonic() - now
-        self._watched.spend(taken)
-        self._moved.spend(taken)
+        self._watched.spent += taken
+        self._moved.spent += taken
 
     def _note_progress(self, step: int, loss: float | None) -> None:
-        training, viewed = self.training, self.viewed
-        if training is None or viewed is None:
+        if self.training is None or self.viewed is None:
             return
-        of = f" of {training.total}" if training.total else ""
-        count = f", {len(viewed.backbone)} Gaussians" if viewed.backbone is not None else ""
-        progress = f"{step}{of}{count}" + ("" if loss is None else f", loss {loss:.4f}")
-        training.progress = f"{progress} (paused)" if training.paused else progress
+        parts = [f"{step} of {self.training.total}" if self.training.total else str(step)]
+        parts += [f"{len(self.viewed.backbone)} Gaussians"] if self.viewed.backbone is not None else []
+        parts += [] if loss is None else [f"loss {loss:.4f}"]
+        self.training.progress = ", ".join(parts) + (" (paused)" if self.training.paused else "")
 
     def _pass_time(self) -> None:
         now = time.monotonic()
@@ -220,8 +214,7 @@ class Viewer:
 
     def _wait(self) -> None:
         """Until something changes; at rest a look now and then is enough to see that nothing did."""
-        with self._guard:
-            playing = any(page.ticked("play") for page, _ in self._pages.values())
+        playing = any(page.ticked("play") for page, _ in self._pages.values())
         self._wake.wait(0.02 if playing else 0.1)
         self._wake.clear()
 
