@@ -1,4 +1,4 @@
-"""Camera paths: a camera's pose and lens for each image of a video, made from the cameras of a recording or read.
+"""Camera paths: a camera for each image of a video, made from the cameras of a recording or read.
 
 All poses are `T_camera_world` [4, 4] float64 in OpenCV axes. Two to four cameras cover a small part of the sphere
 around a scene, and what they did not see cannot be shown: orbit and spiral stay inside the angle that they span.
@@ -12,6 +12,7 @@ world, is undone.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Optional
 
@@ -44,39 +45,25 @@ Above0 = Annotated[float, Range(0, LARGEST_NUMBER, open_low=True)]
 OptionalTime = Optional[Annotated[float, Range()]]  # noqa: UP045  at run time, on Python 3.9 too
 
 
-class Lens(NamedTuple):
-    """Intrinsics and the size they belong to."""
-
-    K: np.ndarray  # [3, 3]
-    width: int
-    height: int
-
-    def fitted(self, width: int, height: int) -> Lens:
-        """The lens for images of another size: scaled to fill them, cut alike on both sides, never stretched."""
-        if (width, height) == (self.width, self.height):
-            return self
-        scale = max(width / self.width, height / self.height)
-        K = self.K.copy()
-        K[:2, :2] *= scale
-        K[:2, 2] = (K[:2, 2] - np.array([self.width, self.height]) / 2) * scale + np.array([width, height]) / 2
-        return Lens(K, width, height)
+def for_size(camera: Camera, width: int, height: int) -> Camera:
+    """The camera for images of another size: scaled to fill them, cut alike on both sides, never stretched."""
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    old, new = np.array([camera.width, camera.height]), np.array([width, height])
+    scale, K = (new / old).max(), camera.K.copy()
+    K[:2, :2] *= scale
+    K[:2, 2] = (K[:2, 2] - old / 2) * scale + new / 2
+    return replace(camera, width=width, height=height, K=K)
 
 
-class Pose(NamedTuple):
-    """One camera of a path."""
-
-    T_camera_world: np.ndarray
-    lens: Lens
-
-
-def pose_of(camera: Camera) -> Pose:
-    """Where a camera of a recording stands."""
-    return Pose(camera.T_camera_world, Lens(camera.K, camera.width, camera.height))
+def at_pose(camera: Camera, T_camera_world: np.ndarray) -> Camera:
+    """The camera at another place, where it is none of the recording's and has no name."""
+    return replace(camera, name="", T_camera_world=T_camera_world)
 
 
 def orbit(
     cameras: Sequence[Camera], count: int, degrees: float | None = None, depth: float | None = None
-) -> list[Pose]:
+) -> list[Camera]:
     """A swing around the point that the cameras look at, from its middle to both ends and back; a whole turn for 360.
 
     Args:
@@ -94,10 +81,10 @@ def orbit(
     angles = 360 * share if span >= 360 else span / 2 * np.sin(2 * np.pi * share)
     start = rig.middle - rig.focus
     around = [rotation_of_vector(np.radians(angle) * rig.up) @ start for angle in angles]
-    return [Pose(look_at(rig.focus + offset, rig.focus, rig.up), rig.lens) for offset in around]
+    return [at_pose(cameras[0], look_at(rig.focus + offset, rig.focus, rig.up)) for offset in around]
 
 
-def spiral(cameras: Sequence[Camera], count: int, depth: float | None = None) -> list[Pose]:
+def spiral(cameras: Sequence[Camera], count: int, depth: float | None = None) -> list[Camera]:
     """LLFF's spiral of two turns about the mean camera, looking at the point that the cameras look at.
 
     Its radii are half of the 90th percentile of the cameras' distances from their mean, along each axis: the whole
@@ -110,10 +97,10 @@ def spiral(cameras: Sequence[Camera], count: int, depth: float | None = None) ->
     radii = np.maximum(radii, 0.02 * np.linalg.norm(rig.focus - rig.middle) * np.array([1, 1, 0]))
     angle = 4 * np.pi * np.arange(count) / max(count, 1)
     local = np.stack([np.sin(angle), np.cos(angle) - 1, np.sin(angle / 2)], -1) * radii
-    return [Pose(look_at(rig.middle + offset @ axes, rig.focus, rig.up), rig.lens) for offset in local]
+    return [at_pose(cameras[0], look_at(rig.middle + offset @ axes, rig.focus, rig.up)) for offset in local]
 
 
-def through(cameras: Sequence[Camera], count: int) -> list[Pose]:
+def through(cameras: Sequence[Camera], count: int) -> list[Camera]:
     """From camera to camera, each the nearest that is left: the first pose is the first camera, the last the last.
 
     Positions, rotations and lenses are interpolated; the path rests at each camera for a moment.
@@ -131,9 +118,7 @@ def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndar
         right = np.cross(forward, np.roll(up, 1))
     right = _unit(right)
     R = np.stack([right, np.cross(forward, right), forward])
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, -R @ position
-    return T
+    return rigid(R, -R @ position)
 
 
 class _Rig(NamedTuple):
@@ -143,7 +128,6 @@ class _Rig(NamedTuple):
     middle: np.ndarray  # [3], where a camera between them stands
     up: np.ndarray  # [3], unit
     span: float  # degrees
-    lens: Lens
 
     @classmethod
     def of(cls, cameras: Sequence[Camera], depth: float | None) -> _Rig:
@@ -156,8 +140,7 @@ class _Rig(NamedTuple):
         azimuth, span = _arc(flat, up)
         radius, height = np.linalg.norm(flat, axis=1).mean(), (offsets @ up).mean()
         towards = rotation_of_vector(np.radians(azimuth) * up) @ _unit(flat[0])
-        first = cameras[0]
-        return cls(focus, focus + radius * towards + height * up, up, span, Lens(first.K, first.width, first.height))
+        return cls(focus, focus + radius * towards + height * up, up, span)
 
 
 def focus_of(centres: np.ndarray, forwards: np.ndarray, depth: float | None = None) -> np.ndarray:
@@ -199,23 +182,21 @@ def _chained(cameras: Sequence[Camera]) -> list[Camera]:
     return [cameras[i] for i in order]
 
 
-def _between(chain: Sequence[Camera], place: float) -> Pose:
+def _between(chain: Sequence[Camera], place: float) -> Camera:
     """The pose at `place` of a chain: whole numbers are its cameras."""
     first = min(int(place), len(chain) - 1)
     share = place - first
     if share == 0:
-        return pose_of(chain[first])
+        return at_pose(chain[first], chain[first].T_camera_world)
     share = share * share * (3 - 2 * share)  # slow at both ends
     a, b = chain[first], chain[first + 1]
     p, q = (quaternion_of_rotation(camera.T_camera_world[:3, :3]) for camera in (a, b))
     q = q if p @ q >= 0 else -q
     angle = np.arccos(np.clip(p @ q, -1, 1))
     weights = (1 - share, share) if angle < 1e-6 else np.sin([(1 - share) * angle, share * angle]) / np.sin(angle)
-    T = np.eye(4)
-    T[:3, :3] = rotation_of_quaternion(weights[0] * p + weights[1] * q)
-    T[:3, 3] = -T[:3, :3] @ ((1 - share) * a.centre + share * b.centre)
-    end = Lens(b.K, b.width, b.height).fitted(a.width, a.height)
-    return Pose(T, Lens((1 - share) * a.K + share * end.K, a.width, a.height))
+    R = rotation_of_quaternion(weights[0] * p + weights[1] * q)
+    K = (1 - share) * a.K + share * for_size(b, a.width, a.height).K
+    return replace(at_pose(a, rigid(R, -R @ ((1 - share) * a.centre + share * b.centre))), K=K)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:
@@ -225,9 +206,9 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 class CameraPath(NamedTuple):
     """What a camera_path.json says."""
 
-    poses: list[Pose]
+    cameras: list[Camera]
     shares: list[float] | None
-    """The instant of each pose, 0 first and 1 last of the recording; None where the file leaves time to run."""
+    """The instant of each camera, 0 first and 1 last of the recording; None where the file leaves time to run."""
     fps: float
 
 
@@ -241,40 +222,33 @@ def read_camera_path(path: Path) -> CameraPath:
         table = read_json(path, EXPORT)
     except NoSuchFile:
         raise D2Error(f"no camera path at {path}: give orbit, spiral, through, held-out, training or a file") from None
-    kind = table.get("camera_type", "perspective")
+    kind, place = table.get("camera_type", "perspective"), str(path)
     if kind != "perspective":
         raise D2Error(f"{path} is for a camera of type {str(kind)[:40]!r}, expected perspective: export it as that")
-    size = field(table, "render_width", Side, str(path), EXPORT), field(table, "render_height", Side, str(path), EXPORT)
-    entries = field(table, "camera_path", list, str(path), EXPORT)
+    size = field(table, "render_width", Side, place, EXPORT), field(table, "render_height", Side, place, EXPORT)
+    entries = field(table, "camera_path", list, place, EXPORT)
     if not entries:
         raise D2Error(f"the camera path {path} has no camera: add keyframes and {EXPORT}")
     dataparser = _dataparser(path.parent / "dataparser_transforms.json")
-    poses, times = [], []
+    cameras, times = [], []
     for number, entry in enumerate(entries):
-        place = f"camera {number} of {path}"
+        where = f"camera {number} of {path}"
         if not isinstance(entry, Mapping):
-            raise D2Error(f"{place} is no object: {EXPORT}")
-        poses.append(_pose(entry, size, dataparser, number, path))
-        times.append(field(entry, "render_time", OptionalTime, place, EXPORT, default=None))
+            raise D2Error(f"{where} is no object: {EXPORT}")
+        T_world_camera = _matrix(entry, "camera_to_world", 4, where)
+        focal = size[1] / 2 / np.tan(np.radians(field(entry, "fov", Vertical, where, EXPORT)) / 2)
+        to_nerfstudio, scale = dataparser
+        R = T_world_camera[:3, :3].T  # whether it is a rotation is checked of the camera that comes of it
+        pose = OPENGL_TO_OPENCV @ rigid(R, -R @ T_world_camera[:3, 3] / scale) @ to_nerfstudio
+        K = pinhole(focal, focal, size[0] / 2, size[1] / 2)
+        cameras.append(replace(checked_camera(str(number), size, K, pose, None, place), name=""))
+        times.append(field(entry, "render_time", OptionalTime, where, EXPORT, default=None))
     known = [float(np.clip(time, 0, 1)) for time in times if time is not None]
     if table.get("fps"):
-        fps = field(table, "fps", Above0, str(path), EXPORT)
+        fps = field(table, "fps", Above0, place, EXPORT)
     else:
-        fps = len(poses) / (field(table, "seconds", Above0, str(path), EXPORT) if table.get("seconds") else 1.0)
-    return CameraPath(poses, known if len(known) == len(times) else None, fps)
-
-
-def _pose(
-    entry: Mapping[str, Any], size: tuple[int, int], dataparser: tuple[np.ndarray, float], number: int, path: Path
-) -> Pose:
-    place = f"camera {number} of {path}"
-    to_nerfstudio, scale = dataparser
-    T_world_camera = _matrix(entry, "camera_to_world", 4, place)
-    T_world_camera[:3, 3] /= scale
-    focal = size[1] / 2 / np.tan(np.radians(field(entry, "fov", Vertical, place, EXPORT)) / 2)
-    T_camera_world = OPENGL_TO_OPENCV @ _inverse(T_world_camera) @ to_nerfstudio
-    K = pinhole(focal, focal, size[0] / 2, size[1] / 2)
-    return pose_of(checked_camera(str(number), size, K, T_camera_world, None, str(path)))
+        fps = len(cameras) / (field(table, "seconds", Above0, place, EXPORT) if table.get("seconds") else 1.0)
+    return CameraPath(cameras, known if len(known) == len(times) else None, fps)
 
 
 def _dataparser(path: Path) -> tuple[np.ndarray, float]:
@@ -287,19 +261,13 @@ def _dataparser(path: Path) -> tuple[np.ndarray, float]:
 
 def _matrix(table: Mapping[str, Any], name: str, rows: int, place: str) -> np.ndarray:
     """The pose under `name`, [4, 4], from the first `rows` rows of 4 numbers, nested or not."""
-    values = field(table, name, list, place, EXPORT)
-    found = np.eye(4)
+    matrix, values = np.eye(4), field(table, name, list, place, EXPORT)
     try:
-        found[:rows] = np.array(values, np.float64).reshape(rows, 4)
+        matrix[:rows] = np.array(values, np.float64).reshape(rows, 4)
     except (TypeError, ValueError, OverflowError):
         raise D2Error(f"{name} of {place} is no matrix of {rows} x 4 numbers: {EXPORT}") from None
-    if not (np.abs(found) <= LARGEST_NUMBER).all():
+    if not (np.abs(matrix) <= LARGEST_NUMBER).all():
         raise D2Error(f"{name} of {place} has a number that is not finite or too large: {EXPORT}")
-    if not np.array_equal(found[3], (0, 0, 0, 1)):
-        raise D2Error(f"{name} of {place} ends in {found[3].tolist()}, expected 0, 0, 0, 1: {EXPORT}")
-    return found
-
-
-def _inverse(T: np.ndarray) -> np.ndarray:
-    """The inverse of a rigid transform; whether it is rigid is checked of the camera that it gives."""
-    return rigid(T[:3, :3].T, -T[:3, :3].T @ T[:3, 3])
+    if not np.array_equal(matrix[3], (0, 0, 0, 1)):
+        raise D2Error(f"{name} of {place} ends in {matrix[3].tolist()}, expected 0, 0, 0, 1: {EXPORT}")
+    return matrix

@@ -14,7 +14,6 @@ from d2_plugin.priors.sheet import LABEL_COLORS, SURE, UNSURE, label_colors, sig
 from d2_plugin.protocol import DepthPrior, Label, View
 from d2_plugin.recordings.images import opencv
 from d2_plugin.runs.drawing import Panel, Scale, as_bytes, color_scale, colorize, depth_panel, error_panel
-from d2_plugin.viewing.camera_paths import Lens
 from d2_plugin.viewing.rendering import RenderedView, gaussians_per_pixel, render_view
 from d2_plugin.viewing.viewed import ViewedRun
 
@@ -136,14 +135,14 @@ RECORDED = ("truth", "error", "true-depth", "prior", "sigma", "labels")
 
 
 def fitted(array: np.ndarray, width: int, height: int, nearest: bool = False) -> np.ndarray:
-    """An image or map at another size, as `Lens.fitted` has it: scaled to fill, cut alike on both sides.
+    """An image or map at another size, as `camera_paths.for_size` has it: scaled to fill, cut alike on both sides.
 
     `nearest` picks one pixel instead of averaging several: for depths and labels, which have no mean across an edge.
     """
     if array.shape[:2] == (height, width):
         return array
     cv2 = opencv("an image of another size than the recording's")
-    scale = Lens(np.eye(3), array.shape[1], array.shape[0]).fitted(width, height).K[0, 0]
+    scale = max(width / array.shape[1], height / array.shape[0])
     whole = max(round(array.shape[1] * scale), width), max(round(array.shape[0] * scale), height)
     how = cv2.INTER_NEAREST if nearest else cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
     large = cv2.resize(array, whole, interpolation=how)

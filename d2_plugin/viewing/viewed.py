@@ -22,7 +22,7 @@ from d2_plugin.recordings import Camera, Recording, Source
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.store.store import PriorStore
-from d2_plugin.viewing.camera_paths import Pose
+from d2_plugin.viewing.camera_paths import for_size
 
 UNKNOWN_IMAGE = 60
 """Grey of an image that was not kept."""
@@ -69,12 +69,12 @@ class ViewedRun:
         """The recorded frame that is nearest to an instant, in seconds."""
         return min(self.recording.frames, key=lambda frame: abs(self.recording.seconds(frame) - time))
 
-    def view(self, pose: Pose, time: float, size: tuple[int, int], camera: str = "") -> View:
-        """The view of a pose at an instant; `camera` names the camera of the recording that it is, if it is one."""
-        lens = pose.lens.fitted(*size)
-        T = torch.tensor(pose.T_camera_world, dtype=torch.float32, device=self.device)
-        K = torch.tensor(lens.K, dtype=torch.float32, device=self.device)
-        return View(camera, self.frame_at(time), self.time_offset + time * self.time_scale, T, K, *size)
+    def view(self, camera: Camera, time: float, size: tuple[int, int] | None = None) -> View:
+        """What a camera sees at an instant, in its own size or another; it has a name if it is one of the recording."""
+        camera = camera if size is None else for_size(camera, *size)
+        T, K = (torch.tensor(m, dtype=torch.float32, device=self.device) for m in (camera.T_camera_world, camera.K))
+        moment = self.frame_at(time), self.time_offset + time * self.time_scale
+        return View(camera.name, *moment, T, K, camera.width, camera.height)
 
     @property
     def depth(self) -> float | None:

@@ -18,7 +18,6 @@ from d2_plugin import registry
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import View
-from d2_plugin.viewing.camera_paths import pose_of
 from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.checkpoints.files import read_options, read_ply
 from d2_plugin.viewing.checkpoints.models import FOUR_C, FOUR_C_STATIC, FUDAN, PLANES, STATIC
@@ -32,7 +31,7 @@ SIZE = (96, 54)
 
 def seen(viewed: ViewedRun, time: float, camera: str = "train0") -> Any:
     """The viewed's view of a camera of the recording."""
-    return viewed.view(pose_of(viewed.recording.cameras[camera]), time, SIZE)
+    return viewed.view(viewed.recording.cameras[camera], time, SIZE)
 
 
 def close(a: Tensor, b: Any, within: float = 2e-5) -> bool:

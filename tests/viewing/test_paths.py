@@ -16,9 +16,8 @@ from d2_plugin.recordings import Camera
 from d2_plugin.recordings.cameras.camera import OPENGL_TO_OPENCV
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.viewing.camera_paths import (
-    Lens,
-    Pose,
     focus_of,
+    for_size,
     look_at,
     orbit,
     read_camera_path,
@@ -35,11 +34,6 @@ def ring(count: int, radius: float = 3.0) -> list[Camera]:
     centres = radius * np.stack([np.sin(angles), np.zeros(count), np.cos(angles)], -1)
     poses = [look_at(centre, np.zeros(3), np.array([0.0, -1, 0])) for centre in centres]
     return [replace(ARC[0], name=f"{i}", T_camera_world=pose) for i, pose in enumerate(poses)]
-
-
-def centre(pose: Pose) -> np.ndarray:
-    R, t = pose.T_camera_world[:3, :3], pose.T_camera_world[:3, 3]
-    return -R.T @ t
 
 
 def focus(cameras: list[Camera]) -> np.ndarray:
@@ -62,7 +56,7 @@ def test_every_pose_is_a_camera_pose(path, cameras: list[Camera]) -> None:
 
 def test_a_path_through_the_cameras_begins_and_ends_at_one_and_visits_all() -> None:
     poses = through(ARC, 31)
-    ends = {tuple(np.round(centre(pose), 9)) for pose in (poses[0], poses[-1])}
+    ends = {tuple(np.round(pose.centre, 9)) for pose in (poses[0], poses[-1])}
     assert ends <= {tuple(np.round(camera.centre, 9)) for camera in ARC}
     assert len(ends) == 2
     for camera in ARC:
@@ -71,28 +65,28 @@ def test_a_path_through_the_cameras_begins_and_ends_at_one_and_visits_all() -> N
 
 def test_an_orbit_looks_at_the_focus_from_one_distance_and_stays_inside_the_cameras() -> None:
     point, poses = focus(ARC), orbit(ARC, 40)
-    distances = [np.linalg.norm(centre(pose) - point) for pose in poses]
+    distances = [np.linalg.norm(pose.centre - point) for pose in poses]
     assert np.ptp(distances) < 1e-9
     for pose in poses:
         ahead = pose.T_camera_world[:3, :3] @ point + pose.T_camera_world[:3, 3]
         assert np.allclose(ahead[:2], 0, atol=1e-9)
         assert ahead[2] > 0
     widest = max(np.linalg.norm(a.centre - b.centre) for a in ARC for b in ARC)
-    swung = max(np.linalg.norm(centre(a) - centre(b)) for a in poses for b in poses)
+    swung = max(np.linalg.norm(a.centre - b.centre) for a in poses for b in poses)
     assert 0.7 * widest < swung < 1.1 * widest
 
 
 def test_cameras_all_around_are_orbited_by_a_whole_turn() -> None:
-    places = np.stack([centre(pose) for pose in orbit(ring(8), 36)])
+    places = np.stack([pose.centre for pose in orbit(ring(8), 36)])
     assert np.allclose(np.linalg.norm(places, axis=1), 3)
     assert np.allclose(places.mean(axis=0), 0, atol=1e-9)
-    half = np.stack([centre(pose) for pose in orbit(ring(8), 36, degrees=90)])
+    half = np.stack([pose.centre for pose in orbit(ring(8), 36, degrees=90)])
     assert np.linalg.norm(half.mean(axis=0)) > 1
 
 
 def test_a_spiral_stays_close_to_the_mean_camera() -> None:
     middle, reach = np.mean([c.centre for c in ARC], axis=0), max(np.linalg.norm(c.centre - ARC[0].centre) for c in ARC)
-    assert max(np.linalg.norm(centre(pose) - middle) for pose in spiral(ARC, 60)) < reach
+    assert max(np.linalg.norm(pose.centre - middle) for pose in spiral(ARC, 60)) < reach
 
 
 def test_parallel_cameras_have_a_focus_in_front_of_them() -> None:
@@ -112,8 +106,7 @@ def test_look_at_is_upright_and_looks_there(x: float, y: float, z: float) -> Non
 
 @pytest.mark.parametrize("size", [(192, 108), (48, 27), (100, 54), (54, 96)])
 def test_a_lens_of_another_size_keeps_its_shape_and_its_middle(size: tuple[int, int]) -> None:
-    lens = Lens(np.array([[90.0, 0, 50], [0, 90.0, 25], [0, 0, 1]]), 96, 54)
-    other = lens.fitted(*size)
+    other = for_size(replace(ARC[0], K=np.array([[90.0, 0, 50], [0, 90.0, 25], [0, 0, 1]])), *size)
     scale = max(size[0] / 96, size[1] / 54)
     assert np.isclose(other.K[0, 0], other.K[1, 1])
     assert np.isclose(other.K[0, 0], 90 * scale)
@@ -141,7 +134,7 @@ class TestCameraPathFiles:
         moved[:3, 3] *= 0.1
         there = replace(ARC[1], T_camera_world=np.linalg.inv(moved))
         found = read_camera_path(self.write(tmp_path, there))
-        assert np.allclose(found.poses[0].T_camera_world, ARC[1].T_camera_world)
+        assert np.allclose(found.cameras[0].T_camera_world, ARC[1].T_camera_world)
 
     def test_times_count_only_where_all_have_one(self, tmp_path: Path) -> None:
         path = self.write(tmp_path, ARC[0])

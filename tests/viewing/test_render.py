@@ -20,7 +20,6 @@ from d2_plugin.recordings.images import read_image
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import make_view
-from d2_plugin.viewing.camera_paths import pose_of
 from d2_plugin.viewing.panels import KINDS, Shot
 from d2_plugin.viewing.videos.plan import RenderSettings, plan_video
 from d2_plugin.viewing.videos.render import run
@@ -73,7 +72,7 @@ def test_a_path_through_the_training_cameras_begins_and_ends_as_the_rasterizer_d
     assert len(found) == 12
     stops = plan_video(viewed, RenderSettings((), path="through", at=0.0, seconds=1.0)).stops
     cameras = viewed.recording.cameras
-    ends = [next(n for n in cameras if cameras[n].T_camera_world is stop.pose.T_camera_world) for stop in stops[::11]]
+    ends = [next(n for n in cameras if cameras[n].T_camera_world is stop.camera.T_camera_world) for stop in stops[::11]]
     assert decibels(found[0], rendered(ends[0], 0)) >= 35
     assert decibels(found[-1], rendered(ends[1], 0)) >= 35
 
@@ -165,7 +164,7 @@ def test_every_kind_of_image_stands_beside_the_others_and_runs_below(trained: Pa
 
 def test_panels_show_what_they_say(viewed: ViewedRun) -> None:
     camera = viewed.recording.cameras["train1"]
-    shot = Shot(viewed, viewed.view(pose_of(camera), 0.0, (96, 54), "train1"), (1.0, 9.0))
+    shot = Shot(viewed, viewed.view(camera, 0.0), (1.0, 9.0))
     assert np.array_equal(KINDS["truth"](shot).image, viewed.recording.image("train1", 0))
     difference = np.abs(shot.rendered.color.numpy() - viewed.recording.image("train1", 0) / np.float32(255))
     expected = -10 * np.log10(np.mean(difference**2))
@@ -173,7 +172,7 @@ def test_panels_show_what_they_say(viewed: ViewedRun) -> None:
     depth = KINDS["true-depth"](shot)
     assert "1..9" in depth.caption
     assert depth.bar is not None
-    half = Shot(viewed, viewed.view(pose_of(camera), 0.0, (48, 27), "train1"), (1.0, 9.0))
+    half = Shot(viewed, viewed.view(camera, 0.0, (48, 27)), (1.0, 9.0))
     assert KINDS["labels"](half).image.shape == (27, 48, 3)
 
 

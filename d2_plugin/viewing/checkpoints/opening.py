@@ -12,7 +12,6 @@ from d2_plugin.protocol import RasterSettings
 from d2_plugin.reading import parsing, shown_path
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.values import checked_arguments
-from d2_plugin.viewing.camera_paths import pose_of
 from d2_plugin.viewing.checkpoints.files import read_tensors
 from d2_plugin.viewing.checkpoints.models import Checkpoint, newest_cloud, of_cloud, of_gsplat, of_tuple
 from d2_plugin.viewing.rendering import render_view
@@ -59,7 +58,7 @@ def open_viewed(
 
 def _check_drawn(viewed: ViewedRun, path: Path) -> None:
     """Draw one small image of somebody else's file, so that what does not fit together is an error now."""
-    view = viewed.view(pose_of(next(iter(viewed.recording.cameras.values()))), 0.0, (16, 16))
+    view = viewed.view(next(iter(viewed.recording.cameras.values())), 0.0, (16, 16))
     with parsing(f"checkpoint {shown_path(path)}", "give one whose tensors fit together"):
         shown = render_view(viewed.backbone, view).splats
     if not all(bool(torch.isfinite(part).all()) for part in (shown.means, shown.covariances, shown.opacities)):

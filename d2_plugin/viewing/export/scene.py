@@ -15,7 +15,7 @@ from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import RasterSettings, Splats, View
 from d2_plugin.recordings import Camera
-from d2_plugin.viewing.camera_paths import focus_of, pose_of
+from d2_plugin.viewing.camera_paths import focus_of
 from d2_plugin.viewing.export.ply import scales_and_rotations
 from d2_plugin.viewing.viewed import ViewedRun
 
@@ -113,8 +113,7 @@ class ExportScene:
 def export_scene(viewed: ViewedRun) -> ExportScene:
     """What is exported of a run or a checkpoint."""
     recording, backbone = viewed.recording, viewed.backbone
-    first = viewed.training[0]
-    view = viewed.view(pose_of(first), 0.0, (first.width, first.height), first.name)
+    view = viewed.view(viewed.training[0], 0.0)
     model: Any = getattr(backbone, "model", None)  # of the bundled backbones
 
     @torch.no_grad()

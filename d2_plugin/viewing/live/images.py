@@ -87,7 +87,7 @@ def draw(page: Page, wanted: Wanted, marked: Tensor | None, seconds: float | Non
     start = time.perf_counter()
     size = resolution.size(wanted.aspect, wanted.height, seconds)
     known = wanted.marked and marked is not None and len(marked) == len(viewed.backbone)
-    view = viewed.view(wanted.camera(*size), wanted.time, size)
+    view = viewed.view(wanted.camera(*size), wanted.time)
     shot = Shot(viewed, view, None, wanted.min_opacity, marked if known else None)
     quality = STILL_QUALITY if seconds is None else MOVING_QUALITY
     scene.set_background_image(KINDS[wanted.show](shot).image, format="jpeg", jpeg_quality=quality)

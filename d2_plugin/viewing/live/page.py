@@ -20,7 +20,6 @@ import numpy as np
 from d2_plugin.recordings import Camera
 from d2_plugin.recordings.cameras.camera import FIELD_OF_VIEW, LARGEST_NUMBER, pinhole, rigid
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation, rotation_of_quaternion
-from d2_plugin.viewing.camera_paths import Lens, Pose
 from d2_plugin.viewing.viewed import ViewedRun
 
 REST = 0.3
@@ -46,12 +45,12 @@ class Wanted(NamedTuple):
     marked: bool
     height: int
 
-    def camera(self, width: int, height: int) -> Pose:
-        """Where the browser's camera stands, with the lens of an image of this size."""
+    def camera(self, width: int, height: int) -> Camera:
+        """The browser's camera for an image of this size."""
         R = rotation_of_quaternion(np.array(self.pose[3:7])).T
         focal = 0.5 * height / math.tan(self.pose[7] / 2)
         K = pinhole(focal, focal, width / 2, height / 2)
-        return Pose(rigid(R, -R @ np.array(self.pose[:3])), Lens(K, width, height))
+        return Camera("", width, height, K, rigid(R, -R @ np.array(self.pose[:3])))
 
 
 @dataclass

@@ -18,7 +18,6 @@ from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import OnStep
 from d2_plugin.settings import AtLeastOne, Positional, Range, Settings
 from d2_plugin.store.store import PriorStore
-from d2_plugin.viewing.camera_paths import pose_of
 from d2_plugin.viewing.checkpoints import is_output_folder, open_viewed
 from d2_plugin.viewing.live.images import Share
 from d2_plugin.viewing.live.server import LOCAL
@@ -154,9 +153,7 @@ class Scorer:
         # Steps that share no factor with the number of views visit all of them, spread over the recording.
         name, frame = self._views[self._next * 7919 % len(self._views)]
         self._next += 1
-        camera = self.viewed.recording.cameras[name]
-        size = camera.width, camera.height
-        view = self.viewed.view(pose_of(camera), self.viewed.recording.seconds(frame), size, name)
+        view = self.viewed.view(self.viewed.recording.cameras[name], self.viewed.recording.seconds(frame))
         truth = torch.from_numpy(self.viewed.recording.image(name, frame)).float() / 255
         self._scores.append(psnr(render_view(self.viewed.backbone, view).color, truth))
         self._share.spent += time.monotonic() - now

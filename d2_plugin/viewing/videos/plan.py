@@ -11,8 +11,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.recordings import Camera
 from d2_plugin.settings import AtLeastOne, Positional, Range, Settings
-from d2_plugin.viewing.camera_paths import Pose, orbit, pose_of, read_camera_path, spiral, through
+from d2_plugin.viewing.camera_paths import orbit, read_camera_path, spiral, through
 from d2_plugin.viewing.panels import RECORDED
 from d2_plugin.viewing.videos.video import RATES, Format
 from d2_plugin.viewing.viewed import ViewedRun
@@ -79,11 +80,9 @@ class RenderSettings(Settings):
 class Stop(NamedTuple):
     """One image of a video."""
 
-    pose: Pose
+    camera: Camera
     time: float
     """Seconds since the first frame."""
-    camera: str = ""
-    """The camera of the recording that stands there, if one does."""
 
 
 class Plan(NamedTuple):
@@ -142,7 +141,7 @@ def _standing(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[S
     else:
         count = max(round(fps), 1)
     times = _instants(viewed, settings, count, fps)
-    return [Stop(pose_of(viewed.recording.cameras[name]), time, name) for name in names for time in times]
+    return [Stop(viewed.recording.cameras[name], time) for name in names for time in times]
 
 
 def _moving(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[Stop]:
@@ -151,12 +150,12 @@ def _moving(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[Sto
     played = 0 if settings.at is not None else viewed.duration / settings.speed
     count = max(round(_bounded((settings.seconds or max(MOVING_SECONDS, played)) * fps)), 2)
     if settings.path == "orbit":
-        poses = orbit(cameras, count, settings.degrees, viewed.depth)
+        path = orbit(cameras, count, settings.degrees, viewed.depth)
     elif settings.path == "spiral":
-        poses = spiral(cameras, count, viewed.depth)
+        path = spiral(cameras, count, viewed.depth)
     else:
-        poses = through(cameras, count)
-    return [Stop(pose, time) for pose, time in zip(poses, _instants(viewed, settings, count, fps), strict=True)]
+        path = through(cameras, count)
+    return [Stop(camera, time) for camera, time in zip(path, _instants(viewed, settings, count, fps), strict=True)]
 
 
 def _from_file(viewed: ViewedRun, settings: RenderSettings) -> tuple[list[Stop], float]:
@@ -167,8 +166,8 @@ def _from_file(viewed: ViewedRun, settings: RenderSettings) -> tuple[list[Stop],
     if path.shares is not None and settings.at is None:
         times = [share * viewed.duration for share in path.shares]
     else:
-        times = _instants(viewed, settings, len(path.poses), fps)
-    return [Stop(pose, time) for pose, time in zip(path.poses, times, strict=True)], fps
+        times = _instants(viewed, settings, len(path.cameras), fps)
+    return [Stop(camera, time) for camera, time in zip(path.cameras, times, strict=True)], fps
 
 
 def _checked_rate(fps: float) -> float:

@@ -75,7 +75,7 @@ def _check(settings: RenderSettings) -> None:
 
 def _size(first: Stop, width: int | None, height: int | None) -> tuple[int, int]:
     """Width and height of an image: as given, the other side in proportion, by default the camera's own."""
-    lens = first.pose.lens
+    lens = first.camera
     if width is None and height is None:
         return lens.width, lens.height
     if height is None:
@@ -97,7 +97,7 @@ def _panels(
     viewed: ViewedRun, stop: Stop, size: tuple[int, int], show: Sequence[str], depths: Scale, named: bool
 ) -> list[Panel]:
     """The panels of one run at one image; `named` puts the run's name into captions that differ from run to run."""
-    shot = Shot(viewed, viewed.view(stop.pose, stop.time, size, stop.camera), depths)
+    shot = Shot(viewed, viewed.view(stop.camera, stop.time, size), depths)
     panels = [KINDS[name](shot) for name in show]
     if not named:
         return panels
@@ -137,5 +137,5 @@ def _depths(runs: Sequence[ViewedRun], plan: Plan, size: tuple[int, int], show: 
     chosen = np.unique(np.linspace(0, len(plan.stops) - 1, SAMPLED).round().astype(int))
     small = max(size[0] // 2, 1), max(size[1] // 2, 1)
     stops = [plan.stops[i] for i in chosen]
-    views = [(viewed, viewed.view(stop.pose, stop.time, small)) for viewed in runs for stop in stops]
+    views = [(viewed, viewed.view(stop.camera, stop.time, small)) for viewed in runs for stop in stops]
     return depth_scale([render_view(viewed.backbone, view).depth.numpy() for viewed, view in views])
