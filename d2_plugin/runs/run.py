@@ -33,7 +33,7 @@ from d2_plugin.runs.saved import (
     watched,
     what_diverged,
 )
-from d2_plugin.runs.scene import Guidance, Remembered, Scene
+from d2_plugin.runs.scene import Guidance, Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config
 from d2_plugin.runs.start import (
     TimedPoints,
@@ -90,9 +90,9 @@ class Run:
     def load(cls, folder: Path) -> Run:
         """The run that lies in `folder`."""
         table = read_run(folder)
-        guidance = table.pop("guidance", None)
-        settings = RunSettings.from_table(table, str(folder / "run.json"))
-        return cls(settings, folder, None if guidance is None else Remembered(guidance))
+        if "guidance" in table:
+            raise D2Error(f"{folder} is a run of {table['guidance']}: continue it with the command that began it")
+        return cls(RunSettings.from_table(table, str(folder / "run.json")), folder)
 
     @property
     def uses_prior(self) -> bool:
@@ -158,10 +158,9 @@ class Run:
     def evaluate(self, images: bool = True) -> dict[str, Any]:
         """Score every held-out camera at every frame; returns the metrics.
 
-        Writes metrics.json (per view, per frame, per camera, mean), the same as tables in metrics.md, and images/.
+        Writes metrics.json (per view, per frame, per camera, mean) and images/.
         """
         from d2_plugin.runs.evaluation import evaluate_scene
-        from d2_plugin.runs.tables import view_tables
 
         with self._writing():
             trainer = self.trained()
@@ -169,7 +168,6 @@ class Run:
                 shown = self.folder / "images" if images else None
                 scores = evaluate_scene(trainer.model, self.scene, self.settings.device, shown)
             metrics = scores | _about(self, trainer)
-            write_text(self.folder / "metrics.md", view_tables(metrics))
             write_table(self.folder / "metrics.json", metrics, METRICS)
         return metrics
 

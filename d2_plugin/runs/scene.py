@@ -14,10 +14,8 @@ from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.cameras.check import check_background_weight, check_recording
 from d2_plugin.recordings.checks.memory import check_memory
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
-from d2_plugin.runs.saved import RUN
 from d2_plugin.runs.settings import RunSettings, prior_settings
 from d2_plugin.runs.start import TimedPoints
-from d2_plugin.values import shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,29 +82,6 @@ class Guidance(Protocol):
 
     def hooks(self, scene: Scene, points: TimedPoints, priors: Path) -> Mapping[str, Hook]:
         """The hooks that run in place of D2's, by name."""
-
-
-@dataclass(frozen=True)
-class Remembered:
-    """The guidance of a run that was read from its folder: enough to score and view it, not to train it further."""
-
-    table: Mapping[str, Any]
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.table, Mapping) or not isinstance(self.table.get("name"), str):
-            raise D2Error(f"the run is guided by {shown(self.table)}, which has no name: {RUN.remedy}")
-
-    def identity(self) -> Mapping[str, Any]:
-        """As run.json has it."""
-        return self.table
-
-    def start(self, scene: Scene, points: TimedPoints, priors: Path) -> TimedPoints:
-        """The triangulated points; a checkpoint takes their place."""
-        return points
-
-    def hooks(self, scene: Scene, points: TimedPoints, priors: Path) -> Mapping[str, Hook]:
-        """Refused: what the hooks are is known by name only."""
-        raise D2Error(f"this run is guided by '{self.table['name']}': continue it with the command that began it")
 
 
 def _without_held_out_instants(recording: Recording, every: int) -> tuple[Recording, tuple[int, ...]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,17 +17,15 @@ class Table(NamedTuple):
 
 def markdown(table: Table, padded: bool = False) -> str:
     """The table as Markdown; what stands out is bold. `padded` makes its columns line up in a terminal."""
-    rows = [
-        [_markdown_cell(cell, (i, k) in table.best) for k, cell in enumerate(row)] for i, row in enumerate(table.rows)
-    ]
-    lines = [[_markdown_cell(title, False) for title in table.header], ["---"] * len(table.header), *rows]
+    rows = [[_cell(cell, (i, k) in table.best) for k, cell in enumerate(row)] for i, row in enumerate(table.rows)]
+    lines = [[_cell(title, False) for title in table.header], ["---"] * len(table.header), *rows]
     if padded:
         widths = [max(len(line[column]) for line in lines) for column in range(len(table.header))]
         lines = [[cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def _markdown_cell(cell: str, best: bool) -> str:
+def _cell(cell: str, best: bool) -> str:
     text = " ".join(cell.splitlines()).replace("|", "\\|").replace("<", "&lt;")  # no tag in a page made of it
     return f"**{text}**" if best else text
 
@@ -76,43 +74,12 @@ STUDY_COLUMNS = tuple(column for column in COLUMNS if column.key in _STUDY)
 
 def metrics_table(runs: Mapping[str, Metrics]) -> str:
     """A Markdown table with one row per run of `metrics.json` contents; what was not measured shows as `-`."""
-    scored = _scored(runs)
-    columns = _columns(list(scored.values()))
+    scores = {name: metrics.get("test") or {} for name, metrics in runs.items()}
+    columns = [c for c in COLUMNS if c.always or any(score.get(c.key) is not None for score in scores.values())]
     header = ("run", *(column.title for column in columns), "Gaussians", "priors s", "train s")
     rows = []
     for name, metrics in runs.items():
         seconds = metrics["seconds"]
         costs = (str(metrics["gaussians"]), f"{seconds['priors']:.1f}", f"{seconds['train']:.1f}")
-        rows.append((name, *_cells(scored[name], columns), *costs))
+        rows.append((name, *(column.text(scores[name].get(column.key)) for column in columns), *costs))
     return markdown(Table(header, tuple(rows)), padded=True)
-
-
-def _scored(runs: Mapping[str, Metrics]) -> dict[str, Mapping[str, Any]]:
-    return {name: metrics.get("test") or {} for name, metrics in runs.items()}
-
-
-def view_tables(metrics: Metrics) -> str:
-    """Markdown of one run: the mean, then per camera, per frame and per view, and what each column means."""
-    means = {name: metrics[name] for name in ("test", "train") if metrics.get(name)}
-    parts = [_section(f"Mean over {name} views", [{"": "all", **scores}], [""]) for name, scores in means.items()]
-    parts.append(_section("Per camera", metrics["per_camera"], ["camera"]))
-    parts.append(_section("Per frame", metrics["per_frame"], ["frame"]))
-    parts.append(_section("Per view", metrics["per_view"], ["camera", "frame"]))
-    shown = _columns(metrics["per_view"])
-    variants = "\n".join(f"- {column.title}: {metrics['variants'][column.key]}" for column in shown)
-    return "\n\n".join([*parts, f"## What is measured\n\n{variants}"]) + "\n"
-
-
-def _columns(scored: Sequence[Mapping[str, Any]]) -> list[Column]:
-    return [c for c in COLUMNS if c.always or any(scores.get(c.key) is not None for scores in scored)]
-
-
-def _section(title: str, rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> str:
-    columns = _columns(rows)
-    header = (*keys, *(column.title for column in columns))
-    lines = tuple((*(str(row[key]) for key in keys), *_cells(row, columns)) for row in rows)
-    return f"## {title}\n\n{markdown(Table(header, lines), padded=True)}"
-
-
-def _cells(scores: Mapping[str, Any], columns: Sequence[Column]) -> list[str]:
-    return [column.text(scores.get(column.key)) for column in columns]

@@ -257,6 +257,13 @@ def folder_of(output: Path, method: str) -> Path:
     return output / "yang4d" / method / "seed0"
 
 
+def run_of(output: Path, name: str) -> Run:
+    """The run of a rival."""
+    stored = read_run(folder_of(output, name))
+    rival = guidance(stored.pop("guidance")["name"], 24)
+    return Run(RunSettings.from_table(stored, "run.json"), folder_of(output, name), rival)
+
+
 class TestOnARecording:
     def test_every_rival_trains_on_one_prior_and_says_its_name(self, ablation: Path) -> None:
         rows = [json.loads(line) for line in (ablation / "runs.jsonl").read_text().splitlines()]
@@ -272,7 +279,7 @@ class TestOnARecording:
         assert len({metrics["test"]["psnr"] for metrics in scores.values()}) == len(scores)
 
     def test_a_dense_start_adds_stereo_points_to_the_triangulated_ones(self, ablation: Path) -> None:
-        run = Run.load(folder_of(ablation, "dense_start"))
+        run = run_of(ablation, "dense_start")
         points = run.prepare(priors=False)
         started = guidance("dense_start", 24).start(run.scene, points, run.priors)
         assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of six images rounds
@@ -281,7 +288,7 @@ class TestOnARecording:
 
     def test_the_store_is_opened_once_for_all_maps(self, ablation: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """A rival is charged for its own work: opening the store costs more than a step."""
-        run, opened = Run.load(folder_of(ablation, "pearson")), []
+        run, opened = run_of(ablation, "pearson"), []
         inputs = Inputs(run.scene, run.prepare(priors=False), run.priors)
         open_store = PriorStore.open
         monkeypatch.setattr(PriorStore, "open", lambda path: opened.append(path) or open_store(path))
@@ -293,10 +300,8 @@ class TestOnARecording:
 
     def test_a_resumed_rival_is_bitwise_the_uninterrupted_one(self, ablation: Path, tmp_path: Path) -> None:
         """patch_norm draws at random: its draws come from the run's own generator, which is saved."""
-        whole = folder_of(ablation, "patch_norm")
-        stored = read_run(whole)
-        rival = guidance(stored.pop("guidance")["name"], 24)
-        settings = RunSettings.from_table(stored, "run.json")
+        whole, begun = folder_of(ablation, "patch_norm"), run_of(ablation, "patch_norm")
+        settings, rival = begun.settings, begun.guidance
         run = Run(settings, tmp_path / "cut", rival)
         (tmp_path / "cut" / "points.npz").write_bytes((whole / "points.npz").read_bytes())
         trainer = run._trainer(run.prepare())
@@ -309,21 +314,15 @@ class TestOnARecording:
         assert len(mine) == len(others) > 10
         assert all(torch.equal(a, b) for a, b in zip(mine, others, strict=True))
 
-    def test_a_rivals_run_can_be_scored_but_not_trained_by_others(self, ablation: Path) -> None:
-        run = Run.load(folder_of(ablation, "pearson"))
+    def test_a_rivals_run_is_its_own_and_no_run_of_others(self, ablation: Path) -> None:
+        folder, run = folder_of(ablation, "pearson"), run_of(ablation, "pearson")
         assert run.evaluate(images=False)["guidance"]["name"] == "pearson"
-        with pytest.raises(D2Error, match="guided by 'pearson'"):
-            run._trainer(run.prepare(priors=False))
-
-    def test_another_rival_does_not_take_the_folder(self, ablation: Path) -> None:
-        folder = folder_of(ablation, "pearson")
-        settings = Run.load(folder).settings
-        with pytest.raises(D2Error, match="other settings of guidance"):
-            Run(settings, folder, guidance("scale_shift", 24))
-        with pytest.raises(D2Error, match="other settings of guidance"):
-            Run(settings, folder)
-        with pytest.raises(D2Error, match="other settings of guidance"):
-            Run(settings, folder, replace(guidance("pearson", 24), config=PearsonConfig(weight=0.5)))
+        with pytest.raises(D2Error, match="pearson.*continue it with the command that began it"):
+            Run.load(folder)
+        stronger = replace(guidance("pearson", 24), config=PearsonConfig(weight=0.5))
+        for other in (guidance("scale_shift", 24), None, stronger):
+            with pytest.raises(D2Error, match="other settings of guidance"):
+                Run(run.settings, folder, other)
 
 
 class TestHooksAsObjects:

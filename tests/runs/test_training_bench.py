@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,7 +17,6 @@ from hypothesis import strategies as st
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.ablation.presets import PRESETS
 from d2_plugin.runs.rows import TRY, Row, make_row
-from d2_plugin.runs.scene import Remembered
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Shared
 from d2_plugin.runs.training.bench import (
@@ -137,7 +137,7 @@ class TestPlan:
 
     def test_other_settings_are_other_runs_wherever_the_files_lie(self) -> None:
         def job(settings: RunSettings, **guidance: object) -> str:
-            rival = Remembered(guidance) if guidance else None
+            rival: Any = SimpleNamespace(identity=lambda: guidance) if guidance else None
             return fingerprint(Work(settings, Path("x"), Path("p"), "room", "full", "d2", TRY, guidance=rival))
 
         elsewhere = replace(SETTINGS, recording="/elsewhere/room", priors="/elsewhere/dual")

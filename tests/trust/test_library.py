@@ -132,9 +132,9 @@ def test_what_is_no_image(image: np.ndarray, tmp_path: Path) -> None:
         Board(7, 5, 0.04).corners(image)
     with (
         pytest.raises(D2Error, match=r"expected RGB uint8 \[H, W, 3\]"),
-        write_video(tmp_path / "a.mp4", "mp4", 24) as video,
+        write_video(tmp_path / "a.mp4", "mp4", 24) as add,
     ):
-        video.add(image)
+        add(image)
     assert not list(tmp_path.iterdir())
 
 

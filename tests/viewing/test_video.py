@@ -32,9 +32,9 @@ def decoded(path: Path) -> list[np.ndarray]:
 
 
 def write(path: Path, images: list[np.ndarray], fps: float = 30, form: str = "mp4") -> None:
-    with write_video(path, form, fps) as video:
+    with write_video(path, form, fps) as add:
         for image in images:
-            video.add(image)
+            add(image)
 
 
 def decibels(a: np.ndarray, b: np.ndarray) -> float:
@@ -114,6 +114,8 @@ def test_a_video_that_fails_leaves_what_was_there_and_nothing_else(tmp_path: Pat
 def test_a_place_where_no_video_can_be_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     (tmp_path / "folder.mp4").mkdir()
+    with pytest.raises(D2Error, match="a video of 100000 images per second cannot be: give --fps from 0.001 to 1000"):
+        write(tmp_path / "a.mp4", soft(1, 32, 32), 1e5)
     for path in (tmp_path / "file" / "a.mp4", tmp_path / f"{'y' * 300}.mp4", tmp_path / "folder.mp4"):
         with pytest.raises(D2Error, match="cannot write"):
             write(path, soft(1, 32, 32))

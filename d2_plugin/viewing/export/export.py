@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 from d2_plugin.durable import make_folder, refuse_foreign, remove_leftovers
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.moving import MovingGaussians
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
 from d2_plugin.settings import AtLeastOne, Count, Positional, Positive, Settings
@@ -45,11 +43,8 @@ class Export(Settings):
     """For such a checkpoint: the recording's cameras with images this many times smaller."""
 
 
-class Written(NamedTuple):
-    """What a format has written, and what a person should know about it."""
-
-    paths: tuple[Path, ...]
-    notes: tuple[str, ...] = ()
+Written = tuple[list[Path], list[str]]
+"""What a format has written, and what a person should know about it."""
 
 
 def run(settings: Export) -> str:
@@ -61,47 +56,41 @@ def run(settings: Export) -> str:
     path = settings.run_folder
     viewed = open_viewed(path, settings.recording, settings.train_cameras, settings.downscale)
     output = settings.output or (path.parent if path.is_file() else path) / "export"
-    written = write_export(export_scene(viewed), settings, output)
-    [first, *more] = written.paths
-    what = f"{len(written.paths)} files in {first.parent}" if more else str(first)
-    size = sum(path.stat().st_size for path in written.paths) / 1e6
-    return "\n".join([f"{what} ({size:.1f} MB)", *([viewed.note] if viewed.note else []), *written.notes])
+    paths, notes = write_export(export_scene(viewed), settings, output)
+    what = f"{len(paths)} files in {paths[0].parent}" if len(paths) > 1 else str(paths[0])
+    size = sum(path.stat().st_size for path in paths) / 1e6
+    return "\n".join([f"{what} ({size:.1f} MB)", *([viewed.note] if viewed.note else []), *notes])
 
 
 def write_export(scene: ExportScene, settings: Export, folder: Path) -> Written:
     """Write the scene under `folder` in the format that the settings name."""
     with only_writer(make_folder(folder)):
         remove_leftovers(folder)
-        written = FORMATS[settings.format](scene, settings, folder)
-    if scene.background is None or settings.format == "html":
-        return written
-    note = "the background behind the Gaussians is left out: the format has no place for it, html has"
-    return written._replace(notes=(*written.notes, note))
+        paths, notes = FORMATS[settings.format](scene, settings, folder)
+    if scene.background is not None and settings.format != "html":
+        notes = [*notes, "the background behind the Gaussians is left out: the format has no place for it, html has"]
+    return paths, notes
 
 
 def _html(scene: ExportScene, settings: Export, folder: Path) -> Written:
     path = folder / "scene.html"
     refuse_foreign(path, f'content="{GENERATOR} ', "d2 export")
-    return Written((path,), tuple(write_page(scene, path, settings.megabytes)))
+    return [path], write_page(scene, path, settings.megabytes)
 
 
 def _splatv(scene: ExportScene, settings: Export, folder: Path) -> Written:
-    path, cameras = folder / "scene.splatv", (*scene.train_cameras, *scene.test_cameras)
+    path, notes, bends = folder / "scene.splatv", [], None
     if scene.moving is not None:
         shown = scene.moving.select(seen_rows(scene.moving, scene.duration))
-        write_splatv(path, shown, scene.duration, cameras)
-        return Written((path,), _color_notes(shown))
-    curves = fit_curves(scene)
-    write_splatv(path, curves.gaussians, scene.duration, cameras, curves.bends)
-    off = f"one cubic curve for each Gaussian: off by {curves.offset}"
-    return Written((path,), (off, *_color_notes(curves.gaussians)))
-
-
-def _color_notes(shown: MovingGaussians) -> tuple[str, ...]:
-    """What a format without harmonics loses of the colours."""
-    flat = ("one colour for every direction: the format has no harmonics",) if shown.harmonics.degree > 0 else ()
-    still = ("colours stand still, as they are at each Gaussian's mean time",) if shown.harmonics.time_degree else ()
-    return (*flat, *still)
+    else:
+        shown, bends, offset = fit_curves(scene)
+        notes.append(f"one cubic curve for each Gaussian: off by {offset}")
+    write_splatv(path, shown, scene.duration, (*scene.train_cameras, *scene.test_cameras), bends)
+    if shown.harmonics.degree > 0:
+        notes.append("one colour for every direction: the format has no harmonics")
+    if shown.harmonics.time_degree:
+        notes.append("colours stand still, as they are at each Gaussian's mean time")
+    return [path], notes
 
 
 def _frame_files(scene: ExportScene, settings: Export, folder: Path) -> Written:
@@ -114,21 +103,16 @@ def _frame_files(scene: ExportScene, settings: Export, folder: Path) -> Written:
     if not chosen:
         raise D2Error("--frames names no frame: give first:last, or leave it out for all of them")
     make_folder(folder / settings.format)
-    paths = []
+    paths, writer = list[Path](), write_spz if settings.format == "spz" else write_ply
     with progress_bar(settings.format, len(set(chosen))) as bar:
         for frame, time in zip(scene.frames, scene.seconds):
             if frame in chosen:
                 paths.append(folder / settings.format / f"frame_{frame:05d}.{settings.format}")
-                (write_spz if settings.format == "spz" else write_ply)(paths[-1], *scene.still_at(time))
+                writer(paths[-1], *scene.still_at(time))
                 bar.update(len(paths))
-    return Written(tuple(paths))
+    return paths, []
 
 
-FORMATS: dict[str, Callable[[ExportScene, Export, Path], Written]] = {
-    "html": _html,
-    "ply": _frame_files,
-    "spz": _frame_files,
-    "splatv": _splatv,
-}
+FORMATS = {"html": _html, "ply": _frame_files, "spz": _frame_files, "splatv": _splatv}
 """By the name of the format; a new one is a function here and a word in `Export.format`."""
 FRAME_FORMATS = ("ply", "spz")

@@ -135,10 +135,9 @@ def bake(scene: ExportScene, most_keys: Callable[[int, int], int]) -> Keys:
     times = list(frames) if len(frames) > MANY else sorted({*frames, *_middles(frames)})
     most = int(np.clip(MOST_STATES // max(count, 1), 12, len(times)))
     times = [times[i] for i in np.unique(np.linspace(0, len(times) - 1, most).round().astype(int))]
-    travel = _travel(scene, times)
-    first, scale = travel.first, travel.scale
+    travel = _Travel(scene, times)
     rank = torch.where(travel.changes, 0, torch.where(travel.moves, 1, 2))
-    order = torch.from_numpy(morton_order(first.positions.numpy()))
+    order = torch.from_numpy(morton_order(travel.first.positions.numpy()))
     order = order[travel.shown[order]]
     rows = order[torch.sort(rank[order], stable=True).indices]
     changing, moving = int((rank[rows] == 0).sum()), int((rank[rows] < 2).sum())
@@ -147,46 +146,42 @@ def bake(scene: ExportScene, most_keys: Callable[[int, int], int]) -> Keys:
     for time in chosen:
         now = State(*(part[rows].double() for part in travel.states[times.index(time)]))
         states.append(State(now.positions[:moving], now.factors[:changing], now.opacities[:changing]))
-    keys = Keys(tuple(chosen), first.select(rows), rows, moving, changing, tuple(states), Offset(0, 0, 0))
+    keys = Keys(tuple(chosen), travel.first.select(rows), rows, moving, changing, tuple(states), Offset(0, 0, 0))
     between = [time for time in sorted({*times, *_middles(chosen)}) if time not in set(chosen)]
-    off = _offset(keys, scene, between[:: -(-len(between) // MOST_CHECKS) or 1], scale)
+    off = _offset(keys, scene, between[:: -(-len(between) // MOST_CHECKS) or 1], travel.scale)
     return replace(keys, offset=off)
 
 
-class _Travel(NamedTuple):
+class _Travel:
     """What is known of each Gaussian after all times were visited."""
 
-    first: State
-    scale: Tensor  # [N] pixels per world unit, in the nearest training camera
-    moves: Tensor  # [N] bool
-    changes: Tensor  # [N] bool, shape or opacity
-    shown: Tensor  # [N] bool, drawn at some time
-    sample: Tensor  # rows by which keys are chosen
-    states: list[State]  # at each time, float32
+    def __init__(self, scene: ExportScene, times: Sequence[float]) -> None:
+        state = self.first = state_at(scene, times[0])
+        count = len(state.positions)
+        far, changed, faded, scale = (torch.zeros(count).double() for _ in range(4))
+        strongest = state.opacities
+        self.sample = torch.arange(0, count, 1 + count // SAMPLE)
+        """Rows by which keys are chosen."""
+        self.states = list[State]()
+        """At each time, float32."""
+        for time in times:
+            state = state_at(scene, time, state)
+            scale = torch.maximum(scale, scene.pixels_per_unit(state.positions))
+            far = torch.maximum(far, (state.positions - self.first.positions).norm(dim=-1))
+            changed = torch.maximum(changed, (state.factors - self.first.factors).norm(dim=-1))
+            faded = torch.maximum(faded, (state.opacities - self.first.opacities).abs())
+            strongest = torch.maximum(strongest, state.opacities)
+            self.states.append(State(*(part.float() for part in state)))
+        # Outside every image a moving Gaussian is held to what the others are held to.
+        self.scale = torch.where(scale > 0, scale, scale[scale > 0].median() if bool((scale > 0).any()) else 1.0)
+        """[N] pixels per world unit, in the nearest training camera."""
+        self.moves = far * self.scale > STILL
+        self.changes = (changed * self.scale > STILL) | (faded > 1 / 510)
+        self.shown = strongest >= ALPHA_MIN
 
 
 def _middles(times: Sequence[float]) -> list[float]:
     return [(a + b) / 2 for a, b in itertools.pairwise(times)]
-
-
-def _travel(scene: ExportScene, times: Sequence[float]) -> _Travel:
-    state = first = state_at(scene, times[0])
-    count = len(first.positions)
-    far, changed, faded = (torch.zeros(count).double() for _ in range(3))
-    scale, strongest = torch.zeros(count).double(), first.opacities
-    sample, states = torch.arange(0, count, 1 + count // SAMPLE), []
-    for time in times:
-        state = state_at(scene, time, state)
-        scale = torch.maximum(scale, scene.pixels_per_unit(state.positions))
-        far = torch.maximum(far, (state.positions - first.positions).norm(dim=-1))
-        changed = torch.maximum(changed, (state.factors - first.factors).norm(dim=-1))
-        faded = torch.maximum(faded, (state.opacities - first.opacities).abs())
-        strongest = torch.maximum(strongest, state.opacities)
-        states.append(State(*(part.float() for part in state)))
-    # Outside every image a moving Gaussian is held to what the others are held to.
-    scale = torch.where(scale > 0, scale, scale[scale > 0].median() if bool((scale > 0).any()) else 1.0)
-    changes = (changed * scale > STILL) | (faded > 1 / 510)
-    return _Travel(first, scale, far * scale > STILL, changes, strongest >= ALPHA_MIN, sample, states)
 
 
 def _choose_keys(times: Sequence[float], travel: _Travel, most: int) -> list[float]:

@@ -69,15 +69,13 @@ def _quaternions(rotations: Tensor) -> Tensor:
     component loses no digits.
     """
     (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotations.unbind(-2))
-    products = torch.stack(
-        [
-            torch.stack([1 + a + e + i, h - f, c - g, d - b], dim=-1),
-            torch.stack([h - f, 1 + a - e - i, b + d, c + g], dim=-1),
-            torch.stack([c - g, b + d, 1 - a + e - i, f + h], dim=-1),
-            torch.stack([d - b, c + g, f + h, 1 - a - e + i], dim=-1),
-        ],
-        dim=-2,
+    rows = (
+        (1 + a + e + i, h - f, c - g, d - b),
+        (h - f, 1 + a - e - i, b + d, c + g),
+        (c - g, b + d, 1 - a + e - i, f + h),
+        (d - b, c + g, f + h, 1 - a - e + i),
     )
+    products = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
     largest = products.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
     chosen = products[torch.arange(len(products)), largest]
     return chosen / chosen.norm(dim=-1, keepdim=True)

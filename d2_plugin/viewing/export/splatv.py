@@ -50,7 +50,7 @@ class Curves(NamedTuple):
 
     gaussians: MovingGaussians
     bends: Tensor  # [N, 2, 3]
-    offset: Offset
+    offset: Offset  # how far off the curves are
 
 
 def write_splatv(

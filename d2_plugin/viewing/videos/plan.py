@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,7 +102,7 @@ def plan_video(viewed: ViewedRun, settings: RenderSettings) -> Plan:
     """
     if settings.at is not None and not 0 <= settings.at <= viewed.duration + 1e-9:
         raise D2Error(f"--at {settings.at:g} s lies outside the recording, which lasts {viewed.duration:g} s")
-    fps = _checked_rate(settings.fps or viewed.recording.fps)
+    fps = settings.fps or viewed.recording.fps
     if settings.path in STANDING:
         stops = _standing(viewed, settings, fps)
     elif settings.path in MOVING:
@@ -135,11 +134,11 @@ def _standing(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[S
     if not names:
         raise D2Error(f"{viewed.name} has no held-out camera: choose --path training, through, orbit or spiral")
     if settings.seconds is not None:
-        count = max(round(_bounded(settings.seconds * fps)), 1)
+        count = _count(settings.seconds * fps, 1)
     elif settings.at is None and viewed.duration > 0:
-        count = math.floor(_bounded(viewed.duration / settings.speed * fps) + 1e-6) + 1
+        count = _count(viewed.duration / settings.speed * fps + 0.5 + 1e-6, 1)  # one more than intervals fit
     else:
-        count = max(round(fps), 1)
+        count = _count(fps, 1)
     times = _instants(viewed, settings, count, fps)
     return [Stop(viewed.recording.cameras[name], time) for name in names for time in times]
 
@@ -148,7 +147,7 @@ def _moving(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[Sto
     names = _known(viewed, settings.cameras or viewed.train_cameras)
     cameras = [viewed.recording.cameras[name] for name in names]
     played = 0 if settings.at is not None else viewed.duration / settings.speed
-    count = max(round(_bounded((settings.seconds or max(MOVING_SECONDS, played)) * fps)), 2)
+    count = _count((settings.seconds or max(MOVING_SECONDS, played)) * fps, 2)
     if settings.path == "orbit":
         path = orbit(cameras, count, settings.degrees, viewed.depth)
     elif settings.path == "spiral":
@@ -162,7 +161,7 @@ def _from_file(viewed: ViewedRun, settings: RenderSettings) -> tuple[list[Stop],
     if not settings.path.endswith(".json"):
         raise unknown_name("camera path", settings.path, [*STANDING, *MOVING, "FILE.json"])
     path = read_camera_path(Path(settings.path))
-    fps = _checked_rate(settings.fps or path.fps)
+    fps = settings.fps or path.fps
     if path.shares is not None and settings.at is None:
         times = [share * viewed.duration for share in path.shares]
     else:
@@ -170,22 +169,14 @@ def _from_file(viewed: ViewedRun, settings: RenderSettings) -> tuple[list[Stop],
     return [Stop(camera, time) for camera, time in zip(path.cameras, times, strict=True)], fps
 
 
-def _checked_rate(fps: float) -> float:
-    if not RATES[0] <= fps <= RATES[1]:
-        raise D2Error(
-            f"a video of {fps:g} images per second cannot be written: give --fps from {RATES[0]:g} to {RATES[1]:g}"
-        )
-    return fps
-
-
-def _bounded(images: float) -> float:
-    """How many images a video would have, where that is no more than one may have."""
+def _count(images: float, least: int) -> int:
+    """How many images a video has, where that is no more than one may have."""
     if not images <= MOST_IMAGES:
         raise D2Error(
             f"the video would have {images:.3g} images, at most {MOST_IMAGES}: choose fewer --seconds, a lower "
             "--fps or a higher --speed"
         )
-    return images
+    return max(round(images), least)
 
 
 def _known(viewed: ViewedRun, names: Sequence[str]) -> Sequence[str]:

@@ -38,13 +38,13 @@ def run(settings: RenderSettings) -> str:
     path = settings.output or _default_output(settings)
     depths = _depths(runs, plan, size, settings.show)
     with (
-        write_video(path, settings.format, plan.fps, settings.quality) as video,
+        write_video(path, settings.format, plan.fps, settings.quality) as add,
         progress_bar("render", len(plan.stops)) as bar,
     ):
         for done, stop in enumerate(plan.stops, start=1):
             rows = [_panels(viewed, stop, size, settings.show, depths, len(runs) > 1) for viewed in runs]
             image = arranged(rows, not settings.no_captions)
-            video.add(image)
+            add(image)
             bar.update(done)
     height, width = image.shape[:2]
     notes = [f"note  {viewed.note}" for viewed in runs if viewed.note]

@@ -6,13 +6,14 @@ copy of its last. Nothing is scaled. Scores are never computed from a video.
 
 from __future__ import annotations
 
+import itertools
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -45,16 +46,13 @@ ENCODINGS = {
     "gif": Encoding("gif", "gif", "pal8", {"loop": "0"}),
 }
 
-
-class Video(Protocol):
-    """A video that is being written."""
-
-    def add(self, image: np.ndarray) -> None: ...
+Add = Callable[[np.ndarray], None]
+"""Adds an image, RGB uint8 [H, W, 3], to a video; all have the size of the first."""
 
 
 @checked_arguments
 @contextmanager
-def write_video(path: Path, form: Format, fps: float, quality: int = 18) -> Iterator[Video]:
+def write_video(path: Path, form: Format, fps: float, quality: int = 18) -> Iterator[Add]:
     """A video at `path`, complete when the block ends; what stood there is replaced then and not before.
 
     Args:
@@ -65,66 +63,49 @@ def write_video(path: Path, form: Format, fps: float, quality: int = 18) -> Iter
             this number.
     """
     if not RATES[0] <= fps <= RATES[1]:
-        raise D2Error(f"a video has {fps:g} images per second, expected {RATES[0]:g} to {RATES[1]:g}: correct them")
+        least, most = RATES
+        raise D2Error(f"a video of {fps:g} images per second cannot be: give --fps from {least:g} to {most:g}")
     if form == "png":
-        yield _Pngs(make_folder(path))
+        folder, number = make_folder(path), itertools.count()
+        yield lambda image: write_png(folder / f"{next(number):05d}.png", checked_image(image, "an image of a video"))
         return
     if path.suffix.lower() != f".{form}":  # a typing error must not replace another kind of file
         raise D2Error(f"a video of format {form} needs a name that ends so, got {path.name}: mend the name or --format")
-    folder = make_folder(path.parent)
-    with one_of_many(folder, lambda: remove_leftovers(folder, below=False)):
-        unfinished = path.with_name(f".{secrets.token_hex(8)}{LEFTOVER}")
+    folder, av = make_folder(path.parent), import_av("writing videos")
+    unfinished = path.with_name(f".{secrets.token_hex(8)}{LEFTOVER}")
+    with one_of_many(folder, lambda: remove_leftovers(folder, below=False)), writing(path):
         try:
-            with _encoding(path):
-                video = _Encoded(unfinished, form, _rate(fps), quality)
-                try:
-                    yield video
-                    video.close()
-                finally:
-                    video.abandon()
-                os.replace(unfinished, path)
+            encoder = _Encoder(av, unfinished, form, _rate(fps), quality)
+            try:
+                yield encoder.add
+                encoder.close()
+            finally:
+                with suppress(av.error.FFmpegError, OSError):  # the earlier error is the one that is reported
+                    encoder.container.close()
+            os.replace(unfinished, path)
+        except (D2Error, OSError):
+            raise
+        except (av.error.FFmpegError, OverflowError) as error:
+            raise D2Error(
+                f"cannot write the video {path} ({said(error)}): choose other --width, --height or --fps, or another "
+                "--format"
+            ) from None
         finally:
             with suppress(OSError):
                 unfinished.unlink(missing_ok=True)
 
 
-@contextmanager
-def _encoding(path: Path) -> Iterator[None]:
-    """Within it, whatever FFmpeg or the system says against a video is one sentence."""
-    with writing(path):
-        try:
-            yield
-        except (D2Error, OSError):
-            raise
-        except (import_av("writing videos").error.FFmpegError, OverflowError) as error:
-            raise D2Error(
-                f"cannot write the video {path} ({said(error)}): choose other --width, --height or --fps, or another "
-                "--format"
-            ) from None
-
-
-class _Pngs:
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.count = folder, 0
-
-    def add(self, image: np.ndarray) -> None:
-        """Write one image."""
-        write_png(self.folder / f"{self.count:05d}.png", checked_image(image, "an image of a video"))
-        self.count += 1
-
-
-class _Encoded:
+class _Encoder:
     """One stream in one container."""
 
-    def __init__(self, path: Path, form: str, rate: Fraction, quality: int) -> None:
-        self.av, self.form, self.rate, self.quality, self.count = import_av("writing videos"), form, rate, quality, 0
+    def __init__(self, av: Any, path: Path, form: str, rate: Fraction, quality: int) -> None:
+        self.av, self.form, self.rate, self.quality, self.count = av, form, rate, quality, 0
         encoding = ENCODINGS[form]
-        self.container: Any = self.av.open(str(path), "w", format=encoding.muxer, options=encoding.options)
+        self.container: Any = av.open(str(path), "w", format=encoding.muxer, options=encoding.options)
         self.stream: Any = None
         self.palette: Any = None
 
     def add(self, image: np.ndarray) -> None:
-        """Encode one image, RGB uint8 [H, W, 3]; all have the size of the first."""
         image = checked_image(image, "an image of a video")
         if self.form == "mp4":
             image = np.pad(image, ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0)), mode="edge")
@@ -134,13 +115,17 @@ class _Encoded:
         if (self.stream.width, self.stream.height) != (width, height):
             raise D2Error(f"a video of {self.stream.width}x{self.stream.height} pixels got {(width, height)}")
         frame = self.av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+        if self.form == "mp4":
+            colors = self.av.video.reformatter
+            to = {"dst_colorspace": colors.Colorspace.ITU709, "dst_color_range": colors.ColorRange.MPEG}
+            frame = frame.reformat(format="yuv420p", interpolation=colors.Interpolation.AREA, **to)
         frame.pts, frame.time_base = self.count, 1 / self.rate
         self.count += 1
         if self.form == "gif":  # kept until the end: the palette is that of all images
             self.palette = self.palette or self._palette(frame)
             self.palette[0].push(frame)
         else:
-            self._mux(self.stream.encode(self._bt709(frame) if self.form == "mp4" else frame))
+            self.container.mux(self.stream.encode(frame))
 
     def close(self) -> None:
         """Write what is still inside."""
@@ -151,17 +136,9 @@ class _Encoded:
             source.push(None)
             with suppress(self.av.error.EOFError, self.av.error.BlockingIOError):
                 while True:
-                    self._mux(self.stream.encode(sink.pull()))
-        self._mux(self.stream.encode())
+                    self.container.mux(self.stream.encode(sink.pull()))
+        self.container.mux(self.stream.encode())
         self.container.close()
-        self.container = None
-
-    def abandon(self) -> None:
-        """Release the file where `close` was not reached."""
-        if self.container is not None:
-            with suppress(self.av.error.FFmpegError, OSError):  # the earlier error is the one that is reported
-                self.container.close()
-            self.container = None
 
     def _begin(self, width: int, height: int) -> None:
         encoding = ENCODINGS[self.form]
@@ -176,20 +153,9 @@ class _Encoded:
             context.colorspace, context.color_range = colors.Colorspace.ITU709, colors.ColorRange.MPEG
             context.color_primaries, context.color_trc = colors.ColorPrimaries.BT709, colors.ColorTrc.BT709
 
-    def _bt709(self, frame: Any) -> Any:
-        colors = self.av.video.reformatter
-        converted = frame.reformat(
-            format="yuv420p",
-            dst_colorspace=colors.Colorspace.ITU709,
-            dst_color_range=colors.ColorRange.MPEG,
-            interpolation=colors.Interpolation.AREA,
-        )
-        converted.pts, converted.time_base = frame.pts, frame.time_base
-        return converted
-
     def _palette(self, frame: Any) -> tuple[Any, Any]:
         """Where images go in, and where they come out with the one palette of all of them."""
-        graph = self.av.filter.Graph()
+        graph = self.graph = self.av.filter.Graph()  # kept alive: it owns both ends
         size = {"width": frame.width, "height": frame.height}
         source = graph.add_buffer(**size, format=frame.format, time_base=frame.time_base)
         split, palette, use = graph.add("split"), graph.add("palettegen"), graph.add("paletteuse", "dither=bayer")
@@ -200,12 +166,7 @@ class _Encoded:
         palette.link_to(use, 0, 1)
         use.link_to(sink)
         graph.configure()
-        self.graph = graph  # kept alive: it owns both ends
         return source, sink
-
-    def _mux(self, packets: Any) -> None:
-        for packet in packets:
-            self.container.mux(packet)
 
 
 def _rate(fps: float) -> Fraction:

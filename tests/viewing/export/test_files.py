@@ -207,8 +207,8 @@ class TestSplatv:
         np.testing.assert_allclose(halves[:3, 31], (2**0.5 * sigmas / DURATION).numpy(), rtol=1e-3)
 
     def test_a_field_becomes_curves_whose_error_is_reported(self, tmp_path: Path) -> None:
-        written = write_export(make_scene(sharp_model("hexplane")), Export(Path(), "splatv"), tmp_path)
-        assert "cubic curve for each Gaussian: off by median" in written.notes[0]
+        _, notes = write_export(make_scene(sharp_model("hexplane")), Export(Path(), "splatv"), tmp_path)
+        assert "cubic curve for each Gaussian: off by median" in notes[0]
 
 
 class TestStills:
@@ -270,6 +270,6 @@ class TestStills:
 @pytest.mark.parametrize("kind", list(FORMATS))
 def test_every_format_says_what_it_wrote(tmp_path: Path, kind: str) -> None:
     scene = make_scene(sharp_model("yang4d", 100))
-    written = write_export(scene, Export(Path(), kind, frames=(1, 5) if kind in ("ply", "spz") else None), tmp_path)
-    assert all(path.stat().st_size for path in written.paths)
-    assert len(written.paths) == (2 if kind in ("ply", "spz") else 1)
+    paths, _ = write_export(scene, Export(Path(), kind, frames=(1, 5) if kind in ("ply", "spz") else None), tmp_path)
+    assert all(path.stat().st_size for path in paths)
+    assert len(paths) == (2 if kind in ("ply", "spz") else 1)

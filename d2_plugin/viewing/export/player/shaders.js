@@ -2,6 +2,27 @@
 // 0.3 pixels squared, alpha at most .99, nothing below 1/255), drawn from the farthest Gaussian to the nearest.
 "use strict";
 
+const HARMONICS = `// The sixteen spherical harmonics of a direction, in the order and with the signs of 3DGS.
+void harmonics(vec3 d, out float values[16]) {
+  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
+  values[0] = 0.28209479177387814;
+  values[1] = -0.4886025119029199 * y;
+  values[2] = 0.4886025119029199 * z;
+  values[3] = -0.4886025119029199 * x;
+  values[4] = 1.0925484305920792 * x * y;
+  values[5] = -1.0925484305920792 * y * z;
+  values[6] = 0.31539156525252005 * (2. * zz - xx - yy);
+  values[7] = -1.0925484305920792 * x * z;
+  values[8] = 0.5462742152960396 * (xx - yy);
+  values[9] = -0.5900435899266435 * y * (3. * xx - yy);
+  values[10] = 2.890611442640554 * x * y * z;
+  values[11] = -0.4570457994644658 * y * (4. * zz - xx - yy);
+  values[12] = 0.3731763325901154 * z * (2. * zz - 3. * xx - 3. * yy);
+  values[13] = -0.4570457994644658 * x * (4. * zz - xx - yy);
+  values[14] = 1.445305721320277 * z * (xx - yy);
+  values[15] = -0.5900435899266435 * x * (xx - 3. * yy);
+}`;
+
 const SPLAT_VERTEX = `#version 300 es
 precision highp float;
 precision highp int;
@@ -26,26 +47,12 @@ const float LN_2 = 0.693147180559945, HALF_EXPONENT = 0.849321800288019;
 
 vec4 texel(sampler2D source, int index) { return texelFetch(source, ivec2(index & 4095, index >> 12), 0); }
 
-vec3 harmonics(vec3 d, int first, float phase) {
+${HARMONICS}
+
+vec3 seenColor(vec3 direction, int first, float phase) {
   if (degree == 0 && timeDegree == 0) return max(0.5 + 0.28209479177387814 * texel(colors, first).rgb, 0.);
-  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
   float values[16];
-  values[0] = 0.28209479177387814;
-  values[1] = -0.4886025119029199 * y;
-  values[2] = 0.4886025119029199 * z;
-  values[3] = -0.4886025119029199 * x;
-  values[4] = 1.0925484305920792 * x * y;
-  values[5] = -1.0925484305920792 * y * z;
-  values[6] = 0.31539156525252005 * (2. * zz - xx - yy);
-  values[7] = -1.0925484305920792 * x * z;
-  values[8] = 0.5462742152960396 * (xx - yy);
-  values[9] = -0.5900435899266435 * y * (3. * xx - yy);
-  values[10] = 2.890611442640554 * x * y * z;
-  values[11] = -0.4570457994644658 * y * (4. * zz - xx - yy);
-  values[12] = 0.3731763325901154 * z * (2. * zz - 3. * xx - 3. * yy);
-  values[13] = -0.4570457994644658 * x * (4. * zz - xx - yy);
-  values[14] = 1.445305721320277 * z * (xx - yy);
-  values[15] = -0.5900435899266435 * x * (xx - 3. * yy);
+  harmonics(direction, values);
   int count = (degree + 1) * (degree + 1);
   vec3 color = vec3(0.5);
   for (int wave = 0; wave <= timeDegree; wave++) {
@@ -107,7 +114,7 @@ void main() {
   gl_Position = vec4(2. * pixel.x / size.x - 1., 1. - 2. * pixel.y / size.y, 0., 1.);
 
   int coefficients = (degree + 1) * (degree + 1) * (timeDegree + 1);
-  vec3 color = asDepth ? vec3(point.z / depthUnit) : harmonics(normalize(mean - centre), coefficients * i, phase);
+  vec3 color = asDepth ? vec3(point.z / depthUnit) : seenColor(normalize(mean - centre), coefficients * i, phase);
   paint = vec4(color, log2Opacity);
 }`;
 
@@ -142,19 +149,14 @@ uniform bool hasSky;
 uniform vec3 sky[16];
 out vec4 result;
 
+${HARMONICS}
+
 vec3 behind() {
   vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
-  vec3 d = normalize(transpose(rotation) * vec3((pixel - principal) / focal, 1.));
-  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
-  vec3 color = 0.5 + 0.28209479177387814 * sky[0]
-    - 0.4886025119029199 * y * sky[1] + 0.4886025119029199 * z * sky[2] - 0.4886025119029199 * x * sky[3]
-    + 1.0925484305920792 * x * y * sky[4] - 1.0925484305920792 * y * z * sky[5]
-    + 0.31539156525252005 * (2. * zz - xx - yy) * sky[6] - 1.0925484305920792 * x * z * sky[7]
-    + 0.5462742152960396 * (xx - yy) * sky[8] - 0.5900435899266435 * y * (3. * xx - yy) * sky[9]
-    + 2.890611442640554 * x * y * z * sky[10] - 0.4570457994644658 * y * (4. * zz - xx - yy) * sky[11]
-    + 0.3731763325901154 * z * (2. * zz - 3. * xx - 3. * yy) * sky[12]
-    - 0.4570457994644658 * x * (4. * zz - xx - yy) * sky[13] + 1.445305721320277 * z * (xx - yy) * sky[14]
-    - 0.5900435899266435 * x * (xx - 3. * yy) * sky[15];
+  float values[16];
+  harmonics(normalize(transpose(rotation) * vec3((pixel - principal) / focal, 1.)), values);
+  vec3 color = vec3(0.5);
+  for (int k = 0; k < 16; k++) color += values[k] * sky[k];
   return clamp(color, 0., 1.);
 }
 
