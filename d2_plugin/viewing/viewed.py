@@ -5,6 +5,7 @@ It comes from the folder of a run, a run that trains, the views of any trainer, 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -93,11 +94,10 @@ def viewed_run(folder: Path) -> ViewedRun:
         D2Error: no run, one of another version, no checkpoint yet, or no Gaussian left.
     """
     run = Run.load(folder)
-    trained = run.trained()
+    trained, total = run.trained(), run.settings.iterations
     if not len(trained.model):
         raise D2Error(f"{folder} has no Gaussian left at step {trained.step}: nothing can be shown, train it anew")
     hooks = torch.load(folder / "checkpoint.pt", map_location="cpu", weights_only=True)["d2"] or {}
-    total = run.settings.iterations
     note = "" if trained.step >= total else f"{folder.name} still trains: this is step {trained.step} of {total}"
     adapter: Any = registry.load(registry.ADAPTERS, run.settings.backbone)
     return replace(_of_run(run, adapter(trained.model), hooks.get("inserted_at")), note=note)
@@ -105,10 +105,10 @@ def viewed_run(folder: Path) -> ViewedRun:
 
 def viewed_training(run: Run, trainer: Any) -> ViewedRun:
     """A run while it trains."""
+    if trainer.d2 is not None:
+        return _of_run(run, trainer.d2.backbone, trainer.d2.inserted_at)
     adapter: Any = registry.load(registry.ADAPTERS, run.settings.backbone)
-    if trainer.d2 is None:
-        return _of_run(run, adapter(trainer.model), None)
-    return _of_run(run, trainer.d2.backbone, trainer.d2.inserted_at)
+    return _of_run(run, adapter(trainer.model), None)
 
 
 def _of_run(run: Run, backbone: Any, inserted_at: Tensor | None) -> ViewedRun:
@@ -146,26 +146,26 @@ def viewed_store(store: PriorStore, fps: float = 30.0) -> ViewedRun:
     Raises:
         D2Error: the store is empty, or does not say where its cameras stood.
     """
-    known = [camera for name in store.cameras if (camera := _stored_camera(store, name)) is not None]
-    if not known:
+    cameras: dict[str, Camera] = {}
+    for name, frame in itertools.product(store.cameras, store.frames):
+        if name in cameras:
+            continue
+        record, prior = store.camera(name, frame), store.prior(name, frame)
+        if record is not None and prior is not None:
+            height, width = prior.depth.shape
+            cameras[name] = Camera(name, width, height, record.K.numpy(), record.T_camera_world.numpy())
+    if not cameras:
         raise D2Error(f"{store.path} has no prior that says where its camera stood: give --recording, or build it anew")
-    cameras = {camera.name: camera for camera in known}
     recording = Recording(store.path.name, cameras, store.frames, fps, KeptImages(cameras, store))
     return ViewedRun(store.path.name, recording, tuple(cameras), store=store)
 
 
-def _stored_camera(store: PriorStore, name: str) -> Camera | None:
-    for frame in store.frames:
-        record, prior = store.camera(name, frame), store.prior(name, frame)
-        if record is not None and prior is not None:
-            height, width = prior.depth.shape
-            return Camera(name, width, height, record.K.numpy(), record.T_camera_world.numpy())
-    return None
-
-
 def viewed_views(views: Sequence[View], backbone: Any, store: Any, name: str) -> ViewedRun:
     """The cameras that a trainer has used so far; its times are taken to grow evenly from frame to frame."""
-    cameras = {view.camera: _camera_of(view) for view in views}
+    cameras = {}
+    for view in views:
+        K, T = (tensor.detach().double().cpu().numpy() for tensor in (view.K, view.T_camera_world))
+        cameras[view.camera] = Camera(view.camera, view.width, view.height, K, T)
     times = {view.frame: view.time for view in views}
     frames = tuple(sorted(times))
     first, last = times[frames[0]], times[frames[-1]]
@@ -174,11 +174,6 @@ def viewed_views(views: Sequence[View], backbone: Any, store: Any, name: str) ->
     kept = store if isinstance(store, PriorStore) else None
     device = str(views[0].T_camera_world.device)
     return ViewedRun(name, recording, tuple(cameras), (), backbone, kept, device=device, time_offset=first)
-
-
-def _camera_of(view: View) -> Camera:
-    K, T = (tensor.detach().double().cpu().numpy() for tensor in (view.K, view.T_camera_world))
-    return Camera(view.camera, view.width, view.height, K, T)
 
 
 @dataclass(frozen=True)

@@ -82,16 +82,20 @@ def of_tuple(stored: Sequence[Any], path: Path, recording: Recording) -> Checkpo
     return _with_lines(dict(zip(names, stored, strict=True)), recording, timed=names in (FUDAN, FOUR_C))
 
 
-def of_gsplat(parameters: Mapping[str, Tensor], settings: RasterSettings, note: str) -> Checkpoint:
-    """Gaussians that stand still, by gsplat's names."""
-    rows = {name: value.detach() for name, value in parameters.items()}
-    backbone = _adapter("gsplat", dict(rows), {}, settings=settings)
+def of_gsplat(parameters: Mapping[str, Tensor]) -> Checkpoint:
+    """The Gaussians of gsplat's simple_trainer, by its names."""
+    rows, note = {name: value.detach() for name, value in parameters.items()}, "gsplat's Gaussians stand still"
+    backbone = _adapter("gsplat", dict(rows), {}, settings=RasterSettings(near=0.01))
     if "sh0" not in rows:
         return Checkpoint(backbone, 1.0, note)
     coefficients = torch.cat([rows["sh0"], rows["shN"]], 1) if "shN" in rows else rows["sh0"]
     harmonics = Harmonics(coefficients, round(coefficients.shape[1] ** 0.5) - 1)
     raw = {"positions": rows["means"], "log_scales": rows["scales"], "left": rows["quats"]}
-    moving = moving_gaussians(raw | {"opacity_logits": rows["opacities"]}, harmonics)
+    return _as_lines(backbone, note, raw | {"opacity_logits": rows["opacities"]}, harmonics)
+
+
+def _as_lines(backbone: Any, note: str, raw: dict[str, Tensor], harmonics: Harmonics) -> Checkpoint:
+    moving = moving_gaussians(raw, harmonics)
     return Checkpoint(backbone, 1.0, note, moving.harmonics, moving)
 
 
@@ -104,8 +108,7 @@ def newest_cloud(folder: Path) -> Path:
     known = []
     for path in (folder / "point_cloud").glob(f"*/{CLOUD}"):
         stage, _, iteration = path.parent.name.rpartition("_")
-        if iteration.isdigit():
-            known.append((not stage.startswith("coarse"), int(iteration), path))
+        known += [(not stage.startswith("coarse"), int(iteration), path)] if iteration.isdigit() else []
     if not known:
         raise D2Error(f"{folder / 'point_cloud'} has no iteration_N/{CLOUD}: give the folder that train.py wrote")
     return max(known)[2]
@@ -142,7 +145,7 @@ def of_cloud(path: Path, recording: Recording) -> Checkpoint:
         return _with_planes(values, field, recording)
     if path.parent.parent.name == "point_cloud" and (output / "deform").is_dir():
         return _with_network(values, output / "deform" / path.parent.name / "deform.pth", recording)
-    return of_gsplat(_gsplat_values(values), RasterSettings(), "a point cloud shows one instant")
+    return _with_lines(values, recording, timed=False)
 
 
 def _inria_values(rows: dict[str, Tensor]) -> dict[str, Any]:
@@ -157,17 +160,6 @@ def _inria_values(rows: dict[str, Tensor]) -> dict[str, Any]:
         "_features_rest": rest,
         "active_sh_degree": round((1 + rest.shape[1]) ** 0.5) - 1,
     }
-
-
-def _gsplat_values(values: Mapping[str, Any]) -> dict[str, Tensor]:
-    names = {
-        "means": "_xyz",
-        "scales": "_scaling",
-        "quats": "_rotation",
-        "sh0": "_features_dc",
-        "shN": "_features_rest",
-    }
-    return {name: values[own] for name, own in names.items()} | {"opacities": values["_opacity"].squeeze(-1)}
 
 
 def _frozen(values: dict[str, Any]) -> SimpleNamespace:
@@ -201,8 +193,7 @@ def _with_lines(values: dict[str, Any], recording: Recording, timed: bool) -> Ch
     if timed:
         raw |= {"times": values["_t"].squeeze(-1), "log_time_scales": values["_scaling_t"].squeeze(-1)}
         raw |= {"right": values["_rotation_r"]}
-    moving = moving_gaussians(raw, harmonics)
-    return Checkpoint(backbone, 1.0, note, moving.harmonics, moving)
+    return _as_lines(backbone, note, raw, harmonics)
 
 
 def _with_planes(values: dict[str, Any], field: PlaneField | None, recording: Recording) -> Checkpoint:

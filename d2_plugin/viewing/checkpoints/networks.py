@@ -53,10 +53,11 @@ class MotionNetwork:
         """
         self.state, self.deform = dict(state), self
         self.is_6dof = "branch_w.weight" in state
-        heads = ["branch_w", "branch_v"] if self.is_6dof else ["gaussian_warp"]
+        motion = ["branch_w", "branch_v"] if self.is_6dof else ["gaussian_warp"]
+        self.heads = [*motion, "gaussian_rotation", "gaussian_scaling"]
         layers = sum(name.startswith("linear.") and name.endswith(".weight") for name in state)
         self.layers = [f"linear.{i}" for i in range(max(layers, 1))]
-        needed = [*self.layers, *heads, "gaussian_rotation", "gaussian_scaling"]
+        needed = [*self.layers, *self.heads]
         missing = [f"{name}.{part}" for name in needed for part in ("weight", "bias") if f"{name}.{part}" not in state]
         if missing:
             raise D2Error(
@@ -82,17 +83,9 @@ class MotionNetwork:
         for name in self.layers:
             again = self.state[f"{name}.weight"].shape[1] > hidden.shape[1]
             hidden = _linear(self.state, name, torch.cat([seen, hidden], -1) if again else hidden).relu()
-        turned, scaled = (
-            _linear(self.state, "gaussian_rotation", hidden),
-            _linear(self.state, "gaussian_scaling", hidden),
-        )
-        if not self.is_6dof:
-            return _linear(self.state, "gaussian_warp", hidden), turned, scaled
-        return (
-            screw_motions(_linear(self.state, "branch_w", hidden), _linear(self.state, "branch_v", hidden)),
-            turned,
-            scaled,
-        )
+        heads = {name: _linear(self.state, name, hidden) for name in self.heads}
+        *motion, turned, scaled = heads.values()
+        return screw_motions(*motion) if self.is_6dof else motion[0], turned, scaled
 
 
 def encoded(values: Tensor, frequencies: int) -> Tensor:
@@ -124,16 +117,12 @@ class PlaneField:
         Raises:
             D2Error: other weights, an option that is not known here, or one that is missing.
         """
-        chosen = [name for name in UNUSED if options.get(name)]
-        if chosen:
-            raise D2Error(
-                f"{path} was trained with {chosen[0]}, which cannot be shown here: use Viewer(d2) in its train.py"
-            )
-        missing_options = [name for name in HEADS if not isinstance(options.get(name), bool)]
-        if missing_options:
-            raise D2Error(
-                f"the options of {path} do not say {missing_options[0]}: expected the cfg_args that its train.py wrote"
-            )
+        for name in UNUSED:
+            if options.get(name):
+                raise D2Error(f"{path} was trained with {name}, which cannot be shown here: use Viewer(d2) in train.py")
+        for name in HEADS:
+            if not isinstance(options.get(name), bool):
+                raise D2Error(f"the options of {path} do not say {name}: expected the cfg_args that train.py wrote")
         prefix = "deformation_net."
         self.state = {name[len(prefix) :]: value for name, value in state.items() if name.startswith(prefix)}
         self.heads = {name: head for name, head in HEADS.items() if not options[name]}
@@ -152,21 +141,19 @@ class PlaneField:
         """Positions [N, 3], log scales, quaternions, opacity logits [N, 1], harmonics [N, C, 3] and times [N, 1], all
         raw -> the first five at those times."""
         *raw, times = attributes
-        hidden = self._hidden(raw[0], times)
-        return tuple(
-            values + self._head(self.heads[option], hidden).view_as(values) if option in self.heads else values
-            for option, values in zip(HEADS, raw, strict=True)
-        )
-
-    def _hidden(self, positions: Tensor, times: Tensor) -> Tensor:
         first, last = self.get_aabb
-        point = torch.cat([(positions - first) * (2 / (last - first)) - 1, times], -1)
+        point = torch.cat([(raw[0] - first) * (2 / (last - first)) - 1, times], -1)
         levels = sum(name.startswith("grid.grids.") and name.endswith(".0") for name in self.state)
         hidden = torch.cat([self._level(level, point) for level in range(levels)], -1)
-        layers = sorted(int(name.split(".")[1]) for name in self.state if name.startswith("feature_out."))
-        for layer in sorted(set(layers)):
+        for layer in sorted({int(name.split(".")[1]) for name in self.state if name.startswith("feature_out.")}):
             hidden = _linear(self.state, f"feature_out.{layer}", hidden.relu() if layer else hidden)
-        return hidden
+        hidden = hidden.relu()
+        deformed = list(raw)
+        for place, option in enumerate(HEADS):
+            if option in self.heads:
+                inner = _linear(self.state, f"{self.heads[option]}.1", hidden).relu()
+                deformed[place] = raw[place] + _linear(self.state, f"{self.heads[option]}.3", inner).view_as(raw[place])
+        return tuple(deformed)
 
     def _level(self, level: int, point: Tensor) -> Tensor:
         """The product of the six planes of one level at points [N, 4]: [N, features]."""
@@ -176,9 +163,6 @@ class PlaneField:
             seen = functional.grid_sample(plane, places, align_corners=True, padding_mode="border")
             product = product * seen[0, :, 0].T
         return product
-
-    def _head(self, name: str, hidden: Tensor) -> Tensor:
-        return _linear(self.state, f"{name}.3", _linear(self.state, f"{name}.1", hidden.relu()).relu())
 
 
 def _linear(state: Mapping[str, Tensor], name: str, values: Tensor) -> Tensor:

@@ -8,7 +8,6 @@ from pathlib import Path
 import torch
 
 from d2_plugin.errors import D2Error
-from d2_plugin.protocol import RasterSettings
 from d2_plugin.reading import parsing, shown_path
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.values import checked_arguments
@@ -70,7 +69,7 @@ def _checkpoint(path: Path, recording: Recording) -> Checkpoint:
         return of_cloud(path, recording)
     stored = read_tensors(path)
     if isinstance(stored, dict) and "splats" in stored:
-        return of_gsplat(stored["splats"], RasterSettings(near=0.01), "gsplat's Gaussians stand still")
+        return of_gsplat(stored["splats"])
     if isinstance(stored, (tuple, list)) and len(stored) == 2 and isinstance(stored[0], (tuple, list)):
         return of_tuple(stored[0], path, recording)
     raise D2Error(
