@@ -16,10 +16,7 @@ from benchmarks.align_measure import (
     measure,
     methods,
     optimum,
-    weights_and_epsilon,
 )
-from d2_plugin.errors import D2Error
-from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.runs.rows import read_rows
 
 SMALL = {"anchors": (60, 300), "outliers": (0.0, 0.4), "seeds": 1, "seconds": 0.0}
@@ -59,24 +56,10 @@ def test_a_tighter_gap_is_closer_to_the_optimum_and_is_kept() -> None:
         assert gaps[1e-10] <= gaps[1e-2]
 
 
-def test_the_absolute_residual_is_smoothed_as_the_default_settings_say() -> None:
-    target = np.array([1.0, 2.0, 4.0])
-    for epsilon in (None, 0.05):
-        settings = AlignSettings() if epsilon is None else AlignSettings(epsilon=epsilon)
-        assert weights_and_epsilon(target, "absolute", settings)[1] == pytest.approx(settings.epsilon * 2.0)
-        assert weights_and_epsilon(target, "relative", settings)[1] == settings.epsilon
-
-
 def test_least_squares_pays_for_wrong_anchors_and_the_certified_fit_little() -> None:
     problems = [align_problem("metric", 5000, 0.2, seed) for seed in range(3)]
     errors = {(m.name, m.setting): measure(m, problems, 0).depth_error for m in methods()}
     assert errors["certified", "relative, gap 1e-10"] < 0.01 < 0.05 < errors["least squares", "closed form"]
-
-
-def test_a_line_that_gives_no_depth_is_wholly_wrong() -> None:
-    problem = align_problem("relative", 500, 0.0)
-    assert (problem.depth_error((-1.0, 0.0)) == 1).all()
-    assert problem.depth_error(TRUE_LINE).max() < 1e-12
 
 
 def test_bench_adds_rows_and_prints_their_tables(tmp_path: Path) -> None:
@@ -86,7 +69,7 @@ def test_bench_adds_rows_and_prints_their_tables(tmp_path: Path) -> None:
     assert all(row["kind"] == "alignment" and row["error"] >= 0 and row["seconds"] > 0 for row in rows)
     assert rows[0]["case"] == "relative map, 60 anchors, 0% wrong"
     assert "| certified | relative, gap 1e-10 |" in told
-    assert rows[0]["command"].startswith("d2 bench align --anchors 60 300 --outliers 0.0 0.4")
+    assert rows[0]["command"].startswith("d2 bench align --anchors 60,300 --outliers 0,0.4")
 
 
 def test_a_refusal_is_counted_and_no_error_is_made_up_for_it(tmp_path: Path) -> None:
@@ -96,8 +79,3 @@ def test_a_refusal_is_counted_and_no_error_is_made_up_for_it(tmp_path: Path) -> 
     assert {row["anchors"] for row in refused} == {20}
     assert all("too few pixels" in row["failed"] and row["error"] is None for row in refused)
     assert "(1 of 2 refused)" in str(tables(rows))
-
-
-def test_an_unknown_method_is_told(tmp_path: Path) -> None:
-    with pytest.raises(D2Error, match="unknown alignment method 'certifed'.*did you mean 'certified'"):
-        run(AlignBench(methods=("certifed",), output=tmp_path / "rows.jsonl"))

@@ -81,22 +81,6 @@ def test_a_rendered_rig_is_measured_without_any_data(measured: tuple[str, list[R
     )
 
 
-def test_the_default_is_the_rig_of_four_and_recordings_replace_it(folder: Path) -> None:
-    (default,) = cases(PriorsBench(width=32))
-    assert default.name == "synthetic4, 4 views"
-    assert len(default.recording.frames) == 2, "the first and the last"
-    (named,) = cases(PriorsBench((str(folder),)))
-    assert named.recording.name == "den"
-    assert named.recording.frames == (0, 2), "those with a true depth"
-    both = cases(PriorsBench((str(folder),), ("synthetic3",), width=32))
-    assert [case.name for case in both] == ["den, 2 views", "synthetic3, 3 views"]
-
-
-def test_named_cameras_are_those_of_the_recordings_that_have_them_all(folder: Path) -> None:
-    settings = PriorsBench((str(folder),), ("synthetic3",), ("train0", "train2"), width=32)
-    assert [case.cameras for case in cases(settings)] == [("train0", "train1"), ("train0", "train2")]
-
-
 def test_what_cannot_be_compared_is_refused_in_a_sentence(folder: Path, tmp_path: Path) -> None:
     blind = shutil.copytree(folder, tmp_path / "blind")
     shutil.rmtree(blind / "depth")

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 
-from benchmarks.raster import RasterBench, parse_size, run
-from benchmarks.raster_measure import Case, peak_memory
+from benchmarks.raster import RasterBench, run
 from benchmarks.raster_scenes import load_scene
-from d2_plugin.errors import D2Error
 from d2_plugin.rasterizer import RasterSettings, reference
 from d2_plugin.runs.rows import read_rows
 
@@ -42,28 +38,6 @@ def test_the_garden_is_cropped_as_gsplat_does(shared_data):
     assert reference.visible(scene.splats(), scene.colors, scene.view, RasterSettings()).numel() > 50_000
 
 
-@pytest.mark.parametrize(
-    ("name", "message"), [("synth", "synth:N"), ("synth:many", "synth:N"), ("garden", "test_garden.npz")]
-)
-def test_an_unknown_scene_is_told(name, message):
-    with pytest.raises(D2Error, match=message):
-        load_scene(name, 64, 48)
-
-
-@pytest.mark.parametrize("text", ["640", "640x", "ax3", "0x5"])
-def test_a_size_that_is_none_is_told(text):
-    with pytest.raises(D2Error, match="not WIDTHxHEIGHT"):
-        parse_size(text)
-
-
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peak memory is measured on Linux")
-def test_peak_memory_is_that_of_the_call_not_of_the_process():
-    case = Case("synth:30000", 320, 180, None)
-    peak = peak_memory(case, "d2", torch.device("cpu"))
-    records = 30_000 * 64 / 1e6
-    assert records < peak < 40 * records
-
-
 def test_bench_adds_rows_and_prints_their_tables(tmp_path):
     path = tmp_path / "rows.jsonl"
     told = run(RasterBench(("synth:30", "synth:60"), ("24x16",), seconds=0, no_memory=True, output=path))
@@ -78,10 +52,3 @@ def test_bench_adds_rows_and_prints_their_tables(tmp_path):
         assert 0 < row["errors"]["color"]["max"] < 1e-3
         assert 0 < row["errors"]["grad covariances"]["relative_l2"] < 1e-3
     assert "| d2 | synth:60 | 24x16 |" in told
-
-
-def test_beyond_the_limit_the_error_is_left_out_not_guessed(tmp_path):
-    path = tmp_path / "rows.jsonl"
-    told = run(RasterBench(("synth:20",), ("16x16",), seconds=0, error_limit=10, no_memory=True, output=path))
-    assert {(row["error"], row["errors"]) for row in read_rows([path])} == {(None, None)}
-    assert "| - | - | - | - | - |" in told

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -13,26 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks import memory, scaling, training_step
-from benchmarks.__main__ import PARTS, main
+from benchmarks.__main__ import main
 from benchmarks.memory import in_fresh_process
 from benchmarks.report import EVERY
 from benchmarks.work_precision import means, pareto_front, work_precision
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.report.report import make_report
 from d2_plugin.runs.rows import Row, make_row, read_rows
-from d2_plugin.settings import Settings, declared
 
 RUNS = Path(__file__).parents[1] / "data" / "runs.jsonl"
 LINUX = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peak memory is measured on Linux")
-
-
-@pytest.mark.parametrize("name", PARTS)
-def test_each_part_has_settings_with_help_and_something_that_runs_them(name: str) -> None:
-    module = importlib.import_module(PARTS[name].module)
-    settings = getattr(module, PARTS[name].settings)
-    assert issubclass(settings, Settings)
-    assert all(setting.help for setting in declared(settings))
-    assert callable(module.run)
 
 
 def test_parts_are_found_from_any_folder_and_a_mistake_is_one_sentence(
@@ -103,11 +92,6 @@ def test_means_over_cases_are_geometric_and_failures_keep_a_setting_off_the_fron
 
 
 # ---------------------------------------------------------------- growth and memory
-
-
-def test_growth_is_the_slope_in_logarithms() -> None:
-    assert scaling.exponent([(n, 3 * n**1.5) for n in (10, 100, 1000)]) == pytest.approx(1.5)
-    assert scaling.exponent([(10, 1.0), (10, 2.0)]) is None
 
 
 def test_scaling_adds_rows_of_time_and_memory_per_length(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 
 from benchmarks.never_worse.bench import BACKBONE, STEREO, NeverWorseBench, run
 from benchmarks.never_worse.maps import SPOILED, Spoiled, spoiled_recording
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
@@ -57,17 +56,6 @@ def test_each_map_is_what_its_name_says(room: Path, tmp_path: Path) -> None:
     assert np.allclose(alone, before.mono(cameras[1], 0), atol=1e-2), "with one frame it is another camera's"
 
 
-def test_a_recording_without_maps_needs_a_network(room: Path, tmp_path: Path) -> None:
-    recording = synthetic_recording(2, held_out=0, frames=1, width=32, height=18)
-    path = save_recording(recording, tmp_path / "den")
-    for map_ in path.glob("mono/*/*"):
-        map_.unlink()
-    for folder in (*path.glob("mono/*"), path / "mono"):
-        folder.rmdir() if folder.is_dir() else folder.unlink()
-    with pytest.raises(D2Error, match="--mono-onnx"):
-        spoiled_recording(path, list(recording.cameras), None, "other", tmp_path / "out", PriorSettings())
-
-
 @pytest.mark.slow
 def test_rows_are_written_once_and_a_rerun_does_nothing(room: Path, tmp_path: Path) -> None:
     names = list(open_recording(room).cameras)
@@ -82,8 +70,3 @@ def test_rows_are_written_once_and_a_rerun_does_nothing(room: Path, tmp_path: Pa
     assert "| stereo alone |" in told
     run(settings)
     assert read_rows([tmp_path / "never-worse.jsonl"]) == rows
-
-
-def test_a_recording_is_asked_for_by_an_example(tmp_path: Path) -> None:
-    with pytest.raises(D2Error, match="PATH@00"):
-        run(NeverWorseBench(output=tmp_path))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +14,7 @@ from tiny import TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
 
 from benchmarks.rivals.dense_start import back_projected
-from benchmarks.rivals.inputs import Inputs, expected_depth
+from benchmarks.rivals.inputs import expected_depth
 from benchmarks.rivals.patch_norm import patch_norm_loss
 from benchmarks.rivals.pearson import PearsonConfig, pearson_correlation, pearson_depth_loss
 from benchmarks.rivals.scale_shift import fitted_scale_and_shift, scale_shift_loss
@@ -32,8 +30,6 @@ from d2_plugin.runs.ablation.presets import PRESETS, rows_named
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import read_run
 from d2_plugin.runs.settings import RunSettings
-from d2_plugin.runs.start import make_view
-from d2_plugin.store.store import PriorStore
 
 RNG = np.random.default_rng(7)
 DEPTH = RNG.uniform(2, 9, (23, 31))
@@ -286,18 +282,6 @@ class TestOnARecording:
         np.testing.assert_array_equal(started.positions[: len(points)], points.positions)
         assert set(started.times) == {0.0, run.scene.recording.seconds(1)}
 
-    def test_the_store_is_opened_once_for_all_maps(self, ablation: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        """A rival is charged for its own work: opening the store costs more than a step."""
-        run, opened = run_of(ablation, "pearson"), []
-        inputs = Inputs(run.scene, run.prepare(priors=False), run.priors)
-        open_store = PriorStore.open
-        monkeypatch.setattr(PriorStore, "open", lambda path: opened.append(path) or open_store(path))
-        views = [
-            make_view(run.scene.recording, c, f) for c in run.scene.train_cameras for f in run.scene.recording.frames
-        ]
-        assert len([m for view in views if (m := inputs.inverse_depth(view)) is not None]) > 1
-        assert len(opened) == 1
-
     def test_a_resumed_rival_is_bitwise_the_uninterrupted_one(self, ablation: Path, tmp_path: Path) -> None:
         """patch_norm draws at random: its draws come from the run's own generator, which is saved."""
         whole, begun = folder_of(ablation, "patch_norm"), run_of(ablation, "patch_norm")
@@ -342,8 +326,3 @@ class TestHooksAsObjects:
     def test_the_name_of_one_of_d2s_is_refused(self) -> None:
         with pytest.raises(D2Error, match="named 'prune'"):
             D2Hooks(D2Config(), make_adapter(make_model()), TinyStore(), {"prune": self.Constant(HookConfig())})
-
-    def test_training_does_not_import_what_it_is_compared_with(self) -> None:
-        asks = "import sys, d2_plugin.runs.training.bench, d2_plugin.commands.train; "
-        code = asks + "print([name for name in sys.modules if name.startswith('benchmarks')])"
-        assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"

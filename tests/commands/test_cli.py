@@ -235,14 +235,6 @@ class TestMistakes:
         assert all(part in message for part in says)
         assert not (tmp_path / "x").exists()
 
-    def test_a_device_that_is_not_there(
-        self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        if torch.cuda.is_available():
-            pytest.skip("this machine has a CUDA device")
-        code = train(recording, tmp_path / "run", "--device", "cuda")
-        assert "leave out --device" in refused(capsys, code)
-
     def test_a_damaged_prior_is_named_and_that_frame_alone_is_built_again(
         self, recording: Path, finished: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
     ) -> None:

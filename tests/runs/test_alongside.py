@@ -113,11 +113,6 @@ class TestARun:
         assert finished.seconds["priors"] > 0
         assert finished.cpu_seconds["priors"] > 0
 
-    def test_is_the_same_with_a_prior_that_was_there_before(self, room: Path, finished: Run, tmp_path: Path) -> None:
-        again = run_of(room, tmp_path / "again", priors=str(finished.folder / "priors"))
-        again.train()
-        assert same(model_of(finished), model_of(again))
-
     def test_continues_bitwise_where_it_was_cut_off(self, room: Path, finished: Run, tmp_path: Path) -> None:
         class Cut(Exception):
             pass

@@ -205,11 +205,6 @@ class TestOneWriter:
         run.train()
         run.train()
 
-    def test_of_two_that_begin_at_once_one_is_refused(self, scene: Path, tmp_path: Path) -> None:
-        (tmp_path / "run").mkdir()
-        with only_writer(tmp_path / "run"), pytest.raises(D2Error, match="another process is writing"):
-            bare(scene, tmp_path / "run")
-
     def test_what_a_kill_left_of_the_first_file_blocks_nobody(self, scene: Path, tmp_path: Path) -> None:
         (tmp_path / "run").mkdir()
         (tmp_path / "run" / ".0123456789abcdef.part").write_bytes(b'{"iter')

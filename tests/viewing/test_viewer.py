@@ -25,7 +25,7 @@ from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.viewing.live import Viewer
-from d2_plugin.viewing.live.images import Resolution, Share
+from d2_plugin.viewing.live.images import Resolution
 from d2_plugin.viewing.live.overlay import cloud_of
 from d2_plugin.viewing.live.page import Page, Wanted
 from d2_plugin.viewing.live.server import COOKIE, Access
@@ -199,19 +199,6 @@ def test_images_of_many_gaussians_are_not_made_small_for_nothing() -> None:
         resolution.drew(still[0] * still[1], seconds(still))
     assert moving[1] > 300
     assert seconds(moving) < 1.2 * seconds((128, 72))
-
-
-def test_a_share_pays_off_what_was_spent_and_saves_little() -> None:
-    share = Share(0.1)
-    assert share.due
-    share.spent += 1.0
-    share.passes(9.0)
-    assert not share.due
-    share.passes(2.0)
-    assert share.due
-    share.passes(1e6)
-    share.spent += 0.2
-    assert not share.due, "an hour without images is not an hour of images"
 
 
 def test_the_browsers_camera_becomes_the_view_of_the_same_camera(viewed: ViewedRun) -> None:
