@@ -125,14 +125,11 @@ def evaluate(
         truth = torch.from_numpy(recording.image(camera, frame).astype(np.float32) / 255)
         color, depth = _checked(render(camera, frame), truth.shape, camera, frame)
         true_depth = recording.depth(camera, frame)
+        moving = None if still is None else np.abs(truth.numpy() - still).max(-1) > CHANGED
         compared = metrics.Compared(
             *(color, truth, depth, None if true_depth is None else torch.from_numpy(true_depth)),
-            *(
-                _moving(truth, still),
-                None if before is None else before[1:],
-                networks,
-                _inside(recording, camera, frame),
-            ),
+            moving if moving is not None and moving.mean() > MOVING_SHARE else None,
+            *(None if before is None else before[1:], networks, _inside(recording, camera, frame)),
         )
         scores = {name: metric.score(compared) for name, metric in metrics.METRICS.items()}
         rows.append({"camera": camera, "frame": frame, **scores})
@@ -144,17 +141,13 @@ def evaluate(
             progress(done, len(views))
     trained = [row for row in rows if row["frame"] not in between]
     apart = [row for row in rows if row["frame"] in between]
-    means = {f"{name}_between": _mean(row[name] for row in apart) for name in BETWEEN if apart}
-    definitions = {f"{name}_between": f"at instants between trained ones: {metrics.VARIANTS[name]}" for name in BETWEEN}
-    return {
-        "test": _means(trained) | means,
-        "per_view": rows,
-        "per_frame": _grouped(rows, "frame"),
-        "per_camera": _grouped(trained, "camera"),
-        "variants": metrics.VARIANTS
-        | {name: text for name, text in definitions.items() if name in means}
-        | {name: net.variant for name, net in networks.items() if net is not None},
-    }
+    means, variants = _means(trained), dict(metrics.VARIANTS)
+    for name in BETWEEN if apart else ():
+        means[f"{name}_between"] = _mean(row[name] for row in apart)
+        variants[f"{name}_between"] = f"at instants between trained ones: {metrics.VARIANTS[name]}"
+    variants |= {name: net.variant for name, net in networks.items() if net is not None}
+    groups = {"per_frame": _grouped(rows, "frame"), "per_camera": _grouped(trained, "camera")}
+    return {"test": means, "per_view": rows, **groups, "variants": variants}
 
 
 def still_image(recording: Recording, camera: str, frames: Sequence[int]) -> np.ndarray | None:
@@ -166,14 +159,6 @@ def still_image(recording: Recording, camera: str, frames: Sequence[int]) -> np.
         return None
     chosen = np.unique(np.linspace(0, len(frames) - 1, 9).round().astype(int))
     return np.median([recording.image(camera, frames[i]) for i in chosen], axis=0).astype(np.float32) / 255
-
-
-def _moving(truth: Tensor, still: np.ndarray | None) -> np.ndarray | None:
-    """The pixels [H, W] that differ from the still image; None where hardly any does."""
-    if still is None:
-        return None
-    moving = np.abs(truth.numpy() - still).max(-1) > CHANGED
-    return moving if moving.mean() > MOVING_SHARE else None
 
 
 def _inside(recording: Recording, camera: str, frame: int) -> np.ndarray | None:

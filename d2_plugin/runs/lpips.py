@@ -44,12 +44,10 @@ class Lpips:
         self.net = net
         with torch.device("meta"):  # no random initial weights, which would advance the global random state
             self.layers = _alexnet() if net == "alex" else _vgg16()
-        trained = _load(features)
-        prefix = "features."
+        trained, weights, prefix = _load(features), _load(linear), "features."
         try:
             convolutions = {k[len(prefix) :]: v for k, v in trained.items() if k.startswith(prefix)}
             self.layers.load_state_dict(convolutions, assign=True)
-            weights = _load(linear)
             self.weights = [weights[f"lin{i}.model.1.weight"].flatten() for i in range(len(_TAPS[net]))]
         except (RuntimeError, KeyError) as failure:
             raise D2Error(f"{features} and {linear} do not fit LPIPS {net} ({failure}): check the files") from None
@@ -73,9 +71,7 @@ class Lpips:
 
     def _features(self, image: Tensor) -> Iterator[Tensor]:
         """Features [C, h, w] of unit length per pixel, layer by layer."""
-        values = image.float().cpu().permute(2, 0, 1)
-        shift, scale = torch.tensor(SHIFT), torch.tensor(SCALE)
-        values = ((values - shift[:, None, None]) / scale[:, None, None])[None]
+        values = ((image.float().cpu() - torch.tensor(SHIFT)) / torch.tensor(SCALE)).permute(2, 0, 1)[None]
         for number, layer in enumerate(self.layers):
             values = layer(values)
             if number in _TAPS[self.net]:
@@ -86,7 +82,10 @@ def find_lpips(net: str = "alex", folder: Path | None = None) -> Lpips | None:
     """LPIPS from weight files in `folder` or the usual places, or None (logged once) where there are none."""
     if net not in _FILES:
         raise unknown_name("LPIPS network", net, _FILES)
-    places = [folder] if folder is not None else list(_usual_places())
+    package = importlib.util.find_spec("lpips")
+    places = [folder] if folder is not None else [Path(torch.hub.get_dir()) / "checkpoints"]
+    if folder is None and package is not None and package.origin:
+        places.append(Path(package.origin).parent / "weights" / "v0.1")
     features, linear = (
         next((file for place in places for file in sorted(place.glob(name))), None) for name in _FILES[net]
     )
@@ -94,13 +93,6 @@ def find_lpips(net: str = "alex", folder: Path | None = None) -> Lpips | None:
         log.info("LPIPS is not available: no %s and %s in %s", *_FILES[net], ", ".join(map(str, places)))
         return None
     return Lpips(net, features, linear)
-
-
-def _usual_places() -> Iterator[Path]:
-    yield Path(torch.hub.get_dir()) / "checkpoints"
-    package = importlib.util.find_spec("lpips")
-    if package is not None and package.origin:
-        yield Path(package.origin).parent / "weights" / "v0.1"
 
 
 def _load(path: Path) -> dict[str, Tensor]:

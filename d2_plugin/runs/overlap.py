@@ -64,7 +64,8 @@ def measure_overlap(
     """
     depths = [_depths(camera, cameras, depth_range, points) for camera in cameras]
     known = all(values is not None for values in depths)
-    anywhere = _any_depths(cameras)
+    centres = np.stack([camera.centre for camera in cameras])
+    anywhere = np.linalg.norm(centres[:, None] - centres, axis=-1).max() * np.geomspace(*ANY_RANGE, ANY_DEPTHS)
     shares, angles = [], []
     for index, (camera, values) in enumerate(zip(cameras, depths, strict=True)):
         others = [other for place, other in enumerate(cameras) if place != index]
@@ -75,7 +76,8 @@ def measure_overlap(
         if shares[-1] > 0:
             best = int(np.argmax([alike.mean() for alike in seen]))
             alike, angle = shared[best]
-            angles.append(float(np.median(angle[alike])) if known else _between_axes(camera, others[best]))
+            between_axes = np.arccos(np.clip(relative_pose(camera, others[best])[2, 2], -1, 1))
+            angles.append(float(np.median(angle[alike]) if known else np.rad2deg(between_axes)))
     return Overlap(tuple(shares), tuple(angles), known)
 
 
@@ -85,15 +87,15 @@ def measure_texture(recording: Recording, cameras: Sequence[str]) -> tuple[float
     The first and the last frame are looked at, made smaller: a window then covers more of the scene, so the share is
     rather too high than too low.
     """
-    frames = sorted({recording.frames[0], recording.frames[-1]})
-    return tuple(float(np.mean([_textured(recording.image(name, f)) for f in frames])) for name in cameras)
-
-
-def _textured(image: np.ndarray) -> float:
-    height, width = image.shape[:2]
-    factor = math.ceil(math.sqrt(height * width / TEXTURE_PIXELS))
-    small = shrink_image(image, factor) if factor > 1 else image
-    return float(texture_mask(gray(small)).mean())
+    shares = []
+    for name in cameras:
+        parts = []
+        for frame in sorted({recording.frames[0], recording.frames[-1]}):
+            image = recording.image(name, frame)
+            factor = math.ceil(math.sqrt(image.shape[0] * image.shape[1] / TEXTURE_PIXELS))
+            parts.append(texture_mask(gray(shrink_image(image, factor) if factor > 1 else image)).mean())
+        shares.append(float(np.mean(parts)))
+    return tuple(shares)
 
 
 def _depths(
@@ -104,7 +106,11 @@ def _depths(
 ) -> np.ndarray | None:
     """Depths [D] at which the things in a camera's image lie, or None if they are unknown."""
     if depth_range is None and points is not None:
-        visible = _visible_depths(camera, points)
+        local = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+        local = local[local[:, 2] > 0]
+        pixels = local @ camera.K.T
+        inside = (pixels[:, :2] >= 0) & (pixels[:, :2] < pixels[:, 2:] * (camera.width, camera.height))
+        visible = local[inside.all(axis=1), 2]
         if visible.size >= ENOUGH_POINTS:
             return np.quantile(visible, np.linspace(0.05, 0.95, KNOWN_DEPTHS))
     declared = [other.near_far for other in (camera, *cameras) if other.near_far is not None]
@@ -112,20 +118,6 @@ def _depths(
         return None
     near, far = depth_range or declared[0]
     return 1 / np.linspace(1 / near, 1 / far, KNOWN_DEPTHS)
-
-
-def _visible_depths(camera: Camera, points: np.ndarray) -> np.ndarray:
-    local = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
-    local = local[local[:, 2] > 0]
-    pixels = local @ camera.K.T
-    inside = (pixels[:, :2] >= 0) & (pixels[:, :2] < pixels[:, 2:] * (camera.width, camera.height))
-    return local[inside.all(axis=1), 2]
-
-
-def _any_depths(cameras: Sequence[Camera]) -> np.ndarray:
-    centres = np.stack([camera.centre for camera in cameras])
-    apart = float(np.linalg.norm(centres[:, None] - centres[None], axis=-1).max())
-    return apart * np.geomspace(*ANY_RANGE, ANY_DEPTHS)
 
 
 def _shared(
@@ -143,8 +135,3 @@ def _shared(
     sine = np.linalg.norm(np.cross(points, away), axis=-1)
     angle = np.rad2deg(np.arctan2(sine, (points * away).sum(axis=-1)))
     return inside & (angle > settings.min_angle) & (angle < settings.max_angle), angle
-
-
-def _between_axes(one: Camera, other: Camera) -> float:
-    """Angle between the directions in which two cameras look, degrees."""
-    return float(np.rad2deg(np.arccos(np.clip(relative_pose(one, other)[2, 2], -1, 1))))

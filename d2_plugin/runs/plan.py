@@ -161,7 +161,9 @@ def _stereo(
     calibrations = [recording.cameras[name] for name in cameras]
     if np.ptp(np.stack([camera.centre for camera in calibrations]), axis=0).max() == 0:
         return Decision("stereo", False, "all training cameras stand at one point", "it takes cameras that stand apart")
-    points = _own_points(recording) if points is None else points
+    if points is None and recording.layout == "colmap" and recording.path is not None:
+        model = find_model(recording.path)
+        points = None if model is None else read_points(model).positions
     seen = measure_overlap(calibrations, settings.stereo, depth_range=settings.depth_range, points=points)
     texture = measure_texture(recording, cameras)
     overlap, textured = max(seen.shares) > MIN_OVERLAP, max(texture) > MIN_TEXTURE
@@ -184,10 +186,8 @@ def appearance_decision(
         return Decision("appearance", False, "one training camera", "it takes a second training camera")
     if set(cameras) <= recording.exposures.keys():  # the import of the videos measured them
         gains = np.log([recording.exposures[name].gain for name in cameras])
-        off = np.abs(gains - gains.mean(0))
-        worst = np.unravel_index(off.argmax(), off.shape)
-        gain = float(off[worst])
-        error = float(np.array([recording.exposures[name].error for name in cameras])[worst])
+        off, errors = np.abs(gains - gains.mean(0)), np.array([recording.exposures[name].error for name in cameras])
+        gain, error = float(off.max()), float(errors.flat[off.argmax()])
         measured = "measured at import"
     else:
         exposures = relative_exposures(recording, cameras, positions, times)
@@ -204,26 +204,17 @@ def appearance_decision(
 def _in_words(seen: Overlap) -> str:
     share = f"{np.mean(seen.shares):.0%} of each image seen by another"
     angles = sorted({round(angle) for angle in seen.angles})
-    apart = f", {angles[0]} to {angles[-1]} degrees apart" if len(angles) > 1 else ""
-    apart = f", {angles[0]} degrees apart" if len(angles) == 1 else apart
+    ends = " to ".join(str(angle) for angle in dict.fromkeys((*angles[:1], *angles[-1:])))
+    apart = f", {ends} degrees apart" if angles else ""
     return f"{share}{apart}" if seen.depth_known else f"at most {share} (depths unknown){apart}"
-
-
-def _own_points(recording: Recording) -> np.ndarray | None:
-    """The sparse points of a recording that is a COLMAP model, [P, 3], or None."""
-    model = find_model(recording.path) if recording.layout == "colmap" and recording.path is not None else None
-    return None if model is None else read_points(model).positions
 
 
 def changed_share(recording: Recording, camera: str) -> float:
     """Largest share of a camera's pixels that differ from the first frame, over five frames spread in time."""
     chosen = np.unique(np.linspace(0, len(recording.frames) - 1, 5).round().astype(int))
     first = recording.image(camera, recording.frames[0]).astype(np.int16)
-    shares = [
-        np.mean(np.abs(recording.image(camera, recording.frames[i]).astype(np.int16) - first).max(-1) > CHANGED * 255)
-        for i in chosen[1:]
-    ]
-    return float(max(shares))
+    later = (recording.image(camera, recording.frames[i]).astype(np.int16) for i in chosen[1:])
+    return float(max(np.mean(np.abs(image - first).max(-1) > CHANGED * 255) for image in later))
 
 
 def _overridden(decision: Decision, choice: bool | None) -> Decision:

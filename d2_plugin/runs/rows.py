@@ -112,7 +112,12 @@ def append_rows(path: Path, rows: Iterable[Row]) -> None:
     Raises:
         D2Error: the file holds something else; nothing is written.
     """
-    check_rows_file(path)
+    if path.exists():
+        remedy = "give another --output"
+        with opened(path, remedy) as file:
+            begin = file.read(1).strip()
+        if begin not in (b"", b"{"):
+            raise D2Error(f"{path} is no file of rows, one JSON object a line, to which more could be added: {remedy}")
     append(path, "".join(as_line(row) for row in rows))
 
 
@@ -129,17 +134,6 @@ def begin_rows(path: Path) -> None:
             path.unlink()
 
 
-def check_rows_file(path: Path) -> None:
-    """Refuse a file that holds something else than rows: they are added to its end."""
-    if not path.exists():
-        return
-    remedy = "give another --output"
-    with opened(path, remedy) as file:
-        begin = file.read(1).strip()
-    if begin not in (b"", b"{"):
-        raise D2Error(f"{path} is no file of rows, one JSON object a line, to which more could be added: {remedy}")
-
-
 def as_line(row: Row) -> str:
     """A row as one line of JSON."""
     return json_text(_plain(row), "the row") + "\n"
@@ -151,12 +145,11 @@ def read_rows(paths: Sequence[Path]) -> list[Row]:
     Raises:
         D2Error: an absent file, a line that is not JSON, or a row that lacks what every row has.
     """
-    return [_checked(line, f"{path}, line {number}") for path in paths for number, line in _lines(path)]
-
-
-def _lines(path: Path) -> list[tuple[int, str]]:
-    text = read_text(path, "give a file that a `d2` command wrote")
-    return [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    rows = []
+    for path in paths:
+        lines = read_text(path, "give a file that a `d2` command wrote").splitlines()
+        rows += [_checked(line, f"{path}, line {i}") for i, line in enumerate(lines, start=1) if line.strip()]
+    return rows
 
 
 def _checked(line: str, where: str) -> Row:

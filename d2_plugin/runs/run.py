@@ -74,7 +74,7 @@ class Run:
         self.settings, self.folder, self.guidance = check(settings), folder, guidance
         self._checkpoint = folder / "checkpoint.pt"
         self.scene = Scene.open(self.settings)
-        claim(folder, self._identity())
+        claim(folder, self.settings.as_table() | ({} if guidance is None else {"guidance": dict(guidance.identity())}))
         self.seconds = {"priors": 0.0, "train": 0.0, "eval": 0.0}
         self.cpu_seconds = dict(self.seconds)
         """The same in CPU time, of a prior that is built in step that of its own process."""
@@ -131,7 +131,9 @@ class Run:
         """
         with self._writing(), self._beside():
             points = self.prepare(self._building is None, on_prior)
-            self._try_prior(points)
+            if self.guidance is None and is_open(self.settings, self.scene):
+                with self._timed("priors"):
+                    kept_trials(self.folder / "trials.json", self.settings, self.scene, points, self.priors)
             trainer = self._trainer(points)
             self._restore(trainer)
             watching = watch(trainer) if watch else lambda step, loss: None
@@ -177,12 +179,6 @@ class Run:
         path = self.folder / "trials.json"
         return Trials.load(path) if path.is_file() else None
 
-    def _try_prior(self, points: TimedPoints) -> None:
-        """Find out what of the prior is worth inserting, where that is open."""
-        if self.guidance is None and is_open(self.settings, self.scene):
-            with self._timed("priors"):
-                kept_trials(self.folder / "trials.json", self.settings, self.scene, points, self.priors)
-
     @property
     def priors(self) -> Path:
         """Folder of the depth prior that was built from the training cameras."""
@@ -209,12 +205,14 @@ class Run:
         if self.guidance is not None and attach:
             triangulated = self.guidance.start(self.scene, triangulated, self.priors)
         start = initial_points(recording, cameras, triangulated, extent, self.settings.seed)
+        # What the scene needs, that alone: a backbone of somebody else's may not know the name.
+        needed = {"appearance": True} if attach and self.scene.plan.uses("appearance") else {}
         model = backbone.create(
             *start.tensors(self.settings.device),
             extent=extent.radius,
             duration=recording.seconds(recording.frames[-1]),
             temporal=self.scene.plan.uses("temporal"),
-            settings=(self._needed() if attach else {}) | dict(self.settings.overrides.get("backbone", {})),
+            settings=needed | dict(self.settings.overrides.get("backbone", {})),
         )
         begin_with_exposures(model, recording, cameras, self.scene.test_cameras)
         training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
@@ -223,10 +221,6 @@ class Run:
         trainer = backbone.Trainer(model, images, training, self._attach if attach and self.uses_prior else None)
         images.awaited = self._building  # only now: what a model begins with needs no prior
         return trainer
-
-    def _needed(self) -> dict[str, Any]:
-        """The backbone's settings that the scene needs, those alone: one of somebody else's may not know the names."""
-        return {"appearance": True} if self.scene.plan.uses("appearance") else {}
 
     def trained(self) -> Any:
         """The trainer at the last checkpoint, without hooks or a look at the prior: the checkpoint says it all."""
@@ -244,11 +238,6 @@ class Run:
         guidance, priors = self.guidance, self.priors
         others = {} if guidance is None else guidance.hooks(self.scene, self._points(), priors)
         return D2Hooks(config, adapter(model), hooks=others)
-
-    def _identity(self) -> dict[str, Any]:
-        """What makes two runs the same run, as run.json has it."""
-        guidance = {} if self.guidance is None else {"guidance": dict(self.guidance.identity())}
-        return self.settings.as_table() | guidance
 
     def _save(self, trainer: Any) -> None:
         used = {"seconds": dict(self.seconds), "cpu_seconds": dict(self.cpu_seconds), "prior": self.prior}

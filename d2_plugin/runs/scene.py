@@ -60,8 +60,12 @@ class Scene:
         recording = replace(
             recording, notes=(*recording.notes, *check_recording(recording, (*train, *test), scored=test))
         )
-        priors = prior_settings(settings)
-        plan = plan_scene(recording, train, _mono_source(recording, settings), priors)
+        priors, mono = prior_settings(settings), None
+        if settings.mono_onnx:
+            mono = f"ONNX model {Path(settings.mono_onnx).name}"
+        elif recording.mono_kind is not None:
+            mono = f"{recording.mono_kind} maps on disk" + (" (emulated)" if recording.mono_emulated else "")
+        plan = plan_scene(recording, train, mono, priors)
         return cls(recording, train, test, plan.override(**settings.overrides.get("plan", {})), priors, between)
 
     def with_points(self, points: TimedPoints, settings: RunSettings) -> Scene:
@@ -109,11 +113,3 @@ def _split(recording: Recording, settings: RunSettings) -> tuple[tuple[str, ...]
     if both:
         raise D2Error(f"camera {both[0]} is named for training and for test: leave it out of one")
     return settings.train_cameras, test
-
-
-def _mono_source(recording: Recording, settings: RunSettings) -> str | None:
-    if settings.mono_onnx:
-        return f"ONNX model {Path(settings.mono_onnx).name}"
-    if recording.mono_kind is None:
-        return None
-    return f"{recording.mono_kind} maps on disk" + (" (emulated)" if recording.mono_emulated else "")

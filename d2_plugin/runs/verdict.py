@@ -103,20 +103,16 @@ EXPLANATION = (
 def verdicts_table(scores: Scores, ours: str, others: Sequence[str], title: str) -> Table:
     """Whether one variant is better than others: a row for each that was run, a column for each metric measured."""
     columns = [column for column in STUDY_COLUMNS if _values(scores, ours, column)]
-    rows = tuple(
-        (other, *(_verdict(scores, ours, other, column) for column in columns))
-        for other in others
-        if any(_values(scores, other, column) for column in columns)
-    )
-    return Table((title, *(column.title for column in columns)), rows)
-
-
-def _verdict(scores: Scores, ours: str, other: str, column: Column) -> str:
-    theirs = _values(scores, other, column)
-    if not theirs:
-        return "-"
-    measured = margin(_values(scores, ours, column), theirs, column.larger_is_better)
-    return f"{measured.verdict} ({measured.text(2 if column.unit else 4, column.unit)})"
+    rows = []
+    for other in others:
+        cells = []
+        for column in columns:
+            theirs = _values(scores, other, column)
+            measured = margin(_values(scores, ours, column), theirs, column.larger_is_better) if theirs else None
+            digits = 2 if column.unit else 4
+            cells.append("-" if measured is None else f"{measured.verdict} ({measured.text(digits, column.unit)})")
+        rows += [(other, *cells)] if {*cells} - {"-"} else []
+    return Table((title, *(column.title for column in columns)), tuple(rows))
 
 
 def _values(scores: Scores, name: str, column: Column) -> list[float]:
