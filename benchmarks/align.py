@@ -12,9 +12,10 @@ from typing import Annotated, Any, NamedTuple, get_args
 import torch
 
 from benchmarks.align_measure import AlignMethod, AlignProblem, align_problem, measure, methods
+from benchmarks.rows import begin_rows
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.recordings.recording import MonoKind
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
+from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import AtATime, NotNegative, Range, Settings, Share
 

@@ -18,6 +18,7 @@ from typing import Annotated, Any, NamedTuple
 
 import torch
 
+from benchmarks.rows import begin_rows
 from benchmarks.stereo_rigs import ARCS
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.build import build_priors
@@ -31,7 +32,7 @@ from d2_plugin.priors.declared_error import (
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
+from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.start import triangulated_points
 from d2_plugin.settings import AtATime, Count, Positional, Range, Settings
 from d2_plugin.store.store import PriorStore

@@ -19,9 +19,10 @@ from benchmarks.raster_measure import (
     peak_memory,
     timed,
 )
+from benchmarks.rows import begin_rows
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.checks.memory import BYTES_PER_PIXEL, check_bytes
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
+from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import AtATime, Count, NotNegative, Settings
 

@@ -16,9 +16,10 @@ from typing import Annotated, Any
 import numpy as np
 
 from benchmarks.memory import in_fresh_process
+from benchmarks.rows import begin_rows
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import split, synthetic_recording
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
+from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.tables import Table, markdown

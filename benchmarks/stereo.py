@@ -11,10 +11,11 @@ from typing import Annotated, Any, Literal
 
 import torch
 
+from benchmarks.rows import begin_rows
 from benchmarks.stereo_measure import Method, measure, methods
 from benchmarks.stereo_rigs import ARCS, MIDDLEBURY, load_rigs
 from d2_plugin.errors import unknown_name
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
+from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import AtATime, Range, Settings
 

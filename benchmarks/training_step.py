@@ -19,9 +19,10 @@ import torch
 from benchmarks.memory import in_fresh_process, peak_resident
 from benchmarks.raster import parse_size
 from benchmarks.raster_measure import timed
+from benchmarks.rows import begin_rows
 from benchmarks.training_step_scene import RASTER, StepScene, look_at_all, works_of
 from d2_plugin.errors import D2Error
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
+from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import AtATime, Range, Settings
 

@@ -14,13 +14,14 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.rows import begin_rows
 from benchmarks.stability.definition import Sweep
 from benchmarks.stability.gaussians import gaussian_sweeps
 from benchmarks.stability.priors import prior_sweeps
 from benchmarks.work_precision import shown
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.progress import progress_bar
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, command_line, make_row
+from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import Settings
 

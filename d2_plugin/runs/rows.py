@@ -13,7 +13,6 @@ import platform
 import shlex
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -119,19 +118,6 @@ def append_rows(path: Path, rows: Iterable[Row]) -> None:
         if begin not in (b"", b"{"):
             raise D2Error(f"{path} is no file of rows, one JSON object a line, to which more could be added: {remedy}")
     append(path, "".join(as_line(row) for row in rows))
-
-
-def begin_rows(path: Path) -> None:
-    """Make sure, before anything is measured, that rows can be added to a file.
-
-    Raises:
-        D2Error: it cannot be written, or holds something else.
-    """
-    absent = not path.exists()
-    append_rows(path, [])
-    if absent:
-        with suppress(OSError):
-            path.unlink()
 
 
 def as_line(row: Row) -> str:

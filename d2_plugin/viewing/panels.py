@@ -17,6 +17,7 @@ from d2_plugin.runs.drawing import Panel, Scale, as_bytes, color_scale, colorize
 from d2_plugin.viewing.rendering import RenderedView, gaussians_per_pixel, render_view
 from d2_plugin.viewing.viewed import ViewedRun
 
+GREYS = np.arange(256, dtype=np.uint8)[:, None].repeat(3, 1)
 MOST_GAUSSIANS = 200.0
 """Gaussians per pixel at the bright end of their scale, which is logarithmic."""
 
@@ -53,21 +54,6 @@ class Shot:
         return store.prior(self.view.camera, self.view.frame) if known and store is not None else None
 
 
-def rgb(shot: Shot) -> Panel:
-    """The render."""
-    return Panel("render", as_bytes(shot.rendered.color.numpy()))
-
-
-def truth(shot: Shot) -> Panel:
-    """The recorded image."""
-    return Panel("recorded", shot.truth)
-
-
-def depth(shot: Shot) -> Panel:
-    """Rendered depth."""
-    return depth_panel("depth", shot.rendered.depth.numpy(), shot.depths)
-
-
 def true_depth(shot: Shot) -> Panel:
     """The recording's true depth; black where it is unknown."""
     recorded = shot.viewed.recording.depth(shot.view.camera, shot.view.frame)
@@ -83,22 +69,11 @@ def error(shot: Shot) -> Panel:
     return error_panel(difference, f"  {-10 * np.log10(noise):.1f} dB" if noise > 0 else "")
 
 
-def alpha(shot: Shot) -> Panel:
-    """Accumulated alpha."""
-    scale = np.arange(256, dtype=np.uint8)[:, None].repeat(3, 1)
-    return Panel("alpha 0..1", colorize(shot.rendered.alpha.numpy(), 0, 1, scale), scale)
-
-
 def count(shot: Shot) -> Panel:
     """Gaussians per pixel."""
     number = gaussians_per_pixel(shot.rendered.splats, shot.view, shot.viewed.backbone.settings).numpy()
     scale, most = color_scale("inferno"), float(np.log1p(MOST_GAUSSIANS))
     return Panel(f"Gaussians 0..{MOST_GAUSSIANS:g} (log)", colorize(np.log1p(number), 0, most, scale), scale)
-
-
-def prior(shot: Shot) -> Panel:
-    """The depth prior D*."""
-    return depth_panel("prior", _of_prior(shot, lambda prior: prior.depth.numpy()), shot.depths)
 
 
 def sigma(shot: Shot) -> Panel:
@@ -118,14 +93,14 @@ def labels(shot: Shot) -> Panel:
 
 
 KINDS: dict[str, Callable[[Shot], Panel]] = {
-    "rgb": rgb,
-    "depth": depth,
-    "alpha": alpha,
+    "rgb": lambda shot: Panel("render", as_bytes(shot.rendered.color.numpy())),
+    "depth": lambda shot: depth_panel("depth", shot.rendered.depth.numpy(), shot.depths),
+    "alpha": lambda shot: Panel("alpha 0..1", colorize(shot.rendered.alpha.numpy(), 0, 1, GREYS), GREYS),
     "count": count,
-    "truth": truth,
+    "truth": lambda shot: Panel("recorded", shot.truth),
     "error": error,
     "true-depth": true_depth,
-    "prior": prior,
+    "prior": lambda shot: depth_panel("prior", _of_prior(shot, lambda prior: prior.depth.numpy()), shot.depths),
     "sigma": sigma,
     "labels": labels,
 }

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.rows import begin_rows
 from d2_plugin.durable import write_table
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.images import write_png
@@ -19,7 +20,7 @@ from d2_plugin.runs.report.quality import groups_of, scores_table
 from d2_plugin.runs.report.report import BUILDERS, ReportSettings, collect, make_report, run
 from d2_plugin.runs.report.run_folders import training_row
 from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure, number
-from d2_plugin.runs.rows import Row, append_rows, begin_rows, make_row, named_by_cameras, read_rows
+from d2_plugin.runs.rows import Row, append_rows, make_row, named_by_cameras, read_rows
 from d2_plugin.runs.saved import METRICS, RUN
 from d2_plugin.runs.settings import RunSettings
 

@@ -51,17 +51,13 @@ def open_viewed(
     if not len(checkpoint.backbone):
         raise D2Error(f"{path} has no Gaussian: nothing can be shown")
     viewed = ViewedRun(path.stem, opened, trained, held_out, **checkpoint._asdict())
-    _check_drawn(viewed, path)
-    return viewed
-
-
-def _check_drawn(viewed: ViewedRun, path: Path) -> None:
-    """Draw one small image of somebody else's file, so that what does not fit together is an error now."""
+    # One small image is drawn of somebody else's file, so that what does not fit together is an error now.
     view = viewed.view(next(iter(viewed.recording.cameras.values())), 0.0, (16, 16))
     with parsing(f"checkpoint {shown_path(path)}", "give one whose tensors fit together"):
         shown = render_view(viewed.backbone, view).splats
     if not all(bool(torch.isfinite(part).all()) for part in (shown.means, shown.covariances, shown.opacities)):
         raise D2Error(f"{path} has numbers that are not finite: its training diverged, give an earlier checkpoint")
+    return viewed
 
 
 def _checkpoint(path: Path, recording: Recording) -> Checkpoint:

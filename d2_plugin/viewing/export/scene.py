@@ -13,7 +13,7 @@ from torch import Tensor
 
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
-from d2_plugin.protocol import RasterSettings, Splats, View
+from d2_plugin.protocol import RasterSettings, Splats
 from d2_plugin.recordings import Camera
 from d2_plugin.viewing.camera_paths import focus_of
 from d2_plugin.viewing.export.ply import scales_and_rotations
@@ -110,9 +110,10 @@ class ExportScene:
         return None if self.moving is None else scales_and_rotations(self.moving.covariances)
 
 
+@torch.no_grad()
 def export_scene(viewed: ViewedRun) -> ExportScene:
     """What is exported of a run or a checkpoint."""
-    recording, backbone = viewed.recording, viewed.backbone
+    recording, backbone, moving = viewed.recording, viewed.backbone, viewed.moving
     view = viewed.view(viewed.training[0], 0.0)
     model: Any = getattr(backbone, "model", None)  # of the bundled backbones
 
@@ -121,12 +122,18 @@ def export_scene(viewed: ViewedRun) -> ExportScene:
         at = replace(view, time=viewed.time_offset + time * viewed.time_scale)
         return Splats(*(part.detach().cpu() for part in backbone.slice_at(at)))
 
-    harmonics, moving = viewed.harmonics, viewed.moving
-    if harmonics is None and hasattr(model, "harmonics"):
+    if viewed.harmonics is not None:
+        harmonics = viewed.harmonics
+    elif hasattr(model, "harmonics"):
         own: Harmonics = model.harmonics()
         harmonics = own._replace(coefficients=own.coefficients.detach().double().cpu())
+    else:  # the colours that one camera sees, for every direction
+        splats, colors = backbone.slice_at(view), torch.zeros(len(backbone), 3)
+        colors[splats.rows.cpu()] = backbone.colors(view, splats).detach().cpu()
+        harmonics = Harmonics(coefficients_from_rgb(colors, 0, 0).double(), 0)
     if moving is None and hasattr(model, "moving"):
         moving = model.moving()
+    behind = getattr(model, "background", None)
     return ExportScene(
         recording.name,
         recording.frames,
@@ -135,25 +142,8 @@ def export_scene(viewed: ViewedRun) -> ExportScene:
         tuple(viewed.training),
         tuple(recording.cameras[name] for name in viewed.test_cameras),
         backbone.settings,
-        _colors_as_seen(backbone, view) if harmonics is None else harmonics,
+        harmonics,
         splats_at,
         moving,
-        _background(model),
+        None if behind is None else torch.cat([behind.constant, behind.harmonics]).detach().double().cpu(),
     )
-
-
-@torch.no_grad()
-def _colors_as_seen(backbone: Any, view: View) -> Harmonics:
-    """Of a model without harmonics: the colours that one camera sees, for every direction."""
-    splats = backbone.slice_at(view)
-    colors = torch.zeros(len(backbone), 3)
-    colors[splats.rows.cpu()] = backbone.colors(view, splats).detach().cpu()
-    return Harmonics(coefficients_from_rgb(colors, 0, 0).double(), 0)
-
-
-def _background(model: Any) -> Tensor | None:
-    """Spherical harmonics [16, 3] of what lies behind all Gaussians of a bundled backbone; None where it has none."""
-    background = getattr(model, "background", None)
-    if background is None:
-        return None
-    return torch.cat([background.constant, background.harmonics]).detach().double().cpu()

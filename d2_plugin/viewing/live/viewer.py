@@ -95,7 +95,10 @@ class Viewer:
         A pause ends when the last browser is closed.
         """
         self.step = step
-        self._pass_time()
+        now = time.monotonic()
+        for share in (self._watched, self._moved):
+            share.passes(now - self._last)
+        self._last = now
         if not self.clients or self.viewed is None:
             return
         self._note_progress(step, loss)
@@ -205,12 +208,6 @@ class Viewer:
         parts += [f"{len(self.viewed.backbone)} Gaussians"] if self.viewed.backbone is not None else []
         parts += [] if loss is None else [f"loss {loss:.4f}"]
         self.training.progress = ", ".join(parts) + (" (paused)" if self.training.paused else "")
-
-    def _pass_time(self) -> None:
-        now = time.monotonic()
-        for share in (self._watched, self._moved):
-            share.passes(now - self._last)
-        self._last = now
 
     def _wait(self) -> None:
         """Until something changes; at rest a look now and then is enough to see that nothing did."""

@@ -35,7 +35,13 @@ def run(settings: RenderSettings) -> str:
     size = _size(plan.stops[0], settings.width, settings.height)
     needed = size[0] * size[1] * (BYTES_PER_PIXEL + BYTES_PER_PANEL * len(settings.show) * len(runs))
     check_bytes(needed, f"images of {size[0]}x{size[1]} pixels", "choose a smaller --width and --height")
-    path = settings.output or _default_output(settings)
+    path = settings.output
+    if path is None:  # RUN/videos/PATH_WHAT.mp4; for several runs in the first one's folder
+        first, several = settings.runs[0], [run.stem for run in settings.runs] if len(runs) > 1 else []
+        frozen = ["frozen"] if settings.at is not None else []
+        name = "_".join([Path(settings.path).stem, *settings.show, *frozen, *several])
+        folder = (first if first.is_dir() else first.parent) / "videos"
+        path = folder / (name if settings.format == "png" else f"{name}.{settings.format}")
     depths = _depths(runs, plan, size, settings.show)
     with (
         write_video(path, settings.format, plan.fps, settings.quality) as add,
@@ -83,16 +89,6 @@ def _size(first: Stop, width: int | None, height: int | None) -> tuple[int, int]
     return (max(round(lens.width * height / lens.height), 1) if width is None else width), height
 
 
-def _default_output(settings: RenderSettings) -> Path:
-    """RUN/videos/PATH_WHAT.mp4; for several runs beside the first run's folder."""
-    first = settings.runs[0]
-    folder = (first if first.is_dir() else first.parent) / "videos"
-    name = "_".join([Path(settings.path).stem, *settings.show, *(["frozen"] if settings.at is not None else [])])
-    if len(settings.runs) > 1:
-        name = f"{name}_{'_'.join(path.stem for path in settings.runs)}"
-    return folder / (name if settings.format == "png" else f"{name}.{settings.format}")
-
-
 def _panels(
     viewed: ViewedRun, stop: Stop, size: tuple[int, int], show: Sequence[str], depths: Scale, named: bool
 ) -> list[Panel]:
@@ -115,10 +111,7 @@ def arranged(rows: Sequence[Sequence[Panel]], captions: bool = True) -> np.ndarr
         rows = [[panel for row in rows for panel in row]]
     if len(rows) == 1 and len(rows[0]) == 1 and rows[0][0].bar is None:
         return rows[0][0].image
-    if captions:
-        drawn = [side_by_side(row) for row in rows]
-    else:
-        drawn = [_joined([panel.image for panel in row], axis=1) for row in rows]
+    drawn = [side_by_side(row) if captions else _joined([panel.image for panel in row], axis=1) for row in rows]
     return _joined(drawn, axis=0)
 
 
