@@ -104,9 +104,8 @@ def claim(folder: Path, identity: Mapping[str, Any]) -> None:
 
 def _refuse_another(folder: Path, identity: Mapping[str, Any]) -> None:
     table = read_run(folder)
-    guidance = table.pop("guidance", None)
-    kept = RunSettings.from_table(table, str(folder / "run.json")).as_table()
-    kept |= {} if guidance is None else {"guidance": guidance}
+    guidance = {"guidance": table.pop("guidance")} if "guidance" in table else {}
+    kept = RunSettings.from_table(table, str(folder / "run.json")).as_table() | guidance
     changed = sorted(k for k in identity.keys() | kept.keys() if identity.get(k) != kept.get(k))
     if changed:
         raise D2Error(

@@ -19,7 +19,7 @@ from d2_plugin.durable import archive_problem, write
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.colmap.points import triangulate_frames
 from d2_plugin.protocol import View
-from d2_plugin.recordings import Camera, Recording
+from d2_plugin.recordings import Recording
 
 POINTS_FORMAT = 1
 """Of points.npz."""
@@ -187,7 +187,9 @@ def scene_extent(recording: Recording, cameras: Sequence[str], points: np.ndarra
     The radius is half the median depth: the spread of the cameras, which dense-rig code uses, says little about the
     scene when there are two of them.
     """
-    depths = [z for name in cameras for z in _depths(recording.cameras[name], points)]
+    poses = [recording.cameras[name].T_camera_world for name in cameras]
+    depths = np.concatenate([points @ T[2, :3] + T[2, 3] for T in poses])
+    depths = depths[depths > 0]
     if len(depths) >= 10:
         low, middle, high = np.percentile(depths, [1, 50, 99])
         return Extent(0.75 * float(low), 1.25 * float(high), 0.5 * float(middle))
@@ -198,11 +200,6 @@ def scene_extent(recording: Recording, cameras: Sequence[str], points: np.ndarra
     centres = np.stack([recording.cameras[name].centre for name in cameras])
     spread = float(np.linalg.norm(centres - centres.mean(0), axis=1).max()) or 1.0
     return Extent(0.2 * spread, 20 * spread, 2 * spread)
-
-
-def _depths(camera: Camera, points: np.ndarray) -> np.ndarray:
-    z = points @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
-    return z[z > 0]
 
 
 def initial_points(
@@ -218,14 +215,11 @@ def initial_points(
     A random point lies on the ray of a random pixel of a random training image, at a depth drawn uniformly in
     inverse depth between near and far, and takes the pixel's colour.
     """
-    missing = max(minimum - len(triangulated), 0)
-    rng = np.random.default_rng(seed)
-    fill = [_random_points(recording, camera, extent, n, rng) for camera, n in _shares(cameras, missing)]
-    return TimedPoints.joined([triangulated, *fill])
-
-
-def _shares(cameras: Sequence[str], count: int) -> list[tuple[str, int]]:
-    return [(camera, len(range(i, count, len(cameras)))) for i, camera in enumerate(cameras)]
+    missing, rng, parts = max(minimum - len(triangulated), 0), np.random.default_rng(seed), [triangulated]
+    for place, camera in enumerate(cameras):
+        share = len(range(place, missing, len(cameras)))
+        parts.append(_random_points(recording, camera, extent, share, rng))
+    return TimedPoints.joined(parts)
 
 
 def _random_points(

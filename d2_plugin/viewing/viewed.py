@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -187,9 +188,8 @@ class KeptImages(Source):
     def image(self, camera: str, frame: int) -> np.ndarray:
         """RGB uint8 [H, W, 3]."""
         size = self.cameras[camera].height, self.cameras[camera].width, 3
-        try:
+        prior = None
+        with suppress(D2Error):  # a camera that has no prior
             prior = None if self.store is None else self.store.prior(camera, frame)
-        except D2Error:  # a camera that has no prior
-            prior = None
         colors = None if prior is None or prior.colors is None else prior.colors.cpu().numpy()
         return colors if colors is not None and colors.shape == size else np.full(size, UNKNOWN_IMAGE, np.uint8)

@@ -23,7 +23,9 @@ OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "insufficient mem
 
 def guarded(answer: Callable[[], str | None], debug: bool = False) -> int:
     """Print what `answer` returns and give 0, or print the sentence of its exception and give another exit code."""
-    _take_any_letter()
+    for stream in (sys.stdout, sys.stderr):  # letters that the terminal lacks are written as escapes
+        with suppress(AttributeError, OSError, ValueError):
+            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
         text = answer()
         if text:
@@ -66,10 +68,3 @@ def sentence(failure: BaseException) -> str:
 def one_line(text: str) -> str:
     """A text without line breaks and control characters, which a name in it may hold."""
     return shown_path(" ".join(text.splitlines()))
-
-
-def _take_any_letter() -> None:
-    """Let the two streams write letters that the terminal lacks as escapes instead of failing."""
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(AttributeError, OSError, ValueError):
-            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]

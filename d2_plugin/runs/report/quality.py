@@ -73,7 +73,9 @@ def section(name: str, rows: Sequence[Row]) -> Section:
         if mine := [group for group in groups if _length(group)[0] == unit]:
             tables.append((f"At equal {where}", scores_table(mine)))
     tables += [(f"Is {D2} better?", order)] if order.rows else []
-    tables += [("Runs without a score", _failures(failed))] if failed else []
+    if failed:
+        cells = tuple((row["case"], row["method"], row["setting"], row["failed"]) for row in failed)
+        tables.append(("Runs without a score", Table(("recording", "method", "run", "why"), cells)))
     if any(row.get("mono_emulated") for row in rows):
         text += " Monocular depth of some recordings is emulated, not predicted."
     text += f" {EXPLANATION}" if order.rows else ""
@@ -196,8 +198,3 @@ def _order(groups: Sequence[Group]) -> Table:
             lines += [{titles[0]: ", ".join(key), **dict(zip(made.header, cells))} for cells in made.rows]
     header = [title for title in titles if any(line.get(title, "-") != "-" for line in lines)]
     return Table(tuple(header), tuple(tuple(line.get(title, "-") for title in header) for line in lines))
-
-
-def _failures(rows: Sequence[Row]) -> Table:
-    cells = tuple((row["case"], row["method"], row["setting"], row["failed"]) for row in rows)
-    return Table(("recording", "method", "run", "why"), cells)

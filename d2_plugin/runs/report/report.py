@@ -100,7 +100,12 @@ def collect(sources: Sequence[Path]) -> tuple[list[Row], list[Image]]:
     Raises:
         D2Error: a folder that holds no finished run, or a file that holds no rows.
     """
-    folders = [folder for source in sources if source.is_dir() for folder in _runs(source)]
+    folders: list[Path] = []
+    for source in (source for source in sources if source.is_dir()):
+        runs = sorted(path.parent for path in source.rglob("metrics.json"))
+        if not runs:
+            raise D2Error(f"no finished run lies in {source}: expected metrics.json, as `d2 train` writes it")
+        folders += runs
     rows = read_rows([source for source in sources if not source.is_dir()]) + [
         training_row(folder) for folder in folders
     ]
@@ -111,10 +116,3 @@ def collect(sources: Sequence[Path]) -> tuple[list[Row], list[Image]]:
         if key not in first and (image := image_of(folder)) is not None:
             first[key] = Image(f"{', '.join(key)}: {image[0]} of run {folder.name}", image[1])
     return rows, [first[key] for key in sorted(first)]
-
-
-def _runs(folder: Path) -> list[Path]:
-    folders = sorted(path.parent for path in folder.rglob("metrics.json"))
-    if not folders:
-        raise D2Error(f"no finished run lies in {folder}: expected metrics.json, as `d2 train` writes it")
-    return folders

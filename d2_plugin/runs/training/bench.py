@@ -215,14 +215,11 @@ def next_steps(target: float, tried: Sequence[Timed]) -> int:
         lengths.setdefault(steps, []).append(max(seconds, 1e-3))
     means = [(steps, sum(seconds_of) / len(seconds_of)) for steps, seconds_of in lengths.items()]
     (steps, seconds), *others = sorted(means, key=lambda timed: abs(math.log(timed[1] / target)))
-    power = _power((steps, seconds), others[0]) if others else GROWTH
+    power = GROWTH
+    if others:  # the slope of log time over log steps, kept where the noise of short runs cannot lead astray
+        power = math.log(others[0][1] / seconds) / math.log(others[0][0] / steps)
+        power = min(max(power, 0.8), 2.0)
     return max(round(steps * (target / seconds) ** (1 / power)), 1)
-
-
-def _power(first: Timed, second: Timed) -> float:
-    """Slope of log time over log steps, kept where the noise of short runs cannot lead astray."""
-    slope = math.log(second[1] / first[1]) / math.log(second[0] / first[0])
-    return min(max(slope, 0.8), 2.0)
 
 
 def fits(target: float, timed: Timed) -> bool:

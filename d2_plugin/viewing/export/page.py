@@ -28,6 +28,8 @@ TEXT_PER_BYTE = 4 / 3
 """Base64."""
 BYTES_AT_REST, BYTES_OF_POSITION, BYTES_OF_SHAPE = 28, 6, 16
 """Per Gaussian, with 16-bit codes and before compression, without harmonics."""
+RASTER = ("near", "blur", "alpha_max", "alpha_min", "fov_clamp")
+"""Settings of the rasterizer that the player's shaders obey."""
 PAGE_SCRIPTS = ("scene.js", "shaders.js", "renderer.js", "controls.js", "pace.js", "player.js")
 WORKER_SCRIPTS = ("scene.js", "sorter.js")
 
@@ -109,13 +111,7 @@ def _header(scene: ExportScene, coded: CodedScene) -> dict[str, Any]:
         "fps": scene.fps,
         "marginal_cut": MARGINAL_CUT,
         "marginal_reach": MARGINAL_REACH,
-        "raster": {
-            "near": raster.near,
-            "blur": raster.blur,
-            "alpha_max": raster.alpha_max,
-            "alpha_min": raster.alpha_min,
-            "fov_clamp": min(raster.fov_clamp, 1e6),
-        },
+        "raster": {name: min(getattr(raster, name), 1e6) for name in RASTER},
         "cameras": [
             *(_camera(camera, held_out=False) for camera in scene.train_cameras),
             *(_camera(camera, held_out=True) for camera in scene.test_cameras),

@@ -46,7 +46,11 @@ def write_spz(path: Path, gaussians: MovingGaussians, shapes: tuple[Tensor, Tens
         (scales.log().numpy() + 10) * 16,
     ]
     body = [np.clip(np.rint(plane), 0, 255).astype(np.uint8).tobytes() for plane in planes]
-    body += [_rotation_words(quaternions.numpy()).tobytes(), _harmonic_bytes(coefficients[:, 1:]).tobytes()]
+    terms = coefficients.shape[1] - 1  # coarser codes compress better
+    step = np.where(np.arange(terms) < 3, 8, 16)[:, None]
+    codes = np.rint(coefficients[:, 1:] * FLIPS[:terms, None] * 128) + 128
+    codes = np.clip(np.floor((codes + step // 2) / step) * step, 0, 255).astype(np.uint8)
+    body += [_rotation_words(quaternions.numpy()).tobytes(), codes.tobytes()]
     header = np.array([(MAGIC, VERSION, len(shown), (degree, bits, 0, 0))], HEADER)
     write(path, gzip.compress(header.tobytes() + b"".join(body), COMPRESSION, mtime=0), synced=False)
 
@@ -62,11 +66,3 @@ def _rotation_words(quaternions: np.ndarray) -> np.ndarray:
         size = np.minimum(np.rint(np.abs(value) * np.sqrt(2) * 511), 511).astype(np.uint32)
         words = np.where(largest == axis, words, words << 10 | (value < 0).astype(np.uint32) << 9 | size)
     return words.astype("<u4")
-
-
-def _harmonic_bytes(coefficients: np.ndarray) -> np.ndarray:
-    """Bytes [M, C, 3] of the coefficients above the constant one; coarser codes compress better."""
-    terms = coefficients.shape[1]
-    codes = np.rint(coefficients * FLIPS[:terms, None] * 128) + 128
-    step = np.where(np.arange(terms) < 3, 8, 16)[:, None]
-    return np.clip(np.floor((codes + step // 2) / step) * step, 0, 255).astype(np.uint8)

@@ -86,10 +86,10 @@ class Overlay:
     def _show_cloud(self, viewed: ViewedRun, frame: int, moving: bool) -> None:
         by = self.page.word("cloud", "none")
         size = self.unit * 0.03 * self.page.number("point_size", 1.0)
-        if by == "none":
-            if self.cloud is not None:
-                self.cloud.remove()
+        if by == "none" and self.cloud is not None:
+            self.cloud.remove()
             self.cloud = self._cloud_of = None
+        if by == "none":
             return
         if (frame, by) != self._cloud_of and (not moving or self.cloud is None):
             self._cloud_of = frame, by
