@@ -105,20 +105,15 @@ def plan_scene(
     cameras: Sequence[str],
     mono_source: str | None,
     settings: PriorSettings | None = None,
-    points: np.ndarray | None = None,
 ) -> ScenePlan:
     """Decide for `recording` trained with `cameras`.
 
-    Args:
-        recording: the recording.
-        cameras: names of the training cameras.
-        mono_source: says where monocular depth comes from; None where there is none.
-        settings: of the prior builder; its stereo's angles and texture decide what can be matched.
-        points: surface points [P, 3], world; those of the recording's own COLMAP model where None.
+    `mono_source` says where monocular depth comes from, None where there is none; `settings` are those of the prior
+    builder, whose stereo's angles and texture decide what can be matched.
     """
     settings = settings or PriorSettings()
     kind = settings.mono_kind if settings.mono_onnx else recording.mono_kind
-    decisions = (_temporal(recording, cameras), *_geometric(recording, cameras, settings, points))
+    decisions = (_temporal(recording, cameras), *_geometric(recording, cameras, settings))
     return ScenePlan(decisions, mono_source, kind)
 
 
@@ -132,9 +127,7 @@ def _temporal(recording: Recording, cameras: Sequence[str]) -> Decision:
     )
 
 
-def _geometric(
-    recording: Recording, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None
-) -> tuple[Decision, ...]:
+def _geometric(recording: Recording, cameras: Sequence[str], settings: PriorSettings) -> tuple[Decision, ...]:
     """Sensor and stereo: depth on disk, from a sensor or COLMAP, is used first."""
     source = find_depth_on_disk(recording, cameras, settings.stereo)
     if source is not None and source.name == SensorDepth.name:
@@ -143,7 +136,7 @@ def _geometric(
         return Decision("sensor", True, source.about), Decision("stereo", False, reason, instead)
     if source is not None:
         return (Decision("stereo", True, source.about),)
-    stereo = _stereo(recording, cameras, settings, points)
+    stereo = _stereo(recording, cameras, settings)
     folder = settings.stereo.folder or "depth"
     if recording.path is None or not (recording.path / folder / "depth.json").is_file():
         return (stereo,)
@@ -151,9 +144,7 @@ def _geometric(
     return Decision("sensor", False, reason), stereo
 
 
-def _stereo(
-    recording: Recording, cameras: Sequence[str], settings: PriorSettings, points: np.ndarray | None
-) -> Decision:
+def _stereo(recording: Recording, cameras: Sequence[str], settings: PriorSettings) -> Decision:
     if len(cameras) < 2:
         return Decision("stereo", False, "one training camera", "it takes a second training camera")
     if settings.stereo.matcher == NO_MATCHER:
@@ -161,9 +152,9 @@ def _stereo(
     calibrations = [recording.cameras[name] for name in cameras]
     if np.ptp(np.stack([camera.centre for camera in calibrations]), axis=0).max() == 0:
         return Decision("stereo", False, "all training cameras stand at one point", "it takes cameras that stand apart")
-    if points is None and recording.layout == "colmap" and recording.path is not None:
-        model = find_model(recording.path)
-        points = None if model is None else read_points(model).positions
+    # The sparse points of a recording that is a COLMAP model tell the depths.
+    model = find_model(recording.path) if recording.path is not None and recording.layout == "colmap" else None
+    points = None if model is None else read_points(model).positions
     seen = measure_overlap(calibrations, settings.stereo, depth_range=settings.depth_range, points=points)
     texture = measure_texture(recording, cameras)
     overlap, textured = max(seen.shares) > MIN_OVERLAP, max(texture) > MIN_TEXTURE
@@ -177,10 +168,7 @@ def appearance_decision(
 ) -> Decision:
     """Whether each training camera learns a change of colour: only where their exposures differ.
 
-    Args:
-        recording: the recording.
-        cameras: names of the training cameras.
-        positions, times: triangulated points [P, 3] and the seconds at which each was seen.
+    `positions` [P, 3] and `times` [P] are triangulated points and the seconds at which each was seen.
     """
     if len(cameras) < 2:
         return Decision("appearance", False, "one training camera", "it takes a second training camera")

@@ -32,15 +32,15 @@ Row = dict[str, Any]
 TRY = "try"
 """`target` of a training that only looked for the number of steps of a time: such a row is in no table."""
 
-MEASURED = ("kind", "case", "method", "setting", "error", "seconds", "failed")
-REQUIRED = (*MEASURED, "device", "threads", "version", "commit", "torch", "command")
 FORM = {
-    **dict.fromkeys(("kind", "case", "method", "setting", "command"), str),
-    **dict.fromkeys(("failed", "device", "version", "commit", "torch"), str | None),
+    **dict.fromkeys(("kind", "case", "method", "setting"), str),
     **dict.fromkeys(("error", "seconds"), float | None),
+    **dict.fromkeys(("failed", "device"), str | None),
     "threads": int | None,
+    **dict.fromkeys(("version", "commit", "torch"), str | None),
+    "command": str,
 }
-"""What each of them is."""
+"""What every row holds, and what each of it is."""
 
 
 def make_row(
@@ -140,7 +140,7 @@ def read_rows(paths: Sequence[Path]) -> list[Row]:
 
 def _checked(line: str, where: str) -> Row:
     row = parse_json(line, where, "restore the file, or remove that line")
-    missing = [name for name in REQUIRED if name not in row] if isinstance(row, dict) else list(REQUIRED)
+    missing = [name for name in FORM if not isinstance(row, dict) or name not in row]
     if missing:
         raise D2Error(f"{where} has no {', '.join(missing)}: measure it again, its form is not that of this version")
     for name, kind in FORM.items():

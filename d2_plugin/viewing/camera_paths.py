@@ -66,12 +66,8 @@ def orbit(
 ) -> list[Camera]:
     """A swing around the point that the cameras look at, from its middle to both ends and back; a whole turn for 360.
 
-    Args:
-        cameras: those of the recording.
-        count: of poses.
-        degrees: angle of the swing; by default the angle that the cameras span, or a whole turn where they stand all
-            around.
-        depth: of what is looked at, in front of the cameras, where their axes do not meet.
+    It swings by `degrees`, by default the angle that the cameras span, or a whole turn where they stand all around.
+    `depth` is that of what is looked at, in front of the cameras, where their axes do not meet.
     """
     rig = _Rig.of(cameras, depth)
     span = rig.span if degrees is None else degrees

@@ -36,14 +36,8 @@ class RenderedView(NamedTuple):
 
 @torch.no_grad()
 def render_view(backbone: Any, view: View, min_opacity: float = 0.0, marked: Tensor | None = None) -> RenderedView:
-    """Draw one view.
-
-    Args:
-        backbone: a `d2_plugin.protocol.Backbone`.
-        view: camera and time; any size.
-        min_opacity: Gaussians whose opacity at that time is lower are left out.
-        marked: rows to highlight, bool [N]; None shows the colours as they are.
-    """
+    """Draw one view of a `d2_plugin.protocol.Backbone`, without Gaussians whose opacity at that time is lower than
+    `min_opacity`, and with the rows `marked`, bool [N], highlighted."""
     splats = backbone.slice_at(view)
     grey = splats.means.new_full((len(splats.means), 3), GREY)
     colors = backbone.colors(view, splats) if hasattr(backbone, "colors") else grey

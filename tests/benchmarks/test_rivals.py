@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +17,8 @@ from torch import Tensor
 from benchmarks.rivals.dense_start import back_projected
 from benchmarks.rivals.inputs import expected_depth
 from benchmarks.rivals.patch_norm import patch_norm_loss
-from benchmarks.rivals.pearson import PearsonConfig, pearson_correlation, pearson_depth_loss
-from benchmarks.rivals.scale_shift import fitted_scale_and_shift, scale_shift_loss
+from benchmarks.rivals.pearson import PearsonConfig, pearson_depth_loss
+from benchmarks.rivals.scale_shift import scale_shift_loss
 from benchmarks.rivals.sparse_points import Seen, sparse_point_loss
 from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, guidance
 from d2_plugin import D2Config, D2Hooks
@@ -42,45 +43,38 @@ def tensor(values: np.ndarray, grad: bool = False) -> Tensor:
     return torch.tensor(values, dtype=torch.float64 if values.dtype != bool else torch.bool, requires_grad=grad)
 
 
-class TestPearson:
-    def test_golden_value(self) -> None:
+PIXELS = np.array([[0.5, 0.5], [3.25, 7.5], [30.5, 22.5], [12.0, 3.0]])
+SEEN = Seen(tensor(PIXELS), tensor(np.array([4.0, 2.5, 7.0, 3.0])))
+NOTHING = np.zeros_like(MASK)
+ONE = NOTHING.copy()
+ONE[3, 4] = True
+
+
+def bilinear(values: np.ndarray) -> np.ndarray:
+    """At PIXELS, by hand, with pixel centres at i + 0.5."""
+    found = []
+    for column, row in PIXELS - 0.5:
+        j, i = min(int(column), values.shape[1] - 2), min(int(row), values.shape[0] - 2)
+        u, v = column - j, row - i
+        found.append((np.outer([1 - v, v], [1 - u, u]) * values[i : i + 2, j : j + 2]).sum())
+    return np.array(found)
+
+
+def normalised(values: np.ndarray, whole: bool, side: int = 5) -> np.ndarray:
+    """Patches [P, 25] of a window that slides by its own size, centred and divided by a deviation."""
+    patches = sliding_window_view(values, (side, side))[::side, ::side].reshape(-1, side**2)
+    deviation = values.std(ddof=1) if whole else patches.std(1, ddof=1, keepdims=True)
+    return (patches - patches.mean(1, keepdims=True)) / (deviation + 0.01 * patches.std(ddof=1))
+
+
+class TestGoldenValues:
+    def test_pearson(self) -> None:
         scaled = (MONO - MONO.min()) / (MONO.max() - MONO.min()) * 2000
         candidates = [np.corrcoef(m.ravel(), DEPTH.ravel())[0, 1] for m in (-scaled, 1 / (scaled + 200))]
         found = pearson_depth_loss(tensor(DEPTH), tensor(MONO))
         assert found.item() == pytest.approx(1 - max(candidates), abs=1e-12)
 
-    def test_gradient(self) -> None:
-        torch.autograd.gradcheck(lambda d: pearson_depth_loss(d, tensor(MONO[:4, :5])), tensor(DEPTH[:4, :5], True))
-
-    def test_pixels_without_a_map_do_not_count(self) -> None:
-        holes = np.where(MASK, MONO, np.nan)
-        d = tensor(DEPTH, True)
-        pearson_depth_loss(d, tensor(holes)).backward()
-        assert (d.grad[~tensor(MASK)] == 0).all()
-        assert torch.isfinite(d.grad).all()
-
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    @pytest.mark.parametrize(
-        ("depth", "mono"),
-        [(FLAT, MONO), (DEPTH, FLAT), (FLAT, FLAT), (DEPTH[:1, :1], MONO[:1, :1]), (DEPTH, DEPTH * np.nan)],
-    )
-    def test_where_nothing_can_be_told_the_loss_is_one_without_a_gradient(
-        self, depth: np.ndarray, mono: np.ndarray, dtype: torch.dtype
-    ) -> None:
-        d = tensor(depth).to(dtype).requires_grad_()
-        loss = pearson_depth_loss(d, tensor(mono).to(dtype))
-        loss.backward()
-        assert loss.item() == pytest.approx(1, abs=1e-6)
-        assert (d.grad == 0).all()
-
-    def test_small_values_in_float32_correlate_as_large_ones(self) -> None:
-        x, y = (torch.tensor(values.ravel(), dtype=torch.float32) for values in (DEPTH, MONO))
-        small, large = pearson_correlation(1e-12 * x, 1e-12 * y).item(), pearson_correlation(x, y).item()
-        assert small == pytest.approx(large, abs=1e-5)
-
-
-class TestScaleShift:
-    def test_golden_value(self) -> None:
+    def test_scale_shift(self) -> None:
         x, y, m = 1 / DEPTH, MONO, MASK
         s, t = np.polyfit(x[m], y[m], 1)
         residual = np.where(m, s * x + t - y, 0)
@@ -92,113 +86,97 @@ class TestScaleShift:
             wanted += 0.5 * differences / n.sum()
         assert scale_shift_loss(tensor(x), tensor(y), tensor(m)).item() == pytest.approx(wanted, rel=1e-10)
 
-    def test_gradient_flows_through_the_fit(self) -> None:
-        y, m = tensor(MONO[:6, :7]), tensor(MASK[:6, :7])
-        torch.autograd.gradcheck(lambda x: scale_shift_loss(x, y, m, scales=2), tensor(1 / DEPTH[:6, :7], True))
-
-    @pytest.mark.parametrize("mask", [np.zeros_like(MASK), np.eye(*MASK.shape) > 2])
-    def test_an_empty_mask_costs_nothing(self, mask: np.ndarray) -> None:
-        x = tensor(1 / DEPTH, True)
-        loss = scale_shift_loss(x, tensor(MONO), tensor(mask))
-        loss.backward()
-        assert loss.item() == 0
-        assert (x.grad == 0).all()
-
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    def test_a_constant_render_and_a_single_pixel_have_no_fit_and_no_gradient(self, dtype: torch.dtype) -> None:
-        one = np.zeros_like(MASK)
-        one[3, 4] = True
-        for render, mask in ((FLAT, MASK), (1 / DEPTH, one)):
-            x = tensor(render).to(dtype).requires_grad_()
-            scale_shift_loss(x, tensor(MONO).to(dtype), tensor(mask)).backward()
-            assert (x.grad == 0).all()
-            assert fitted_scale_and_shift(x[tensor(mask)], tensor(MONO).to(dtype)[tensor(mask)])[0] == 0
-
-
-class TestPatchNorm:
-    SIDE = 5
-
-    def cut(self, values: np.ndarray) -> np.ndarray:
-        """[P, 25], by a window that slides by its own size."""
-        found = sliding_window_view(values, (self.SIDE, self.SIDE))[:: self.SIDE, :: self.SIDE]
-        return found.reshape(-1, self.SIDE**2)
-
-    def normalised(self, values: np.ndarray, whole: bool) -> np.ndarray:
-        p = self.cut(values)
-        deviation = values.std(ddof=1) if whole else p.std(1, ddof=1, keepdims=True)
-        return (p - p.mean(1, keepdims=True)) / (deviation + 0.01 * p.std(ddof=1))
-
     @pytest.mark.parametrize("whole", [True, False])
     @pytest.mark.parametrize("tolerance", [0.00025, 0.2])
-    def test_golden_value(self, whole: bool, tolerance: float) -> None:
-        difference = self.normalised(DEPTH, whole) - self.normalised(-MONO, whole)
+    def test_patch_norm(self, whole: bool, tolerance: float) -> None:
+        difference = normalised(DEPTH, whole) - normalised(-MONO, whole)
         wanted = (difference[np.abs(difference) > tolerance] ** 2).mean()
-        found = patch_norm_loss(tensor(DEPTH), tensor(-MONO), self.SIDE, tolerance, whole)
+        found = patch_norm_loss(tensor(DEPTH), tensor(-MONO), 5, tolerance, whole)
         assert found.item() == pytest.approx(wanted, rel=1e-10)
 
-    def test_gradient_of_the_local_one(self) -> None:
-        target = tensor(-MONO[:10, :10])
-        torch.autograd.gradcheck(lambda d: patch_norm_loss(d, target, 5, 1e-9, False), tensor(DEPTH[:10, :10], True))
-
-    def test_the_global_deviation_has_no_gradient(self) -> None:
-        """Scaling the render changes the loss through the centred values alone: the divisor is held."""
-        d = tensor(DEPTH, True)
-        patch_norm_loss(d, tensor(-MONO), 5, 0.0, True).backward()
-        fixed = DEPTH.std(ddof=1)
-
-        def by_hand(x: Tensor) -> Tensor:
-            cut = torch.stack([x[i : i + 5, j : j + 5].flatten() for i in range(0, 20, 5) for j in range(0, 30, 5)])
-            mine = (cut - cut.mean(1, keepdim=True)) / (fixed + 0.01 * cut.std())
-            return (mine - tensor(self.normalised(-MONO, True))).square().mean()
-
-        x = tensor(DEPTH, True)
-        by_hand(x).backward()
-        torch.testing.assert_close(d.grad, x.grad, rtol=1e-9, atol=1e-12)
-
-    @pytest.mark.parametrize("whole", [True, False])
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    @pytest.mark.parametrize("depth", [FLAT, np.zeros_like(FLAT), FLAT[:3, :3], FLAT[:1, :1]])
-    def test_constant_and_tiny_maps_have_finite_gradients(
-        self, depth: np.ndarray, dtype: torch.dtype, whole: bool
-    ) -> None:
-        d = tensor(depth).to(dtype).requires_grad_()
-        loss = patch_norm_loss(d, tensor(-MONO[: depth.shape[0], : depth.shape[1]]).to(dtype), 5, 0.0, whole)
-        loss.backward()
-        assert loss.isfinite()
-        assert d.grad.isfinite().all()
+    def test_sparse_points(self) -> None:
+        wanted = 2.5 * np.abs(1 / bilinear(DEPTH) - 1 / SEEN[1].numpy()).mean()
+        assert sparse_point_loss(tensor(DEPTH), SEEN, 2.5).item() == pytest.approx(wanted, rel=1e-12)
 
 
-class TestSparsePoints:
-    PIXELS = np.array([[0.5, 0.5], [3.25, 7.5], [30.5, 22.5], [12.0, 3.0]])
-    Z = np.array([4.0, 2.5, 7.0, 3.0])
+LOSSES: dict[str, tuple[Callable[[Tensor], Tensor], np.ndarray]] = {
+    "pearson": (lambda d: pearson_depth_loss(d, tensor(MONO[:4, :5])), DEPTH[:4, :5]),
+    "scale_shift": (
+        lambda x: scale_shift_loss(x, tensor(MONO[:6, :7]), tensor(MASK[:6, :7]), scales=2),
+        1 / DEPTH[:6, :7],
+    ),
+    "patch_norm": (lambda d: patch_norm_loss(d, tensor(-MONO[:10, :10]), 5, 1e-9, False), DEPTH[:10, :10]),
+    "sparse_points": (lambda d: sparse_point_loss(d, SEEN, 1.0), DEPTH),
+}
 
-    def bilinear(self, values: np.ndarray) -> np.ndarray:
-        """By hand, with pixel centres at i + 0.5."""
-        found = []
-        for column, row in self.PIXELS - 0.5:
-            j, i = min(int(column), values.shape[1] - 2), min(int(row), values.shape[0] - 2)
-            u, v = column - j, row - i
-            weights = np.outer([1 - v, v], [1 - u, u])
-            found.append((weights * values[i : i + 2, j : j + 2]).sum())
-        return np.array(found)
 
-    def seen(self) -> Seen:
-        return Seen(tensor(self.PIXELS), tensor(self.Z))
+@pytest.mark.parametrize("name", LOSSES)
+def test_gradients_are_those_of_the_loss(name: str) -> None:
+    """That of scale_shift flows through its fit."""
+    loss, at = LOSSES[name]
+    torch.autograd.gradcheck(loss, tensor(at, True))
 
-    def test_golden_value(self) -> None:
-        wanted = 2.5 * np.abs(1 / self.bilinear(DEPTH) - 1 / self.Z).mean()
-        assert sparse_point_loss(tensor(DEPTH), self.seen(), 2.5).item() == pytest.approx(wanted, rel=1e-12)
 
-    def test_gradient(self) -> None:
-        torch.autograd.gradcheck(lambda d: sparse_point_loss(d, self.seen(), 1.0), tensor(DEPTH, True))
+def test_the_global_deviation_of_patch_norm_has_no_gradient() -> None:
+    """Scaling the render changes the loss through the centred values alone: the divisor is held."""
+    d, x, fixed = tensor(DEPTH, True), tensor(DEPTH, True), DEPTH.std(ddof=1)
+    patch_norm_loss(d, tensor(-MONO), 5, 0.0, True).backward()
+    cut = torch.stack([x[i : i + 5, j : j + 5].flatten() for i in range(0, 20, 5) for j in range(0, 30, 5)])
+    mine = (cut - cut.mean(1, keepdim=True)) / (fixed + 0.01 * cut.std())
+    (mine - tensor(normalised(-MONO, True))).square().mean().backward()
+    torch.testing.assert_close(d.grad, x.grad, rtol=1e-9, atol=1e-12)
 
-    def test_no_depth_counts_as_infinitely_far_and_no_point_as_nothing(self) -> None:
-        d = tensor(np.zeros_like(DEPTH), True)
-        loss = sparse_point_loss(d, self.seen(), 1.0)
-        loss.backward()
-        assert loss.item() == pytest.approx((1 / self.Z).mean())
-        assert (d.grad == 0).all()
-        assert sparse_point_loss(d, Seen(tensor(np.zeros((0, 2))), tensor(np.zeros(0))), 1.0).item() == 0
+
+DEGENERATE: dict[str, tuple[Callable[[Tensor], Tensor], np.ndarray, float | None]] = {
+    "pearson, flat render": (lambda d: pearson_depth_loss(d, tensor(MONO).to(d)), FLAT, 1),
+    "pearson, flat map": (lambda d: pearson_depth_loss(d, tensor(FLAT).to(d)), DEPTH, 1),
+    "pearson, one pixel": (lambda d: pearson_depth_loss(d, tensor(MONO[:1, :1]).to(d)), DEPTH[:1, :1], 1),
+    "pearson, no map": (lambda d: pearson_depth_loss(d, tensor(DEPTH * np.nan).to(d)), DEPTH, 1),
+    "scale_shift, no pixel": (lambda x: scale_shift_loss(x, tensor(MONO).to(x), tensor(NOTHING)), 1 / DEPTH, 0),
+    "scale_shift, one pixel": (lambda x: scale_shift_loss(x, tensor(MONO).to(x), tensor(ONE)), 1 / DEPTH, None),
+    "scale_shift, flat render": (lambda x: scale_shift_loss(x, tensor(MONO).to(x), tensor(MASK)), FLAT, None),
+}
+"""Where nothing can be told: the loss of what, at which render, and its value where that is known."""
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_where_nothing_can_be_told_there_is_no_gradient(name: str, dtype: torch.dtype) -> None:
+    loss, at, value = DEGENERATE[name]
+    d = tensor(at).to(dtype).requires_grad_()
+    found = loss(d)
+    found.backward()
+    assert value is None or found.item() == pytest.approx(value, abs=1e-6)
+    assert (d.grad == 0).all()
+
+
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("depth", [FLAT, np.zeros_like(FLAT), FLAT[:3, :3], FLAT[:1, :1]])
+def test_patch_norm_of_constant_and_tiny_maps_has_finite_gradients(
+    depth: np.ndarray, dtype: torch.dtype, whole: bool
+) -> None:
+    d = tensor(depth).to(dtype).requires_grad_()
+    loss = patch_norm_loss(d, tensor(-MONO[: depth.shape[0], : depth.shape[1]]).to(dtype), 5, 0.0, whole)
+    loss.backward()
+    assert loss.isfinite()
+    assert d.grad.isfinite().all()
+
+
+def test_pixels_without_a_map_do_not_count() -> None:
+    d = tensor(DEPTH, True)
+    pearson_depth_loss(d, tensor(np.where(MASK, MONO, np.nan))).backward()
+    assert (d.grad[~tensor(MASK)] == 0).all()
+    assert torch.isfinite(d.grad).all()
+
+
+def test_no_depth_counts_as_infinitely_far_and_no_point_as_nothing() -> None:
+    d = tensor(np.zeros_like(DEPTH), True)
+    loss = sparse_point_loss(d, SEEN, 1.0)
+    loss.backward()
+    assert loss.item() == pytest.approx((1 / SEEN[1]).mean().item())
+    assert (d.grad == 0).all()
+    assert sparse_point_loss(d, Seen(tensor(np.zeros((0, 2))), tensor(np.zeros(0))), 1.0).item() == 0
 
 
 def test_expected_depth_is_zero_without_gradient_where_little_is_drawn() -> None:

@@ -54,13 +54,8 @@ def recording_form(
 ) -> Form:
     """The form of a command on a recording.
 
-    Args:
-        command: as it is typed.
-        about: the text above its help.
-        run: what it does.
-        more: settings of a run that it takes beside those in `RECORDING`.
-        options: the dataclass of the command's own settings; they replace settings of a run with the same name.
-        tables: which tables of settings may be given by dotted flags; that of the import beside --calibration alone.
+    It takes the settings of a run in `RECORDING` and `more`, those of its own in `options`, which replace settings of a
+    run with the same name, and `tables` of settings by dotted flags, that of the import beside --calibration alone.
     """
     from d2_plugin.runs.settings import RunSettings
 

@@ -34,12 +34,8 @@ def ablate(
     Priors and starting points are made once under `output`, before the runs that share them start. Writes ablation.md
     and one row per run in runs.jsonl.
 
-    Args:
-        base: gives recording, cameras, iterations and the user's own tables; hooks, backbone and seed are set here.
-        presets, backbones, seeds: what is run; runs with the same variant of the prior share one.
-        output: folder of the ablation.
-        workers: processes of this machine.
-        command: how this was started, for the rows.
+    `base` gives recording, cameras, iterations and the user's own tables, and `command`, for the rows, is how this was
+    started. Runs with the same variant of the prior share one.
     """
     output = output.absolute()
     works = [

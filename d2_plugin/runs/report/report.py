@@ -56,14 +56,8 @@ def make_report(
 ) -> list[Path]:
     """Write report.html, report.md and one SVG per plot into `output`.
 
-    Args:
-        rows: of any kinds, see `d2_plugin.runs.rows`.
-        output: folder, created where absent; an earlier report in it is replaced.
-        images: for the page; the Markdown has none.
-        builders: what makes a section of each kind of row.
-
-    Returns:
-        The files that were written.
+    An earlier report in the folder is replaced. `images` are for the page; `builders` make a section of each kind of
+    row. Returns the files that were written.
 
     Raises:
         D2Error: there is no row, or one that no builder knows, or a file of somebody else stands where one of the

@@ -127,9 +127,7 @@ def state_at(scene: ExportScene, time: float, before: State | None = None) -> St
 def bake(scene: ExportScene, most_keys: Callable[[int, int], int]) -> Keys:
     """The scene at key times, which are frames or, where these are few, also halfway between them.
 
-    Args:
-        scene: the first and the last of its frames are keys.
-        most_keys: how many keys there may be, from the numbers of Gaussians that move and that change their shape.
+    `most_keys` says how many there may be, from the numbers of Gaussians that move and that change their shape.
     """
     frames, count = scene.seconds, len(scene.harmonics.coefficients)
     times = list(frames) if len(frames) > MANY else sorted({*frames, *_middles(frames)})

@@ -96,7 +96,7 @@ def _color_error(scene: ExportScene, coded: CodedScene) -> float:
 
 
 def _header(scene: ExportScene, coded: CodedScene) -> dict[str, Any]:
-    outlook, raster, keys = scene.outlook(), scene.raster, coded.keys
+    raster, keys = scene.raster, coded.keys
     return {
         "count": len(coded.rows),
         "motion": coded.motion,
@@ -118,7 +118,7 @@ def _header(scene: ExportScene, coded: CodedScene) -> dict[str, Any]:
         ],
         "background": None if scene.background is None else scene.background.tolist(),
         "palette": color_scale("viridis").tobytes().hex(),
-        **outlook._asdict(),
+        **scene.outlook(),
     }
 
 

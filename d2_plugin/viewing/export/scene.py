@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,16 +18,6 @@ from d2_plugin.recordings import Camera
 from d2_plugin.viewing.camera_paths import focus_of
 from d2_plugin.viewing.export.ply import scales_and_rotations
 from d2_plugin.viewing.viewed import ViewedRun
-
-
-class Outlook(NamedTuple):
-    """Where a player may start, in world units."""
-
-    focus: list[float]
-    """What the training cameras look at."""
-    up: list[float]
-    depth_range: tuple[float, float]
-    """From the hundredth-nearest to the hundredth-farthest opaque Gaussian that a training camera sees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +64,10 @@ class ExportScene:
         inside = ((pixels > 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(1)
         return torch.where((depth > self.raster.near) & inside, depth, 0)
 
-    def outlook(self) -> Outlook:
-        """From the Gaussians of the first, the middle and the last frame."""
+    def outlook(self) -> dict[str, list[float]]:
+        """Where a player may start, in world units: `focus` is what the training cameras look at, `up`, and
+        `depth_range` from the hundredth-nearest to the hundredth-farthest opaque Gaussian that one of them sees, at the
+        first, the middle and the last frame."""
         cameras, depths = self.train_cameras, []
         for time in sorted({self.seconds[0], self.seconds[len(self.seconds) // 2], self.seconds[-1]}):
             splats = self.splats_at(time)
@@ -88,7 +80,8 @@ class ExportScene:
         focus = focus_of(np.stack([camera.centre for camera in cameras]), axes[:, 2], float(middle))
         up = -axes[:, 1].mean(axis=0)
         up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else -axes[0, 1]
-        return Outlook(focus.tolist(), up.tolist(), (float(near), float(max(far, near * (1 + 1e-6)))))
+        ends = [float(near), float(max(far, near * (1 + 1e-6)))]
+        return {"focus": focus.tolist(), "up": up.tolist(), "depth_range": ends}
 
     def still_at(self, time: float) -> tuple[MovingGaussians, tuple[Tensor, Tensor]]:
         """The Gaussians of one instant with its colours, and their scales [M, 3] and quaternions [M, 4]."""

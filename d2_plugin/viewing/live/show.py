@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -106,13 +107,13 @@ class LiveRun:
         viewed = viewed_training(self.run, trainer)
         iterations = self.run.settings.iterations
         self.viewer = viewer = Viewer(viewed=viewed, iterations=iterations)
-        scorer = Scorer(viewed)
+        scores = _scores(viewed)
         if trainer.d2 is not None:
             viewer.marks = lambda: trainer.d2.inserted_at
         _print(f"watch it train at {viewer.url}")
 
         def on_step(step: int, loss: float) -> None:
-            if viewer.clients and (score := scorer.score()) is not None:
+            if viewer.clients and (score := next(scores)) is not None:
                 viewer.set_score(score)
             viewer.after_step(step, loss)
 
@@ -133,30 +134,25 @@ class LiveRun:
             viewer.close()
 
 
-class Scorer:
-    """PSNR of the held-out views so far: one view after the other, as far as its share of the time allows."""
-
-    def __init__(self, viewed: ViewedRun) -> None:
-        self.viewed = viewed
-        names = viewed.test_cameras or viewed.train_cameras
-        self._views = [(name, frame) for frame in viewed.recording.frames for name in names]
-        self._scores: deque[float] = deque(maxlen=min(AVERAGED, len(self._views)))
-        self._next, self._share, self._last = 0, Share(SCORED), time.monotonic()
-
-    def score(self) -> str | None:
-        """The score so far, where there was time for another view."""
+def _scores(viewed: ViewedRun) -> Iterator[str | None]:
+    """PSNR of the held-out views so far, one view after the other; None where its share of the time allows no more."""
+    recording, share, last = viewed.recording, Share(SCORED), time.monotonic()
+    names = viewed.test_cameras or viewed.train_cameras
+    views = [(name, frame) for frame in recording.frames for name in names]
+    scores: deque[float] = deque(maxlen=min(AVERAGED, len(views)))
+    kind, visited = "held-out" if viewed.test_cameras else "training", 0
+    while True:
         now = time.monotonic()
-        self._share.passes(now - self._last)
-        self._last = now
-        if not self._share.due:
-            return None
+        share.passes(now - last)
+        last = now
+        if not share.due:
+            yield None
+            continue
         # Steps that share no factor with the number of views visit all of them, spread over the recording.
-        name, frame = self._views[self._next * 7919 % len(self._views)]
-        self._next += 1
-        view = self.viewed.view(self.viewed.recording.cameras[name], self.viewed.recording.seconds(frame))
-        truth = torch.from_numpy(self.viewed.recording.image(name, frame)).float() / 255
-        self._scores.append(psnr(render_view(self.viewed.backbone, view).color, truth))
-        self._share.spent += time.monotonic() - now
-        kind = "held-out" if self.viewed.test_cameras else "training"
-        mean = sum(self._scores) / len(self._scores)
-        return f"{mean:.2f} dB PSNR, {kind}, last {len(self._scores)} views"
+        name, frame = views[visited * 7919 % len(views)]
+        visited += 1
+        view = viewed.view(recording.cameras[name], recording.seconds(frame))
+        truth = torch.from_numpy(recording.image(name, frame)).float() / 255
+        scores.append(psnr(render_view(viewed.backbone, view).color, truth))
+        share.spent += time.monotonic() - now
+        yield f"{sum(scores) / len(scores):.2f} dB PSNR, {kind}, last {len(scores)} views"
