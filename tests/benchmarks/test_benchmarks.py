@@ -105,14 +105,10 @@ def test_scaling_adds_rows_of_time_and_memory_per_length(monkeypatch: pytest.Mon
     assert rows[0]["command"] == "d2 bench scaling --frames 1,2 --width 96 --iterations 2 --output runs.jsonl"
 
 
-def fill(megabytes: int) -> float:
-    return float(np.ones(megabytes * 125_000).sum())
-
-
 @LINUX
 def test_memory_is_that_of_the_work_not_of_what_was_there_before() -> None:
     before = np.ones(20_000_000)  # 160 MB that stay
-    result, peak = in_fresh_process(fill, 100)
-    assert result == 100 * 125_000
+    result, peak = in_fresh_process(eval, "len(b'x' * 100_000_000)")
+    assert result == 100_000_000
     assert 95 < peak < 130
     assert before[0] == 1
