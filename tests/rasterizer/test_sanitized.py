@@ -51,7 +51,7 @@ def run(words: list[str], environment: dict[str, str]) -> subprocess.CompletedPr
 @pytest.mark.parametrize(
     ("module", "chosen"),
     [
-        ("rasterizer/test_rasterizer_cuda.py", "shim and (1x1 or 15x33 or without_gaussians or survey_is) or order_of"),
+        ("rasterizer/test_rasterizer_kernels.py", "shim and (one or 7x5 or survey_is) or order_of"),
         ("priors/test_patchmatch_gpu.py", "shim and (window or bits) or order_of"),
     ],
 )
