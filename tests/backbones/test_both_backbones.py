@@ -107,7 +107,7 @@ def apply(action: str, seed: int, adapter: Backbone, model: SplatModel) -> None:
 
 
 @pytest.mark.parametrize("name", BACKBONES)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(sequence=edits)
 def test_every_per_gaussian_state_stays_on_its_row(name: str, sequence: list[tuple[str, int]]) -> None:
     """Numbers follow the reports; parameters, Adam moments, statistics and pruning streaks must have followed too."""
@@ -177,18 +177,6 @@ def test_a_resume_without_a_part_of_the_field_differs(part: str) -> None:
     second.load_state_dict(state)
     second.run()
     assert not same(parameters(whole), parameters(second))
-
-
-def test_a_run_never_touches_the_global_random_state(backbone: str) -> None:
-    before = torch.get_rng_state()
-    make_trainer(ALL_HOOKS, backbone=backbone).run()
-    assert torch.equal(before, torch.get_rng_state())
-
-
-def test_every_hook_changes_every_backbone(backbone: str) -> None:
-    trainer = make_trainer(ALL_HOOKS, backbone=backbone)
-    trainer.run()
-    assert {(entry.hook, entry.action) for entry in trainer.d2.trace} >= {("densify", "insert"), ("depth_loss", "loss")}
 
 
 def test_training_lowers_the_loss_of_the_tiny_scene(backbone: str) -> None:

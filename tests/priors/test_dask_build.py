@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from prior_cases import contents
 
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.build import PriorSummary, build_priors
@@ -51,10 +52,6 @@ def two_workers() -> Iterator[object]:
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=50
     ) as cluster:
         yield cluster
-
-
-def contents(path: Path) -> dict[str, bytes]:
-    return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
 
 
 def worker_pids(cluster: object) -> list[int]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from colmap_maps import write_dense_array
+from prior_cases import write_dense_array
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors import depth_on_disk
