@@ -1,7 +1,4 @@
-"""PatchMatch on the GPU: the same .cu source on the CPU (fibre shim) and, where there is one, on a GPU.
-
-Both must return the bits of the CPU's kernels: they share `kernels/spread.h`, and every sum has one order.
-"""
+"""PatchMatch on the GPU: the same .cu source on the CPU (fibre shim) and, where there is one, on a GPU."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What the rasterizer knows of the prior: the weight in space that must be free, and how much each pixel counts.
-
-front(p) = sum_i w_i max(0, 1 - z_i / D_near(p)); test_rasterizer_reference.py holds it against this definition.
-"""
+"""What the rasterizer knows of the prior: the weight in space that must be free, and how much each pixel counts."""
 
 from __future__ import annotations
 

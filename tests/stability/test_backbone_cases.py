@@ -1,8 +1,4 @@
-"""Cases 25 to 36 of the stiff ones: a training step with hooks where a mask is empty or a number leaves its range.
-
-What a formula does with such numbers is tested beside it (test_hooks.py, test_slice_stability.py); here whole backbones
-are trained, and must come out finite, or with exactly nothing changed.
-"""
+"""Cases 25 to 36 of the stiff ones: a training step with hooks where a mask is empty or a number leaves its range."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""What a trainer's process imports: contract, hooks, rasterizer and store, and nothing that makes priors.
-
-A trainer lives in an environment of its own, often an old one with packages pinned, and D2 is a guest there. Every
-module that it imports can fail in such an environment, slows its start, and must keep to Python 3.9 and torch 2.0.
-Reading a prior needs the store, not the parsers of calibrations and videos that made it.
-"""
+"""What a trainer's process imports: contract, hooks, rasterizer and store, and nothing that makes priors."""
 
 from __future__ import annotations
 
