@@ -41,10 +41,6 @@ class TestSlice:
         expected = torch.sigmoid(apart.gaussians["opacity_logits"]) * torch.exp(-0.5 * offset**2 / 0.2)
         torch.testing.assert_close(opacities, expected)
 
-    def test_initial_temporal_variance_is_a_fifth_of_the_duration(self) -> None:
-        model = make_model()
-        torch.testing.assert_close(model.gaussians["log_time_scales"].exp() ** 2, torch.full((60,), 0.5 / 5))
-
 
 class TestInitialScales:
     def test_is_the_root_mean_square_distance_to_three_neighbours(self) -> None:
