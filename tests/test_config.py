@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny import ALL_HOOKS
 
@@ -73,6 +73,7 @@ def test_what_cannot_be_meant_is_one_sentence(read: Callable, table: dict[str, A
     assert "\n" not in str(refusal.value)
 
 
+@settings(max_examples=40)
 @given(
     st.builds(
         D2Config,
