@@ -191,7 +191,6 @@ def gsplat_edits(params: Any, optimizers: Any, state: dict[str, Any]) -> dict[st
 
     operations = {name: getattr(gsplat, name) for name in ("duplicate", "split", "remove")}
     edits = {name: partial(every_fourth, operation) for name, operation in operations.items()}
-    edits["relocate"] = partial(every_fourth, gsplat.relocate)  # dead ones become copies of living ones: all are new
     return edits | {"sample_add": lambda: gsplat.sample_add(params, optimizers, state, 3)}
 
 
