@@ -7,6 +7,7 @@ import os
 import zlib  # noqa: F401  before pycolmap, whose own copy of zlib would otherwise be bound
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
@@ -17,6 +18,8 @@ with contextlib.suppress(ImportError):
     import pycolmap  # noqa: F401
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch is imported; see d2_plugin.commands.cli.main
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # there is a worker for each core
 
 hypothesis.settings.register_profile("house", deadline=None)  # no test may fail because a machine is busy
 hypothesis.settings.load_profile("house")
@@ -40,10 +43,46 @@ def shared_data() -> Callable[[str], Path]:
 
 
 @pytest.fixture
-def threads() -> Iterator[None]:
-    """A test may set torch's number of threads."""
+def threads() -> Iterator[Callable[[int], None]]:
+    """Sets torch's number of threads for a test."""
     import torch  # after the environment is set above
 
     before = torch.get_num_threads()
-    yield
+    yield torch.set_num_threads
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def same_for_any_threads(threads: Callable[[int], None]) -> Callable[..., None]:
+    """Asserts that what a function returns, arrays or tensors, has the same bits for 1, 2 and 5 threads."""
+    import numpy as np
+
+    def check(function: Callable[[], Any]) -> None:
+        results = []
+        for count in (1, 2, 5):
+            threads(count)
+            results.append([np.asarray(part) for part in function()])
+        for other in results[1:]:
+            for one, two in zip(results[0], other, strict=True):
+                np.testing.assert_array_equal(one, two)
+
+    return check
+
+
+GPU = pytest.param("cuda", marks=pytest.mark.cuda)
+
+
+@pytest.fixture(params=["cpu", "shim", GPU])
+def kernels(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A `Path` of the rasterizer whose kernels draw."""
+    from splat_scenes import path_of
+
+    return path_of(request.param, monkeypatch)
+
+
+@pytest.fixture(params=["cpu", "shim", "torch", GPU])
+def path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Every `Path` of the rasterizer."""
+    from splat_scenes import path_of
+
+    return path_of(request.param, monkeypatch)

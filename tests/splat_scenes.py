@@ -1,15 +1,78 @@
-"""For the rasterizer's tests: random Gaussians, a camera, and the definition of splatting in numpy."""
+"""For the rasterizer's tests: random Gaussians and cameras, the paths that draw them, the definition in NumPy."""
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import math
+from pathlib import Path as File
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
-from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize, reference
+from d2_plugin.compiler import NoCompiler, find_compiler, load_library
+from d2_plugin.protocol import DepthPrior, Label
+from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, autograd, cuda, rasterize, reference
+
+HERE = File(__file__).parent / "rasterizer"
+CPU = torch.device("cpu")
+
+
+class Path(NamedTuple):
+    """Who draws: torch in float64, the CPU's kernels, or the GPU's, in the fibre shim or on a device."""
+
+    dtype: torch.dtype
+    device: torch.device = CPU
+
+
+def path_of(name: str, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The path `torch`, `cpu`, `shim` or `cuda`; skips the test where this machine lacks it."""
+    if name == "torch":
+        return Path(torch.float64)
+    if name == "cuda":
+        if not torch.cuda.is_available():
+            pytest.skip("no CUDA device (torch.cuda.is_available() is False)")
+        return Path(torch.float32, torch.device("cuda", 0))
+    try:
+        find_compiler()
+    except NoCompiler as error:
+        pytest.skip(str(error))
+    if name == "shim":
+        use_shim(monkeypatch, ShimLauncher())
+    return Path(torch.float32)
+
+
+def use_shim(monkeypatch: pytest.MonkeyPatch, launcher: cuda.Launcher) -> None:
+    """Let float32 on the CPU run the GPU's kernels, by this launcher."""
+    monkeypatch.setattr(autograd, "_kernels", lambda part: cuda)
+    monkeypatch.setattr(cuda, "launcher", lambda device: launcher)
+
+
+class ShimLauncher:
+    """Runs the kernels on the CPU, with blocks, warps and lanes in an order of `cuda_shim.h`."""
+
+    def __init__(self, order: int = 0) -> None:
+        self.order = order
+        self.launched: set[str] = set()
+
+    def launch(self, kernel: str, blocks: int, frame: cuda.Frame, rows: int = 1) -> None:
+        self.launched.add(kernel)
+        run = shim_library(frame.channels or 3).d2_shim_launch
+        error = run(kernel.encode(), blocks, rows, self.order, ctypes.byref(frame))
+        assert error is None, error.decode()
+
+
+@functools.cache
+def shim_library(channels: int) -> ctypes.CDLL:
+    flags = (f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda.Frame)}", "-ffp-contract=off")
+    headers = (HERE / "cuda_shim.h", cuda.PROGRAM.source, *cuda.PROGRAM.headers)
+    library = load_library("cuda-shim", (HERE / "cuda_shim.cpp",), headers, flags)
+    library.d2_shim_launch.restype = ctypes.c_char_p
+    library.d2_shim_stream.restype = ctypes.c_void_p
+    return library
 
 
 class Scene(NamedTuple):
@@ -23,14 +86,37 @@ class Scene(NamedTuple):
     def splats(self) -> Splats:
         return Splats(*self[:3], torch.arange(len(self.means)))
 
-    def to(self, dtype: torch.dtype) -> Scene:
-        return Scene(*(part.to(dtype) for part in self[:4]), self.view)
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.view.height, self.view.width
+
+    def on(self, path: Path) -> Scene:
+        view = self.view
+        pose, K = (part.to(path.device) for part in (view.T_camera_world, view.K))
+        view = View(view.camera, view.frame, view.time, pose, K, view.width, view.height)
+        return Scene(*(part.to(path.device, path.dtype) for part in self[:4]), view)
 
     def requires_grad(self) -> Scene:
         return Scene(*(part.detach().clone().requires_grad_() for part in self[:4]), self.view)
 
     def render(self, settings: RasterSettings = RasterSettings(), **options: Tensor | None) -> Render:  # noqa: B008
         return rasterize(self.splats, self.colors, self.view, settings, **options)
+
+    def turned(self) -> Scene:
+        """The same scene in another world frame, so that the camera is neither at the origin nor straight."""
+        cos, sin = math.cos(0.7), math.sin(0.7)
+        R = torch.tensor([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]], dtype=self.means.dtype)
+        t = torch.tensor([0.3, -2.0, 5.0], dtype=self.means.dtype)
+        full = R.T @ self.covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3) @ R
+        pose = torch.eye(4, dtype=self.means.dtype)
+        pose[:3, :3], pose[:3, 3] = R, t
+        view = View("cam", 0, 0.0, pose, self.view.K, self.view.width, self.view.height)
+        return Scene((self.means - t) @ R, packed(full), self.opacities, self.colors, view)
+
+
+def packed(full: Tensor) -> Tensor:
+    """Matrices [M, 3, 3] as their six numbers."""
+    return full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
 
 
 def make_view(width: int, height: int, focal: float | None = None, principal: tuple | None = None) -> View:
@@ -43,8 +129,7 @@ def make_view(width: int, height: int, focal: float | None = None, principal: tu
 def covariance(scales: Tensor, generator: torch.Generator) -> Tensor:
     """Covariances [M, 6] with standard deviations `scales` [M, 3] in random directions."""
     axes = torch.linalg.qr(torch.randn(len(scales), 3, 3, dtype=scales.dtype, generator=generator))[0]
-    full = (axes * scales[:, None] ** 2) @ axes.mT
-    return full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return packed((axes * scales[:, None] ** 2) @ axes.mT)
 
 
 def random_scene(seed: int, count: int, width: int, height: int, channels: int = 3, radius: float = 3.0) -> Scene:
@@ -74,10 +159,7 @@ def single(
 
 
 def near_edge_of(view: View, seed: int = 3) -> Tensor:
-    """Near edges [H, W] of a prior, float32, among the Gaussians of `random_scene`.
-
-    At every third pixel nothing is known; some numbers are no edge, others next to the camera or far beyond.
-    """
+    """Near edges [H, W] of a prior, float32, among the Gaussians of `random_scene`; one in three is unknown or odd."""
     g = torch.Generator().manual_seed(seed)
     edge = 0.5 + 6 * torch.rand(view.height, view.width, generator=g)
     odd = torch.tensor([math.nan, math.inf, -math.inf, -1.0, 1e-3, 1e6, 1e-35])
@@ -85,7 +167,19 @@ def near_edge_of(view: View, seed: int = 3) -> Tensor:
     flat[::3] = 0
     places = flat[1::5][: len(odd)]
     places.copy_(odd[: len(places)])
-    return edge
+    return edge.to(view.K.device)
+
+
+def prior_of(view: View, reliable: bool = False, seed: int = 1) -> DepthPrior:
+    """A prior of random depths and labels, with a reliability where asked, and numbers among them that say nothing."""
+    g = torch.Generator().manual_seed(seed)
+    depth, r = 1 + 4 * torch.rand(2, view.height, view.width, generator=g)
+    odd = torch.tensor([math.nan, math.inf, 0.0])
+    for part, step in ((depth, 7), (r, 9)):
+        places = part.view(-1)[::step][: len(odd)]
+        places.copy_(odd[: len(places)])
+    labels = torch.randint(0, len(Label), depth.shape, generator=g, dtype=torch.uint8)
+    return DepthPrior(depth, labels, reliability=(r - 1) / 4 if reliable else None)
 
 
 class Fragments(NamedTuple):
@@ -96,10 +190,22 @@ class Fragments(NamedTuple):
     after: np.ndarray  # [M, H, W] transmittance that it would leave behind it; 1 where it is skipped or comes too late
     depths: np.ndarray  # [M]
 
+    def front(self, near_edge: Tensor) -> np.ndarray:
+        """w max(0, 1 - z / D_near) [M, H, W], 0 where nothing is known."""
+        edge = near_edge.double().numpy()
+        known = np.isfinite(edge) & (edge > 1e-30)
+        return self.weights * np.maximum(0, 1 - self.depths[:, None, None] / np.where(known, edge, 1)) * known
+
+    def away(self, settings: RasterSettings = RasterSettings()) -> Tensor:  # noqa: B008
+        """Pixels [H, W] where rounding decides nothing: no alpha and no transmittance is at its threshold."""
+        at_alpha = np.abs(self.unclamped / settings.alpha_min - 1) < 1e-4
+        at_end = np.abs(self.after / settings.transmittance_min - 1) < 1e-3
+        return torch.from_numpy(~(at_alpha | at_end).any(0))
+
 
 def brute_force(scene: Scene, settings: RasterSettings = RasterSettings()) -> Fragments:  # noqa: B008
-    """The image formation model with explicit matrices, in numpy float64, one pixel at a time."""
-    means, packed, opacities = (part.detach().double().numpy() for part in scene[:3])
+    """The image formation model with explicit matrices, in numpy float64, one Gaussian at a time."""
+    means, covariances, opacities = (part.detach().double().numpy() for part in scene[:3])
     view = scene.view
     pose, K = view.T_camera_world.double().numpy(), view.K.double().numpy()
     points = means @ pose[:3, :3].T + pose[:3, 3]
@@ -111,7 +217,7 @@ def brute_force(scene: Scene, settings: RasterSettings = RasterSettings()) -> Fr
         x, y, z = points[i]
         if z <= settings.near:
             continue
-        screen = _screen_covariance(packed[i], pose[:3, :3], x, y, z, K, view, settings)
+        screen = _screen_covariance(covariances[i], pose[:3, :3], x, y, z, K, view, settings)
         inverse, share = np.linalg.inv(screen), 1.0
         if settings.antialiased:
             own = np.linalg.det(screen - settings.blur * np.eye(2)) / np.linalg.det(screen)
@@ -128,9 +234,16 @@ def brute_force(scene: Scene, settings: RasterSettings = RasterSettings()) -> Fr
 
 
 def _screen_covariance(
-    packed: np.ndarray, R: np.ndarray, x: float, y: float, z: float, K: np.ndarray, view: View, settings: RasterSettings
+    covariances: np.ndarray,
+    R: np.ndarray,
+    x: float,
+    y: float,
+    z: float,
+    K: np.ndarray,
+    view: View,
+    settings: RasterSettings,
 ) -> np.ndarray:
-    xx, xy, xz, yy, yz, zz = packed
+    xx, xy, xz, yy, yz, zz = covariances
     world = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     limits = []
     for slope, size, focal, middle in ((x / z, view.width, K[0, 0], K[0, 2]), (y / z, view.height, K[1, 1], K[1, 2])):
@@ -138,17 +251,3 @@ def _screen_covariance(
         limits.append(np.clip(slope, centre - half, centre + half))
     jacobian = np.array([[K[0, 0], 0, -K[0, 0] * limits[0]], [0, K[1, 1], -K[1, 1] * limits[1]]]) / z
     return jacobian @ R @ world @ R.T @ jacobian.T + settings.blur * np.eye(2)
-
-
-def brute_force_front(found: Fragments, near_edge: Tensor) -> np.ndarray:
-    """w max(0, 1 - z / D_near) [M, H, W], 0 where nothing is known."""
-    edge = near_edge.double().numpy()
-    known = np.isfinite(edge) & (edge > 1e-30)
-    return found.weights * np.maximum(0, 1 - found.depths[:, None, None] / np.where(known, edge, 1)) * known
-
-
-def near_threshold(fragments: Fragments, settings: RasterSettings = RasterSettings()) -> np.ndarray:  # noqa: B008
-    """Pixels [H, W] where rounding may decide differently: somebody's alpha or transmittance is at its threshold."""
-    at_alpha = np.abs(fragments.unclamped / settings.alpha_min - 1) < 1e-4
-    at_end = np.abs(fragments.after / settings.transmittance_min - 1) < 1e-3
-    return (at_alpha | at_end).any(0)

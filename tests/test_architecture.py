@@ -1,12 +1,10 @@
-"""The house: a room for every idea and imports that run one way, and all of it is packaged and documented.
-
-`ROOMS` is the plan. Files are parsed and nothing is imported, so that imports inside functions are seen, too.
-"""
+"""The house: a room for every idea and imports that run one way, and all of it is packaged and documented."""
 
 from __future__ import annotations
 
 import ast
 import configparser
+import functools
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from graphlib import TopologicalSorter
@@ -70,6 +68,11 @@ def room(module: str) -> str:
     return top if top == "benchmarks" else (*inner, "__init__")[0]
 
 
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def imports_of(name: str, modules: Mapping[str, Path]) -> Iterator[tuple[str, int, bool]]:
     """Each module of this project that a module imports, the line, and whether importing the one loads the other."""
     parts = name.split(".") if modules[name].name == "__init__.py" else name.split(".")[:-1]
@@ -77,7 +80,9 @@ def imports_of(name: str, modules: Mapping[str, Path]) -> Iterator[tuple[str, in
     def walk(node: ast.AST, at_once: bool) -> Iterator[tuple[str, int, bool]]:
         for child in ast.iter_child_nodes(node):
             inside = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
-            inside |= isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)
+            inside |= isinstance(child, ast.If) and any(
+                getattr(n, "id", "") == "TYPE_CHECKING" for n in ast.walk(child.test)
+            )
             targets: Iterable[str] = ()
             if isinstance(child, ast.Import):
                 targets = [alias.name for alias in child.names]
@@ -89,7 +94,7 @@ def imports_of(name: str, modules: Mapping[str, Path]) -> Iterator[tuple[str, in
             yield from ((target, child.lineno, at_once) for target in targets if target in modules)
             yield from walk(child, at_once and not inside)
 
-    return walk(ast.parse(modules[name].read_text(encoding="utf-8")), True)
+    return walk(parsed(modules[name]), True)
 
 
 def wrong_arrows(modules: Mapping[str, Path], rooms: Mapping[str, str], ground: str) -> list[str]:

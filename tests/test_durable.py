@@ -154,11 +154,10 @@ def test_lines_are_added_whole_and_a_line_that_was_cut_off_stays_alone(
         append(tmp_path, "5\n")
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_flipped_bit_of_an_archive_is_found_or_changes_no_array(tmp_path: Path, seed: int) -> None:
+def test_a_flipped_bit_of_an_archive_is_found_or_changes_no_array(tmp_path: Path) -> None:
     arrays = {"a": np.arange(40.0), "b": np.arange(9, dtype=np.uint8)}
     np.savez(tmp_path / "whole.npz", **arrays)
-    whole, draw, found = (tmp_path / "whole.npz").read_bytes(), random.Random(seed), 0
+    whole, draw, found = (tmp_path / "whole.npz").read_bytes(), random.Random(0), 0
     for _ in range(150):
         damaged = bytearray(whole)
         place = draw.randrange(8 * len(whole))

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from colmap_maps import write_dense_array
 from fuzzing import bounded_memory, expect_result_or_sentence, mutate_file
+from prior_cases import write_dense_array
 from small_layouts import small_recording
 from tiny_onnx import mean_network
 

@@ -48,34 +48,43 @@ def machine(
     return dict(gpu_state())
 
 
-def test_a_machine_that_has_everything_says_what_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert machine(monkeypatch) == {
-        "device": "Some GPU (sm_90), torch built for CUDA 13.0",
-        "driver": "for CUDA 13.0",
-        "NVRTC": "13.0, compiles for sm_90 at first use",
-    }
+HAS = {
+    "device": "Some GPU (sm_90), torch built for CUDA 13.0",
+    "driver": "for CUDA 13.0",
+    "NVRTC": "13.0, compiles for sm_90 at first use",
+}
 
 
-def test_a_torch_without_cuda_is_named_with_where_to_get_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = machine(monkeypatch, built_for=None, driver_for=None, device=False, compiler=False)
-    assert f"torch {torch.__version__} is built without CUDA" in found["device"]
-    assert "https://pytorch.org" in found["device"]
-    assert "bring it along" in found["NVRTC"]
-
-
-def test_a_missing_driver_says_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = machine(monkeypatch, driver_for=None, device=False)
-    assert "no CUDA device found, though torch is built for CUDA 13.0" in found["device"]
-    assert found["driver"] == "missing: the NVIDIA driver (libcuda.so.1) was not found: install it, or use the CPU"
-
-
-def test_a_driver_older_than_torch_says_update_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = machine(monkeypatch, driver_for=12040, device=False)
-    assert found["driver"] == "for CUDA 12.4, but torch is built for CUDA 13.0: update the NVIDIA driver"
-
-
-def test_missing_nvrtc_says_which_extra_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert machine(monkeypatch, compiler=False)["NVRTC"] == f"missing: {NO_NVRTC}"
+@pytest.mark.parametrize(
+    ("lacks", "says"),
+    [
+        ({}, HAS),
+        ({"compiler": False}, {"NVRTC": f"missing: {NO_NVRTC}"}),
+        (
+            {"driver_for": 12040, "device": False},
+            {"driver": "for CUDA 12.4, but torch is built for CUDA 13.0: update the NVIDIA driver"},
+        ),
+        (
+            {"driver_for": None, "device": False},
+            {
+                "device": "no CUDA device found, though torch is built for CUDA 13.0",
+                "driver": "missing: the NVIDIA driver (libcuda.so.1) was not found: install it, or use the CPU",
+            },
+        ),
+        (
+            {"built_for": None, "driver_for": None, "device": False, "compiler": False},
+            {"device": f"torch {torch.__version__} is built without CUDA", "NVRTC": "bring it along"},
+        ),
+    ],
+    ids=["nothing", "NVRTC", "a newer driver", "a driver", "a torch with CUDA"],
+)
+def test_what_a_machine_lacks_is_named_with_what_to_do(
+    lacks: dict, says: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = machine(monkeypatch, **lacks)
+    assert all(sentence in report[part] for part, sentence in says.items())
+    assert report == HAS or lacks
+    assert "https://pytorch.org" in report["device"] or "built_for" not in lacks
 
 
 def test_this_machine_is_described_without_an_error() -> None:

@@ -5,11 +5,8 @@ from __future__ import annotations
 import copy
 import inspect
 import random
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -199,29 +196,6 @@ def test_the_state_of_other_hooks_is_refused() -> None:
     other = D2Hooks(only("densify"), Yang4DAdapter(make_model()), TinyStore())
     with pytest.raises(D2Error, match=r"made with hooks \['prune'\] but this run has \['densify'\]"):
         other.load_state_dict(state)
-
-
-def test_configuration_survives_toml(tmp_path) -> None:
-    path = tmp_path / "d2.toml"
-    path.write_text(replace(ALL_HOOKS, prior="/somewhere").to_toml())
-    assert D2Config.from_toml(path) == replace(ALL_HOOKS, prior="/somewhere")
-    path.write_text('prior = "maps"\n[densify]\n')
-    assert D2Config.from_toml(path).prior == str(tmp_path / "maps")
-    path.write_text("[densify\n")
-    with pytest.raises(D2Error, match="not valid TOML"):
-        D2Config.from_toml(path)
-
-
-def test_training_with_a_finished_prior_needs_torch_and_numpy_alone() -> None:
-    script = """
-import sys
-for name in ("cv2", "pycolmap", "onnxruntime", "kornia", "rich", "matplotlib"):
-    sys.modules[name] = None  # an import of it now fails
-import d2_plugin.store.store
-from tiny import ALL_HOOKS, make_trainer
-make_trainer(ALL_HOOKS, iterations=6).run()
-"""
-    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parent, timeout=300)
 
 
 class TestRetirement:

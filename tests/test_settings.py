@@ -26,7 +26,6 @@ from d2_plugin.errors import D2Error
 from d2_plugin.hooks import HOOKS
 from d2_plugin.protocol import RasterSettings
 from d2_plugin.settings import (
-    FORMAT,
     AtLeastOne,
     Count,
     Positional,
@@ -37,7 +36,6 @@ from d2_plugin.settings import (
     Share,
     Steps,
     declared,
-    of_this_format,
     table_of,
 )
 from d2_plugin.values import bare_and_range
@@ -180,13 +178,6 @@ def test_a_mistake_is_told_with_what_was_expected_and_what_to_do(table: dict[str
         Example.from_dict(table, "run")
 
 
-def test_the_top_of_a_file_has_no_name() -> None:
-    with pytest.raises(D2Error, match=r"^setting inner\.part must be"):
-        Example.from_dict({"inner": {"part": -1}}, "")
-    with pytest.raises(D2Error, match=r"^unknown setting 'inne'"):
-        Example.from_dict({"inne": {}}, "")
-
-
 def test_a_setting_without_a_default_is_asked_for() -> None:
     @dataclass(frozen=True)
     class Needy(Settings):
@@ -207,23 +198,6 @@ def test_help_range_unit_and_place_are_found() -> None:
     assert NAMES["start"].range == Range(0, unit="steps")
     assert NAMES["levels"].default == (1, 2)
     assert next(iter(NAMES)) == "start", "a base's settings come first"
-
-
-def test_a_class_without_source_has_no_help() -> None:
-    space: dict[str, Any] = {"dataclass": dataclass, "Settings": Settings, "Count": Count}
-    text = "@dataclass(frozen=True)\nclass Typed(Settings):\n    count: Count = 3\n    '''Help.'''"
-    exec(compile(text, "nowhere", "exec", dont_inherit=True), space)
-    assert declared(space["Typed"])[0].help == ""
-
-
-@pytest.mark.parametrize("version", [FORMAT + 1, 0, "1", True, None])
-def test_a_file_of_another_version_is_named(version: object) -> None:
-    with pytest.raises(D2Error, match=f"d2.toml has settings of version {version!r}, and this d2-4dgs reads version 1"):
-        of_this_format({"version": version}, "d2.toml")
-
-
-def test_a_file_without_a_version_is_of_the_first() -> None:
-    assert of_this_format({"prior": "x"}, "d2.toml") == of_this_format({"prior": "x", "version": 1}, "d2.toml")
 
 
 def every_settings_class() -> list[type[Settings]]:

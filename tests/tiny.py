@@ -66,9 +66,7 @@ class TinyStore:
 def make_model(
     count: int = 60, temporal: bool = True, seed: int = 0, backbone: str = "yang4d", **chosen: object
 ) -> SplatModel:
-    """Gaussians scattered between the cameras and beyond the plane; `backbone` is one of `BACKBONES`.
-
-    `chosen` are settings of every backbone, over those of the tests."""
+    """Gaussians scattered between the cameras and beyond the plane; `backbone` is one of `BACKBONES`."""
     generator = torch.Generator().manual_seed(seed)
     positions = torch.rand(count, 3, generator=generator) * torch.tensor([3.0, 2.0, 3.0]) + torch.tensor(
         [-1.5, -1, 1.5]

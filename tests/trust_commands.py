@@ -1,8 +1,4 @@
-"""`d2` commands in processes of their own that can be killed, and whose disk can be made to fail.
-
-They are forked from one process that has imported everything, so that one costs what the command costs. `faults.c`,
-preloaded there, makes the operating system fail; nothing of the package is patched.
-"""
+"""`d2` commands in processes of their own that can be killed, and whose disk can be made to fail."""
 
 from __future__ import annotations
 

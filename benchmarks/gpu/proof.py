@@ -96,7 +96,7 @@ def _part(*words: str) -> list[str]:
 
 def _sanitizer(tool: str) -> Step:
     # Small scenes: a sanitizer slows a kernel down a hundred times.
-    chosen = ["-m", "cuda", "tests/rasterizer/test_rasterizer_cuda.py", "-k", "1x1 or 15x33 or empty or survey"]
+    chosen = ["-m", "cuda", "tests/rasterizer/test_rasterizer_kernels.py", "-k", "one or 7x5 or survey"]
     watched = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9"]
     words = [*watched, sys.executable, "-m", "pytest", "-q", *chosen]
     return Step(120, (_device, _tests, _program("compute-sanitizer")), lambda settings: words)
@@ -142,7 +142,7 @@ def _stereo(device: str) -> Callable[[GpuBench], list[str]]:
     return words
 
 
-SHIM = ("-k", "shim", "tests/rasterizer/test_rasterizer_cuda.py", "tests/priors/test_patchmatch_gpu.py")
+SHIM = ("-k", "shim", "tests/rasterizer/test_rasterizer_kernels.py", "tests/priors/test_patchmatch_gpu.py")
 STEPS = {
     "static": Step(100, (_program("nvcc"),), None),
     "tests": Step(180, (_device, _tests), _pytest("-m", "cuda", "tests")),

@@ -128,49 +128,38 @@ def fudan_model(**attributes: object) -> tuple[Any, Any]:
     return model, scene
 
 
-def make_fudan() -> Standing:
-    model, scene = fudan.make()
-    return inria(fudan, model, lambda: FudanAdapter(model, scene), scene.train_cameras[1.0])
-
-
-def make_spacetime() -> Standing:
-    model, scene = spacetime.make()
-    return inria(spacetime, model, lambda: SpacetimeAdapter(model, 2), scene.cameras)
-
-
-def make_ex4dgs() -> Standing:
-    model, scene = ex4dgs.make()
-    return inria(ex4dgs, model, lambda: Ex4DGSAdapter(model), scene.cameras)
-
-
-def make_hust4d(stage: str = "fine") -> Standing:
-    model, scene = hust4d.make()
-    return inria(hust4d, model, lambda: Hust4DAdapter(model, scene, stage), scene.cameras, stage=stage)
+def standing(mimic: ModuleType, make_adapter: Callable[[Any, Any], Backbone], **options: Any) -> Standing:
+    """Of a mimic that is a model and a scene; `options` are those of its render."""
+    model, scene = mimic.make()
+    cameras = scene.train_cameras[1.0] if mimic is fudan else scene.cameras
+    return inria(mimic, model, lambda: make_adapter(model, scene), cameras, **options)
 
 
 def make_swift4d(stage: str = "fine") -> Standing:
-    model, scene = swift4d.make()
-    return inria(swift4d, model, lambda: Swift4DAdapter(model, scene, stage), scene.cameras, stage=stage)
+    return standing(swift4d, lambda model, scene: Swift4DAdapter(model, scene, stage), stage=stage)
+
+
+def make_hust4d(stage: str = "fine") -> Standing:
+    return standing(hust4d, lambda model, scene: Hust4DAdapter(model, scene, stage), stage=stage)
 
 
 def make_cem4dgs() -> Standing:
-    model, scene = cem4dgs.make()
-    standing = inria(cem4dgs, model, lambda: CEM4DGSAdapter(model, near=0.2, far=100.0), scene.cameras)
+    made = standing(cem4dgs, lambda model, scene: CEM4DGSAdapter(model, near=0.2, far=100.0))
     with torch.no_grad():
-        model.extract_dynamic_points_from_static(0.3)
-    jitter(model._xyz_motion, model._rotation_motion)
-    return standing
+        made.model.extract_dynamic_points_from_static(0.3)
+    jitter(made.model._xyz_motion, made.model._rotation_motion)
+    return made
 
 
 def make_deformable3d(is_6dof: bool = False) -> Standing:
     model, deform, scene = deformable3d.make(is_6dof)
-    standing = inria(deformable3d, model, lambda: Deformable3DAdapter(model, deform, warm_up=0), scene.cameras)
+    made = inria(deformable3d, model, lambda: Deformable3DAdapter(model, deform, warm_up=0), scene.cameras)
 
     def draw(camera: Any) -> Tensor:
         motion = deform.step(model.get_xyz, camera.fid.expand(len(model.get_xyz), 1))
         return deformable3d.render(camera, model, [0, 0, 0], *motion, is_6dof)["depth"][0]
 
-    return standing._replace(draw=draw)
+    return made._replace(draw=draw)
 
 
 def make_fastergs4d() -> Standing:
@@ -238,9 +227,9 @@ def make_gsplat_dynamic() -> Standing:
 
 
 VARIANTS: dict[str, Callable[[], Standing]] = {
-    "fudan": make_fudan,
-    "spacetime": make_spacetime,
-    "ex4dgs": make_ex4dgs,
+    "fudan": partial(standing, fudan, FudanAdapter),
+    "spacetime": partial(standing, spacetime, lambda model, scene: SpacetimeAdapter(model, 2)),
+    "ex4dgs": partial(standing, ex4dgs, lambda model, scene: Ex4DGSAdapter(model)),
     "hust4d": make_hust4d,
     "hust4d coarse": partial(make_hust4d, "coarse"),
     "deformable3d": make_deformable3d,

@@ -23,6 +23,17 @@ def test_without_a_state_growth_counts_as_appended() -> None:
     assert reports[0].tolist() == [*range(60), *[-1] * 5]
 
 
+def test_gaussians_that_were_copied_over_dead_ones_count_anew() -> None:
+    """MCMC zeroes the state of those that it copied; of the dead it says nothing, and they keep their row."""
+    standing, reports = make_gsplat(), []
+    standing.adapter.on_resize(reports.append)
+    dead = torch.arange(60) % 4 == 0
+    gsplat.relocate(standing.model, standing.adapter.optimizers, standing.adapter.state, dead)
+    assert len(standing.adapter) == 60
+    copied = torch.where(~dead)[0][: int(dead.sum())]
+    assert reports[0].tolist() == torch.arange(60).index_fill(0, copied, -1).tolist()
+
+
 def test_cameras_are_views_and_anything_else_is_refused() -> None:
     adapter = make_gsplat().adapter
     view = make_views()[2]

@@ -102,18 +102,6 @@ class TestFudan:
         assert torch.equal(splats.rows, rows)
         torch.testing.assert_close(splats.opacities, (model.get_opacity[:, 0] * marginal)[rows])
 
-    def test_prefiltering_changes_the_marginal_and_nothing_else(self) -> None:
-        model, _ = fudan_model()
-        with torch.no_grad():
-            model._rotation += 0.3 * torch.randn(60, 4, generator=torch.Generator().manual_seed(0))
-        view = make_views()[3]
-        plain = FudanAdapter(model).slice_at(view)
-        model.prefilter_var = 1e-12
-        filtered = FudanAdapter(model).slice_at(view)
-        assert torch.equal(plain.rows, filtered.rows)
-        torch.testing.assert_close(plain.means, filtered.means)
-        torch.testing.assert_close(plain.covariances, filtered.covariances, rtol=1e-4, atol=1e-6)
-
     def test_three_dimensional_models_and_forks_without_a_prefilter(self) -> None:
         model, _ = fudan_model(gaussian_dim=3)
         assert len(FudanAdapter(model).slice_at(make_views()[0]).rows) == 60
@@ -156,26 +144,6 @@ class TestDeformations:
         normalised = adapter.slice_at(make_views()[0]).covariances
         assert (covariances[:, 5] / normalised[:, 5]).median() > 2
 
-    @pytest.mark.parametrize("name", ["mlp", "hexplane"])
-    def test_inserted_gaussians_are_seen_where_they_were_asked_for(self, name: str) -> None:
-        """Points of two instants, each found at its own instant after the field has moved it."""
-        if name == "mlp":
-            model, deform, _ = deformable3d.make()
-            model.training_setup(default_options())
-            adapter = Deformable3DAdapter(model, deform, warm_up=0)
-        else:
-            model, scene = hust4d.make()
-            model.training_setup(default_options())
-            adapter = Hust4DAdapter(model, scene, "fine")
-        points = some_points(40)._replace(times=torch.tensor([0.0, 0.5]).repeat(20))
-        added = adapter.insert(points)
-        assert added == 40
-        assert adapter.inversion.accepted.float().mean() > 0.9
-        for view in (make_views()[0], make_views()[3]):
-            means = adapter.slice_at(view).means[-40:]
-            chosen = (points.times == view.time) & adapter.inversion.accepted
-            assert ((means - points.positions)[chosen].norm(dim=-1) <= 0.5 * points.scales[chosen] + 1e-6).all()
-
     def test_points_outside_the_grid_of_4dgaussians_are_left_out(self) -> None:
         model, scene = hust4d.make()
         model.training_setup(default_options())
@@ -197,23 +165,6 @@ class TestDeformations:
 
 
 class TestEx4DGS:
-    def test_static_rows_that_become_dynamic_are_followed(self) -> None:
-        model, _ = ex4dgs.make()
-        model.training_setup(default_options())
-        adapter, reports = Ex4DGSAdapter(model), []
-        adapter.on_resize(reports.append)
-        model.xyz_error_min_timestamp.zero_()
-        with torch.no_grad():
-            model._xyz_disp[:6] = 1.0
-            model.extract_dynamic_points_from_static()
-        assert len(reports) == 1
-        assert reports[0].tolist() == [*range(6, 60), *[-1] * 6]
-        adapter.insert(some_points(2))
-        assert reports[1].tolist() == [*range(54), -1, -1, *range(54, 60)], "appended static rows land in the middle"
-        adapter.remove(torch.arange(62) >= 58)
-        assert reports[2].tolist() == list(range(58))
-        assert len(model._xyz_motion) == 2
-
     def test_inserted_rows_survive_the_next_prune(self) -> None:
         """Two statistics are extended by its own callers by hand; without them the next prune_points fails."""
         model, _ = ex4dgs.make()

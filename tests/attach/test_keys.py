@@ -92,10 +92,6 @@ class TestNames:
         listed = SimpleNamespace(train_camera=SimpleNamespace(dataset=infos))
         assert Hust4DAdapter(model, listed, "fine").view(scene.cameras[4]).camera == "cam1"
 
-    def test_spacetime_counts_frames_by_time(self) -> None:
-        model, scene = spacetime.make()
-        assert SpacetimeAdapter(model, 2).view(scene.cameras[4]).frame == 1
-
     def test_ex4dgs_reads_the_path_of_the_image(self) -> None:
         """Its `timestamp` is no frame number: it starts at 0 wherever the clip starts, and padding mirrors it."""
         model, scene = ex4dgs.make()

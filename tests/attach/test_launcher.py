@@ -7,16 +7,18 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from mimics import fudan, hust4d
 from mimics.inria import default_options
+from mimics.page import attached
+from mimics.workplace import furnish
 from tiny import TinyStore
 
 from d2_plugin import D2Config, D2Error, D2Hooks
-from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
 from d2_plugin.attach import launch
 from d2_plugin.attach.launch import main
@@ -92,11 +94,13 @@ class TestSession:
         attached, _ = run_wrapped(D2Config(), monkeypatch)
         assert torch.equal(bare, attached)
 
-    def test_the_loss_is_that_of_the_three_lines(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_the_loss_is_that_of_the_three_lines(self, repository: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """The term is weighted like the trainer's own loss, which is divided by the batch size."""
         bare, _ = run_wrapped(None, monkeypatch)
         launched, _ = run_wrapped(DEPTH_LOSS, monkeypatch)
-        three_lines = _fudan_with_three_lines(DEPTH_LOSS)
+        furnish(repository, monkeypatch)
+        (repository / "d2.toml").write_text(replace(DEPTH_LOSS, prior="prior").to_toml())
+        three_lines = attached(fudan, "fudan").training(*fudan.make(), OPTIONS).gaussians._xyz.detach()
         assert (launched - bare).abs().max() > 1e-3
         torch.testing.assert_close(launched, three_lines, atol=2e-5, rtol=1e-4)
 
@@ -133,32 +137,6 @@ class TestSession:
         assert session._drawn == 0
         render(scene.train_cameras[1.0][0], gaussians, [0, 0, 0])
         assert session._drawn == 1
-
-
-def _fudan_with_three_lines(config: D2Config) -> torch.Tensor:
-    """The mimic's training with D2's loss added before the division by the batch size."""
-    gaussians, scene = fudan.make()
-    state: dict = {}
-    setup, loss_of = gaussians.training_setup, fudan.l1_loss
-
-    def training_setup(options: object) -> None:
-        setup(options)
-        state["d2"], state["drawn"] = D2Hooks(config, FudanAdapter(gaussians, scene), TinyStore()), []
-
-    def render(camera: object, model: object, background: list[int]) -> dict:
-        state["drawn"].append(camera)
-        return original(camera, model, background)
-
-    def l1_loss(image: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
-        iteration = (len(state["drawn"]) + 1) // OPTIONS.batch_size
-        return loss_of(image, truth) + state["d2"].loss(iteration, state["drawn"][-1])
-
-    original, gaussians.training_setup = fudan.render, training_setup
-    fudan.render, fudan.l1_loss = render, l1_loss
-    try:
-        return fudan.training(gaussians, scene, OPTIONS).gaussians._xyz.detach()
-    finally:
-        fudan.render, fudan.l1_loss = original, loss_of
 
 
 def test_the_image_passes_unchanged_and_the_term_gets_its_weight() -> None:

@@ -85,36 +85,20 @@ def test_ours_takes_the_place_and_the_rest_says_so_when_it_is_called(script: Pat
         Anything(1)
 
 
-def test_names_that_numpy_dropped_are_restored(monkeypatch) -> None:
+def test_what_newer_libraries_dropped_is_restored(monkeypatch) -> None:
+    """Names of numpy 1, signed bytes as images (fudan), processes of joblib as threads (cem-4dgs), numbers in JSON."""
+    image, joblib = pytest.importorskip("PIL.Image"), pytest.importorskip("joblib")
+    monkeypatch.setattr(image, "fromarray", image.fromarray)
+    monkeypatch.setattr(joblib.parallel, "BACKENDS", dict(joblib.parallel.BACKENDS))
+    monkeypatch.setattr(json.JSONEncoder, "default", json.JSONEncoder.default)
     for name in repairs.NUMPY_NAMES.keys() & vars(np).keys():
         monkeypatch.delattr(np, name)
-    said = repairs._numpy()
+    repairs.repair()
     assert np.NaN is np.nan
-    assert "has no np.NaN" in said
-    assert repairs._numpy() is None
-
-
-def test_signed_bytes_become_a_image(monkeypatch) -> None:
-    """As fudan hands them over (utils/data_utils.py:22)."""
-    image = pytest.importorskip("PIL.Image")
-    monkeypatch.setattr(image, "fromarray", image.fromarray)
-    repairs._pillow()
     values = np.array([[[0, 127, 255]]], np.uint8)
     assert np.array_equal(np.array(image.fromarray(values.view(np.int8), "RGB")), values)
-
-
-def test_workers_that_unpickle_the_repositorys_modules_are_threads(monkeypatch) -> None:
-    """cem-4dgs asks for processes, which would import torchvision again, where nothing stands in for it."""
-    joblib = pytest.importorskip("joblib")
-    monkeypatch.setattr(joblib.parallel, "BACKENDS", dict(joblib.parallel.BACKENDS))
-    assert "threads" in repairs._joblib()
     here = joblib.Parallel(n_jobs=2, backend="loky")(joblib.delayed(os.getpid)() for _ in range(2))
     assert set(here) == {os.getpid()}
-
-
-def test_numbers_of_numpy_become_json(monkeypatch) -> None:
-    monkeypatch.setattr(json.JSONEncoder, "default", json.JSONEncoder.default)
-    assert "JSON" in repairs._json()
     assert json.dumps({"SSIM": np.float32(0.5)}) == '{"SSIM": 0.5}'
     with pytest.raises(TypeError, match="not JSON serializable"):
         json.dumps(object())

@@ -19,15 +19,6 @@ from d2_plugin.protocol import Points
 
 
 class TestFasterGS4D:
-    def test_growth_is_told_with_the_prune_that_follows_it(self) -> None:
-        standing = make_fastergs4d()
-        reports: list[Tensor] = []
-        standing.adapter.on_resize(reports.append)
-        standing.edits["grow"]()
-        assert len(reports) == 1
-        assert len(reports[0]) == len(standing.adapter) > 60
-        assert (reports[0][60:] == -1).all()
-
     def test_another_object_or_camera_is_refused(self) -> None:
         with pytest.raises(D2Error, match="SimpleNamespace has no prune, which FasterGS4DAdapter needs"):
             FasterGS4DAdapter(SimpleNamespace(_spatial_means=torch.zeros(1, 3)))

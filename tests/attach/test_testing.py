@@ -84,41 +84,32 @@ def broken(change: Callable[[WatchedModel], None]) -> str:
     return str(caught.value)
 
 
-def with_view(**changes: object) -> Callable[[WatchedModel], None]:
-    """An adapter whose views are different."""
-    return lambda adapter: setattr(
-        adapter, "view", lambda camera: replace(camera, **{k: f(camera) for k, f in changes.items()})
-    )
+def changed(
+    name: str, given: Callable = lambda value: value, back: Callable = lambda value: value
+) -> Callable[[WatchedModel], None]:
+    """An adapter one of whose methods gets, or gives back, something else."""
+
+    def apply(adapter: WatchedModel) -> None:
+        inner = getattr(adapter, name)
+        setattr(adapter, name, lambda value: back(inner(given(value))))
+
+    return apply
+
+
+def with_view(**changes: Callable[[View], object]) -> Callable[[WatchedModel], None]:
+    return changed("view", back=lambda view: replace(view, **{name: make(view) for name, make in changes.items()}))
 
 
 def with_slice(change: Callable[[Splats], Splats]) -> Callable[[WatchedModel], None]:
-    """An adapter whose slices are different."""
-
-    def apply(adapter: WatchedModel) -> None:
-        inner = adapter.slice_at
-        adapter.slice_at = lambda view: change(inner(view))
-
-    return apply
+    return changed("slice_at", back=change)
 
 
 def with_insert(change: Callable[[Points], Points]) -> Callable[[WatchedModel], None]:
-    """An adapter that inserts something else than it was given."""
-
-    def apply(adapter: WatchedModel) -> None:
-        insert = adapter.insert
-        adapter.insert = lambda points: insert(change(points))
-
-    return apply
+    return changed("insert", given=change)
 
 
 def with_report(change: Callable[[Tensor], Tensor]) -> Callable[[WatchedModel], None]:
-    """An adapter whose reports are different."""
-
-    def apply(adapter: WatchedModel) -> None:
-        report = adapter._report
-        adapter._report = lambda index: report(change(index))
-
-    return apply
+    return changed("_report", given=change)
 
 
 def after_remove(change: Callable[[Optimizer, Mapping[str, Tensor]], None]) -> Callable[[WatchedModel], None]:
@@ -153,16 +144,6 @@ def early(adapter: WatchedModel) -> None:
     adapter.model.select = lambda index: (report(index), select(adapter.model, index))
 
 
-def keeps_instead(adapter: WatchedModel) -> None:
-    remove = adapter.remove
-    adapter.remove = lambda mask: remove(~mask)
-
-
-def overcounts(adapter: WatchedModel) -> None:
-    insert = adapter.insert
-    adapter.insert = lambda points: insert(points) + 1
-
-
 def stale(optimizer: Optimizer, before: Mapping[str, Tensor]) -> None:
     """Moments of the first rows stay in front, whichever rows are kept."""
     for group in optimizer.param_groups:
@@ -179,14 +160,8 @@ def refuses(points: Points) -> Points:
     raise RuntimeError("no room")
 
 
-def normalised_depth(adapter: WatchedModel) -> None:
-    rendered = adapter.rendered_depth
-
-    def divided(view: object) -> object:
-        maps = rendered(view)
-        return maps and (maps[0] / (maps[1] + 1e-6), maps[1])
-
-    adapter.rendered_depth = divided
+def divided(maps: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] | None:
+    return maps and (maps[0] / (maps[1] + 1e-6), maps[1])
 
 
 def any_camera(adapter: WatchedModel) -> None:
@@ -227,19 +202,14 @@ def swaps_a_batch(adapter: WatchedModel) -> None:
     adapter._renders.put, adapter.rendered_depth = remember, wrong
 
 
-def transposed(view: object) -> Tensor:
-    return view.T_camera_world.T
-
-
-def mirrored(view: object) -> Tensor:
-    return torch.diag(torch.tensor([1.0, -1, 1, 1])) @ view.T_camera_world
+MIRROR = torch.diag(torch.tensor([1.0, -1, 1, 1]))
 
 
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (with_view(T_camera_world=transposed), "the last row of T_camera_world is not 0 0 0 1"),
-        (with_view(T_camera_world=mirrored), "mirrors the world"),
+        (with_view(T_camera_world=lambda view: view.T_camera_world.T), "the last row of T_camera_world is not 0 0 0 1"),
+        (with_view(T_camera_world=lambda view: MIRROR @ view.T_camera_world), "mirrors the world"),
         (with_view(T_camera_world=lambda view: view.T_camera_world * 2), "is not orthonormal"),
         (with_view(K=lambda view: -view.K), "positive focal lengths"),
         (with_view(camera=lambda view: "one", frame=lambda view: 0), "6 cameras share 1 keys"),
@@ -259,15 +229,15 @@ def mirrored(view: object) -> Tensor:
         (with_report(lambda index: index.flip(0)), "are not those of the rows that the report names"),
         (with_report(lambda index: index + 100), "reports rows outside -1..59"),
         (with_report(lambda index: index >= 0), "reports torch.bool .* expected an index"),
-        (keeps_instead, "remove was given 20 rows and took 40"),
-        (overcounts, "insert returns 9 but 8 Gaussians were added"),
+        (changed("remove", given=torch.logical_not), "remove was given 20 rows and took 40"),
+        (changed("insert", back=lambda count: count + 1), "insert returns 9 but 8 Gaussians were added"),
         (with_insert(lambda p: p._replace(positions=p.positions + 0.7)), "are not where their points are"),
         (with_insert(lambda p: p._replace(scales=p.scales * 5)), "have a standard deviation of .* asked for"),
         (with_insert(lambda p: p._replace(opacities=p.opacities * 0.1)), "have an opacity of .* asked for"),
         (after_remove(lambda optimizer, _: optimizer.state.clear()), "has lost its state"),
         (after_remove(stale), "does not stay on its row"),
         (with_insert(draws), "the global random state changes"),
-        (normalised_depth, "depth_sum is not the slice's"),
+        (changed("rendered_depth", back=divided), "depth_sum is not the slice's"),
         (any_camera, "render of one camera for another"),
         (last_only, "rendered_depth knows the last render alone"),
         (swaps_a_batch, "the render of one camera of a batch for another"),

@@ -11,34 +11,14 @@ import torch
 from tiny import TinyFrames, is_finite, make_model, make_trainer, make_views, parameters
 
 from d2_plugin.backbones.densify import DensifySettings, grow, prune
-from d2_plugin.backbones.gaussians import Gaussians
 from d2_plugin.backbones.starting import nearest_neighbour_scales
 from d2_plugin.backbones.trainer import Trainer, TrainSettings
-from d2_plugin.backbones.yang4d import Yang4DSettings, create
+from d2_plugin.backbones.yang4d import create
 from d2_plugin.gaussians import spherical_harmonics as sh
-from d2_plugin.gaussians.photometric import photometric_loss, ssim
-from d2_plugin.runs.metrics import ssim_3dgs
+from d2_plugin.gaussians.photometric import photometric_loss
 
 
 class TestSlice:
-    def test_gaussians_outside_their_temporal_support_are_not_projected(self) -> None:
-        model = make_model()
-        with torch.no_grad():
-            model.gaussians["log_time_scales"].fill_(math.log(0.01))
-            model.gaussians["times"].copy_(torch.linspace(0, 1, 60))
-        splats = model.slice_at(make_views()[0])  # at time 0
-        offsets = torch.linspace(0, 1, 60)[splats.rows]
-        assert 0 < len(splats.rows) < 60
-        assert offsets.max() < 2.4478 * 0.01, "F(t) = 0.05 is 2.4477 standard deviations away"
-
-    def test_opacity_includes_the_temporal_factor(self) -> None:
-        model = make_model()
-        with torch.no_grad():
-            model.gaussians["log_time_scales"].fill_(math.log(0.4))
-            model.gaussians["times"].fill_(0.2)
-        expected = 0.5 * math.exp(-0.5 * (0.2 / 0.4) ** 2)
-        torch.testing.assert_close(model.slice_at(make_views()[0]).opacities, torch.full((60,), expected))
-
     def test_time_apart_from_space_leaves_every_gaussian_where_it_is(self) -> None:
         rows = (torch.rand(9, 3), torch.rand(9, 3), torch.full((9,), 0.3))
         apart, coupled = (
@@ -60,10 +40,6 @@ class TestSlice:
         offset = 0.32 - apart.gaussians["times"]
         expected = torch.sigmoid(apart.gaussians["opacity_logits"]) * torch.exp(-0.5 * offset**2 / 0.2)
         torch.testing.assert_close(opacities, expected)
-
-    def test_initial_temporal_variance_is_a_fifth_of_the_duration(self) -> None:
-        model = make_model()
-        torch.testing.assert_close(model.gaussians["log_time_scales"].exp() ** 2, torch.full((60,), 0.5 / 5))
 
 
 class TestInitialScales:
@@ -100,17 +76,6 @@ class TestColour:
 
 
 class TestPhotometricLoss:
-    def test_ssim_is_the_one_of_3d_gaussian_splatting(self) -> None:
-        rng = np.random.default_rng(0)
-        a = rng.random((24, 30, 3))
-        b = np.clip(a + 0.1 * rng.standard_normal(a.shape), 0, 1)
-        ours = ssim(torch.from_numpy(a), torch.from_numpy(b)).item()
-        assert ours == pytest.approx(float(ssim_3dgs(torch.from_numpy(a), torch.from_numpy(b))), abs=1e-9)
-
-    def test_equal_images_cost_nothing(self) -> None:
-        image = torch.rand(20, 20, 3, dtype=torch.float64)
-        assert photometric_loss(image, image).item() == pytest.approx(0, abs=1e-12)
-
     def test_passes_gradcheck(self) -> None:
         generator = torch.Generator().manual_seed(0)
         image, target = torch.rand(2, 12, 13, 3, dtype=torch.float64, generator=generator)
@@ -149,21 +114,6 @@ class TestDensityControl:
         assert len(model) == 58
 
 
-class TestGaussians:
-    def test_appended_rows_start_without_momentum(self) -> None:
-        gaussians = Gaussians({"x": torch.zeros(2, 3)}, {"x": 0.1})
-        gaussians["x"].sum().backward()
-        gaussians.optimizer.step()
-        gaussians.append({"x": torch.ones(1, 3)})
-        moments = gaussians.optimizer.state[gaussians["x"]]["exp_avg"]
-        assert (moments[:2] != 0).all()
-        assert (moments[2] == 0).all()
-
-    def test_rows_and_rates_must_name_the_same_tensors(self) -> None:
-        with pytest.raises(ValueError, match="name different tensors"):
-            Gaussians({"x": torch.zeros(2, 3)}, {"y": 0.1})
-
-
 def test_every_training_view_is_used_once_per_round() -> None:
     trainer = make_trainer()
     count = len(TinyFrames().views)
@@ -183,17 +133,6 @@ def test_every_variant_trains_and_grows(settings: dict[str, object], temporal: b
     trainer.run()
     assert is_finite(trainer)
     assert len(model) > 60
-
-
-def test_settings_arrive_through_the_entry_point() -> None:
-    model = create(
-        torch.rand(4, 3), torch.rand(4, 3), torch.zeros(4), extent=1.0, duration=1.0, temporal=True,
-        settings={"sh_degree": 1, "densify": {"every": 9}, "raster": {"near": 0.01}},
-    )  # fmt: skip
-    assert model.gaussians["harmonics"].shape == (4, 3, 3)
-    assert model.settings == Yang4DSettings(
-        sh_degree=1, densify=DensifySettings(every=9), raster=type(model.settings.raster)(near=0.01)
-    )
 
 
 def parameters_of(model) -> dict[str, torch.Tensor]:

@@ -140,10 +140,6 @@ class TestColour:
         monkeypatch.setattr(module, "NODES", large.width)
         assert (coarse - sky_of(some_sky(), large)).abs().max() < 2e-3
 
-    def test_where_a_camera_stands_makes_no_difference(self) -> None:
-        sky, (left, _, right) = some_sky(), make_views()[:3]
-        assert torch.equal(sky_of(sky, left), sky_of(sky, right))
-
     def test_another_lens_on_the_same_camera_sees_other_directions(self) -> None:
         sky, view = some_sky(), make_views()[0]
         zoomed = replace(view, K=view.K * torch.tensor([2.0, 2.0, 1.0])[:, None])
@@ -156,7 +152,7 @@ class TestColour:
         plain, with_sky = make_model(), make_model(background=True)
         assert torch.equal(with_sky.render(view, white).color, plain.render(view, white).color)
 
-    @pytest.mark.parametrize("bright", [0.02, 0.6, 0.98])
+    @pytest.mark.parametrize("bright", [0.02, 0.98])
     def test_a_sky_is_learned_and_a_held_out_camera_sees_it(self, bright: float) -> None:
         class Sky(TinyFrames):
             def image(self, index: int) -> Tensor:

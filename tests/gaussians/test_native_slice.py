@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import pytest
 import torch
@@ -86,22 +86,12 @@ def test_kernel_agrees_with_the_reference_implementation(name: str) -> None:
     torch.testing.assert_close(opacities[0], torch.tensor(0.5 * marginal), atol=0, rtol=1e-6)
 
 
-@pytest.mark.parametrize("count", [0, 40])
-def test_nothing_drawn_gives_empty_splats_and_zero_gradients(count: int) -> None:
-    rows = random_rows(count, True)
-    outputs, gradients = slice_with_gradients(native_slice, rows, torch.float32, at=1e6)
-    assert [tuple(output.shape) for output in outputs] == [(0, 3), (0, 6), (0,), (0,)]
-    assert all(not gradient.any() and gradient.shape == rows[name].shape for name, gradient in gradients.items())
+def test_the_number_of_threads_changes_no_bit(temporal: bool, same_for_any_threads: Callable) -> None:
+    def everything() -> list[Tensor]:
+        outputs, gradients = slice_with_gradients(native_slice, random_rows(10_000, temporal), torch.float32)
+        return [*outputs, *gradients.values()]
 
-
-@pytest.mark.usefixtures("threads")
-def test_one_and_two_threads_give_the_same_bits(temporal: bool) -> None:
-    rows, results = random_rows(10_000, temporal), []
-    for count in (1, 2):
-        torch.set_num_threads(count)
-        outputs, gradients = slice_with_gradients(native_slice, rows, torch.float32)
-        results.append([*outputs, *gradients.values()])
-    assert all(torch.equal(one, two) for one, two in zip(*results))
+    same_for_any_threads(everything)
 
 
 @pytest.mark.parametrize("spoilt", list(TEMPORAL))
@@ -113,13 +103,14 @@ def test_nan_or_infinity_in_one_gaussian_leaves_the_others_untouched(spoilt: str
     # The same upstream gradient for each Gaussian, whether or not the spoilt one is still drawn.
     raw = {name: tensor.clone().requires_grad_() for name, tensor in rows.items()}
     *outputs, drawn = native_slice(raw, AT, *CONSTANTS)
-    kept, before = drawn != 7, clean[3] != 7
     generator = torch.Generator().manual_seed(7)
-    upstream = [torch.randn(o.shape, generator=generator) for o in clean[:3]]
-    places = torch.searchsorted(clean[3], drawn)
+    upstream, places = (
+        [torch.randn(o.shape, generator=generator) for o in clean[:3]],
+        torch.searchsorted(clean[3], drawn),
+    )
     torch.autograd.backward(outputs, [gradient[places] for gradient in upstream])
     for output, expected in zip(outputs, clean):
-        assert torch.equal(output[kept], expected[before])
+        assert torch.equal(output[drawn != 7], expected[clean[3] != 7])
     others = torch.arange(200) != 7
     for name, tensor in raw.items():
         assert torch.equal(tensor.grad[others], clean_gradients[name][others]), name

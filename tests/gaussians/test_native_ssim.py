@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -29,41 +30,33 @@ def images(height: int, width: int, channels: int = 3, seed: int = 0, noise: flo
     return (target + noise * torch.randn(target.shape, generator=generator)).clamp(0, 1), target
 
 
-def loss_with_gradient(loss_of, image: Tensor, target: Tensor, dtype: torch.dtype, **options) -> tuple[Tensor, Tensor]:
+def loss_with_gradient(
+    image: Tensor, target: Tensor, dtype: torch.dtype = torch.float32, loss_of: Callable = photometric_loss, **options
+) -> tuple[Tensor, Tensor]:
     image = image.to(dtype, copy=True).requires_grad_()
     loss = loss_of(image, target.to(dtype), **options)
     loss.backward()
     return loss.detach(), image.grad
 
 
-def assert_agree(image: Tensor, target: Tensor, **options) -> None:
-    """Kernel in float32 against torch in float64."""
-    loss, gradient = loss_with_gradient(photometric_loss, image, target, torch.float32, **options)
-    exact, exact_gradient = loss_with_gradient(reference_photometric_loss, image, target, torch.float64, **options)
+@pytest.mark.parametrize(
+    ("shape", "weight"),
+    [*(((*size, 3), 0.2) for size in SIZES), *(((20, 30, channels), 0.2) for channels in (1, 2, 4))]
+    + [((20, 30, 3), weight) for weight in (1e-3, 0.5, 1.0)],
+)
+@pytest.mark.parametrize("transposed", [False, True], ids=["", "transposed"])
+def test_value_and_gradient_are_those_of_torch_in_float64(
+    shape: tuple[int, int, int], weight: float, transposed: bool
+) -> None:
+    image, target = images(*shape)
+    if transposed:  # and so not contiguous
+        image, target = image.transpose(0, 1), target.flip(0).transpose(0, 1)
+    loss, gradient = loss_with_gradient(image, target, ssim_weight=weight)
+    exact, slope = loss_with_gradient(image, target, torch.float64, reference_photometric_loss, ssim_weight=weight)
     assert loss.dtype == torch.float32
     assert loss.shape == ()
     torch.testing.assert_close(loss.double(), exact, rtol=3e-6, atol=5e-7)
-    assert (gradient - exact_gradient).norm() < 5e-6 * exact_gradient.norm()
-
-
-@pytest.mark.parametrize(("height", "width"), SIZES)
-def test_value_and_gradient_are_those_of_torch_in_float64_for_any_size(height: int, width: int) -> None:
-    assert_agree(*images(height, width))
-
-
-@pytest.mark.parametrize("channels", [1, 2, 4])
-def test_any_number_of_channels(channels: int) -> None:
-    assert_agree(*images(20, 30, channels))
-
-
-@pytest.mark.parametrize("weight", [1e-3, 0.5, 1.0])
-def test_any_weight_of_the_structural_part(weight: float) -> None:
-    assert_agree(*images(20, 30), ssim_weight=weight)
-
-
-def test_images_need_not_be_contiguous() -> None:
-    image, target = images(30, 20)
-    assert_agree(image.transpose(0, 1), target.flip(0).transpose(0, 1))
+    assert (gradient - slope).norm() < 5e-6 * slope.norm()
 
 
 @pytest.mark.parametrize("level", [0.1, 0.9])
@@ -72,9 +65,10 @@ def test_flat_images_lose_fewer_digits_than_in_torch(level: float) -> None:
     generator = torch.Generator().manual_seed(0)
     target = torch.full((60, 60, 3), level)
     image = target + 0.02 + 1e-3 * torch.rand(60, 60, 3, generator=generator)
-    _, gradient = loss_with_gradient(photometric_loss, image, target, torch.float32)
-    _, plain = loss_with_gradient(reference_photometric_loss, image, target, torch.float32)
-    _, exact = loss_with_gradient(reference_photometric_loss, image, target, torch.float64)
+    _, gradient = loss_with_gradient(image, target)
+    plain, exact = (
+        loss_with_gradient(image, target, t, reference_photometric_loss)[1] for t in (torch.float32, torch.float64)
+    )
     assert (gradient - exact).norm() < 2e-5 * exact.norm()
     if level > 0.5:  # dark images have little to lose
         assert (gradient - exact).norm() < (plain - exact).norm()
@@ -90,21 +84,16 @@ def test_the_structural_part_is_that_of_scikit_image() -> None:
     np.testing.assert_allclose(1 - photometric_loss(image, target, 1.0), expected, rtol=1e-6)
 
 
-@pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("height", [63, 64, 131])
-def test_one_and_more_threads_give_the_same_bits(height: int) -> None:
-    results = []
-    for count in (1, 2, 4):
-        torch.set_num_threads(count)
-        results.append(loss_with_gradient(photometric_loss, *images(height, 50), torch.float32))
-    assert all(torch.equal(one, other) for result in results[1:] for one, other in zip(results[0], result))
+def test_the_number_of_threads_changes_no_bit(height: int, same_for_any_threads: Callable) -> None:
+    same_for_any_threads(lambda: loss_with_gradient(*images(height, 50)))
 
 
 def test_a_nan_pixel_spoils_only_its_surroundings() -> None:
     image, target = images(60, 60)
-    _, clean = loss_with_gradient(photometric_loss, image, target, torch.float32)
+    _, clean = loss_with_gradient(image, target)
     image[30, 20, 1] = math.nan
-    loss, gradient = loss_with_gradient(photometric_loss, image, target, torch.float32)
+    loss, gradient = loss_with_gradient(image, target)
     assert loss.isnan()
     touched = torch.zeros_like(gradient, dtype=torch.bool)
     touched[20:41, 10:31, 1] = True  # two windows
@@ -112,23 +101,16 @@ def test_a_nan_pixel_spoils_only_its_surroundings() -> None:
     assert torch.equal(gradient[~touched], clean[~touched])
 
 
-def test_the_gradient_scales_with_what_comes_back_and_may_be_asked_for_twice() -> None:
+def test_the_gradient_scales_with_what_comes_back_and_may_be_asked_for_twice_or_not_at_all() -> None:
     image, target = images(30, 30)
-    _, once = loss_with_gradient(photometric_loss, image, target, torch.float32)
-    image.requires_grad_()
-    loss = photometric_loss(image, target)
+    value, once = loss_with_gradient(image, target)
+    alone = photometric_loss(image, target)
+    assert not alone.requires_grad
+    assert torch.equal(alone, value)
+    loss = photometric_loss(image.requires_grad_(), target)
     loss.backward(retain_graph=True)
     (3 * loss).backward()
     torch.testing.assert_close(image.grad, 4 * once)
-
-
-def test_without_gradients_the_value_is_the_same() -> None:
-    image, target = images(30, 30)
-    loss = photometric_loss(image, target)
-    assert not loss.requires_grad
-    with torch.no_grad():
-        assert torch.equal(photometric_loss(image.requires_grad_(), target), loss)
-    assert torch.equal(photometric_loss(image, target).detach(), loss)
 
 
 def test_torch_takes_over_where_the_kernel_does_not_apply(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,9 +129,8 @@ def test_torch_takes_over_where_the_kernel_does_not_apply(monkeypatch: pytest.Mo
 def test_a_target_of_bytes_is_the_same_as_its_numbers_to_the_bit(height: int) -> None:
     image, target = images(height, 45)
     kept = (255 * target).round().to(torch.uint8)
-    exact = loss_with_gradient(photometric_loss, image, kept.float() / 255, torch.float32)
-    image.requires_grad_()
-    loss = photometric_loss(image, kept)
+    exact = loss_with_gradient(image, kept.float() / 255)
+    loss = photometric_loss(image.requires_grad_(), kept)
     loss.backward()
     assert torch.equal(loss.detach(), exact[0])
     assert torch.equal(image.grad, exact[1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -24,15 +25,6 @@ def tensor(*values: float) -> Tensor:
     return torch.tensor(values)
 
 
-class TestCharbonnier:
-    def test_equals_the_formula_and_kornia_rescaled(self) -> None:
-        kornia = pytest.importorskip("kornia", reason="kornia is in the `test` extra")
-        r = torch.linspace(-3, 3, 31, dtype=torch.float64)
-        torch.testing.assert_close(charbonnier(r, 0.1), torch.sqrt(r**2 + 0.01) - 0.1)
-        expected = 0.1 * kornia.losses.charbonnier_loss(r / 0.1, torch.zeros_like(r))
-        torch.testing.assert_close(charbonnier(r, 0.1), expected)
-
-
 class TestThePapersLoss:
     def test_counts_only_pixels_that_are_trusted_and_validly_rendered(self) -> None:
         depth, prior = tensor(2.0, 2.0, 2.0), tensor(1.0, 4.0, 8.0)
@@ -40,14 +32,13 @@ class TestThePapersLoss:
         expected = charbonnier(tensor(1.0), 0.01).squeeze()
         torch.testing.assert_close(depth_loss(depth, valid, prior, verified, 0.01), expected)
 
-    @pytest.mark.parametrize("bad", [float("nan"), float("inf"), 0.0, -1.0])
-    def test_bad_prior_pixels_outside_the_mask_never_leak(self, bad: float) -> None:
-        depth = torch.tensor([1.0, 2.0], requires_grad=True)
-        verified = torch.tensor([True, False])
-        loss = depth_loss(depth, torch.ones(2, dtype=torch.bool), tensor(1.1, bad), verified, 0.01)
+    def test_bad_prior_pixels_outside_the_mask_never_leak(self) -> None:
+        depth = torch.tensor([1.0, 2.0, 2.0, 2.0, 2.0], requires_grad=True)
+        prior, verified = tensor(1.1, math.nan, math.inf, 0.0, -1.0), torch.tensor([True, *[False] * 4])
+        loss = depth_loss(depth, torch.ones(5, dtype=torch.bool), prior, verified, 0.01)
         loss.backward()
-        assert torch.isfinite(loss)
-        assert torch.isfinite(depth.grad).all()
+        torch.testing.assert_close(loss, charbonnier(tensor(-1 / 11), 0.01)[0])
+        assert not depth.grad[1:].any()
 
 
 def prior_of(seed: int, height: int, width: int, labels: tuple[Label, ...] = LABELS, paper: bool = False) -> DepthPrior:
@@ -158,13 +149,8 @@ class TestKernel:
         for one, other in zip(found, exact, strict=True):
             torch.testing.assert_close(one.double(), other, rtol=1e-4, atol=1e-12)
 
-    @pytest.mark.usefixtures("threads")
-    def test_any_number_of_threads_gives_the_same_bits(self) -> None:
-        results = []
-        for count in (1, 2, 4):
-            torch.set_num_threads(count)
-            results.append(loss_and_gradients(render_of(90, 400), prior_of(0, 90, 400)))
-        assert all(torch.equal(*pair) for result in results[1:] for pair in zip(results[0], result, strict=True))
+    def test_the_number_of_threads_changes_no_bit(self, same_for_any_threads: Callable) -> None:
+        same_for_any_threads(lambda: loss_and_gradients(render_of(90, 400), prior_of(0, 90, 400)))
 
     def test_nan_in_a_known_pixel_shows_in_the_loss(self) -> None:
         prior, (depth_sum, alpha) = prior_of(0, 20, 30), render_of(20, 30)
@@ -185,17 +171,8 @@ class TestKernel:
         with pytest.raises(RuntimeError, match="once_differentiable|does not require grad"):
             slope.sum().backward()
 
-    def test_without_gradients_the_value_is_the_same(self) -> None:
-        prior, render = prior_of(0, 20, 30), render_of(20, 30)
-        with torch.no_grad():
-            alone = supervision(
-                *(part.clone().requires_grad_() for part in render), KnownMaps.of(prior), DepthLossConfig()
-            )
-        assert not alone.requires_grad
-        assert alone == loss_and_gradients(render, prior)[0]
 
-
-@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 3])
 def test_the_hook_adds_the_weighted_mean_of_a_batch(count: int) -> None:
     priors = [prior_of(seed, 20, 30) for seed in range(count)]
     renders = [[part.requires_grad_() for part in render_of(20, 30, seed)] for seed in range(count)]
@@ -221,10 +198,3 @@ class TestLoader:
             for view in (*views, *views):
                 assert loader.known(view).near > 0
             assert len(reads) == expected
-
-    def test_the_maps_are_the_priors_own(self) -> None:
-        prior = prior_of(0, 20, 30)
-        known = KnownMaps.of(prior)
-        assert known.depth is prior.depth
-        assert known.sigma is prior.sigma
-        assert known.kind.dtype == torch.uint8

@@ -161,16 +161,6 @@ class TestLoader:
         assert loader(view).reliability.tolist() == [[1, 0, 1, 0, 0, 0]]
         assert loader.known(view).kind.tolist() == [[1, 1, 1, FAR, 0, 0]]
 
-    def test_a_reliability_of_the_store_is_kept(self) -> None:
-        kept = torch.tensor([[0.25]])
-        prior = DepthPrior(torch.ones(1, 1), torch.ones(1, 1).byte(), sigma=torch.zeros(1, 1), reliability=kept)
-        loader, view = loader_of(prior)
-        assert torch.equal(loader(view).reliability, kept)
-
-    def test_without_sigma_reliability_stays_the_papers(self) -> None:
-        loader, view = loader_of(DepthPrior(torch.ones(1, 1), torch.ones(1, 1).byte()))
-        assert loader(view).reliability is None
-
 
 class TestStiff:
     def test_everything_extreme_in_one_view(self) -> None:

@@ -1,7 +1,4 @@
-"""After gsplat's simple_trainer: a dict of parameters, an Adam each, and the operations of its strategies.
-
-The operations swap entries of the dicts and carry every tensor of the strategy's state along, as gsplat's ops.py does.
-"""
+"""After gsplat's simple_trainer: a dict of parameters, an Adam each, and the operations of its strategies."""
 
 from __future__ import annotations
 

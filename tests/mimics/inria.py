@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import torch
-from tiny import HEIGHT, WIDTH, TinyFrames
+from tiny import TinyFrames
 from torch import Tensor, nn
 
 from d2_plugin.protocol import View
@@ -307,4 +307,3 @@ def shuffled(count: int, epoch: int) -> list[int]:
     return np.random.default_rng(epoch).permutation(count).tolist()
 
 
-PIXELS = WIDTH * HEIGHT

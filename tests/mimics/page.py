@@ -24,11 +24,6 @@ def added_lines(page: str) -> list[tuple[str, str, str]]:
     return found
 
 
-def changed_lines(page: str) -> list[str]:
-    """The added lines that are not imports."""
-    return [line for _, line, _ in added_lines(page) if not re.match(r"(from|import) ", line)]
-
-
 def attached(mimic: ModuleType, page: str, after_first: str = "") -> ModuleType:
     """The mimic with the page's lines in its `training`; `after_first` is code to run after line 1."""
     mimic = sys.modules[mimic.training.__module__]  # cem4dgs is trained by Ex4DGS's loop
@@ -39,13 +34,9 @@ def attached(mimic: ModuleType, page: str, after_first: str = "") -> ModuleType:
             continue
         at = _place(lines, before, after)
         indent = re.match(r" *", lines[at])[0]
-        text = [indent + added]
-        if added.startswith("d2 = ") and after_first:
-            text += [indent + after_first]
-        if lines[at].strip() == before:
-            lines[at + 1 : at + 1] = text
-        else:
-            lines[at:at] = text
+        at += lines[at].strip() == before
+        more = [after_first] if added.startswith("d2 = ") and after_first else []
+        lines[at:at] = [indent + line for line in (added, *more)]
     module = ModuleType(f"{mimic.__name__}_attached")
     module.__package__ = mimic.__package__
     sys.modules[module.__name__] = module

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tiny_onnx
 import torch
+from prior_cases import contents, showing
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, PriorSummary, build_priors
@@ -21,7 +18,7 @@ from d2_plugin.priors.monocular.align import align
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo import matched_depth
 from d2_plugin.protocol import Label
-from d2_plugin.recordings.recording import Recording, Source
+from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
@@ -31,40 +28,9 @@ NAMES = ["train0", "train1", "train2"]
 SETTINGS = PriorSettings(stereo=StereoSettings(matcher="patchmatch"))
 
 
-@dataclass
-class Recorder(Source):
-    """A source that passes on what another one has, notes what was read, and may be told to lie."""
-
-    inner: Source
-    reads: set[tuple[str, str, int]]
-    flip_mono: tuple[tuple[str, int], ...] = ()
-    no_mono: tuple[tuple[str, int], ...] = ()
-    brighter: tuple[tuple[str, int], ...] = ()
-
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        self.reads.add(("image", camera, frame))
-        image = self.inner.image(camera, frame)
-        return np.minimum(image, 250) + 5 if (camera, frame) in self.brighter else image
-
-    def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        self.reads.add(("depth", camera, frame))
-        return self.inner.depth(camera, frame)
-
-    def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        if (camera, frame) in self.no_mono:
-            return None
-        mono = self.inner.mono(camera, frame)
-        return -mono if (camera, frame) in self.flip_mono else mono
-
-
 @pytest.fixture(scope="module")
 def plain() -> Recording:
     return synthetic_recording(cameras=3, held_out=1, frames=2, width=160, height=90, arc_degrees=20)
-
-
-@pytest.fixture
-def recording(plain: Recording) -> Recording:
-    return replace(plain, source=Recorder(plain.source, set()))
 
 
 @pytest.fixture(scope="module")
@@ -74,12 +40,15 @@ def built(plain: Recording, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     return path, build_priors(plain, NAMES, path, SETTINGS)
 
 
-def lying(recording: Recording, **lies: tuple) -> Recording:
-    return replace(recording, source=replace(recording.source, **lies))
+def lying(plain: Recording) -> Recording:
+    """One monocular map is turned around, another one is missing."""
 
+    def mono(camera: str, frame: int) -> np.ndarray | None:
+        if (camera, frame) == ("train2", 0):
+            return None
+        return plain.mono(camera, frame) * (-1 if (camera, frame) == ("train0", 1) else 1)
 
-def contents(path: Path) -> dict[str, bytes]:
-    return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
+    return showing(plain, {"mono": mono})
 
 
 def no_stereo(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,10 +97,16 @@ def test_the_summary_and_the_record_say_what_was_built(built: tuple) -> None:
 
 
 def test_training_cameras_alone_are_read_and_matched_within_their_timestamp(
-    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    plain: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither held-out cameras nor true depth."""
-    matched = []
+    matched, reads = [], set()
+
+    def image(camera: str, frame: int) -> np.ndarray:
+        reads.add((camera, frame))
+        return plain.image(camera, frame)
+
+    recording = showing(plain, {"image": image, "depth": lambda *_: pytest.fail("true depth was read")})
     original = matched_depth.geometric_depth
 
     def watch(images: list, *rest: object) -> list:
@@ -140,7 +115,7 @@ def test_training_cameras_alone_are_read_and_matched_within_their_timestamp(
 
     monkeypatch.setattr(matched_depth, "geometric_depth", watch)
     build_priors(recording, NAMES[:2], tmp_path, SETTINGS)
-    assert recording.source.reads == {("image", camera, frame) for camera in NAMES[:2] for frame in (0, 1)}
+    assert reads == {(camera, frame) for camera in NAMES[:2] for frame in (0, 1)}
     for frame, images in zip(recording.frames, matched, strict=True):
         for camera, image in zip(NAMES, images):
             np.testing.assert_array_equal(image, recording.image(camera, frame))
@@ -177,9 +152,13 @@ def test_other_fusion_settings_reuse_the_stereo_cache(
     assert loose.shares["train0"]["mono"] == strict.shares["train0"]["mono"]
 
 
-def test_a_changed_image_rebuilds_its_timestamp_and_no_other(recording: Recording, tmp_path: Path) -> None:
-    build_priors(recording, NAMES, tmp_path, SETTINGS)
-    summary = build_priors(lying(recording, brighter=(("train1", 1),)), NAMES, tmp_path, SETTINGS)
+def test_a_changed_image_rebuilds_its_timestamp_and_no_other(plain: Recording, tmp_path: Path) -> None:
+    def image(camera: str, frame: int) -> np.ndarray:
+        image = plain.image(camera, frame)
+        return np.minimum(image, 250) + 5 if (camera, frame) == ("train1", 1) else image
+
+    build_priors(plain, NAMES, tmp_path, SETTINGS)
+    summary = build_priors(showing(plain, {"image": image}), NAMES, tmp_path, SETTINGS)
     assert (summary.built, summary.kept) == (3, 3)
 
 
@@ -200,36 +179,10 @@ def test_a_damaged_prior_is_rebuilt_and_named(
     }
 
 
-def test_a_kill_in_the_middle_loses_only_the_frame_in_work(plain: Recording, built: tuple, tmp_path: Path) -> None:
-    script = (
-        "from d2_plugin.recordings.synthetic.room import synthetic_recording\n"
-        "from d2_plugin.priors.build import *\n"
-        "from d2_plugin.priors.settings import StereoSettings\n"
-        "import sys, time\n"
-        "recording = synthetic_recording(cameras=3, held_out=1, frames=2, width=160, height=90, arc_degrees=20)\n"
-        "def progress(done, total, note):\n"
-        "    print(done, flush=True)\n"
-        "    time.sleep(60 if done == 4 else 0)\n"
-        "settings = PriorSettings(stereo=StereoSettings(matcher='patchmatch'))\n"
-        f"build_priors(recording, {NAMES}, sys.argv[1], settings, progress=progress)"
-    )
-    process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True)
-    for line in process.stdout:
-        if int(line) == 4:
-            break
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
-    summary = build_priors(plain, NAMES, tmp_path, SETTINGS)
-    assert (summary.built, summary.kept) == (2, 4)
-    assert contents(tmp_path) == contents(built[0])
-
-
-def test_a_refused_map_leaves_stereo_as_it_is(recording: Recording, tmp_path: Path) -> None:
-    lies = lying(recording, flip_mono=(("train0", 1),), no_mono=(("train2", 0),))
-    summary = build_priors(lies, NAMES, tmp_path / "refused", SETTINGS)
+def test_a_refused_map_leaves_stereo_as_it_is(plain: Recording, tmp_path: Path) -> None:
+    summary = build_priors(lying(plain), NAMES, tmp_path / "refused", SETTINGS)
     assert {(camera, frame) for camera, frame, _ in summary.refused} == {("train0", 1), ("train2", 0)}
-    build_priors(recording, NAMES, tmp_path / "stereo", replace(SETTINGS, variant="mvs"))
+    build_priors(plain, NAMES, tmp_path / "stereo", replace(SETTINGS, variant="mvs"))
     refused, stereo = PriorStore.open(tmp_path / "refused"), PriorStore.open(tmp_path / "stereo")
     for view in (("train0", 1), ("train2", 0)):
         found, expected = refused.prior(*view), stereo.prior(*view)
@@ -242,10 +195,9 @@ def test_a_refused_map_leaves_stereo_as_it_is(recording: Recording, tmp_path: Pa
 
 @pytest.mark.parametrize("settings", [PriorSettings(uncertainty=False), PriorSettings.paper()])
 def test_in_the_paper_a_refused_view_is_empty_with_its_reason_and_the_others_are_not(
-    recording: Recording, tmp_path: Path, settings: PriorSettings
+    plain: Recording, tmp_path: Path, settings: PriorSettings
 ) -> None:
-    lies = lying(recording, flip_mono=(("train0", 1),), no_mono=(("train2", 0),))
-    summary = build_priors(lies, NAMES, tmp_path, replace(settings, stereo=SETTINGS.stereo))
+    summary = build_priors(lying(plain), NAMES, tmp_path, replace(settings, stereo=SETTINGS.stereo))
     assert summary.built == 6
     refused = {(camera, frame) for camera, frame, _ in summary.refused}
     assert refused >= {("train0", 1), ("train2", 0)}
@@ -277,11 +229,7 @@ def test_one_camera_has_no_depth_from_a_relative_map(plain: Recording, tmp_path:
 
 
 def test_one_camera_has_mono_only_depth_from_a_metric_map(plain: Recording, tmp_path: Path) -> None:
-    class Metric(Recorder):
-        def mono(self, camera: str, frame: int) -> np.ndarray:
-            return self.inner.depth(camera, frame)
-
-    metric = replace(plain, source=Metric(plain.source, set()), mono_kind="metric")
+    metric = showing(plain, {"mono": plain.depth}, mono_kind="metric")
     build_priors(metric, NAMES[:1], tmp_path, SETTINGS)
     prior = PriorStore.open(tmp_path).prior("train0", 0)
     assert set(np.unique(prior.labels)) <= {Label.MONO, Label.EMPTY}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from colmap_maps import write_dense_array
+from prior_cases import write_dense_array
 
 from benchmarks.stereo_measure import score
 from benchmarks.stereo_rigs import Rig, textured_rig

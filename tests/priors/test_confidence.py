@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from oracles.surface import back_project
+from prior_cases import showing
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.maps_on_disk import planar
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.protocol import Label
-from d2_plugin.recordings.recording import Recording, Source
+from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
@@ -105,27 +106,11 @@ def test_an_unknown_direction_is_refused(recording: Recording) -> None:
         built(recording)
 
 
-class Monocular(Source):
-    """A source whose monocular map is given."""
-
-    def __init__(self, room: Recording, map_: np.ndarray) -> None:
-        self.inner, self.map = room.source, map_
-
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        return self.inner.image(camera, frame)
-
-    def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        return self.inner.depth(camera, frame)
-
-    def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        return self.map
-
-
 def test_metric_maps_may_measure_along_the_ray_and_relative_ones_may_not(tmp_path: Path) -> None:
     room = synthetic_recording(cameras=1, held_out=0, frames=1, width=96, height=54)
     truth, camera = room.depth(NAME, 0), room.cameras[NAME]
     distance = np.linalg.norm(back_project(camera, truth) - camera.centre, axis=-1).astype(np.float32)
-    metric = replace(room, path=tmp_path, mono_kind="metric", source=Monocular(room, distance))
+    metric = showing(room, {"mono": lambda *_: distance}, path=tmp_path, mono_kind="metric")
     found = built(metric, PriorSettings(mono_along="ray", hanging_limit=0)).prior(NAME, 0).depth
     np.testing.assert_allclose(found, truth, rtol=1e-3)
     with pytest.raises(D2Error, match="mono_along = ray needs metric maps"):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from prior_cases import showing
 
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.declared_error import DeclaredErrors, held_against_truth, truth_rounding
@@ -16,29 +17,13 @@ from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.recording import Recording, Source
+from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")
 
 TRAINING = ["00", "02", "05", "07"]
-
-
-class WithTruth(Source):
-    """A source that has a truth of its own, or none."""
-
-    def __init__(self, recording: Recording, truth: np.ndarray | None) -> None:
-        self.inner, self.truth = recording.source, truth
-
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        return self.inner.image(camera, frame)
-
-    def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        return self.truth
-
-    def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        return self.inner.mono(camera, frame)
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +46,7 @@ def test_the_table_counts_normal_errors_as_normal(tmp_path: Path) -> None:
     sigma = np.where(labels == Label.MONO, 0.1, 0.01).astype(np.float32)
     depth = truth * np.exp(sigma * np.random.default_rng(0).standard_normal(truth.shape))
     store = store_of(tmp_path, recording, depth.astype(np.float32), labels, sigma)
-    found = held_against_truth(store, replace(recording, source=WithTruth(recording, truth)))
+    found = held_against_truth(store, showing(recording, {"depth": lambda *_: truth}))
     assert found.views == 1
     assert set(found.labels) == {Label.MONO, Label.VERIFIED}
     for label, share, declared in ((Label.MONO, 0.75, 0.1), (Label.VERIFIED, 0.25, 0.01)):
@@ -85,7 +70,7 @@ def test_far_pixels_count_against_the_sky_and_infinite_sigma_promises_nothing(tm
     labels[:8] = labels[19] = Label.FAR
     depth, sigma = np.full(truth.shape, 5.0, np.float32), np.full(truth.shape, np.inf, np.float32)
     store = store_of(tmp_path, small, depth, labels, sigma)
-    found = held_against_truth(store, replace(small, source=WithTruth(small, truth)))
+    found = held_against_truth(store, showing(small, {"depth": lambda *_: truth}))
     assert found.sky_found == pytest.approx(0.8)
     assert found.false_far == pytest.approx(0.1)
     assert found.labels == {}
@@ -96,7 +81,7 @@ def test_far_pixels_count_against_the_sky_and_infinite_sigma_promises_nothing(tm
 def test_without_truth_or_without_priors_there_is_no_table(tmp_path: Path, small: Recording) -> None:
     depth = np.full((20, 40), 5.0, np.float32)
     store = store_of(tmp_path / "a", small, depth, np.full(depth.shape, 1, np.uint8), depth)
-    assert held_against_truth(store, replace(small, source=WithTruth(small, None))) is None
+    assert held_against_truth(store, showing(small, {"depth": lambda *_: None})) is None
     empty = PriorStore.create(tmp_path / "b", list(small.cameras), [0], {})
     assert held_against_truth(empty, small) is None
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
-from colmap_maps import write_dense_array
+from prior_cases import write_dense_array
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors import depth_on_disk
@@ -17,7 +16,6 @@ from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.colmap.mvs import write_model
 from d2_plugin.priors.colmap.workspace import WorkspaceDepth, scale_of_world, seen_by
 from d2_plugin.priors.depth_on_disk import DepthOnDisk, SensorDepth, find_depth_on_disk
-from d2_plugin.priors.evidence import AT_BEST
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.protocol import Label
@@ -366,20 +364,6 @@ def test_priors_from_a_workspace_pass_the_filter_and_are_right_as_is_what_other_
         np.testing.assert_allclose(prior.depth.numpy()[verified[frame]], truth[verified[frame]], rtol=2e-4)
     survivors = store.record("train1", 0)["stereo"]["survivors"]
     assert 0 < survivors["kept"] <= survivors["confirmed"] < survivors["matched"]
-
-
-def test_what_other_cameras_saw_adds_to_the_depth_of_a_workspace_and_is_right(recording: Recording) -> None:
-    write_maps(recording, "colmap/00000", 0, 3.0)
-    write_maps(recording, "colmap/00001", 1, 0.2)
-    priors = {}
-    for agreement in (0.0, 0.02):
-        build_priors(recording, NAMES, recording.path / "p", PriorSettings(agreement=agreement))
-        priors[agreement] = prior = PriorStore.open(recording.path / "p").prior("train1", 0)
-    assert torch.equal(priors[0.0].verified, priors[0.02].verified), "no other camera makes stereo of this one's"
-    added = ((prior.labels == Label.AGREED) & (prior.sigma < AT_BEST)).numpy()  # a surface, not another camera's map
-    assert added.any()
-    truth = recording.depth("train1", 0)
-    assert np.median(np.abs(prior.depth.numpy() / truth - 1)[added]) < 0.002
 
 
 @pytest.mark.parametrize(

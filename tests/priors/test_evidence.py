@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.cross_view.kernel import BESIDE, LIKE, NEAR, WITHIN
 from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, with_evidence
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.protocol import DepthPrior, Label
+from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
@@ -157,14 +156,6 @@ def test_points_behind_another_camera_or_off_its_image_are_not_looked_up() -> No
             compared = with_evidence({"left": prior_of(WALL), "away": theirs}, {"left": camera(0), "away": there}, 0.02)
             assert share(compared["left"], Label.MONO) == 1
             np.testing.assert_array_equal(compared["left"].sigma, np.float32(SIGMA))
-
-
-def test_trusted_is_verified_and_agreed_and_far_is_neither_trusted_nor_supported() -> None:
-    prior = DepthPrior(torch.ones(1, 6), torch.arange(6, dtype=torch.uint8)[None])
-    assert prior.trusted.tolist() == [[False, False, True, False, True, False]]
-    assert prior.support.tolist() == [[False, True, True, False, True, False]]
-    assert prior.verified.tolist() == [[False, False, True, False, False, False]]
-    assert prior.far.tolist() == [[False, False, False, False, False, True]]
 
 
 def test_cameras_are_compared_for_the_dual_prior_alone(tmp_path: Path) -> None:

@@ -17,10 +17,7 @@ KINDS: tuple[MonoKind, ...] = ("relative", "metric")
 
 
 def scene(kind: MonoKind, bend: float, measured: float = 4.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(aligned map, anchors, true depth): depth 2 to 12 from left to right, anchors where it is below `measured`.
-
-    The prediction is the true one bent by a power, so that no line aligns all of it.
-    """
+    """(aligned map, anchors, true depth): depth 2 to 12 from left to right, anchors where it is below `measured`."""
     truth = np.tile(np.geomspace(2, FAR, 160), (90, 1))
     anchors = np.where(truth < measured, truth, 0).astype(np.float32)
     prediction = (1 / truth if kind == "relative" else truth) ** (1 + bend)

@@ -9,7 +9,7 @@ import pytest
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import FusedPrior
-from d2_plugin.priors.sheet import LABEL_COLORS, UNKNOWN, contact_sheet, depth_colors, label_colors, sigma_colors
+from d2_plugin.priors.sheet import LABEL_COLORS, UNKNOWN, contact_sheet, depth_colors, sigma_colors
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
@@ -65,8 +65,3 @@ def test_sigma_is_brighter_where_it_is_larger_grey_where_unknown_and_black_witho
     assert tuple(colors[6]) == UNKNOWN
     assert not colors[7].any()
     assert colors[0].any(), "a certain depth is not shown as none"
-
-
-def test_each_label_has_its_own_colour() -> None:
-    colors = label_colors(np.array([list(Label)]))
-    assert len({tuple(color) for color in colors[0]}) == len(Label)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from prior_cases import contents
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, PriorSummary, build_priors
@@ -35,10 +36,6 @@ def recording() -> Recording:
 
 def built(recording: Recording, folder: Path, names: list[str] = NAMES) -> PriorSummary:
     return build_priors(recording, names, folder, SETTINGS)
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def moved(recording: Recording, name: str) -> Recording:

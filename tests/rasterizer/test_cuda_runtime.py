@@ -10,21 +10,12 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from cuda_cases import (
-    assert_same_gradients,
-    assert_same_image,
-    gradients_of_kernels,
-    make_prior,
-    make_scene,
-    reference_with_gradients,
-    render_kernels,
-    shim_library,
-    survey_kernels,
-)
+from splat_scenes import Path as Where
+from splat_scenes import prior_of, random_scene, shim_library, use_shim
 
 from d2_plugin import D2Error
 from d2_plugin.compiler import NoCompiler, driver, nvrtc
-from d2_plugin.rasterizer import cuda
+from d2_plugin.rasterizer import cuda, survey
 
 
 @pytest.fixture
@@ -137,14 +128,15 @@ def shim_driver(compiler: nvrtc.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path
 
 def test_the_launcher_talks_to_the_driver(shim_driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
     """Context, module, functions, frame and stream arrive; the kernels themselves run in the shim."""
-    launcher = cuda.CudaLauncher(torch.device("cuda", 0))
-    monkeypatch.setattr(cuda, "launcher", lambda device: launcher)
-    scene = make_scene(100, 32, 32)
-    render, upstream, expected = reference_with_gradients(scene)
-    cpu = torch.device("cpu")
-    assert_same_image(scene, render_kernels(scene, cpu)[1], render)
-    assert_same_gradients(gradients_of_kernels(scene, cpu, upstream), expected)
-    assert survey_kernels(scene, make_prior(scene), cpu).hits.any()
+    use_shim(monkeypatch, cuda.CudaLauncher(torch.device("cuda", 0)))
+    scene, results = random_scene(0, 100, 32, 32), []
+    for dtype in (torch.float32, torch.float64):
+        leaves = scene.on(Where(dtype)).requires_grad()
+        render = leaves.render()
+        results.append([*render[:3], *torch.autograd.grad(render.color.square().sum(), leaves[:4])])
+    for found, expected in zip(*results):
+        assert (found.double() - expected).norm() < 1e-3 * expected.norm()
+    assert survey(scene.on(Where(torch.float32)).splats, scene.view, prior_of(scene.view)).hits.any()
     assert shim_driver.d2_shim_stream() == 77
     assert shim_driver.d2_shim_contexts() == 0
 

@@ -48,17 +48,24 @@ def run(words: list[str], environment: dict[str, str]) -> subprocess.CompletedPr
     )
 
 
+SSIM = ("gaussians/test_native_ssim.py", "torch_in_float64 or threads or bytes")
+
+
 @pytest.mark.parametrize(
-    ("module", "chosen"),
+    ("module", "chosen", "machine"),
     [
-        ("rasterizer/test_rasterizer_cuda.py", "shim and (1x1 or 15x33 or without_gaussians or survey_is) or order_of"),
-        ("priors/test_patchmatch_gpu.py", "shim and (window or bits) or order_of"),
+        ("rasterizer/test_rasterizer_kernels.py", "shim and (one or 7x5 or survey_is) or order_of", ""),
+        ("priors/test_patchmatch_gpu.py", "shim and (window or bits) or order_of", ""),
+        *(
+            (*SSIM, machine) for machine in ("-march=native", "-march=x86-64-v3", "-march=x86-64")
+        ),  # lanes: most, 8, few
     ],
 )
-def test_no_kernel_leaves_its_arrays(module: str, chosen: str, environment: dict[str, str]) -> None:
-    done = run(
-        ["-m", "pytest", "-s", "-q", "-n", "0", "-p", "no:cacheprovider", f"tests/{module}", "-k", chosen], environment
-    )
+def test_no_kernel_leaves_its_arrays(module: str, chosen: str, machine: str, environment: dict[str, str]) -> None:
+    if "v3" in machine and " avx2 " not in Path("/proc/cpuinfo").read_text():
+        pytest.skip("no AVX2 here")
+    words = ["-m", "pytest", "-s", "-q", "-n", "0", "-p", "no:cacheprovider", f"tests/{module}", "-k", chosen]
+    done = run(words, environment | {"D2_CXXFLAGS": f"{SANITIZED} {machine}"})
     said = (done.stdout + done.stderr)[-4000:]
     assert done.returncode == 0, said
     assert " passed" in done.stdout, said

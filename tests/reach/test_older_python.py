@@ -1,7 +1,4 @@
-"""What a trainer's process imports runs where official environments stand: Python 3.9 and torch 2.0.
-
-The list of modules is what importing them brings in, never one that is kept by hand.
-"""
+"""What a trainer's process imports runs where official environments stand: Python 3.9 and torch 2.0."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Cases 25 to 36 of the stiff ones: a training step with hooks where a mask is empty or a number leaves its range.
-
-What a formula does with such numbers is tested beside it (test_hooks.py, test_slice_stability.py); here whole backbones
-are trained, and must come out finite, or with exactly nothing changed.
-"""
+"""Cases 25 to 36 of the stiff ones: a training step with hooks where a mask is empty or a number leaves its range."""
 
 from __future__ import annotations
 
@@ -113,14 +109,6 @@ def test_case_25_without_a_trusted_pixel_there_is_no_depth_loss(model: SplatMode
     assert d2.loss(1, view) == 0.0
 
 
-def test_case_25_far_pixels_supervise_what_lies_in_front_of_them_alone(model: SplatModel) -> None:
-    view = make_views()[0]
-    for bound, in_front in ((1.0, False), (100.0, True)):  # the Gaussians are between 1.5 and 4.5
-        d2 = D2Hooks(DEPTH_LOSS, make_adapter(model), unlabelled(Label.FAR, bound))
-        model.render(view)
-        assert (d2.loss(1, view) > 0) == in_front
-
-
 @pytest.mark.parametrize("label", TRUSTED)
 def test_every_trusted_pixel_supervises_and_judges(model: SplatModel, label: Label) -> None:
     """The cases with no such pixel can fail."""
@@ -181,16 +169,6 @@ def test_case_28_and_29_training_survives_any_temporal_variance(variance: float,
         model.gaussians["log_time_scales"].fill_(0.5 * math.log(variance))
         model.gaussians["times"].fill_(0.3 * math.sqrt(variance) if offset is None else offset)
     step(model, time=0.0)
-
-
-def test_case_30_a_long_life_with_turned_axes_is_drawn_and_trained() -> None:
-    model, generator = make_model(), torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        model.gaussians["log_scales"].copy_(torch.tensor([1e-2, 1e-2, 1e-3]).log().expand(60, 3))
-        model.gaussians["log_time_scales"].fill_(math.log(100.0))
-        for name in ("left", "right"):
-            model.gaussians[name].copy_(torch.randn(60, 4, generator=generator))
-    step(model)
 
 
 def test_case_31_a_huge_velocity_is_culled_and_trained(model: SplatModel) -> None:

@@ -91,10 +91,7 @@ def test_every_rename_may_be_the_last_thing_that_happens(workplace: Any, name: s
 
 
 def killed_at_random(place: Any, name: str, draw: random.Random, times: int) -> int:
-    """Kill the command at moments drawn from its CPU time, so many times in a row; then it is run to its end.
-
-    Returns how many kills came before its end: what was killed before has less left to do.
-    """
+    """Kill the command at moments drawn from its CPU time, so many times in a row; then it is run to its end."""
     work, hits = place.work[name], 0
     work.anew()
     for _ in range(times):

@@ -1,0 +1,43 @@
+"""For tests of priors: sources that show something else, stores byte by byte, depth maps as COLMAP writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from d2_plugin.recordings.recording import Recording, Source
+
+Shown = Callable[[str, int], "np.ndarray | None"]
+
+
+class _Showing(Source):
+    def __init__(self, source: Source, instead: dict[str, Shown]) -> None:
+        self.source, self.instead = source, instead
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        return self.instead.get("image", self.source.image)(camera, frame)
+
+    def depth(self, camera: str, frame: int) -> np.ndarray | None:
+        return self.instead.get("depth", self.source.depth)(camera, frame)
+
+    def mono(self, camera: str, frame: int) -> np.ndarray | None:
+        return self.instead.get("mono", self.source.mono)(camera, frame)
+
+
+def showing(recording: Recording, instead: dict[str, Shown], **changes: object) -> Recording:
+    """The recording with other images, depth or monocular maps, and other values of `changes`."""
+    return replace(recording, source=_Showing(recording.source, instead), **changes)
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """Every file below a folder."""
+    return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
+
+
+def write_dense_array(path: Path, depth: np.ndarray) -> None:
+    """Write a depth map [H, W] as COLMAP would."""
+    height, width = depth.shape
+    path.write_bytes(f"{width}&{height}&1&".encode() + np.ascontiguousarray(depth, dtype="<f4").tobytes())

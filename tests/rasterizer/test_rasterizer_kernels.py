@@ -1,0 +1,334 @@
+"""The kernels of the CPU and of the GPU against the reference in float64; nothing about threads or order changes them.
+
+The GPU's run on the CPU (`shim`: the same .cu source and host code) and, where there is one, on a device (`cuda`).
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+import threading
+import warnings
+from collections.abc import Callable
+from pathlib import Path as File
+
+import pytest
+import torch
+from splat_scenes import (
+    CPU,
+    Path,
+    Scene,
+    ShimLauncher,
+    brute_force,
+    make_view,
+    near_edge_of,
+    path_of,
+    prior_of,
+    random_scene,
+    single,
+    use_shim,
+)
+
+from d2_plugin.compiler import NoCompiler, find_compiler
+from d2_plugin.errors import D2Error
+from d2_plugin.protocol import Label
+from d2_plugin.rasterizer import RasterSettings, Render, Splats, cuda, native, rasterize, reference, survey
+
+try:
+    find_compiler()
+except NoCompiler as error:
+    pytest.skip(str(error), allow_module_level=True)
+
+NAMES = ("means", "covariances", "opacities", "colors", "background", "screen_offsets")
+REFERENCE = Path(torch.float64)
+
+
+def behind() -> Scene:
+    """Some Gaussians behind a turned camera, some beside the image."""
+    scene = random_scene(6, 200, 64, 48)
+    scene.means[::20] *= -1
+    scene.means[1::20, 0] += 100
+    return scene.turned()
+
+
+def layers(count: int, opacity: float) -> Scene:
+    """Many over each tile: several batches of the forward pass and of the backward."""
+    scene = random_scene(7, count, 33, 17, radius=60.0)
+    return scene._replace(opacities=torch.full_like(scene.opacities, opacity))
+
+
+SCENES = {
+    "small Gaussians": lambda: random_scene(0, 250, 61, 37),
+    "a third of a pixel": lambda: random_scene(3, 200, 50, 37, radius=0.3),
+    "large Gaussians, early finish": lambda: random_scene(1, 150, 70, 40, radius=40.0),
+    "a turned camera, some behind it": behind,
+    "many opaque layers": lambda: layers(700, 0.97),
+    "many faint layers": lambda: layers(600, 0.006),
+    "one channel": lambda: random_scene(2, 200, 40, 40, channels=1),
+    "two channels": lambda: random_scene(2, 200, 40, 40, channels=2),
+    "five channels": lambda: random_scene(3, 200, 33, 66, channels=5),
+    "forty channels": lambda: random_scene(3, 40, 33, 20, channels=40),
+    "one pixel": lambda: random_scene(4, 30, 1, 1),
+    "7x5": lambda: random_scene(5, 50, 7, 5),
+    "one Gaussian": single,
+}
+
+PLAIN, SMOOTH = RasterSettings(), RasterSettings(antialiased=True)
+edges = pytest.mark.parametrize("edge", [False, True], ids=["", "edge"])
+
+
+def with_gradients(
+    scene: Scene, path: Path, edge: bool, settings: RasterSettings = PLAIN, calm: torch.Tensor | None = None
+) -> tuple[Render, list[torch.Tensor]]:
+    """The image, and gradients of a random sum of its pixels that are `calm`, by default all, in float64 on the CPU."""
+    leaves = scene.on(path).requires_grad()
+    background = torch.linspace(0.2, 0.9, scene.colors.shape[1]).to(leaves.means).requires_grad_()
+    offsets = torch.zeros_like(leaves.means[:, :2], requires_grad=True)
+    near_edge = near_edge_of(scene.view).to(path.device) if edge else None
+    render = leaves.render(settings, background=background, screen_offsets=offsets, near_edge=near_edge)
+    g, loss = torch.Generator().manual_seed(0), 0
+    for part in render[: 3 + edge]:
+        weight = torch.randn(part.shape, generator=g)
+        weight *= 1 if calm is None else calm.view(*scene.size, *[1] * (part.ndim - 2))
+        loss = loss + (part * weight.to(part)).sum()
+    gradients = torch.autograd.grad(loss, (*leaves[:4], background, offsets))
+    assert all(gradient.dtype == path.dtype for gradient in gradients)
+    return render, [gradient.to(CPU).double() for gradient in gradients]
+
+
+@functools.cache
+def calm_scene(name: str, settings: RasterSettings) -> tuple[Scene, torch.Tensor]:
+    """A scene, and its pixels where rounding decides nothing."""
+    scene = SCENES[name]()
+    calm = brute_force(scene, settings).away(settings)
+    assert calm.double().mean() > 0.8, "most pixels must count"
+    return scene, calm
+
+
+@functools.cache
+def exact_gradients(name: str, settings: RasterSettings, edge: bool) -> tuple[Render, list[torch.Tensor]]:
+    scene, calm = calm_scene(name, settings)
+    return with_gradients(scene, REFERENCE, edge, settings, calm)
+
+
+@edges
+@pytest.mark.parametrize("settings", [PLAIN, SMOOTH], ids=["", "antialiased"])
+@pytest.mark.parametrize("name", SCENES)
+def test_image_and_gradients_are_the_references(kernels: Path, name: str, settings: RasterSettings, edge: bool) -> None:
+    scene, calm = calm_scene(name, settings)
+    fast, gradients = with_gradients(scene, kernels, edge, settings, calm)
+    exact, expected = exact_gradients(name, settings, edge)
+    assert (fast.front is not None) == (exact.front is not None) == edge
+    for part, other in zip(fast[: 3 + edge], exact):
+        assert part.dtype == torch.float32
+        assert (part.to(CPU).double() - other)[calm].abs().max() < 1e-4
+    for part, gradient, other in zip(NAMES, gradients, expected):
+        assert (gradient - other).norm() <= 1e-3 * other.norm() + 1e-6, part
+
+
+@edges
+@pytest.mark.parametrize("reliable", [False, True], ids=["", "reliability"])
+@pytest.mark.parametrize("name", SCENES)
+def test_survey_is_the_references(kernels: Path, name: str, reliable: bool, edge: bool) -> None:
+    settings = SMOOTH if reliable else PLAIN
+    scene, calm = calm_scene(name, settings)
+    prior = prior_of(scene.view, reliable)
+    prior.labels[~calm] = Label.MONO
+    near_edge = near_edge_of(scene.view) if edge else None
+    for part in (near_edge, prior.reliability):
+        if part is not None:
+            part[~calm] = 0
+    exact = survey(scene.splats, scene.view, prior, settings, near_edge=near_edge)
+    there = scene.on(kernels)
+    fast = survey(there.splats, there.view, prior, settings, near_edge=near_edge)
+    fast = type(fast)(*(part.to(CPU) for part in fast))
+    assert edge or not fast.front.any()
+    assert fast.hits.dtype == torch.int32
+    assert torch.equal(fast.hits, exact.hits)
+    for sums in ("weight", "error", "front"):
+        torch.testing.assert_close(getattr(fast, sums).double(), getattr(exact, sums), rtol=1e-4, atol=2e-4)
+    for map_ in ("depth_sum", "alpha"):
+        assert (getattr(fast, map_).double() - getattr(exact, map_))[calm].abs().max() < 1e-4
+    off = (fast.max_weight.double() - exact.max_weight).abs() > 1e-4
+    assert off.sum() <= 0.02 * len(off), "more than those whose maximum may lie at a cut-off"
+
+
+@pytest.mark.parametrize("used", range(4), ids=Render._fields)
+def test_any_one_output_alone_has_its_gradient(kernels: Path, used: int) -> None:
+    found = []
+    for path in (kernels, REFERENCE):
+        leaves = random_scene(10, 80, 25, 25).on(path).requires_grad()
+        render = leaves.render(near_edge=near_edge_of(leaves.view))
+        found.append([part.to(CPU) for part in torch.autograd.grad(render[used].sum(), leaves[:3])])
+    for gradient, other in zip(*found):
+        assert (gradient.double() - other).norm() <= 1e-3 * other.norm()
+
+
+def everything(scene: Scene, path: Path = Path(torch.float32)) -> list[torch.Tensor]:  # noqa: B008  a frozen value
+    """Image, gradients and surveys."""
+    render, gradients = with_gradients(scene, path, edge=True)
+    there, edge = scene.on(path), near_edge_of(scene.view)
+    surveys = [survey(there.splats, there.view, prior_of(scene.view, r), near_edge=edge) for r in (False, True)]
+    return [part.detach().to(CPU) for part in (*render, *gradients, *surveys[0], *surveys[1])]
+
+
+def test_two_runs_give_the_same_bits(kernels: Path) -> None:
+    scene = random_scene(0, 250, 61, 37)
+    assert all(torch.equal(*pair) for pair in zip(everything(scene, kernels), everything(scene, kernels)))
+
+
+def test_the_number_of_threads_changes_no_bit(same_for_any_threads: Callable) -> None:
+    scene = random_scene(7, 3000, 150, 110)
+    same_for_any_threads(lambda: everything(scene))
+
+
+def test_the_order_of_blocks_warps_and_lanes_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, results = random_scene(8, 400, 45, 37, radius=12.0), []
+    for order in range(4):  # as they are numbered, in the opposite order, at random
+        launcher = ShimLauncher(order)
+        use_shim(monkeypatch, launcher)
+        results.append(everything(scene))
+        named = {"d2_project", "d2_list", "d2_render_front", "d2_backward_front", "d2_survey_front"}
+        assert named <= launcher.launched
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_calls_from_several_python_threads_do_not_disturb_each_other() -> None:
+    scenes = [random_scene(seed, 500, 80, 60) for seed in range(3)]
+    expected = [everything(scene) for scene in scenes]
+    found: dict[int, list] = {}
+
+    def work(index: int) -> None:
+        for _ in range(3):
+            found[index] = everything(scenes[index])
+
+    workers = [threading.Thread(target=work, args=(index,)) for index in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    for index, parts in found.items():
+        assert all(torch.equal(part, other) for part, other in zip(parts, expected[index]))
+
+
+FORK = """
+import os, torch
+from splat_scenes import Path, random_scene
+scene = random_scene(0, 500, 80, 60).on(Path(torch.float32))
+before = scene.render().color
+child = os.fork()
+if child == 0:
+    os._exit(0 if torch.equal(scene.render().color, before) else 1)
+assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_forked_process_can_still_render() -> None:
+    environment = {**os.environ, "PYTHONPATH": str(File(__file__).parents[1])}
+    subprocess.run([sys.executable, "-c", FORK], check=True, env=environment, timeout=120)
+
+
+@pytest.mark.parametrize("flags", ["-march=x86-64-v3", "-march=x86-64"])
+def test_other_instruction_sets_agree_with_the_reference(flags: str) -> None:
+    if os.uname().machine != "x86_64":
+        pytest.skip("flags of x86")
+    if "v3" in flags and "avx2" not in File("/proc/cpuinfo").read_text():
+        pytest.skip("no AVX2 here")
+    chosen = "references and cpu and (one or five or 7x5)"
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", __file__, "-k", chosen]
+    environment = {**os.environ, "D2_CXXFLAGS": flags}
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert result.returncode == 0, result.stdout
+
+
+def test_inputs_need_not_be_contiguous_and_gradients_may_be_expanded(kernels: Path) -> None:
+    scene = random_scene(9, 100, 30, 30).on(kernels)
+    strided = Scene(
+        scene.means.T.contiguous().T,
+        scene.covariances.flip(0).flip(0),
+        torch.stack([scene.opacities, scene.opacities], 1)[:, 0],
+        scene.colors.T.contiguous().T,
+        scene.view,
+    ).requires_grad()
+    plain = scene.requires_grad()
+    for leaves in (strided, plain):
+        leaves.render().color.sum().backward()
+    assert all(torch.equal(part.grad, other.grad) for part, other in zip(strided[:4], plain[:4]))
+
+
+def test_only_what_requires_gradients_gets_one(kernels: Path) -> None:
+    scene = random_scene(11, 50, 20, 20).on(kernels)
+    assert not scene.render().color.requires_grad
+    scene.opacities.requires_grad_()
+    scene.render().alpha.sum().backward()
+    assert scene.opacities.grad is not None
+    assert scene.means.grad is None
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_torch_compile_leaves_it_as_it_is() -> None:
+    scene = random_scene(12, 40, 20, 18).on(Path(torch.float32)).requires_grad()
+    edge = near_edge_of(scene.view)
+
+    def loss(means, covariances, opacities, colors):
+        splats = Splats(means, covariances, opacities, torch.arange(40))
+        render = rasterize(splats, colors, scene.view, near_edge=edge)
+        return (render.color.sin() + (render.alpha + render.front)[..., None]).sum()
+
+    expected = torch.autograd.grad(loss(*scene[:4]), scene[:4])
+    compiled = torch.compile(loss, backend="aot_eager")
+    found = torch.autograd.grad(compiled(*scene[:4]), scene[:4])
+    for part, other in zip(found, expected):
+        torch.testing.assert_close(part, other)
+
+
+def test_without_a_compiler_the_torch_path_takes_over_with_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = random_scene(14, 50, 20, 20).on(Path(torch.float32))
+    native.library.cache_clear()
+    native.available.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setenv("CXX", "no-such-compiler")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            slow = scene.render()
+            scene.render()
+        (message,) = [str(warning.message) for warning in caught]
+        assert "no-such-compiler" in message
+        assert "orders of magnitude slower" in message
+    native.available.cache_clear()
+    torch.testing.assert_close(slow.color, scene.render().color, atol=1e-5, rtol=0)
+
+
+def test_an_image_as_wide_as_a_panorama_has_its_gaussians_in_place(kernels: Path) -> None:
+    scene = single(depth=2.0, opacity=0.9, variance=1e-6)._replace(view=make_view(5000, 3, focal=2000.0))
+    scene.means[0, 0] = 2.4005
+    alpha = scene.on(kernels).render().alpha.to(CPU)
+    assert alpha.argmax().item() == 5000 + 4900
+    torch.testing.assert_close(alpha.double(), scene.render().alpha, atol=1e-4, rtol=0)
+
+
+def test_more_pairs_than_slots_can_number_are_refused() -> None:
+    with pytest.raises(D2Error, match="2147483648 pairs of Gaussian and tile"):
+        cuda._count_pairs(torch.tensor([5, 2**31]), torch.eye(3))
+
+
+@pytest.mark.cuda
+def test_on_a_device_its_kernels_draw_on_the_current_stream_and_a_prior_may_lie_on_the_cpu(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = path_of("cuda", monkeypatch)
+    monkeypatch.setattr(reference, "rasterize", None)
+    monkeypatch.setattr(reference, "survey", None)
+    scene = random_scene(0, 250, 61, 37)
+    expected = everything(scene, path)
+    torch.cuda.synchronize()
+    with torch.cuda.stream(torch.cuda.Stream(path.device)):
+        found = everything(scene, path)
+    assert all(torch.equal(*pair) for pair in zip(found, expected))
+    there = scene.on(path)
+    assert survey(there.splats, there.view, prior_of(scene.view), near_edge=near_edge_of(scene.view)).hits.is_cuda
