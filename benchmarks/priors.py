@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 
@@ -57,6 +57,10 @@ class PriorsBench(Settings):
     """Cameras that the prior is built for, in every recording that has them all; all cameras in the others."""
     frames: tuple[Count, ...] = ()
     """Numbers of the frames, in every recording; the first and the last with a true depth if none is named."""
+    mono_onnx: str | None = None
+    """ONNX model of monocular depth, for every recording; the maps beside the images if none is named."""
+    mono_kind: Literal["relative", "metric"] | None = None
+    """What the model returns."""
     width: Annotated[int, Range(32, unit="pixels")] = 320
     """Width of rendered images, which are 16:9, pixels."""
     threads: AtATime = 1
@@ -78,8 +82,9 @@ def run(settings: PriorsBench) -> str:
     begin_rows(settings.output)
     torch.set_num_threads(settings.threads)
     command, shown_text = command_line("bench priors", settings), []
+    prior_settings = PriorSettings(mono_onnx=settings.mono_onnx, mono_kind=settings.mono_kind)
     for case in cases(settings):
-        found, seconds = measure(case)
+        found, seconds = measure(case, prior_settings)
         append_rows(settings.output, rows_of(case, found, seconds, command))
         shown_text.append(f"{case.name}, {seconds:.2f} s per image, {found}")
         logger.info("the prior of %s is measured", case.name)
@@ -129,12 +134,12 @@ def _listed(frames: Sequence[int]) -> str:
     return f"frame{'s' if len(frames) > 1 else ''} {', '.join(map(str, frames[:8]))}"
 
 
-def measure(case: Case) -> tuple[DeclaredErrors, float]:
-    """How the prior that the defaults make compares with the truth, and the seconds that it takes per image."""
+def measure(case: Case, settings: PriorSettings) -> tuple[DeclaredErrors, float]:
+    """How the prior compares with the truth, and the seconds that it takes per image."""
     points = triangulated_points(case.recording, case.cameras).positions
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        build_priors(case.recording, case.cameras, folder, PriorSettings(), sparse_points=points)
+        build_priors(case.recording, case.cameras, folder, settings, sparse_points=points)
         seconds = time.perf_counter() - start
         found = held_against_truth(PriorStore.open(folder), case.recording)
     if found is None:

@@ -46,6 +46,8 @@ from d2_plugin.store.store import PriorStore
 
 LEAST_ITERATIONS = 1000
 """Of a run that is worth trials; a shorter one uses the whole prior."""
+LEAST_CAMERAS = 3
+"""Without one of two cameras, one would train alone: that shows nothing of what two show."""
 STEPS = 200
 """Of one trial. What is inserted begins faint, and a trial that is too short sees its cost alone."""
 EVALUATIONS = 10
@@ -118,13 +120,13 @@ def _mean_ssim(scores: Mapping[str, Score]) -> float:
 
 
 def is_open(settings: RunSettings, scene: Scene) -> bool:
-    """Whether trials can decide: two depth sources, a second camera, a run long enough, and no choice of the user's."""
+    """Whether trials can decide: two depth sources, three cameras, a run long enough, and no choice of the user's."""
     if settings.iterations < LEAST_ITERATIONS:
         return False
     chosen = "believe" in settings.overrides.get("d2", {})
     uses_depth = bool({"densify", "depth_loss"} & set(settings.hooks))
     both = scene.plan.uses("verification") and prior_settings(settings).variant == "dual"
-    return both and uses_depth and not chosen and not settings.priors_in_step and len(scene.train_cameras) > 1
+    return both and uses_depth and not chosen and not settings.priors_in_step and len(scene.train_cameras) >= LEAST_CAMERAS
 
 
 def kept_trials(path: Path, settings: RunSettings, scene: Scene, points: TimedPoints, priors: Path) -> Trials:
