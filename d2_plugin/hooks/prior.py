@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Literal, NamedTuple, Protocol
 
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import CameraRecord, DepthPrior, Label, View
+from d2_plugin.store.maps import UNKNOWN, CodedPrior
 
 log = logging.getLogger(__name__)
 
@@ -21,11 +23,15 @@ log = logging.getLogger(__name__)
 class Store(Protocol):
     """What the loader needs of a prior store (d2_plugin.store.store.PriorStore).
 
-    Where it also has `camera(camera, frame) -> CameraRecord | None`, views are checked against it.
+    Where it also has `camera(camera, frame) -> CameraRecord | None`, views are checked against it; where it has
+    `coded(camera, frame) -> CodedPrior | None`, that is kept in memory in the place of the prior.
     """
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
 
+
+Key = tuple[str, int]
+"""A camera and a frame."""
 
 Belief = Literal["all", "stereo", "nothing"]
 """What of a prior is believed: `all` of it, `stereo` alone, or `nothing`."""
@@ -92,10 +98,14 @@ class KnownMaps(NamedTuple):
     @classmethod
     def of(cls, prior: DepthPrior) -> KnownMaps:
         """The maps of a prior; waits for its device to count."""
-        known = prior.trusted if prior.sigma is None else prior.support & torch.isfinite(prior.sigma)
-        kind = known.byte() * NEAR + prior.far.byte() * FAR
+        kind = prior.trusted if prior.sigma is None else prior.support & torch.isfinite(prior.sigma)
+        return cls.of_kinds(kind.byte() * NEAR + prior.far.byte() * FAR, prior.depth, prior.sigma)
+
+    @classmethod
+    def of_kinds(cls, kind: Tensor, depth: Tensor, sigma: Tensor | None) -> KnownMaps:
+        """The maps with the counts of `kind`; waits for its device."""
         near, far = (int(torch.count_nonzero(kind == which)) for which in (NEAR, FAR))
-        return cls(kind, prior.depth, prior.sigma, near, far)
+        return cls(kind, depth, sigma, near, far)
 
 
 class CameraCheck:
@@ -155,17 +165,78 @@ class CameraCheck:
             )
 
 
+class Kept(NamedTuple):
+    """One prior as it is kept in memory: as it is stored, or as a store of the user's own returned it."""
+
+    maps: DepthPrior | CodedPrior
+    known: KnownMaps
+    """Its depth and sigma are those of `maps`, codes where these are."""
+
+    @classmethod
+    def of(cls, read: DepthPrior | CodedPrior, belief: Belief, pin: bool) -> Kept:
+        """What of a prior may be used; in memory that a GPU copies from without a wait, where `pin` is set."""
+        coded = isinstance(read, CodedPrior)
+        maps = believed(read.codes if isinstance(read, CodedPrior) else read, belief)
+        empty = torch.zeros_like(maps.far) if coded else ~(torch.isfinite(maps.depth) & (maps.depth > 0))
+        if bool(maps.far.any()):
+            empty |= _outline(maps.far)
+        maps = maps._replace(labels=maps.labels.masked_fill(empty, int(Label.EMPTY)))
+        certain = maps.trusted if maps.sigma is None else maps.support
+        if maps.sigma is not None:
+            certain = certain & (maps.sigma != UNKNOWN if coded else maps.sigma.isfinite())
+        kind = certain.byte() * NEAR + maps.far.byte() * FAR
+        if pin:
+            maps = DepthPrior._make(part if part is None or part.is_cuda else part.pin_memory() for part in maps)
+            kind = kind if kind.is_cuda else kind.pin_memory()
+        known = KnownMaps.of_kinds(kind, maps.depth, maps.sigma)
+        return cls(read._replace(codes=maps) if isinstance(read, CodedPrior) else maps, known)
+
+    @property
+    def bytes(self) -> int:
+        """What it takes."""
+        maps = self.maps.codes if isinstance(self.maps, CodedPrior) else self.maps
+        return sum(part.numel() * part.element_size() for part in (*maps, self.known.kind) if part is not None)
+
+    def prior(self, device: torch.device) -> DepthPrior:
+        """All maps on a device. Pixels judge Gaussians where sigma is small, whatever their label."""
+        prior = self._decoded(self.maps.codes if isinstance(self.maps, CodedPrior) else self.maps, device)
+        if prior.sigma is None or prior.reliability is not None:
+            return prior
+        return prior._replace(reliability=(prior.support & (prior.sigma <= JUDGES)).to(prior.depth))
+
+    def known_on(self, device: torch.device) -> KnownMaps:
+        """What the depth loss reads: 4 bytes a pixel are copied where depth and sigma are codes."""
+        known = self.known
+        moved = self._decoded(DepthPrior(known.depth, known.kind, sigma=known.sigma), device)
+        return known._replace(kind=moved.labels, depth=moved.depth, sigma=moved.sigma)
+
+    def depths(self) -> Tensor:
+        """Every fourth depth of every fourth row."""
+        return self._decoded(DepthPrior(self.known.depth[::4, ::4], self.known.kind), self.known.kind.device).depth
+
+    def _decoded(self, maps: DepthPrior, device: torch.device) -> DepthPrior:
+        moved = DepthPrior._make(None if part is None else part.to(device, non_blocking=True) for part in maps)
+        return self.maps._replace(codes=moved).decoded() if isinstance(self.maps, CodedPrior) else moved
+
+
 class PriorLoader:
-    """Looks up D* by camera and frame, on the view's device; keeps the last few: memory must not grow with frames."""
+    """Looks up D* by camera and frame, on the view's device.
+
+    The last few stay in the host's memory, as they are stored: memory must not grow with the number of frames.
+    """
 
     def __init__(
         self, store: Store, memory_mb: int = 512, rename: Rename | None = None, believe: Belief = "all"
     ) -> None:
         """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes."""
         self.store, self.keep_bytes, self._rename, self.believe = store, memory_mb << 20, rename, believe
-        self._kept: OrderedDict[tuple[str, int], DepthPrior | None] = OrderedDict()
-        self._known: dict[tuple[str, int], KnownMaps] = {}
+        self._kept: OrderedDict[Key, Kept | None] = OrderedDict()
+        self._bytes = 0
+        self._reading: dict[Key, Future[Kept | None]] = {}
+        self._thread: ThreadPoolExecutor | None = None
         self._cameras = CameraCheck()
+        self._checked: set[Key] = set()
+        self._pin = self._dropped = False
         self._without: set[str] = set()
         self.named = False
         """Whether `name_by` was called."""
@@ -181,44 +252,64 @@ class PriorLoader:
 
     def __call__(self, view: View) -> DepthPrior | None:
         """D* of the view, or None where the store has none; refuses one made for another size, K or pose."""
+        kept = self._look_up(view)
+        return None if kept is None else kept.prior(view.K.device)
+
+    def known(self, view: View) -> KnownMaps | None:
+        """What is known of the depth of the view's pixels, or None where nothing is of any."""
+        kept = self._look_up(view)
+        return None if kept is None or not kept.known.near + kept.known.far else kept.known_on(view.K.device)
+
+    def prefetch(self, keys: Iterable[Key]) -> None:
+        """Read these priors in a thread of its own, because their views come next. A failure waits until they do."""
+        for key in keys:
+            if self.named and key not in self._kept and key not in self._reading:
+                self._thread = self._thread or ThreadPoolExecutor(1, "d2-prior")
+                self._reading[key] = self._thread.submit(self._read, key)
+
+    def _look_up(self, view: View) -> Kept | None:
         key = (view.camera, view.frame)
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key]
-        prior = self.store.prior(*key)
-        if prior is None and view.camera not in self._without:
+        self._pin = self._pin or view.K.is_cuda
+        for other in [other for other, reading in self._reading.items() if other == key or reading.done()]:
+            reading = self._reading.pop(other)
+            if other == key or reading.exception() is None:
+                self._keep(other, reading.result())
+        if key not in self._kept:
+            self._keep(key, self._read(key))
+        self._kept.move_to_end(key)
+        kept = self._kept[key]
+        if kept is None:
+            self._warn_without(view)
+        elif key not in self._checked:
+            self._check(view, kept)
+            self._checked.add(key)
+        return kept
+
+    def _read(self, key: Key) -> Kept | None:
+        read = getattr(self.store, "coded", self.store.prior)(*key)
+        return None if read is None else Kept.of(read, self.believe, self._pin)
+
+    def _keep(self, key: Key, kept: Kept | None) -> None:
+        self._kept[key] = kept
+        self._bytes += 0 if kept is None else kept.bytes
+        while len(self._kept) > 1 and self._bytes > self.keep_bytes:
+            _, dropped = self._kept.popitem(last=False)
+            self._bytes -= 0 if dropped is None else dropped.bytes
+            if not self._dropped:
+                self._dropped = True
+                message = "prior_memory_mb = %d holds the priors of %d views: the others are read from disk each time"
+                log.info(message, self.keep_bytes >> 20, len(self._kept))
+
+    def _warn_without(self, view: View) -> None:
+        if view.camera not in self._without:
             self._without.add(view.camera)
             log.warning(
                 "camera %s has no prior at frame %d and is trained without D2 there; the prior has cameras %s",
                 view.camera, view.frame, ", ".join(map(str, getattr(self.store, "cameras", ()))) or "unknown",
             )  # fmt: skip
-        if prior is not None:
-            self._check(view, prior)
-            prior = believed(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior), self.believe)
-            prior = _usable(prior)
-        self._kept[key] = prior
-        while len(self._kept) > 1 and self._bytes() > self.keep_bytes:
-            dropped, _ = self._kept.popitem(last=False)
-            self._known.pop(dropped, None)
-        return prior
 
-    def known(self, view: View) -> KnownMaps | None:
-        """What is known of the depth of the view's pixels, or None where nothing is of any."""
-        key, prior = (view.camera, view.frame), self(view)
-        if prior is None:
-            return None
-        if key not in self._known:
-            self._known[key] = KnownMaps.of(prior)
-        known = self._known[key]
-        return known if known.near + known.far else None
-
-    def _bytes(self) -> int:
-        tensors = [part for prior in self._kept.values() if prior is not None for part in prior if part is not None]
-        tensors += [known.kind for known in self._known.values()]
-        return sum(part.numel() * part.element_size() for part in tensors)
-
-    def _check(self, view: View, prior: DepthPrior) -> None:
-        height, width = prior.depth.shape
+    def _check(self, view: View, kept: Kept) -> None:
+        height, width = kept.known.kind.shape
         if (width, height) != (view.width, view.height):
             raise D2Error(
                 f"the prior of camera {view.camera}, frame {view.frame} is {width}x{height} pixels but the view is "
@@ -227,26 +318,15 @@ class PriorLoader:
         describe = getattr(self.store, "camera", None)
         record = describe(view.camera, view.frame) if describe is not None else None
         if record is not None:
-            self._cameras.check(view, record, prior.depth)
+            self._cameras.check(view, record, kept.depths())
 
 
-def _usable(prior: DepthPrior) -> DepthPrior:
-    """The same prior, empty where the depth is no finite positive number: no store can put NaN into a loss.
+def _outline(far: Tensor) -> Tensor:
+    """The far pixels [H, W] less than `OUTLINE` pixels inside of what is far; the rim of the image is no outline.
 
-    It is also empty at the outline of what is far: a Gaussian of the surface in front spills over it. Pixels judge
-    Gaussians where sigma is small, whatever their label.
-    """
-    usable = torch.isfinite(prior.depth) & (prior.depth > 0) & ~(prior.far & ~_inside(prior.far))
-    prior = prior._replace(labels=torch.where(usable, prior.labels, int(Label.EMPTY)))
-    if prior.sigma is None or prior.reliability is not None:
-        return prior
-    return prior._replace(reliability=(prior.support & (prior.sigma <= JUDGES)).to(prior.depth))
-
-
-def _inside(far: Tensor) -> Tensor:
-    """The far pixels [H, W] at least `OUTLINE` pixels inside of what is far; the rim of the image is no outline."""
+    A Gaussian of the surface in front spills over them."""
     others = (~far).float()[None, None]
-    return F.max_pool2d(others, 2 * OUTLINE + 1, stride=1, padding=OUTLINE)[0, 0] == 0
+    return far & (F.max_pool2d(others, 2 * OUTLINE + 1, stride=1, padding=OUTLINE)[0, 0] > 0)
 
 
 def _relative(pose: Tensor, first: Tensor) -> Tensor:
