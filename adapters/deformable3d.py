@@ -19,7 +19,7 @@ from d2_plugin.protocol import Points, Splats, View
 from .inria import InriaAdapter
 from .inverse_deformation import Inversion, invert_at_times
 from .keys import KeyOf
-from .shared import optional, splats_of
+from .shared import once_per_camera, optional, splats_of
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +57,7 @@ class Deformable3DAdapter(InriaAdapter):
             log.info("the trainer uses its field from iteration %d on: hooks wait until then", warm_up)
         self.is_6dof = bool(optional(deform.deform, "is_6dof", False))
         self.inversion: Inversion | None = None
+        self._fid = once_per_camera("fid", lambda camera: float(camera.fid))
 
     def trained(self) -> dict[str, Tensor]:
         """See `InriaAdapter.trained`; the network has an optimizer of its own."""
@@ -92,7 +93,7 @@ class Deformable3DAdapter(InriaAdapter):
 
     def _time(self, camera: Any) -> float:
         """`fid`, a tensor of one number."""
-        return float(camera.fid)
+        return self._fid(camera)
 
     def _append(self, points: Points) -> None:
         """Canonical Gaussians that the field moves onto the points at the points' times; they exist at all times."""

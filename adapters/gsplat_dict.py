@@ -104,7 +104,8 @@ class GsplatAdapter(Resizing):
                 f"a camera of type {type(camera).__name__} is no View: pass views, or give the adapter `view`"
             )
         seen, like = self._view(camera), self.parameters["means"]  # data sets leave their items on the CPU
-        return replace(seen, T_camera_world=seen.T_camera_world.to(like), K=seen.K.to(like))
+        pose, K = (matrix.to(like, non_blocking=True) for matrix in (seen.T_camera_world, seen.K))
+        return replace(seen, T_camera_world=pose, K=K)
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable."""
@@ -202,12 +203,21 @@ class GsplatAdapter(Resizing):
     def _report_changes(self) -> None:
         """Report what the strategy did: a row keeps its number, its copies and new rows are -1."""
         numbers = None if self.state is None else self.state.get(ROWS)
+        if numbers is not None and numbers is self._seen and numbers._version == self._version:
+            return  # the very tensor that was there, and nobody wrote into it: no need to wait for the device
         if numbers is None or len(numbers) != self._count:
             self._report_growth()
         elif len(numbers) != self._known or not torch.equal(numbers, self._numbers()):
             index = _first_occurrences(numbers - 1)
             self._renumber()
             self._report(index)
+        else:
+            self._see(numbers)
+
+    def _see(self, numbers: Tensor) -> None:
+        """Put row numbers into the state that are those of the present rows."""
+        assert self.state is not None
+        self.state[ROWS], self._seen, self._version = numbers, numbers, numbers._version
 
     def _report_growth(self) -> None:
         """Without row numbers: growth means appended rows (gsplat's sample_add); D2Hooks notices shrinking."""
@@ -221,7 +231,7 @@ class GsplatAdapter(Resizing):
     def _renumber(self) -> None:
         self._known = self._count
         if self.state is not None:
-            self.state[ROWS] = self._numbers()
+            self._see(self._numbers())
 
     def _numbers(self) -> Tensor:
         return torch.arange(1, self._count + 1, device=self.parameters["means"].device)
@@ -229,7 +239,8 @@ class GsplatAdapter(Resizing):
 
 def gsplat_view(camera: str, frame: int, time: float, camtoworld: Tensor, K: Tensor, width: int, height: int) -> View:
     """The view of one camera of gsplat's data sets: camtoworld [4, 4] or [1, 4, 4] in OpenCV axes, K likewise."""
-    return View(camera, frame, time, torch.linalg.inv(camtoworld.reshape(4, 4)), K.reshape(3, 3), width, height)
+    pose = torch.linalg.inv_ex(camtoworld.reshape(4, 4)).inverse
+    return View(camera, frame, time, pose, K.reshape(3, 3), width, height)
 
 
 def _first_occurrences(rows: Tensor) -> Tensor:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from typing import Any, Generic, TypeVar
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -13,6 +15,7 @@ from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Points, ResizeListener, Splats, View
 
 Render = TypeVar("Render")
+Answer = TypeVar("Answer")
 
 
 class Resizing:
@@ -50,6 +53,23 @@ class Renders(Generic[Render]):
     def forget(self) -> None:
         """Forget all renders."""
         self._by_key.clear()
+
+
+def once_per_camera(name: str, ask: Callable[[Any], Answer]) -> Callable[[Any], Answer]:
+    """`ask` of a camera object, whose answer is kept as long as its tensor `name` is the same: if that lies on a GPU,
+    every question waits for it."""
+    answers: WeakKeyDictionary[Any, tuple[Tensor, int, Answer]] = WeakKeyDictionary()
+
+    def asked(camera: Any) -> Answer:
+        tensor = getattr(camera, name)
+        if not isinstance(tensor, Tensor) or not isinstance(camera, Hashable):
+            return ask(camera)
+        known = answers.get(camera)
+        if known is None or known[0] is not tensor or known[1] != tensor._version:
+            known = answers[camera] = tensor, tensor._version, ask(camera)
+        return known[2]
+
+    return asked
 
 
 def optional(owner: Any, name: str, default: Any = None) -> Any:

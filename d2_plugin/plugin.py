@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -164,6 +164,12 @@ class D2Hooks:
                 total = total + term if isinstance(total, Tensor) else term
         self._finite.remember(total, shown)
         return total
+
+    def prefetch(self, cameras: Iterable[object]) -> None:
+        """Read the priors of the views that come next in a thread of its own; for a trainer that knows them."""
+        if self.prior is not None and self.prior.named:
+            views = [converted(self.backbone, camera) for camera in cameras]
+            self.prior.prefetch((view.camera, view.frame) for view in views)
 
     @torch.no_grad()
     def step(self, step: int) -> Report:

@@ -73,6 +73,7 @@ class Points(NamedTuple):
 
     def select(self, which: Tensor) -> Points:
         """Those of a mask bool [K], or of indices."""
+        which = torch.nonzero(which).squeeze(-1) if which.dtype == torch.bool else which  # one wait for a GPU, not six
         lifetimes = None if self.lifetimes is None else self.lifetimes[which]
         return self._replace(lifetimes=lifetimes, **{name: getattr(self, name)[which] for name in self._fields[:5]})
 

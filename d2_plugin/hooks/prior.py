@@ -226,7 +226,7 @@ class PriorLoader:
     """
 
     def __init__(
-        self, store: Store, memory_mb: int = 512, rename: Rename | None = None, believe: Belief = "all"
+        self, store: Store, memory_mb: int = 2048, rename: Rename | None = None, believe: Belief = "all"
     ) -> None:
         """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes."""
         self.store, self.keep_bytes, self._rename, self.believe = store, memory_mb << 20, rename, believe
