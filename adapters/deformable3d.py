@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.protocol import Points, Splats, View
+from d2_plugin.protocol import Points, ResizeListener, Splats, View
 
 from .inria import InriaAdapter
 from .inverse_deformation import Inversion, invert_at_times
@@ -29,8 +29,9 @@ class Deformable3DAdapter(InriaAdapter):
 
     The slice is that of its render (gaussian_renderer/__init__.py:70-90): offsets of scales are added AFTER exp and may
     leave a negative scale, offsets of rotations after normalising, and neither the Python side nor the rasterizer
-    normalises the sum: its length scales the covariance, and is kept. Before `warm_up` nothing is deformed. The noise
-    that training adds to times of real scenes is left out: it has mean zero.
+    normalises the sum: its length scales the covariance, and is kept. Before `warm_up` nothing is deformed. The depth
+    loss uses the offsets that the trainer's own render was drawn with, at a time to which training adds a noise of a
+    tenth of a frame and less in real scenes; everything else uses the field without it.
 
     Args:
         gaussians: the model, after `training_setup`.
@@ -79,11 +80,16 @@ class Deformable3DAdapter(InriaAdapter):
         opacities = torch.sigmoid(model._opacity.squeeze(-1))
         means, scales, rotations = model._xyz, model._scaling.exp(), torch.nn.functional.normalize(model._rotation)
         if self.deforms:
-            motion, rotation, scaling = self._field(model._xyz.detach(), view.time)
+            motion, rotation, scaling = self._evaluated(view, self._offsets, model._xyz.detach(), view.time)
             means, scales, rotations = self._moved(means, motion), scales + scaling, rotations + rotation
         return splats_of(means, scales, rotations, opacities)
 
-    def _field(self, positions: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
+    def on_resize(self, listener: ResizeListener) -> None:
+        """Register a listener; D2Hooks does so only where a hook is on."""
+        super().on_resize(listener)
+        self._keep_evaluations(self.deform.deform)
+
+    def _offsets(self, positions: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
         return self.deform.step(positions, positions.new_full((len(positions), 1), time))
 
     def _moved(self, positions: Tensor, motion: Tensor) -> Tensor:
@@ -105,4 +111,4 @@ class Deformable3DAdapter(InriaAdapter):
     def _deformed(self, positions: Tensor, time: float) -> Tensor:
         if not len(positions):
             return positions
-        return self._moved(positions, self._field(positions, time)[0])
+        return self._moved(positions, self._own(self._offsets, positions, time)[0])

@@ -13,7 +13,6 @@ so a column of row numbers in there shows afterwards what became of each row.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -30,6 +29,7 @@ from .shared import (
     constant_harmonics,
     finite,
     identities,
+    on_device,
     replaced,
     seen_colors,
     splats_of,
@@ -98,14 +98,12 @@ class GsplatAdapter(Resizing):
     def view(self, camera: object) -> View:
         """The view of the trainer's camera, or a `View` as it is."""
         if isinstance(camera, View):
-            return camera
+            return on_device(camera, self.parameters["means"])
         if self._view is None:
             raise D2Error(
                 f"a camera of type {type(camera).__name__} is no View: pass views, or give the adapter `view`"
             )
-        seen, like = self._view(camera), self.parameters["means"]  # data sets leave their items on the CPU
-        pose, K = (matrix.to(like, non_blocking=True) for matrix in (seen.T_camera_world, seen.K))
-        return replace(seen, T_camera_world=pose, K=K)
+        return on_device(self._view(camera), self.parameters["means"])  # data sets leave their items on the CPU
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable."""

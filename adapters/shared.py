@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from dataclasses import replace
 from typing import Any, Generic, TypeVar
 from weakref import WeakKeyDictionary
 
@@ -76,6 +77,14 @@ def optional(owner: Any, name: str, default: Any = None) -> Any:
     """An attribute that some versions of a repository lack or leave at None; `default` there."""
     value = getattr(owner, name, None)
     return default if value is None else value
+
+
+def on_device(view: View, like: Tensor) -> View:
+    """The view with its matrices where the Gaussians are."""
+    if view.K.device == like.device and view.T_camera_world.device == like.device:
+        return view
+    pose, K = (matrix.to(like, non_blocking=True) for matrix in (view.T_camera_world, view.K))
+    return replace(view, T_camera_world=pose, K=K)
 
 
 def finite(points: Points) -> Points:

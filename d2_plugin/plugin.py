@@ -168,8 +168,10 @@ class D2Hooks:
     def prefetch(self, cameras: Iterable[object]) -> None:
         """Read the priors of the views that come next in a thread of its own; for a trainer that knows them."""
         if self.prior is not None and self.prior.named:
-            views = [converted(self.backbone, camera) for camera in cameras]
-            self.prior.prefetch((view.camera, view.frame) for view in views)
+            key = getattr(self.backbone, "prior_key", None)
+            views = [] if key is not None else [converted(self.backbone, camera) for camera in cameras]
+            keys = map(key, cameras) if key is not None else ((view.camera, view.frame) for view in views)
+            self.prior.prefetch(keys)
 
     @torch.no_grad()
     def step(self, step: int) -> Report:

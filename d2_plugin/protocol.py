@@ -225,6 +225,8 @@ class Backbone(Protocol):
         called with the number of the training step before anything else is asked in it.
     ``image_name(camera) -> str | None``
         path of the image of a trainer's camera; priors of an exported recording are found by it.
+    ``prior_key(camera) -> (camera, frame)``
+        the key of the prior of a trainer's camera, where it is cheaper than its whole view.
     ``active(step) -> bool``
         False while the hooks must wait (stages, warm-up); changes nothing.
     ``colors(view, splats) -> Tensor``

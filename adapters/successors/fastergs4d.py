@@ -21,7 +21,17 @@ from d2_plugin.gaussians.slicing import slice_gaussians
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from ..keys import KeyOf, PriorKey, key_from_image_name
-from ..shared import Resizing, appended, constant_harmonics, finite, identities, optional, seen_colors, with_rows
+from ..shared import (
+    Resizing,
+    appended,
+    constant_harmonics,
+    finite,
+    identities,
+    on_device,
+    optional,
+    seen_colors,
+    with_rows,
+)
 
 CONSTANTS = RasterSettings(alpha_max=1 - 1e-6)
 """Of its rasterizer (rasterization_config.h): alpha is not clamped; near comes from the camera."""
@@ -65,7 +75,7 @@ class FasterGS4DAdapter(Resizing):
     def view(self, camera: Any) -> View:
         """The view of NeRFICG's `View` (Datasets/utils.py), which holds camera, pose and time, or a `View` as it is."""
         if isinstance(camera, View):
-            return camera
+            return on_device(camera, self.gaussians._spatial_means)
         lens = optional(camera, "camera")
         if lens is None or not hasattr(lens, "focal_x"):
             kind = type(camera).__name__

@@ -14,6 +14,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from d2_plugin.hooks.expected import check_device
 from d2_plugin.hooks.hook import Context, Hook, HookConfig
 from d2_plugin.hooks.native_depth_loss import can_compare, native_depth_loss
 from d2_plugin.hooks.prior import FAR, NEAR, KnownMaps
@@ -123,6 +124,7 @@ def depth_and_alpha(context: Context, view: View) -> tuple[Tensor, Tensor]:
     if rendered is not None:
         return rendered
     splats = context.backbone.slice_at(view)
+    check_device(splats, view)
     colors = splats.means.new_zeros(len(splats.means), 1)
     render = rasterize(splats, colors, view, context.backbone.settings)
     return render.depth_sum, render.alpha

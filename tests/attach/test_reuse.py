@@ -1,0 +1,109 @@
+"""What the trainer evaluated to draw a view is not evaluated again for D2's depth of that view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from mimics import deformable3d, hust4d
+from mimics.inria import default_options
+from mimics.workplace import furnish
+from torch import Tensor, nn
+
+from d2_plugin import D2Hooks
+from d2_plugin.adapters.deformable3d import Deformable3DAdapter
+from d2_plugin.adapters.hust4d import Hust4DAdapter
+from d2_plugin.config import D2Config, DepthLossConfig
+
+
+class Attached(SimpleNamespace):
+    """A mimic with the depth loss alone: its adapter, cameras, field, and how it draws one of them."""
+
+    adapter: Any
+    field: nn.Module
+    cameras: list[Any]
+    draw: Callable[[Any], object]
+    d2: D2Hooks
+    calls: list[int]
+
+
+def make(name: str) -> Attached:
+    if name == "hust4d":
+        model, scene = hust4d.make()
+        model.training_setup(default_options())
+        adapter, field = Hust4DAdapter(model, scene, "fine"), model._deformation
+
+        def draw(camera: Any) -> object:
+            return hust4d.render(camera, model, [0, 0, 0])
+    else:
+        model, deform, scene = deformable3d.make()
+        model.training_setup(default_options())
+        adapter, field = Deformable3DAdapter(model, deform, warm_up=0), deform.deform
+
+        def draw(camera: Any) -> object:
+            return deform.step(model.get_xyz.detach(), camera.fid.expand(len(model.get_xyz), 1))
+
+    calls: list[int] = []
+    field.register_forward_hook(lambda *_: calls.append(1))
+    d2 = D2Hooks(D2Config(prior="prior", depth_loss=DepthLossConfig()), adapter)
+    return Attached(adapter=adapter, field=field, cameras=scene.cameras, draw=draw, d2=d2, calls=calls, model=model)
+
+
+def gradients(made: Attached, loss: Tensor) -> list[Tensor]:
+    parameters = [*made.field.parameters(), made.model._xyz, made.model._opacity]
+    parts = torch.autograd.grad(loss, parameters, allow_unused=True)
+    return [torch.zeros_like(p) if part is None else part for p, part in zip(parameters, parts, strict=True)]
+
+
+@pytest.fixture(params=["hust4d", "deformable3d"])
+def name(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    furnish(tmp_path, monkeypatch)
+    return request.param
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_the_field_is_evaluated_once_a_view_and_gradients_are_the_same(name: str, batch: int) -> None:
+    losses = []
+    for drawn in (True, False):
+        made = make(name)
+        cameras = made.cameras[:batch]
+        for camera in cameras if drawn else ():
+            made.draw(camera)
+        loss = made.d2.loss(1, cameras)
+        assert len(made.calls) == batch
+        losses.append((loss.detach(), *gradients(made, loss)))
+        assert not made.adapter._unassigned
+    assert any(part.any() for part in losses[0][1:-2]), "the field has gradients"
+    for one, other in zip(*losses, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-7)
+
+
+def test_what_cannot_be_assigned_is_evaluated_anew(name: str) -> None:
+    """A viewer that draws with gradients on, rows that changed since, an evaluation of a test image."""
+    made = make(name)
+    expected = made.d2.loss(1, made.cameras[0]).detach()
+    made.draw(made.cameras[3])
+    made.draw(made.cameras[0])
+    made.calls.clear()
+    torch.testing.assert_close(made.d2.loss(2, made.cameras[0]).detach(), expected)
+    assert len(made.calls) == 1
+    with torch.no_grad():
+        made.draw(made.cameras[3])
+    made.calls.clear()
+    torch.testing.assert_close(made.d2.loss(3, made.cameras[0]).detach(), expected)
+    made.draw(made.cameras[0])
+    made.adapter.remove(torch.arange(len(made.adapter)) == 0)
+    made.calls.clear()
+    assert made.d2.loss(4, made.cameras[0]).isfinite()
+    assert len(made.calls) == 1
+
+
+def test_without_a_hook_nothing_is_kept(name: str) -> None:
+    made = make(name)
+    made.adapter.detach()
+    made.draw(made.cameras[0])
+    assert not made.adapter._unassigned
