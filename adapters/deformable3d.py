@@ -23,15 +23,18 @@ from .shared import once_per_camera, optional, splats_of
 
 log = logging.getLogger(__name__)
 
+NOISE_ENDS = 20_000
+"""Iteration at which the noise of times has died down (train.py:53). Before, it grows to a tenth of the clip for the
+last views of a round, since it is divided by how many are left."""
+
 
 class Deformable3DAdapter(InriaAdapter):
     """A `GaussianModel` with its `DeformModel` as a `d2_plugin.protocol.Backbone`.
 
     The slice is that of its render (gaussian_renderer/__init__.py:70-90): offsets of scales are added AFTER exp and may
     leave a negative scale, offsets of rotations after normalising, and neither the Python side nor the rasterizer
-    normalises the sum: its length scales the covariance, and is kept. Before `warm_up` nothing is deformed. The depth
-    loss uses the offsets that the trainer's own render was drawn with, at a time to which training adds a noise of a
-    tenth of a frame and less in real scenes; everything else uses the field without it.
+    normalises the sum: its length scales the covariance, and is kept. Before `warm_up` nothing is deformed. The noise
+    that training adds to times of real scenes is left out: it has mean zero.
 
     Args:
         gaussians: the model, after `training_setup`.
@@ -39,6 +42,8 @@ class Deformable3DAdapter(InriaAdapter):
         warm_up: iteration from which the field is used (opt.warm_up).
         in_warm_up: whether hooks run before it. The trainer's own reports are drawn with the untrained field until
             then, which widens every Gaussian by about .04 units and hides what hooks gain (docs/results/attach.md).
+        exact_times: whether training adds no noise to times, as where `dataset.is_blender`: the depth loss then uses
+            the offsets that the trainer evaluated for its own render. From iteration 20,000 on it does so anywhere.
         key: finds the prior of a camera; needed where the image's name does not say camera and frame
         (poses_bounds.npy with images 0000.png).
     """
@@ -50,10 +55,12 @@ class Deformable3DAdapter(InriaAdapter):
         *,
         warm_up: int = 3000,
         in_warm_up: bool = True,
+        exact_times: bool = False,
         key: KeyOf | None = None,
     ) -> None:
         super().__init__(gaussians, key)
         self.deform, self.warm_up, self.in_warm_up = deform, warm_up, in_warm_up
+        self.exact_times = exact_times
         if warm_up > 1 and not in_warm_up:
             log.info("the trainer uses its field from iteration %d on: hooks wait until then", warm_up)
         self.is_6dof = bool(optional(deform.deform, "is_6dof", False))
@@ -80,7 +87,9 @@ class Deformable3DAdapter(InriaAdapter):
         opacities = torch.sigmoid(model._opacity.squeeze(-1))
         means, scales, rotations = model._xyz, model._scaling.exp(), torch.nn.functional.normalize(model._rotation)
         if self.deforms:
-            motion, rotation, scaling = self._evaluated(view, self._offsets, model._xyz.detach(), view.time)
+            inputs = self._offsets, model._xyz.detach(), view.time
+            exact = self.exact_times or self._step >= NOISE_ENDS
+            motion, rotation, scaling = self._evaluated(view, *inputs) if exact else self._own(*inputs)
             means, scales, rotations = self._moved(means, motion), scales + scaling, rotations + rotation
         return splats_of(means, scales, rotations, opacities)
 

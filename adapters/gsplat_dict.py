@@ -12,7 +12,7 @@ so a column of row numbers in there shows afterwards what became of each row.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from typing import Any
 
 import torch
@@ -24,6 +24,7 @@ from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from .keys import ViewsByPose
 from .shared import (
+    Renders,
     Resizing,
     appended,
     constant_harmonics,
@@ -87,6 +88,7 @@ class GsplatAdapter(Resizing):
         self.settings = settings
         self._view = view if parser is None else ViewsByPose(parser)
         self._slice, self._new_rows, self.scene = slice_at, new_rows, scene
+        self._renders: Renders[tuple[Tensor, Tensor]] = Renders()
         self._known = 0
         self._renumber()
 
@@ -104,6 +106,21 @@ class GsplatAdapter(Resizing):
                 f"a camera of type {type(camera).__name__} is no View: pass views, or give the adapter `view`"
             )
         return on_device(self._view(camera), self.parameters["means"])  # data sets leave their items on the CPU
+
+    def rendered(self, cameras: Sequence[object], depth_sums: Tensor, alphas: Tensor) -> list[View]:
+        """Pass these to `D2Hooks.loss` instead of the cameras that were just drawn with `render_mode="RGB+D"`.
+
+        D2 then uses the trainer's own depth, the fourth channel [C, H, W], and alpha [C, H, W], and draws nothing.
+        """
+        self._renders.forget()
+        views = [self.view(camera) for camera in cameras]
+        for view, depth_sum, alpha in zip(views, depth_sums, alphas):
+            self._renders.put(view, (depth_sum, alpha))
+        return views
+
+    def rendered_depth(self, view: View) -> tuple[Tensor, Tensor] | None:
+        """Depth sum and alpha of the trainer's render of this view, or None; hands them out once."""
+        return self._renders.take(view)
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable."""

@@ -9,13 +9,15 @@ from typing import Any
 
 import pytest
 import torch
-from mimics import deformable3d, hust4d
+from mimics import deformable3d, gsplat, hust4d
 from mimics.inria import default_options
 from mimics.workplace import furnish
+from tiny import make_views
 from torch import Tensor, nn
 
 from d2_plugin import D2Hooks
 from d2_plugin.adapters.deformable3d import Deformable3DAdapter
+from d2_plugin.adapters.gsplat_dict import GsplatAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
 from d2_plugin.config import D2Config, DepthLossConfig
 
@@ -42,7 +44,7 @@ def make(name: str) -> Attached:
     else:
         model, deform, scene = deformable3d.make()
         model.training_setup(default_options())
-        adapter, field = Deformable3DAdapter(model, deform, warm_up=0), deform.deform
+        adapter, field = Deformable3DAdapter(model, deform, warm_up=0, exact_times=True), deform.deform
 
         def draw(camera: Any) -> object:
             return deform.step(model.get_xyz.detach(), camera.fid.expand(len(model.get_xyz), 1))
@@ -107,3 +109,31 @@ def test_without_a_hook_nothing_is_kept(name: str) -> None:
     made.adapter.detach()
     made.draw(made.cameras[0])
     assert not made.adapter._unassigned
+
+
+def test_gsplat_gives_its_own_depth_once() -> None:
+    splats, optimizers, strategy = gsplat.make()
+    adapter, views = GsplatAdapter(splats, optimizers, strategy.initialize_state()), make_views()[:2]
+    drawn = [gsplat.render(splats, view) for view in views]
+    images = torch.stack([torch.cat([image.color, image.depth_sum[..., None]], -1) for image in drawn])
+    shown = adapter.rendered(views, images[..., -1], torch.stack([image.alpha for image in drawn]))
+    for view, image in zip(shown, drawn, strict=True):
+        depth_sum, alpha = adapter.rendered_depth(view)
+        assert torch.equal(depth_sum, image.depth_sum)
+        assert torch.equal(alpha, image.alpha)
+        assert depth_sum.requires_grad
+        assert adapter.rendered_depth(view) is None
+    adapter.rendered(views, images[..., -1], images[..., 0])
+    adapter.rendered(views[:1], images[..., -1], images[..., 0])
+    assert adapter.rendered_depth(views[1]) is None, "renders of an earlier step are out of date"
+
+
+def test_offsets_at_noisy_times_are_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    furnish(tmp_path, monkeypatch)
+    made = make("deformable3d")
+    made.adapter.exact_times = False
+    for step, evaluations in ((1, 2), (20_000, 1)):
+        made.calls.clear()
+        made.draw(made.cameras[0])
+        made.d2.loss(step, made.cameras[0])
+        assert len(made.calls) == evaluations
