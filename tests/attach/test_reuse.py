@@ -115,16 +115,16 @@ def test_gsplat_gives_its_own_depth_once() -> None:
     splats, optimizers, strategy = gsplat.make()
     adapter, views = GsplatAdapter(splats, optimizers, strategy.initialize_state()), make_views()[:2]
     drawn = [gsplat.render(splats, view) for view in views]
-    images = torch.stack([torch.cat([image.color, image.depth_sum[..., None]], -1) for image in drawn])
-    shown = adapter.rendered(views, images[..., -1], torch.stack([image.alpha for image in drawn]))
+    depths = torch.stack([image.depth_sum for image in drawn])
+    shown = adapter.rendered(views, depths, depths / 3)
     for view, image in zip(shown, drawn, strict=True):
         depth_sum, alpha = adapter.rendered_depth(view)
         assert torch.equal(depth_sum, image.depth_sum)
-        assert torch.equal(alpha, image.alpha)
+        assert torch.equal(alpha, image.depth_sum / 3)
         assert depth_sum.requires_grad
         assert adapter.rendered_depth(view) is None
-    adapter.rendered(views, images[..., -1], images[..., 0])
-    adapter.rendered(views[:1], images[..., -1], images[..., 0])
+    adapter.rendered(views, depths, depths)
+    adapter.rendered(views[:1], depths, depths)
     assert adapter.rendered_depth(views[1]) is None, "renders of an earlier step are out of date"
 
 
