@@ -18,7 +18,6 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils.hooks import RemovableHandle
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
@@ -40,9 +39,6 @@ from .shared import (
 )
 
 log = logging.getLogger(__name__)
-
-MOST_VIEWS = 64
-"""Evaluations of a deformation that are kept at a time: those of the largest batch."""
 
 Report = Callable[[], Tensor]
 """The index of a change, once it is done."""
@@ -87,8 +83,8 @@ class InriaAdapter(Resizing, ABC):
         self._key = key
         self._renders: Renders[Mapping[str, Any]] = Renders()
         self._evaluations: Renders[tuple[Tensor, ...]] = Renders()
-        self._unassigned: deque[tuple[Tensor, ...]] = deque(maxlen=MOST_VIEWS)
-        self._watched: RemovableHandle | None = None
+        self._unassigned: deque[tuple[Tensor, ...]] = deque(maxlen=64)  # of one batch
+        self._watched: Any = None
         self._asking = False
         self._step = 0
         self._overridden: dict[str, Any] = {}
@@ -196,9 +192,7 @@ class InriaAdapter(Resizing, ABC):
         return package["depth"].reshape(view.height, view.width), package["alpha"].reshape(view.height, view.width)
 
     def _keep_evaluations(self, field: Any) -> None:
-        """From now on keep what the trainer's deformation field returns when it draws a view, with its graph.
-
-        D2's depth of that view then needs no second evaluation, forward or backward."""
+        """Keep what the trainer's field returns when it draws a view, with its graph: D2's depth of it uses that."""
 
         def keep(_: Any, __: Any, result: tuple[Tensor, ...]) -> None:
             if torch.is_grad_enabled() and not self._asking:
@@ -209,14 +203,11 @@ class InriaAdapter(Resizing, ABC):
 
     def _evaluated(self, view: View, field: Callable[..., Any], *inputs: Any) -> Any:
         """What the trainer's own evaluation for this view returned in the present step, else ours of `field`."""
-        if torch.is_grad_enabled():
-            if self._unassigned:  # more evaluations than views: which is whose is not known
-                self._unassigned.clear()
-                self._evaluations.forget()
-            known = self._evaluations.take(view)
-            if known is not None and len(known[0]) == len(self):
-                return known
-        return self._own(field, *inputs)
+        if self._unassigned:  # more evaluations than views: which is whose is not known
+            self._unassigned.clear()
+            self._evaluations.forget()
+        known = self._evaluations.take(view) if torch.is_grad_enabled() else None
+        return known if known is not None and len(known[0]) == len(self) else self._own(field, *inputs)
 
     def _own(self, field: Callable[..., Any], *inputs: Any) -> Any:
         """An evaluation of the field that is not the trainer's."""

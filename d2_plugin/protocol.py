@@ -226,7 +226,7 @@ class Backbone(Protocol):
     ``image_name(camera) -> str | None``
         path of the image of a trainer's camera; priors of an exported recording are found by it.
     ``prior_key(camera) -> (camera, frame)``
-        the key of the prior of a trainer's camera, where it is cheaper than its whole view.
+        the key of the prior of a trainer's camera, without its view: what comes next is read ahead by it.
     ``active(step) -> bool``
         False while the hooks must wait (stages, warm-up); changes nothing.
     ``colors(view, splats) -> Tensor``

@@ -117,7 +117,9 @@ class GsplatSession(Session):
         """The views with D2's term; depth is drawn beside the colours, so that D2 need not draw it again."""
         means = arguments[0] if arguments else named["means"]
         training = self.hooks is not None and torch.is_grad_enabled() and means.requires_grad
-        deeper = training and named.get("render_mode", "RGB") == "RGB" and self._depth_is_due()
+        depth_loss = None if self.hooks is None else self.hooks.hooks.get("depth_loss")
+        due = depth_loss is not None and depth_loss.window.due(self._iteration + 1)
+        deeper = training and due and named.get("render_mode", "RGB") == "RGB"
         image, *rest = rasterization(*arguments, **(named | {"render_mode": "RGB+D"} if deeper else named))
         if self.hooks is None or not training:
             return image, *rest
@@ -129,11 +131,6 @@ class GsplatSession(Session):
             image = image[..., :-1]
         term = self._term(self.hooks, items)
         return image if term is None else AddGradient.apply(image, term, 1.0), *rest
-
-    def _depth_is_due(self) -> bool:
-        """Whether the depth loss is added in the step that is drawn."""
-        hook = None if self.hooks is None else self.hooks.hooks.get("depth_loss")
-        return hook is not None and hook.window.due(self._iteration + 1)
 
 
 def wrap_attribute(owner: Any, name: str, around: Callable[..., Any]) -> None:

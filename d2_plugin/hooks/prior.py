@@ -96,16 +96,12 @@ class KnownMaps(NamedTuple):
     """How many pixels are `FAR`."""
 
     @classmethod
-    def of(cls, prior: DepthPrior) -> KnownMaps:
-        """The maps of a prior; waits for its device to count."""
-        kind = prior.trusted if prior.sigma is None else prior.support & torch.isfinite(prior.sigma)
-        return cls.of_kinds(kind.byte() * NEAR + prior.far.byte() * FAR, prior.depth, prior.sigma)
-
-    @classmethod
-    def of_kinds(cls, kind: Tensor, depth: Tensor, sigma: Tensor | None) -> KnownMaps:
-        """The maps with the counts of `kind`; waits for its device."""
+    def of(cls, prior: DepthPrior, unknown: float = math.inf) -> KnownMaps:
+        """The maps of a prior whose sigma is `unknown` where nothing is; waits for its device to count."""
+        known = prior.trusted if prior.sigma is None else prior.support & (prior.sigma < unknown)
+        kind = known.byte() * NEAR + prior.far.byte() * FAR
         near, far = (int(torch.count_nonzero(kind == which)) for which in (NEAR, FAR))
-        return cls(kind, depth, sigma, near, far)
+        return cls(kind, prior.depth, prior.sigma, near, far)
 
 
 class CameraCheck:
@@ -168,55 +164,45 @@ class CameraCheck:
 class Kept(NamedTuple):
     """One prior as it is kept in memory: as it is stored, or as a store of the user's own returned it."""
 
-    maps: DepthPrior | CodedPrior
+    maps: CodedPrior
     known: KnownMaps
     """Its depth and sigma are those of `maps`, codes where these are."""
 
     @classmethod
-    def of(cls, read: DepthPrior | CodedPrior, belief: Belief, pin: bool) -> Kept:
+    def of(cls, read: CodedPrior, belief: Belief, pin: bool) -> Kept:
         """What of a prior may be used; in memory that a GPU copies from without a wait, where `pin` is set."""
-        coded = isinstance(read, CodedPrior)
-        maps = believed(read.codes if isinstance(read, CodedPrior) else read, belief)
+        maps, coded = believed(read.codes, belief), read.range is not None
         empty = torch.zeros_like(maps.far) if coded else ~(torch.isfinite(maps.depth) & (maps.depth > 0))
         if bool(maps.far.any()):
             empty |= _outline(maps.far)
         maps = maps._replace(labels=maps.labels.masked_fill(empty, int(Label.EMPTY)))
-        certain = maps.trusted if maps.sigma is None else maps.support
-        if maps.sigma is not None:
-            certain = certain & (maps.sigma != UNKNOWN if coded else maps.sigma.isfinite())
-        kind = certain.byte() * NEAR + maps.far.byte() * FAR
-        if pin:
-            maps = DepthPrior._make(part if part is None or part.is_cuda else part.pin_memory() for part in maps)
-            kind = kind if kind.is_cuda else kind.pin_memory()
-        known = KnownMaps.of_kinds(kind, maps.depth, maps.sigma)
-        return cls(read._replace(codes=maps) if isinstance(read, CodedPrior) else maps, known)
+        if pin and not maps.depth.is_cuda:
+            maps = DepthPrior._make(part if part is None else part.pin_memory() for part in maps)
+        known = KnownMaps.of(maps, UNKNOWN if coded else math.inf)
+        kind = known.kind.pin_memory() if pin and not known.kind.is_cuda else known.kind
+        return cls(read._replace(codes=maps), known._replace(kind=kind))
 
     @property
     def bytes(self) -> int:
         """What it takes."""
-        maps = self.maps.codes if isinstance(self.maps, CodedPrior) else self.maps
-        return sum(part.numel() * part.element_size() for part in (*maps, self.known.kind) if part is not None)
+        parts = [part for part in (*self.maps.codes, self.known.kind) if part is not None]
+        return sum(part.numel() * part.element_size() for part in parts)
 
     def prior(self, device: torch.device) -> DepthPrior:
         """All maps on a device. Pixels judge Gaussians where sigma is small, whatever their label."""
-        prior = self._decoded(self.maps.codes if isinstance(self.maps, CodedPrior) else self.maps, device)
+        prior = self._decoded(self.maps.codes, device)
         if prior.sigma is None or prior.reliability is not None:
             return prior
         return prior._replace(reliability=(prior.support & (prior.sigma <= JUDGES)).to(prior.depth))
 
     def known_on(self, device: torch.device) -> KnownMaps:
         """What the depth loss reads: 4 bytes a pixel are copied where depth and sigma are codes."""
-        known = self.known
-        moved = self._decoded(DepthPrior(known.depth, known.kind, sigma=known.sigma), device)
-        return known._replace(kind=moved.labels, depth=moved.depth, sigma=moved.sigma)
-
-    def depths(self) -> Tensor:
-        """Every fourth depth of every fourth row."""
-        return self._decoded(DepthPrior(self.known.depth[::4, ::4], self.known.kind), self.known.kind.device).depth
+        moved = self._decoded(DepthPrior(self.known.depth, self.known.kind, sigma=self.known.sigma), device)
+        return self.known._replace(kind=moved.labels, depth=moved.depth, sigma=moved.sigma)
 
     def _decoded(self, maps: DepthPrior, device: torch.device) -> DepthPrior:
         moved = DepthPrior._make(None if part is None else part.to(device, non_blocking=True) for part in maps)
-        return self.maps._replace(codes=moved).decoded() if isinstance(self.maps, CodedPrior) else moved
+        return self.maps._replace(codes=moved).decoded()
 
 
 class PriorLoader:
@@ -287,7 +273,8 @@ class PriorLoader:
 
     def _read(self, key: Key) -> Kept | None:
         read = getattr(self.store, "coded", self.store.prior)(*key)
-        return None if read is None else Kept.of(read, self.believe, self._pin)
+        coded = CodedPrior(read, None) if isinstance(read, DepthPrior) else read
+        return None if coded is None else Kept.of(coded, self.believe, self._pin)
 
     def _keep(self, key: Key, kept: Kept | None) -> None:
         self._kept[key] = kept
@@ -318,13 +305,13 @@ class PriorLoader:
         describe = getattr(self.store, "camera", None)
         record = describe(view.camera, view.frame) if describe is not None else None
         if record is not None:
-            self._cameras.check(view, record, kept.depths())
+            some = DepthPrior(kept.known.depth[::4, ::4], kept.known.kind)  # a sample says how large the scene is
+            self._cameras.check(view, record, kept.maps._replace(codes=some).decoded().depth)
 
 
 def _outline(far: Tensor) -> Tensor:
-    """The far pixels [H, W] less than `OUTLINE` pixels inside of what is far; the rim of the image is no outline.
-
-    A Gaussian of the surface in front spills over them."""
+    """The far pixels [H, W] less than `OUTLINE` pixels inside of what is far, where a Gaussian of the surface in front
+    spills over them; the rim of the image is no outline."""
     others = (~far).float()[None, None]
     return far & (F.max_pool2d(others, 2 * OUTLINE + 1, stride=1, padding=OUTLINE)[0, 0] > 0)
 

@@ -71,11 +71,12 @@ class CodedPrior(NamedTuple):
     """The maps of one prior as they are stored and as they travel to the trainer's device: 7 bytes per pixel.
 
     `codes` has the fields of a `DepthPrior` [H, W], of which depth (int16, the bits of the uint16 codes) and sigma
-    (uint8) are codes. In single precision decoding adds less than 2e-6 of a depth to the error of its code.
+    (uint8) are codes; with a range of None they are the numbers themselves. In single precision decoding adds less than
+    2e-6 of a depth to the error of its code.
     """
 
     codes: DepthPrior
-    range: DepthRange
+    range: DepthRange | None
 
     @classmethod
     def of(cls, stored: np.ndarray, depth_range: DepthRange) -> CodedPrior:
@@ -89,6 +90,8 @@ class CodedPrior(NamedTuple):
 
     def decoded(self) -> DepthPrior:
         """Depth and sigma as numbers, on the device where the codes are."""
+        if self.range is None:
+            return self.codes
         depth, sigma = self.codes.depth.int() & 0xFFFF, self.codes.sigma
         step = np.log(self.range.far / self.range.near) / CODES
         depth = torch.where(depth > 0, self.range.near * torch.exp((depth - 1) * float(step)), 0.0)

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import make_views
+from tiny import ALL_HOOKS, make_adapter, make_model, make_views
 
+from d2_plugin import D2Hooks
 from d2_plugin.hooks.prior import JUDGES, KnownMaps, PriorLoader
 from d2_plugin.protocol import DepthPrior, Label, View
 from d2_plugin.store.maps import FusedPrior
@@ -123,3 +124,13 @@ def test_an_array_that_was_intact_is_not_checked_again(store: PriorStore, monkey
     for _ in range(3):
         store.coded("cam0", 0)
     assert len(checks) == 1
+
+
+def test_d2_reads_ahead_what_a_trainer_says_comes_next(store: PriorStore) -> None:
+    plain = Plain(store)
+    d2 = D2Hooks(ALL_HOOKS, make_adapter(make_model()), plain)
+    d2.prefetch([view_of(1)])  # not before the first view
+    d2.loss(1, view_of(0))
+    d2.prefetch([view_of(1), "a camera that nobody knows"])
+    d2.loss(2, view_of(1))
+    assert plain.reads == [(0, True), (1, False)]
