@@ -57,8 +57,7 @@ class Renders(Generic[Render]):
 
 
 def once_per_camera(name: str, ask: Callable[[Any], Answer]) -> Callable[[Any], Answer]:
-    """`ask` of a camera object, whose answer is kept as long as its tensor `name` is the same: if that lies on a GPU,
-    every question waits for it."""
+    """`ask` of a camera object, asked again if its tensor `name` changed: each question may wait for a GPU."""
     answers: WeakKeyDictionary[Any, tuple[Tensor, int, Answer]] = WeakKeyDictionary()
 
     def asked(camera: Any) -> Answer:
@@ -81,10 +80,8 @@ def optional(owner: Any, name: str, default: Any = None) -> Any:
 
 def on_device(view: View, like: Tensor) -> View:
     """The view with its matrices where the Gaussians are."""
-    if view.K.device == like.device and view.T_camera_world.device == like.device:
-        return view
     pose, K = (matrix.to(like, non_blocking=True) for matrix in (view.T_camera_world, view.K))
-    return replace(view, T_camera_world=pose, K=K)
+    return view if pose is view.T_camera_world and K is view.K else replace(view, T_camera_world=pose, K=K)
 
 
 def finite(points: Points) -> Points:

@@ -73,8 +73,7 @@ def reference_slice(
 
 
 def rows_to_draw(alive: Tensor) -> Tensor:
-    """Rows [M] where `alive` [N] is True; all N on a GPU, where the host would wait to learn how many: there the caller
-    makes the others' opacity 0."""
+    """Rows [M] where `alive` is True; all N on a GPU, since M would be waited for: others get an opacity of 0 there."""
     return torch.arange(len(alive), device=alive.device) if alive.is_cuda else torch.nonzero(alive).squeeze(-1)
 
 
