@@ -62,7 +62,7 @@ def once_per_camera(name: str, ask: Callable[[Any], Answer]) -> Callable[[Any], 
 
     def asked(camera: Any) -> Answer:
         tensor = getattr(camera, name)
-        if not isinstance(tensor, Tensor) or not isinstance(camera, Hashable):
+        if not (isinstance(tensor, Tensor) and isinstance(camera, Hashable) and hasattr(camera, "__weakref__")):
             return ask(camera)
         known = answers.get(camera)
         if known is None or known[0] is not tensor or known[1] != tensor._version:

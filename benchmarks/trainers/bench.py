@@ -16,11 +16,10 @@ from typing import Annotated
 from benchmarks.trainers.page import read_rows, replaced, table
 from benchmarks.trainers.prepare import Source, prepare
 from benchmarks.trainers.trial_run import METHODS, Row, trial_row
-from benchmarks.trainers.trials import TRIALS, Trial
+from benchmarks.trainers.trials import TRIALS
 from d2_plugin.durable import append
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import json_text, read_text
-from d2_plugin.recordings import open_recording
 from d2_plugin.runs.rows import circumstances, command_line
 from d2_plugin.settings import Positional, Range, Seed, Settings
 
@@ -88,28 +87,13 @@ def rows_of(name: str, settings: TrainersBench) -> Iterator[Row]:
         raise D2Error("no recording to train on: give --recordings, each with cameras 00 to 07")
     command = command_line("bench trainers", settings)
     for recording in settings.recordings:
-        source = Source(recording.resolve(), settings.frames, fitting_downscale(recording, trial, settings.downscale))
-        prepared = prepare(source, trial, settings.work)
+        prepared = prepare(Source(recording.resolve(), settings.frames, settings.downscale), trial, settings.work)
         for seed in settings.seeds:
             for method in settings.methods:
                 folder = settings.work / "runs" / f"{name}-{recording.name}-{method.replace(' ', '-')}-{seed}"
                 checkout = settings.checkouts / trial.folder
                 row = trial_row(name, trial, checkout, prepared, folder, method, settings.iterations, seed)
                 yield row | circumstances() | {"command": command}
-
-
-def fitting_downscale(recording: Path, trial: Trial, downscale: int) -> int:
-    """`downscale`, or the largest below it at which the trainer's report can be measured."""
-    sides = [min(camera.width, camera.height) for camera in open_recording(recording).cameras.values()]
-    fitting = [factor for factor in range(1, downscale + 1) if min(sides) // factor >= trial.least_side]
-    if not fitting:
-        raise D2Error(
-            f"{recording} has images of {min(sides)} pixels along a side, and the report of {trial.folder} needs "
-            f"{trial.least_side}: leave it out with --only, or give a larger recording"
-        )
-    if fitting[-1] != downscale:
-        log.info("%s is made %d times smaller, not %d times: see Trial.least_side", recording, fitting[-1], downscale)
-    return fitting[-1]
 
 
 def _sentence(row: Row) -> str:
