@@ -114,23 +114,13 @@ class GsplatSession(Session):
         return result
 
     def _drawing(self, rasterization: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-        """The views with D2's term; depth is drawn beside the colours, so that D2 need not draw it again."""
-        means = arguments[0] if arguments else named["means"]
-        training = self.hooks is not None and torch.is_grad_enabled() and means.requires_grad
-        depth_loss = None if self.hooks is None else self.hooks.hooks.get("depth_loss")
-        due = depth_loss is not None and depth_loss.window.due(self._iteration + 1)
-        deeper = training and due and named.get("render_mode", "RGB") == "RGB"
-        image, *rest = rasterization(*arguments, **(named | {"render_mode": "RGB+D"} if deeper else named))
-        if self.hooks is None or not training:
-            return image, *rest
+        drawn = rasterization(*arguments, **named)
+        if self.hooks is None or not (torch.is_grad_enabled() and drawn[0].requires_grad):
+            return drawn
         size = {"width": named["width"], "height": named["height"]}
         poses = torch.linalg.inv_ex(named["viewmats"].detach()).inverse
-        items: list[Any] = [{"camtoworld": pose, "K": K, **size} for pose, K in zip(poses, named["Ks"])]
-        if deeper:
-            items = self.hooks.backbone.rendered(items, image[..., -1], rest[0][..., 0])  # type: ignore[attr-defined]
-            image = image[..., :-1]
-        term = self._term(self.hooks, items)
-        return image if term is None else AddGradient.apply(image, term, 1.0), *rest
+        term = self._term(self.hooks, [{"camtoworld": pose, "K": K, **size} for pose, K in zip(poses, named["Ks"])])
+        return drawn if term is None else (AddGradient.apply(drawn[0], term, 1.0), *drawn[1:])
 
 
 def wrap_attribute(owner: Any, name: str, around: Callable[..., Any]) -> None:
