@@ -29,8 +29,8 @@ def inria_view(camera: Any, key: PriorKey, time: float, like: Tensor) -> View:
         camera=key.camera,
         frame=key.frame,
         time=time,
-        T_camera_world=pose.to(like).contiguous(),
-        K=intrinsics(camera, width, height).to(like),
+        T_camera_world=pose.to(like, non_blocking=True).contiguous(),
+        K=intrinsics(camera, width, height).to(like, non_blocking=True),
         width=width,
         height=height,
     )
@@ -39,13 +39,16 @@ def inria_view(camera: Any, key: PriorKey, time: float, like: Tensor) -> View:
 def intrinsics(camera: Any, width: int, height: int) -> Tensor:
     """K [3, 3] float64 in pixels, with pixel centres at i + 0.5, as the trainer's rasterizer has it.
 
-    From the projection P (clip = P camera, w = z): f_x = P_00 W / 2 and c_x = (P_02 + 1) W / 2, rows alike.
+    From the projection P (clip = P camera, w = z): f_x = P_00 W / 2 and c_x = (P_02 + 1) W / 2, rows alike. It is made
+    where P is, so that nothing waits for a GPU.
     """
-    half = torch.tensor([width / 2, height / 2], dtype=torch.float64)
     projection = optional(camera, "projection_matrix")
     if projection is not None:
-        P = projection.detach().T.double().cpu()
-        focal, centre = P.diagonal()[:2] * half, (P[:2, 2] + 1) * half
+        P = projection.detach().T.double()
+        K = torch.eye(3, dtype=torch.float64, device=P.device)
+        for row, half in enumerate((width / 2, height / 2)):
+            K[row, row] = P[row, row] * half
+            K[row, 2] = (P[row, 2] + 1) * half
     else:
         angles = float(camera.FoVx), float(camera.FoVy)
         if min(angles) <= 0:
@@ -53,10 +56,9 @@ def intrinsics(camera: Any, width: int, height: int) -> Tensor:
                 f"camera '{camera.image_name}' has fields of view {angles[0]:g}, {angles[1]:g} and no projection "
                 "matrix: give it one of the two"
             )
-        focal, centre = half / torch.tensor([math.tan(angle / 2) for angle in angles], dtype=torch.float64), half
-    K = torch.eye(3, dtype=torch.float64)
-    K[0, 0], K[1, 1] = focal
-    K[:2, 2] = centre
+        focal_x, focal_y = (size / 2 / math.tan(angle / 2) for size, angle in zip((width, height), angles))
+        rows = [[focal_x, 0, width / 2], [0, focal_y, height / 2], [0, 0, 1]]
+        K = torch.tensor(rows, dtype=torch.float64)
     return K
 
 

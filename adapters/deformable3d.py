@@ -14,14 +14,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.protocol import Points, Splats, View
+from d2_plugin.protocol import Points, ResizeListener, Splats, View
 
 from .inria import InriaAdapter
 from .inverse_deformation import Inversion, invert_at_times
 from .keys import KeyOf
-from .shared import optional, splats_of
+from .shared import once_per_camera, optional, splats_of
 
 log = logging.getLogger(__name__)
+
+NOISE_ENDS = 20_000
+"""Iteration at which the noise of times has died down (train.py:53). Before, it grows to a tenth of the clip for the
+last views of a round, since it is divided by how many are left."""
 
 
 class Deformable3DAdapter(InriaAdapter):
@@ -38,6 +42,8 @@ class Deformable3DAdapter(InriaAdapter):
         warm_up: iteration from which the field is used (opt.warm_up).
         in_warm_up: whether hooks run before it. The trainer's own reports are drawn with the untrained field until
             then, which widens every Gaussian by about .04 units and hides what hooks gain (docs/results/attach.md).
+        exact_times: whether training adds no noise to times, as where `dataset.is_blender`: the depth loss then uses
+            the offsets that the trainer evaluated for its own render. From iteration 20,000 on it does so anywhere.
         key: finds the prior of a camera; needed where the image's name does not say camera and frame
         (poses_bounds.npy with images 0000.png).
     """
@@ -49,14 +55,17 @@ class Deformable3DAdapter(InriaAdapter):
         *,
         warm_up: int = 3000,
         in_warm_up: bool = True,
+        exact_times: bool = False,
         key: KeyOf | None = None,
     ) -> None:
         super().__init__(gaussians, key)
         self.deform, self.warm_up, self.in_warm_up = deform, warm_up, in_warm_up
+        self.exact_times = exact_times
         if warm_up > 1 and not in_warm_up:
             log.info("the trainer uses its field from iteration %d on: hooks wait until then", warm_up)
         self.is_6dof = bool(optional(deform.deform, "is_6dof", False))
         self.inversion: Inversion | None = None
+        self._fid = once_per_camera("fid", lambda camera: float(camera.fid))
 
     def trained(self) -> dict[str, Tensor]:
         """See `InriaAdapter.trained`; the network has an optimizer of its own."""
@@ -78,11 +87,18 @@ class Deformable3DAdapter(InriaAdapter):
         opacities = torch.sigmoid(model._opacity.squeeze(-1))
         means, scales, rotations = model._xyz, model._scaling.exp(), torch.nn.functional.normalize(model._rotation)
         if self.deforms:
-            motion, rotation, scaling = self._field(model._xyz.detach(), view.time)
+            inputs = self._offsets, model._xyz.detach(), view.time
+            exact = self.exact_times or self._step >= NOISE_ENDS
+            motion, rotation, scaling = self._evaluated(view, *inputs) if exact else self._own(*inputs)
             means, scales, rotations = self._moved(means, motion), scales + scaling, rotations + rotation
         return splats_of(means, scales, rotations, opacities)
 
-    def _field(self, positions: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
+    def on_resize(self, listener: ResizeListener) -> None:
+        """Register a listener; D2Hooks does so only where a hook is on."""
+        super().on_resize(listener)
+        self._keep_evaluations(self.deform.deform)
+
+    def _offsets(self, positions: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
         return self.deform.step(positions, positions.new_full((len(positions), 1), time))
 
     def _moved(self, positions: Tensor, motion: Tensor) -> Tensor:
@@ -92,7 +108,7 @@ class Deformable3DAdapter(InriaAdapter):
 
     def _time(self, camera: Any) -> float:
         """`fid`, a tensor of one number."""
-        return float(camera.fid)
+        return self._fid(camera)
 
     def _append(self, points: Points) -> None:
         """Canonical Gaussians that the field moves onto the points at the points' times; they exist at all times."""
@@ -104,4 +120,4 @@ class Deformable3DAdapter(InriaAdapter):
     def _deformed(self, positions: Tensor, time: float) -> Tensor:
         if not len(positions):
             return positions
-        return self._moved(positions, self._field(positions, time)[0])
+        return self._moved(positions, self._own(self._offsets, positions, time)[0])

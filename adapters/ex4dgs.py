@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from d2_plugin.gaussians.slicing import rows_to_draw
 from d2_plugin.protocol import Points, Splats, View
 
 from .inria import InriaAdapter
@@ -74,11 +75,15 @@ class Ex4DGSAdapter(InriaAdapter):
         model, time = self.gaussians, view.time
         means = model.get_xyz_at_t(time)
         camera = means @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
-        rows = torch.nonzero(self._in_frustum(camera.detach(), view)).squeeze(-1)
+        inside = self._in_frustum(camera.detach(), view)
+        rows = rows_to_draw(inside)
+        if camera.is_cuda:
+            camera = torch.where(inside[:, None], camera, 1.0)  # in front, where nothing is divided by 0
         scales, rotations = model.get_scaling()[rows], model.get_rotation_at_t(time)[rows]
         splats = splats_of(means[rows], scales, rotations, model.get_opacity_at_t(time)[rows, 0], rows)
         compensation = self._compensation(camera[rows], splats.covariances, view)
-        return splats._replace(opacities=splats.opacities * compensation)
+        opacities = splats.opacities * compensation
+        return splats._replace(opacities=torch.where(inside, opacities, 0.0) if camera.is_cuda else opacities)
 
     def _harmonics(self) -> Tensor:
         model = self.gaussians
@@ -89,8 +94,9 @@ class Ex4DGSAdapter(InriaAdapter):
         """Which centres [N, 3] in camera axes the rasterizer draws."""
         z = camera[:, 2]
         pixels = camera @ view.K.T[:, :2] / z[:, None].clamp_min(SMALL)
-        half = pixels.new_tensor([view.width / 2, view.height / 2])
-        return (z > self.settings.near) & (z <= self.far) & ((pixels / half - 1).abs() <= FRUSTUM).all(-1)
+        columns, rows = (2 * pixels[:, axis] / size - 1 for axis, size in enumerate((view.width, view.height)))
+        within = (columns.abs() <= FRUSTUM) & (rows.abs() <= FRUSTUM)
+        return (z > self.settings.near) & (z <= self.far) & within
 
     def _compensation(self, camera: Tensor, covariances: Tensor, view: View) -> Tensor:
         """sqrt(det C / det (C + blur)) of the projected covariances C, [M], with the rasterizer's guards."""
@@ -98,9 +104,10 @@ class Ex4DGSAdapter(InriaAdapter):
         fx, fy = view.K[0, 0], view.K[1, 1]
         zero = torch.zeros_like(z)
         J = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], -1).view(-1, 2, 3)
-        i = covariances.new_tensor([0, 1, 2, 1, 3, 4, 2, 4, 5], dtype=torch.long)
+        xx, xy, xz, yy, yz, zz = covariances.unbind(-1)
+        full = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).view(-1, 3, 3)
         A = J @ view.T_camera_world[:3, :3]
-        C = A @ covariances[:, i].view(-1, 3, 3) @ A.transpose(1, 2)
+        C = A @ full @ A.transpose(1, 2)
         a, b, c = C[:, 0, 0], C[:, 0, 1], C[:, 1, 1]
         blur = self.settings.blur
         sharp = a * c - b * b

@@ -12,8 +12,7 @@ so a column of row numbers in there shows afterwards what became of each row.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, MutableMapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from typing import Any
 
 import torch
@@ -25,11 +24,13 @@ from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from .keys import ViewsByPose
 from .shared import (
+    Renders,
     Resizing,
     appended,
     constant_harmonics,
     finite,
     identities,
+    on_device,
     replaced,
     seen_colors,
     splats_of,
@@ -87,6 +88,7 @@ class GsplatAdapter(Resizing):
         self.settings = settings
         self._view = view if parser is None else ViewsByPose(parser)
         self._slice, self._new_rows, self.scene = slice_at, new_rows, scene
+        self._renders: Renders[tuple[Tensor, Tensor]] = Renders()
         self._known = 0
         self._renumber()
 
@@ -98,13 +100,27 @@ class GsplatAdapter(Resizing):
     def view(self, camera: object) -> View:
         """The view of the trainer's camera, or a `View` as it is."""
         if isinstance(camera, View):
-            return camera
+            return on_device(camera, self.parameters["means"])
         if self._view is None:
             raise D2Error(
                 f"a camera of type {type(camera).__name__} is no View: pass views, or give the adapter `view`"
             )
-        seen, like = self._view(camera), self.parameters["means"]  # data sets leave their items on the CPU
-        return replace(seen, T_camera_world=seen.T_camera_world.to(like), K=seen.K.to(like))
+        return on_device(self._view(camera), self.parameters["means"])  # data sets leave their items on the CPU
+
+    def rendered(self, cameras: Sequence[object], depth_sums: Tensor, alphas: Tensor) -> list[View]:
+        """Pass these to `D2Hooks.loss` instead of the cameras that were just drawn with `render_mode="RGB+D"`.
+
+        D2 then uses the trainer's own depth, the fourth channel [C, H, W], and alpha [C, H, W], and draws nothing.
+        """
+        self._renders.forget()
+        views = [self.view(camera) for camera in cameras]
+        for view, depth_sum, alpha in zip(views, depth_sums, alphas):
+            self._renders.put(view, (depth_sum, alpha))
+        return views
+
+    def rendered_depth(self, view: View) -> tuple[Tensor, Tensor] | None:
+        """Depth sum and alpha of the trainer's render of this view, or None; hands them out once."""
+        return self._renders.take(view)
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable."""
@@ -202,12 +218,21 @@ class GsplatAdapter(Resizing):
     def _report_changes(self) -> None:
         """Report what the strategy did: a row keeps its number, its copies and new rows are -1."""
         numbers = None if self.state is None else self.state.get(ROWS)
+        if numbers is not None and numbers is self._seen and numbers._version == self._version:
+            return  # the very tensor that was there, and nobody wrote into it: no need to wait for the device
         if numbers is None or len(numbers) != self._count:
             self._report_growth()
         elif len(numbers) != self._known or not torch.equal(numbers, self._numbers()):
             index = _first_occurrences(numbers - 1)
             self._renumber()
             self._report(index)
+        else:
+            self._see(numbers)
+
+    def _see(self, numbers: Tensor) -> None:
+        """Put row numbers into the state that are those of the present rows."""
+        assert self.state is not None
+        self.state[ROWS], self._seen, self._version = numbers, numbers, numbers._version
 
     def _report_growth(self) -> None:
         """Without row numbers: growth means appended rows (gsplat's sample_add); D2Hooks notices shrinking."""
@@ -221,7 +246,7 @@ class GsplatAdapter(Resizing):
     def _renumber(self) -> None:
         self._known = self._count
         if self.state is not None:
-            self.state[ROWS] = self._numbers()
+            self._see(self._numbers())
 
     def _numbers(self) -> Tensor:
         return torch.arange(1, self._count + 1, device=self.parameters["means"].device)
@@ -229,7 +254,8 @@ class GsplatAdapter(Resizing):
 
 def gsplat_view(camera: str, frame: int, time: float, camtoworld: Tensor, K: Tensor, width: int, height: int) -> View:
     """The view of one camera of gsplat's data sets: camtoworld [4, 4] or [1, 4, 4] in OpenCV axes, K likewise."""
-    return View(camera, frame, time, torch.linalg.inv(camtoworld.reshape(4, 4)), K.reshape(3, 3), width, height)
+    pose = torch.linalg.inv_ex(camtoworld.reshape(4, 4)).inverse
+    return View(camera, frame, time, pose, K.reshape(3, 3), width, height)
 
 
 def _first_occurrences(rows: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import unit_quaternions
-from d2_plugin.protocol import Points, Splats, View
+from d2_plugin.protocol import Points, ResizeListener, Splats, View
 
 from .inria import InriaAdapter, RenderedCamera
 from .inverse_deformation import Inversion, invert_at_times
@@ -63,6 +63,11 @@ class Hust4DAdapter(InriaAdapter):
         self.inversion: Inversion | None = None
         self._dataset = optional(optional(scene, "train_camera"), "dataset")
 
+    def on_resize(self, listener: ResizeListener) -> None:
+        """Register a listener; D2Hooks does so only where a hook is on."""
+        super().on_resize(listener)
+        self._keep_evaluations(optional(self.gaussians, "_deformation"))
+
     def enter_stage(self, stage: str) -> None:
         """From now on the model is drawn as in this stage."""
         if stage not in STAGES:
@@ -75,7 +80,9 @@ class Hust4DAdapter(InriaAdapter):
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable in the model's and in the field's parameters."""
-        xyz, log_scales, rotations, logits, _ = self._raw_at(view.time)
+        xyz, log_scales, rotations, logits, _ = (
+            self._evaluated(view, self._raw_at, view.time) if self.stage == "fine" else self._raw_at(view.time)
+        )
         return splats_of(xyz, log_scales.exp(), unit_quaternions(rotations).T, torch.sigmoid(logits.squeeze(-1)))
 
     def colors(self, view: View, splats: Splats) -> Tensor:
@@ -92,7 +99,8 @@ class Hust4DAdapter(InriaAdapter):
 
     def _field(self, raw: tuple[Tensor, ...], time: float) -> tuple[Tensor, ...]:
         """Raw attributes, deformed."""
-        moved: tuple[Tensor, ...] = self.gaussians._deformation(*raw, raw[0].new_full((len(raw[0]), 1), time))
+        times = raw[0].new_full((len(raw[0]), 1), time)
+        moved: tuple[Tensor, ...] = self._own(self.gaussians._deformation, *raw, times)
         return moved
 
     def _time(self, camera: Any) -> float:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,7 +26,17 @@ from d2_plugin.rasterizer import rasterize
 from .cameras import inria_view
 from .keys import KeyOf, PriorKey, key_from_image_name
 from .probe import Probe, probe_package
-from .shared import Renders, Resizing, appended, constant_harmonics, finite, identities, optional, seen_colors
+from .shared import (
+    Renders,
+    Resizing,
+    appended,
+    constant_harmonics,
+    finite,
+    identities,
+    on_device,
+    optional,
+    seen_colors,
+)
 
 log = logging.getLogger(__name__)
 
@@ -71,6 +82,10 @@ class InriaAdapter(Resizing, ABC):
         self.probe: Probe | None = None
         self._key = key
         self._renders: Renders[Mapping[str, Any]] = Renders()
+        self._evaluations: Renders[tuple[Tensor, ...]] = Renders()
+        self._unassigned: deque[tuple[Tensor, ...]] = deque(maxlen=64)  # of one batch
+        self._watched: Any = None
+        self._asking = False
         self._step = 0
         self._overridden: dict[str, Any] = {}
         self._logged: set[str] = set()
@@ -85,7 +100,7 @@ class InriaAdapter(Resizing, ABC):
         if isinstance(camera, RenderedCamera):
             camera, package = camera.camera, camera.package
         if isinstance(camera, View):
-            return camera
+            return on_device(camera, self.gaussians._xyz)
         if not hasattr(camera, "world_view_transform"):
             raise D2Error(
                 f"a camera of type {type(camera).__name__} has no world_view_transform: pass the trainer's own camera "
@@ -94,7 +109,13 @@ class InriaAdapter(Resizing, ABC):
         view = inria_view(camera, self._key_of(camera), self._time(camera), self.gaussians._xyz)
         if package is not None:
             self._renders.put(view, package)
+        if self._unassigned:  # views are asked for in the order in which they were drawn
+            self._evaluations.put(view, self._unassigned.popleft())
         return view
+
+    def prior_key(self, camera: Any) -> PriorKey:
+        """Camera and frame of the prior of a camera object."""
+        return PriorKey(camera.camera, camera.frame) if isinstance(camera, View) else self._key_of(camera)
 
     def image_name(self, camera: Any) -> str | None:
         """Path of the image that a camera shows, where its object says it: an export's names are found by it."""
@@ -107,6 +128,7 @@ class InriaAdapter(Resizing, ABC):
         """Note the training step; renders of earlier steps are out of date and forgotten."""
         if step != self._step:
             self._renders.forget()
+            self._evaluations.forget()
         self._step = step
 
     @abstractmethod
@@ -169,6 +191,32 @@ class InriaAdapter(Resizing, ABC):
             return None
         return package["depth"].reshape(view.height, view.width), package["alpha"].reshape(view.height, view.width)
 
+    def _keep_evaluations(self, field: Any) -> None:
+        """Keep what the trainer's field returns when it draws a view, with its graph: D2's depth of it uses that."""
+
+        def keep(_: Any, __: Any, result: tuple[Tensor, ...]) -> None:
+            if torch.is_grad_enabled() and not self._asking:
+                self._unassigned.append(result)
+
+        if self._watched is None and isinstance(field, torch.nn.Module):
+            self._watched = field.register_forward_hook(keep)
+
+    def _evaluated(self, view: View, field: Callable[..., Any], *inputs: Any) -> Any:
+        """What the trainer's own evaluation for this view returned in the present step, else ours of `field`."""
+        if self._unassigned:  # more evaluations than views: which is whose is not known
+            self._unassigned.clear()
+            self._evaluations.forget()
+        known = self._evaluations.take(view) if torch.is_grad_enabled() else None
+        return known if known is not None and len(known[0]) == len(self) else self._own(field, *inputs)
+
+    def _own(self, field: Callable[..., Any], *inputs: Any) -> Any:
+        """An evaluation of the field that is not the trainer's."""
+        self._asking = True
+        try:
+            return field(*inputs)
+        finally:
+            self._asking = False
+
     def _log_once(self, sentence: str) -> None:
         if sentence not in self._logged:
             self._logged.add(sentence)
@@ -183,6 +231,8 @@ class InriaAdapter(Resizing, ABC):
                 setattr(self.gaussians, name, earlier)
         self._overridden.clear()
         self._listeners.clear()
+        if self._watched is not None:
+            self._watched.remove()
 
     @abstractmethod
     def _append(self, points: Points) -> None:

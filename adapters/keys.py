@@ -18,6 +18,8 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import View
 
+from .shared import once_per_camera
+
 
 class PriorKey(NamedTuple):
     """The name of a camera and the number of a frame, as the prior store has them."""
@@ -106,9 +108,13 @@ class KeysByPose:
     def __init__(self, cameras: Mapping[str, Tensor], frame: Callable[[Any], int], tolerance: float = 1e-3) -> None:
         self.names, self.poses = list(cameras), torch.stack([torch.as_tensor(pose) for pose in cameras.values()])
         self.frame, self.tolerance = frame, tolerance
+        self._key = once_per_camera("world_view_transform", self._nearest)
 
     def __call__(self, camera: Any) -> PriorKey:
         """The key of a camera object of the Inria family."""
+        return self._key(camera)
+
+    def _nearest(self, camera: Any) -> PriorKey:
         pose = camera.world_view_transform.detach().T
         distances = _distances(self.poses, pose)
         nearest = int(distances.argmin())
@@ -121,9 +127,9 @@ class KeysByPose:
 
 
 def _distances(poses: Tensor, pose: Tensor) -> Tensor:
-    """How far poses [P, 4, 4] lie from one, in the world's unit per unit of distance, [P]."""
-    scale = max(1.0, float(pose.abs().max()))
-    return (poses.double().cpu() - pose.double().cpu()).abs().flatten(1).amax(1) / scale
+    """How far poses [P, 4, 4] lie from one, in the world's unit per unit of distance, [P]; on the CPU."""
+    pose = pose.cpu().double()
+    return (poses.double().cpu() - pose).abs().flatten(1).amax(1) / max(1.0, float(pose.abs().max()))
 
 
 class ViewsByPose:
@@ -156,4 +162,4 @@ class ViewsByPose:
                 "it one instant of the recording (`d2 export-recording --format gsplat`), and no pose_opt or pose_noise"
             )
         key = self.keys[int(near)]
-        return View(key.camera, key.frame, 0.0, torch.linalg.inv(pose), K, int(width), int(height))
+        return View(key.camera, key.frame, 0.0, torch.linalg.inv_ex(pose).inverse, K, int(width), int(height))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
+from dataclasses import replace
 from typing import Any, Generic, TypeVar
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -13,6 +16,7 @@ from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Points, ResizeListener, Splats, View
 
 Render = TypeVar("Render")
+Answer = TypeVar("Answer")
 
 
 class Resizing:
@@ -52,10 +56,32 @@ class Renders(Generic[Render]):
         self._by_key.clear()
 
 
+def once_per_camera(name: str, ask: Callable[[Any], Answer]) -> Callable[[Any], Answer]:
+    """`ask` of a camera object, asked again if its tensor `name` changed: each question may wait for a GPU."""
+    answers: WeakKeyDictionary[Any, tuple[Tensor, int, Answer]] = WeakKeyDictionary()
+
+    def asked(camera: Any) -> Answer:
+        tensor = getattr(camera, name)
+        if not (isinstance(tensor, Tensor) and isinstance(camera, Hashable) and hasattr(camera, "__weakref__")):
+            return ask(camera)
+        known = answers.get(camera)
+        if known is None or known[0] is not tensor or known[1] != tensor._version:
+            known = answers[camera] = tensor, tensor._version, ask(camera)
+        return known[2]
+
+    return asked
+
+
 def optional(owner: Any, name: str, default: Any = None) -> Any:
     """An attribute that some versions of a repository lack or leave at None; `default` there."""
     value = getattr(owner, name, None)
     return default if value is None else value
+
+
+def on_device(view: View, like: Tensor) -> View:
+    """The view with its matrices where the Gaussians are."""
+    pose, K = (matrix.to(like, non_blocking=True) for matrix in (view.T_camera_world, view.K))
+    return view if pose is view.T_camera_world and K is view.K else replace(view, T_camera_world=pose, K=K)
 
 
 def finite(points: Points) -> Points:

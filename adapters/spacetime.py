@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from d2_plugin.gaussians.rotation4d import unit_quaternions
+from d2_plugin.gaussians.slicing import rows_to_draw
 from d2_plugin.protocol import Points, Splats, View
 
 from .inria import InriaAdapter
@@ -57,7 +58,7 @@ class SpacetimeAdapter(InriaAdapter):
         model = self.gaussians
         with torch.no_grad():
             faint = self._opacities(view.time, torch.arange(len(self), device=model._xyz.device))
-            rows = torch.nonzero(faint >= self.settings.alpha_min).squeeze(-1)
+            rows = rows_to_draw(faint >= self.settings.alpha_min)  # the rasterizer leaves out the faint itself
         since = (view.time - model._trbf_center[rows]).detach()
         first, second, third = model._motion[rows].split(3, 1)
         means = model._xyz[rows] + first * since + second * since**2 + third * since**3

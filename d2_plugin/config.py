@@ -64,9 +64,9 @@ class D2Config(_HookTables):
     finite_every: Count = 100
     """Steps from one check to the next that all parameters are finite; they are checked before hooks edit Gaussians and
     before their state is saved as well. Training stops where one is not; 0 never checks."""
-    prior_memory_mb: Annotated[int, Range(1, 1_000_000, unit="MB")] = 512
-    """Memory for priors that were read, on the backbone's device: about 17 bytes a pixel and view. The least recently
-    used leave first and are read again."""
+    prior_memory_mb: Annotated[int, Range(1, 1_000_000, unit="MB")] = 2048
+    """Memory of the host, not of the GPU, for priors that were read: 8 bytes a pixel and view. The least recently used
+    leave first and are read again; the log says when that begins."""
     seed: Seed = 0
     """Seed of D2's own random generator."""
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from d2_plugin.hooks.finite import FiniteCheck
 from d2_plugin.hooks.prior import Store
 from d2_plugin.hooks.reports import OnReport, Report, RunLog, ScalarWriter, Trace
 from d2_plugin.hooks.views import ViewSampler
-from d2_plugin.protocol import Backbone, Edit, Points, call_optional
+from d2_plugin.protocol import Backbone, Edit, Points, View, call_optional
 from d2_plugin.reading import said
 from d2_plugin.registry import ADAPTERS, load
 from d2_plugin.values import checked_arguments
@@ -164,6 +164,15 @@ class D2Hooks:
                 total = total + term if isinstance(total, Tensor) else term
         self._finite.remember(total, shown)
         return total
+
+    def prefetch(self, cameras: Iterable[object]) -> None:
+        """Read the priors of the views that come next in a thread of its own; for a trainer that knows them."""
+        if self.prior is not None and self.prior.named:
+            known = [
+                (c.camera, c.frame) if isinstance(c, View) else call_optional(self.backbone, "prior_key", c)
+                for c in cameras
+            ]
+            self.prior.prefetch(key for key in known if key is not None)
 
     @torch.no_grad()
     def step(self, step: int) -> Report:

@@ -73,6 +73,7 @@ class Points(NamedTuple):
 
     def select(self, which: Tensor) -> Points:
         """Those of a mask bool [K], or of indices."""
+        which = torch.nonzero(which).squeeze(-1) if which.dtype == torch.bool else which  # one wait for a GPU, not six
         lifetimes = None if self.lifetimes is None else self.lifetimes[which]
         return self._replace(lifetimes=lifetimes, **{name: getattr(self, name)[which] for name in self._fields[:5]})
 
@@ -224,6 +225,8 @@ class Backbone(Protocol):
         called with the number of the training step before anything else is asked in it.
     ``image_name(camera) -> str | None``
         path of the image of a trainer's camera; priors of an exported recording are found by it.
+    ``prior_key(camera) -> (camera, frame)``
+        the key of the prior of a trainer's camera, without its view: what comes next is read ahead by it.
     ``active(step) -> bool``
         False while the hooks must wait (stages, warm-up); changes nothing.
     ``colors(view, splats) -> Tensor``

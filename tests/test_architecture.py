@@ -33,7 +33,7 @@ ROOMS = {
     "recordings": "ground",
     "store": "ground",
     "priors": "ground recordings store",
-    "hooks": "ground rasterizer",
+    "hooks": "ground rasterizer store",
     "config": "ground hooks",
     "plugin": "ground config hooks (store)",
     "runs": "ground config plugin hooks priors store recordings gaussians rasterizer",

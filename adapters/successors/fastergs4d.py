@@ -10,7 +10,7 @@ Its rasterizer returns an image and nothing else, so depth comes from ours. It c
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -21,7 +21,17 @@ from d2_plugin.gaussians.slicing import slice_gaussians
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from ..keys import KeyOf, PriorKey, key_from_image_name
-from ..shared import Resizing, appended, constant_harmonics, finite, identities, optional, seen_colors, with_rows
+from ..shared import (
+    Resizing,
+    appended,
+    constant_harmonics,
+    finite,
+    identities,
+    on_device,
+    optional,
+    seen_colors,
+    with_rows,
+)
 
 CONSTANTS = RasterSettings(alpha_max=1 - 1e-6)
 """Of its rasterizer (rasterization_config.h): alpha is not clamped; near comes from the camera."""
@@ -65,7 +75,7 @@ class FasterGS4DAdapter(Resizing):
     def view(self, camera: Any) -> View:
         """The view of NeRFICG's `View` (Datasets/utils.py), which holds camera, pose and time, or a `View` as it is."""
         if isinstance(camera, View):
-            return camera
+            return on_device(camera, self.gaussians._spatial_means)
         lens = optional(camera, "camera")
         if lens is None or not hasattr(lens, "focal_x"):
             kind = type(camera).__name__
@@ -73,22 +83,21 @@ class FasterGS4DAdapter(Resizing):
         key = self._key(camera) if self._key is not None else _key_of_image(camera)
         like = self.gaussians._spatial_means
         K = torch.tensor([[lens.focal_x, 0, lens.center_x], [0, lens.focal_y, lens.center_y], [0, 0, 1]])
-        pose = camera.w2c.detach().to(like).contiguous()
-        return View(key.camera, key.frame, float(camera.timestamp), pose, K.to(like), int(lens.width), int(lens.height))
+        pose, size = camera.w2c.detach().to(like, non_blocking=True).contiguous(), (int(lens.width), int(lens.height))
+        return View(key.camera, key.frame, float(camera.timestamp), pose, K.to(like, non_blocking=True), *size)
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`; those with F(t) below 0.05 are left out, as in its rasterizer."""
         model = self.gaussians
-        like = model._left_isoclinic_rotations
         return slice_gaussians(
             {
                 "positions": model._spatial_means,
                 "log_scales": model._spatial_scales,
-                "left": like * like.new_tensor(LEFT_SIGNS),
+                "left": _signed(model._left_isoclinic_rotations, LEFT_SIGNS),
                 "opacity_logits": model._opacities.squeeze(-1),
                 "times": model._temporal_means.squeeze(-1),
                 "log_time_scales": model._temporal_scales.squeeze(-1),
-                "right": model._right_isoclinic_rotations * like.new_tensor(RIGHT_SIGNS),
+                "right": _signed(model._right_isoclinic_rotations, RIGHT_SIGNS),
             },
             view.time,
         )
@@ -163,3 +172,8 @@ def _key_of_image(view: Any) -> PriorKey:
     if image is None:
         raise D2Error("a view without an image does not say its camera: give the adapter a function `key`")
     return key_from_image_name(str(image.path))
+
+
+def _signed(quaternions: Tensor, signs: Sequence[float]) -> Tensor:
+    """Quaternions [N, 4] with each component times its sign; by Python's numbers, which a GPU gets without a wait."""
+    return torch.stack([sign * part for sign, part in zip(signs, quaternions.unbind(-1))], -1)

@@ -128,6 +128,4 @@ class GsplatDynamicAdapter(GsplatAdapter):
             raise D2Error(f"got {given}: pass views, or the data set's items and `frames=`, or give the adapter `view`")
         time, (height, width) = float(item["time"]), item["image"].shape[:2]
         frame = frame_of_time(time, self.frames)
-        like = self.parameters["means"]
-        pose, K = item["camtoworld"].to(like), item["K"].to(like)
-        return gsplat_view(self.camera, frame, time, pose, K, int(width), int(height))
+        return gsplat_view(self.camera, frame, time, item["camtoworld"], item["K"], int(width), int(height))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from benchmarks.trainers.trials import HELD_OUT, TRAINED, Trial
@@ -13,6 +14,8 @@ from d2_plugin.commands.export_recording import run as export
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.recordings import open_recording
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -49,12 +52,29 @@ class Prepared:
 
 def prepare(source: Source, trial: Trial, work: Path) -> Prepared:
     """Export the recording in the trainer's layout and build its prior, where they are not there yet."""
+    source = replace(source, downscale=fitting_downscale(source.recording, trial, source.downscale))
     named = f"{source.name}-{trial.layout}-{len(trial.held_out)}-{trial.points}"
     data = _exported(source, trial, work / "exports" / named, TRAINED, trial.held_out)
     held_out = None
     if trial.also_held_out:
         held_out = _exported(source, trial, work / "exports" / f"{named}-held-out", HELD_OUT, ())
     return Prepared(source, data, held_out, _prior(source, work / "priors" / source.name))
+
+
+def fitting_downscale(recording: Path, trial: Trial, downscale: int) -> int:
+    """`downscale`, or the largest below it at which the trainer's report can be measured."""
+    if trial.least_side == 1:
+        return downscale
+    sides = [min(camera.width, camera.height) for camera in open_recording(recording).cameras.values()]
+    fitting = [factor for factor in range(1, downscale + 1) if min(sides) // factor >= trial.least_side]
+    if not fitting:
+        raise D2Error(
+            f"{recording} has images of {min(sides)} pixels along a side, and the report of {trial.folder} needs "
+            f"{trial.least_side}: leave it out with --only, or give a larger recording"
+        )
+    if fitting[-1] != downscale:
+        log.info("%s is made %d times smaller, not %d times: see Trial.least_side", recording, fitting[-1], downscale)
+    return fitting[-1]
 
 
 def _exported(source: Source, trial: Trial, output: Path, trained: tuple[str, ...], held_out: tuple[str, ...]) -> Path:

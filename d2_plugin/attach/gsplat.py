@@ -118,7 +118,7 @@ class GsplatSession(Session):
         if self.hooks is None or not (torch.is_grad_enabled() and drawn[0].requires_grad):
             return drawn
         size = {"width": named["width"], "height": named["height"]}
-        poses = torch.linalg.inv(named["viewmats"].detach())
+        poses = torch.linalg.inv_ex(named["viewmats"].detach()).inverse
         term = self._term(self.hooks, [{"camtoworld": pose, "K": K, **size} for pose, K in zip(poses, named["Ks"])])
         return drawn if term is None else (AddGradient.apply(drawn[0], term, 1.0), *drawn[1:])
 

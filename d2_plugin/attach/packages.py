@@ -210,7 +210,7 @@ def needed(script: Path, conditional: bool = True) -> dict[str, str]:
         roots = (root, file.parent, *(folder for folder in file.parents if root in folder.parents))
         for name, line in _imports(file, conditional):
             inside = next((place for base in roots for place in _inside(base, name)), None)
-            top = name.split(".")[0]
+            top = "tensorboard" if name.startswith("torch.utils.tensorboard") else name.split(".")[0]
             if inside is not None:
                 waiting.append(inside)
             elif top not in _standard_library() and not any((base / top).is_dir() for base in roots):

@@ -18,7 +18,9 @@ def _fudan(adapter: Adapter, objects: Objects) -> Backbone:
 
 
 def _deformable3d(adapter: Adapter, objects: Objects) -> Backbone:
-    return adapter(objects.model, objects.deform, warm_up=objects.options.warm_up)
+    arguments, _ = objects.given.get("scene", ((None,), {}))
+    exact = bool(getattr(arguments[0], "is_blender", False))
+    return adapter(objects.model, objects.deform, warm_up=objects.options.warm_up, exact_times=exact)
 
 
 def _hust4d(adapter: Adapter, objects: Objects) -> Backbone:

@@ -223,6 +223,8 @@ class Session:
     def _rendering(self, render: Callable[..., Mapping[str, Any]]) -> Callable[..., Mapping[str, Any]]:
         @wraps(render)
         def rendering(camera: Any, model: Any, *arguments: Any, **named: Any) -> Mapping[str, Any]:
+            if self.hooks is not None and model is self.objects.model and torch.is_grad_enabled():
+                self.hooks.prefetch([camera])  # its prior is read while it is drawn
             package = render(camera, model, *arguments, **named)
             training = torch.is_grad_enabled() and package["render"].requires_grad
             if self.hooks is None or model is not self.objects.model or not training:

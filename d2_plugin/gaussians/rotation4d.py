@@ -19,7 +19,7 @@ def normalized_quaternions(quaternions: Tensor) -> Tensor:
     """Unit quaternions [4, N], w first; zero, vanishing and non-finite ones become the identity with zero gradient."""
     largest = quaternions.detach().abs().amax(0)
     ok = (largest > SMALL_NORM) & torch.isfinite(largest)
-    if not ok.all():
+    if ok.is_cuda or not ok.all():  # to ask a GPU would be to wait for it
         identity = torch.zeros_like(quaternions)
         identity[0] = 1
         quaternions = torch.where(ok, quaternions, identity)

@@ -53,10 +53,16 @@ def reference_slice(
     with torch.no_grad():
         axes = unit_quaternions(raw["left"]), unit_quaternions(raw["right"])
         last = time_row(*axes) * _scales(log_scales, log_scale_limit)
-        rows = torch.nonzero(temporal_marginal(time - raw["times"], last.square().sum(0)) > marginal_cut).squeeze(-1)
+        alive = temporal_marginal(time - raw["times"], last.square().sum(0)) > marginal_cut
+        rows = rows_to_draw(alive)
     if len(rows) < len(log_scales):
         parts = tuple(part.index_select(0, rows) for part in parts)
     positions, log_scales, left, right, logits, times = parts
+    if (
+        alive.is_cuda
+    ):  # all rows are here; those outside their support get an opacity of 0, and numbers that harm nobody
+        log_scales, times = torch.where(alive[:, None], log_scales, 0.0), torch.where(alive, times, time)
+        logits = torch.where(alive, logits, -torch.inf)
     rotation = rotation_matrices_4d(unit_quaternions(left), unit_quaternions(right))
     factors = rotation * _scales(log_scales, log_scale_limit)
     spatial, velocity = condition_on_time(factors)
@@ -64,6 +70,11 @@ def reference_slice(
     means = positions + (velocity * offset).T
     opacities = torch.sigmoid(logits) * temporal_marginal(offset, factors[3].square().sum(0))
     return means, covariances_from_factors(spatial), opacities, rows
+
+
+def rows_to_draw(alive: Tensor) -> Tensor:
+    """Rows [M] where `alive` is True; all N on a GPU, since M would be waited for: others get an opacity of 0 there."""
+    return torch.arange(len(alive), device=alive.device) if alive.is_cuda else torch.nonzero(alive).squeeze(-1)
 
 
 def _scales(log_scales: Tensor, limit: float) -> Tensor:

@@ -90,7 +90,7 @@ def under_reconstructed(depth: Tensor, valid: Tensor, prior: Tensor, support: Te
 def back_project(view: View, pixels: Tensor, depth: Tensor) -> Tensor:
     """World points [K, 3] = Pi^-1(p, D) of pixels [K, 2] (column, row; integers) at planar depths [K]."""
     centres = torch.cat([pixels.to(depth) + 0.5, torch.ones_like(depth)[:, None]], -1)
-    camera = torch.linalg.solve(view.K.to(depth), centres.T).T * depth[:, None]
+    camera = torch.linalg.solve_ex(view.K.to(depth), centres.T).result.T * depth[:, None]
     rotation, translation = view.T_camera_world[:3, :3].to(depth), view.T_camera_world[:3, 3].to(depth)
     return (camera - translation) @ rotation  # R^T (x - t), row by row
 
@@ -98,7 +98,7 @@ def back_project(view: View, pixels: Tensor, depth: Tensor) -> Tensor:
 def shuffled_pixels(mask: Tensor, generator: torch.Generator) -> Tensor:
     """All pixels [K, 2] (column, row) of `mask` [H, W], in random order."""
     rows, columns = torch.nonzero(mask, as_tuple=True)
-    order = torch.randperm(len(rows), generator=generator).to(rows.device)
+    order = torch.randperm(len(rows), generator=generator).to(rows.device, non_blocking=True)
     return torch.stack([columns, rows], -1)[order]
 
 
@@ -138,6 +138,7 @@ class Motion:
 
     def __init__(self) -> None:
         self._still: dict[str, tuple[tuple[int, ...], Tensor]] = {}
+        self._places: dict[tuple[str, int], list[float]] = {}
 
     def intervals(self, view: View, context: Context) -> Tensor | None:
         """The time from one instant to the next at pixels that move, infinite elsewhere: [H, W], the views' unit.
@@ -145,7 +146,7 @@ class Motion:
         None where nothing is known: a prior without colours, fewer than three instants, a camera that moves, light
         that changes.
         """
-        seen = [other for other in context.instants(view.camera) if _same_place(view, other)]
+        seen = [other for other in context.instants(view.camera) if self._place(view) == self._place(other)]
         prior, still = context.prior(view), self._median(view.camera, seen[:INSTANTS], context)
         if prior is None or prior.colors is None or still is None:
             return None
@@ -153,6 +154,13 @@ class Motion:
         if moving.float().mean() > MOST_MOVING:
             return None
         return torch.where(moving, _interval(seen), torch.inf)
+
+    def _place(self, view: View) -> list[float]:
+        """Where a view is and what it looks through, on the host; each is asked once, since that waits for a GPU."""
+        key = (view.camera, view.frame)
+        if key not in self._places:
+            self._places[key] = torch.cat([view.T_camera_world.flatten(), view.K.flatten()]).tolist()
+        return self._places[key]
 
     def _median(self, camera: str, views: Sequence[View], context: Context) -> Tensor | None:
         """The median image uint8 [H, W, 3] of some views of a camera."""
@@ -225,15 +233,20 @@ class Densify(Hook):
 
     def _free(self, view: View, splats: Splats, positions: Tensor, earlier: list[Points], spacing: float) -> Tensor:
         """Mask of candidates whose frustum cell is empty, the first one of each cell: a stratified sample."""
-        opaque = splats.means[splats.opacities > OCCUPIED]
-        taken = torch.cat([opaque, *(p.positions for p in earlier)])
+        taken = torch.cat([splats.means, *(p.positions for p in earlier)])
         cells = frustum_cells(view, positions, spacing, self.config.tau_u)
         occupied = frustum_cells(view, taken, spacing, self.config.tau_u)
-        return (cells >= 0) & ~torch.isin(cells, occupied) & first_of_each(cells)
+        opaque = splats.opacities > OCCUPIED
+        occupied[: len(opaque)].masked_fill_(~opaque, -1)
+        return (cells >= 0) & ~_among(cells, occupied) & first_of_each(cells)
 
 
-def _same_place(view: View, other: View) -> bool:
-    return torch.equal(view.T_camera_world, other.T_camera_world) and torch.equal(view.K, other.K)
+def _among(keys: Tensor, known: Tensor) -> Tensor:
+    """Mask [K]: which keys are among the known ones [N]; unlike `torch.isin` it waits for no GPU."""
+    if not len(known):
+        return torch.zeros_like(keys, dtype=torch.bool)
+    known = known.sort().values
+    return known[torch.searchsorted(known, keys).clamp(max=len(known) - 1)] == keys
 
 
 def _interval(views: Sequence[View]) -> float:

@@ -14,6 +14,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from d2_plugin.hooks.expected import check_device
 from d2_plugin.hooks.hook import Context, Hook, HookConfig
 from d2_plugin.hooks.native_depth_loss import can_compare, native_depth_loss
 from d2_plugin.hooks.prior import FAR, NEAR, KnownMaps
@@ -49,7 +50,8 @@ class DepthLossConfig(HookConfig):
 
 def charbonnier(residual: Tensor, epsilon: float | Tensor) -> Tensor:
     """rho(r) = sqrt(r^2 + epsilon^2) - epsilon, elementwise, without cancellation near 0 or overflow of r^2."""
-    root = torch.hypot(residual, torch.as_tensor(epsilon).to(residual))
+    epsilon = epsilon.to(residual) if isinstance(epsilon, Tensor) else torch.full_like(residual, epsilon)
+    root = torch.hypot(residual, epsilon)
     return residual * (residual / (root + epsilon))
 
 
@@ -96,7 +98,7 @@ def supervision(
     near, far = known.kind == NEAR, known.kind == FAR
     sigma = torch.zeros_like(known.depth) if known.sigma is None else torch.where(near, known.sigma, 0.0)
     weight = torch.where(known.kind > 0, config.sigma_full / sigma.clamp(min=config.sigma_full), 0.0)
-    epsilon = torch.hypot(sigma, sigma.new_tensor(config.epsilon))
+    epsilon = torch.hypot(sigma, torch.full_like(sigma, config.epsilon))
     depth, valid = rendered_depth(depth_sum, alpha, config.tau_v)
     through = torch.where(near, 1 - alpha, 0.0).sum() / max(known.near, 1)
     return factor * (depth_loss(depth, valid, known.depth, weight, epsilon, far) + config.opaque * through)
@@ -122,6 +124,7 @@ def depth_and_alpha(context: Context, view: View) -> tuple[Tensor, Tensor]:
     if rendered is not None:
         return rendered
     splats = context.backbone.slice_at(view)
+    check_device(splats, view)
     colors = splats.means.new_zeros(len(splats.means), 1)
     render = rasterize(splats, colors, view, context.backbone.settings)
     return render.depth_sum, render.alpha

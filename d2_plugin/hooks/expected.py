@@ -85,6 +85,15 @@ def check_splats(splats: Splats, count: int, inserting: bool) -> None:
         )
 
 
+def check_device(splats: Splats, view: View) -> None:
+    """Refuse Gaussians that do not lie where their view does, and its prior with it."""
+    if splats.means.device != view.K.device:
+        raise D2Error(
+            f"the view of camera {shown(view.camera)} at frame {shown(view.frame)} is on {view.K.device} but "
+            f"slice_at() returned Gaussians on {splats.means.device}: make view() return K and T_camera_world there"
+        )
+
+
 def check_step(step: object) -> None:
     """Refuse what is no number of an optimizer step."""
     try:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from d2_plugin.hooks.expected import check_splats
+from d2_plugin.hooks.expected import check_device, check_splats
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.protocol import Backbone, DepthPrior, Edit, Splats, Survey, View
 from d2_plugin.rasterizer import survey
@@ -103,6 +103,7 @@ class Context:
             return None
         splats = self.backbone.slice_at(view)
         check_splats(splats, len(self.backbone), inserting=False)
+        check_device(splats, view)
         near_edge = prior.near_edge(FREE_SIGMAS) if prior.measured else None
         return Surveyed(view, splats, prior, survey(splats, view, prior, self.backbone.settings, near_edge=near_edge))
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Literal, NamedTuple, Protocol
 
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import CameraRecord, DepthPrior, Label, View
+from d2_plugin.store.maps import UNKNOWN, CodedPrior
 
 log = logging.getLogger(__name__)
 
@@ -21,11 +23,15 @@ log = logging.getLogger(__name__)
 class Store(Protocol):
     """What the loader needs of a prior store (d2_plugin.store.store.PriorStore).
 
-    Where it also has `camera(camera, frame) -> CameraRecord | None`, views are checked against it.
+    Where it also has `camera(camera, frame) -> CameraRecord | None`, views are checked against it; where it has
+    `coded(camera, frame) -> CodedPrior | None`, that is kept in memory in the place of the prior.
     """
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
 
+
+Key = tuple[str, int]
+"""A camera and a frame."""
 
 Belief = Literal["all", "stereo", "nothing"]
 """What of a prior is believed: `all` of it, `stereo` alone, or `nothing`."""
@@ -90,9 +96,9 @@ class KnownMaps(NamedTuple):
     """How many pixels are `FAR`."""
 
     @classmethod
-    def of(cls, prior: DepthPrior) -> KnownMaps:
-        """The maps of a prior; waits for its device to count."""
-        known = prior.trusted if prior.sigma is None else prior.support & torch.isfinite(prior.sigma)
+    def of(cls, prior: DepthPrior, unknown: float = math.inf) -> KnownMaps:
+        """The maps of a prior whose sigma is `unknown` where nothing is; waits for its device to count."""
+        known = prior.trusted if prior.sigma is None else prior.support & (prior.sigma < unknown)
         kind = known.byte() * NEAR + prior.far.byte() * FAR
         near, far = (int(torch.count_nonzero(kind == which)) for which in (NEAR, FAR))
         return cls(kind, prior.depth, prior.sigma, near, far)
@@ -155,17 +161,68 @@ class CameraCheck:
             )
 
 
+class Kept(NamedTuple):
+    """One prior as it is kept in memory: as it is stored, or as a store of the user's own returned it."""
+
+    maps: CodedPrior
+    known: KnownMaps
+    """Its depth and sigma are those of `maps`, codes where these are."""
+
+    @classmethod
+    def of(cls, read: CodedPrior, belief: Belief, pin: bool) -> Kept:
+        """What of a prior may be used; in memory that a GPU copies from without a wait, where `pin` is set."""
+        maps, coded = believed(read.codes, belief), read.range is not None
+        empty = torch.zeros_like(maps.far) if coded else ~(torch.isfinite(maps.depth) & (maps.depth > 0))
+        if bool(maps.far.any()):
+            empty |= _outline(maps.far)
+        maps = maps._replace(labels=maps.labels.masked_fill(empty, int(Label.EMPTY)))
+        if pin and not maps.depth.is_cuda:
+            maps = DepthPrior._make(part if part is None else part.pin_memory() for part in maps)
+        known = KnownMaps.of(maps, UNKNOWN if coded else math.inf)
+        kind = known.kind.pin_memory() if pin and not known.kind.is_cuda else known.kind
+        return cls(read._replace(codes=maps), known._replace(kind=kind))
+
+    @property
+    def bytes(self) -> int:
+        """What it takes."""
+        parts = [part for part in (*self.maps.codes, self.known.kind) if part is not None]
+        return sum(part.numel() * part.element_size() for part in parts)
+
+    def prior(self, device: torch.device) -> DepthPrior:
+        """All maps on a device. Pixels judge Gaussians where sigma is small, whatever their label."""
+        prior = self._decoded(self.maps.codes, device)
+        if prior.sigma is None or prior.reliability is not None:
+            return prior
+        return prior._replace(reliability=(prior.support & (prior.sigma <= JUDGES)).to(prior.depth))
+
+    def known_on(self, device: torch.device) -> KnownMaps:
+        """What the depth loss reads: 4 bytes a pixel are copied where depth and sigma are codes."""
+        moved = self._decoded(DepthPrior(self.known.depth, self.known.kind, sigma=self.known.sigma), device)
+        return self.known._replace(kind=moved.labels, depth=moved.depth, sigma=moved.sigma)
+
+    def _decoded(self, maps: DepthPrior, device: torch.device) -> DepthPrior:
+        moved = DepthPrior._make(None if part is None else part.to(device, non_blocking=True) for part in maps)
+        return self.maps._replace(codes=moved).decoded()
+
+
 class PriorLoader:
-    """Looks up D* by camera and frame, on the view's device; keeps the last few: memory must not grow with frames."""
+    """Looks up D* by camera and frame, on the view's device.
+
+    The last few stay in the host's memory, as they are stored: memory must not grow with the number of frames.
+    """
 
     def __init__(
-        self, store: Store, memory_mb: int = 512, rename: Rename | None = None, believe: Belief = "all"
+        self, store: Store, memory_mb: int = 2048, rename: Rename | None = None, believe: Belief = "all"
     ) -> None:
         """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes."""
         self.store, self.keep_bytes, self._rename, self.believe = store, memory_mb << 20, rename, believe
-        self._kept: OrderedDict[tuple[str, int], DepthPrior | None] = OrderedDict()
-        self._known: dict[tuple[str, int], KnownMaps] = {}
+        self._kept: OrderedDict[Key, Kept | None] = OrderedDict()
+        self._bytes = 0
+        self._reading: dict[Key, Future[Kept | None]] = {}
+        self._thread: ThreadPoolExecutor | None = None
         self._cameras = CameraCheck()
+        self._checked: set[Key] = set()
+        self._pin = self._dropped = False
         self._without: set[str] = set()
         self.named = False
         """Whether `name_by` was called."""
@@ -181,44 +238,65 @@ class PriorLoader:
 
     def __call__(self, view: View) -> DepthPrior | None:
         """D* of the view, or None where the store has none; refuses one made for another size, K or pose."""
+        kept = self._look_up(view)
+        return None if kept is None else kept.prior(view.K.device)
+
+    def known(self, view: View) -> KnownMaps | None:
+        """What is known of the depth of the view's pixels, or None where nothing is of any."""
+        kept = self._look_up(view)
+        return None if kept is None or not kept.known.near + kept.known.far else kept.known_on(view.K.device)
+
+    def prefetch(self, keys: Iterable[Key]) -> None:
+        """Read these priors in a thread of its own, because their views come next. A failure waits until they do."""
+        for key in keys:
+            if self.named and key not in self._kept and key not in self._reading:
+                self._thread = self._thread or ThreadPoolExecutor(1, "d2-prior")
+                self._reading[key] = self._thread.submit(self._read, key)
+
+    def _look_up(self, view: View) -> Kept | None:
         key = (view.camera, view.frame)
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key]
-        prior = self.store.prior(*key)
-        if prior is None and view.camera not in self._without:
+        self._pin = self._pin or view.K.is_cuda
+        for other in [other for other, reading in self._reading.items() if other == key or reading.done()]:
+            reading = self._reading.pop(other)
+            if other == key or reading.exception() is None:
+                self._keep(other, reading.result())
+        if key not in self._kept:
+            self._keep(key, self._read(key))
+        self._kept.move_to_end(key)
+        kept = self._kept[key]
+        if kept is None:
+            self._warn_without(view)
+        elif key not in self._checked:
+            self._check(view, kept)
+            self._checked.add(key)
+        return kept
+
+    def _read(self, key: Key) -> Kept | None:
+        read = getattr(self.store, "coded", self.store.prior)(*key)
+        coded = CodedPrior(read, None) if isinstance(read, DepthPrior) else read
+        return None if coded is None else Kept.of(coded, self.believe, self._pin)
+
+    def _keep(self, key: Key, kept: Kept | None) -> None:
+        self._kept[key] = kept
+        self._bytes += 0 if kept is None else kept.bytes
+        while len(self._kept) > 1 and self._bytes > self.keep_bytes:
+            _, dropped = self._kept.popitem(last=False)
+            self._bytes -= 0 if dropped is None else dropped.bytes
+            if not self._dropped:
+                self._dropped = True
+                message = "prior_memory_mb = %d holds the priors of %d views: the others are read from disk each time"
+                log.info(message, self.keep_bytes >> 20, len(self._kept))
+
+    def _warn_without(self, view: View) -> None:
+        if view.camera not in self._without:
             self._without.add(view.camera)
             log.warning(
                 "camera %s has no prior at frame %d and is trained without D2 there; the prior has cameras %s",
                 view.camera, view.frame, ", ".join(map(str, getattr(self.store, "cameras", ()))) or "unknown",
             )  # fmt: skip
-        if prior is not None:
-            self._check(view, prior)
-            prior = believed(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior), self.believe)
-            prior = _usable(prior)
-        self._kept[key] = prior
-        while len(self._kept) > 1 and self._bytes() > self.keep_bytes:
-            dropped, _ = self._kept.popitem(last=False)
-            self._known.pop(dropped, None)
-        return prior
 
-    def known(self, view: View) -> KnownMaps | None:
-        """What is known of the depth of the view's pixels, or None where nothing is of any."""
-        key, prior = (view.camera, view.frame), self(view)
-        if prior is None:
-            return None
-        if key not in self._known:
-            self._known[key] = KnownMaps.of(prior)
-        known = self._known[key]
-        return known if known.near + known.far else None
-
-    def _bytes(self) -> int:
-        tensors = [part for prior in self._kept.values() if prior is not None for part in prior if part is not None]
-        tensors += [known.kind for known in self._known.values()]
-        return sum(part.numel() * part.element_size() for part in tensors)
-
-    def _check(self, view: View, prior: DepthPrior) -> None:
-        height, width = prior.depth.shape
+    def _check(self, view: View, kept: Kept) -> None:
+        height, width = kept.known.kind.shape
         if (width, height) != (view.width, view.height):
             raise D2Error(
                 f"the prior of camera {view.camera}, frame {view.frame} is {width}x{height} pixels but the view is "
@@ -227,26 +305,15 @@ class PriorLoader:
         describe = getattr(self.store, "camera", None)
         record = describe(view.camera, view.frame) if describe is not None else None
         if record is not None:
-            self._cameras.check(view, record, prior.depth)
+            some = DepthPrior(kept.known.depth[::4, ::4], kept.known.kind)  # a sample says how large the scene is
+            self._cameras.check(view, record, kept.maps._replace(codes=some).decoded().depth)
 
 
-def _usable(prior: DepthPrior) -> DepthPrior:
-    """The same prior, empty where the depth is no finite positive number: no store can put NaN into a loss.
-
-    It is also empty at the outline of what is far: a Gaussian of the surface in front spills over it. Pixels judge
-    Gaussians where sigma is small, whatever their label.
-    """
-    usable = torch.isfinite(prior.depth) & (prior.depth > 0) & ~(prior.far & ~_inside(prior.far))
-    prior = prior._replace(labels=torch.where(usable, prior.labels, int(Label.EMPTY)))
-    if prior.sigma is None or prior.reliability is not None:
-        return prior
-    return prior._replace(reliability=(prior.support & (prior.sigma <= JUDGES)).to(prior.depth))
-
-
-def _inside(far: Tensor) -> Tensor:
-    """The far pixels [H, W] at least `OUTLINE` pixels inside of what is far; the rim of the image is no outline."""
+def _outline(far: Tensor) -> Tensor:
+    """The far pixels [H, W] less than `OUTLINE` pixels inside of what is far, where a Gaussian of the surface in front
+    spills over them; the rim of the image is no outline."""
     others = (~far).float()[None, None]
-    return F.max_pool2d(others, 2 * OUTLINE + 1, stride=1, padding=OUTLINE)[0, 0] == 0
+    return far & (F.max_pool2d(others, 2 * OUTLINE + 1, stride=1, padding=OUTLINE)[0, 0] > 0)
 
 
 def _relative(pose: Tensor, first: Tensor) -> Tensor:

@@ -135,10 +135,8 @@ class Prune(Hook):
     def follow(self, index: Tensor) -> None:
         """Streaks move with their Gaussians; new ones start at 0."""
         if self.streak is not None:
-            kept = index >= 0
-            moved = self.streak.new_zeros(len(index))
-            moved[kept] = self.streak[index[kept]]
-            self.streak = moved
+            before = self.streak[index.clamp(min=0)] if len(self.streak) else self.streak.new_zeros(len(index))
+            self.streak = torch.where(index >= 0, before, 0)
 
     def reset(self) -> None:
         """Forget all streaks."""

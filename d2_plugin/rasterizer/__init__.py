@@ -96,6 +96,10 @@ def survey(
     return path.survey(splats, view, prior, settings, eps, near_edge)
 
 
+MOST_IN_TORCH = 200_000
+"""Gaussians that plain torch draws in float32: it holds every pixel of a row of tiles times every Gaussian there."""
+
+
 def _has_kernels(means: Tensor) -> bool:
     """Whether kernels run on the device of `means`: on a GPU or the CPU, in float32, where they can be compiled."""
     if means.dtype != torch.float32:
@@ -103,8 +107,15 @@ def _has_kernels(means: Tensor) -> bool:
     if means.device.type == "cuda":
         from d2_plugin.rasterizer import cuda  # a trainer on the CPU loads none of it
 
-        return cuda.available(means.device)
-    return means.device.type == "cpu" and native.available()
+        there = cuda.available(means.device)
+    else:
+        there = means.device.type == "cpu" and native.available()
+    if not there and len(means) > MOST_IN_TORCH:
+        raise D2Error(
+            f"{len(means)} Gaussians on {means.device} and no compiled kernels: plain torch draws at most "
+            f"{MOST_IN_TORCH} before memory runs out; the warning before this says what to install"
+        )
+    return there
 
 
 def _check(splats: Splats, view: View, settings: RasterSettings, **extra: Tensor | None) -> None:

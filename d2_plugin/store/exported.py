@@ -50,6 +50,10 @@ class RenamedStore:
         """D* of one view, or None where there is none; a camera that the export does not have is refused."""
         return self._of_source("prior", camera, frame)
 
+    def coded(self, camera: str, frame: int) -> Any:
+        """The same as it is stored, where the store has that."""
+        return self._of_source("coded" if hasattr(self.store, "coded") else "prior", camera, frame)
+
     def camera(self, camera: str, frame: int) -> Any:
         """The camera that one prior was built for, or None where the store does not say."""
         return self._of_source("camera", camera, frame)

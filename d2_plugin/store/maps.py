@@ -5,12 +5,16 @@ Logarithmic depth in 16 bits is exact to 1e-5 in a room and to 1.6e-4 from 1e-3 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.protocol import Label
+from d2_plugin.protocol import DepthPrior, Label
 
 PRIOR_DTYPE = np.dtype([("depth", "<u2"), ("label", "u1"), ("sigma", "u1"), ("color", "u1", (3,))])
 """The maps of a `FusedPrior` as they are stored, pixel by pixel."""
@@ -57,6 +61,48 @@ def encode_sigma(sigma: np.ndarray) -> np.ndarray:
     position = 1 + np.log(np.clip(sigma, SIGMA[1], 1) / SIGMA[1]) * (253 / steps)
     codes = np.where(sigma <= 1, np.rint(np.minimum(position, 254)), 255)
     return np.where(sigma == 0, 0, codes).astype(np.uint8)
+
+
+UNKNOWN = 255
+"""The code of an infinite sigma."""
+
+
+class CodedPrior(NamedTuple):
+    """The maps of one prior as they are stored and as they travel to the trainer's device: 7 bytes per pixel.
+
+    `codes` has the fields of a `DepthPrior` [H, W], of which depth (int16, the bits of the uint16 codes) and sigma
+    (uint8) are codes; with a range of None they are the numbers themselves. In single precision decoding adds less than
+    2e-6 of a depth to the error of its code.
+    """
+
+    codes: DepthPrior
+    range: DepthRange | None
+
+    @classmethod
+    def of(cls, stored: np.ndarray, depth_range: DepthRange) -> CodedPrior:
+        """From an array of `PRIOR_DTYPE` [H, W]."""
+        colors = np.empty((*stored.shape, 3), np.uint8)
+        for channel in range(3):  # five times as fast as all three at once
+            colors[..., channel] = stored["color"][..., channel]
+        depth, labels, sigma = (np.ascontiguousarray(stored[name]) for name in ("depth", "label", "sigma"))
+        planes = depth.astype("<u2", copy=False).view(np.int16), labels, colors, sigma
+        return cls(DepthPrior(*map(torch.from_numpy, planes)), depth_range)
+
+    def decoded(self) -> DepthPrior:
+        """Depth and sigma as numbers, on the device where the codes are."""
+        if self.range is None:
+            return self.codes
+        depth, sigma = self.codes.depth.int() & 0xFFFF, self.codes.sigma
+        step = np.log(self.range.far / self.range.near) / CODES
+        depth = torch.where(depth > 0, self.range.near * torch.exp((depth - 1) * float(step)), 0.0)
+        if sigma is not None:
+            sigma = _sigmas_on(sigma.device).index_select(0, sigma.flatten().int()).view_as(sigma)
+        return self.codes._replace(depth=depth, sigma=sigma)
+
+
+@functools.cache
+def _sigmas_on(device: torch.device) -> Tensor:
+    return torch.from_numpy(SIGMA).to(device)
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,7 +32,7 @@ from d2_plugin.durable import Kind, is_leftover, make_folder, read_table, remove
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.protocol import CameraRecord, DepthPrior
 from d2_plugin.store.files import Entry, EntryFolder, hash_of
-from d2_plugin.store.maps import PRIOR_DTYPE, SIGMA, DepthRange, FusedPrior, check_maps, encode_sigma
+from d2_plugin.store.maps import PRIOR_DTYPE, CodedPrior, DepthRange, FusedPrior, check_maps, encode_sigma
 from d2_plugin.values import checked_arguments
 
 FORMAT = 4
@@ -53,6 +53,7 @@ class PriorStore:
         self.path, self.about = Path(path), about
         self.cameras, self.frames = tuple(cameras), tuple(frames)
         self.entries = EntryFolder(self.path / "priors")
+        self._intact: set[Path] = set()
 
     @classmethod
     @checked_arguments
@@ -149,14 +150,17 @@ class PriorStore:
         Raises:
             D2Error: an unknown camera, or an array that does not match the checksum of its record.
         """
+        coded = self.coded(camera, frame)
+        return None if coded is None else coded.decoded()
+
+    def coded(self, camera: str, frame: int) -> CodedPrior | None:
+        """The same, not decoded: what a training keeps in memory. The checksum is compared at the first reading."""
         entry = self._entry(camera, frame)
         if entry is None:
             return None
-        codes = entry.array(PRIOR_DTYPE)
-        depth = DepthRange(*entry.record["depth_range"]).decode(codes["depth"])
-        labels, colors = np.ascontiguousarray(codes["label"]), np.ascontiguousarray(codes["color"])
-        sigma = SIGMA[codes["sigma"]]
-        return DepthPrior(*(torch.from_numpy(map_) for map_ in (depth, labels, colors, sigma)))
+        stored = entry.array(PRIOR_DTYPE, intact=entry.path in self._intact)
+        self._intact.add(entry.path)
+        return CodedPrior.of(stored, DepthRange(*entry.record["depth_range"]))
 
     @checked_arguments
     def record(self, camera: str, frame: int) -> dict[str, Any] | None:

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import Label
-from d2_plugin.store.store import FORMAT, SIGMA, DepthRange, PriorStore, encode_sigma
+from d2_plugin.store.maps import SIGMA, DepthRange, encode_sigma
+from d2_plugin.store.store import FORMAT, PriorStore
 
 SHAPE = (12, 17)
 IMAGE = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3)).astype(np.uint8)

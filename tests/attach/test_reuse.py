@@ -1,0 +1,139 @@
+"""What the trainer evaluated to draw a view is not evaluated again for D2's depth of that view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from mimics import deformable3d, gsplat, hust4d
+from mimics.inria import default_options
+from mimics.workplace import furnish
+from tiny import make_views
+from torch import Tensor, nn
+
+from d2_plugin import D2Hooks
+from d2_plugin.adapters.deformable3d import Deformable3DAdapter
+from d2_plugin.adapters.gsplat_dict import GsplatAdapter
+from d2_plugin.adapters.hust4d import Hust4DAdapter
+from d2_plugin.config import D2Config, DepthLossConfig
+
+
+class Attached(SimpleNamespace):
+    """A mimic with the depth loss alone: its adapter, cameras, field, and how it draws one of them."""
+
+    adapter: Any
+    field: nn.Module
+    cameras: list[Any]
+    draw: Callable[[Any], object]
+    d2: D2Hooks
+    calls: list[int]
+
+
+def make(name: str) -> Attached:
+    if name == "hust4d":
+        model, scene = hust4d.make()
+        model.training_setup(default_options())
+        adapter, field = Hust4DAdapter(model, scene, "fine"), model._deformation
+
+        def draw(camera: Any) -> object:
+            return hust4d.render(camera, model, [0, 0, 0])
+    else:
+        model, deform, scene = deformable3d.make()
+        model.training_setup(default_options())
+        adapter, field = Deformable3DAdapter(model, deform, warm_up=0, exact_times=True), deform.deform
+
+        def draw(camera: Any) -> object:
+            return deform.step(model.get_xyz.detach(), camera.fid.expand(len(model.get_xyz), 1))
+
+    calls: list[int] = []
+    field.register_forward_hook(lambda *_: calls.append(1))
+    d2 = D2Hooks(D2Config(prior="prior", depth_loss=DepthLossConfig()), adapter)
+    return Attached(adapter=adapter, field=field, cameras=scene.cameras, draw=draw, d2=d2, calls=calls, model=model)
+
+
+def gradients(made: Attached, loss: Tensor) -> list[Tensor]:
+    parameters = [*made.field.parameters(), made.model._xyz, made.model._opacity]
+    parts = torch.autograd.grad(loss, parameters, allow_unused=True)
+    return [torch.zeros_like(p) if part is None else part for p, part in zip(parameters, parts, strict=True)]
+
+
+@pytest.fixture(params=["hust4d", "deformable3d"])
+def name(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    furnish(tmp_path, monkeypatch)
+    return request.param
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_the_field_is_evaluated_once_a_view_and_gradients_are_the_same(name: str, batch: int) -> None:
+    losses = []
+    for drawn in (True, False):
+        made = make(name)
+        cameras = made.cameras[:batch]
+        for camera in cameras if drawn else ():
+            made.draw(camera)
+        loss = made.d2.loss(1, cameras)
+        assert len(made.calls) == batch
+        losses.append((loss.detach(), *gradients(made, loss)))
+        assert not made.adapter._unassigned
+    assert any(part.any() for part in losses[0][1:-2]), "the field has gradients"
+    for one, other in zip(*losses, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-7)
+
+
+def test_what_cannot_be_assigned_is_evaluated_anew(name: str) -> None:
+    """A viewer that draws with gradients on, rows that changed since, an evaluation of a test image."""
+    made = make(name)
+    expected = made.d2.loss(1, made.cameras[0]).detach()
+    made.draw(made.cameras[3])
+    made.draw(made.cameras[0])
+    made.calls.clear()
+    torch.testing.assert_close(made.d2.loss(2, made.cameras[0]).detach(), expected)
+    assert len(made.calls) == 1
+    with torch.no_grad():
+        made.draw(made.cameras[3])
+    made.calls.clear()
+    torch.testing.assert_close(made.d2.loss(3, made.cameras[0]).detach(), expected)
+    made.draw(made.cameras[0])
+    made.adapter.remove(torch.arange(len(made.adapter)) == 0)
+    made.calls.clear()
+    assert made.d2.loss(4, made.cameras[0]).isfinite()
+    assert len(made.calls) == 1
+
+
+def test_without_a_hook_nothing_is_kept(name: str) -> None:
+    made = make(name)
+    made.adapter.detach()
+    made.draw(made.cameras[0])
+    assert not made.adapter._unassigned
+
+
+def test_gsplat_gives_its_own_depth_once() -> None:
+    splats, optimizers, strategy = gsplat.make()
+    adapter, views = GsplatAdapter(splats, optimizers, strategy.initialize_state()), make_views()[:2]
+    drawn = [gsplat.render(splats, view) for view in views]
+    depths = torch.stack([image.depth_sum for image in drawn])
+    shown = adapter.rendered(views, depths, depths / 3)
+    for view, image in zip(shown, drawn, strict=True):
+        depth_sum, alpha = adapter.rendered_depth(view)
+        assert torch.equal(depth_sum, image.depth_sum)
+        assert torch.equal(alpha, image.depth_sum / 3)
+        assert depth_sum.requires_grad
+        assert adapter.rendered_depth(view) is None
+    adapter.rendered(views, depths, depths)
+    adapter.rendered(views[:1], depths, depths)
+    assert adapter.rendered_depth(views[1]) is None, "renders of an earlier step are out of date"
+
+
+def test_offsets_at_noisy_times_are_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    furnish(tmp_path, monkeypatch)
+    made = make("deformable3d")
+    made.adapter.exact_times = False
+    for step, evaluations in ((1, 2), (20_000, 1)):
+        made.calls.clear()
+        made.draw(made.cameras[0])
+        made.d2.loss(step, made.cameras[0])
+        assert len(made.calls) == evaluations

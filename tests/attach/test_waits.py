@@ -1,0 +1,111 @@
+"""On a GPU an attached step waits for the device once, and a prior travels there as small as it is stored.
+
+Counted on a GPU that is not there (`fake_gpu`), with the real kernels of gpu.cu in their shim.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import torch
+from fake_gpu import FakeGpu, OnGpu, fake_gpu, move  # noqa: F401  a fixture
+from mimics.workplace import furnish
+from repositories import VARIANTS
+from tiny import HEIGHT, WIDTH
+from torch import Tensor
+
+from d2_plugin import D2Hooks
+from d2_plugin.config import D2Config, DepthLossConfig
+from d2_plugin.hooks.densify import DensifyConfig
+from d2_plugin.hooks.prune import PruneConfig
+
+ONE_MORE = {"swift4d", "gsplat_dynamic"}
+"""Their own code, too, draws which Gaussians move from a mask, whose number has to be known."""
+
+PER_VIEW, PER_EVALUATION = 4, 24
+"""Waits of an evaluation: for each view whether its prior knows free space, the pairs to sort, the pixels that lack a
+surface, and those of them that are free; and for the edit that follows, an inverse deformation included."""
+
+SMALL = 512
+"""Bytes of matrices and numbers."""
+
+
+def on_the_gpu(name: str) -> tuple[object, list[object]]:
+    """The adapter of a mimic, and two of its cameras."""
+    standing, moved = VARIANTS[name](), {}
+    items = name == "gsplat_dynamic"  # a data set's items stay on the host
+    cameras = [camera if items else move(camera, moved) for camera in standing.cameras[:2]]
+    return move(standing.adapter, moved), cameras
+
+
+def own(waits: Counter[str]) -> Counter[str]:
+    """Without those of the trainer's own functions."""
+    return Counter({place: count for place, count in waits.items() if "mimics/" not in place})
+
+
+@pytest.mark.parametrize("name", sorted(VARIANTS.keys() - {"deformable3d 6dof"}))  # whose mimic stays on the host
+def test_a_step_waits_once_and_copies_no_more_than_the_codes(
+    name: str,
+    fake_gpu: FakeGpu,  # noqa: F811
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    furnish(tmp_path, monkeypatch)
+    adapter, cameras = on_the_gpu(name)
+    due = {"start": 4, "every": 4, "stop": 5}
+    hooks = {"densify": DensifyConfig(**due), "prune": PruneConfig(**due), "depth_loss": DepthLossConfig()}
+    d2 = D2Hooks(D2Config(prior="prior", finite_every=0, views_per_evaluation=2, **hooks), adapter)
+    for step in (1, 2):  # a new view is checked once
+        d2.loss(step, cameras[step - 1])
+        d2.step(step)
+    with fake_gpu.counting():
+        loss = d2.loss(3, cameras[0])
+        if isinstance(loss, Tensor):
+            loss.backward()
+        d2.step(3)
+        waits, copied = own(fake_gpu.where), Counter(fake_gpu.copied)
+    assert isinstance(loss, OnGpu) == (name != "hust4d coarse")  # where hooks wait
+    assert sum(waits.values()) <= 1 + (name in ONE_MORE), waits
+    assert copied["to device"] <= 4 * WIDTH * HEIGHT + SMALL, copied
+    assert copied["to host"] <= SMALL, copied
+    d2.loss(4, cameras[1])
+    with fake_gpu.counting():
+        d2.step(4)
+        waits = own(fake_gpu.where)
+    views = len(cameras)
+    assert sum(waits.values()) <= (PER_VIEW + (name in ONE_MORE)) * views + PER_EVALUATION, waits
+    if name != "hust4d coarse":
+        assert d2.log.inserted > 0
+
+
+def test_what_waits_is_counted_and_nothing_else(fake_gpu: FakeGpu) -> None:  # noqa: F811
+    numbers = torch.rand(4, 3)
+    with fake_gpu.counting():
+        there = numbers.to("cuda", non_blocking=True)
+        assert isinstance(there, OnGpu)
+        assert there.device == torch.device("cuda:0")
+        assert isinstance(torch.arange(3, device=there.device), OnGpu)
+        leaf = torch.nn.Parameter(there)
+        torch.where(leaf > 0.5, leaf, 0.0).sum().backward()
+        assert isinstance(leaf.grad, OnGpu)
+        there[0, 0] = 3.0
+        there[there > 1] = 0.0  # filled where the mask is
+        torch.linalg.inv_ex(there[:3])
+        assert not fake_gpu.waits
+        assert fake_gpu.copied == {"to device": 48, "largest": 48}
+    ways = {
+        "_local_scalar_dense": lambda: float(there.sum()),
+        "equal": lambda: torch.equal(there, there),
+        "tolist": lambda: there.tolist(),
+        "nonzero": lambda: torch.nonzero(there),
+        "mask as an index": lambda: there[there > 0],
+        "copy to the host": lambda: there.cpu(),
+        "copy to the device": lambda: there.new_tensor([1.0, 2.0]),
+        "_linalg_check_errors": lambda: torch.linalg.inv(there[:3] + torch.eye(3, device="cuda")),
+    }
+    for name, way in ways.items():
+        with fake_gpu.counting():
+            way()
+            assert fake_gpu.waits == {name: 1}

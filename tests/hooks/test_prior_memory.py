@@ -1,0 +1,136 @@
+"""Priors in memory: as they are stored, no more of them than the setting allows, the next ones read in a thread."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny import ALL_HOOKS, make_adapter, make_model, make_views
+
+from d2_plugin import D2Hooks
+from d2_plugin.hooks.prior import JUDGES, KnownMaps, PriorLoader
+from d2_plugin.protocol import DepthPrior, Label, View
+from d2_plugin.store.maps import FusedPrior
+from d2_plugin.store.store import PriorStore
+
+SIZE = HEIGHT, WIDTH = 24, 32
+
+
+def a_prior(seed: int) -> FusedPrior:
+    """Depths from 1e-3 to 1e3, every label, sigmas from none to infinite."""
+    rng = np.random.default_rng(seed)
+    labels = rng.choice([label for label in Label if label != Label.CONFLICT], SIZE).astype(np.uint8)
+    labels[:8, :8] = Label.FAR
+    depth = np.where(labels == Label.EMPTY, 0, 10 ** rng.uniform(-3, 3, SIZE)).astype(np.float32)
+    sigma = np.where(rng.random(SIZE) < 0.2, np.inf, 10 ** rng.uniform(-4, 0, SIZE)).astype(np.float32)
+    sigma[rng.random(SIZE) < 0.1] = 0
+    return FusedPrior(depth, labels, sigma, rng.integers(0, 256, (*SIZE, 3), dtype=np.uint8))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> PriorStore:
+    made = PriorStore.create(tmp_path / "prior", ["cam0"], range(6), {"recording": "made"})
+    for frame in range(6):
+        made.write("cam0", frame, a_prior(frame), {})
+    return PriorStore.open(tmp_path / "prior")
+
+
+def view_of(frame: int) -> View:
+    return replace(make_views()[0], camera="cam0", frame=frame)
+
+
+class Plain:
+    """A store of one's own: it has the maps themselves."""
+
+    def __init__(self, store: PriorStore) -> None:
+        self.store, self.reads = store, []
+
+    def prior(self, camera: str, frame: int) -> DepthPrior | None:
+        self.reads.append((frame, threading.current_thread() is threading.main_thread()))
+        return self.store.prior(camera, frame)
+
+
+def test_codes_say_what_the_maps_say(store: PriorStore) -> None:
+    coded, plain = PriorLoader(store), PriorLoader(Plain(store))
+    for frame in range(3):
+        view, written = view_of(frame), a_prior(frame)
+        one, other = coded(view), plain(view)
+        for ours, theirs in zip(one, other, strict=True):
+            assert torch.equal(ours, theirs)
+        assert torch.equal(one.reliability.bool(), one.support & (one.sigma <= JUDGES))
+        for ours, theirs in zip(coded.known(view), plain.known(view), strict=True):
+            assert torch.equal(torch.as_tensor(ours), torch.as_tensor(theirs))
+        known = KnownMaps.of(one)
+        assert (known.near, known.far) == coded.known(view)[3:]
+        kept = one.labels.numpy() != Label.EMPTY
+        error = np.abs(one.depth.numpy() / np.where(kept, written.depth, 1) - 1)[kept].max()
+        assert error < 1.1e-4 + 2e-6  # half a code of 1e-3 to 1e3, and single precision
+        finite = np.isfinite(written.sigma) & (written.sigma > 0)
+        np.testing.assert_allclose(one.sigma.numpy()[finite], written.sigma[finite], rtol=0.02)
+        assert np.array_equal(one.sigma.numpy() == 0, written.sigma == 0)
+
+
+def test_memory_holds_eight_bytes_a_pixel_and_the_log_says_when_it_is_full(
+    store: PriorStore, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    loader = PriorLoader(store)
+    loader.keep_bytes = 3 * 8 * HEIGHT * WIDTH
+    for frame in (0, 1, 2):
+        loader.known(view_of(frame))
+    assert loader._bytes == loader.keep_bytes
+    assert not caplog.records
+    for frame in (3, 4, 5, 0):
+        loader.known(view_of(frame))
+        assert loader._bytes <= loader.keep_bytes
+    assert [record.message for record in caplog.records] == [
+        "prior_memory_mb = 0 holds the priors of 3 views: the others are read from disk each time"
+    ]
+
+
+def test_what_comes_next_is_read_in_a_thread_once(store: PriorStore) -> None:
+    plain = Plain(store)
+    loader = PriorLoader(plain)
+    loader.prefetch([("cam0", 3)])  # before the first view nobody knows what the trainer calls its cameras
+    loader.name_by(None)
+    loader(view_of(0))
+    loader.prefetch([("cam0", 1), ("cam0", 0), ("cam0", 1)])
+    loader(view_of(1))
+    loader(view_of(2))
+    assert plain.reads == [(0, True), (1, False), (2, True)]
+
+
+def test_a_failure_ahead_is_raised_when_its_view_comes(store: PriorStore) -> None:
+    loader = PriorLoader(store)
+    loader.name_by(None)
+    loader.prefetch([("nobody", 0), ("cam0", 1)])
+    assert loader(view_of(1)) is not None
+    assert loader(view_of(2)) is not None
+    with pytest.raises(Exception, match="camera of the prior store"):
+        loader(replace(view_of(0), camera="nobody"))
+
+
+def test_an_array_that_was_intact_is_not_checked_again(store: PriorStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    from d2_plugin.store import files
+
+    checks: list[Any] = []
+    original = files.Entry.checksum_problem
+    monkeypatch.setattr(files.Entry, "checksum_problem", lambda entry: checks.append(1) or original(entry))
+    for _ in range(3):
+        store.coded("cam0", 0)
+    assert len(checks) == 1
+
+
+def test_d2_reads_ahead_what_a_trainer_says_comes_next(store: PriorStore) -> None:
+    plain = Plain(store)
+    d2 = D2Hooks(ALL_HOOKS, make_adapter(make_model()), plain)
+    d2.prefetch([view_of(1)])  # not before the first view
+    d2.loss(1, view_of(0))
+    d2.prefetch([view_of(1), "a camera that nobody knows"])
+    d2.loss(2, view_of(1))
+    assert plain.reads == [(0, True), (1, False)]
