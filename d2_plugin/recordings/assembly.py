@@ -28,8 +28,7 @@ from d2_plugin.values import shown
 
 log = logging.getLogger(__name__)
 
-BLACK_NOTED = 1e-3
-"""Black share of an undistorted image above which a note reports it."""
+BLACK_NOTED = 1e-3  # black share of an undistorted image above which a note reports it
 
 CORRECT = "correct the file, see docs/recordings.md"
 REPLACE = "replace the file or remove it"

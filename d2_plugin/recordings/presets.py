@@ -24,14 +24,9 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.readers.n3dv import UNSYNCHRONISED
 
-ALL = ("all",)
-"""In place of camera names: every camera that is not held out trains."""
-
-PRESET, PROTOCOL = "preset:", "protocol:"
-"""How a text begins that stands in place of camera names."""
-
-PAPER = "d2-4dgs"
-"""Protocols whose names begin so are refused."""
+ALL = ("all",)  # in place of camera names: every camera that is not held out trains
+PRESET, PROTOCOL = "preset:", "protocol:"  # how a text begins that stands in place of camera names
+PAPER = "d2-4dgs"  # protocols whose names begin so are refused
 
 
 class Rig(NamedTuple):
@@ -79,8 +74,7 @@ GC_4DGS: dict[str, dict[int, tuple[int, ...]]] = {
 }
 """Places of the training cameras, from 0, in the sorted list of a scene's cameras, by number of views."""
 
-FEWEST_CAMERAS = 18
-"""Of a whole N3DV recording (coffee_martini): with fewer the places would mean other cameras."""
+FEWEST_CAMERAS = 18  # of a whole N3DV recording (coffee_martini): with fewer the places would mean other cameras
 
 CAMERAS_4C4D = ("cam01", "cam10", "cam13", "cam20")
 

@@ -22,44 +22,25 @@ from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.selection import spread
 
-USUAL_VIEW = (5.0, 170.0)
-"""Degrees across or down that a camera usually sees."""
-
-FAR_FROM_ORIGIN = 1e4
-"""A rig this many times as far from the origin as it is wide loses digits in float32."""
+USUAL_VIEW = (5.0, 170.0)  # degrees across or down that a camera usually sees
+FAR_FROM_ORIGIN = 1e4  # A rig this many times as far from the origin as it is wide loses digits in float32
 
 DEPTHS = np.geomspace(0.05, 1000, 25)
 """Where cameras without declared bounds may see the same thing, in widths of the rig."""
 
-GRID = 12
-"""Pixels across and down that stand for an image."""
-
-ONE_COLOUR = 2
-"""An image whose channels vary by no more levels of 255 than this shows nothing."""
-
-SPARSE = 8
-"""Where every eighth pixel each way varies, the others need not be asked."""
+GRID = 12  # pixels across and down that stand for an image
+ONE_COLOUR = 2  # an image whose channels vary by no more levels of 255 than this shows nothing
+SPARSE = 8  # where every eighth pixel each way varies, the others need not be asked
 
 LOOKED_AT = 1 << 25
 """Pixels that are read, at most: all images of a small recording, some of each camera of a large one."""
 
-LONG_SIDE = 640
-"""Features are looked for in images of at most this many pixels along the longer side."""
-
-MOST_PAIRS = 12
-"""Pairs of cameras whose features are matched, at most."""
-
-ENOUGH = 12
-"""Matched features on one geometry, any, below which two images say nothing about their calibration."""
-
-ENOUGH_SHARE = 0.5
-"""Share of the matched features that must lie on one geometry: false matches do not."""
-
-MOST_SWAPPED = 6
-"""Cameras of a recording in which two that were swapped are looked for."""
-
-MISSED = 0.01
-"""Median distance from the epipolar lines, in diagonals of the image, beyond which a calibration is named."""
+LONG_SIDE = 640  # features are looked for in images of at most this many pixels along the longer side
+MOST_PAIRS = 12  # pairs of cameras whose features are matched, at most
+ENOUGH = 12  # matched features on one geometry, any, below which two images say nothing about their calibration
+ENOUGH_SHARE = 0.5  # share of the matched features that must lie on one geometry: false matches do not
+MOST_SWAPPED = 6  # cameras of a recording in which two that were swapped are looked for
+MISSED = 0.01  # median distance from the epipolar lines, in diagonals of the image, beyond which a calibration is named
 
 
 class _Pair(NamedTuple):

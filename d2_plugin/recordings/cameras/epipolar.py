@@ -7,8 +7,7 @@ import numpy as np
 from d2_plugin.recordings.images import checked_image, opencv
 from d2_plugin.recordings.recording import Camera
 
-OPENCVS_CONTRAST = 0.04
-"""Of a SIFT feature, at least."""
+OPENCVS_CONTRAST = 0.04  # of a SIFT feature, at least
 
 
 def sift_features(

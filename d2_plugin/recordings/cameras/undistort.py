@@ -18,14 +18,9 @@ from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Source
 from d2_plugin.values import checked_arguments
 
-KEPT_MAPS = 8
-"""Cameras whose resampling map stays in memory (6 bytes per pixel each)."""
-
-COVERAGE_STEP = 8
-"""Grid step in pixels, across and down, for measuring how much of an image is black."""
-
-MOST_BLACK = 0.5
-"""Share of an undistorted image that may be without a recorded pixel: more is a wrong coefficient."""
+KEPT_MAPS = 8  # cameras whose resampling map stays in memory (6 bytes per pixel each)
+COVERAGE_STEP = 8  # grid step in pixels, across and down, for measuring how much of an image is black
+MOST_BLACK = 0.5  # share of an undistorted image that may be without a recorded pixel: more is a wrong coefficient
 
 
 class Undistortion:

@@ -15,11 +15,8 @@ from d2_plugin.recordings.recording import Camera, Recording
 FAR_APART = 35.0
 """Degrees between a camera and its nearest neighbour from which stereo verifies little: see docs/your-recording.md."""
 
-SHORT_SIDE = 180
-"""Images with a shorter side have little to match."""
-
-UNEQUAL, UNEQUAL_TIME = 0.02, 0.25
-"""Gain off the mean, and lateness in frames, that are noted."""
+SHORT_SIDE = 180  # images with a shorter side have little to match
+UNEQUAL, UNEQUAL_TIME = 0.02, 0.25  # gain off the mean, and lateness in frames, that are noted
 
 
 class Finding(NamedTuple):

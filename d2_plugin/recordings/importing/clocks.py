@@ -23,14 +23,12 @@ METHODS = ("auto", "timecode", "sound", "motion", "none")
 APART = 0.75
 """Frames by which evidence may differ from the whole, beside three times its error: more is a contradiction."""
 
-TIMECODE_ERROR = 12**-0.5
-"""Frames: the standard deviation of what is rounded to whole frames."""
+TIMECODE_ERROR = 12**-0.5  # frames: the standard deviation of what is rounded to whole frames
 
 SOUND_ERROR = 1e-3
 """Seconds at least that an offset from sound may be wrong: sound travels a third of a metre in that time."""
 
-DAY = 86_400
-"""Seconds after which a timecode begins anew, so that the shorter way around midnight counts."""
+DAY = 86_400  # seconds after which a timecode begins anew, so that the shorter way around midnight counts
 
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.])(\d{2,3})$")
 

@@ -18,8 +18,7 @@ from d2_plugin.recordings.importing.video import VideoFile, usual_rate
 REACH = 0.75
 """An image farther than this many frames of the recording, or half of the camera's own, stands for no instant."""
 
-TOGETHER = 1e-4
-"""Seconds: cameras that are late by no more exposed together."""
+TOGETHER = 1e-4  # seconds: cameras that are late by no more exposed together
 
 
 @dataclass(frozen=True)

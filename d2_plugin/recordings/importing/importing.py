@@ -46,8 +46,7 @@ from d2_plugin.recordings.readers.videos import TABLE
 from d2_plugin.recordings.recording import Exposure, Recording
 from d2_plugin.values import checked_arguments
 
-Report = Callable[[str], None]
-"""Called with a sentence after each step."""
+Report = Callable[[str], None]  # called with a sentence after each step
 
 JPEG_QUALITY = 95
 

@@ -21,35 +21,16 @@ from d2_plugin.recordings.cameras.undistort import Undistortion
 from d2_plugin.recordings.importing.video import Decoder, VideoFile
 from d2_plugin.recordings.recording import Camera
 
-LONG_SIDE = 160
-"""Pixels of the images that are compared."""
-
-MOST_FRAMES = 900
-"""Of each camera; they take 13 MB."""
-
-FEWEST = 8
-"""Frames that a camera must share with one of the others."""
-
-ALIKE = 0.2
-"""Mean correlation that the pairs of a camera must reach."""
-
-RIVAL = 0.8
-"""Another lag that is this good, outside of the peak, makes a camera's offset doubtful."""
-
-ERROR = 0.25
-"""Frames: the standard error of an offset from motion."""
-
-PLANES = 48
-"""Half-planes between the common limits of two images."""
-
-FINE = 8
-"""Steps per frame in which lags are compared; between them lies a parabola."""
-
-NOISE = (2.0, 3.0)
-"""Change counts above this many times a pixel's usual change, and this many levels of 255 more."""
-
-LEAST_COMMON = 5
-"""Frames that two cameras must share at a lag."""
+LONG_SIDE = 160  # pixels of the images that are compared
+MOST_FRAMES = 900  # of each camera; they take 13 MB
+FEWEST = 8  # frames that a camera must share with one of the others
+ALIKE = 0.2  # mean correlation that the pairs of a camera must reach
+RIVAL = 0.8  # another lag that is this good, outside of the peak, makes a camera's offset doubtful
+ERROR = 0.25  # frames: the standard error of an offset from motion
+PLANES = 48  # half-planes between the common limits of two images
+FINE = 8  # steps per frame in which lags are compared; between them lies a parabola
+NOISE = (2.0, 3.0)  # change counts above this many times a pixel's usual change, and this many levels of 255 more
+LEAST_COMMON = 5  # frames that two cameras must share at a lag
 
 
 class Watched(NamedTuple):

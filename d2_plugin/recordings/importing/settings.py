@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Count, Positional, Range, Settings
 
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""Metres in the units of calibration files."""
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # Metres in the units of calibration files
 
 
 @dataclass(frozen=True)

@@ -30,17 +30,10 @@ from d2_plugin.recordings.importing.settings import ImportChoices, by_camera, fi
 from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
 from d2_plugin.recordings.selection import spread
 
-MOMENTS = 8
-"""Images of each camera that are read, spread over the recording."""
-
-BOARD_MOMENTS = 24
-"""The same where a board was filmed, which is held in many places."""
-
-TOGETHER = 0.1
-"""Frames by which cameras may expose apart for what moves to be a witness."""
-
-SHARED, EACH = "shared", "each"
-"""Focal lengths that are not known: one for all cameras, or one for each of them."""
+MOMENTS = 8  # images of each camera that are read, spread over the recording
+BOARD_MOMENTS = 24  # the same where a board was filmed, which is held in many places
+TOGETHER = 0.1  # frames by which cameras may expose apart for what moves to be a witness
+SHARED, EACH = "shared", "each"  # focal lengths that are not known: one for all cameras, or one for each of them
 
 
 class _NeedsMotion(Exception):

@@ -17,16 +17,12 @@ from d2_plugin.recordings.cameras.camera import check_name
 from d2_plugin.recordings.importing.settings import ImportSettings
 from d2_plugin.recordings.importing.video import VIDEO_SUFFIXES, videos_below
 
-STEPS = "import"
-"""Folder of what each step gave."""
+STEPS = "import"  # folder of what each step gave
 
 KIND = Kind("step of an import", 1, "delete it, it will be made again")
 
-MOST_FILES = 1000
-"""Of a calibration that is a folder."""
-
-ENDS = 1 << 20
-"""Bytes at either end of a file that stand for it."""
+MOST_FILES = 1000  # of a calibration that is a folder
+ENDS = 1 << 20  # bytes at either end of a file that stand for it
 
 
 def paths_of(settings: ImportSettings) -> dict[str, Path]:

@@ -30,8 +30,7 @@ REMEDY = "replace the file or leave its camera out"
 SKIP_LIMIT = 48
 """A frame at most this far ahead is reached by decoding on; any other by a seek, which starts at a key frame."""
 
-MOST_FRAMES = 10_000_000
-"""A video that has more is damaged: this many are four days at 30 per second."""
+MOST_FRAMES = 10_000_000  # A video that has more is damaged: this many are four days at 30 per second
 
 ATOMS = (b"ftyp", b"styp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
 """What an MP4 or MOV may begin with, behind its length."""

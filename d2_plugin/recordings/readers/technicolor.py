@@ -27,8 +27,7 @@ from d2_plugin.recordings.images import IMAGE_SUFFIXES, image_size
 from d2_plugin.recordings.recording import Recording
 
 PARAMETERS = "cameras_parameters.txt"
-UNDISTORTED, DISTORTED = 12, 14
-"""Numbers in a line of the two releases."""
+UNDISTORTED, DISTORTED = 12, 14  # numbers in a line of the two releases
 
 TECHNICOLOR_FPS = 30.0
 

@@ -13,8 +13,7 @@ from d2_plugin.recordings.cameras.calibrating.features import Features, Matches,
 from d2_plugin.recordings.cameras.camera import pinhole, rigid
 from d2_plugin.recordings.recording import Camera
 
-SMALLEST_ANGLE = 1.0
-"""Degrees between the rays of a point below which its depth is a guess."""
+SMALLEST_ANGLE = 1.0  # degrees between the rays of a point below which its depth is a guess
 
 
 @dataclass(frozen=True, eq=False)

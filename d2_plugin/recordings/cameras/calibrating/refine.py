@@ -29,28 +29,22 @@ from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.selection import spread
 from d2_plugin.values import checked_arguments
 
-MOMENTS = 6
-"""Frames that are read, spread over the recording."""
-
-REACH = 0.04
-"""Matches farther from where the given poses expect them are not believed, in diagonals of the image."""
+MOMENTS = 6  # frames that are read, spread over the recording
+REACH = 0.04  # matches farther from where the given poses expect them are not believed, in diagonals of the image
 
 SCHEDULE = ((20.0, 1.3), (10.0, 1.3), (2.5, 0.4), (1.3, 0.13))
 """Rounds of the adjustment: (largest error that counts, scale of the Cauchy loss), in `pixel_error`."""
 
-FEWEST_POINTS = 20
-"""Points per half, and `FEWEST_SEEN` of them per camera, below which nothing is concluded."""
+FEWEST_POINTS = 20  # points per half, and `FEWEST_SEEN` of them per camera, below which nothing is concluded
 FEWEST_SEEN = 8
 
-FALLS_TO = 0.9
-"""The error of the other half falls at least to this part of what it was."""
+FALLS_TO = 0.9  # the error of the other half falls at least to this part of what it was
 
 BEYOND_DOUBT = 1.0
 """The poses turn or move by more than this many times what the two halves' poses differ by, which is about two
 standard deviations of the result."""
 
-CELLS = 8
-"""Across and down an image; alternating ones are the two halves, as on a board for chess."""
+CELLS = 8  # across and down an image; alternating ones are the two halves, as on a board for chess
 
 
 @dataclass(frozen=True, eq=False)

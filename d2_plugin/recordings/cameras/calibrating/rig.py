@@ -14,8 +14,7 @@ from d2_plugin.recordings.cameras.camera import rig_width, rigid
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.values import checked_arguments
 
-ARBITRARY = "arbitrary: give the distance of two cameras, or video a board"
-"""Of a scale that nothing says."""
+ARBITRARY = "arbitrary: give the distance of two cameras, or video a board"  # of a scale that nothing says
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,16 +18,12 @@ from d2_plugin.values import Range, shown
 
 CORRECT = "correct the file, see docs/calibration.md"
 
-MOST_BYTES = 1 << 26
-"""Larger calibrations are refused: a rig of 500 cameras takes a few hundred kilobytes."""
-
-DEEPEST = 64
-"""Of lists and tables within each other in YAML."""
+MOST_BYTES = 1 << 26  # larger calibrations are refused: a rig of 500 cameras takes a few hundred kilobytes
+DEEPEST = 64  # of lists and tables within each other in YAML
 
 NUMBER = Annotated[float, Range(-LARGEST_NUMBER, LARGEST_NUMBER)]
 
-Table = dict[str, Any]
-"""What stands between braces in a file, or under a heading: names and whatever the file says."""
+Table = dict[str, Any]  # what stands between braces in a file, or under a heading: names and whatever the file says
 
 
 class Document:
