@@ -135,9 +135,9 @@ def called_alike(given: Filmed) -> None:
 CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
     (no_frames, [], r"has no frame|no frame of video"),
     (damaged, [], r"can(not)? be decoded.*(repair|replace) the"),
-    (cut_off, [], r"cannot read video .*03\.mp4.*replace the file or leave its camera out"),
-    (overwritten("videos/03.mp4", b"not a video\n" * 1000), [], r"03\.mp4.*replace the file or leave its camera out"),
-    (overwritten("videos/03.mp4", b""), [], r"03\.mp4.*replace the file or leave its camera out"),
+    (cut_off, [], r"cannot read video .*03\.mp4.*replace the file or leave camera 03 out"),
+    (overwritten("videos/03.mp4", b"not a video\n" * 1000), [], r"03\.mp4.*replace the file or leave camera 03 out"),
+    (overwritten("videos/03.mp4", b""), [], r"03\.mp4.*replace the file or leave camera 03 out"),
     (only_sound, [], r"03\.mp4 holds audio and no image: give a video"),
     (lambda given: [path.unlink() for path in given.videos.iterdir()], [], r"holds no video: give videos, or a folder"),
     (called_alike, [], r"are both called 03: name each video like its camera"),
@@ -225,7 +225,7 @@ def test_one_video_of_another_event(room: Recording, tmp_path: Path, capsys: pyt
     words = ["import", str(take.videos), "--calibration", str(take.calibration), "--output", str(tmp_path / "c")]
     assert main([*words, "--offsets", "sound"]) == 2
     said = capsys.readouterr().err
-    assert "nothing in the sound links 04 with 02, 03: leave the camera out, give the offsets" in said
+    assert "nothing in the sound links 04 with 02, 03: leave camera 04 out, give the offsets" in said
 
 
 def test_timecode_against_sound(room: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
