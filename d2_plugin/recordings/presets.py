@@ -34,8 +34,7 @@ class Rig(NamedTuple):
 
     order: tuple[str, ...]
     spare: tuple[str, ...]
-    held_out: tuple[str, ...]
-    """Never trained on: what dense-view comparisons test with."""
+    held_out: tuple[str, ...]  # never trained on: what dense-view comparisons test with
     source: str
 
 

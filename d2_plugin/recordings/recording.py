@@ -35,8 +35,7 @@ class Exposure(NamedTuple):
     """How bright a camera sees what others see, per channel: its gain over their geometric mean."""
 
     gain: tuple[float, float, float]
-    error: tuple[float, float, float]
-    """Standard error."""
+    error: tuple[float, float, float]  # standard error
 
 
 class Source:

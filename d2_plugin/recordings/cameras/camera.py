@@ -48,13 +48,10 @@ class CalibratedCamera:
 
     name: str
     width: int
-    height: int
-    """Pixels of the images; both 0 where a file names no size."""
+    height: int  # pixels of the images; both 0 where a file names no size
     lens: Lens
-    T_camera_world: np.ndarray
-    """[4, 4] float64, world to camera, in the unit of the file."""
-    near_far: tuple[float, float] | None = None
-    """Depth range that the file declares, world units."""
+    T_camera_world: np.ndarray  # [4, 4] float64, world to camera, in the unit of the file
+    near_far: tuple[float, float] | None = None  # depth range that the file declares, world units
 
     @property
     def size(self) -> tuple[int, int]:

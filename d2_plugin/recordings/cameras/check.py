@@ -50,6 +50,7 @@ class _Pair(NamedTuple):
     other: str
     distance: float
     missed: bool
+    matches: int
 
 
 def check_recording(recording: Recording, cameras: Sequence[str], scored: Sequence[str] = ()) -> tuple[str, ...]:
@@ -162,7 +163,7 @@ def _empty_masks(recording: Recording, cameras: Sequence[str], frames: Sequence[
         if recorded is not None and not recorded.any():
             raise D2Error(
                 f"nothing of camera {name} was recorded, as its mask in valid/ and its lens say: correct that mask, or "
-                "leave the camera out"
+                f"leave camera {name} out"
             )
         masks = {frame: recording.mask(name, frame) for frame in frames}
         empty = [frame for frame, mask in masks.items() if mask is not None and not mask.any()]
@@ -176,11 +177,25 @@ def _range(image: np.ndarray) -> np.ndarray:
     return colours.max(axis=0).astype(int) - colours.min(axis=0)
 
 
-def calibration_contradicted(recording: Recording) -> str:
-    """What `check_recording` says of a calibration that contradicts the images, and whose swap would mend it; or ""."""
-    said = next(iter(_contradicted(recording, list(recording.cameras))), "")
-    swap = _swapped(recording) if said else None
-    return f"cameras {swap[0]} and {swap[1]} are swapped: exchange their videos or their entries" if swap else said
+def calibration_contradicted(recording: Recording) -> tuple[bool, str]:
+    """(whether the calibration must be wrong, what `check_recording` says of it or whose swap would mend it; or "")."""
+    names = list(recording.cameras)
+    checked = _checked(recording, names, {name: _features(recording, name) for name in names})
+    said, wrong = _missed(checked), _outweighed(checked)
+    swap = _swapped(recording) if wrong else None
+    return (
+        wrong,
+        f"cameras {swap[0]} and {swap[1]} are swapped: exchange their videos or their entries" if swap else said,
+    )
+
+
+def _outweighed(checked: Sequence[_Pair]) -> bool:
+    """Whether more matches of some camera speak against the calibration than for it: one bad pair of many does not."""
+    for name in {name for pair in checked for name in pair[:2]}:
+        votes = [pair.matches * (1 if pair.missed else -1) for pair in checked if name in pair[:2]]
+        if sum(votes) > 0:
+            return True
+    return False
 
 
 def _swapped(recording: Recording) -> tuple[str, str] | None:
@@ -203,14 +218,24 @@ def _contradicted(recording: Recording, cameras: Sequence[str]) -> Iterator[str]
     """Pairs whose calibration misses the features that their images share."""
     if len(cameras) < 2:
         return
-    checked = _checked(recording, cameras, {name: _features(recording, name) for name in cameras})
+    said = _missed(_checked(recording, cameras, {name: _features(recording, name) for name in cameras}))
+    if said:
+        yield said
+
+
+def _missed(checked: Sequence[_Pair]) -> str:
     wrong = [pair for pair in checked if pair.missed]
-    if not wrong:
-        return
-    suspects = _suspects(checked)
     listed = ", ".join(f"{pair.one} and {pair.other} by {pair.distance:.0f} pixels" for pair in wrong[:4])
+    if not wrong:
+        return ""
+    if not _outweighed(checked):
+        return (
+            f"the calibration misses features of {listed}, but not those of their other pairs, which are more: most "
+            "likely a pattern that repeats, so it stands"
+        )
+    suspects = _suspects(checked)
     whose = f"camera {' and '.join(suspects)}" if suspects else "these cameras"
-    yield (
+    return (
         f"the calibration misses features that two images share, {listed}{', ...' if len(wrong) > 4 else ''} "
         f"(median; good calibrations miss by one): check R, t and K of {whose}"
     )
@@ -272,4 +297,4 @@ def _pair(recording: Recording, one: str, other: str, features: Mapping[str, _Fe
         return None
     off = np.abs((epipolar_lines(a, b, p[inside]) * homogeneous(q[inside])).sum(axis=1))
     distance = float(np.median(off))
-    return _Pair(one, other, distance, distance > max(MISSED * diagonal, 4.0))
+    return _Pair(one, other, distance, distance > max(MISSED * diagonal, 4.0), int(inside.sum()))

@@ -75,8 +75,7 @@ class UndistortedSource(Source):
     """The images of `source` as pinhole cameras would have taken them; maps on disk fit these already."""
 
     source: Source
-    cameras: Mapping[str, CalibratedCamera]
-    """Those whose images are undistorted."""
+    cameras: Mapping[str, CalibratedCamera]  # those whose images are undistorted
     _kept: dict[str, Undistortion] = field(default_factory=dict, repr=False)
 
     def image(self, camera: str, frame: int) -> np.ndarray:

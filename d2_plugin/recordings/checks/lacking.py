@@ -22,8 +22,7 @@ UNEQUAL, UNEQUAL_TIME = 0.02, 0.25  # gain off the mean, and lateness in frames,
 class Finding(NamedTuple):
     """One line."""
 
-    verdict: str
-    """`has`, `lacks` or `check`."""
+    verdict: str  # `has`, `lacks` or `check`
     what: str
     text: str
 
@@ -67,7 +66,9 @@ def _cameras(rig: Sequence[Camera]) -> Iterator[Finding]:
 def _images(recording: Recording) -> Iterator[Finding]:
     sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
     shown = ", ".join(f"{width}x{height}" for width, height in sizes)
-    yield Finding("has", "images", f"{len(recording.frames)} frames at {recording.fps:g} per second, {shown} pixels")
+    count, seconds = len(recording.frames), recording.seconds(recording.frames[-1])
+    rate = (count - 1) / seconds if seconds > 0 else recording.fps  # of a choice of frames it is lower than `fps`
+    yield Finding("has", "images", f"{count} frames at {rate:g} per second, {shown} pixels")
     if min(min(size) for size in sizes) < SHORT_SIDE:
         yield Finding("lacks", "resolution", f"a side below {SHORT_SIDE} pixels: import with a larger --scale")
     if len(recording.frames) < 2:

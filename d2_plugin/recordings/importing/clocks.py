@@ -23,6 +23,7 @@ METHODS = ("auto", "timecode", "sound", "motion", "none")
 APART = 0.75
 """Frames by which evidence may differ from the whole, beside three times its error: more is a contradiction."""
 
+STAMPS = "the files' own stamps"  # how a method begins that takes them
 STAMPS_ERROR = 0.5  # frames: the same of stamps that nothing confirms
 
 TIMECODE_ERROR = 12**-0.5  # frames: the standard deviation of what is rounded to whole frames
@@ -42,10 +43,8 @@ class Clock:
     """When the clock of a video began, after that of the first camera."""
 
     seconds: float
-    error: float
-    """Standard error, seconds; 0 for what was given."""
-    method: str
-    """Where it comes from, such as `sound`."""
+    error: float  # standard error, seconds; 0 for what was given
+    method: str  # where it comes from, such as `sound`
 
 
 class Evidence(NamedTuple):
@@ -81,7 +80,7 @@ def common_clock(
         if doubt and (evidence or how == "motion" or not _of_one_recorder(videos.values())):
             raise D2Error(f"{doubt}: {INSTEAD}")
         if doubt:
-            method = f"the files' own stamps, as if one program had recorded them all ({doubt})"
+            method = f"{STAMPS}, as if one program had recorded them all ({doubt})"
             return {name: Clock(0.0, STAMPS_ERROR * frame, method) for name in names}
         evidence += by_motion
     linked = linked_names(names, [one[:2] for one in evidence])

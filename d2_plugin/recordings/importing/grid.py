@@ -25,12 +25,9 @@ TOGETHER = 1e-4  # seconds: cameras that are late by no more exposed together
 class Grid:
     """Which frame of which video is which frame of the recording."""
 
-    rate: float
-    """Frames of the recording per second."""
-    indices: dict[str, dict[int, int]]
-    """By camera: frame of the recording -> frame of the video."""
-    late: dict[str, dict[int, float]]
-    """By camera and frame, seconds; empty where all exposed together."""
+    rate: float  # frames of the recording per second
+    indices: dict[str, dict[int, int]]  # by camera: frame of the recording -> frame of the video
+    late: dict[str, dict[int, float]]  # by camera and frame, seconds; empty where all exposed together
     notes: tuple[str, ...] = ()
 
 

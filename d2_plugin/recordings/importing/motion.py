@@ -41,12 +41,9 @@ LEAST_COMMON = 5  # frames that two cameras must share at a lag
 class Watched(NamedTuple):
     """Small images of a camera that stands still."""
 
-    camera: Camera
-    """The pinhole of the small images."""
-    images: np.ndarray
-    """[T, h, w] uint8, brightness."""
-    times: np.ndarray
-    """[T] seconds on the clock of the video."""
+    camera: Camera  # the pinhole of the small images
+    images: np.ndarray  # [T, h, w] uint8, brightness
+    times: np.ndarray  # [T] seconds on the clock of the video
 
 
 class Curve(NamedTuple):
@@ -60,12 +57,9 @@ class Curve(NamedTuple):
 class Seen(NamedTuple):
     """What motion says about one camera."""
 
-    seconds: float
-    """When its clock began, after that of the first camera."""
-    error: float
-    """Standard error, seconds."""
-    doubt: str
-    """Why it cannot be trusted; empty where it can."""
+    seconds: float  # when its clock began, after that of the first camera
+    error: float  # standard error, seconds
+    doubt: str  # why it cannot be trusted; empty where it can
 
 
 Scores = Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]  # cameras -> (lags [L], how well they agree there [L])

@@ -39,6 +39,8 @@ class ImportChoices(Settings):
     """Measure how much brighter one camera sees the same surfaces than the others."""
     refine_poses: bool = False
     """Correct the poses of the calibration by features of all cameras; kept as they are where that mends nothing."""
+    accept_calibration: bool = False
+    """Import though features contradict the calibration, or a camera seems to have been moved; a note says so."""
 
     intrinsics: Path | None = None
     """Without a calibration: a file with the lenses alone, in any of its formats; its poses are not used."""

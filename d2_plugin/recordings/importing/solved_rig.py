@@ -45,8 +45,7 @@ class Lenses:
     """Cameras without poses, and whether their focal lengths are known, `SHARED` or `EACH` of its own."""
 
     cameras: dict[str, CalibratedCamera]
-    focal: str | None
-    """None where it is known."""
+    focal: str | None  # none where it is known
 
 
 def rig_of_videos(

@@ -41,18 +41,15 @@ AROUND = 0.05  # seconds around the lag of the whole within which that of a part
 class Sound(NamedTuple):
     """The sound of a camera, one channel."""
 
-    samples: np.ndarray
-    """[N] float32 at `RATE` samples per second."""
-    start: float
-    """Seconds of the first sample on the clock of the file, which the frames share."""
+    samples: np.ndarray  # [N] float32 at `RATE` samples per second
+    start: float  # seconds of the first sample on the clock of the file, which the frames share
 
 
 class Lag(NamedTuple):
     """When the other camera started, after the first one."""
 
     seconds: float
-    error: float
-    """Standard error, seconds."""
+    error: float  # standard error, seconds
 
 
 def read_sound(path: Path) -> Sound | None:

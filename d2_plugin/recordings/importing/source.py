@@ -88,8 +88,7 @@ class VideosSource(Source):
     """The images of a recording that stays in its videos; not for several threads at the same time."""
 
     videos: Mapping[str, VideoFile]
-    indices: Mapping[str, Mapping[int, int]]
-    """By camera, the video's frame of each frame of the recording."""
+    indices: Mapping[str, Mapping[int, int]]  # by camera, the video's frame of each frame of the recording
     cameras: Mapping[str, CalibratedCamera]
     cuts: Mapping[str, Cut]
     _undistorted: UndistortedSource = field(init=False, repr=False, compare=False)

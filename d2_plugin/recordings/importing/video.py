@@ -50,19 +50,16 @@ class VideoFile:
     """One video as its container describes it."""
 
     path: Path
-    stored_size: tuple[int, int]
-    """(width, height) in pixels before the turn."""
-    turn: int
-    """How a stored image becomes an upright one: 0, 90, 180 or 270 degrees, counter-clockwise."""
-    stamps: np.ndarray
-    """[N] int64, ascending: when each frame is shown, in units of `unit`."""
-    unit: Fraction
-    """Seconds."""
+    stored_size: tuple[int, int]  # (width, height) in pixels before the turn
+    turn: int  # how a stored image becomes an upright one: 0, 90, 180 or 270 degrees, counter-clockwise
+    stamps: np.ndarray  # [N] int64, ascending: when each frame is shown, in units of `unit`
+    unit: Fraction  # seconds
     timecode: str | None = None
     sound: bool = False
-    counted: bool = False  # frames are found by their order, since what the container says of their times is not ordered
-    hdr: str = ""
-    """How its colours are coded where that is no BT.709, such as "PQ, BT.2020"; they are converted."""
+    counted: bool = (
+        False  # frames are found by their order, since what the container says of their times is not ordered
+    )
+    hdr: str = ""  # how its colours are coded where that is no BT.709, such as "PQ, BT.2020"; they are converted
 
     @property
     def size(self) -> tuple[int, int]:
@@ -125,7 +122,9 @@ def _check_container(path: Path) -> None:
     riff = head[:4] == b"RIFF" and head[8:11] == b"AVI"
     transport = any(head[first : first + 1] == b"G" == head[second : second + 1] for first, second in PACKETS)
     if not (riff or transport or head[4:8] in ATOMS or head[:4] in BEGINNINGS):
-        raise D2Error(f"{shown_path(path)} is no video in an MP4, MOV, Matroska, WebM, AVI or MPEG container: {_remedy(path)}")
+        raise D2Error(
+            f"{shown_path(path)} is no video in an MP4, MOV, Matroska, WebM, AVI or MPEG container: {_remedy(path)}"
+        )
 
 
 def read_video(path: Path) -> VideoFile:
@@ -146,7 +145,9 @@ def read_video(path: Path) -> VideoFile:
         sound = bool(container.streams.audio)
     first = _first_frame(path)
     turn = 90 * (round(float(first.rotation) / 90) % 4)
-    coding = [name for table, code in ((HDR, first.color_trc), (WIDE, first.color_primaries)) if (name := table.get(code))]
+    coding = [
+        name for table, code in ((HDR, first.color_trc), (WIDE, first.color_primaries)) if (name := table.get(code))
+    ]
     return VideoFile(path, (first.width, first.height), turn, stamps, unit, timecode, sound, counted, ", ".join(coding))
 
 

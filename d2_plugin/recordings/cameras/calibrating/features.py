@@ -133,7 +133,7 @@ def verified(
     for (a, b), pairs in matches.items():
         if near is not None:
             p, q = features[a].pixels[pairs[:, 0]], features[b].pixels[pairs[:, 1]]
-            pairs = pairs[sampson(cameras[a], cameras[b], p, q) < near]
+            pairs = pairs[np.abs(sampson(cameras[a], cameras[b], p, q)) < near]
         result = _ransac((a, b), pairs, features, cameras)
         inside = np.zeros(len(pairs), bool) if result is None else np.asarray(result["inlier_mask"], bool)
         if inside.sum() >= ENOUGH_MATCHES:

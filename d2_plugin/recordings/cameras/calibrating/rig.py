@@ -11,6 +11,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.calibrating.bundle import Bundle
 from d2_plugin.recordings.cameras.calibrating.features import Features
 from d2_plugin.recordings.cameras.camera import rig_width, rigid
+from d2_plugin.recordings.cameras.epipolar import degrees_between
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.values import checked_arguments
 
@@ -22,10 +23,8 @@ class SolvedRig:
     """A rig that was solved; the first camera's axes are the world's, and the width of the rig is 1."""
 
     cameras: dict[str, Camera]
-    pixels: dict[str, float]
-    """Camera -> median reprojection error in pixels."""
-    seen: dict[str, int]
-    """Camera -> points that it sees."""
+    pixels: dict[str, float]  # camera -> median reprojection error in pixels
+    seen: dict[str, int]  # camera -> points that it sees
     doubt: dict[str, tuple[float, float]]
     """Camera -> (degrees, share of the rig's width) that two halves of the images differ by: about two standard
     deviations."""
@@ -120,8 +119,6 @@ def differences(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> di
     laid = aligned(cameras, onto)
     apart = {}
     for name in laid:
-        turn = laid[name].T_camera_world[:3, :3] @ onto[name].T_camera_world[:3, :3].T
-        sine = np.linalg.norm(turn - turn.T) / (2 * np.sqrt(2))  # accurate at small angles, as a cosine is not
-        degrees = np.rad2deg(np.arctan2(sine, (np.trace(turn) - 1) / 2))
-        apart[name] = (float(degrees), float(np.linalg.norm(laid[name].centre - onto[name].centre) / width))
+        degrees = degrees_between(laid[name], onto[name])
+        apart[name] = (degrees, float(np.linalg.norm(laid[name].centre - onto[name].centre) / width))
     return apart

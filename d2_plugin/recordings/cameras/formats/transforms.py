@@ -30,13 +30,10 @@ NAMES = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y
 class ListedImage(NamedTuple):
     """One image of the list `frames`."""
 
-    name: str
-    """Its path as the file has it, without a leading ./"""
-    matrix: np.ndarray
-    """[4, 4] from camera to world, OpenGL axes."""
+    name: str  # its path as the file has it, without a leading ./
+    matrix: np.ndarray  # [4, 4] from camera to world, OpenGL axes
     time: float | None
-    table: Table
-    """What stands beside the image, and at the top of the file where that says nothing else."""
+    table: Table  # what stands beside the image, and at the top of the file where that says nothing else
 
 
 def listed_images(content: Table, where: str) -> list[ListedImage]:
