@@ -116,6 +116,12 @@ class Recording:
         valid = self.source.recorded(camera)
         return None if valid is None else self._sized(valid, camera, self.frames[0], "valid region at frame")
 
+    @property
+    def rate(self) -> float:
+        """Frames per second of those that are here: of a choice of frames fewer than `fps`."""
+        seconds = self.seconds(self.frames[-1])
+        return (len(self.frames) - 1) / seconds if seconds > 0 else self.fps
+
     def seconds(self, frame: int, camera: str | None = None) -> float:
         """Time of a frame since the first one, in seconds; with `camera`, the instant at which that one took it."""
         late = 0.0 if camera is None else self.late.get(camera, {}).get(frame, 0.0)

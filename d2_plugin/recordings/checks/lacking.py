@@ -66,9 +66,7 @@ def _cameras(rig: Sequence[Camera]) -> Iterator[Finding]:
 def _images(recording: Recording) -> Iterator[Finding]:
     sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
     shown = ", ".join(f"{width}x{height}" for width, height in sizes)
-    count, seconds = len(recording.frames), recording.seconds(recording.frames[-1])
-    rate = (count - 1) / seconds if seconds > 0 else recording.fps  # of a choice of frames it is lower than `fps`
-    yield Finding("has", "images", f"{count} frames at {rate:g} per second, {shown} pixels")
+    yield Finding("has", "images", f"{len(recording.frames)} frames at {recording.rate:g} per second, {shown} pixels")
     if min(min(size) for size in sizes) < SHORT_SIDE:
         yield Finding("lacks", "resolution", f"a side below {SHORT_SIDE} pixels: import with a larger --scale")
     if len(recording.frames) < 2:

@@ -215,7 +215,8 @@ def _notes_of_videos(
     for name, steady in steadiness(videos, indices).items():
         if steady.moved:
             first, last = steady.between
-            said = f"camera {name} was moved, by {steady.moved:.0f} pixels between {first:.2f} and {last:.2f} s of its video"
+            when = f"between {first:.2f} and {last:.2f} seconds of its video"
+            said = f"camera {name} was moved by {steady.moved:.0f} pixels {when}"
             if not settings.accept_calibration:
                 raise D2Error(
                     f"{said}: import the parts by themselves (--times), each with its calibration, or give "

@@ -44,8 +44,9 @@ def _steadiness(video: VideoFile, taken: Sequence[int]) -> Steadiness:
     )
     images /= np.maximum(gains, 1e-3)[:, None, None]
     jumps = [_jump(np.median(images[:k], axis=0), np.median(images[k:], axis=0)) for k in range(1, len(images))]
-    largest = int(np.argmax(jumps)) if jumps else 0
     moved = max(jumps, default=0.0)
+    changes = np.abs(np.diff(images, axis=0)).mean(axis=(1, 2))
+    largest = int(changes.argmax()) if len(changes) else 0
     seconds = video.times - video.times[0]
     scale = max(video.stored_size) / max(images.shape[1:])
     between = (float(seconds[places[largest]]), float(seconds[places[min(largest + 1, len(places) - 1)]]))

@@ -31,9 +31,7 @@ UNDISTORTED, DISTORTED = 12, 14  # numbers in a line of the two releases
 
 TECHNICOLOR_FPS = 30.0
 
-DAMAGED = {
-    "birthday": {("09", 12): 13, ("09", 173): 172, ("02", 255): 254},
-}
+DAMAGED = {"birthday": {("09", 12): 13, ("09", 173): 172, ("02", 255): 254}}
 """Images of the data set that cannot be decoded, by scene, camera and frame, and the frame that stands in for each.
 Public loaders of the data set do the same."""
 

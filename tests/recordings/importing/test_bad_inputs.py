@@ -164,6 +164,9 @@ CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
         r"puts all cameras at one place: give a calibration with their poses|does not fit",
     ),
     (edited(lambda c: c["all"]["cameras"].remove(c["03"])), [], r"no camera for 03"),
+    (edited(lambda c: c["03"].update(R=c["02"]["R"], t=c["02"]["t"])), [], r"cameras 02 and 03 the identical pose"),
+    (overwritten("cameras.json", b"<?xml version='1.0'?><calibration/>"), [], r"of Qualisys: convert it to TOML with"),
+    (overwritten("cameras.json", b"<?xml version='1.0'?><opencv_storage/>"), [], r"XML of OpenCV.*write intri.yml"),
     (overwritten("cameras.json", b"{]"), [], r"not JSON|no calibration that can be read"),
     (overwritten("cameras.json", None), [], r"no such calibration|there is no such file|is not there"),
     (lambda given: None, ["--offsets", "07=3"], r"--offsets names camera '07', have 02, 03, 04"),
@@ -212,6 +215,13 @@ def test_another_import_and_another_folder_are_not_written_over(
     assert main([*command, "--frames", "0:2"]) == 2
     assert "holds another import, made with other frames: give another --output" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    refused = [*command[:-4], "--offsets", "none", "--scale", "0.3"]
+    refused[5] = str(tmp_path / "later")
+    assert main([*refused, "--frames", "500"]) == 2
+    assert main([*refused, "--frames", "0:4:2"]) == 0, "a refused import leaves nothing that blocks its own advice"
+    later = open_recording(tmp_path / "later")
+    assert later.rate == pytest.approx(later.fps / 2)
+    capsys.readouterr()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("mine")
     assert main([*command[:5], str(tmp_path / "mine"), "--frames", "0:1"][:6]) == 2

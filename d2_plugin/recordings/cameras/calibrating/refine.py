@@ -10,7 +10,7 @@ neither.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -77,7 +77,7 @@ class RefinedPoses:
     doubt: dict[str, tuple[float, float]]
     """Camera -> the same between the poses of the two halves, about two standard deviations."""
     points: int
-    turns: dict[str, Turn]
+    turns: dict[str, Turn] = field(default_factory=dict)
 
     def applied(self, recording: Recording) -> Recording:
         """The recording with these poses and a note; the same recording where they were not accepted."""
@@ -298,7 +298,7 @@ def _judged(
         reason = f"the poses stay: two halves of the images differ about them by as much as they would change, {change}"
     accepted = falls and bool(larger.any())
     cameras = laid if accepted else dict(given)
-    return RefinedPoses(cameras, accepted, reason, *pixels, changes, doubt, len(whole.points), {})
+    return RefinedPoses(cameras, accepted, reason, *pixels, changes, doubt, len(whole.points))
 
 
 def _mean_square(changes: Mapping[str, tuple[float, float]]) -> np.ndarray:
@@ -308,4 +308,4 @@ def _mean_square(changes: Mapping[str, tuple[float, float]]) -> np.ndarray:
 
 
 def _kept(given: Mapping[str, Camera], reason: str) -> RefinedPoses:
-    return RefinedPoses(dict(given), False, reason, None, None, {}, {}, 0, {})
+    return RefinedPoses(dict(given), False, reason, None, None, {}, {}, 0)
