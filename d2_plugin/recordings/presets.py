@@ -2,7 +2,6 @@
 
     preset:4                       four views of the data set that the recording is recognised as; 2 and 3 alike
     preset:n3dv:4                  four views by the order of N3DV, whatever the recording is
-    protocol:ours-4                the same as preset:4
     protocol:gc-4dgs-2  -3  -4     N3DV as GC-4DGS trains it (Li et al. 2025, github.com/liyw420/GC-4DGS, its script
                                    scripts/pre_dynerf/pose2MVS.py): lists by scene, which count the recording's
                                    cameras in the order of their names; the first camera, cam00, is scored
@@ -80,7 +79,6 @@ CAMERAS_4C4D = ("cam01", "cam10", "cam13", "cam20")
 PROTOCOLS = {
     **{f"gc-4dgs-{views}": "GC-4DGS, scripts/pre_dynerf/pose2MVS.py" for views in VIEWS},
     "4c4d": "4C4D, default of scripts/n3v2blender.py",
-    **{f"ours-{views}": "this project's choice" for views in VIEWS},
 }
 """By name, where each is written."""
 
@@ -133,12 +131,10 @@ def camera_split(recording: Recording, text: str) -> CameraSplit:
     if name.startswith(PAPER):
         raise D2Error(
             "the camera lists of the D²-4DGS paper are in a supplement that is not public: choose "
-            f"{', '.join(PROTOCOL + one for one in PROTOCOLS)}, or name the training cameras"
+            f"preset:4, {', '.join(PROTOCOL + one for one in PROTOCOLS)}, or name the training cameras"
         )
     if name not in PROTOCOLS:
         raise unknown_name("protocol", name, PROTOCOLS)
-    if name.startswith("ours-"):
-        return _preset(recording, f"{PRESET}{name[-1]}")
     train = _trained_by_4c4d(recording) if name == "4c4d" else _trained_by_gc_4dgs(recording, int(name[-1]))
     others = tuple(one for one in recording.cameras if one not in train)
     test = others if name == "4c4d" else (min(recording.cameras),)
@@ -189,7 +185,7 @@ def _trained_by_gc_4dgs(recording: Recording, views: int) -> tuple[str, ...]:
     if scene is None:
         raise D2Error(
             f"protocol:gc-4dgs-{views} has lists for {', '.join(GC_4DGS)} of N3DV and not for '{recording.name}': "
-            "name the folder after its scene, or choose protocol:ours-2, -3 or -4"
+            "name the folder after its scene, or choose preset:2, preset:3 or preset:4"
         )
     cameras = sorted(recording.cameras)
     if len(cameras) < FEWEST_CAMERAS:

@@ -79,24 +79,19 @@ class UndistortedSource(Source):
     _kept: dict[str, Undistortion] = field(default_factory=dict, repr=False)
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """RGB uint8 [H, W, 3], black where nothing was recorded."""
         return self._undone(camera, self.source.image(camera, frame))
 
     def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        """True planar z of the undistorted image as it lies on disk, or None."""
         return self.source.depth(camera, frame)
 
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        """A monocular map of the undistorted image as it lies on disk, or None."""
         return self.source.mono(camera, frame)
 
     def mask(self, camera: str, frame: int) -> np.ndarray | None:
-        """The mask of the recorded image, undistorted with it, or None."""
         mask = self.source.mask(camera, frame)
         return None if mask is None else self._undone(camera, mask)
 
     def recorded(self, camera: str) -> np.ndarray | None:
-        """Which pixels [H, W] of the undistorted image were recorded, or None where all were."""
         valid = self.source.recorded(camera)
         if camera not in self.cameras:
             return valid

@@ -58,12 +58,13 @@ class Evidence(NamedTuple):
 
 
 def common_clock(
-    videos: Mapping[str, VideoFile], how: str, watching: Callable[[], Mapping[str, Watched]]
+    videos: Mapping[str, VideoFile], how: str, watching: Callable[[], Mapping[str, Watched]] | None
 ) -> dict[str, Clock]:
     """When each video's clock began, by the best evidence there is: timecode, then sound, then motion.
 
     Where nothing says it and all files are alike, their own stamps are taken, and `method` says so.
-    `watching` gives small images of all cameras; all videos are decoded for it, so only where motion must decide.
+    `watching` gives small images of all cameras; all videos are decoded for it, so only where motion must decide. With
+    None, as motion takes the calibration that may be looked for, nothing comes back there.
 
     Raises:
         D2Error: no evidence links a camera to the others, or the evidence contradicts itself.
@@ -76,6 +77,8 @@ def common_clock(
     if how in ("auto", "sound"):
         evidence += _of_sound({name: read_sound(video.path) for name, video in videos.items() if video.sound})
     if how == "motion" or (how == "auto" and len(linked_names(names, [one[:2] for one in evidence])) < len(names)):
+        if watching is None:
+            return {}
         by_motion, doubt = _of_motion(watching(), names, videos)
         if doubt and (evidence or how == "motion" or not _of_one_recorder(videos.values())):
             raise D2Error(f"{doubt}: {INSTEAD}")

@@ -41,7 +41,7 @@ from d2_plugin.recordings.importing.settings import UNITS, ImportSettings, check
 from d2_plugin.recordings.importing.solved_rig import calibration_table, rig_of_videos, summary
 from d2_plugin.recordings.importing.source import Cut, VideosSource, cuts_of
 from d2_plugin.recordings.importing.steady import DRIFT, steadiness
-from d2_plugin.recordings.importing.steps import STEPS, identity, kept, paths_of, refuse_another
+from d2_plugin.recordings.importing.steps import SOLVED, STEPS, identity, kept, paths_of, refuse_another
 from d2_plugin.recordings.importing.video import VideoFile, read_video
 from d2_plugin.recordings.readers.videos import KIND as VIDEOS
 from d2_plugin.recordings.readers.videos import TABLE
@@ -83,8 +83,8 @@ def import_videos(settings: ImportSettings, report: Report = lambda line: None) 
         remove_leftovers(folder)
         if solved is not None:
             kept(folder, "rig", lambda: solved)
-            table = json_text(solved, "calibration.json", indent=1, sort_keys=True)  # as the one that is kept has them
-            write_text(folder / "calibration.json", table + "\n")
+            table = json_text(solved, SOLVED, indent=1, sort_keys=True)  # as the one that is kept has them
+            write_text(folder / SOLVED, table + "\n")
         clocks = _clocks(settings, folder, videos, cameras)
         report(_clocks_in_words(clocks, videos))
         grid = grid_of(videos, clocks, settings.rate, settings.times, settings.frames)
@@ -132,8 +132,8 @@ def _known_rig(
     for one, other in combinations(cameras, 2):
         if np.allclose(one.T_camera_world, other.T_camera_world, atol=SAME_POSE * width):
             raise D2Error(
-                f"{calibration} gives cameras {one.name} and {other.name} the identical pose: correct one, or leave its "
-                "video out"
+                f"{calibration} gives cameras {one.name} and {other.name} the identical pose: correct one, or leave "
+                "its video out"
             )
     wrong, said = _contradiction(turned, cameras) if len(cameras) > 1 else (False, "")
     if wrong and not settings.accept_calibration:

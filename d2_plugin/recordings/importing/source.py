@@ -102,7 +102,6 @@ class VideosSource(Source):
         return {name: self.cuts[name].camera(camera) for name, camera in self.cameras.items()}
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """RGB uint8 [H, W, 3]: undistorted, black where nothing was recorded, cut and made smaller."""
         image = self._undistorted.image(camera, frame)
         expected = self.cameras[camera]
         if image.shape[:2] != (expected.height, expected.width):
@@ -114,7 +113,6 @@ class VideosSource(Source):
         return self.cuts[camera].of(image)
 
     def recorded(self, camera: str) -> np.ndarray | None:
-        """Which pixels [h, w] were recorded, or None where all were."""
         valid = valid_pixels(self.cameras[camera], self.cuts[camera])
         return None if valid.all() else valid
 

@@ -21,6 +21,8 @@ from d2_plugin.recordings.importing.video import VIDEO_SUFFIXES, videos_below
 
 STEPS = "import"  # folder of what each step gave
 
+SOLVED = "calibration.json"  # of poses that were found from the videos
+
 KIND = Kind("step of an import", 1, "delete it, it will be made again")
 
 MOST_FILES = 1000  # of a calibration that is a folder
@@ -68,11 +70,10 @@ def refuse_another(folder: Path, wanted: Mapping[str, Any]) -> None:
     if kept_settings.is_file():
         there = read_table(kept_settings, KIND)
         changed = sorted(key for key in {*there, *wanted} if there.get(key) != wanted.get(key))
-        if changed and all(
-            is_leftover(inside) or inside.name in (STEPS, "calibration.json") for inside in folder.iterdir()
-        ):
+        if changed and all(is_leftover(inside) or inside.name in (STEPS, SOLVED) for inside in folder.iterdir()):
             with only_writer(folder):
                 shutil.rmtree(folder / STEPS)
+                (folder / SOLVED).unlink(missing_ok=True)
         elif changed:
             raise D2Error(
                 f"{folder} holds another import, made with other {', '.join(changed)}: give another --output, or "

@@ -35,14 +35,11 @@ SKIP_LIMIT = 48
 
 MOST_FRAMES = 10_000_000  # A video that has more is damaged: this many are four days at 30 per second
 
-ATOMS = (b"ftyp", b"styp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
-"""What an MP4 or MOV may begin with, behind its length."""
-
-BEGINNINGS = (b"\x1aE\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3")
-"""Of Matroska and WebM, of an MPEG program stream and of MPEG video."""
-
-PACKETS = ((0, 188), (4, 196))
-"""Where the first two packets of an MPEG transport stream begin, without and with time codes."""
+OPENING = {
+    "format_whitelist": "mov,matroska,webm,avi,mpeg,mpegts,mpegvideo",
+    "protocol_whitelist": "file",
+}
+"""Options of FFmpeg, which else follows playlists and scripts to other files and addresses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,22 +106,25 @@ def pyav() -> ModuleType:
 @contextmanager
 def container_of(path: Path) -> Iterator[Any]:
     """The opened file; whatever FFmpeg says against it becomes one sentence."""
-    av = pyav()
-    _check_container(path)
-    with parsing(f"video {shown_path(path)}", _remedy(path)), av.open(str(path)) as container:
+    with parsing(f"video {shown_path(path)}", _remedy(path)), open_container(path) as container:
         yield container
 
 
-def _check_container(path: Path) -> None:
-    """Refuse what holds no video itself: FFmpeg also follows playlists and scripts to other files and addresses."""
-    with opened(path, _remedy(path)) as file:  # a pipe or a device would block
-        head = file.read(256)
-    riff = head[:4] == b"RIFF" and head[8:11] == b"AVI"
-    transport = any(head[first : first + 1] == b"G" == head[second : second + 1] for first, second in PACKETS)
-    if not (riff or transport or head[4:8] in ATOMS or head[:4] in BEGINNINGS):
+def open_container(path: Path) -> Any:
+    """The file as PyAV opens it.
+
+    Raises:
+        D2Error: no file, or one of another kind.
+    """
+    av = pyav()
+    with opened(path, _remedy(path)):  # a pipe or a device would block
+        pass
+    try:
+        return av.open(str(path), options=OPENING)
+    except av.error.ArgumentError:
         raise D2Error(
             f"{shown_path(path)} is no video in an MP4, MOV, Matroska, WebM, AVI or MPEG container: {_remedy(path)}"
-        )
+        ) from None
 
 
 def read_video(path: Path) -> VideoFile:
@@ -267,8 +267,7 @@ class Decoder:
         if self.video.counted and index <= self._reached:
             self.close()
         if self._container is None:
-            _check_container(self.video.path)
-            self._container = pyav().open(str(self.video.path))
+            self._container = open_container(self.video.path)
             self._container.streams.video[0].thread_type = "AUTO"
             self._frames = self._container.decode(video=0)
         if not self.video.counted and not 0 < index - self._reached <= SKIP_LIMIT:
@@ -287,7 +286,6 @@ class VideoFrames(Source):
     _decoders: dict[str, Decoder] = field(default_factory=dict, repr=False, compare=False)
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """RGB uint8 [H, W, 3]."""
         index = frame if self.indices is None else self.indices[camera].get(frame)
         if index is None:
             raise D2Error(f"camera {camera} has no frame {frame}: choose one of the recording's frames")

@@ -131,15 +131,12 @@ class SyntheticSource(Source):
     _cache: OrderedDict[tuple[str, str, int], np.ndarray] = field(default_factory=OrderedDict, repr=False)
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """RGB uint8 [H, W, 3]."""
         return self._kept("image", camera, frame, render_color)
 
     def depth(self, camera: str, frame: int) -> np.ndarray:
-        """Exact planar z float32 [H, W]; every ray meets a surface."""
         return self._kept("depth", camera, frame, render_depth)
 
     def mono(self, camera: str, frame: int) -> np.ndarray:
-        """Emulated monocular prediction float32 [H, W]: affine-invariant inverse depth, larger is nearer."""
         number = list(self.cameras).index(camera)
         depth = self.depth(camera, frame)
         fixed = np.random.default_rng([self.seed, 1, number])
