@@ -47,7 +47,7 @@ class TestRefinedPoses:
         refined = refine_poses(given, seen_by(truth))
         assert [name for name, turn in refined.turns.items() if turn.wrong] == ["c2"]
         assert refined.turns["c2"].degrees == pytest.approx(degrees, abs=0.1)
-        assert "camera c2 is turned by" in turns_in_words(refined.turns)[0]
+        assert "camera c2 is turned by" in turns_in_words(refined.turns, truth)[0]
         assert max(degrees_between(refined.cameras[name], truth[name]) for name in truth) < 0.1
 
     def test_right_poses_stay(self) -> None:

@@ -81,6 +81,8 @@ def turned(name: str, cameras: Mapping[str, Camera], matched: Matched) -> Camera
     """
     own = {pair: pixels for pair, pixels in matched.items() if name in pair}
     camera, step = cameras[name], 1e-5
+    if not own:
+        return camera
 
     def misses(angles: np.ndarray) -> np.ndarray:
         trial = {**cameras, name: rotated(camera, angles)}

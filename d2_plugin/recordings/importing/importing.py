@@ -235,7 +235,7 @@ def _with_checked_poses(recording: Recording, report: Report) -> Recording:
     except MissingExtra as missing:
         report(f"poses are not checked: {missing}")
         return recording
-    sentences = turns_in_words(turns)
+    sentences = turns_in_words(turns, recording.cameras)
     for sentence in sentences:
         report(sentence)
     return replace(recording, notes=(*recording.notes, *sentences[: sum(turn.wrong for turn in turns.values())]))

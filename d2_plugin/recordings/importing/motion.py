@@ -102,7 +102,7 @@ def offsets_from_motion(watched: Mapping[str, Watched], search: float) -> dict[s
             curves[one, other] = pair
     whole, *without = (_scores(curves, which) for which in range(1 + GROUPS))
     offsets = _agreed(names, whole, _tree(names, whole))
-    apart = {name: [] for name in names}
+    apart: dict[str, list[float]] = {name: [] for name in names}
     for scores in without:
         for name, offset in _agreed(names, scores, offsets).items():
             apart[name].append(offset)

@@ -59,7 +59,7 @@ def _jump(before: np.ndarray, after: np.ndarray) -> float:
     cv2 = opencv("comparing images over time")
     (x, y), _ = cv2.phaseCorrelate(before, after, cv2.createHanningWindow(before.shape[::-1], cv2.CV_32F))
     back = cv2.warpAffine(
-        after, np.float32([[1, 0, -x], [0, 1, -y]]), before.shape[::-1], borderMode=cv2.BORDER_REPLICATE
+        after, np.array([[1, 0, -x], [0, 1, -y]], np.float32), before.shape[::-1], borderMode=cv2.BORDER_REPLICATE
     )
     inner = tuple(slice(round(abs(shift)) + 1, -round(abs(shift)) - 1) for shift in (y, x))
     left, there = (float(np.abs(one - before)[inner].mean()) if one[inner].size else np.inf for one in (back, after))

@@ -229,6 +229,16 @@ def test_another_import_and_another_folder_are_not_written_over(
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
 
 
+def test_who_knows_better_imports_all_the_same(given: Filmed, tmp_path: Path, capsys) -> None:
+    of_another_rig(given)
+    words = ["import", str(given.videos), "--calibration", str(given.calibration), "--output", str(tmp_path / "c")]
+    words += ["--exposure", "false", "--offsets", "none", "--frames", "0:1", "--images", "videos"]
+    assert main(words) == 2
+    assert "or give --accept-calibration true" in capsys.readouterr().err
+    assert main([*words, "--accept-calibration", "true"]) == 0
+    assert any("misses features" in note for note in open_recording(tmp_path / "c").notes)
+
+
 def test_one_video_of_another_event(room: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The same room, another take: sound of its own, and things that move at other times."""
     take = video(room, tmp_path / "one", {name: Shooting() for name in NAMES}, sound=True, sounds={"04": 99})

@@ -9,7 +9,7 @@ neither.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -123,8 +123,8 @@ def check_poses(recording: Recording) -> dict[str, Turn]:
     return _turns(small.cameras, *_expected(small.cameras, features)[:2])[0]
 
 
-def turns_in_words(turns: Mapping[str, Turn]) -> list[str]:
-    """A sentence for each camera that is turned, and one about the others."""
+def turns_in_words(turns: Mapping[str, Turn], cameras: Collection[str]) -> list[str]:
+    """A sentence for each camera that is turned, then what is known of the others."""
     sentences = [
         f"camera {name} is turned by {turn.degrees:.2f} degrees (known within {turn.doubt:.2f}) and misses what others "
         f"see by {turn.pixels:.1f} pixels: give --refine-poses true, or calibrate it again"
@@ -136,7 +136,9 @@ def turns_in_words(turns: Mapping[str, Turn]) -> list[str]:
         for name, turn in turns.items()
         if not turn.wrong
     )
-    return [*sentences, f"poses hold as far as features tell: {held}"] if held else sentences
+    unknown = ", ".join(name for name in cameras if name not in turns)
+    more = [f"poses hold as far as features tell: {held}"] if held else []
+    return sentences + more + ([f"poses not checked: {unknown}, too few shared features"] if unknown else [])
 
 
 def _expected(
@@ -153,7 +155,8 @@ def _turns(
     given: Mapping[str, Camera], features: Mapping[str, Features], matches: Matches
 ) -> tuple[dict[str, Turn], dict[str, Camera]]:
     """(what is said about each camera with matches, the cameras with the proven turns), the worst camera first."""
-    cameras, turns = dict(given), {}
+    cameras = dict(given)
+    turns: dict[str, Turn] = {}
     halves = [halved(matches, features, given, which) for which in (0, 1)]
     while True:
         tried = {}
@@ -273,7 +276,8 @@ def _rms(cameras: Mapping[str, Camera], matches: Matches, features: Mapping[str,
     for (a, b), pairs in matches.items():
         p, q = features[a].pixels[pairs[:, 0]], features[b].pixels[pairs[:, 1]]
         squares.append(np.minimum(np.abs(sampson(cameras[a], cameras[b], p, q)), 2 * pixel_error(cameras[a])) ** 2)
-    return float(np.sqrt(np.concatenate(squares).mean()))
+    joined = np.concatenate(squares)
+    return float(np.sqrt(joined.mean())) if len(joined) else 0.0
 
 
 def _judged(
